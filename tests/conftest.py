@@ -93,10 +93,10 @@ BY_KIND = (
 LONGEST = (
     *BY_KIND,
     *("test_keops.py", "test_torch_program.py", "test_report.py", "test_registered.py", "test_recalibrate.py"),
-    *("test_outliers.py", "test_recalibrate_checks.py", "test_transforms.py", "test_rigid.py"),
-    *("test_hidden_markers_whole.py", "test_registered_hardware.py", "test_plausibility.py", "test_json_results.py"),
+    *("test_outliers.py", "test_sockets.py", "test_transforms.py", "test_rigid.py"),
+    *("test_hidden_markers.py", "test_planned_sensors.py", "test_json_results.py"),
     *("test_distributed.py", "test_analysis.py", "test_evaluators.py", "test_readings.py", "test_tree_calibrations.py"),
-    *("test_open_directions.py", "test_calibrate.py", "test_hardware.py", "test_unusual_data.py"),
+    *("test_registration.py", "test_calibrate.py", "test_hardware.py", "test_unusual_data.py"),
     *("test_refused.py", "test_second_device.py", "test_torchdiffeq.py", "test_fit.py", "test_default_device.py"),
     *("test_examples.py", "test_calibrated.py", "test_tools.py", "test_mixtures.py", "test_sessions.py"),
 )

@@ -11,8 +11,6 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-from branch_bank import branches, lines_of
-
 import diffeo_calib
 
 # From the ground up: a folder may import from those before it in this table, and from itself, but not in a circle.
@@ -60,7 +58,6 @@ MOST_PUBLIC_NAMES = 53
 
 PACKAGE = Path(diffeo_calib.__file__).parent
 LEVEL = {name: level for level, (name, _) in enumerate(FLOORS)}
-REPOSITORY = PACKAGE.parent
 
 
 def module_name(path: Path) -> str:
@@ -189,7 +186,7 @@ def habits(module: str, tree: ast.Module) -> Iterator[str]:
 
 
 def test_says_what_it_is_and_neither_prints_nor_asserts() -> None:
-    assert len(trees()) > 200
+    assert len(trees()) > 100
     found = [text for module, tree in trees().items() for text in habits(module, tree)]
     assert not found, "\n".join(found)
 
@@ -203,54 +200,17 @@ def test_few_public_names() -> None:
 
 # --- the checks above find what they are made for ---------------------------------------------------
 
-EXAMPLE = """
-import torch, diffeo_calib.common.errors
-from diffeo_calib.common import checks, Gaussian
-from . import integrators
-from .integrators import RK4
-from ..kernels.named import VonMises
-def later():
-    from diffeo_calib.robots.chain import Chain
-"""
-
-
-def test_imports_are_found_and_resolved() -> None:
-    root = PACKAGE.name
-    names = ("common", "common.checks", "flows", "flows.integrators", "flows.geodesic", "kernels", "kernels.named")
-    known = {f"{root}.{name}" for name in names} | {root}
-    tree = ast.parse(EXAMPLE)
-    expected = ["common.errors", "common.checks", "common", "flows.integrators", "flows.integrators"]
-    expected += ["kernels.named", "robots.chain"]
-    for module, source in ((f"{root}.flows.geodesic", tree), (f"{root}.flows", tree)):
-        found = [name for name, _ in imported_modules(module, source, known)]
-        assert found == [f"{root}.{name}" for name in expected]
-
-
 ARROWS = [
     ("kernels.radial", "kernels.spaces", True),
-    ("kernels.radial", "kernels.reductions.backends", True),
     ("kernels.reductions.backends", "kernels.radial", False),
-    ("kernels.profiles", "kernels.reductions.tiled", False),
-    ("flows.geodesic", "flows.integrators", True),
-    ("maps.geodesic", "flows.geodesic", True),
-    ("flows.geodesic", "maps.geodesic", False),
     ("maps.nominal", "robots.geometry", False),
-    ("fitting.problem", "robots.chain", False),
     ("fitting.problem", "measurements.table", False),
     ("robots.chain", "kernels.base", False),
-    ("robots.chain", "fitting.fit", False),
-    ("measurements.table", "flows.integrators", False),
-    ("measurements.poses", "robots.se3", True),
-    ("robots.chain", "measurements.table", False),
     ("kinematics.nominal", "robots.geometry", True),
     ("kinematics.nominal", "calibration.calibrate", False),
-    ("calibration.identification.registration", "calibration.scales.noise_model", False),
     ("calibration.scales.noise_model", "calibration.identification.registration", True),
-    ("calibration.calibrate", "calibration.diagnostics.plausibility", True),
-    ("calibration.diagnostics.plausibility", "calibration.calibrate", False),
     ("fitting.fit", "paper.eulerian", True),
     ("fitting.problem", "paper.eulerian", False),
-    ("reports.report", "cli.main", False),
     ("cli.main", "", False),
 ]
 """A module, one that it imports, and whether it may."""
@@ -263,40 +223,99 @@ def test_floors_are_enforced() -> None:
         assert (mistakes == []) is allowed, (module, other)
 
 
-def test_bad_habits_are_found() -> None:
-    code = "def f(x):\n    assert x\n    print(x)\n"
-    found = [text.partition(": ")[0] for text in habits("diffeo_calib.flows.f", ast.parse(code))]
-    assert found == ["diffeo_calib.flows.f", "diffeo_calib.flows.f, line 2", "diffeo_calib.flows.f, line 3"]
-    assert not list(habits("diffeo_calib.cli.f", ast.parse('"""A command."""\nprint()\n')))
-
-
-def test_cycles_are_found() -> None:
-    assert find_cycle({"a": {"b"}, "b": {"c"}, "c": set()}) == []
-    assert find_cycle({"a": {"b"}, "b": {"c", "d"}, "c": set(), "d": {"b"}}) == ["b", "d", "b"]
-
-
 # --- no branch on the kind of the rows ------------------------------------------------------------------------------
+#
+# A branch is the test of an `if`, a ternary, a `while` or a filter of a comprehension, or a truth value that is a
+# factor, as in ``text * bool(x)``. It asks for a kind if one of the values that decide it
+#
+# * is ``isinstance`` with a table: `Measurements`, `Readings` or `Observations`;
+# * is compared with the name of a kind, such as "image";
+# * is an attribute, or a name, of what rows of some kinds alone have: ``data.sockets``, ``model.lever``, ``session``.
+#
+# The values that decide a test are found through `not`, `and`, `or`, comparisons, indices, ``len``, ``bool``, ``int``,
+# ``any`` and ``all``. Files of a set of devices, in which kinds may differ, are not looked at.
+# What differs between kinds belongs into the file of its sensor or of its set of devices.
 
-BRANCHES = {}
-"""Branches on a kind in calibration/, kinematics/, reports/ and cli/commands/, see branch_bank: they may only shrink.
-
-What differs between kinds belongs into the file of its sensor or of its set of devices. This prints the table anew:
-``python tests/test_architecture.py``.
-"""
-SLACK = 15
-"""By as much the budget may exceed the branches in all: renew it then."""
-
-
-def test_no_new_branches_on_a_kind() -> None:
-    found = branches(PACKAGE)
-    new = [f"{name}, lines {lines}: {BRANCHES.get(name, 0)} allowed" for name, lines in found.items()]
-    new = [text for text, (name, lines) in zip(new, found.items(), strict=True) if len(lines) > BRANCHES.get(name, 0)]
-    assert not new, "branches on the kind of rows:\n" + "\n".join(new)
+ROOMS = ("calibration", "kinematics", "reports", "cli/commands")
+OF_DEVICES = ("calibration/placing/readings.py", "calibration/placing/sessions.py", "calibration/placing/sockets.py")
+TABLES = {"Measurements", "Readings", "Observations"}
+KINDS = {"position", "pose", "socket", "mixture", "distance", "displacement", "height", "image"}
+NAMES = {"sockets", "socket", "session", "sessions", "readings", "lever", "payload", "board"}
+ATTRIBUTES = {
+    *(NAMES | {"poses", "frames", "places", "socket_numbers", "camera_on_tool", "session_names"}),
+    *("without_device", "ball", "workspace"),
+}
+THROUGH = {"len", "bool", "int", "float"}
 
 
-def test_the_budget_of_branches_shrinks() -> None:
-    found = branches(PACKAGE)
-    assert sum(BRANCHES.values()) - sum(map(len, found.values())) <= SLACK, "run this file to renew the table"
+def branches(root: Path) -> dict[str, list[int]]:
+    """Lines of the branches on a kind, by file, of the package in ``root``."""
+    found = {}
+    for path in (path for room in ROOMS for path in sorted((root / room).rglob("*.py"))):
+        name = path.relative_to(root).as_posix()
+        lines = [] if name in OF_DEVICES else lines_of(path.read_text(encoding="utf-8"))
+        found |= {name: lines} if lines else {}
+    return found
+
+
+def lines_of(source: str) -> list[int]:
+    """Lines of the branches on a kind in a file."""
+    return sorted(test.lineno for test in _tests(ast.parse(source)) if any(map(_asks, _deciding(test))))
+
+
+def _tests(tree: ast.AST) -> Iterator[ast.expr]:
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.If, ast.IfExp, ast.While)):
+            yield node.test
+        elif isinstance(node, ast.comprehension):
+            yield from node.ifs
+        elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult):
+            yield from (side for side in (node.left, node.right) if _is_truth(side))
+
+
+def _is_truth(node: ast.expr) -> bool:
+    called = isinstance(node, ast.Call) and ast.unparse(node.func) == "bool"
+    return called or isinstance(node, (ast.Compare, ast.BoolOp))
+
+
+def _deciding(node: ast.expr) -> Iterator[ast.expr]:
+    """The values that decide a test, and the comparisons on the way to them."""
+    inner: list[ast.expr] = []
+    if isinstance(node, ast.BoolOp):
+        inner = node.values
+    elif isinstance(node, ast.UnaryOp):
+        inner = [node.operand]
+    elif isinstance(node, ast.Compare):
+        yield node
+        inner = [node.left, *node.comparators]
+    elif isinstance(node, ast.Subscript):
+        inner = [node.value]
+    elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in ("any", "all"):
+        inner = [node.func.value]
+    elif isinstance(node, ast.Call) and ast.unparse(node.func) in THROUGH:
+        inner = node.args
+    else:
+        yield node
+    for one in inner:
+        yield from _deciding(one)
+
+
+def _asks(node: ast.expr) -> bool:
+    if isinstance(node, ast.Call):
+        named = {one.id for one in ast.walk(node) if isinstance(one, ast.Name)}
+        return ast.unparse(node.func) == "isinstance" and bool(named & TABLES)
+    if isinstance(node, ast.Compare):
+        constants = [one for side in (node.left, *node.comparators) for one in ast.walk(side)]
+        return any(
+            isinstance(one, ast.Constant) and isinstance(one.value, str) and one.value in KINDS for one in constants
+        )
+    if isinstance(node, ast.Attribute):
+        return node.attr in ATTRIBUTES
+    return isinstance(node, ast.Name) and node.id in NAMES
+
+
+def test_no_branches_on_a_kind() -> None:
+    assert branches(PACKAGE) == {}
 
 
 def test_branches_on_a_kind_are_found() -> None:
@@ -330,8 +349,3 @@ def test_one_table_of_the_priors_of_places() -> None:
     assert pattern.search("PLACE_DEVIATION_M = 0.1")
     found = [path.name for path in SOURCES.values() if pattern.search(path.read_text(encoding="utf-8"))]
     assert not found, found
-
-
-if __name__ == "__main__":
-    for file, lines in branches(PACKAGE).items():
-        print(f'    "{file}": {len(lines)},')

@@ -24,7 +24,11 @@ README, PAGES = ROOT / "README.md", ROOT / "scripts/docs/pages"
 TEXTS = [README, *(PAGES / name for name in re.findall(r"[\w/]+\.md", (ROOT / "scripts/docs/mkdocs.yml").read_text()))]
 """In the order of the site; pages that it makes itself are no files."""
 MOST_LINES = 130
-ELSEWHERE = {"camera.md": "scripts/examples/board_afternoon.py", "live.md": "tests/campaign"}
+ELSEWHERE = {
+    "camera.md": "scripts/examples/board_afternoon.py",
+    "live.md": "tests/campaign",
+    "makers.md": "tests/cli/test_makers.py",
+}
 """Pages whose commands other tests run; here their options are checked."""
 
 

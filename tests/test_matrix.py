@@ -363,7 +363,7 @@ def _(bench: Bench) -> None:
     share_places(kind, "compare", bench.command.monkeypatch)
     found: Any = dc.compare(kind.model, kind.moved)
     assert not found.changes.found
-    bench.command.monkeypatch.setattr("diffeo_calib.cli.commands.compare.compare", lambda *_, **__: found)
+    bench.command.monkeypatch.setattr("diffeo_calib.cli.commands.recalibrate.compare", lambda *_, **__: found)
     table, options = kind.table("moved")
     bench.judged("compare", kind.file, table, *options)
 

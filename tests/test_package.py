@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import ast
 import importlib
+import logging
+import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from command_bank import Command
 from hatchling.builders.wheel import WheelBuilder
+from lxml import html
+from product_bank import Case, simulated
 
 import diffeo_calib as dc
 
@@ -48,10 +54,6 @@ def test_models_are_used_without_scipy() -> None:
     file = PACKAGE.parent / "tests/interop/data/robot_format_3.safetensors"
     code = f"import sys, diffeo_calib as dc; m = dc.load({str(file)!r}); m([[0.1] * m.robot.n]); dc.calibrate; "
     assert run(code + "print('scipy' in sys.modules)") == "False"
-
-
-def test_errors_are_loaded_without_torch() -> None:
-    assert run("import sys, diffeo_calib as dc; dc.DiffeoCalibError; print('torch' in sys.modules)") == "False"
 
 
 def test_every_public_name_is_loaded_and_listed() -> None:
@@ -95,12 +97,6 @@ def test_names_seen_by_type_checkers_are_those_that_are_loaded() -> None:
         assert getattr(sys.modules[str(module)], name) is getattr(dc, name), "the table names another module"
 
 
-def test_no_module_has_the_name_of_a_public_function() -> None:
-    """The import of a module binds its name in its package, here in place of the function."""
-    modules = {path.stem for path in PACKAGE.iterdir() if path.is_dir() or path.suffix == ".py"}
-    assert not modules & set(dc.__all__)
-
-
 def test_unknown_names_are_attribute_errors() -> None:
     with pytest.raises(AttributeError, match=r"^module 'diffeo_calib' has no attribute 'calibarte'$"):
         dc.calibarte  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
@@ -124,5 +120,125 @@ def test_extras_in_messages_and_pages_exist() -> None:
     files = [*PACKAGE.rglob("*.py"), *(root / "scripts/docs/pages").rglob("*.md")]
     text = "\n".join(path.read_text(encoding="utf-8") for path in files)
     named = set(re.findall(r"pip install \W*(?:diffeo_calib|\.)\[(\w+)\]", text))
-    assert {"camera", "collisions", "fused", "notebooks", "onnx", "ros"} == named
+    assert {"camera", "collisions", "excel", "fused", "notebooks", "onnx", "ros"} == named
     assert named <= set(re.findall(r"^(\w+) = ", table, re.MULTILINE))
+
+
+# --- every Python -----------------------------------------------------------------------------------------------------
+
+IMPORT_ALL = """
+import importlib, pkgutil, sys
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from unittest.mock import MagicMock
+
+class Anything(MetaPathFinder, Loader):
+    # Stands for every library: torch and its companions take minutes to install for one more Python.
+    def find_spec(self, name, path=None, target=None):
+        ours = name.partition(".")[0] in {*sys.stdlib_module_names, "diffeo_calib"}
+        return None if ours else ModuleSpec(name, self, is_package=True)
+
+    def create_module(self, spec):
+        return MagicMock(__path__=[])
+
+    def exec_module(self, module):
+        pass
+
+sys.meta_path.append(Anything())
+import diffeo_calib
+for found in pkgutil.walk_packages(diffeo_calib.__path__, "diffeo_calib."):
+    if not found.name.endswith(("__main__", ".sklearn")):  # the bases of its classes cannot be stood for
+        importlib.import_module(found.name)
+"""
+
+
+def interpreter(version: str) -> str | None:
+    """A Python of this version that runs: a name on the path may be a shim of one that is not chosen."""
+    pyenv = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
+    for name in (f"python{version}", *map(str, sorted(pyenv.glob(f"{version}.*/bin/python")))):
+        found = shutil.which(name)
+        if found and subprocess.run([found, "-c", ""], capture_output=True, check=False, timeout=60).returncode == 0:
+            return found
+    return None
+
+
+@pytest.mark.parametrize("version", ["3.10", "3.12", "3.13", "3.14"])
+def test_every_module_can_be_imported(version: str) -> None:
+    python = interpreter(version)
+    if python is None:
+        pytest.skip(f"no Python {version} here")
+    command = [python, "-S", "-B", "-W", "error", "-c", IMPORT_ALL]
+    environment = {**os.environ, "PYTHONPATH": str(Path(dc.__file__).parents[1])}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+# --- logging ----------------------------------------------------------------------------------------------------------
+
+
+def messages(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.name.startswith("diffeo_calib.")]
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_the_steps_of_a_calibration_and_of_a_report(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+    arm, train, test = simulated(30)
+    points = train.points.clone()
+    points[7] += 0.01
+    with caplog.at_level(logging.INFO, logger="diffeo_calib"):
+        result = dc.calibrate(arm.nominal, dc.Measurements(train.q, points))
+        dc.save(result.model, tmp_path / "arm.safetensors")
+        both = dc.Measurements.joined([train[:20], test[:20]])
+        dc.write_report(result.model, tmp_path / "arm.html", both)
+    found = messages(caplog)
+    assert {record.levelname for record in caplog.records} == {"INFO"}
+    begins = ("calibrating", "registration: ", "scales: ", "fit of 30 rows: converged", "rows that look")
+    places = [next(k for k, text in enumerate(found) if text.startswith(begin)) for begin in begins]
+    assert places == sorted(places)
+    assert found[places[-1]] == "rows that look wrong and hardly count: 7"
+    assert f"model written to {tmp_path}/arm.safetensors" in found
+    assert "judged by 20 rows it has not seen, 20 were used before" in found
+
+
+def test_nothing_is_shown_unasked(tmp_path: Path) -> None:
+    code = (
+        "import diffeo_calib as dc, torch, logging\n"
+        "q = torch.rand(5, 1); dc.Measurements(q, torch.rand(5, 3))\n"
+        "log = logging.getLogger('diffeo_calib'); log.warning('heard by nobody')\n"
+        "print(log.level, [type(one).__name__ for one in log.handlers])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    assert (done.stdout.strip(), done.stderr) == ("0 ['NullHandler']", "")
+
+
+def test_the_command_line_shows_them_with_verbose(command: Command, tmp_path: Path) -> None:
+    arm, *_ = simulated(1)
+    arm.write_urdf(tmp_path / "arm.urdf")
+    plan = ["plan", "--robot", tmp_path / "arm.urdf", "--base", "base_link", "--tip", "flange", "-n", 5, "--draw", 50]
+    quiet = command(*plan, "--length", "mm", "--angle", "deg", "-o", tmp_path / "a.csv")
+    asked = command("--verbose", *plan, "--length", "mm", "--angle", "deg", "-o", tmp_path / "b.csv")
+    assert (quiet.code, asked.code) == (0, 0)
+    assert "5 poses chosen of 50" not in quiet.err
+    assert "5 poses chosen of 50" in asked.err
+    assert not logging.getLogger("diffeo_calib").isEnabledFor(logging.INFO)
+    assert len(logging.getLogger("diffeo_calib").handlers) == 1
+
+
+# --- notebooks --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["arm", "posed"])
+def test_everything_has_a_table(name: str, request: pytest.FixtureRequest) -> None:
+    case: Case = request.getfixturevalue(name)
+    errors = dc.evaluate(case.model, case.test)
+    for shown, expected in (
+        (case.model, ["simulated_arm", "rows of the fit", str(len(case.train))]),
+        (case.result, ["gravity on joints", "transmission of elbow_joint", case.result.status]),
+        (errors, [f"{1e3 * errors.rms:.4f}", f"{1e3 * errors.p95:.4f}"]),
+        (case.test, [repr(case.test), "0" if case.test.joint_names is None else "elbow_joint"]),
+    ):
+        page = html.fromstring(shown._repr_html_())
+        assert len(list(page.iter("table"))) >= 1
+        for text in expected:
+            assert text in page.text_content()
+    assert ("orientation" in errors._repr_html_()) == (name == "posed")

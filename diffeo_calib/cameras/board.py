@@ -39,9 +39,8 @@ class BoardPrior:
 def real_board(points: Tensor, board: Tensor, size: float) -> Tensor:
     """Points (..., 3) of the board as it is, m, from those meant; board (5,)."""
     x, y, z = points.unbind(-1)
-    return torch.stack([(1 + board[0] + board[1]) * x, (1 + board[0] - board[1]) * y, z], -1) + torch.cat(
-        [torch.zeros_like(points[..., :2]), (size * (_bends(points, size) @ board[2:]))[..., None]], -1
-    )
+    bent = z + size * (_bends(points, size) @ board[2:])
+    return torch.stack([(1 + board[0] + board[1]) * x, (1 + board[0] - board[1]) * y, bent], -1)
 
 
 def board_slopes(points: Tensor, size: float) -> Tensor:

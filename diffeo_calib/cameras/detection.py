@@ -81,12 +81,12 @@ class Board:
             expected = "charuco:5x7:0.04:0.03:DICT_5X5_100, chessboard:7x5:0.03, aruco:4x5:0.04:0.01:DICT or "
             raise InputError.of("the board", expected=expected + "tag:0.1:DICT_APRILTAG_36h11:3", got=text)
         try:
-            made = {"charuco": _charuco, "chessboard": _chessboard, "aruco": _grid, "tag": _tag}[kind](cv2, words)
+            make = {"charuco": _charuco, "chessboard": _chessboard, "aruco": _grid, "tag": _tag}[kind]
+            points, find, markers, layout = make(cv2, words)
         except (ValueError, AttributeError, SystemError, cv2.error) as error:
             fix = "lengths in m, numbers of squares as 5x7, a dictionary of OpenCV such as DICT_5X5_100"
             what, expected = f"the board {text}", "numbers and a dictionary"
             raise InputError.of(what, expected=expected, got=str(error), fix=fix) from None
-        points, find, markers, layout = made
         middle = (points.min(0) + points.max(0)) / 2
         return cls(text, points - middle, find, markers, layout, min(FEWEST_CORNERS, len(points)))
 
@@ -122,9 +122,8 @@ def opencv() -> Any:
     try:
         import cv2  # noqa: PLC0415
     except ImportError:
-        raise InputError.of(
-            "boards are found by OpenCV, which is not installed", fix="pip install 'diffeo_calib[camera]'"
-        ) from None
+        what, fix = "boards are found by OpenCV, which is not installed", "pip install 'diffeo_calib[camera]'"
+        raise InputError.of(what, fix=fix) from None
     return cv2
 
 
@@ -191,10 +190,8 @@ def edge_widths(grey: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     steps = np.array([[1.0, 0.0], [0.0, 1.0], [0.5**0.5, 0.5**0.5], [0.5**0.5, -(0.5**0.5)]])
     found = []
     for column, row in np.rint(pixels).astype(int):
-        patch = grey[
-            max(row - HALF_PATCH_PX, 0) : row + HALF_PATCH_PX + 1,
-            max(column - HALF_PATCH_PX, 0) : column + HALF_PATCH_PX + 1,
-        ].astype(float)
+        rows, columns = (slice(max(at - HALF_PATCH_PX, 0), at + HALF_PATCH_PX + 1) for at in (row, column))
+        patch = grey[rows, columns].astype(float)
         if min(patch.shape) > HALF_PATCH_PX:
             down, right = np.gradient(patch)
             slopes = np.abs(right[..., None] * steps[:, 0] + down[..., None] * steps[:, 1]).max((0, 1))
@@ -239,11 +236,9 @@ def _layout(board: Any) -> dict[int, np.ndarray]:
 
 def _charuco(cv2: Any, words: list[str]) -> Made:
     markers = _dictionary(cv2, words[3])
-    board = cv2.aruco.CharucoBoard(_size(words[0]), float(words[1]), float(words[2]), markers)
-    detectors = [cv2.aruco.CharucoDetector(board)]
-    old = cv2.aruco.CharucoBoard(_size(words[0]), float(words[1]), float(words[2]), markers)
+    board, old = (cv2.aruco.CharucoBoard(_size(words[0]), *map(float, words[1:3]), markers) for _ in range(2))
     old.setLegacyPattern(True)  # boards printed before OpenCV 4.6 begin with a marker
-    detectors.append(cv2.aruco.CharucoDetector(old))
+    detectors = [cv2.aruco.CharucoDetector(own) for own in (board, old)]
 
     def find(grey: np.ndarray) -> Found:
         for detector in detectors:

@@ -70,9 +70,7 @@ def camera_text(camera: Camera, *, ros: bool = False) -> str:
         head += [f"avg_reprojection_error: {camera.noise!r}", f"board_half_size: {camera.half_size!r}"]
         root = ROOT, len(UNKNOWNS), camera.root.flatten().tolist()
         own = [matrix, lens, (BOARD, 1, camera.board.tolist()), root]
-    return "\n".join(
-        [*head, *(line for name, rows, data in own for line in matrix_lines(name, rows, data, ros=ros)), ""]
-    )
+    return "\n".join([*head, *(line for matrix in own for line in matrix_lines(*matrix, ros=ros)), ""])
 
 
 def read_camera(path: str | PathLike[str]) -> Camera:
@@ -201,10 +199,5 @@ def matrix_lines(name: str, rows: int, data: list[float], *, ros: bool = False) 
     """A matrix in YAML, of OpenCV or of ROS, from its numbers row by row."""
     cols, numbers = len(data) // rows, ", ".join(repr(float(value)) for value in data)
     kind = [] if ros else ["   dt: d"]
-    return [
-        f"{name}:" + " !!opencv-matrix" * (not ros),
-        f"   rows: {rows}",
-        f"   cols: {cols}",
-        *kind,
-        f"   data: [{numbers}]",
-    ]
+    head = f"{name}:" + " !!opencv-matrix" * (not ros)
+    return [head, f"   rows: {rows}", f"   cols: {cols}", *kind, f"   data: [{numbers}]"]

@@ -103,14 +103,11 @@ def page(folders: Sequence[Folder]) -> str:
 def read_folders(
     folders: Sequence[Path], joints: Path, board: Board, sep: str = ",", progress: Progress = lambda *_: None
 ) -> list[Folder]:
-    """Find a board in the images of a table of joint values.
+    """Find a board in the images of a table of joint values, in a folder for each camera.
 
-    Args:
-        folders: of the images, one of each camera.
-        joints: a table with a header; its column `image`, or another one of file names of images, names the file of
-            each row, in every folder that has one; without it the rows are those of the files of each folder in the
-            order of the numbers in their names.
-        board: to look for. sep: between cells. progress: called as ``progress(task, done, total)``.
+    The table's column `image`, or another one of file names of images, names the file of each row, in every folder that
+    has one; without it the rows are those of the files of each folder in the order of the numbers in their names.
+    ``progress`` is called as ``progress(task, done, total)``.
 
     Raises:
         MeasurementError: rows and images that do not belong to one another, or a folder without an image that shows the
@@ -192,10 +189,8 @@ def _named(folders: Sequence[Path], names: Sequence[str]) -> list[list[str | Non
 
 def _ordered(folders: Sequence[Path], joints: Path, count: int) -> list[list[str]]:
     """The file of each row in every folder, in the order of the numbers in their names: 2.png before 10.png."""
-    files = [
-        sorted((own.name for own in folder.iterdir() if own.suffix.lower() in SUFFIXES), key=_by_numbers)
-        for folder in folders
-    ]
+    names = ([own.name for own in folder.iterdir() if own.suffix.lower() in SUFFIXES] for folder in folders)
+    files = [sorted(own, key=_by_numbers) for own in names]
     others = [f"{len(own)} in '{folder}'" for folder, own in zip(folders, files, strict=True) if len(own) != count]
     if others:
         expected, got = f"{count} images, one for each row of '{joints}'", few(others)
@@ -212,10 +207,8 @@ def _by_numbers(name: str) -> list[tuple[str, int]]:
 
 def _column_of_images(header: list[str], rows: list[list[str]]) -> int | None:
     """The column `image`, else the first one whose cells all have the suffix of an image."""
-    if IMAGE in header:
-        return header.index(IMAGE)
-    named = (k for k in range(len(header)) if all(Path(row[k].strip()).suffix.lower() in SUFFIXES for row in rows))
-    return next(named, None)
+    named = [k for k in range(len(header)) if all(Path(row[k].strip()).suffix.lower() in SUFFIXES for row in rows)]
+    return header.index(IMAGE) if IMAGE in header else next(iter(named), None)
 
 
 def _seen(name: str, cells: list[str], grey: np.ndarray | None, board: Board, usual: tuple[int, ...]) -> Seen:

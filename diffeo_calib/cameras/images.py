@@ -22,16 +22,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.cameras.board import (
-    BOARD,
-    LENS,
-    BoardPrior,
-    View,
-    board_slopes,
-    project,
-    project_slopes,
-    real_board,
-)
+from diffeo_calib.cameras.board import BOARD, LENS, BoardPrior, View, board_slopes, project, project_slopes, real_board
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.robots.se3 import nearest_rotations, rotation, skew, transforms
 
@@ -48,6 +39,10 @@ CENTRE_SHARE, FOCAL_SHARE = 0.25, 1.0
 """Prior deviations of the principal point relative to the image's width, and of focal lengths."""
 BOARD_DIGITS = 7
 """Decimal places, m, of corners of a board that are the same."""
+EDGE_SHARE = 1.02
+"""Largest angle from the axis at which corners are seen, relative to that of the image's own corners."""
+MOST_TOGETHER = 512
+"""Images whose slopes are held at a time."""
 DISTORTIONS = (0.5, 1.0, 0.02, 0.02, 1.0)
 """Prior standard deviations of k1, k2, p1, p2, k3."""
 
@@ -123,6 +118,13 @@ class Camera:
         real = real_board(points, self.board, self.half_size)
         return project(real @ poses[:, :3, :3].mT + poses[:, None, :3, 3], self.lens)
 
+    @property
+    def corners(self) -> Tensor:
+        """(K, 3) corners of the board as it was meant, m, of a camera with images."""
+        if self.view is None:
+            raise AssertionError("a camera with images")
+        return self.view.points
+
     def entry(self) -> dict[str, object]:
         """For programs: pixels, and ratios of the board."""
         known = zip(UNKNOWNS, self.unknowns.tolist(), self.deviations.tolist(), strict=True)
@@ -181,15 +183,12 @@ def sighted(images: Images, camera: Camera | None = None, board: BoardPrior | No
 def sighted_by_several(
     images: Sequence[Images], cameras: Sequence[Camera | None], board: BoardPrior | None = None
 ) -> list[Sights]:
-    """Poses of one board, lenses, and the board, from images of several cameras.
+    """Poses of one board, lenses, and the board, from images of several cameras: the c errors are the same in all.
 
     Args:
         images: of each camera. cameras: what is known of the lens and board of each before; None if nothing is, and of
             the board nothing if its size there is 0. The board is that of the first camera that knows one.
         board: prior of a board of which nothing is known.
-
-    Returns:
-        one for each camera; the c errors, of all lenses and the board, are the same in all of them.
 
     Raises:
         MeasurementError: an image with too few corners, or corners on a line; corners that are no image of the board.
@@ -217,20 +216,19 @@ def _known(images: Sequence[Images], cameras: Sequence[Camera | None], board: Bo
     size = max(one.half_size for one in images)
     known = [first_guess(one, board, size) if own is None else own for one, own in zip(images, cameras, strict=True)]
     first = next((k for k, own in enumerate(cameras) if own is not None and own.half_size), 0)
-    whole = known[first] if known[first].half_size else _with_board(known[first], size, board)
+    whole = known[first]
+    if not whole.half_size:  # its lens is known alone
+        own = torch.diag(whole.unknowns.new_tensor(board.deviations(size)))
+        whole = replace(whole, half_size=size, root=torch.block_diag(whole.root[: len(LENS)], own))
     nothing = torch.zeros_like(whole.root[: len(LENS)])
-    lenses = [nothing[:, :0] if k == first else _lens_root(own) for k, own in enumerate(known)]
+    roots = [torch.linalg.qr(own.root[: len(LENS)].mT).R.mT for own in known]  # (9, c) of the lens alone
+    lenses = [nothing[:, :0] if k == first else root for k, root in enumerate(roots)]
     found = []
     for k, (own, others) in enumerate(zip(known, torch.block_diag(*lenses).split(len(LENS)), strict=True)):
         lens = torch.cat([whole.root[: len(LENS)] if k == first else nothing, others], 1)
         root = torch.cat([lens, torch.nn.functional.pad(whole.root[len(LENS) :], (0, others.shape[1]))])
         found.append(replace(own, half_size=whole.half_size, unknowns=torch.cat([own.lens, whole.board]), root=root))
     return found
-
-
-def _lens_root(camera: Camera) -> Tensor:
-    """(9, c) root of the covariance of the lens alone."""
-    return torch.linalg.qr(camera.root[: len(LENS)].mT).R.mT
 
 
 def first_guess(images: Images, board: BoardPrior, half_size: float | None = None) -> Camera:
@@ -254,13 +252,6 @@ def first_guess(images: Images, board: BoardPrior, half_size: float | None = Non
     size = half_size or images.half_size
     root = torch.diag(H.new_tensor([*lens, *board.deviations(size)]))
     return Camera(images.width, images.height, size, unknowns, root)
-
-
-def _with_board(camera: Camera, half_size: float, board: BoardPrior) -> Camera:
-    """A camera of which the lens is known, with a board of which nothing is known."""
-    own = torch.diag(camera.unknowns.new_tensor(board.deviations(half_size)))
-    root = torch.block_diag(camera.root[: len(LENS)], own)
-    return replace(camera, half_size=half_size, root=root)
 
 
 def homographies(images: Images) -> Tensor:
@@ -422,7 +413,8 @@ def _weights(state: State, noise: Tensor | None = None) -> Tensor:
 def _result(states: Sequence[State], weights: Sequence[Tensor]) -> list[Sights]:
     parts = [_Normal.of(state, own) for state, own in zip(states, weights, strict=True)]
     root = torch.linalg.inv(torch.linalg.cholesky(_together(parts))).mT  # root root^T = K^-1
-    points, found = _board(states), []
+    every = torch.cat([state.images.points[state.images.seen] for state in states])
+    points, found = every.round(decimals=BOARD_DIGITS).unique(dim=0), []
     for state, own, part in zip(states, weights, parts, strict=True):
         squares, seen = state.errors().square().sum(-1).nan_to_num(0.0), state.images.seen
         noise = float((2 * seen.sum() / own.square().sum() / 2).sqrt())
@@ -431,12 +423,6 @@ def _result(states: Sequence[State], weights: Sequence[Tensor]) -> list[Sights]:
         rms = (squares.sum(1) / (2 * seen.sum(1))).sqrt()
         found.append(Sights(camera, state.poses, part.inverse, part.effect @ root, rms))
     return found
-
-
-def _board(states: Sequence[State]) -> Tensor:
-    """(K, 3) all corners that images showed, m."""
-    every = torch.cat([state.images.points[state.images.seen] for state in states])
-    return every.round(decimals=BOARD_DIGITS).unique(dim=0)
 
 
 def _check(images: Images) -> None:
@@ -456,3 +442,46 @@ def _check(images: Images) -> None:
 
 def _eye(size: int, like: Tensor) -> Tensor:
     return torch.eye(size, dtype=like.dtype, device=like.device)
+
+
+def sees(camera: Camera, poses: Tensor) -> Tensor:
+    """(N,) boolean: whether it sees boards at poses (N, 4, 4) in its frame, m, as well as in the worst of its images.
+
+    They are as near and as little inclined, and show as many corners. A camera without images sees all.
+    """
+    if camera.view is None:
+        return torch.ones(len(poses), dtype=torch.bool, device=poses.device)
+    found = camera.view.allows(poses)
+    found[found.clone()] = shown(camera, poses[found]).sum(1) >= camera.view.fewest
+    return found
+
+
+def shown(camera: Camera, poses: Tensor) -> Tensor:
+    """(N, K) boolean: which corners of boards at poses (N, 4, 4) are inside the image of a camera with images.
+
+    Far outside of the image, where nothing showed the distortion, it may fold rays back into it.
+    """
+    points, size = camera.corners, camera.unknowns.new_tensor([camera.width - 1, camera.height - 1])
+    edge = undistorted(size * size.new_tensor([[0, 0], [0, 1], [1, 0], [1, 1]]), camera.lens).norm(dim=1).max()
+    there = points @ poses[:, :3, :3].mT + poses[:, None, :3, 3]
+    ahead = there[..., :2].norm(dim=-1) <= EDGE_SHARE * edge * there[..., 2]
+    pixels = camera.pixels(poses, points.expand(len(poses), -1, -1))
+    return ahead & (pixels >= 0).all(-1) & (pixels <= size).all(-1)
+
+
+def expected(camera: Camera, poses: Tensor) -> tuple[Tensor, Tensor]:
+    """Errors expected of boards at poses (N, 4, 4), m, in images by a camera that has taken images before.
+
+    Covariance (N, 6, 6) of shift (m) and turn (rad) in the camera's axes, and effects (N, 6, 14) of lens and board.
+    """
+    points, parts = camera.corners, list[tuple[Tensor, Tensor]]()
+    eye = torch.eye(len(UNKNOWNS), dtype=poses.dtype, device=poses.device)
+    whole = replace(camera, root=eye)
+    for some in poses.split(MOST_TOGETHER):
+        images = Images(points.expand(len(some), -1, -1), points[:0], camera.width, camera.height)
+        seen = shown(camera, some)[..., None, None] / camera.noise
+        by_pose, by_unknowns = ((own * seen).flatten(1, 2) for own in State(images, whole, some, 0.0 * eye[0]).slopes())
+        covariance = inverses(by_pose.mT @ by_pose)
+        parts.append((covariance, covariance @ by_pose.mT @ by_unknowns))
+    covariances, effects = (torch.cat(each) for each in zip(*parts, strict=True))
+    return covariances, effects

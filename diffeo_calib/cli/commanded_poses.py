@@ -15,9 +15,8 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.cli import proposals
 from diffeo_calib.cli.column_names import WORDS, column, whole
-from diffeo_calib.cli.guesses import ROTATIONS, Sheet
+from diffeo_calib.cli.guesses import ROTATIONS, Choice, RowColumns, Sheet, entries, matrix_in, rows_in
 from diffeo_calib.cli.proposals import Source
-from diffeo_calib.cli.row_columns import Choice, RowColumns, entries, matrix_in, rows_in
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.checks import quiet
@@ -28,12 +27,13 @@ from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.poses import ALL_CONVENTIONS, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat
 from diffeo_calib.robots.cartesian import cartesian
-from diffeo_calib.robots.se3 import nearest_rotations
 
 NUMBERED = "0123456", "1234567", "012345", "123456"
 """Poses of the tool as a series: a place, then a quaternion, a rotation vector or angles."""
 SURELY_METRES, LARGEST_IN_METRES = 2.0, 20.0
 """Numbers below the first are metres, above the second millimetres; between them a machine may be small or large."""
+UNUSUAL_LENGTHS = ("", ""), ("cm", ""), ("inch", ""), ("", "cm"), ("", "inch")
+"""Units of the machine's places and of those measured, tried until one explains the rows; empty: by their size."""
 MOST_ROWS, STEPS = 40, (1, 3)
 """Rows whose motions are compared, and how many rows each of these spans."""
 JOINTS = "q0", "q1"
@@ -41,10 +41,6 @@ JOINTS = "q0", "q1"
 MOST_WAYS = 60
 """Ways to read the rows that are tried with a registration; where there are more, nothing about rotations is sure."""
 TURNED = "robot-pose", "angle", "convention", "rotation-angle", "camera-on-tool"
-SMALLEST_M = 1e-9
-"""Mean motion of a flange that turns at one place."""
-RANK = 1e-6
-"""Directions of X whose squares are smaller than this share of the largest are open: those along a single axis."""
 ALIKE = 6.0
 """Ways that leave more than so many times what the best one leaves are wrong."""
 
@@ -127,9 +123,7 @@ def choices(csv: Path, sheet: Sheet) -> tuple[Source, list[Choice], list[Choice]
     """
     bodies = bodies_in(csv, sheet)
     if not bodies:
-        expected = (
-            "a ROBOT whose joints the table has columns of, or columns of the poses that a machine was commanded to"
-        )
+        expected = "a ROBOT whose joints the table has columns of, or columns of the poses of a machine"
         raise InputError.of(f"'{csv}' without a robot's description", expected=expected, got=few(sheet.header, 20))
     machine = machine_of(bodies)
     used = [*machine.place, *machine.turn]
@@ -142,15 +136,18 @@ def choices(csv: Path, sheet: Sheet) -> tuple[Source, list[Choice], list[Choice]
     if body is not None and body.turn and len(rows.markers) > 1:  # poses of one frame
         left = [f"{few(names)}: beside the pose of {few(body.place)}" for names in rows.markers[1:]]
         rows = replace(rows, markers=rows.markers[:1], left=[*rows.left, *left])
-    found = sorted(_read(csv, sheet, machine, rows, body), key=lambda entry: entry[0])
+    tried = list[list[tuple[float, Source]]]()
+    for lengths in UNUSUAL_LENGTHS:
+        tried.append(sorted(_read(csv, sheet, machine, rows, body, lengths=lengths), key=lambda entry: entry[0]))
+        if tried[-1] and tried[-1][0][0] <= proposals.LARGEST_RESIDUAL:
+            break
+    found = min(tried, key=lambda own: own[0][0] if own else inf)
     if found and found[0][0] == inf:
         found[0][1].read_residual(found[0][1].table)  # says why
     if not found or found[0][0] > proposals.LARGEST_RESIDUAL:
         got = "no way to read them" if not found else f"{100 * found[0][0]:.3g} % of what the rows vary unexplained"
         what = f"poses of the machine in {few(used, 16)}"
-        fix = (
-            "check that the rows belong together, or write the campaign file yourself; for joint values name the robot"
-        )
+        fix = "check that the rows belong together, or write the campaign file yourself; for joints name the robot"
         raise InputError.of(what, expected="a convention and units that explain the rows", got=got, fix=fix)
     size, limit = found[0][0], gates.READINGS_TOLD_APART * found[0][0]
     alike, worse = [one for left, one in found if left < limit], [left for left, _ in found if left >= limit]
@@ -161,9 +158,8 @@ def choices(csv: Path, sheet: Sheet) -> tuple[Source, list[Choice], list[Choice]
     columns = [Choice("robot-pose", text, first, sure=len(texts) == 1) for text in texts]
     units = [*_units(alike, _lengths(machine.place, _numbers(csv, sheet, machine.place)), why)]
     if len(found) >= MOST_WAYS:
-        columns, units = (
-            [one._replace(sure=one.sure and one.name not in TURNED) for one in own] for own in (columns, units)
-        )
+        both = [[one._replace(sure=one.sure and one.name not in TURNED) for one in own] for own in (columns, units)]
+        columns, units = both
     return alike[0], columns, units
 
 
@@ -182,17 +178,20 @@ def _units(alike: Sequence[Source], lengths: Sequence[str], why: str) -> Iterato
 
 
 def _read(
-    csv: Path, sheet: Sheet, machine: Body, rows: RowColumns, body: Body | None
+    csv: Path, sheet: Sheet, machine: Body, rows: RowColumns, body: Body | None, *, lengths: tuple[str, str]
 ) -> Iterator[tuple[float, Source]]:
-    """The likeliest ways to read the table, and the share of what the rows vary that each leaves unexplained."""
+    """The likeliest ways to read the table, and the share of what the rows vary that each leaves unexplained.
+
+    ``lengths``: units of the machine's places and of those measured; empty for the likeliest.
+    """
     turn, place = ([], []) if body is None else (body.turn, body.place)
     groups = machine.place, machine.turn, place, turn
     numbers = _numbers(csv, sheet, [name for names in groups for name in names])
     if not len(numbers):
         return
     commanded_at, commanded_turn, seen_at, seen_turn = numbers.split([len(names) for names in groups], 1)
-    length = _lengths(machine.place, commanded_at)[0]
-    other = _lengths(place, seen_at)[0] if place else length
+    length = lengths[0] or _lengths(machine.place, commanded_at)[0]
+    other = lengths[1] or (_lengths(place, seen_at)[0] if place else length)
     own, seen = _readings(commanded_turn), _readings(seen_turn)
     if own and seen:
         metres = [values / UNITS_PER_METRE[unit] for values, unit in ((commanded_at, length), (seen_at, other))]
@@ -247,54 +246,35 @@ def _alike(
 ) -> list[tuple[Reading, Reading, bool]]:
     """Ways to read the rotations of both bodies, and whether what stands was seen from the flange, the likeliest first.
 
-    Motions of the flange between rows, A, and of what was seen, B, are conjugate, A X = X B: the rotation of X and its
-    shift by linear least squares (N. Andreff, R. Horaud, B. Espiau, "Robot hand-eye calibration using
-    structure-from-motion", 2001), and what is left.
+    Motions of the flange between rows, A, and of what was seen, B, are conjugate, A X = X B: their angles and their
+    shifts along the axes are the same (H. H. Chen, "A screw motion approach to uniqueness analysis of head-eye
+    geometry", 1991). So are those of the inverse: who saw whom is for the rows to tell.
 
     Args:
         commanded: places (N, 3), m, and rotations (N, 3, 3) by reading. seen: of the other body.
     """
     some = slice(None, None, -(-len(commanded[0]) // MOST_ROWS))
-    found = list[tuple[float, tuple[Reading, Reading, bool]]]()
-    R, t = _motions(commanded[0][some], torch.stack([*commanded[1].values()])[:, some])
-    for camera in (False, True):
-        turns, places = torch.stack([*seen[1].values()])[:, some], seen[0][some]
-        shifts = -(turns.mT @ places[:, :, None])[..., 0] if camera else places
-        S, u = _motions(shifts, turns.mT if camera else turns)
-        X = torch.stack([_conjugation(own, shift, S, u) for own, shift in zip(R, t, strict=True)])  # (a, b, 3, 3)
-        turned = R[:, None] @ X[:, :, None] - X[:, :, None] @ S  # (a, b, K, 3, 3)
-        G = R - torch.eye(3, dtype=R.dtype, device=R.device)
-        right = torch.einsum("abij,bkj->abki", X, u) - t[:, None]
-        shift = torch.einsum("aij,abj->abi", torch.linalg.pinv(G.flatten(1, 2)), right.flatten(2))
-        moved = (torch.einsum("akij,abj->abki", G, shift) - right).square().sum(3).mean(2)
-        size = t.square().sum(2).mean(1)[:, None].clamp(min=SMALLEST_M**2)
-        left = turned.square().sum((3, 4)).mean(2).sqrt() + (moved / size).sqrt()
-        each = product(commanded[1], seen[1])
-        found += [(float(size), (*pair, camera)) for size, pair in zip(left.flatten(), each, strict=True)]
-    found.sort(key=lambda entry: entry[0])
-    return [way for size, way in found if size <= ALIKE * found[0][0]][:MOST_WAYS]
+    bodies = [(place[some], torch.stack([*turns.values()])[:, some]) for place, turns in (commanded, seen)]
+    size = max(float((place - place.mean(0)).norm(dim=1).mean()) for place, _ in bodies) or 1.0
+    own, others = (_screws(*body, size) for body in bodies)
+    left = (own[:, None] - others).square().mean(2).sqrt().flatten().tolist()
+    found = sorted(zip(left, product(commanded[1], seen[1]), strict=True), key=lambda entry: entry[0])
+    alike = [pair for one, pair in found if one <= ALIKE * found[0][0]][: MOST_WAYS // 2]
+    return [(*pair, camera) for pair in alike for camera in (False, True)]
 
 
-def _motions(places: Tensor, R: Tensor) -> tuple[Tensor, Tensor]:
-    """Motions from rows to later ones, in the frame of the first: (c, K, 3, 3), and (c, K, 3), m."""
-    places = places.expand(len(R), -1, -1)
-    pairs = [(R.roll(-step, 1), places.roll(-step, 1)) for step in STEPS]
-    turns = torch.cat([R.mT @ later for later, _ in pairs], 1)
-    return turns, torch.cat([(R.mT @ (later - places)[..., None])[..., 0] for _, later in pairs], 1)
-
-
-def _conjugation(R: Tensor, t: Tensor, S: Tensor, u: Tensor) -> Tensor:
-    """Rotations (b, 3, 3) of X with A X = X B, also where all turns are about one axis.
+def _screws(places: Tensor, R: Tensor, size: float) -> Tensor:
+    """Angles, rad, and shifts along the axes times sines, over a size, of motions between rows: (c, 2 K).
 
     Args:
-        R: (K, 3, 3) and t: (K, 3), m, of A. S: (b, K, 3, 3) and u: (b, K, 3), m, of b readings of B.
+        places: (N, 3), m. R: (c, N, 3, 3), of c readings.
     """
-    eye, size = torch.eye(3, dtype=R.dtype, device=R.device), t.norm(dim=1).mean().clamp(min=SMALLEST_M)
-    turns = torch.einsum("kip,jq->kijpq", R, eye) - torch.einsum("ip,bkqj->bkijpq", eye, S)
-    shifts = torch.einsum("ip,bkq->bkipq", eye, u) / size
-    by_shift = ((eye - R) / size).expand(len(S), -1, -1, -1).flatten(1, 2)  # (b, 3 K, 3)
-    rows = torch.cat([shifts.flatten(3).flatten(1, 2), by_shift], 2)
-    rows = torch.cat([torch.nn.functional.pad(turns.flatten(4).flatten(1, 3), (0, 3)), rows], 1)  # (b, 12 K, 12)
-    wanted = torch.cat([t.new_zeros(9 * len(t)), (t / size).flatten()])
-    found = torch.linalg.pinv(rows.mT @ rows, rtol=RANK, hermitian=True) @ (rows.mT @ wanted)[..., None]
-    return nearest_rotations(found[:, :9, 0].unflatten(1, (3, 3)))
+    found = list[Tensor]()
+    for step in STEPS:
+        turns = R.mT @ R.roll(-step, 1)
+        shifts = (R.mT @ (places.roll(-step, 0) - places)[..., None])[..., 0]
+        skew = turns - turns.mT
+        axes = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], 2)
+        trace = turns.diagonal(dim1=2, dim2=3).sum(2)
+        found += [torch.atan2(axes.norm(dim=2), trace - 1), (axes * shifts).sum(2) / (2 * size)]
+    return torch.cat(found, 1)

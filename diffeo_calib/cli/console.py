@@ -16,15 +16,13 @@ from time import monotonic
 from types import FrameType
 from typing import Any
 
-import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, SpinnerColumn, Task, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 from rich.table import Table
-from rich.text import Text
 
-from diffeo_calib.cli.record import record
+from diffeo_calib.cli.record import EXIT_INTERRUPTED, record
 from diffeo_calib.common.errors import PACKAGE, few, printable
 from diffeo_calib.common.files import remove_unfinished
 
@@ -56,14 +54,10 @@ def say(*lines: str) -> None:
         out.print(_as_options(plain(line)), highlight=False, soft_wrap=True)
 
 
-def show_error(error: object) -> None:
-    """Print an error as one sentence, with Python keywords as options."""
-    err.print(f"[bold red]error:[/] {_as_options(plain(error))}", highlight=False, soft_wrap=True)
-
-
-def show_warning(message: Warning | str) -> None:
-    """Print a warning as one sentence, with Python keywords as options."""
-    err.print(f"[bold yellow]warning:[/] {_as_options(plain(message))}", highlight=False, soft_wrap=True)
+def show(kind: str, message: object) -> None:
+    """Print an error or a warning as one sentence, with Python keywords as options."""
+    colour = {"error": "red", "warning": "yellow"}[kind]
+    err.print(f"[bold {colour}]{kind}:[/] {_as_options(plain(message))}", highlight=False, soft_wrap=True)
 
 
 def text_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]], labels: int = 1, **how: Any) -> Table:
@@ -83,15 +77,14 @@ def progress_bar(clock: Callable[[], float] = monotonic) -> Iterator[Progress]:
     Python users pass it on too: ``with progress_bar() as progress: dc.calibrate(..., progress=progress)``.
     """
     times = TimeElapsedColumn(), TimeRemainingColumn()
-    columns = SpinnerColumn(), TextColumn("{task.description}"), _Steps(bar_width=30), *times
+    columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=30), *times
     seen = err.is_terminal or err.is_jupyter
     with Bar(*columns, console=err, transient=True, get_time=clock, disable=not seen) as bar:
         line, current, last = bar.add_task("starting", total=None), "", 0
 
         def update(task: str, done: int, total: int) -> None:
-            """Show this task, from its beginning if it is another one or starts again."""
             nonlocal current, last
-            if task != current or done < last:
+            if task != current or done < last:  # another one, or it starts again
                 bar.reset(line, description=WORDS.get(task, task), total=None)
             bar.update(line, completed=done, total=total if total > 1 else None)
             current, last = task, done
@@ -99,18 +92,16 @@ def progress_bar(clock: Callable[[], float] = monotonic) -> Iterator[Progress]:
         yield update
 
 
-class _Steps(BarColumn):
-    """A bar for tasks of several steps."""
-
-    def render(self, task: Task) -> Any:
-        return Text("") if task.total is None else super().render(task)
-
-
 @contextmanager
 def log_lines() -> Iterator[None]:
     """Print what the library logs, with the seconds since the start, on standard error."""
-    handler, logger = _LogLines(logging.INFO), logging.getLogger(PACKAGE)
-    before = logger.level
+
+    def emit(record: logging.LogRecord) -> None:
+        text = f"{record.relativeCreated / 1e3:7.1f} s  {record.getMessage()}"
+        err.print(plain(text), highlight=False, soft_wrap=True)
+
+    handler, logger = logging.Handler(logging.INFO), logging.getLogger(PACKAGE)
+    handler.emit, before = emit, logger.level
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)
     try:
@@ -118,24 +109,6 @@ def log_lines() -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         logger.setLevel(before)
-
-
-class _LogLines(logging.Handler):
-    """One line for each record."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        text = f"{record.relativeCreated / 1e3:7.1f} s  {record.getMessage()}"
-        err.print(plain(text), highlight=False, soft_wrap=True)
-
-
-@contextmanager
-def exit_on_interrupt() -> Iterator[None]:
-    """Turn a KeyboardInterrupt that leaves no result into a sentence and an exit code."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        show_error(f"{INTERRUPTED}.")
-        raise typer.Exit(EXIT_INTERRUPTED) from None
 
 
 def plain(text: object) -> str:
@@ -146,16 +119,11 @@ def plain(text: object) -> str:
 def _as_options(text: str) -> str:
     """Keywords of Python as options: ``sep=';'`` -> ``--sep ';'``, `rotation_angle` -> --rotation-angle."""
     given = r"\b(sep|decimal|angle|length|joint_length|convention|duplicates|position|joints|rotation_angle)=('[^']*')"
-    text = re.sub(given, lambda found: f"{_option(found[1])} {found[2]}", text)
+    text = re.sub(given, lambda found: f"--{found[1].replace('_', '-')} {found[2]}", text)
     named = r"`(length|joint_length|angle|rotation|convention|rotation_angle|std|rotation_std|controls|tip|payload)`"
-    return re.sub(named, lambda found: _option(found[1]), text)
+    return re.sub(named, lambda found: f"--{found[1].replace('_', '-')}", text)
 
 
-def _option(name: str) -> str:
-    return "--" + name.replace("_", "-")
-
-
-EXIT_INTERRUPTED = 130
 INTERRUPTED = "interrupted before there was a result to keep"
 NOTHING_TO_KEEP = ("registration", "geometry")
 """Tasks of a calibration whose interruption leaves no model."""
@@ -167,12 +135,8 @@ Progress = Callable[[str, int, int], None]
 class Interrupts:
     """Ctrl-C ends the program at once as long as there is no result to keep, and whenever it is pressed again.
 
-    Otherwise the first Ctrl-C asks for the best result so far: the handler takes note of it, and the next step that
-    :meth:`watching` sees raises KeyboardInterrupt. Raised wherever the signal arrives, the exception could be
-    swallowed, for instance by the import of a library.
-
-    Attributes:
-        asked: whether the user asked for the best result so far.
+    Otherwise the first one asks for the best result so far (``asked``): the next step that :meth:`watching` sees
+    raises KeyboardInterrupt. Raised where the signal arrives, it could be swallowed, for instance by an import.
     """
 
     def __init__(self) -> None:
@@ -185,11 +149,7 @@ class Interrupts:
         signal.signal(signal.SIGINT, self._handle)
 
     def watching(self, progress: Progress, note: Callable[[str], object]) -> Progress:
-        """Return the same progress callback, which raises KeyboardInterrupt once after a Ctrl-C.
-
-        Args:
-            progress: called at every step. note: prints the answer to Ctrl-C beside the progress bar.
-        """
+        """The same callback, which raises KeyboardInterrupt once after a Ctrl-C; ``note`` prints the answer to that."""
         self._note = note
 
         def step(task: str, done: int, total: int) -> None:

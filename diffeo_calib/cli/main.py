@@ -6,26 +6,251 @@ out of step with their joints, or a median error above a tenth of the robot's re
 3 the fit stopped before it converged (the model is written); 130 interrupted by Ctrl-C (the best model so far is
 written).
 
-The module declarations.py only declares the commands. Each command imports its work when it runs, so that help, the
-version and shell completion load neither torch nor SciPy and appear at once.
+Each command imports its work when it runs, so that help, the version and shell completion load neither torch nor SciPy
+and appear at once.
+
+Campaign files hold options so that they are written once:
+
+    csv = "measurements.csv"            robot = "robot.urdf"
+    base = "base_link"                  tip = "flange"
+    position = ["x,y,z"]                length = "mm"
+    angle = "deg"                       output = "robot.safetensors"
+
+`diffeo-calib fit campaign.toml` runs as if the options had been typed. Options that are typed as well win,
+also those that may be repeated, such as `--tip`. Paths are relative to the folder of the file.
 """
 
 from __future__ import annotations
 
+import inspect
 import os
+import shlex
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any, TextIO
+from dataclasses import MISSING
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any, TextIO
 
-from diffeo_calib.cli import declarations  # noqa: F401  # declares the commands
-from diffeo_calib.cli.app import app
-from diffeo_calib.cli.console import EXIT_INTERRUPTED, interrupts
-from diffeo_calib.cli.record import record
-from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
+import typer
+from typer.core import TyperGroup
 
-EXIT_ERROR = 1
+from diffeo_calib.cli.console import INTERRUPTED, interrupts, log_lines, show
+from diffeo_calib.cli.options import COMMANDS, CORNERS, Command, description, has
+from diffeo_calib.cli.record import EXIT_ERROR, EXIT_INTERRUPTED, check_outputs, record, remove_earlier
+from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning, InputError, as_written, printable
+from diffeo_calib.common.files import PROGRAM
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # pyright: ignore[reportMissingImports]
+
+SUFFIX = ".toml"
+COMMAND, LIVE = "fit", "campaign"
+JOINED = ("rotation-std",)
+"""Entries that may be lists of columns although the option can be repeated."""
+LONGEST_FILE = 1 << 20
+"""Bytes: a file of options is short."""
+IN_FILE_OF = {"compare": "recalibrate", "report": "evaluate", "record": "images", "demo": "fit"}
+"""Command -> that whose file holds its work."""
+DECLARED: dict[str, dict[str, Any]] = {}
+"""Command -> name of an option or argument, without dashes -> type of its value."""
+_arguments: list[str] = []
+"""Of the command that runs."""
+
+
+def command_line() -> str:
+    """The command that runs, as a shell would take it."""
+    return shlex.join(["diffeo-calib", *_arguments])
+
+
+def add_to_command_line(words: Sequence[str]) -> None:
+    """Add options that were not typed but hold, so that the command line says how a table was read."""
+    _arguments.extend(words)
+
+
+class FlagsOff(TyperGroup):
+    """A group whose flags are off by default rather than unset, which typer converts by a library that loads slowly."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """The options of the program itself, all of which are flags: version, completion, help."""
+        flags = super().get_params(ctx)
+        for flag in flags:
+            flag.default = False
+        return flags
+
+    def make_context(self, info_name: str | None, args: list[str], *others: Any, **options: Any) -> Any:
+        """Parse a command line, with a campaign file written out, and remember it."""
+        running = not (others or options.get("resilient_parsing")) and not {"-h", "--help"} & set(args)
+        if running:
+            remove_earlier(args)
+        _arguments[:] = expanded(args)
+        if running:
+            remove_earlier(_arguments)
+        return super().make_context(info_name, list(_arguments), *others, **options)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command; a bad value is named without typer's own words, and without control characters."""
+        try:
+            with record.written(list(_arguments)):
+                try:
+                    return super().invoke(ctx)
+                except KeyboardInterrupt:  # there is no result to keep
+                    show("error", f"{INTERRUPTED}.")
+                    raise typer.Exit(EXIT_INTERRUPTED) from None
+        except typer.BadParameter as error:
+            error.message = printable(error.message.removeprefix("Value error, "))
+            raise
+
+
+app = typer.Typer(
+    cls=FlagsOff,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _remember(path: Path | None) -> Path | None:
+    """The command writes its results to this file when it ends."""
+    if path is not None:
+        record.path = path
+        check_outputs({}, {})
+    return path
+
+
+Json = Annotated[
+    Path | None,
+    typer.Option(
+        "--json",
+        metavar="FILE",
+        callback=_remember,
+        help="Also write the results to this file, for programs, as diffeo_calib/cli/result.schema.json says.",
+    ),
+]
+
+
+def _declare(name: str, options: type[Command]) -> None:
+    """Declare a command by the class of its options; every command has --json."""
+    own, parameters = list(options.all()), list[inspect.Parameter]()
+    named = {one: option.hint for option in own for one in option.names or (option.shown,)} | {"--json": Path}
+    DECLARED[name] = {one.removeprefix("--").lower(): hint for one, hint in named.items()}
+
+    def run(_json: Any, **given: Any) -> None:
+        written, read, appended = dict[str, Path](), dict[str, Path](), dict[str, Path]()
+        files = {"output": written, "source": written, "file": read, "files": read, "table": appended}
+        for one in own:
+            value = given[one.field]
+            for path in value if isinstance(value, list) else [value]:
+                if one.kind in files and path is not None:
+                    files[one.kind][one.shown + f" {path}" * isinstance(value, list)] = path
+                    if one.kind == "source":
+                        written[f"{one.shown} (its header)"] = path.with_suffix(".h")
+        check_outputs(written, read | appended, may_come=appended)
+        options.check_together(given)
+        module = import_module(f"diffeo_calib.cli.commands.{IN_FILE_OF.get(name, name)}")
+        getattr(module, f"run_{name}" if name in IN_FILE_OF else "run")(options.made(given))
+
+    for one in own:
+        typed = typer.Option(*one.names, **one.how) if one.names else typer.Argument(**one.how)
+        default = inspect.Parameter.empty if one.default is MISSING else one.default
+        kind, annotation = inspect.Parameter.KEYWORD_ONLY, Annotated[one.hint, typed]
+        parameters.append(inspect.Parameter(one.field, kind, default=default, annotation=annotation))
+    parameters.append(inspect.Parameter("_json", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Json))
+    run.__name__, run.__doc__ = f"{name}_command", description()[name].text
+    run.__annotations__ = {one.name: one.annotation for one in parameters}
+    vars(run)["__signature__"] = inspect.Signature(parameters)
+    app.command(name)(run)
+
+
+for _name, _options in COMMANDS.items():
+    _declare(_name, _options)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"diffeo-calib {version('diffeo_calib')}")
+        raise typer.Exit
+
+
+@app.callback()
+def common(
+    context: typer.Context,
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop.")
+    ] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Say what is being done, line by line.")] = False,
+) -> None:
+    """Calibrate robot kinematics from rows of measurements, whatever measured them."""
+    if verbose:
+        context.with_resource(log_lines())
+
+
+# --- campaign files ---------------------------------------------------------------------------------------------------
+
+
+def expanded(arguments: Sequence[str]) -> list[str]:
+    """The same command line with a campaign file written out, for `campaign` without what only `fit` knows."""
+    words = list(arguments)
+    at = next((place for place, word in enumerate(words) if not word.startswith("-")), 0)
+    if len(words) < at + 2 or words[at] not in (COMMAND, LIVE) or not words[at + 1].lower().endswith(SUFFIX):
+        return words
+    path = Path(words[at + 1])
+    options = DECLARED[words[at]]
+    of_fit = {*DECLARED[COMMAND]} - {*options}
+    entries = {name: value for name, value in _entries(path).items() if name not in of_fit}
+    if unknown := [name for name in entries if name not in options]:
+        expected = f"options of `{words[at]}`: {', '.join(options)}"
+        raise InputError.of(f"{path}: {', '.join(unknown)}", expected=expected, fix="correct the names")
+    if "csv" not in entries:
+        raise InputError.of(f"{path} has no entry csv", fix='add csv = "measurements.csv", the table to calibrate with')
+    typed = {word.removeprefix("--").partition("=")[0] for word in words[at + 2 :] if word.startswith("--")}
+    table = _text(path, "csv", entries.pop("csv"), options["csv"])
+    kept = {name: value for name, value in entries.items() if name not in typed}
+    written = [word for name, value in kept.items() for word in _words(path, name, value, options[name])]
+    return [*words[: at + 1], table, *written, *words[at + 2 :]]
+
+
+def _entries(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > LONGEST_FILE:
+            raise InputError.of(f"{path}", expected="a file of options", got="more than 1 MiB")
+        entries = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return {name.replace("_", "-"): value for name, value in entries.items()}
+    except OSError as error:
+        raise InputError.of(f"{path} cannot be read ({error.strerror})", fix="check the path") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        fix = 'write one option per line: length = "mm"'
+        raise InputError.of(f"{path} is no TOML", got=str(error), fix=fix) from error
+
+
+def _words(path: Path, name: str, value: object, hint: Any) -> list[str]:
+    """One entry as words of a command line."""
+    if isinstance(value, bool):
+        return [f"--{name}"] * value
+    values = value if isinstance(value, list) else [value]
+    if isinstance(value, list) and (name in JOINED or not has(hint, list)):
+        values = [",".join(map(str, value))]
+    return [word for one in values for word in (f"--{name}", _text(path, name, one, hint))]
+
+
+def _text(path: Path, name: str, value: object, hint: Any) -> str:
+    """A value as a word; files relative to the folder of the campaign."""
+    if isinstance(value, bool) or not isinstance(value, (str, int, float)):
+        raise InputError.of(f"{path}: {name}", expected="text or a number", got=as_written(value))
+    begin = CORNERS if str(value).startswith(CORNERS) and str(value).endswith(".yaml") else ""
+    if PROGRAM in str(value):
+        begin = str(value).rpartition("=")[0] + "="
+    file = str(value).removeprefix(begin)
+    return f"{begin}{path.parent / file}" if begin or has(hint, Path) else file
+
+
+# --- the program ---
 
 
 def main() -> None:
@@ -37,53 +262,39 @@ def main() -> None:
         try:
             app()
         except DiffeoCalibError as error:
-            from diffeo_calib.cli.console import show_error  # noqa: PLC0415
-
-            show_error(error)
+            show("error", error)
             sys.exit(EXIT_ERROR)
-        except KeyboardInterrupt:
-            sys.exit(EXIT_INTERRUPTED)
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
     """Takes the place of :func:`warnings.showwarning`."""
-    from diffeo_calib.cli.console import show_warning  # noqa: PLC0415
-
-    record.warn(str(message))
-    show_warning(message)
+    record.warnings.append(str(message))
+    show("warning", message)
 
 
 class ForgivingStream:
-    """A text stream whose failures to write end the output, not the program.
-
-    Args:
-        stream: standard output or standard error; None where the process has none.
-    """
+    """A text stream, or the lack of one, whose failures to write end the output, not the program."""
 
     def __init__(self, stream: TextIO | None) -> None:
         self._stream = stream if stream is not None else open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
 
     def write(self, text: str) -> int:
         """Write, or drop the text where that fails."""
-        try:
-            return self._stream.write(text)
-        except (OSError, ValueError):
-            self._give_up()
-            return len(text)
+        self._try(self._stream.write, text)
+        return len(text)
 
     def flush(self) -> None:
         """Flush, or drop what is buffered where that fails."""
-        try:
-            self._stream.flush()
-        except (OSError, ValueError):
-            self._give_up()
+        self._try(self._stream.flush)
 
-    def _give_up(self) -> None:
-        """Send the rest nowhere: the buffer, too, is flushed again when the interpreter ends."""
-        with suppress(OSError, ValueError):
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self._stream.fileno())
-            os.close(nowhere)
+    def _try(self, action: Any, *given: str) -> None:
+        try:
+            action(*given)
+        except (OSError, ValueError):
+            with suppress(OSError, ValueError):  # the buffer, too, is flushed again when the interpreter ends
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, self._stream.fileno())
+                os.close(nowhere)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
@@ -92,7 +303,11 @@ class ForgivingStream:
 @contextmanager
 def forgiving_streams() -> Iterator[None]:
     """Forgive failures of standard output and standard error inside."""
-    _open_missing()
+    for number in range(3):  # closed ones: the next file would be number 1 or 2, and take what others print
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = (ForgivingStream(stream) for stream in before)  # pyright: ignore[reportAttributeAccessIssue]
     try:
@@ -101,12 +316,3 @@ def forgiving_streams() -> Iterator[None]:
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         sys.stdout, sys.stderr = before
-
-
-def _open_missing() -> None:
-    """Open what the process was started without: the next file would be number 1 or 2, and take what others print."""
-    for number in range(3):
-        try:
-            os.fstat(number)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from torch import Tensor
 
-from diffeo_calib.cli.app import command_line
 from diffeo_calib.cli.console import say
+from diffeo_calib.cli.main import command_line
 from diffeo_calib.cli.options import Links, Robot, Rows, Units
 from diffeo_calib.cli.tables import MeasuredTable, as_at_the_fit, measured_table, rows_in_table, tool_frame
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
@@ -72,11 +72,7 @@ def is_urdf(path: Path) -> bool:
 
 
 def load_laden(path: Path, mass: float | None) -> CalibratedKinematics:
-    """Load the model of a robot that carries a payload.
-
-    Args:
-        path: the file. mass: in the unit of the model's measurements; None for a model without payloads.
-    """
+    """The model of a robot that carries a mass, in the unit of its measurements; None for one without payloads."""
     model = load_kinematics(path)
     if model.payload is not None and mass is None:
         what = f"{path} was calibrated with payloads"
@@ -111,10 +107,7 @@ def as_fitted(model: CalibratedKinematics, rows: Rows | None, units: Units) -> t
 
 
 def table_of(model: CalibratedKinematics, csv: Path, typed: Rows, typed_units: Units) -> MeasuredTable:
-    """A table of measurements, read as that of the model's fit unless the options say otherwise.
-
-    Kinds of rows of the fit that the table has no column of are left out.
-    """
+    """A table read as that of the model's fit unless options say otherwise, without kinds of rows that it lacks."""
     rows, units = as_fitted(model, typed, typed_units)
     if not typed.named:
         rows, missing = rows_in_table(csv, rows, units)
@@ -153,19 +146,18 @@ def tool_in_tip(model: CalibratedKinematics, text: str | None, tool_from: str, t
             raise InputError.of(f"--tool-from {tool_from} without --tool", fix="give the tool too, or leave it out")
         return model.tool
     tool = tool_frame(text, table)
-    length = float(tool[:3, 3].norm())
-    if length > model.robot.reach:
+    if (length := float(tool[:3, 3].norm())) > model.robot.reach:
         what = f"--tool is {length:g} m long, more than the robot reaches"
         warn_user(sentence(what, fix="check the unit (--length)"))
     if tool_from == "tip":
         return tool
-    if model.lever is None:
-        what = "--tool-from measured: this model was calibrated with points, which have no measured frame"
-        raise InputError.of(what, fix="give the tool in the frame of the tip (--tool-from tip)")
     tip = model.tool_tip or model.robot.tips[0]
-    frames = by_frame(model.measured_frame[None])[0]
-    own = [frame for frame, name in zip(frames, model.on[::POINTS], strict=True) if name == tip]
+    frames = [] if model.lever is None else list(by_frame(model.measured_frame[None])[0])
+    own = [frame for frame, name in zip(frames, model.on[::POINTS], strict=False) if name == tip]
     if len(own) != 1:
-        what = f"--tool-from measured: {len(own)} frames were measured on '{tip}'"
-        raise InputError.of(what, fix="give the tool in the frame of the tip (--tool-from tip)")
+        found = f"{len(own)} frames were measured on '{tip}'"
+        found = "this model was calibrated with points, which have no measured frame" if not frames else found
+        raise InputError.of(
+            f"--tool-from measured: {found}", fix="give the tool in the frame of the tip (--tool-from tip)"
+        )
     return own[0] @ tool

@@ -79,9 +79,9 @@ class ErrorTable:
 
 def parts_table(parts: Sequence[Part]) -> Table:
     """How much each part of a model explains."""
-    angles = ["" if part.angle is None else f"{1e3 * part.angle:.4f}" for part in parts]
     rows = [
-        [plain(part.name), f"{1e3 * part.displacement:.4f}", angle] for part, angle in zip(parts, angles, strict=True)
+        [plain(part.name), f"{1e3 * part.displacement:.4f}", "" if part.angle is None else f"{1e3 * part.angle:.4f}"]
+        for part in parts
     ]
     title = "What explains how much (RMS over the training rows; parts may cancel)"
     return text_table(title, ["part", "displacement, mm", "angle, mrad (prismatic: mm)"], rows)
@@ -96,7 +96,7 @@ def outlier_lines(outliers: Sequence[Outlier], rows: int, what: str = "training 
     yield f"{flagged} of {rows} {what} look wrong (numbers are lines of the file){kept}:"
     for outlier in outliers[:MOST_OUTLIERS]:
         marker = "" if outlier.marker is None else f", marker {outlier.marker}"
-        marker = marker if outlier.tip is None else f", {plain(outlier.tip)}"
+        marker = f", {plain(outlier.tip)}" if outlier.tip is not None else marker
         weight = "" if outlier.weight is None else f", weight {outlier.weight:.2g}"
         size, unit = outlier.shown
         yield f"  row {outlier.number}{marker}: {size:.3f} {unit} off{weight}; {outlier.reason}"
@@ -107,17 +107,13 @@ def outlier_lines(outliers: Sequence[Outlier], rows: int, what: str = "training 
 def placement_lines(
     geometry: Geometry, *, poses: bool, ball: bool = False, frame: str = "the measuring frame"
 ) -> Iterator[str]:
-    """Where the robot's base was found in the measuring frame, and the markers in their tips' frames.
+    """Where the robot's base was found in the measuring ``frame``, and the markers in their tips' frames.
 
     Args:
-        geometry: as refined with the deformations.
-        poses: whether the markers are the points of measured frames, three of each.
-        ball: whether the last one of several is a ball that rested in sockets.
-        frame: of the base, in words.
+        geometry: as refined with the deformations. poses: whether the markers are the points of measured frames, three
+            of each. ball: whether the last one of several is a ball that rested in sockets.
     """
-    base = geometry.base
-    place, turn = 1e3 * base[:3, 3], rotation_numbers(base[None, :3, :3], "rotvec", angle="deg")[0]
-    yield f"robot base in {frame}: {_triple(place)} mm, rotation vector {_triple(turn)} deg"
+    yield f"robot base in {frame}: {_transform(geometry.base)}"
     yield from _marker_lines(geometry.tool, geometry.on, poses=poses, ball=ball)
 
 
@@ -133,6 +129,12 @@ def _marker_lines(
         yield f"{what} in the frame of '{tip}': {_triple(1e3 * place)} mm{end}"
 
 
+def _transform(frame: Tensor) -> str:
+    """A transform (4, 4), m, in words."""
+    turn = rotation_numbers(frame[None, :3, :3], "rotvec", angle="deg")[0]
+    return f"{_triple(1e3 * frame[:3, 3])} mm, rotation vector {_triple(turn)} deg"
+
+
 def _triple(values: Tensor, digits: str = ".3f") -> str:
     return " ".join(f"{value:{digits}}" for value in values.tolist())
 
@@ -143,11 +145,9 @@ def registration_lines(model: CalibratedKinematics) -> Iterator[str]:
     if found is None:
         return
     yield from motion_lines(found, model.on, doubt=": what else has changed is in them" * found.doubtful)
-    rows = f"{found.rows} rows took part"
-    yield (
-        f"{rows}: RMS {1e3 * found.rms_after:.4f} mm on these rows, to which device and markers were fitted; "
-        f"{1e3 * found.left_out_rms:.4f} mm with each row left out in turn"
-    )
+    fitted = f"RMS {1e3 * found.rms_after:.4f} mm on these rows, to which device and markers were fitted"
+    left_out = f"{1e3 * found.left_out_rms:.4f} mm with each row left out in turn"
+    yield f"{found.rows} rows took part: {fitted}; {left_out}"
 
 
 def motion_lines(found: Registration, tips: Sequence[str], *, doubt: str = "") -> Iterator[str]:
@@ -173,12 +173,9 @@ def motion_lines(found: Registration, tips: Sequence[str], *, doubt: str = "") -
 
 def frame_lines(found: Registration) -> Iterator[str]:
     """Where the measuring frame is now."""
-    turn = rotation_numbers(found.transform[None, :3, :3], "rotvec", angle="deg")[0]
-    moved = f"{_triple(1e3 * found.transform[:3, 3])} mm, rotation vector {_triple(turn)} deg"
-    yield f"the measuring frame of the model, seen from the new one: {moved}"
-    deviations = found.frame_deviations
-    shift, small = 1e3 * deviations[:3], torch.rad2deg(deviations[3:])
-    yield f"  known to {_triple(shift, '.2g')} mm at the middle of the rows, and to {_triple(small, '.2g')} deg"
+    yield f"the measuring frame of the model, seen from the new one: {_transform(found.transform)}"
+    shift, turn = 1e3 * found.frame_deviations[:3], torch.rad2deg(found.frame_deviations[3:])
+    yield f"  known to {_triple(shift, '.2g')} mm at the middle of the rows, and to {_triple(turn, '.2g')} deg"
 
 
 def socket_lines(errors: Evaluation, rows: str) -> Iterator[str]:

@@ -21,13 +21,15 @@ from diffeo_calib.cli.column_names import column
 from diffeo_calib.cli.guesses import (
     LENS,
     SOME_LENS,
+    Choice,
     JointColumns,
+    RowColumns,
     Sheet,
+    entries,
     guess_deviations,
     guess_rotation,
 )
 from diffeo_calib.cli.options import Rows
-from diffeo_calib.cli.row_columns import Choice, RowColumns, entries
 from diffeo_calib.cli.tables import readings_columns
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, few
@@ -62,8 +64,7 @@ LARGEST_DEVIATION = 0.01
 def beside(source: Source, sheet: Sheet) -> Iterator[Choice]:
     """Rotations, standard deviations and distances of sockets."""
     if source.rows.sockets:
-        lines = distance_lines(source.csv, sheet, source.rows.sockets[-1], source.table.length)
-        yield from (Choice("", "", line) for line in lines)
+        yield from distances(source.csv, sheet, source.rows.sockets[-1], source.table.length)
     if source.rows.markers:
         yield from rotation(source)
         yield from deviations(source)
@@ -95,15 +96,19 @@ class Source:
 
     def read(self, table: TableFormat) -> Any:
         """The rows in another format, of any kinds."""
-        session = self.rows.named.get("session")
+        rows, session = self.rows, self.rows.named.get("session")
         options = Rows(session=session, camera_on_tool=table.camera_on_tool)
-        readings = readings_columns([text.replace(LENS, SOME_LENS) for text in self.rows.readings], options)
-        sockets = SocketColumns(tuple(self.rows.sockets)) if self.rows.sockets else None
-        markers = self.rows.markers or None
-        marker = None if self.marker is None else str(self.marker.value)
-        table = replace(table, joints=self.joints, kinds=self.robot.kinds, position=markers, sockets=sockets)
-        table = replace(table, readings=readings, session=session if markers else None, marker=marker)
-        table = replace(table, camera_on_tool=table.camera_on_tool and not self.rows.of_boards)  # said of the corners
+        table = replace(
+            table,
+            joints=self.joints,
+            kinds=self.robot.kinds,
+            position=rows.markers or None,
+            sockets=SocketColumns(tuple(rows.sockets)) if rows.sockets else None,
+            readings=readings_columns([text.replace(LENS, SOME_LENS) for text in rows.readings], options),
+            session=session if rows.markers else None,
+            marker=None if self.marker is None else str(self.marker.value),
+            camera_on_tool=table.camera_on_tool and not rows.of_boards,  # it is said of the corners
+        )
         data: Any = read_observations(self.csv, table, duplicates="keep")
         data = data.with_joint_names(self.robot.joint_names)
         return data.with_tips(self.tips) if self.tips else data
@@ -119,6 +124,10 @@ class Source:
                 return self.read_residual(table)
             except DiffeoCalibError:
                 return inf
+
+    def residuals(self, formats: Iterable[TableFormat]) -> list[tuple[float, TableFormat]]:
+        """In every format; the smallest first."""
+        return sorted(((self.residual(table), table) for table in formats), key=lambda found: found[0])
 
     def read_residual(self, table: TableFormat) -> float:
         """The same; DiffeoCalibError says why a table cannot be read so, or calibrates nothing."""
@@ -148,10 +157,8 @@ class Source:
         """
         if self.rows.sockets or self.rows.readings:
             return
-        likely, turning = (
-            list[tuple[float, str, str, Measurements]](),
-            torch.tensor(self.robot.periodic, dtype=torch.bool, device=HOST),
-        )
+        turning = torch.tensor(self.robot.periodic, dtype=torch.bool, device=HOST)
+        likely = list[tuple[float, str, str, Measurements]]()
         for length, angle, own in self.in_units():
             if length in (entry[1] for entry in likely):
                 continue
@@ -165,10 +172,8 @@ class Source:
             for one in found:
                 own = one.of_columns(joints.matrix, joints.offset, *units)
                 text = ",".join(own.texts(joints.columns, *units))
-                why = (
-                    f"the nominal robot then leaves {100 * one.left:.2g} % of what the rows vary, with the columns as "
-                )
-                why += f"they are {100 * best:.3g} %"
+                why = f"the nominal robot then leaves {100 * one.left:.2g} % of what the rows vary, with the columns "
+                why += f"as they are {100 * best:.3g} %"
                 why += "; these rows do not tell which: uncomment one" * (len(found) > 1)
                 yield Choice("joints", text, why, sure=len(found) == 1)
             if found:
@@ -241,7 +246,7 @@ def joint_columns(source: Source, found: Sequence[JointColumns]) -> tuple[Source
     best, equal, clear = found[0], [one for one in found if one.rank == found[0].rank], [(1.0, found[0])]
     for length in UNITS_PER_METRE if len(equal) > 1 else ():
         tables = [replace(source.table, length=length, angle=angle) for angle in ("rad", "deg")]
-        tried = [(residuals(replace(source, joints=one.names), tables)[0][0], one) for one in equal]
+        tried = [(replace(source, joints=one.names).residuals(tables)[0][0], one) for one in equal]
         (least, own), (second, _), *_ = sorted(tried, key=lambda entry: entry[0])
         clear.append((second / least if 0 < least < LARGEST_RESIDUAL else 1.0, own))
     ratio, taken = max(clear, key=lambda entry: entry[0])
@@ -250,12 +255,16 @@ def joint_columns(source: Source, found: Sequence[JointColumns]) -> tuple[Source
         lines = [Choice("joints", ",".join(one.names), f"{why}: {one.how}", sure=False) for one in equal]
         return replace(source, joints=best.names), lines
     why = taken.how + f"; the nominal robot explains them {ratio:.3g} times better" * (len(equal) > 1)
-    why += "".join(f"; not {one.shown}" for one in found[:4] if one is not taken)
+    for one in (one for one in found[:4] if one is not taken):
+        why += f"; not {one.names[0]} to {one.names[-1]}" + " (commanded)" * bool(one.rank and one.rank[0])
     return replace(source, joints=taken.names), [Choice("joints", ",".join(taken.names), why)]
 
 
 def measured(source: Source) -> Source:
-    """The same without markers that are copies, or that the nominal robot explains in some units and others not."""
+    """The same with the column of its markers, if any.
+
+    Without markers that are copies, or that the nominal robot explains in some units and others not.
+    """
     found, several = dict[int, str](), len(source.rows.markers) > 1
     for _, _, positions in source.in_units() if several else ():
         every = unmeasured_markers(source.robot, positions)
@@ -263,7 +272,8 @@ def measured(source: Source) -> Source:
     rows, kept = source.rows, [k for k in range(len(source.rows.markers)) if k not in found]
     left = [f"{few(rows.markers[k])}: {words} (counted from 0)" for k, words in found.items()]
     rows = replace(rows, markers=[rows.markers[k] for k in kept], left=[*rows.left, *left])
-    return replace(source, rows=rows, tips=[source.tips[k] for k in kept] if source.tips else source.tips)
+    seen = replace(source, rows=rows, tips=[source.tips[k] for k in kept] if source.tips else source.tips)
+    return replace(seen, marker=seen.marker or marker(seen))
 
 
 def other_units(source: Source, table: TableFormat) -> list[str]:
@@ -272,11 +282,6 @@ def other_units(source: Source, table: TableFormat) -> list[str]:
     places = [name for triple in source.rows.markers for name in triple]
     pairs = *product(turning, (table.angle,)), *product(places, (table.length,))
     return [name for name, unit in pairs if column(name).unit not in ("", unit)]
-
-
-def residuals(source: Source, formats: Iterable[TableFormat]) -> list[tuple[float, TableFormat]]:
-    """Median residual of the nominal robot in every format; the smallest first."""
-    return sorted(((source.residual(table), table) for table in formats), key=lambda found: found[0])
 
 
 def is_clear(found: Sequence[tuple[float, Any]], ratio: float) -> bool:
@@ -310,17 +315,11 @@ def rotation(source: Source, *, camera: bool = False) -> Iterator[Choice]:
     turns = product(conventions, ("deg", "rad") if len(each[0]) == 3 else (None,))
     units = product(UNITS_PER_METRE, ("rad", "deg")) if camera else [(table.length, table.angle)]
     known = replace(table, rotation=each[0] if len(each) == 1 else each, camera_on_tool=camera)
-    formats = (
-        replace(known, length=unit[0], angle=unit[1], convention=turn[0], rotation_angle=turn[1])
-        for unit, turn in product(units, turns)
-    )
-    clear = residuals(source, formats)
+    ways = [(*unit, *turn) for unit, turn in product(units, turns)]
+    clear = source.residuals(replace(known, length=a, angle=b, convention=c, rotation_angle=d) for a, b, c, d in ways)
     if not clear or not is_clear(clear, gates.READINGS_TOLD_APART):
-        what = (
-            "rotations of no convention that is clearly better than others"
-            if own_body
-            else "rotations, but not one for each marker"
-        )
+        what = "rotations of no convention that is clearly better than others"
+        what = what if own_body else "rotations, but not one for each marker"
         usual = " or ".join(dict.fromkeys(words for _, words in found))
         if not camera:
             yield Choice("", "", f"{few(names, 9)}: {what}; not used; such names usually mean {usual}")
@@ -352,15 +351,15 @@ def deviations(source: Source) -> Iterator[Choice]:
     yield Choice("std", ",".join(names), why)
 
 
-def distance_lines(csv: Path, sheet: Sheet, column: str, unit: str) -> Iterator[str]:
-    """Options about known distances between sockets as lines for the user to complete: no table holds them."""
+def distances(csv: Path, sheet: Sheet, column: str, unit: str) -> Iterator[Choice]:
+    """Options about known distances between sockets, for the user to complete: no table holds them."""
     header, rows = read_cells(csv, sheet.sep)
     place = header.index(column)
     names = list(dict.fromkeys(cells[place].strip() for _, cells in rows if cells[place].strip()))
     if len(names) < 2:
-        yield "there is one socket alone, and no distance to know: the URDF gives the robot's size"
+        yield Choice("", "", "there is one socket alone, and no distance to know: the URDF gives the robot's size")
         return
     length, deviation = (f"{metres * UNITS_PER_METRE[unit]:g}" for metres in (0.05, 3e-5))
-    pair = f"{names[0]},{names[1]}={length}"
-    yield f'distance = ["{pair}"]  # measure it, in {unit}, and uncomment: it gives the robot its size'
-    yield f"distance-std = {deviation}  # how well it is known, in {unit}: so well with a caliper"
+    why = f"measure it, in {unit}, and uncomment: it gives the robot its size"
+    yield Choice("distance", [f"{names[0]},{names[1]}={length}"], why, sure=False)
+    yield Choice("", "", f"distance-std = {deviation}  # how well it is known, in {unit}: so well with a caliper")

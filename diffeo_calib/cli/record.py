@@ -51,10 +51,6 @@ class Record:
         """Files that are written."""
         return [str(path) for path in self._results.get("files", {}).values()]
 
-    def warn(self, text: str) -> None:
-        """Add a warning."""
-        self.warnings.append(text)
-
     @contextmanager
     def written(self, arguments: list[str]) -> Iterator[None]:
         """Write the file, if it is wanted, when the outermost command inside has ended."""
@@ -70,9 +66,6 @@ class Record:
         except DiffeoCalibError as raised:
             code, error = EXIT_ERROR, str(raised)
             raise
-        except KeyboardInterrupt:
-            code = EXIT_INTERRUPTED
-            raise
         except SystemExit as ended:  # of a command inside this one
             code = ended.code if isinstance(ended.code, int) else 0
             raise
@@ -85,16 +78,10 @@ class Record:
                 write_whole(self.path, self._text(arguments, code, error).encode())
 
     def _text(self, arguments: list[str], code: int, error: str | None) -> str:
-        made = {
-            "format": FORMAT,
-            "format_version": VERSION,
-            "diffeo_calib": _version(),
-            "arguments": arguments,
-            "exit_code": code,
-            "error": error,
-            "warnings": self.warnings,
-            "results": self._results,
-        }
+        made = {"format": FORMAT, "format_version": VERSION, "diffeo_calib": "unknown", "arguments": arguments}
+        made |= {"exit_code": code, "error": error, "warnings": self.warnings, "results": self._results}
+        with suppress(PackageNotFoundError):  # copied instead of installed
+            made["diffeo_calib"] = version("diffeo_calib")
         return json.dumps(_plain(made), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 
@@ -103,20 +90,15 @@ record = Record()
 
 def remove_earlier(arguments: Sequence[str]) -> None:
     """Remove the result of an earlier run at the place that a command line names; any other file stays."""
-    for number, word in enumerate(arguments):
+    for word, following in zip(arguments, [*arguments[1:], ""], strict=False):
         name, given, value = word.partition("=")
-        following = arguments[number + 1 : number + 2]
-        for place in [value] if given else following:
-            path = Path(os.path.realpath(place))
-            with suppress(OSError, ValueError):
-                if name == OPTION and path.is_file() and _is_result(path):
+        with suppress(OSError, ValueError):
+            path = Path(os.path.realpath(value if given else following))
+            if name == OPTION and path.is_file():
+                with path.open("rb") as file:
+                    begin = file.read(100)
+                if FORMAT.encode() in begin:
                     path.unlink()
-
-
-def _is_result(path: Path) -> bool:
-    """Whether a file begins as the files that are written here."""
-    with path.open("rb") as file:
-        return FORMAT.encode() in file.read(100)
 
 
 NAMES = "rms", "median", "p95", "max"
@@ -124,17 +106,16 @@ ERRORS = "errors"
 """As in sensors/errors.py, which loads torch."""
 
 
-def errors_entry(errors: Evaluation) -> dict[str, float | int | None]:
+def errors_entry(errors: Evaluation) -> dict[str, object]:
     """Errors of measured positions in m, and of orientations in degrees (null without), over some rows."""
-    entry: dict[str, float | int | None] = {"rows": errors.count}
-    entry |= {f"{name}_m": getattr(errors, name) for name in NAMES}
+    entry = {"rows": errors.count} | {f"{name}_m": getattr(errors, name) for name in NAMES}
     return entry | {f"angle_{name}_deg": getattr(errors, f"angle_{name}") for name in NAMES}
 
 
 def kind_entry(errors: Evaluation) -> dict[str, object]:
     """Errors of rows of any kind in the unit in which they are shown, and of orientations in degrees."""
     unit, per_unit = errors.shown
-    entry: dict[str, object] = {"rows": errors.count, "what": errors.what, "unit": unit}
+    entry = {"rows": errors.count, "what": errors.what, "unit": unit}
     entry |= {name: per_unit * getattr(errors, name) for name in NAMES}
     return entry | {f"angle_{name}_deg": getattr(errors, f"angle_{name}") for name in NAMES}
 
@@ -173,33 +154,24 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def _version() -> str:
-    try:
-        return version("diffeo_calib")
-    except PackageNotFoundError:  # copied instead of installed
-        return "unknown"
-
-
-def check_outputs(
-    outputs: Mapping[str, Path | None], inputs: dict[str, Path], *, may_come: Container[str] = ()
-) -> None:
+def check_outputs(named: dict[str, Path], inputs: dict[str, Path], *, may_come: Container[str] = ()) -> None:
     """Refuse files that cannot be written, that are also read, or that are named twice, and unknown kinds of images.
 
     --json is one of the files. Files that are read must exist, which is known at once, before anything is loaded.
 
     Args:
-        outputs: option -> file to write, None if not wanted. inputs: name of an argument -> file that is read.
+        named: option -> file to write. inputs: name of an argument -> file that is read.
         may_come: names of files that may not exist yet.
     """
     wanted, record.path = record.path, None  # nothing is written there before the place has been checked
-    named = {option: path for option, path in outputs.items() if path is not None}
-    _check("--json", wanted, inputs | named)
+    if wanted is not None:
+        _check("--json", wanted, inputs | named)
     record.path = wanted
     taken = dict(inputs)
     for option, path in named.items():
         _check(option, path, taken)
         taken[option] = path
-    figure = outputs.get("--figure")
+    figure = named.get("--figure")
     if figure is not None and figure.suffix.lower() not in IMAGE_SUFFIXES:
         raise InputError.of(f"--figure {figure}", expected=f"a name ending in {', '.join(IMAGE_SUFFIXES)}")
     for name, path in inputs.items():
@@ -211,10 +183,7 @@ def check_outputs(
             raise InputError.of(f"there is no {kind} {path}", fix=fix)
 
 
-def _check(option: str, path: Path | None, taken: dict[str, Path]) -> None:
-    """Refuse one file, if it is wanted."""
-    if path is None:
-        return
+def _check(option: str, path: Path, taken: dict[str, Path]) -> None:
     try:
         check_writable(path)
         for name, other in taken.items():

@@ -19,9 +19,9 @@ import typer
 from torch import Tensor
 
 from diffeo_calib.cameras.files import read_camera
-from diffeo_calib.cli.app import add_to_command_line, check_together, has, leaves_of, names_of, typed_options
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.options import CORNERS, Rows, Targets, Units
+from diffeo_calib.cli.main import add_to_command_line
+from diffeo_calib.cli.options import CORNERS, Rows, Targets, Units, has
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.files import PROGRAM
@@ -40,9 +40,6 @@ from diffeo_calib.sensors.kinds import known_kinds
 from diffeo_calib.sensors.range import UNKNOWN_ZERO_M
 
 POSE_JOINTS = 6
-NEEDS = {"--lever": "--rotation", "--camera-on-tool": "--rotation --reading", "--places": "--by", "--by": "--places"}
-NEEDS |= {"--distance-std": "--socket", "--distance": "--distance-std"}
-"""Options of rows, and those of which they need one."""
 
 
 def table_format(units: Units) -> TableFormat:
@@ -50,20 +47,19 @@ def table_format(units: Units) -> TableFormat:
 
     InputError for a unit that is neither typed nor kept with the model.
     """
-    length, angle, sep = units.length, units.angle, "," if units.sep is None else units.sep
+    length, angle = units.length, units.angle
     if length is None or angle is None:
         missing = " and ".join(f"--{name}" for name in ("length", "angle") if getattr(units, name) is None)
         fix = "state the units of the table; a model that `fit` made knows those of its own"
         raise InputError.of(f"{missing} missing", fix=fix)
-    mark = "\t" if sep in ("\\t", "tab") else sep
-    return TableFormat(
-        length, angle, mark, "." if units.decimal is None else units.decimal, joint_length=units.joint_length
-    )
+    sep = "," if units.sep is None else "\t" if units.sep in ("\\t", "tab") else units.sep
+    decimal = "." if units.decimal is None else units.decimal
+    return TableFormat(length, angle, sep, decimal, joint_length=units.joint_length)
 
 
 def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
     """The same format with the columns that options name, but for readings; lever in the unit of length."""
-    check_together(typed_options(dict(leaves_of(Rows)), vars(rows)), NEEDS, {})
+    Rows.check_together(vars(rows))
     as_typed = "convention", "rotation_angle", "remounted", "payload", "time", "temperature", "session", "marker"
     return replace(
         table,
@@ -74,18 +70,23 @@ def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
         camera_on_tool=rows.camera_on_tool and not rows.images,
         std=None if rows.std is None else _split_names(rows.std),
         rotation_std=_names_of_each(rows.rotation_std),
-        sockets=socket_columns(rows.socket, rows.distance, rows.distance_std, table),
+        sockets=None if rows.socket is None else socket_columns(rows.socket, rows, table),
     )
 
 
 def measured_table(csv: Path, rows: Rows, units: Units, duplicates: str = "keep") -> MeasuredTable:
     """The table that options describe, joined of two files if these do; exact repeats are kept by default."""
-    check_place(rows)
+    if not rows.named:
+        text = "name the position columns, or those of --socket or --reading"
+        raise typer.BadParameter(text, param_hint="--position")
     table = with_rows(table_format(units), rows)
-    csv = with_places(csv, rows, table)
+    csv, names = with_places(csv, rows, table), list[str]()
     if isinstance(csv, JoinedFile):
         say(csv.sentence)
-    readings = readings_columns(rows.reading or (), rows, _number_columns(csv, rows, table))
+    if csv.is_file() and any(_number(text.partition("=")[2]) is not None for text in rows.reading or ()):
+        with suppress(MeasurementError):  # rows may come later
+            names = CsvLines(csv, table.sep).header
+    readings = readings_columns(rows.reading or (), rows, names)
     return MeasuredTable(csv, joints_of(units), replace(table, readings=readings), duplicates)
 
 
@@ -94,13 +95,6 @@ def with_places(csv: Path, rows: Rows, table: TableFormat) -> Path:
     if rows.places is None or rows.by is None:
         return csv
     return joined_file(csv, rows.places, rows.by, table.sep, table.decimal, several=rows.marker is not None)
-
-
-def check_place(rows: Rows) -> None:
-    """Raise an error unless positions, sockets or readings are named."""
-    if not rows.named:
-        text = "name the position columns, or those of --socket or --reading"
-        raise typer.BadParameter(text, param_hint="--position")
 
 
 # --- as at the fit ------------------------------------------------------------------------------------------------
@@ -135,9 +129,8 @@ def as_at_the_fit(command: str, rows: Rows | None, units: Units) -> tuple[Rows, 
     except (ValueError, IndexError) as error:  # of a file that was edited
         fix = "name the columns (--position, --socket, --reading), --length and --angle"
         raise InputError.of("the options that the model was fitted with", got=str(error), fix=fix) from error
-    named = PROGRAM in command and not units.robot_pose
-    program = _stated(shlex.split(command), Units).get("robot_pose", ("", []))[0] if named else ""
-    if PROGRAM in program:
+    program = _stated(shlex.split(command), Units).get("robot_pose", ("", []))[0] if PROGRAM in command else ""
+    if PROGRAM in program and units.robot_pose in (None, program.partition("=")[0]):  # of other names: places
         fix = f"type it again, a model file starts no program: --robot-pose {program}"
         raise InputError.of("--robot-pose", expected="the function that the model was fitted with", fix=fix)
     if words:
@@ -172,21 +165,21 @@ def _stated(words: Sequence[str], group: type[Units] | type[Rows]) -> dict[str, 
     ValueError or IndexError for a value that is none.
     """
     found = dict[str, tuple[Any, list[str]]]()
-    for name, (hint, field) in leaves_of(group):
-        option, given = names_of(field)[0], list[list[str]]()
+    for option in group.all():
+        name, hint, given = option.shown, option.hint, list[list[str]]()
         for place, word in enumerate(words):
             begin, equal, value = word.partition("=")
-            if begin == option:
-                given.append([option] if hint is bool else [option, value if equal else words[place + 1]])
+            if begin == name:
+                given.append([name] if hint is bool else [name, value if equal else words[place + 1]])
         given = given if has(hint, list) else given[-1:]
         texts = [own[-1] for own in given]
         allowed = next((get_args(one) for one in (hint, *get_args(hint)) if get_origin(one) is Literal), texts)
         if wrong := [text for text in texts if text not in allowed]:
-            raise ValueError(f"'{wrong[0]}' for {option}")
+            raise ValueError(f"'{wrong[0]}' for {name}")
         if given:
             values = [float(text) for text in texts] if has(hint, float) else texts
             value = True if hint is bool else values if has(hint, list) else values[-1]
-            found[name] = value, [word for own in given for word in own]
+            found[option.field] = value, [word for own in given for word in own]
     return found
 
 
@@ -198,10 +191,8 @@ class MeasuredTable:
     """A table of measurements as the options describe it.
 
     Args:
-        csv: the file.
         joints: names of the joint columns, separated by commas; None if they are named after the robot's joints; or
-            the columns of a pose.
-        table: what it holds, but for the joints, which are those of the robot that reads them.
+            the columns of a pose. table: what it holds, but for the joints.
         duplicates: what to do with exactly repeated rows. growing: whether rows will be added.
     """
 
@@ -212,13 +203,9 @@ class MeasuredTable:
     growing: bool = False
 
     def read(self, robot: Tree, tips: Sequence[str] = ()) -> Any:
-        """Read the rows of a robot, under the names of its own joints.
+        """The rows of a robot, under the names of its own joints, as of :func:`read_observations`.
 
-        Args:
-            robot: n joints. tips: that of every marker, for a robot with several.
-
-        Returns:
-            what :func:`read_observations` returns: measurements, readings, or observations of several kinds.
+        ``tips`` are those of every marker, for a robot with several.
         """
         given, triples = self.table, self.table.position
         several = len(tips) > 1 and given.sockets is None and not given.readings
@@ -245,14 +232,7 @@ class MeasuredTable:
 
 @dataclass(frozen=True)
 class ProgramTable:
-    """A robot's program as the options describe it.
-
-    Args:
-        csv: the file.
-        joints: names of the joint columns, separated by commas; None if they are named after the robot's joints.
-        table: units, separator and decimal mark.
-        given: columns of the targets of every tool; none if the commands' nominal poses are the targets.
-    """
+    """A robot's program as the options describe it, with the columns of the targets of every tool, if any."""
 
     csv: Path
     joints: str | PoseColumns | None
@@ -338,11 +318,6 @@ def joint_columns(joints: str | PoseColumns | None, robot: Tree) -> list[str] | 
     return names
 
 
-def written_columns(names: list[str] | PoseColumns) -> list[str] | PoseColumns:
-    """Columns in which joint values are written that were read from these."""
-    return names.written if isinstance(names, PoseColumns) else names
-
-
 def _position_triples(position: list[str]) -> list[list[str]]:
     triples = [_split_names(text) for text in position]
     for triple in triples:
@@ -361,32 +336,17 @@ def _names_of_each(texts: list[str] | None) -> list[str] | list[list[str]] | Non
     return (names[0] if len(names) == 1 else names) or None
 
 
-def socket_columns(
-    socket: str | None, distance: list[str] | None, std: float | None, table: TableFormat
-) -> SocketColumns | None:
-    """The options of sockets in SI units; None without sockets."""
-    if socket is None:
-        return None
-    known = dict(_distance(text, table) for text in distance or ())
+def socket_columns(socket: str, rows: Rows, table: TableFormat) -> SocketColumns:
+    """The options of sockets in SI units."""
+    known, std = dict[tuple[str, str], float](), rows.distance_std
+    for text in rows.distance or ():
+        pair, _, length = text.rpartition("=")
+        names, value = _split_names(pair), _number(length) or 0.0
+        if len(names) != 2 or value <= 0.0:
+            fix = "write two names of sockets and a length, such as 0,1=50 or front/0,front/1=50"
+            raise InputError.of(f"--distance {text}", expected="A,B=LENGTH", fix=fix)
+        known[names[0], names[1]] = value / table.per_metre
     return SocketColumns(tuple(_split_names(socket)), known or None, None if std is None else std / table.per_metre)
-
-
-def _distance(text: str, table: TableFormat) -> tuple[tuple[str, str], float]:
-    pair, _, length = text.rpartition("=")
-    names, value = _split_names(pair), _number(length) or 0.0
-    if len(names) != 2 or value <= 0.0:
-        fix = "write two names of sockets and a length, such as 0,1=50 or front/0,front/1=50"
-        raise InputError.of(f"--distance {text}", expected="A,B=LENGTH", fix=fix)
-    return (names[0], names[1]), value / table.per_metre
-
-
-def _number_columns(csv: Path, rows: Rows, table: TableFormat) -> list[str]:
-    """The columns of a table, if a reading may be meant as a number or as the name of one."""
-    if not csv.is_file() or all(_number(text.partition("=")[2]) is None for text in rows.reading or ()):
-        return []
-    with suppress(MeasurementError), CsvLines(csv, table.sep) as file:  # rows may come later
-        return file.header
-    return []
 
 
 def readings_columns(texts: Sequence[str], rows: Rows, names: Sequence[str] = ()) -> tuple[Any, ...]:

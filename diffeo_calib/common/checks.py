@@ -19,14 +19,10 @@ from diffeo_calib.common.data_frames import ARRAY_KINDS, real_array
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import InputError, as_written
 
-MOST_SHOWN = 12
-"""Values that a message lists."""
-LARGEST_SEED = 2**63 - 1
-"""Of torch; NumPy's generators take any."""
-LARGEST = 1e75
-"""Its fourth power is finite."""
-Shape = Sequence[int | str]
-"""A pattern such as ``("N", 6)``: an integer must match, a letter stands for any size."""
+MOST_SHOWN = 12  # values that a message lists
+LARGEST_SEED = 2**63 - 1  # of torch; NumPy's generators take any
+LARGEST = 1e75  # its fourth power is finite
+Shape = Sequence[int | str]  # a pattern such as ``("N", 6)``: an integer must match, a letter stands for any size
 
 
 def as_tensor(

@@ -23,12 +23,9 @@ if TYPE_CHECKING:
 
 _SHORT = Repr()
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 80
-MOST_NAMES = 12
-"""Most names that a message lists."""
-LONGEST_LIST = 1200
-"""Most characters of one part of a message: more than the longest list of names."""
-LONGEST_NAME = 80
-"""Most characters of a name in a list."""
+MOST_NAMES = 12  # most names that a message lists
+LONGEST_LIST = 1200  # most characters of one part of a message: more than the longest list of names
+LONGEST_NAME = 80  # most characters of a name in a list
 PACKAGE = __name__.partition(".")[0]
 
 
@@ -65,8 +62,7 @@ class DiffeoCalibWarning(UserWarning):
     """Something looks wrong, but a result is still returned."""
 
 
-_KEPT: ContextVar[list[str] | None] = ContextVar("kept", default=None)
-"""Where texts of warnings are kept too."""
+_KEPT: ContextVar[list[str] | None] = ContextVar("kept", default=None)  # where texts of warnings are kept too
 
 
 @contextmanager

@@ -27,8 +27,7 @@ except ImportError:  # Windows, where leftovers stay
 
 
 SUFFIX = ".part"
-LONGEST_STEM = 200
-"""Bytes of a file's name that are part of the name of its temporary file; names have 255 at most."""
+LONGEST_STEM = 200  # bytes of a file's name that are part of the name of its temporary file; names have 255 at most
 FULL = "free some space, or name a file on another disk"
 FIXES = {
     errno.ENOSPC: FULL,
@@ -38,8 +37,7 @@ FIXES = {
 }
 """Advice on failures."""
 
-_unfinished: set[Path] = set()
-"""Temporary files of this process."""
+_unfinished: set[Path] = set()  # temporary files of this process
 
 
 class WholeFile:
@@ -248,10 +246,8 @@ def _take_permissions(part: Path, target: Path) -> None:
     part.chmod(known.st_mode & 0o777)
 
 
-PROGRAM = ".py:"
-"""In FILE.py:NAME, a function in a file."""
-IMAGE_SUFFIXES = (".png", ".pdf", ".svg")
-"""Suffixes of the files that figures can be written to."""
+PROGRAM = ".py:"  # in FILE.py:NAME, a function in a file
+IMAGE_SUFFIXES = (".png", ".pdf", ".svg")  # suffixes of the files that figures can be written to
 
 
 def write_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 160) -> None:

@@ -10,13 +10,13 @@ Medians are torch's ``nanmedian``, means ``nanmean``.
 from __future__ import annotations
 
 from math import inf, nan
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-MOST_FOR_TORCH = 1 << 24
-"""Largest number of values for which torch computes quantiles."""
+MOST_FOR_TORCH = 1 << 24  # largest number of values for which torch computes quantiles
 
 
 def quantile(values: Tensor, fraction: float) -> float:
@@ -28,6 +28,13 @@ def quantile(values: Tensor, fraction: float) -> float:
     return float(np.quantile(values.cpu().numpy(), fraction))
 
 
+def _special() -> Any:
+    """scipy.special, which is slow to import and not needed to use a model."""
+    from scipy import special  # noqa: PLC0415
+
+    return special
+
+
 def chi2_median(freedom: float) -> float:
     """The median of chi-square with this number of degrees of freedom."""
     return chi2_above(0.5, freedom)
@@ -35,30 +42,27 @@ def chi2_median(freedom: float) -> float:
 
 def chi2_above(probability: float, freedom: float) -> float:
     """The value that chi-square with this number of degrees of freedom exceeds with this probability."""
-    from scipy.special import chdtri  # noqa: PLC0415  # slow to import, not needed to use a model
-
-    return float(chdtri(freedom, probability))
+    return float(_special().chdtri(freedom, probability))
 
 
 def chi2_probability(value: float, freedom: float) -> float:
     """The probability that chi-square with this number of degrees of freedom exceeds a value."""
-    from scipy.special import chdtrc  # noqa: PLC0415  # see above
-
-    return float(chdtrc(freedom, value))
+    return float(_special().chdtrc(freedom, value))
 
 
 def f_below(probability: float, upper: float, lower: float) -> float:
     """The value below which the F ratio of ``upper`` and ``lower`` degrees of freedom lies with this probability."""
-    from scipy.special import fdtri  # noqa: PLC0415  # see above
+    return float(_special().fdtri(upper, lower, probability))
 
-    return float(fdtri(upper, lower, probability))
+
+def above_estimated(probability: float, freedom: float, lower: float) -> float:
+    """As :func:`chi2_above`, of squares in units of a variance that ``lower`` degrees of freedom estimate."""
+    return freedom * f_below(1.0 - probability, freedom, lower)
 
 
 def binomial_band(count: int, share: float, chance: float) -> tuple[int, int]:
     """The successes of ``count`` trials of probability ``share``: fewer, or more, have at most this chance each."""
-    from scipy.special import bdtr  # noqa: PLC0415  # see above
-
-    at_most = bdtr(np.arange(count + 1), count, share)
+    at_most = _special().bdtr(np.arange(count + 1), count, share)
     at_least = 1.0 - np.concatenate([[0.0], at_most[:-1]])
     return int((at_most > chance).argmax()), int(np.flatnonzero(at_least > chance)[-1])
 

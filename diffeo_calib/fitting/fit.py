@@ -31,14 +31,11 @@ Formulation = Literal["exact", "eulerian"]
 
 MAX_STEP_ERROR_RATIO = 0.01
 """Largest accepted time-stepping error, as a fraction of the noise, when time steps are chosen."""
-FINEST_INTEGRATOR = RK8(8)
-"""The finest time stepping that is chosen."""
+FINEST_INTEGRATOR = RK8(8)  # the finest time stepping that is chosen
 MAX_EXCESS_FOR_TWO_STEPS = 8.0
 """Largest error of one RK4 step, relative to the accepted one, at which two steps (16 times less error) are tried."""
-TRIAL_ITERATIONS = 4
-"""Iterations of Gauss-Newton after which the momenta are accurate enough to choose the time steps."""
-COARSE_START_INTEGRATOR = RK4(2)
-"""Time stepping of the fit that starts a coarse model."""
+TRIAL_ITERATIONS = 4  # iterations of Gauss-Newton after which the momenta are accurate enough to choose the time steps
+COARSE_START_INTEGRATOR = RK4(2)  # time stepping of the fit that starts a coarse model
 
 
 class Solver(Protocol):
@@ -102,14 +99,18 @@ def fit(
     """
     solver = solver if solver is not None else (LBFGS() if formulation == "eulerian" else GaussNewton())
     _check_arguments(problem, solver, integrator, start)
-    integrator = _one_integrator(integrator, solver.integrator)
+    own = solver.integrator
+    if integrator is not None and own is not None and integrator != own:
+        got = f"{integrator} and {own}"
+        raise InputError.of("`integrator`", expected="the same for `fit` and its solver", got=got, fix="pass one")
+    integrator = own if integrator is None else integrator
     problem = problem.using(backend, accuracy)
     begin = time.perf_counter()
     if isinstance(controls, Integral) and not isinstance(controls, bool):
         rows = choose_controls(problem, int(controls))
-        few, problem = _few_rows(problem, rows), problem.with_controls(problem.x[rows])
+        whole, problem = problem, problem.with_controls(problem.x[rows])
         if start is None and problem.reduced and formulation == "exact":
-            first, used, integrator = _start_of_coarse(few, solver, integrator, progress)
+            first, used, integrator = _start_of_coarse(whole, rows, solver, integrator, progress)
             start = first.momenta
             if first.interrupted:
                 return certify(problem, problem, first, used, time.perf_counter() - begin)
@@ -149,46 +150,25 @@ def formulate(problem: Problem, formulation: str, errata: Mapping[str, object]) 
 
 
 def _start_of_coarse(
-    few: list[Problem], solver: Solver, integrator: Integrator | None, progress: Progress
+    problem: Problem, rows: Tensor, solver: Solver, integrator: Integrator | None, progress: Progress
 ) -> tuple[Solution, Integrator, Integrator | None]:
-    """The solutions of these problems, each from the one before, up to the first that was interrupted.
+    """A solution to start a coarse model from whose controls are some rows.
+
+    First that of the exact model of these rows, then, of many rows, that of the coarse model of a sample of them: an
+    iteration over all rows is expensive then.
 
     Returns:
-        the last solution, its time stepping, and that for all rows; None if it is still to be chosen.
+        the solution, its time stepping, and that for all rows; None if it is still to be chosen.
     """
-    exact, *coarse = few
-    used = integrator or COARSE_START_INTEGRATOR
-    solution = solver.solve(exact, used, None, progress)
-    for some in coarse:
-        if solution.interrupted:
-            break
-        if integrator is None:
-            solution, integrator, _ = _with_chosen_steps(some, solver, solution.momenta, progress)
-            used = integrator
-        else:
-            solution = solver.solve(some, used, solution.momenta, progress)
-    return solution, used, integrator
-
-
-def _few_rows(problem: Problem, controls: Tensor) -> list[Problem]:
-    """Problems whose solutions lead to that of a coarse model, each from the one before.
-
-    First the exact model of the data at the control points, then, of many rows, the coarse model of a sample of them:
-    an iteration over all rows is expensive then.
-    """
-    some = sample(problem)
-    found = [problem.subset(controls)]
-    if some is not None and len(some) > len(controls):
-        found.append(problem.subset(some).with_controls(problem.x[controls]))
-    return found
-
-
-def _one_integrator(given: Integrator | None, own: Integrator | None) -> Integrator | None:
-    if given is not None and own is not None and given != own:
-        raise InputError.of(
-            "`integrator`", expected="the same for `fit` and its solver", got=f"{given} and {own}", fix="pass one"
-        )
-    return own if given is None else given
+    used, some = integrator or COARSE_START_INTEGRATOR, sample(problem)
+    solution = solver.solve(problem.subset(rows), used, None, progress)
+    if solution.interrupted or some is None or len(some) <= len(rows):
+        return solution, used, integrator
+    coarse = problem.subset(some).with_controls(problem.x[rows])
+    if integrator is not None:
+        return solver.solve(coarse, used, solution.momenta, progress), used, integrator
+    solution, used, _ = _with_chosen_steps(coarse, solver, solution.momenta, progress)
+    return solution, used, used
 
 
 def _check_arguments(problem: object, solver: object, integrator: object, start: object) -> None:
@@ -237,24 +217,15 @@ def _with_chosen_steps(
         if solution.interrupted or (wanted == integrator and not (trial and solution.exhausted)):
             return solution, integrator, run
         trial, integrator = False, wanted
-        origin = problem.zero() if start is None else start
-        solution = _solved_from(problem, solver, integrator, (origin, solution.momenta), progress)
-
-
-def _solved_from(
-    problem: Objective, solver: Solver, integrator: Integrator, path: tuple[Momenta, Momenta], progress: Progress
-) -> Solution:
-    """The solution from the end of a path of momenta, or from nearer to its beginning where the flows overflow.
-
-    Coarse time steps may reach momenta whose flows overflow with finer ones.
-    """
-    origin, far = path
-    for halvings in range(MOST_HALVINGS):
-        try:
-            return solver.solve(problem, integrator, origin.towards(far, 0.5**halvings), progress)
-        except NumericalError:
-            continue
-    return solver.solve(problem, integrator, origin, progress)
+        # Coarse time steps may reach momenta whose flows overflow with finer ones: start nearer to the beginning then.
+        origin, far = problem.zero() if start is None else start, solution.momenta
+        for share in (*(0.5**halvings for halvings in range(MOST_HALVINGS)), 0.0):
+            try:
+                solution = solver.solve(problem, integrator, origin.towards(far, share), progress)
+                break
+            except NumericalError:
+                if share == 0.0:
+                    raise
 
 
 def _enough_steps(
@@ -276,8 +247,7 @@ def _enough_steps(
     return integrator.refined() if isinstance(integrator, RK8) else RK8(1), run
 
 
-MOST_HALVINGS = 6
-"""Of the way from the start of a fit to momenta whose flows overflow with finer time steps."""
+MOST_HALVINGS = 6  # of the way from the start of a fit to momenta whose flows overflow with finer time steps
 SAMPLE_COORDINATES = 8000
 """Measured coordinates of the random rows that stand for all rows where these are many: in the choice of control
 points, and in the fit that starts the fit of all rows."""

@@ -27,8 +27,7 @@ from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegress
 from diffeo_calib.regression.control_points import ControlPointRegression
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 
-PREDICT_ROWS, WORKSPACE_ROWS = 1024, 100
-"""Number of configurations that are linearised together for their covariances."""
+PREDICT_ROWS, WORKSPACE_ROWS = 1024, 100  # number of configurations that are linearised together for their covariances
 OPEN_TURN_RAD = 1.0
 """Prior standard deviation from which a turn of all points is open: between that of a base that was found, 0.1, which a
 changed robot widens by up to ten, and that of an open one, 2."""
@@ -230,8 +229,7 @@ class FittedMap:
             at: linearisation of the points. effects: (M, r, k) of k shifts of unit prior variance on them.
             columns: (c,) boolean, which of the shifts of the fit these are.
         """
-        known, K = self.conditional, len(self.geodesic.spec.prior_variance)
-        known = known.conditional if isinstance(known, WithoutRigidMotions) else known
+        known, K = self.conditional.inner, len(self.geodesic.spec.prior_variance)
         if isinstance(known, ConjugateGradientRegression):
             known.features(at)  # which it has not
         slopes = of_parameters(at, K + len(columns)).clone()
@@ -338,8 +336,7 @@ class FittedMap:
     def shift_covariance(self) -> Tensor:
         """(c, c) posterior covariance of the shifts that rows of the fit share, in units of their deviations."""
         Z, first = self.noise.shared, len(self.geodesic.spec.prior_variance)
-        known = self.conditional
-        known = known.conditional if isinstance(known, WithoutRigidMotions) else known
+        known = self.conditional.inner
         if not isinstance(known, ConjugateGradientRegression):
             return self.parameter_covariance(first + torch.arange(Z.shape[2], device=Z.device))
         alone = ConjugateGradientRegression(known.linearisation, self.noise.own)  # 1 - Z^T K^-1 Z would lose all digits
@@ -406,9 +403,7 @@ class FittedMap:
     def weighted_residual(self) -> Tensor:
         """R^-1 (y - h(k1)) at the optimum: (N, r), zero where nothing was measured."""
         deformation = self.geodesic
-        conditional = self.conditional if self.data is not None else None
-        if isinstance(conditional, WithoutRigidMotions):
-            conditional = conditional.conditional
+        conditional = self.conditional.inner if self.data is not None else None
         if isinstance(conditional, ControlPointRegression):
             return conditional.weighted_residual()
         pull = deformation.end_momenta.reshape(deformation.z1.shape)

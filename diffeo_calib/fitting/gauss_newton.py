@@ -34,18 +34,14 @@ from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.regression.choose import LinearSolver, choose
 from diffeo_calib.regression.conjugate_gradients import CG_TOLERANCE
 
-SHORTEST_STEP = 1e-3
-"""Smallest fraction of a Gauss-Newton step that is tried."""
-INNER_TOLERANCE_RATIO = 1e-3
-"""Tolerance of conjugate gradients, relative to that of the iteration."""
+SHORTEST_STEP = 1e-3  # smallest fraction of a Gauss-Newton step that is tried
+INNER_TOLERANCE_RATIO = 1e-3  # tolerance of conjugate gradients, relative to that of the iteration
 SETTLED_RESIDUAL_RATIO = 0.95
 """Where the energy is flat, a residual that falls to no less than this fraction has settled."""
-STEP_ERROR_SHARE = 0.1
-"""Relative change of a settled residual with finer time steps from which the time steps limit it."""
+STEP_ERROR_SHARE = 0.1  # relative change of a settled residual with finer time steps from which the time steps limit it
 MIXED_RESIDUAL = 0.1
 """Residual below which steps are mixed with earlier ones: before, the map of steps is not nearly linear."""
-MIXING_DEPTH = 5
-"""Number of differences between steps that are kept."""
+MIXING_DEPTH = 5  # number of differences between steps that are kept
 FLAT_ENERGY_RISE = 1e-7
 """Relative rise of the energy that still counts as flat: the fixed point of the discretised iteration and
 the minimiser of the discretised energy differ by the time-stepping error."""

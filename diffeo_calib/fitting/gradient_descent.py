@@ -11,12 +11,12 @@ fewer evaluations.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import nan
 
-from torch import Tensor
+import torch
 
 from diffeo_calib.common.checks import check_count, check_number
-from diffeo_calib.fitting.objective import Objective, slope
+from diffeo_calib.fitting.lbfgs import Descent
+from diffeo_calib.fitting.objective import Objective
 from diffeo_calib.fitting.result import Progress, Solution, Stop, silent
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Momenta
@@ -53,48 +53,28 @@ class GradientDescent:
 
         If the descent diverges or Ctrl-C interrupts it, the best state is kept.
         """
-        run = _Run(problem, integrator, start if start is not None else problem.zero())
+        run = Descent(problem, integrator, start if start is not None else problem.zero())
+        run.renew()
         try:
             for iteration in range(self.max_iterations):
                 progress("gradient descent", iteration, self.max_iterations)
-                gradient = run.evaluate()
-                if gradient is None:
+                if not self._evaluate(run):
                     return run.solution(Stop.DIVERGED)
-                size = float(gradient.norm())
+                size = float(run.gradient.norm())
                 if size < self.tolerance:
-                    return run.solution(Stop.GRADIENT, size)
-                run.at = run.at - self.step * gradient
-            run.evaluate()
+                    return run.solution(Stop.GRADIENT, measure=size)
+                with torch.no_grad():
+                    run.variables -= self.step * run.gradient
+                run.iterations += 1
+            self._evaluate(run)
         except KeyboardInterrupt:
             return run.solution(Stop.INTERRUPTED)
-        return run.solution(Stop.LIMIT, limit=self.max_iterations, advice="raise `max_iterations` or `step`")
+        return run.solution(Stop.LIMIT, "raise `max_iterations` or `step`", self.max_iterations)
 
-
-class _Run:
-    """State of one solve: current momenta, best momenta and their energy."""
-
-    def __init__(self, problem: Objective, integrator: Integrator, start: Momenta) -> None:
-        self.problem, self.integrator, self.shape = problem, integrator, start
-        self.at = self.best = start.flatten().detach()
-        self.best_energy = float("inf")
-        self.history: list[float] = []
-        self.evaluations = 0
-
-    def evaluate(self) -> Tensor | None:
-        """The gradient at the current momenta, or None where the descent has diverged."""
-        variables = self.at.clone().requires_grad_()
-        found = slope(self.problem, self.integrator, self.shape.unflatten(variables), variables)
-        self.evaluations += 1
-        if found is None:
-            return None
-        energy, gradient = float(found[0]), found[1]
-        self.history.append(energy)
-        if energy < self.best_energy:
-            self.best, self.best_energy = self.at, energy
-        return gradient if energy <= DIVERGED_ENERGY_RATIO * self.best_energy else None
-
-    def solution(self, stop: Stop, measure: float = nan, *, limit: int = 0, advice: str = "") -> Solution:
-        """The best state and the reason to stop."""
-        momenta, iterations = self.shape.unflatten(self.best), max(len(self.history) - 1, 0)
-        done = (self.history, iterations, self.evaluations)
-        return Solution(momenta, stop, *done, measure=measure, limit=limit, advice=advice)
+    def _evaluate(self, run: Descent) -> bool:
+        """Evaluate the current momenta; False where the descent has diverged."""
+        energy = float(run.closure())
+        if run.overflowed:
+            return False
+        run.history.append(energy)
+        return energy <= DIVERGED_ENERGY_RATIO * run.best_energy

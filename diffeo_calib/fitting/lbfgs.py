@@ -15,22 +15,21 @@ from the optimum: directions that are flat in the linearised problem are curved 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import nan
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_count, check_number
 from diffeo_calib.common.errors import InputError, as_written
-from diffeo_calib.fitting.objective import Objective, Start, slope
+from diffeo_calib.fitting.objective import Objective, slope
 from diffeo_calib.fitting.result import Progress, Solution, Stop, silent
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.regression.cholesky import CholeskyRegression
 
-ITERATIONS_PER_CALL = 5
-"""Iterations per call of torch's optimiser; progress is reported between calls."""
-RENEWAL_ITERATIONS = 40
-"""Iterations after which the preconditioned variables are renewed."""
+ITERATIONS_PER_CALL = 5  # iterations per call of torch's optimiser; progress is reported between calls
+RENEWAL_ITERATIONS = 40  # iterations after which the preconditioned variables are renewed
 OVERFLOW_ENERGY_RATIO = 1e6
 """Energy, relative to the best one, reported for momenta whose flows overflow, so that the line search turns back."""
 
@@ -71,15 +70,15 @@ class LBFGS:
         Raises:
             NumericalError: the flows of the start overflow.
         """
-        begin = Start(start) if start is not None else problem.start(integrator)
-        run = _Run(problem, integrator, begin.momenta, self.history_size, evaluations=begin.evaluations)
+        begin, evaluations = (start, 0) if start is not None else problem.start(integrator)
+        run = Descent(problem, integrator, begin, self.history_size, evaluations=evaluations)
         run.begin()
         try:
             return self._iterate(run, progress)
         except KeyboardInterrupt:
             return run.solution(Stop.INTERRUPTED)
 
-    def _iterate(self, run: _Run, progress: Progress) -> Solution:
+    def _iterate(self, run: Descent, progress: Progress) -> Solution:
         renewal: bool | None = self.preconditioned
         while run.iterations < self.max_iterations:
             progress("L-BFGS", run.iterations, self.max_iterations)
@@ -97,37 +96,42 @@ class LBFGS:
 
 
 @dataclass
-class _Run:
+class Descent:
     """State of one solve: the optimiser's variables and the best momenta."""
 
     problem: Objective
     integrator: Integrator
     best: Momenta
-    history_size: int
+    history_size: int = 0
     history: list[float] = field(default_factory=list)
     iterations: int = 0
     evaluations: int = 0
     best_energy: float = float("inf")
+    overflowed: bool = False
 
     @property
     def age(self) -> int:
         """Iterations since the variables were renewed."""
         return self.iterations - self._before
 
+    @property
+    def gradient(self) -> Tensor:
+        """Of the energy by the variables, after :meth:`closure`."""
+        return self.variables.grad  # pyright: ignore[reportReturnType]
+
     def begin(self) -> None:
         """Evaluate the start."""
         self._note(self.best, float(self.problem.energy(self.problem.deform(self.best, self.integrator)).total))
         self.history.append(self.best_energy)
 
-    def renew(self, preconditioned: bool) -> None:
-        """Choose new variables around the best momenta and start an optimiser in them."""
-        self.origin = self.best.flatten()
+    def renew(self, preconditioned: bool = False) -> None:
+        """Choose new variables around the best momenta."""
+        self.origin, self._before = self.best.flatten().detach(), self.iterations
+        self.factor: CholeskyRegression | None = None
+        self.variables = self.origin.clone().requires_grad_()
         if preconditioned:
-            self.factor: CholeskyRegression | None = self.problem.preconditioner(self.best, self.integrator)
+            self.factor = self.problem.preconditioner(self.best, self.integrator)
             self.variables = torch.zeros_like(self.factor.factor.L[0], requires_grad=True)
-        else:
-            self.factor = None
-            self.variables = self.origin.clone().requires_grad_()
         self.optimizer = torch.optim.LBFGS(
             [self.variables],
             max_iter=ITERATIONS_PER_CALL,
@@ -137,7 +141,6 @@ class _Run:
             history_size=self.history_size,
             line_search_fn="strong_wolfe",
         )
-        self._before = self.iterations
 
     def burst(self) -> None:
         """Run a few iterations."""
@@ -159,6 +162,7 @@ class _Run:
         with torch.enable_grad():
             momenta = self.momenta()
         found = slope(self.problem, self.integrator, momenta, self.variables)
+        self.overflowed = found is None
         if found is None:
             self.evaluations += 1
             self.variables.grad = torch.zeros_like(self.variables)
@@ -173,7 +177,7 @@ class _Run:
             self.best_energy = energy
             self.best = Momenta(*(t.detach().clone() for t in momenta.tensors))
 
-    def solution(self, stop: Stop, advice: str = "", limit: int = 0) -> Solution:
+    def solution(self, stop: Stop, advice: str = "", limit: int = 0, measure: float = nan) -> Solution:
         """The best state and the reason to stop."""
         done = (self.history, self.iterations, self.evaluations)
-        return Solution(self.best, stop, *done, limit=limit, advice=advice)
+        return Solution(self.best, stop, *done, measure=measure, limit=limit, advice=advice)

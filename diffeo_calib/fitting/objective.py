@@ -54,18 +54,6 @@ class EnergyParts:
         return self.field_x + self.field_y + self.prior + self.data
 
 
-class Start(NamedTuple):
-    """The start of a descent.
-
-    Args:
-        momenta: initial momenta.
-        evaluations: runs of the flows that were needed to find them.
-    """
-
-    momenta: Momenta
-    evaluations: int = 0
-
-
 class Objective(ABC, Generic[D]):
     """Measured pairs, kernels and noise, with the equations of one formulation that give k1 from the unknowns.
 
@@ -94,8 +82,12 @@ class Objective(ABC, Generic[D]):
         """The unknowns of no deformation, k1 = k0."""
 
     @abstractmethod
-    def start(self, integrator: Integrator) -> Start:
-        """The default start of L-BFGS, near the tangent solution: it makes no progress from zero."""
+    def start(self, integrator: Integrator) -> tuple[Momenta, int]:
+        """The default start of L-BFGS, near the tangent solution: it makes no progress from zero.
+
+        Returns:
+            its momenta; runs of the flows that were needed to find them.
+        """
 
     @abstractmethod
     def deform(self, momenta: Momenta, integrator: Integrator) -> D:
@@ -172,18 +164,7 @@ class Objective(ABC, Generic[D]):
 def slope(
     objective: Objective[D], integrator: Integrator, momenta: Momenta, variables: Tensor
 ) -> tuple[Tensor, Tensor] | None:
-    """Energy and its gradient, or None where the flows overflow.
-
-    Args:
-        objective: the energy to differentiate.
-        integrator: time stepping.
-        momenta: where to evaluate it; computed from ``variables`` with autograd enabled.
-        variables: the tensor to differentiate by, any shape.
-
-    Returns:
-        the energy (a scalar) and the gradient, shaped like ``variables``, both detached; None if either is not
-        finite.
-    """
+    """Energy and its gradient by ``variables``, of which the momenta are made; None where they are not finite."""
     with torch.enable_grad():
         try:
             total = objective.energy(objective.deform(momenta, integrator)).total
@@ -194,14 +175,8 @@ def slope(
     return (total, gradient) if bool(torch.isfinite(total)) and bool(torch.isfinite(gradient).all()) else None
 
 
-@dataclass(frozen=True)
-class Regression:
-    """A linearisation conditioned on its data.
-
-    Args:
-        conditional: the linearisation, conditioned by one of the methods in regression/.
-        target: (N, m) measured minus linearised model at zero fields, m.
-    """
+class Regression(NamedTuple):
+    """A linearisation conditioned on its data; ``target`` (N, m) is measured minus linearised at zero fields, m."""
 
     conditional: DataConditional
     target: Tensor
@@ -217,11 +192,9 @@ def regress(
     linear: LinearSolver = "auto",
     tolerance: float = CG_TOLERANCE,
 ) -> Regression:
-    """Linearise a problem around a deformation and condition it on its data, which are its control points.
+    """Linearise a problem around a deformation of it and condition it on its data, which are its control points.
 
     Args:
-        problem: data, noise, control points.
-        deformation: a deformation of this problem.
         linear: "cholesky" of G + R, conjugate gradients "cg", or "auto" by size.
         tolerance: of conjugate gradients, relative residual.
 

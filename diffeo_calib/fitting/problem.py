@@ -19,7 +19,7 @@ from diffeo_calib.common.checks import as_tensor, check_count, check_covariance,
 from diffeo_calib.common.data_frames import refuse_data_frame
 from diffeo_calib.common.device import methods_outside_inference_mode, usable
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.fitting.objective import Objective, Start, linear_optimum
+from diffeo_calib.fitting.objective import Objective, linear_optimum
 from diffeo_calib.flows.integrators import RK4, Integrator
 from diffeo_calib.kernels.base import Kernel, check_kernel
 from diffeo_calib.kernels.reductions.backends import Backend
@@ -30,10 +30,8 @@ from diffeo_calib.maps.nominal import NominalMap, as_nominal
 from diffeo_calib.maps.observation import Observation, coordinate_noise, observed_dim
 from diffeo_calib.regression.cholesky import CholeskyRegression
 
-SMALLEST_NOISE = 1e-100
-"""Smallest standard deviation in m: its square must not underflow."""
-NEGLIGIBLE_VARIANCE = 1e-18
-"""Noise in m^2 of new coordinates where none were measured: a nanometre."""
+SMALLEST_NOISE = 1e-100  # smallest standard deviation in m: its square must not underflow
+NEGLIGIBLE_VARIANCE = 1e-18  # noise in m^2 of new coordinates where none were measured: a nanometre
 
 
 @methods_outside_inference_mode
@@ -126,21 +124,20 @@ class Problem(Objective[GeodesicDeformation]):
         check_covariance(checked, "`new_noise`")
         return checked.to(self.y.device)
 
+    def _with(self, **changes: object) -> Problem:
+        other = copy(self)
+        vars(other).update(changes)
+        return other
+
     def using(self, backend: Backend, accuracy: float | None = None) -> Problem:
         """The same problem with its kernel sums evaluated by this backend; ``accuracy`` as :meth:`Kernel.using`."""
-        other = copy(self)
-        other.spec = self.spec.using(backend, accuracy)
-        return other
+        return self._with(spec=self.spec.using(backend, accuracy))
 
     def to(self, device: torch.device | str) -> Problem:
         """The same problem on a device, where its fits and their models then run."""
-        other, device = copy(self), usable(device, numbers=False)
-        other.x, other.y, other.controls = (t.to(device) for t in (self.x, self.y, self.controls))
-        other.spec, other.noise = self.spec.to(device), self.noise.to(device)
-        other.new_noise = None if self.new_noise is None else self.new_noise.to(device)
-        other.observe = None if self.observe is None else self.observe.to(device)
-        other.whole = None if self.whole is None else self.whole.to(device)
-        return other
+        device = usable(device, numbers=False)
+        parts = {name: value for name, value in vars(self).items() if hasattr(value, "to")}
+        return self._with(**{name: value.to(device) for name, value in parts.items()})
 
     def with_controls(self, controls: object) -> Problem:
         """A coarse version: only these configurations (M, n) carry momenta; the N data are passive points.
@@ -150,20 +147,14 @@ class Problem(Objective[GeodesicDeformation]):
         Raises:
             InputError: wrong shape, or values that are not finite.
         """
-        other = copy(self)
         n = self.x.shape[1]
-        other.controls = as_tensor(controls, "controls", ("M", n), fix=f"pass configurations of {n} joints").detach()
-        other.reduced = not torch.equal(other.controls, self.x)
-        other.whole = None if self.whole is None else self.whole.with_controls(controls)
-        return other
+        points = as_tensor(controls, "controls", ("M", n), fix=f"pass configurations of {n} joints").detach()
+        whole = None if self.whole is None else self.whole.with_controls(controls)
+        return self._with(controls=points, reduced=not torch.equal(points, self.x), whole=whole)
 
     def with_nominal_of_rows(self, nominal: NominalMap) -> Problem:
         """The same problem with another k0 at its own rows than elsewhere, see :class:`ModelSpec`."""
-        if nominal is self.spec.nominal:
-            return self
-        other = copy(self)
-        other.spec = replace(self.spec, at_controls=nominal)
-        return other
+        return self if nominal is self.spec.nominal else self._with(spec=replace(self.spec, at_controls=nominal))
 
     def standing_for(self, whole: Problem) -> Problem:
         """The same problem, whose fits lead to the maps of another one with the same unknowns.
@@ -171,39 +162,31 @@ class Problem(Objective[GeodesicDeformation]):
         It has the same optimum, and fewer numbers: functionals of the coordinates that the other one has, which tell
         all there is to know.
         """
-        other = copy(self)
-        other.whole = whole
-        return other
+        return self._with(whole=whole)
 
     def subset(self, rows: Tensor) -> Problem:
         """The same problem with only the measurements of these row numbers."""
-        other = copy(self)
-        other.x, other.y, other.noise = self.x[rows], self.y[rows], self.noise.rows(rows)
-        other.controls, other.reduced = other.x, False
-        other.observe = None if self.observe is None else self.observe.rows(rows)
-        other.whole = None if self.whole is None else self.whole.subset(rows)
-        return other
+        x = self.x[rows]
+        observe = None if self.observe is None else self.observe.rows(rows)
+        whole = None if self.whole is None else self.whole.subset(rows)
+        measured = {"x": x, "y": self.y[rows], "noise": self.noise.rows(rows), "observe": observe}
+        return self._with(controls=x, reduced=False, whole=whole, **measured)
 
     def zero(self) -> Momenta:
-        """No deformation: k1 = k0."""
         m = self.y.shape[1] if self.observe is None else self.observe.dim
         points = len(self.controls) * (m // self.spec.task_dim)
-        return Momenta(
-            torch.zeros_like(self.controls),
-            self.y.new_zeros(points, self.spec.task_dim),
-            torch.zeros_like(self.spec.prior_variance),
-        )
+        task = self.y.new_zeros(points, self.spec.task_dim)
+        return Momenta(torch.zeros_like(self.controls), task, torch.zeros_like(self.spec.prior_variance))
 
     def deform(self, momenta: Momenta, integrator: Integrator, *, variational: bool = False) -> GeodesicDeformation:
         """Run both flows for these momenta; pass ``variational`` if the result will be linearised."""
         return GeodesicDeformation(self.spec, self.controls, momenta, integrator, variational=variational)
 
-    def start(self, integrator: Integrator) -> Start:
+    def start(self, integrator: Integrator) -> tuple[Momenta, int]:
         """The tangent solution."""
-        return Start(linear_optimum(self, self.deform(self.zero(), RK4(1)))[0])
+        return linear_optimum(self, self.deform(self.zero(), RK4(1)))[0], 0
 
     def unknowns(self, momenta: Momenta) -> Momenta:
-        """All momenta are free."""
         return momenta
 
     def preconditioner(self, momenta: Momenta, integrator: Integrator) -> CholeskyRegression:

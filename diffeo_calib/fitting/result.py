@@ -59,8 +59,7 @@ NEGLIGIBLE_ENERGY = 1e-12
 """Energy per measured coordinate below which k0 fits the data up to rounding, so that residuals are meaningless."""
 UNFINISHED_COUPLING_RESIDUAL = 0.01
 """Coupling residual above which a descent has not reached the optimum (time steps hardly change this residual)."""
-MAX_END_RESIDUAL = 0.05
-"""Largest violation of the end condition (12) of a converged fit."""
+MAX_END_RESIDUAL = 0.05  # largest violation of the end condition (12) of a converged fit
 
 
 def silent(task: str, done: int, total: int) -> None:
@@ -127,6 +126,8 @@ class Fit:
         iterations, evaluations: number of accepted iterations, and of forward runs of the two flows.
         history: energy by iteration (L-BFGS: every few iterations).
         backend: backends of the kernel sums between the control points, (joint space, task space).
+        momenta: b, p and theta at the solution; p is the paper's P0 (in the Eulerian formulation b is implied and
+            empty). integrator: time stepping.
         status: why the fit stopped. converged: whether it met its tolerance.
         advice: what to change if the fit did not converge; replaces the solver's advice.
         seconds: wall time of the fit.
@@ -176,7 +177,6 @@ class Fit:
 
     @property
     def converged(self) -> bool:
-        """Whether the solver met its tolerance and, in the exact formulation, the end condition (12) holds."""
         return self.solution.stop.converged and not self._violated
 
     @property
@@ -187,37 +187,30 @@ class Fit:
 
     @property
     def iterations(self) -> int:
-        """Accepted iterations."""
         return self.solution.iterations
 
     @property
     def evaluations(self) -> int:
-        """Forward runs of the two flows."""
         return self.solution.evaluations
 
     @property
     def history(self) -> list[float]:
-        """Energy after every iteration, the start first."""
         return self.solution.history
 
     @property
     def formulation(self) -> str:
-        """ "exact" or "eulerian"."""
         return self.model.formulation
 
     @property
     def backend(self) -> tuple[str, str]:
-        """Backends of the kernel sums between the control points: in joint space, in task space."""
         return self.model.deformation.backends
 
     @property
     def momenta(self) -> Momenta:
-        """b, p and theta at the solution; p is the paper's P0 (in the Eulerian formulation b is implied and empty)."""
         return self.solution.momenta
 
     @property
     def integrator(self) -> Integrator:
-        """The time stepping of the fit."""
         return self.model.deformation.integrator
 
 

@@ -18,8 +18,9 @@ tolerance.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from copy import copy
+from functools import partial
 from math import isqrt
 from typing import Any
 
@@ -28,7 +29,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from diffeo_calib.common.checks import wrapped
-from diffeo_calib.flows.integrators import Integrator, integrate_alongside
+from diffeo_calib.flows.integrators import Integrator, Run
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.kernels.reductions.backends import Backend
 
@@ -125,8 +126,7 @@ class _Energy(torch.autograd.Function):
         return grads[0] * gradient, grads[0] * velocity, None
 
 
-BLOCK_ROWS = 4096
-"""Number of points that are evaluated together, which bounds the memory of large queries."""
+BLOCK_ROWS = 4096  # number of points that are evaluated together, which bounds the memory of large queries
 
 
 class Flow:
@@ -141,49 +141,40 @@ class Flow:
 
     Attributes:
         nodes: the controls' states (2, N, n) at the nodes of the time grid.
+        stages: at every stage of the run; empty if the method is not replayable.
     """
 
     def __init__(
         self, kernel: Kernel, q: Tensor, a: Tensor, integrator: Integrator, *, variational: bool = False
     ) -> None:
-        self.kernel = kernel
-        self.integrator = integrator
-        self._stages: list[Tensor] = []
+        self.kernel, self.integrator = kernel, integrator
         self._jacobians: list[Tensor] | None = None
         if variational:
             n = q.shape[1]
-            packed = integrator.nodes(self._variational_controls, torch.cat([q, a, _eye(q).flatten(1)], -1))
-            self.nodes = [torch.stack([s[:, :n], s[:, n : 2 * n]]) for s in packed]
-            self._jacobians = [s[:, 2 * n :].unflatten(1, (n, n)) for s in packed]
+            packed = Run(integrator, self._variational_controls, torch.cat([q, a, _eye(q).flatten(1)], -1))
+            self._jacobians = [s[:, 2 * n :].unflatten(1, (n, n)) for s in packed.nodes]
+            self._run = copy(packed)
+            self._run.field = partial(geodesic_field, kernel)
+            self._run.nodes, self._run.stages = (
+                [torch.stack([s[:, :n], s[:, n : 2 * n]]) for s in states] for states in (packed.nodes, packed.stages)
+            )
         else:
-            self.nodes = integrator.nodes(self._recorded_field, torch.stack([q, a]))
+            self._run = Run(integrator, partial(geodesic_field, kernel), torch.stack([q, a]))
+        self.nodes, self.stages = self._run.nodes, self._run.stages
 
     def using(self, backend: Backend) -> Flow:
         """The same flow, whose passive points move by kernel sums of this backend."""
         other = copy(self)
-        other.kernel = self.kernel.using(backend)
+        other.kernel, other._run = self.kernel.using(backend), copy(self._run)
+        other._run.field = partial(geodesic_field, other.kernel)
         return other
 
-    def _recorded_field(self, stage: int, state: Tensor) -> Tensor:
-        self._record(state)
-        return geodesic_field(self.kernel, state)
-
-    def _variational_controls(self, stage: int, packed: Tensor) -> Tensor:
+    def _variational_controls(self, packed: Tensor) -> Tensor:
         """q' = v, a' = -Dv^T a, M' = Dv M: one kernel sum gives all three."""
         n = isqrt(packed.shape[1] + 1) - 1  # columns: n + n + n^2
         q, a, m = packed[:, :n], packed[:, n : 2 * n], packed[:, 2 * n :].unflatten(1, (n, n))
-        self._record(torch.stack([q, a]))
         v, dv = self.kernel.field_and_jacobian(None, q, a)
         return torch.cat([v, -(dv.mT @ a[:, :, None])[:, :, 0], (dv @ m).flatten(1)], -1)
-
-    def _record(self, state: Tensor) -> None:
-        if self.integrator.replayable:
-            self._stages.append(state)
-
-    @property
-    def stages(self) -> list[Tensor]:
-        """The controls' states (2, N, n) at every stage of the run; empty if the method is not replayable."""
-        return self._stages
 
     @property
     def end(self) -> Tensor:
@@ -197,7 +188,11 @@ class Flow:
 
     def __call__(self, x: Tensor) -> Tensor:
         """The flow of passive points: (M, n) -> (M, n); differentiable by autograd."""
-        return torch.cat([self._points(x[rows])[-1] for rows in row_blocks(x)])
+
+        def field(points: Tensor, controls: Tensor) -> Tensor:
+            return velocity(self.kernel, points, *controls)
+
+        return torch.cat([self._run.alongside(field, x[rows])[-1] for rows in row_blocks(x)])
 
     def with_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The flow (M, n) and its Jacobian (M, n, n) at passive points x (M, n)."""
@@ -207,7 +202,12 @@ class Flow:
     def path(self, x: Tensor) -> tuple[list[Tensor], list[Tensor]]:
         """Passive points (M, n) and their Jacobians (M, n, n) at all nodes of the time grid."""
         n = x.shape[1]
-        states = self._transport(self._variational_field, torch.cat([x, _eye(x).flatten(1)], -1))
+
+        def field(state: Tensor, controls: Tensor) -> Tensor:
+            v, dv = self.kernel.field_and_jacobian(state[:, :n], *controls)
+            return torch.cat([v, (dv @ state[:, n:].unflatten(1, (n, n))).flatten(1)], -1)
+
+        states = self._run.alongside(field, torch.cat([x, _eye(x).flatten(1)], -1))
         return [s[:, :n] for s in states], [s[:, n:].unflatten(1, (n, n)) for s in states]
 
     def control_path(self) -> tuple[list[Tensor], list[Tensor]]:
@@ -215,26 +215,6 @@ class Flow:
         if self._jacobians is None:
             return self.path(self.nodes[0][0])
         return [q for q, _ in self.nodes], self._jacobians
-
-    def _points(self, x: Tensor) -> list[Tensor]:
-        return self._transport(lambda p, q, a: velocity(self.kernel, p, q, a), x)
-
-    def _variational_field(self, state: Tensor, q: Tensor, a: Tensor) -> Tensor:
-        n = q.shape[-1]
-        x, m = state[:, :n], state[:, n:].unflatten(1, (n, n))
-        v, dv = self.kernel.field_and_jacobian(x, q, a)
-        return torch.cat([v, (dv @ m).flatten(1)], -1)
-
-    def _transport(self, field: Callable[[Tensor, Tensor, Tensor], Tensor], start: Tensor) -> list[Tensor]:
-        """Integrate ``state' = field(state, q, a)`` alongside the controls and return the states at the nodes."""
-        return integrate_alongside(
-            self.integrator,
-            lambda state, controls: field(state, *controls),
-            start,
-            stages=self._stages,
-            controls=self.nodes[0],
-            control_field=lambda controls: geodesic_field(self.kernel, controls),
-        )
 
 
 def _eye(x: Tensor) -> Tensor:

@@ -80,42 +80,45 @@ class Integrator(ABC):
         return [w / (3.0 * count) for w in (1.0, *inner, 1.0)]
 
 
-def integrate_alongside(
-    integrator: Integrator,
-    field: Callable[[Tensor, Tensor], Tensor],
-    start: Tensor,
-    *,
-    stages: list[Tensor],
-    controls: Tensor,
-    control_field: Callable[[Tensor], Tensor],
-) -> list[Tensor]:
-    """Integrate ``state' = field(state, controls)`` along an earlier run of the controls.
+class Run:
+    """A run of controls that others follow with the same stages.
 
     Args:
-        integrator: time stepping of that run.
-        field: right-hand side, given the state and the controls' state at the same time.
-        start: initial state, any shape.
-        stages: the controls' states at every stage of their run; replayed if the method is replayable.
-        controls: the controls' initial state, any shape; integrated again if the method is not replayable.
-        control_field: right-hand side of the controls.
+        integrator: time stepping. field: right-hand side of the controls. start: their initial state, any shape.
 
-    Returns:
-        the states at the nodes of the time grid.
+    Attributes:
+        nodes: the controls' states at the nodes of the time grid.
+        stages: at every stage; empty if the method is not replayable.
     """
-    if integrator.replayable:
-        return integrator.nodes(lambda stage, state: field(state, stages[stage]), start)
-    size = controls.numel()
 
-    def packed_field(_: int, packed: Tensor) -> Tensor:
-        live, state = packed[:size].view_as(controls), packed[size:].view_as(start)
-        return torch.cat([control_field(live).flatten(), field(state, live).flatten()])
+    def __init__(self, integrator: Integrator, field: Callable[[Tensor], Tensor], start: Tensor) -> None:
+        self.integrator, self.field, self.stages = integrator, field, list[Tensor]()
+        self.nodes = integrator.nodes(self._recorded, start)
 
-    nodes = integrator.nodes(packed_field, torch.cat([controls.flatten(), start.flatten()]))
-    return [node[size:].view_as(start) for node in nodes]
+    def _recorded(self, _: int, state: Tensor) -> Tensor:
+        if self.integrator.replayable:
+            self.stages.append(state)
+        return self.field(state)
+
+    def alongside(self, field: Callable[[Tensor, Tensor], Tensor], start: Tensor) -> list[Tensor]:
+        """The states at the nodes of ``state' = field(state, controls)``, from any state.
+
+        The controls' stages are replayed; if the method is not replayable, the controls are integrated again.
+        """
+        if self.integrator.replayable:
+            return self.integrator.nodes(lambda stage, state: field(state, self.stages[stage]), start)
+        controls = self.nodes[0]
+        size = controls.numel()
+
+        def packed_field(_: int, packed: Tensor) -> Tensor:
+            live, state = packed[:size].view_as(controls), packed[size:].view_as(start)
+            return torch.cat([self.field(live).flatten(), field(state, live).flatten()])
+
+        nodes = self.integrator.nodes(packed_field, torch.cat([controls.flatten(), start.flatten()]))
+        return [node[size:].view_as(start) for node in nodes]
 
 
-_TENSORS: dict[str, tuple[Tensor, Tensor]] = {}
-"""Tableaus that were used, by the kinds of their methods."""
+_TENSORS: dict[str, tuple[Tensor, Tensor]] = {}  # tableaus that were used, by the kinds of their methods
 
 
 @dataclass(frozen=True)
@@ -143,7 +146,6 @@ class RungeKutta(Integrator):
 
     @property
     def intervals(self) -> int:
-        """The number of steps."""
         return self.steps
 
     @property
@@ -152,7 +154,6 @@ class RungeKutta(Integrator):
         return 1.0 / (1.0 - 2.0**-self.order)
 
     def nodes(self, field: RightHandSide, state: Tensor) -> list[Tensor]:
-        """The states at the steps + 1 nodes."""
         coefficients, weights = (t.to(state) / self.steps for t in self.tableau())
         states = [state]
         for step in range(self.steps):
@@ -163,7 +164,6 @@ class RungeKutta(Integrator):
         return states
 
     def refined(self) -> RungeKutta:
-        """The same method with twice the steps."""
         return type(self)(2 * self.steps)
 
 

@@ -16,16 +16,11 @@ from diffeo_calib.common.checks import check_number, wrapped
 from diffeo_calib.common.errors import InputError, NumericalError, as_written
 from diffeo_calib.flows.integrators import MOST_STEPS, Integrator, RightHandSide
 
-FIXED = {"midpoint": 2, "rk4": 4}
-"""Methods with a fixed step, and their orders."""
-ADAPTIVE = ("bosh3", "dopri5", "dopri8")
-"""Methods that choose their steps by tolerances."""
-MAX_ADAPTIVE_STEPS = 10_000
-"""Largest number of adaptive steps between two nodes."""
-FINEST_RTOL, FINEST_ATOL = 1e-13, 1e-16
-"""Smallest tolerances that float64 can meet."""
-REFINED_TOLERANCE_RATIO = 100.0
-"""Factor by which the tolerances of an adaptive method shrink when it is refined."""
+FIXED = {"midpoint": 2, "rk4": 4}  # methods with a fixed step, and their orders
+ADAPTIVE = ("bosh3", "dopri5", "dopri8")  # methods that choose their steps by tolerances
+MAX_ADAPTIVE_STEPS = 10_000  # largest number of adaptive steps between two nodes
+FINEST_RTOL, FINEST_ATOL = 1e-13, 1e-16  # smallest tolerances that float64 can meet
+REFINED_TOLERANCE_RATIO = 100.0  # factor by which the tolerances of an adaptive method shrink when it is refined
 
 
 @dataclass(frozen=True)
@@ -66,7 +61,6 @@ class TorchDiffEq(Integrator):
 
     @property
     def intervals(self) -> int:
-        """1 / step_size."""
         return round(1.0 / self.step_size)
 
     @property

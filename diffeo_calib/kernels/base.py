@@ -24,8 +24,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, as_written, sentence, warn_user
 from diffeo_calib.kernels.reductions.backends import Backend, check_accuracy, check_backend
 
-PROBE_POINTS = 3
-"""Number of points at which the default check evaluates a kernel's matrix."""
+PROBE_POINTS = 3  # number of points at which the default check evaluates a kernel's matrix
 ROUNDING_RATIO = 1e-8
 """Asymmetry and negative eigenvalues of a kernel matrix, relative to its largest entry, that count as rounding."""
 
@@ -110,6 +109,13 @@ class Kernel(ABC):
         (M, k, n), (N, r, width) = left.shape, right.shape
         half = left @ self.matrix(x, y).view(M, n, N * width)  # (M, k, N Q n)
         return torch.einsum("ikjb,jlb->ikjl", half.view(M, k, N, width), right).reshape(M * k, N * r)
+
+    def diagonal(self, x: Tensor, y: Tensor) -> Iterator[tuple[int, Tensor]] | None:
+        """For every component k that is not always zero, k and K(x_i, y_j)_kk (N, M), differentiable.
+
+        None for a kernel whose values are not diagonal matrices. Sums of kernels add theirs before :meth:`gram`.
+        """
+        return None
 
     def own_blocks(self, x: Tensor, effect: Tensor) -> Tensor:
         """The blocks of effect K(x, x) effect^T on its diagonal: x (N Q, n), effect (N, k, Q n) -> (N, k, k)."""
@@ -213,12 +219,26 @@ def check_points(x: Tensor | None, q: Tensor, a: Tensor) -> None:
         raise InputError.of("the momenta `a`", expected=expected, got=f"shape {tuple(a.shape)}")
 
 
-class DiagonalKernel(Kernel):
-    """A kernel whose values K(x, y) are diagonal matrices. Sums of such kernels are cheap to materialise."""
+def _added(name: str) -> Any:
+    """A method that adds up the results of the terms: tensors, or tuples of tensors."""
 
-    @abstractmethod
-    def diagonal(self, x: Tensor, y: Tensor) -> Iterator[tuple[int, Tensor]]:
-        """Yield k and K(x_i, y_j)_kk (N, M), differentiable, for every component k that is not always zero."""
+    def method(self: SumKernel, *arguments: Any) -> Any:
+        return reduce(_plus, (getattr(term, name)(*arguments) for term in self.terms))
+
+    return method
+
+
+def _plus(a: Any, b: Any) -> Any:
+    return a + b if isinstance(a, Tensor) else tuple(map(torch.add, a, b))
+
+
+def _of_each(name: str) -> Any:
+    """A method that gives the sum of what it gives of every term."""
+
+    def method(self: SumKernel, *arguments: Any, **options: Any) -> SumKernel:
+        return SumKernel([getattr(term, name)(*arguments, **options) for term in self.terms])
+
+    return method
 
 
 class SumKernel(Kernel):
@@ -237,63 +257,26 @@ class SumKernel(Kernel):
     def __repr__(self) -> str:
         return " + ".join(map(repr, self.terms))
 
-    def matrix(self, x: Tensor, y: Tensor) -> Tensor:
-        """K(x_i, y_j) as one matrix: (M n, N n)."""
-        return _total(t.matrix(x, y) for t in self.terms)
+    matrix, own_blocks, field, field_and_jacobian, gradient, hamiltonian_gradient, hessian_product = map(
+        _added,
+        ("matrix", "own_blocks", "field", "field_and_jacobian", "gradient", "hamiltonian_gradient", "hessian_product"),
+    )
+    scaled, using, to = map(_of_each, ("scaled", "using", "to"))
 
     def check(self, dim: int, name: str) -> None:
-        """Raise InputError unless every term acts on vectors of ``dim`` coordinates."""
         for term in self.terms:
             term.check(dim, name)
 
-    def scaled(self, factor: float) -> SumKernel:
-        """The kernel factor * K, factor > 0."""
-        return SumKernel([term.scaled(factor) for term in self.terms])
-
-    def using(self, backend: Backend, accuracy: float | None = None) -> SumKernel:
-        """The same kernel with its sums evaluated by this backend; ``accuracy`` as :meth:`Kernel.using`."""
-        return SumKernel([term.using(backend, accuracy) for term in self.terms])
-
     def backends(self, count: int, device: torch.device) -> set[str]:
-        """Names of the backends that evaluate sums over ``count`` points."""
         return set().union(*(term.backends(count, device) for term in self.terms))
 
-    def to(self, device: torch.device | str) -> SumKernel:
-        """The same kernel on a device."""
-        return SumKernel([term.to(device) for term in self.terms])
-
-    def field(self, x: Tensor | None, q: Tensor, a: Tensor) -> Tensor:
-        """v(x) (M, n)."""
-        return _total(t.field(x, q, a) for t in self.terms)
-
-    def field_and_jacobian(self, x: Tensor | None, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
-        """v(x) (M, n) and Dv(x) (M, n, n)."""
-        return _total_pair(t.field_and_jacobian(x, q, a) for t in self.terms)
-
-    def gradient(self, x: Tensor, c: Tensor, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradient of sum_ij c_i^T K(x_i, q_j) a_j in c and in x: (M, n) each."""
-        return _total_pair(t.gradient(x, c, q, a) for t in self.terms)
-
-    def hamiltonian_gradient(self, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradient of H in a and in q: (N, n) each."""
-        return _total_pair(t.hamiltonian_gradient(q, a) for t in self.terms)
-
-    def hessian_product(self, q: Tensor, a: Tensor, dq: Tensor, da: Tensor) -> tuple[Tensor, Tensor]:
-        """Derivative of H's gradient along (dq, da): (N, n) each."""
-        return _total_pair(t.hessian_product(q, a, dq, da) for t in self.terms)
-
     def gram(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor) -> Tensor:
-        """Blocks left_i K(x_i, y_j) right_j^T: (M k, N l)."""
-        diagonal = [t for t in self.terms if isinstance(t, DiagonalKernel)]
-        parts = [t.gram(x, left, y, right) for t in self.terms if not isinstance(t, DiagonalKernel)]
-        if diagonal:
-            values = chain.from_iterable(term.diagonal(x, y) for term in diagonal)
-            parts.append(component_gram(values, left, right))
-        return _total(parts)
-
-    def own_blocks(self, x: Tensor, effect: Tensor) -> Tensor:
-        """The blocks of effect K(x, x) effect^T on its diagonal: (N, k, k)."""
-        return _total(t.own_blocks(x, effect) for t in self.terms)
+        diagonals = [term.diagonal(x, y) for term in self.terms]
+        parts = [t.gram(x, left, y, right) for t, own in zip(self.terms, diagonals, strict=True) if own is None]
+        present = [own for own in diagonals if own is not None]
+        if present:
+            parts.append(component_gram(chain.from_iterable(present), left, right))
+        return reduce(torch.add, parts)
 
 
 def check_kernel(kernel: object, dim: int, name: str) -> None:
@@ -331,14 +314,6 @@ def _plain(value: object, what: str) -> Any:
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     raise InputError.of(f"{what} cannot be saved", expected="numbers, text or tensors", got=type(value).__name__)
-
-
-def _total(parts: Iterable[Tensor]) -> Tensor:
-    return reduce(torch.add, parts)
-
-
-def _total_pair(pairs: Iterable[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
-    return reduce(lambda total, part: (total[0] + part[0], total[1] + part[1]), pairs)
 
 
 def diagonal_gram(values: Tensor, left: Tensor, right: Tensor) -> Tensor:

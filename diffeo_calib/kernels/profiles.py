@@ -21,8 +21,7 @@ from diffeo_calib.common.checks import wrapped
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 
-MAX_ORDER = 3
-"""Highest derivative that every profile provides."""
+MAX_ORDER = 3  # highest derivative that every profile provides
 
 
 class Profile(ABC):
@@ -243,10 +242,8 @@ SHIPPED = {type(profile) for profile in PROFILES.values()}
 """Their classes: unlike those of a user, they have no parameter that torch follows, and always compute the same."""
 PROBED_R2 = (0.0, 0.31, 1.7, 4.3)
 """Squared distances at which a user's profile is checked, and compared with the one of a model file."""
-DIFFERENCE_STEP = 1e-4
-"""Step of finite differences, relative to r2."""
-DERIVATIVE_TOLERANCE = 1e-4
-"""Largest relative error of a derivative: beyond what finite differences leave, about 1e-7."""
+DIFFERENCE_STEP = 1e-4  # step of finite differences, relative to r2
+DERIVATIVE_TOLERANCE = 1e-4  # largest relative error of a derivative: beyond what finite differences leave, about 1e-7
 ROUNDING_TOLERANCE = 1e-8
 """The same relative to the derivative before, where a derivative is so small that its differences are rounding."""
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, positive, wrapped
 from diffeo_calib.common.errors import InputError, as_written
-from diffeo_calib.kernels.base import DiagonalKernel, SumKernel, check_points, diagonal_gram
+from diffeo_calib.kernels.base import Kernel, SumKernel, check_points, diagonal_gram
 from diffeo_calib.kernels.profiles import (
     PROFILES,
     SHIPPED,
@@ -41,11 +41,10 @@ from diffeo_calib.kernels.reductions.formulas import (
 )
 from diffeo_calib.kernels.spaces import FeatureMap, Space
 
-PROBE = "profile_probe"
-"""Entry of a kernel whose profile is a user's: its values, see :func:`probe`."""
+PROBE = "profile_probe"  # entry of a kernel whose profile is a user's: its values, see :func:`probe`
 
 
-class RadialKernel(DiagonalKernel):
+class RadialKernel(Kernel):
     """kappa(|F(x) - F(x')|^2) L L^T.
 
     Args:
@@ -95,7 +94,6 @@ class RadialKernel(DiagonalKernel):
         )
 
     def check(self, dim: int, name: str) -> None:
-        """Raise InputError unless the kernel acts on vectors of ``dim`` coordinates."""
         sizes = [] if isinstance(self.periodic, bool) else [len(self.periodic)]
         sizes += [self.variance.numel()] if self.variance.ndim else []
         out_of_range = [c for c in (*(self.columns or ()), self.output or 0) if not 0 <= c < dim]
@@ -109,13 +107,11 @@ class RadialKernel(DiagonalKernel):
         self._features(dim)
 
     def using(self, backend: Backend, accuracy: float | None = None) -> RadialKernel:
-        """The same kernel with its sums evaluated by this backend; ``accuracy`` as :meth:`Kernel.using`."""
         other = copy(self)
         other.backend, other.accuracy = check_backend(backend), check_accuracy(accuracy)
         return other
 
     def scaled(self, factor: float) -> RadialKernel:
-        """The kernel factor * K, factor > 0."""
         other = copy(self)
         other.variance = factor * self.variance
         for known in ("_fixed_amplitude", "vanishes"):
@@ -127,12 +123,10 @@ class RadialKernel(DiagonalKernel):
         return self.vanishes or not (wrapped(a) or a.requires_grad or bool(a.any()))
 
     def backends(self, count: int, device: torch.device) -> set[str]:
-        """Name of the backend that evaluates sums over ``count`` points."""
         name = backends.choose(self.backend, count, count, device)
         return {name if self.accuracy is None else f"{name} within {self.accuracy:g}"}
 
     def to(self, device: torch.device | str) -> RadialKernel:
-        """The same kernel with its hyper-parameters on a device."""
         moved = copy(self)
         moved.lengthscale, moved.variance, moved._maps = self.lengthscale.to(device), self.variance.to(device), {}
         vars(moved).pop("_fixed_amplitude", None)
@@ -205,12 +199,10 @@ class RadialKernel(DiagonalKernel):
         return torch.nn.functional.pad(scaled, (self.output, dim - 1 - self.output))
 
     def matrix(self, x: Tensor, y: Tensor) -> Tensor:
-        """K(x_i, y_j) as one matrix: (M, n), (N, n) -> (M n, N n)."""
         eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
         return self.gram(x, eye.expand(len(x), -1, -1), y, eye.expand(len(y), -1, -1))
 
     def field(self, x: Tensor | None, q: Tensor, a: Tensor) -> Tensor:
-        """v(x) = sum_j K(x, q_j) a_j: (M, n); several fields at once with (N, k, n) -> (M, k, n)."""
         check_points(x, q, a)
         n, rows = q.shape[-1], (q if x is None else x).shape[0]
         if self._field_vanishes(a):
@@ -222,7 +214,6 @@ class RadialKernel(DiagonalKernel):
         return self._expand(v.unflatten(1, u.shape[1:]), n)
 
     def field_and_jacobian(self, x: Tensor | None, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
-        """v(x) (M, n) and Dv(x) (M, n, n)."""
         check_points(x, q, a)
         at, n = (q if x is None else x), q.shape[-1]
         if self._field_vanishes(a):
@@ -234,7 +225,6 @@ class RadialKernel(DiagonalKernel):
         return self._expand(v, n), self._expand(dv.mT, n).mT
 
     def gradient(self, x: Tensor, c: Tensor, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradient of sum_ij c_i^T K(x_i, q_j) a_j in c and in x: (M, n) each."""
         check_points(x, q, a)
         check_points(None, x, c)
         if self._field_vanishes(a):
@@ -245,7 +235,6 @@ class RadialKernel(DiagonalKernel):
         return self._expand(v, x.shape[-1]), features.pull(x, g)
 
     def hamiltonian_gradient(self, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradient of H(q, a) = 1/2 sum_ij a_i^T K(q_i, q_j) a_j in a, which is v(q), and in q: (N, n) each."""
         check_points(None, q, a)
         if self._field_vanishes(a):
             return torch.zeros_like(q), torch.zeros_like(q)
@@ -254,7 +243,6 @@ class RadialKernel(DiagonalKernel):
         return self._expand(v, q.shape[-1]), features.pull(q, g)
 
     def hessian_product(self, q: Tensor, a: Tensor, dq: Tensor, da: Tensor) -> tuple[Tensor, Tensor]:
-        """Derivative of H's gradient along (dq, da): (N, n) each."""
         check_points(None, q, a)
         check_points(dq, q, da)
         if self.vanishes:
@@ -265,7 +253,6 @@ class RadialKernel(DiagonalKernel):
         return self._expand(dv, q.shape[-1]), features.pull(q, dg) + features.pull_derivative(q, dq, g)
 
     def gram(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor) -> Tensor:
-        """Blocks left_i K(x_i, y_j) right_j^T: (M k, N l); arguments as :meth:`Kernel.gram`."""
         (M, k, n), (N, r, _) = left.shape, right.shape
         if self.vanishes:
             return left.new_zeros(M * k, N * r)
@@ -275,7 +262,6 @@ class RadialKernel(DiagonalKernel):
         return diagonal_gram(kappa[:, None].expand(-1, left.shape[2], -1), left, right)
 
     def own_blocks(self, x: Tensor, effect: Tensor) -> Tensor:
-        """The blocks of effect K(x, x) effect^T on its diagonal: (N, k, k); arguments as :meth:`Kernel.own_blocks`."""
         (N, k, _), n = effect.shape, x.shape[1]
         if self.vanishes:
             return effect.new_zeros(N, k, k)
@@ -286,7 +272,6 @@ class RadialKernel(DiagonalKernel):
         return reduced.flatten(2) @ half.flatten(2).mT
 
     def diagonal(self, x: Tensor, y: Tensor) -> Iterator[tuple[int, Tensor]]:
-        """Yield k and K(x_i, y_j)_kk as a matrix (N, M) for every component k of the field that is not always zero."""
         if self.vanishes:
             return
         n = x.shape[-1]

@@ -49,7 +49,7 @@ class Space:
 
 @dataclass(frozen=True)
 class FeatureMap:
-    """The map F of the module docstring on some coordinates of a space.
+    """The map F of the module docstring on some coordinates of a space; D features: lines, cosines, sines.
 
     Args:
         columns: the coordinates of x that it depends on, in increasing order.
@@ -72,92 +72,84 @@ class FeatureMap:
             )
 
     @cached_property
-    def lines(self) -> list[int]:
-        """Columns of x that are lines."""
-        return [c for c, p in zip(self.columns, self.periodic, strict=True) if not p]
+    def _places(self) -> list[list[int]]:
+        """Where lines and circles stand among the columns."""
+        return [[k for k, p in enumerate(self.periodic) if p == wanted] for wanted in (False, True)]
 
     @cached_property
-    def circles(self) -> list[int]:
-        """Columns of x that are circles."""
-        return [c for c, p in zip(self.columns, self.periodic, strict=True) if p]
+    def _selections(self) -> list[tuple[slice | list[int], slice | list[int]]]:
+        """Indices of lines and of circles in the coordinates of x, and in the length scales."""
+        return [(_as_slice([self.columns[k] for k in places]), _as_slice(places)) for places in self._places]
+
+    def _parts(self, x: Tensor, *others: Tensor) -> list[list[Tensor] | None]:
+        """The lines and the circles of points and of others, with their inverse scales; None where there are none."""
+        scales = self._scales() if self.lengthscale.requires_grad else self._fixed_scales
+        scales = scales.to(x)
+        return [
+            [*(t[..., own] for t in (x, *others)), scales[scaled]] if places else None
+            for places, (own, scaled) in zip(self._places, self._selections, strict=True)
+        ]
+
+    def _scales(self) -> Tensor:
+        return (1.0 / self.lengthscale).expand(len(self.columns))
 
     @cached_property
-    def _selections(self) -> tuple[slice | list[int], ...]:
-        """Indices of lines and of circles in the columns of x, then in the length scales."""
-        positions = [[k for k, p in enumerate(self.periodic) if p == wanted] for wanted in (False, True)]
-        return tuple(_as_slice(s) for s in (self.lines, self.circles, *positions))
-
-    def _lines(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """The lines of x and their inverse scales."""
-        lines, _, scaled, _ = self._selections
-        return x[..., lines], self._inverse_scales(x)[scaled]
-
-    def _circles(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """The angles of x and their inverse scales."""
-        _, circles, _, scaled = self._selections
-        return x[..., circles], self._inverse_scales(x)[scaled]
-
-    def _inverse_scales(self, x: Tensor) -> Tensor:
-        if self.lengthscale.requires_grad:
-            return (1.0 / self.lengthscale).to(x).expand(len(self.columns))
-        return self._fixed_inverse_scales.to(x)
-
-    @cached_property
-    def _fixed_inverse_scales(self) -> Tensor:
+    def _fixed_scales(self) -> Tensor:
         with torch.inference_mode(False):  # kept, and used in derivatives later
-            return (1.0 / self.lengthscale).expand(len(self.columns))
+            return self._scales()
 
     def lift(self, x: Tensor) -> Tensor:
-        """F(x): (..., n) -> (..., D), ordered lines, cosines, sines."""
-        parts = []
-        if self.lines:
-            value, scale = self._lines(x)
-            parts.append(value * scale)
-        if self.circles:
-            angle, scale = self._circles(x)
-            parts += [angle.cos() * scale, angle.sin() * scale]
-        return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
+        """F(x): (..., n) -> (..., D)."""
+        lines, circles, found = *self._parts(x), []
+        if lines is not None:
+            found.append(lines[0] * lines[1])
+        if circles is not None:
+            angle, scale = circles
+            found += [angle.cos() * scale, angle.sin() * scale]
+        return _joined(found)
 
     def push(self, x: Tensor, dx: Tensor) -> Tensor:
         """DF(x) dx: (..., n), (..., n) -> (..., D)."""
-        parts = []
-        if self.lines:
-            value, scale = self._lines(dx)
-            parts.append(value * scale)
-        if self.circles:
-            (angle, scale), (turn, _) = self._circles(x), self._circles(dx)
-            parts += [-angle.sin() * turn * scale, angle.cos() * turn * scale]
-        return torch.cat(parts, -1)
+        lines, circles, found = *self._parts(x, dx), []
+        if lines is not None:
+            found.append(lines[1] * lines[2])
+        if circles is not None:
+            angle, turn, scale = circles
+            found += [-angle.sin() * turn * scale, angle.cos() * turn * scale]
+        return _joined(found)
 
     def pull(self, x: Tensor, g: Tensor) -> Tensor:
         """DF(x)^T g: (..., n), (..., D) -> (..., n)."""
+        lines, circles, found = *self._parts(x), []
         g_line, g_cos, g_sin = self._split(g)
-        parts = []
-        if self.lines:
-            parts.append(g_line * self._lines(x)[1])
-        if self.circles:
-            angle, scale = self._circles(x)
-            parts.append((angle.cos() * g_sin - angle.sin() * g_cos) * scale)
-        return self._scatter(x, parts)
+        if lines is not None:
+            found.append(g_line * lines[1])
+        if circles is not None:
+            angle, scale = circles
+            found.append((angle.cos() * g_sin - angle.sin() * g_cos) * scale)
+        return self._scatter(x, found)
 
     def pull_derivative(self, x: Tensor, dx: Tensor, g: Tensor) -> Tensor:
         """(D^2F(x)[dx])^T g: the derivative of ``pull(x, g)`` along dx at fixed g; (..., n)."""
         g_line, g_cos, g_sin = self._split(g)
-        parts = []
-        if self.lines:
-            parts.append(torch.zeros_like(g_line))
-        if self.circles:
-            (angle, scale), (turn, _) = self._circles(x), self._circles(dx)
-            parts.append(-(angle.cos() * g_cos + angle.sin() * g_sin) * scale * turn)
-        return self._scatter(x, parts)
+        found = [torch.zeros_like(g_line)]
+        _, circles = self._parts(x, dx)
+        if circles is not None:
+            angle, turn, scale = circles
+            found.append(-(angle.cos() * g_cos + angle.sin() * g_sin) * scale * turn)
+        return self._scatter(x, found)
+
+    @cached_property
+    def _ordered(self) -> list[int]:
+        return [self.columns[k] for places in self._places for k in places]
 
     def _split(self, g: Tensor) -> Sequence[Tensor]:
-        n_line, n_circle = len(self.lines), len(self.circles)
-        return torch.split(g, [n_line, n_circle, n_circle], dim=-1)
+        lines, circles = map(len, self._places)
+        return torch.split(g, [lines, circles, circles], dim=-1)
 
     def _scatter(self, x: Tensor, parts: list[Tensor]) -> Tensor:
         """Values on lines and circles as a vector of all n coordinates, zero elsewhere."""
-        values, columns = torch.cat(parts, -1), self.lines + self.circles
+        values, columns = _joined(parts), self._ordered
         if isinstance(where := _as_slice(columns), slice):  # without a copy of the indices to the device
             before, after = where.start, x.shape[-1] - where.stop
             return torch.nn.functional.pad(values, (before, after)) if before or after else values
@@ -165,7 +157,11 @@ class FeatureMap:
         return out.index_copy(-1, torch.tensor(columns, dtype=torch.int64, device=out.device), values)
 
 
+def _joined(parts: list[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
+
+
 def _as_slice(columns: list[int]) -> slice | list[int]:
     """Consecutive columns as a slice, which indexes without a copy."""
-    consecutive = columns == list(range(columns[0], columns[0] + len(columns))) if columns else False
-    return slice(columns[0], columns[-1] + 1) if consecutive else columns
+    first = columns[0] if columns else 0
+    return slice(first, first + len(columns)) if columns == list(range(first, first + len(columns))) else columns

@@ -8,6 +8,7 @@ is a session, whose frame is known from that of the model: their errors and thos
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -125,6 +126,17 @@ class HandEye:
             return {cameras[0]: cls.of(model, **known)}
         sessions = [name for own in model.placement if own.kind in TRANSFORMS for name in own.names]
         return {name: cls.of(model, camera=name, **known) for name in sessions}
+
+    @classmethod
+    def of_fit(cls, model: CalibratedKinematics) -> dict[str, HandEye]:
+        """The same where the model's images, or the command that made it, say where the camera is; else nothing."""
+        made, seen = model.provenance, [one for own in model.placement for one in own.cameras.values()]
+        words = shlex.split(made.command or "") if made is not None else []
+        on_tool = seen[0].on_tool if seen else "--camera-on-tool" in words
+        seen_board = bool(model.lever) and (bool(seen) or on_tool or "--robot-pose" in words)
+        if not seen_board or model.registration:
+            return {}
+        return cls.of_each(model, camera_on_tool=on_tool)
 
     def entry(self) -> dict[str, object]:
         """Both poses for programs."""

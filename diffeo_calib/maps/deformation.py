@@ -176,12 +176,9 @@ def relative(difference: Tensor, reference: Tensor) -> float:
 
 
 INVERSE_ITERATIONS = 50
-LONGEST_JOINT_STEP = 0.5
-"""Longest step of a joint in the search for an inverse, rad or m."""
-SETTLED_JOINT_STEP = 1e-12
-"""The search for an inverse has settled when no joint moves by more than this, rad or m."""
-MAX_INVERSE_RESIDUAL = 1e-9
-"""Largest distance from a target, m, at which it counts as reached."""
+LONGEST_JOINT_STEP = 0.5  # longest step of a joint in the search for an inverse, rad or m
+SETTLED_JOINT_STEP = 1e-12  # the search for an inverse has settled when no joint moves by more than this, rad or m
+MAX_INVERSE_RESIDUAL = 1e-9  # largest distance from a target, m, at which it counts as reached
 
 
 def inverse_of(deformation: Deformation, target: Tensor, x: Tensor) -> Tensor:

@@ -60,7 +60,6 @@ class GeodesicDeformation(Deformation):
 
     @small_work()
     def __call__(self, x: Tensor) -> Tensor:
-        """k1(x): (M, n) -> (M, m), differentiable by autograd in x."""
         return torch.cat([self._values(x[rows], self.spec.nominal.rows(rows)) for rows in row_blocks(x)])
 
     def _values(self, x: Tensor, nominal: NominalMap) -> Tensor:
@@ -68,7 +67,6 @@ class GeodesicDeformation(Deformation):
         return self.task_flow(self._points(z0)).reshape(z0.shape)
 
     def at_controls(self, x: Tensor) -> Tensor | None:
-        """The end of the controls' own flows; see :meth:`Deformation.at_controls`."""
         same = self.spec.nominal is self._nominal_of_z1 and x.device == self.x.device and torch.equal(x, self.x)
         return self.z1.detach().clone() if same else None
 
@@ -81,22 +79,18 @@ class GeodesicDeformation(Deformation):
         return self._apply_blocks(d_psi, self.spec.nominal.jacobian(xi, self.momenta.theta) @ d_phi)
 
     def field_energies(self) -> tuple[Tensor, Tensor]:
-        """1/2 b^T K_V b and 1/2 p^T K_W p, differentiable once in b and p."""
         spec, (b, p, _) = self.spec, self.momenta.tensors
         return energy(spec.joint_kernel, self.x, b), energy(spec.task_kernel, self.z0.reshape(p.shape), p)
 
     @property
     def task_controls(self) -> Tensor:
-        """z0 as points: (N P, d)."""
         return self._points(self.z0)
 
     @property
     def end_momenta(self) -> Tensor:
-        """p at the end of the task-space geodesic: (N P, d)."""
         return self.task_flow.end[1]
 
     def coupling_residual(self) -> float:
-        """|b_end - Dk0(xi)^T p| / |b_end|, zero at an optimum."""
         p = self.momenta.task.reshape(self.z1.shape)
         b_end = self.joint_flow.end[1]
         return relative(b_end - (self._slopes.mT @ p[:, :, None])[:, :, 0], b_end)
@@ -111,7 +105,6 @@ class GeodesicDeformation(Deformation):
         return max(self.joint_flow.energy_drift(), self.task_flow.energy_drift())
 
     def to(self, device: torch.device | str) -> GeodesicDeformation:
-        """The same deformation with its flows on a device."""
         moved = self.spec.to(device), self.x.to(device), self.momenta.to(device)
         return GeodesicDeformation(*moved, self.integrator)
 
@@ -121,15 +114,18 @@ class GeodesicDeformation(Deformation):
         other.joint_flow, other.task_flow = self.joint_flow.using(backend), self.task_flow.using(backend)
         return other
 
+    def _with_spec(self, **changes: object) -> GeodesicDeformation:
+        other = copy(self)
+        vars(other).pop("_slopes", None)
+        other.spec = replace(self.spec, **changes)
+        return other
+
     def with_nominal(self, nominal: NominalMap) -> GeodesicDeformation:
         """The same two flows around another nominal map with the same parameters: k1 of other points of the body.
 
         The controls stay those of the fit; evaluate and linearise the result at given configurations only.
         """
-        other = copy(self)
-        vars(other).pop("_slopes", None)
-        other.spec = replace(self.spec, nominal=nominal)
-        return other
+        return self._with_spec(nominal=nominal)
 
     def at_rows(self, index: slice) -> GeodesicDeformation:
         """The same at some of the rows that its nominal map was made for."""
@@ -138,9 +134,7 @@ class GeodesicDeformation(Deformation):
 
     def with_prior(self, variance: Tensor) -> GeodesicDeformation:
         """The same deformation with other prior variances (K,) of theta, for covariances."""
-        other = copy(self)
-        other.spec = replace(self.spec, prior_variance=variance)
-        return other
+        return self._with_spec(prior_variance=variance)
 
     def linearise(self, x: Tensor | None = None) -> Linearisation:
         """First-order response of k1(x) to the fields v_t, w_t and to theta.
@@ -153,7 +147,7 @@ class GeodesicDeformation(Deformation):
     @small_work()
     def linearised_value(self, x: Tensor | None = None) -> tuple[Tensor, Linearisation]:
         """k1(x) (M, m) and the linearisation at x from one run of the flows; x as in :meth:`linearise`."""
-        theta, weights = self.momenta.theta, self.integrator.weights()
+        theta = self.momenta.theta
         nominal = self.spec.nominal_of_controls if x is None else self.spec.nominal
         if x is None:
             (chi, m_x), (z, m_y) = self.joint_flow.control_path(), self.task_flow.control_path()
@@ -166,8 +160,8 @@ class GeodesicDeformation(Deformation):
         sensitivity = self._apply_blocks(m_y[-1], nominal.sensitivities(chi[-1], theta))
         linearisation = Linearisation(
             self.spec,
-            [NodeSensitivity(c, p, to_end @ _inverse(m)) for c, p, m in zip(weights, chi, m_x, strict=True)],
-            [NodeSensitivity(c, p, m_y[-1] @ _inverse(m)) for c, p, m in zip(weights, z, m_y, strict=True)],
+            self._nodes(chi, m_x, to_end),
+            self._nodes(z, m_y, m_y[-1]),
             sensitivity,
         )
         return z[-1].reshape(sensitivity.shape[:2]), linearisation
@@ -191,12 +185,15 @@ class GeodesicDeformation(Deformation):
         Returns:
             nodes of the joint flow and of the task flow, with effects M_s^-1.
         """
-        weights = self.integrator.weights()
-        joint, task = (
-            [NodeSensitivity(c, p, _inverse(m)) for c, p, m in zip(weights, *flow.control_path(), strict=True)]
-            for flow in (self.joint_flow, self.task_flow)
-        )
-        return joint, task
+        return self._nodes(*self.joint_flow.control_path()), self._nodes(*self.task_flow.control_path())
+
+    def _nodes(
+        self, points: list[Tensor], jacobians: list[Tensor], to_end: Tensor | None = None
+    ) -> list[NodeSensitivity]:
+        """The nodes of one flow, with effects M_s^-1, or to_end M_s^-1."""
+        inverses = [_inverse(m) for m in jacobians]
+        effects = inverses if to_end is None else [to_end @ inverse for inverse in inverses]
+        return [NodeSensitivity(*n) for n in zip(self.integrator.weights(), points, effects, strict=True)]
 
     def _points(self, z: Tensor) -> Tensor:
         """(M, m) -> (M P, d) marker points."""

@@ -92,6 +92,11 @@ class Linearisation:
     sensitivity: Tensor
 
     @property
+    def sides(self) -> tuple[tuple[Kernel, list[NodeSensitivity]], tuple[Kernel, list[NodeSensitivity]]]:
+        """The kernels of joint and task space with the sensitivities to their fields."""
+        return (self.spec.joint_kernel, self.joint), (self.spec.task_kernel, self.task)
+
+    @property
     def joint_to_start(self) -> Tensor:
         """Theta_0 (M, m, n)."""
         return self.joint[0].effect
@@ -120,13 +125,9 @@ class Linearisation:
         if other is None or other is self:
             return self._own_gram()
         left, right = self.sensitivity.flatten(0, 1), other.sensitivity.flatten(0, 1)
-        sides = (
-            (self.spec.joint_kernel, self.joint, other.joint),
-            (self.spec.task_kernel, self.task, other.task),
-        )
         with large_work(len(left) * len(right)):
             total = (right * self.spec.prior_variance @ left.T).T
-            for kernel, mine, theirs in sides:
+            for (kernel, mine), (_, theirs) in zip(self.sides, other.sides, strict=True):
                 for a, b in zip(mine, theirs, strict=True):
                     total += a.gram(kernel, b)
         return total
@@ -148,7 +149,7 @@ class Linearisation:
     def own_blocks(self) -> Tensor:
         """Prior covariance of every configuration of a projected linearisation with itself: (M, r, r)."""
         total = self.sensitivity * self.spec.prior_variance @ self.sensitivity.mT
-        for kernel, nodes in ((self.spec.joint_kernel, self.joint), (self.spec.task_kernel, self.task)):
+        for kernel, nodes in self.sides:
             for node in nodes:
                 total = total + node.weight * kernel.own_blocks(node.points, node.effect)
         return total
@@ -181,7 +182,7 @@ class Linearisation:
         """G mu without the matrix G: (N, m, k) -> (N, m, k), by kernel sums."""
         prior = self.spec.prior_variance[:, None] * torch.einsum("imt,imk->tk", self.sensitivity, mu)
         total = torch.einsum("imt,tk->imk", self.sensitivity, prior)
-        for kernel, nodes in ((self.spec.joint_kernel, self.joint), (self.spec.task_kernel, self.task)):
+        for kernel, nodes in self.sides:
             for node in nodes:
                 values = kernel.field(None, node.points, node.pulled(mu).mT).mT  # (L Q, n, k)
                 values = values.reshape(len(node.effect), -1, mu.shape[-1])

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
 
-HIDDEN_VARIANCE = 1e8
-"""Variance, m^2, of a coordinate that was not measured: it carries no information."""
+HIDDEN_VARIANCE = 1e8  # variance, m^2, of a coordinate that was not measured: it carries no information
 
 
 def measured_coordinates(covariance: Tensor) -> Tensor:

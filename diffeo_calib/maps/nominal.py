@@ -56,7 +56,6 @@ class SmoothMap(NominalMap):
         self.function = function
 
     def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
-        """k0(x): (N, m)."""
         value = self.function(x)
         if not isinstance(value, Tensor) or value.dtype != torch.float64:
             got = f"a {value.dtype} tensor" if isinstance(value, Tensor) else type(value).__name__
@@ -84,7 +83,6 @@ class SmoothMap(NominalMap):
         return torch.stack(rows, 1)
 
     def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
-        """No parameters: (N, m, 0)."""
         return x.new_zeros(len(x), self(x, theta).shape[1], 0)
 
 

@@ -26,8 +26,7 @@ from diffeo_calib.maps.noise import Noise
 O = TypeVar("O", bound="Observation")  # noqa: E741
 SMALLEST_DISTANCE_M = 1e-6
 """Nearer to its fixed end the direction of a distance, and nearer to its lens the image of a camera, is undefined."""
-UNSEEN_SHARE = 1e-6
-"""Information about coordinates that no row sees, relative to the mean of all coordinates."""
+UNSEEN_SHARE = 1e-6  # information about coordinates that no row sees, relative to the mean of all coordinates
 
 
 class Observation(ABC):
@@ -95,7 +94,6 @@ class Distances(Observation):
         self.offsets = given.detach()
 
     def value(self, points: Tensor) -> Tensor:
-        """Distances (N, 1), m."""
         return (points - self.fixed).norm(dim=1, keepdim=True) + self.offsets
 
     def slope(self, points: Tensor) -> Tensor:
@@ -133,15 +131,12 @@ class LinearFunctionals(Observation):
 
     @property
     def size(self) -> int:
-        """r."""
         return self.axes.shape[1]
 
     def value(self, points: Tensor) -> Tensor:
-        """(N, r)."""
         return (self.axes @ points[:, :, None])[:, :, 0] - self.offsets
 
     def slope(self, points: Tensor) -> Tensor:
-        """A: (N, r, m)."""
         return self.axes
 
     def by_constants(self, points: Tensor) -> Tensor:
@@ -186,7 +181,6 @@ class CameraPoints(Observation):
         return seen
 
     def value(self, points: Tensor) -> Tensor:
-        """Image coordinates (N, 2)."""
         seen = self._in_front(points)
         return self.focal * seen[:, :2] / seen[:, 2:]
 
@@ -266,35 +260,29 @@ class Stacked(Observation):
 
     @property
     def size(self) -> int:
-        """R."""
         return self._size
 
     @property
     def dim(self) -> int:
-        """m."""
         return self._dim
 
     def __len__(self) -> int:
         return self.count
 
     def rows(self, index: Tensor) -> Stacked:
-        """The observation of some configurations."""
         parts = [part.of_rows(index, self.count) for part in self.parts]
         return Stacked(len(index), self.size, self.dim, [part for part in parts if part is not None])
 
     def to(self, device: torch.device | str) -> Stacked:
-        """The same observation on a device."""
         return Stacked(self.count, self.size, self.dim, [part.to(device) for part in self.parts])
 
     def value(self, points: Tensor) -> Tensor:
-        """(N, R)."""
         found = points.new_zeros(len(points), self.size)
         for part in self.parts:
             found[part.rows[:, None], part.numbers] = part.observe.value(part.seen(points))
         return found
 
     def slope(self, points: Tensor) -> Tensor:
-        """(N, R, m)."""
         found = points.new_zeros(len(points), self.size, self.dim)
         for part in self.parts:
             rows = part.rows[:, None, None]
@@ -302,7 +290,6 @@ class Stacked(Observation):
         return found
 
     def by_constants(self, points: Tensor) -> Tensor:
-        """The constants of all parts side by side: (N, R, sum of c)."""
         columns = []
         for part in self.parts:
             own = part.observe.by_constants(part.seen(points))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Iterator, Mapping
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -36,23 +37,19 @@ LONGEST_GAP_S, LONGEST_GAP = 0.5, 5.0
 
 
 def read_bag(bag: Path, joints: str, seen: str) -> tuple[Recording, list[str], Recording]:
-    """Two topics of a bag.
+    """Two topics of a bag: joint values (T, n), rad or m, their names, and places (T, 3), m, perhaps with quaternions.
 
     Joints are joined by their names over all messages and publishers: each has the times of the messages that hold it,
-    between which its values are interpolated.
+    between which its values are interpolated. Of images there is nothing but times: (T, 0).
 
     Args:
         joints: topic of sensor_msgs/JointState, or TOPIC:NAME,NAME for some of its joints.
         seen: of geometry_msgs, stamped points, poses or transforms; or images. Of tf2_msgs/TFMessage with the frame
             whose motion was measured: TOPIC:CHILD, or TOPIC:PARENT>CHILD for two frames that transforms join.
 
-    Returns:
-        joint values (T, n), rad or m, and the joints' names; places (T, 3), m, with unit quaternions (T, 7) if there
-        are any, or (T, 0) for images.
-
     Raises:
-        InputError: rosbags is missing, or the bag cannot be read. MeasurementError: topics, joints or frames that it
-            does not have, or topics that hold something else.
+        InputError: rosbags is missing, or the bag cannot be read.
+        MeasurementError: topics, joints or frames that it does not have, or topics that hold something else.
     """
     (joints, _, wanted), (seen, _, frames) = (words.partition(":") for words in (joints, seen))
     states, edges, fixed = dict[str, _Rows](), dict[_Edge, _Rows](), set[_Edge]()
@@ -90,7 +87,7 @@ def _add_joints(states: dict[str, _Rows], message: Any, topic: str) -> None:
 def _joined(states: Mapping[str, _Rows], wanted: list[str], topic: str) -> tuple[Recording, list[str]]:
     """All joints, or those wanted, at the times of the one in most messages, where messages of all of them span them.
 
-    Unless it is wanted, a joint whose messages span less than half of the time is left out with a warning.
+    Unless wanted, a joint whose messages span less than half of the time is left out with a warning.
     """
     missing = [name for name in wanted if name not in states]
     if missing:
@@ -161,9 +158,7 @@ def _path(edges: Collection[_Edge], parent: str, child: str) -> list[tuple[_Edge
 def read_images(bag: Path, topic: str, times: Collection[float]) -> Iterator[tuple[float, str, bytes]]:
     """The images of some times [s]: time, suffix and content of a file.
 
-    Raises:
-        InputError: OpenCV is missing. MeasurementError: no sensor_msgs/Image or CompressedImage, or an encoding that is
-            not read.
+    InputError if OpenCV is missing, MeasurementError for other messages, or an encoding that is not read.
     """
     for _, message in _messages(bag, (topic,)):
         time = _time(message, topic)
@@ -230,17 +225,14 @@ def _place(message: Any, topic: str) -> list[float]:
     """Place and, if the message has one, rotation; nothing of an image."""
     if hasattr(message, "encoding") or hasattr(message, "format"):
         return []
-    place = next(filter(None, (_part(message, path) for path in PLACES)), None)
+
+    def part(path: str) -> Any:
+        return reduce(lambda own, name: getattr(own, name, None), path.split("."), message)
+
+    place, turn = (next(filter(None, map(part, paths)), None) for paths in (PLACES, TURNS))
     if place is None:
         raise MeasurementError.of(f"messages of {topic}", expected=KINDS, got=message.__msgtype__)
-    turn = next(filter(None, (_part(message, path) for path in TURNS)), None)
     return [place.x, place.y, place.z] + ([] if turn is None else [turn.x, turn.y, turn.z, turn.w])
-
-
-def _part(message: Any, path: str) -> Any:
-    for name in path.split("."):
-        message = getattr(message, name, None)
-    return message
 
 
 def _recording(rows: list[list[float]], topic: str) -> Recording:

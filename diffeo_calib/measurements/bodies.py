@@ -14,20 +14,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, printable
-from diffeo_calib.measurements.pose_frames import (
-    POINTS,
-    block_diagonal,
-    by_frame,
-    directions_of_frames,
-    frame_tips,
-    frames_of_points,
-    middles,
-    own_blocks,
-    points_of_frames,
-    pose_jacobian,
-    transforms_of_frames,
-    visible_rotation_numbers,
-)
+from diffeo_calib.measurements import pose_frames
 from diffeo_calib.measurements.poses import angle_between, check_lever, mark_points, rotation_numbers
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.sockets import BALL
@@ -71,7 +58,7 @@ class Bodies:
     @property
     def points(self) -> int:
         """Points of one of them."""
-        return 1 if self.lever is None else POINTS
+        return 1 if self.lever is None else pose_frames.POINTS
 
     @property
     def numbers(self) -> int:
@@ -97,10 +84,10 @@ class Bodies:
         if self.lever is None:
             mean, covariance = model.predict(q, noise=noise)
             return Predicted(mean, mean, covariance, NUMBERS[:3])
-        frames, covariance = map(by_frame, model.predict_poses(q, noise=noise))
-        turns = visible_rotation_numbers(frames, "rotvec", "rad")
+        frames, covariance = map(pose_frames.by_frame, model.predict_poses(q, noise=noise))
+        turns = rotation_numbers(frames[..., :3, :3], "rotvec")
         mean = torch.cat([frames[..., :3, 3], turns.to(frames)], 2)
-        return Predicted(points_of_frames(frames, self.lever), mean, covariance, NUMBERS)
+        return Predicted(pose_frames.points_of_frames(frames, self.lever), mean, covariance, NUMBERS)
 
     def written(self, model: Any, q: Tensor) -> tuple[Tensor, Tensor]:
         """The same as files hold it: markers (N, B, 3) m, or poses; covariances."""
@@ -108,12 +95,12 @@ class Bodies:
 
     def origins(self, points: Tensor) -> Tensor:
         """Origins (N, B, 3) of bodies with points (N, P, 3), m."""
-        return points if self.lever is None else middles(points)
+        return points if self.lever is None else pose_frames.middles(points)
 
     def averaging(self, like: Tensor) -> Tensor:
         """The origins (3 B,) as linear functions of all coordinates (m,) of points: (3 B, m), m that of ``like``."""
         mean = torch.eye(3, dtype=like.dtype, device=like.device).repeat(1, self.points) / self.points
-        return block_diagonal(mean.expand(1, like.shape[-1] // (3 * self.points), -1, -1))[0]
+        return pose_frames.block_diagonal(mean.expand(1, like.shape[-1] // (3 * self.points), -1, -1))[0]
 
     def claimed(self, points: Tensor, covariance: Tensor, usual: Tensor) -> tuple[Tensor, Tensor]:
         """Origins (N, B, 3) of points (N, P, 3), m, and their covariances, from those of all points (N, 3 P, 3 P).
@@ -121,10 +108,10 @@ class Bodies:
         ``usual``: (N, P, 3), in place of points that are hidden.
         """
         if self.lever is None:
-            return points, own_blocks(covariance, points.shape[1])
-        frames = frames_of_points(points.where(~points.isnan(), usual), self.lever)
-        along = directions_of_frames(frames, self.lever)
-        whole = own_blocks(along @ covariance @ along.mT, frames.shape[1])
+            return points, pose_frames.own_blocks(covariance, points.shape[1])
+        frames = pose_frames.frames_of_points(points.where(~points.isnan(), usual), self.lever)
+        along = pose_frames.directions_of_frames(frames, self.lever)
+        whole = pose_frames.own_blocks(along @ covariance @ along.mT, frames.shape[1])
         return frames[..., :3, 3], whole[..., :3, :3]
 
     def noise_rms(self, noise: Tensor) -> float:
@@ -136,33 +123,33 @@ class Bodies:
         """(N, B, k) measured minus predicted by points (N, P, 3), m and rad; NaN where hidden."""
         if self.lever is None:
             return data.points - points
-        mean = frames_of_points(points, self.lever)
+        mean = pose_frames.frames_of_points(points, self.lever)
         shift = data.frames[..., :3, 3] - mean[..., :3, 3]
-        turned = transforms_of_frames(data.frames[..., :3, :3] @ mean[..., :3, :3].mT, data.frames[..., :3, 3])
-        return torch.cat([shift, visible_rotation_numbers(turned, "rotvec", "rad")], 2)
+        turned = rotation_numbers(data.frames[..., :3, :3] @ mean[..., :3, :3].mT, "rotvec")
+        return torch.cat([shift, turned], 2)
 
     def turns(self, data: Any, points: Tensor) -> Tensor:
         """(N, T) angles, rad, from T measured frames to those of points (N, P, 3); T is 0 for markers."""
         if self.lever is None:
             return points.new_zeros(len(points), 0)
-        return angle_between(frames_of_points(points, self.lever)[..., :3, :3], data.frames[..., :3, :3])
+        return angle_between(pose_frames.frames_of_points(points, self.lever)[..., :3, :3], data.frames[..., :3, :3])
 
     def modes(self, data: Any) -> Tensor | None:
         """(N, T, 9, 6) displacements of points by a shift and a turn, zero where hidden; None for markers."""
         if self.lever is None:
             return None
-        return pose_jacobian(data.frames, self.lever, data.board).nan_to_num(0.0)
+        return pose_frames.pose_jacobian(data.frames, self.lever, data.board).nan_to_num(0.0)
 
     def modes_of(self, data: Any, points: Tensor) -> Tensor | None:
         """The same of other rows of the device, whose points (K, P, 3) are known, m: a camera sees its board there."""
         if self.lever is None:
             return None
-        frames, seen = frames_of_points(points, self.lever), seen_board(data)
+        frames, seen = pose_frames.frames_of_points(points, self.lever), seen_board(data)
         board = None
         if seen is not None:
             away = seen.origins.mean(0) - frames[:, 0, :3, 3]
             board = (frames[:, 0, :3, :3].mT @ away[..., None])[..., 0]
-        return pose_jacobian(frames, self.lever, board)
+        return pose_frames.pose_jacobian(frames, self.lever, board)
 
     def moved_words(self, points: int) -> str:
         """Name in messages for this number of points of the tool that may have moved."""
@@ -181,13 +168,13 @@ class Bodies:
         count = data.markers // self.points
         if self.lever is None:
             return [(number if count > 1 else None, None) for number in range(count)]
-        return [(None, tip if count > 1 else None) for tip in frame_tips(data.on or on, count)]
+        return [(None, tip if count > 1 else None) for tip in pose_frames.frame_tips(data.on or on, count)]
 
     def represented(self, data: Any) -> Any:
         """The rows with the points of these bodies."""
         if self.lever is None or data.frames is None or data.lever == self.lever:
             return data
-        return with_attributes(data, points=points_of_frames(data.frames, self.lever), lever=self.lever)
+        return with_attributes(data, points=pose_frames.points_of_frames(data.frames, self.lever), lever=self.lever)
 
     def check_points(self, points: int) -> None:
         """Raise InputError for a number of points of a model that no such bodies have."""
@@ -206,7 +193,7 @@ class Bodies:
         if self.lever is None:
             return like.new_zeros(points, 3)
         eye = torch.eye(4, dtype=like.dtype, device=like.device)
-        return mark_points(eye, self.lever).repeat(points // POINTS, 1)
+        return mark_points(eye, self.lever).repeat(points // pose_frames.POINTS, 1)
 
     def prefixes(self, model: Any) -> list[str]:
         """Nothing for a single marker or frame; marker1_, ... and ball_ for the ball, TIP_ of frames."""
@@ -214,7 +201,7 @@ class Bodies:
         if count == 1:
             return [""]
         if self.lever is not None:
-            return [f"{tip}_" for tip in frame_tips(model.on, count)]
+            return [f"{tip}_" for tip in pose_frames.frame_tips(model.on, count)]
         seen = count - model.ball
         return [*("marker_" if seen == 1 else f"marker{k + 1}_" for k in range(seen)), *[f"{BALL}_"] * model.ball]
 
@@ -222,7 +209,8 @@ class Bodies:
         """Where the bodies of a model are in the frames of their tips, for a record."""
         geometry = model.geometry
         if self.lever is not None:
-            for tip, frame in zip(self.tips(geometry.on), by_frame(model.measured_frame[None])[0], strict=True):
+            frames = pose_frames.by_frame(model.measured_frame[None])[0]
+            for tip, frame in zip(self.tips(geometry.on), frames, strict=True):
                 yield f"measured frame in the frame of {printable(tip)}, 4 x 4 [m]:"
                 yield from matrix_lines(frame)
             return

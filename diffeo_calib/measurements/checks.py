@@ -33,12 +33,7 @@ USUAL_SIZES = {
     "prismatic joints": (100.0, 2.0),
 }
 """Larger values in rad or m, and smaller ones in deg or mm, are probably in the other unit."""
-OTHER_UNITS = {
-    "rad": ("deg", "degrees"),
-    "deg": ("rad", "radians"),
-    "m": ("mm", "millimetres"),
-    "mm": ("m", "metres"),
-}
+OTHER_UNITS = {"rad": ("deg", "degrees"), "deg": ("rad", "radians"), "m": ("mm", "millimetres"), "mm": ("m", "metres")}
 
 
 ANGLE_MISTAKES = ((math.pi / 180, "degrees: convert them to radians"), (180 / math.pi, "radians that were converted"))
@@ -72,15 +67,15 @@ def in_other_unit(ratio: float, tolerance: float) -> bool:
     return any(abs(ratio * factor - 1.0) < tolerance for factor in (1e-3, 1e3))
 
 
-def unlikely_units(what: str, largest: float, unit: str, option: str, *, kinds_known: bool = True) -> list[str]:
-    """A sentence about values that reach ``largest`` in ``unit``, if that is unusual.
+def unlikely_units(what: str, values: Tensor, unit: str, option: str, *, kinds_known: bool = True) -> list[str]:
+    """A sentence about values in ``unit`` whose largest is unusual; none if it is not.
 
     Args:
         what: of USUAL_SIZES. option: argument that names their unit.
         kinds_known: whether the kinds of the joints are; otherwise angles may be lengths.
     """
     most, least = USUAL_SIZES[what]
-    small = unit in ("deg", "mm")
+    small, largest = unit in ("deg", "mm"), float(values.nan_to_num(0.0).abs().max()) if values.numel() else 0.0
     if unit not in OTHER_UNITS or not (0 < largest <= least if small else largest > most):
         return []
     other, words = OTHER_UNITS[unit]
@@ -102,16 +97,11 @@ def unlikely_si_joints(q: Tensor, joint_names: Sequence[str] | None) -> list[str
 
 
 def row_names(names: object, rows: int, what: str) -> list[str]:
-    """Names of rows as texts, without spaces around them.
-
-    Raises:
-        MeasurementError: not one per row, or rows without a name: None, NaN or an empty text.
-    """
-    if isinstance(names, str) or not isinstance(names, Iterable):
-        raise MeasurementError.of(what, expected=f"{rows} names, one per row", got=as_written(names))
-    given = names.tolist() if isinstance(names, Tensor) else list(names)
+    """Names of rows as texts; MeasurementError if not one per row, or for None, NaN or an empty text."""
+    names = names.tolist() if isinstance(names, Tensor) else names
+    given = list(names) if isinstance(names, Iterable) and not isinstance(names, str) else []
     if len(given) != rows:
-        raise MeasurementError.of(what, expected=f"{rows} names, one per row", got=len(given))
+        raise MeasurementError.of(what, expected=f"{rows} names, one per row", got=len(given) or as_written(names))
     empty = [name is None or (isinstance(name, float) and isnan(name)) for name in given]  # NaN in data frames
     texts = ["" if none else str(name).strip() for none, name in zip(empty, given, strict=True)]
     unnamed = [row for row, text in enumerate(texts) if not text]
@@ -174,12 +164,7 @@ def arrays_sha256(arrays: Mapping[str, Tensor | None], others: Mapping[str, byte
 
 
 def chosen_rows(index: object, count: int) -> Tensor:
-    """Row numbers (M,) that an integer, a slice, a list of integers or a boolean mask chooses of ``count`` rows.
-
-    Raises:
-        IndexError: an index out of range, or a mask of the wrong length.
-        MeasurementError: no row, or nothing that chooses rows.
-    """
+    """Row numbers (M,) that an index chooses of ``count`` rows; see :meth:`RowGroups.rows`."""
     rows = np.arange(count)
     try:
         index = index.numpy(force=True) if isinstance(index, Tensor) else index
@@ -254,11 +239,7 @@ def copied(value: object, name: str, shape: Shape, *also: Shape, fix: str) -> Te
 
 
 def tip_names(names: Sequence[str] | None, bodies: int, points: int = 1) -> tuple[str, ...] | None:
-    """Return the names of the tips that carry the points: one for each body, several of which may share a tip.
-
-    Args:
-        names: of the bodies' tips. bodies: number of markers or measured frames. points: of each body.
-    """
+    """The tip of each point, of names of the tips of bodies, markers or frames, with so many points each."""
     each = "marker" if points == 1 else "measured frame"
     found = checked_names(names, "on", bodies, each, distinct=False)
     return found and tuple(name for name in found for _ in range(points))
@@ -324,16 +305,6 @@ def marker_places(points: object) -> Tensor:
     places = copied(raw.masked_fill(empty, 0.0), "points", *shapes, fix=fix)
     if not bool(empty.any()):
         return places.reshape(len(places), -1, 3)  # (N, 3) -> (N, 1, 3)
-    _check_whole(empty)
-    rows = empty.all(2).all(1).nonzero()[:, 0].tolist()
-    if rows:
-        what = f"`points`, row {few(rows)}: no marker was seen"
-        raise MeasurementError.of(what, expected="at least one in every row", fix="leave these rows out")
-    return places.masked_fill(empty, torch.nan)
-
-
-def _check_whole(empty: Tensor) -> None:
-    """Refuse markers with one or two coordinates: (N, P, 3) boolean."""
     half = (empty.any(2) & ~empty.all(2)).nonzero()
     if len(half):
         row, marker = half[0].tolist()
@@ -341,28 +312,24 @@ def _check_whole(empty: Tensor) -> None:
         what = f"`points`, row {row}, marker {marker}" + f" (and {len(half) - 1} more)" * (len(half) > 1)
         expected = "three finite numbers, or NaN for all three of a hidden marker"
         raise MeasurementError.of(what, expected=expected, got=f"NaN for {got} only", fix="repair these rows")
+    rows = empty.all(2).all(1).nonzero()[:, 0].tolist()
+    if rows:
+        what = f"`points`, row {few(rows)}: no marker was seen"
+        raise MeasurementError.of(what, expected="at least one in every row", fix="leave these rows out")
+    return places.masked_fill(empty, torch.nan)
 
 
 def rare_names(names: Sequence[str], lines: Sequence[int], fewest: int) -> list[str]:
-    """Names with fewer rows than that, in words: with their rows, and the frequent name that they resemble.
+    """Names (N,), "" for none, with fewer rows, in words: with their lines, and the frequent name that they resemble.
 
-    Most of them are spelling mistakes of another name.
-
-    Args:
-        names: (N,) of the rows, "" for none. lines: (N,) numbers of the rows in their file. fewest: rows of a name.
+    Most of them are spelling mistakes of another name. Names that differ in digits, such as "0/0" and "0/1", are not.
     """
-    counts = Counter(name for name in names if name)
-    usual = [name for name, count in counts.items() if count >= fewest]
-    found = []
+    counts, found = Counter(name for name in names if name), []
+    digits = {name: "".join(filter(str.isdigit, name)) for name in counts}
     for name, count in counts.items():
         if count < fewest:
             own = [line for line, other in zip(lines, names, strict=True) if other == name]
-            near = get_close_matches(name, [other for other in usual if _digits(other) == _digits(name)], n=1)
-            meant = "".join(f", perhaps meant as '{other}'" for other in near)
+            usual = [other for other, rows in counts.items() if rows >= fewest and digits[other] == digits[name]]
+            meant = "".join(f", perhaps meant as '{other}'" for other in get_close_matches(name, usual, n=1))
             found.append(f"'{name}' in {count} row{'s' * (count > 1)} ({few(own)}){meant}")
     return found
-
-
-def _digits(name: str) -> str:
-    """The digits of a name: names that differ in them, such as "0/0" and "0/1", are seldom meant for one another."""
-    return "".join(character for character in name if character.isdigit())

@@ -13,7 +13,7 @@ from diffeo_calib.cameras.board import BoardPrior
 from diffeo_calib.cameras.images import Camera, Images, Sights, sighted, sighted_by_several
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, listed, sentence, warn_user
-from diffeo_calib.measurements.checks import check_rows, joint_table, session_numbers, texts_of
+from diffeo_calib.measurements import checks
 from diffeo_calib.measurements.pose_frames import of_frames, points_of_frames, pose_jacobian
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.sockets import ONE_SESSION, SocketTable
@@ -90,8 +90,8 @@ class ImageTable(SocketTable):
             MeasurementError: as the constructor; too few corners in an image, or corners that are not in a plane;
                 a camera of which nothing is said.
         """
-        angles, joints = joint_table(q, joint_names)
-        numbers, names = session_numbers(seen_by, len(angles))
+        angles, joints = checks.joint_table(q, joint_names)
+        numbers, names = checks.session_numbers(seen_by, len(angles))
         known = _known(names or (ONLY_CAMERA,), camera)
         given = torch.as_tensor(corners, dtype=torch.float64, device=HOST).detach().clone()
         if given.ndim != 3 or given.shape[2] != 5:
@@ -99,7 +99,7 @@ class ImageTable(SocketTable):
                 "pass x, y, z of the board's corners and their pixels u, v, NaN for corners that an image does not show"
             )
             raise MeasurementError.of("`corners`", expected="shape (N, K, 5)", got=tuple(given.shape), fix=fix)
-        check_rows(angles, given, "corners")
+        checks.check_rows(angles, given, "corners")
         given = given.masked_fill(given.isnan().any(2, keepdim=True), torch.nan)
         own = torch.zeros(len(angles), dtype=torch.int64, device=HOST) if numbers is None else numbers
         found = _sights([given[own == number] for number in range(len(known))], known, board)
@@ -122,7 +122,7 @@ class ImageTable(SocketTable):
     @property
     def camera_names(self) -> list[str]:
         """(N,) name of the camera of each image."""
-        return [] if self.seen_by is None else texts_of(self.seen_by, list(self.cameras), len(self))
+        return [] if self.seen_by is None else checks.texts_of(self.seen_by, list(self.cameras), len(self))
 
     def set_ups(self, names: Sequence[str] | None, *, remounted: bool) -> Sequence[str] | None:
         """Names (N,) of set-ups: several fixed cameras, each of which has a frame of its own, come before them.
@@ -149,16 +149,16 @@ class ImageTable(SocketTable):
 
     def shared_errors(self) -> Iterator[SharedErrors]:
         """Those of images; none of other rows."""
-        if self.seen_by is not None and self.pose_shared is not None and self.pose_covariance is not None:
-            slopes = self._pose_slopes()
-            noise = slopes @ self.pose_covariance @ slopes.mT
-            yield SharedErrors(self.cameras, self.seen_by, slopes @ self.pose_shared, noise)
+        shared, own, lever = self.pose_shared, self.pose_covariance, self.lever
+        if self.seen_by is not None and shared is not None and own is not None and lever is not None:
+            slopes = pose_jacobian(self.frames, lever, self.board)[:, 0]
+            yield SharedErrors(self.cameras, self.seen_by, slopes @ shared, slopes @ own @ slopes.mT)
 
     def by_board_size(self) -> Tensor:
         """Effects (N, 9, 1) on the points of poses of a board that is larger than was said, as a share; m."""
-        if self.pose_larger is None:
+        if self.pose_larger is None or self.lever is None:
             raise AssertionError("a table of images")
-        return self._pose_slopes() @ self.pose_larger
+        return pose_jacobian(self.frames, self.lever, self.board)[:, 0] @ self.pose_larger
 
     def with_own_focal_lengths(self, deviation: float) -> Self:
         """The rows as if the focal length of every image had an error of its own, a share, as of an autofocus."""
@@ -187,9 +187,7 @@ class ImageTable(SocketTable):
     def with_board_at(self, q: Tensor, poses: Tensor, errors: tuple[Tensor, Tensor]) -> Self:
         """The rows as if at q (N, n) the cameras had seen their board at poses (N, 4, 4), m; corners stay.
 
-        Args:
-            q: rad or m. poses: of the board in the camera. errors: as of :func:`~diffeo_calib.cameras.seeing.expected`,
-                those of lens and board as effects (N, 6, c) of unit variance.
+        ``errors``: as of :func:`~diffeo_calib.cameras.images.expected`, of lens and board as effects of unit variance.
         """
         on_tool = self.board is not None
         seen = self.from_poses(q, poses, self.joint_names, camera_on_tool=on_tool, lever=self.lever, doubt=False)
@@ -209,17 +207,11 @@ class ImageTable(SocketTable):
         changes["board"] = (R @ self.board[..., None])[..., 0] + M[:, :3, 3]
         return with_attributes(self, **changes, **self.errors_along(R))
 
-    def _pose_slopes(self) -> Tensor:
-        return pose_jacobian(self.frames, self.lever, self.board)[:, 0]
-
 
 class SharedErrors(NamedTuple):
-    """What images of cameras share.
+    """What images (N,) of cameras by name share: the number of each image's camera, and errors of the points of poses.
 
-    Args:
-        cameras: by name. seen_by: (N,) number of the camera of each image.
-        slopes: (N, 9, c) effects of the cameras' c errors of unit variance on the points of poses, m.
-        noise: (N, 9, 9) covariance of the points by the noise of each image, m^2.
+    ``slopes`` (N, 9, c), m, are effects of the cameras' c errors of unit variance, ``noise`` (N, 9, 9), m^2, the own.
     """
 
     cameras: Mapping[str, Camera]

@@ -15,14 +15,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.measurements.checks import arrays_sha256, chosen_rows, numbers_of
-from diffeo_calib.measurements.rows import (
-    NO_SOCKET,
-    RowGroups,
-    RowTable,
-    check_alike,
-    common,
-    set_attributes,
-)
+from diffeo_calib.measurements.rows import NO_SOCKET, RowGroups, RowTable, check_alike, common, set_attributes
 
 WITH_POSITION = ("position", "pose", "mixture")
 """Kinds of rows of which a device measures positions."""
@@ -49,13 +42,12 @@ class Observations(RowGroups):
         tables = [parts[k] for k in order]
         _check_joinable(tables)
         set_attributes(self, parts=tuple(tables), index=tuple(index[k] for k in order))
-        for name in ("joint_names", "payload_at", "covariate_names"):
-            set_attributes(self, **{name: getattr(tables[0], name)})
-        for name in ("file_sha256", "origin"):
-            set_attributes(self, **{name: common([getattr(part, name) for part in tables])})
+        alike = {name: getattr(tables[0], name) for name in ("joint_names", "payload_at", "covariate_names")}
+        alike |= {name: common([getattr(part, name) for part in tables]) for name in ("file_sha256", "origin")}
         for name in ("q", "line_numbers", "payload", "covariates"):
             own = [getattr(part, name) for part in tables]
-            set_attributes(self, **{name: None if own[0] is None else self._whole(own)})
+            alike[name] = None if own[0] is None else self._whole(own)
+        set_attributes(self, **alike)
 
     @classmethod
     def joined(cls, parts: Sequence[Any]) -> Observations:
@@ -81,15 +73,11 @@ class Observations(RowGroups):
 
     @property
     def device_names(self) -> list[str]:
-        """(N,) name of the device of each row, or of its set-up; "" without one.
-
-        Devices of other kinds are other devices, whatever their names.
-        """
+        """(N,) name of the device of each row, or of its set-up; "" without one. Kinds have devices of their own."""
         return self._texts([part.device_names for part in self.parts])
 
     @property
     def _devices(self) -> list[str]:
-        """See :class:`RowGroups`."""
         return self._texts([[name and f"{part.kind} {name}" for name in part.device_names] for part in self.parts])
 
     @property

@@ -23,7 +23,6 @@ from diffeo_calib.measurements.poses import (
     poses_from_marks,
     poses_of_triangles,
     rigid_poses,
-    rotation_numbers,
 )
 from diffeo_calib.robots.se3 import transforms
 
@@ -71,10 +70,7 @@ def points_of_frames(frames: Tensor, lever: float) -> Tensor:
 
 
 def frames_of_points(points: Tensor, lever: float) -> Tensor:
-    """The frames whose points are nearest to the given ones: (N, 3 T, 3) -> (N, T, 4, 4) m, NaN where hidden.
-
-    See :func:`poses_from_marks`.
-    """
+    """The frames (N, T, 4, 4), NaN where hidden, of points (N, 3 T, 3), m; see :func:`poses_from_marks`."""
     triples = points.unflatten(1, (-1, POINTS))
     if wrapped(points):
         check_lever(lever)
@@ -139,16 +135,10 @@ def inverse_poses(poses: Tensor) -> Tensor:
 
 
 def camera_jacobian(poses: Tensor, lever: float, board: Tensor) -> Tensor:
-    """Derivatives of the three points of a camera's pose by the errors (-dt, -dw) of the board's pose that it sees.
+    """Derivatives (N, 9, 6) of the points of cameras at poses (N, 4, 4), m, by errors (-dt, -dw) of the board's pose.
 
-    Args:
-        poses: (N, 4, 4) of the camera in the measuring frame, m.
-        lever: distance of the points from the camera's origin, m.
-        board: (N, 3) the board's origin in the camera's frame, m.
-
-    Returns:
-        (N, 9, 6): coordinates of a point adjacent; three columns for the position in m, three for the rotation in rad,
-        along and about the axes of the camera.
+    Shift, m, and turn, rad, are along and about the axes of the camera, in whose frame the board's origin is at
+    ``board`` (N, 3), m; coordinates of a point are adjacent.
     """
     axes = poses[:, :3, :3]
     arms = lever * marks(poses.device) - board[:, None]  # (N, point, 3) from the board, in the camera's frame
@@ -165,12 +155,3 @@ def pose_jacobian(poses: Tensor, lever: float, board: Tensor | None) -> Tensor:
         board: see :func:`camera_jacobian`; None if the measuring device stood and saw the tool.
     """
     return mark_jacobian(poses, lever) if board is None else camera_jacobian(poses[:, 0], lever, board)[:, None]
-
-
-def visible_rotation_numbers(frames: Tensor, convention: str, angle: str) -> Tensor:
-    """Rotations of frames (N, T, 4, 4) written as numbers (N, T, k), see :func:`rotation_numbers`; NaN where hidden."""
-    hidden = frames.isnan().flatten(2).any(2)
-    written = rotation_numbers(frames[~hidden][:, :3, :3], convention, angle=angle)
-    found = written.new_full((*hidden.shape, written.shape[1]), torch.nan)
-    found[~hidden] = written
-    return found

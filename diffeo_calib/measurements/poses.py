@@ -12,7 +12,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import as_tensor, check_number, wrapped
+from diffeo_calib.common.checks import as_tensor, check_number, real_tensor, wrapped
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.measurements.checks import quiet
 from diffeo_calib.robots import se3
@@ -45,11 +45,7 @@ def marks(device: torch.device) -> Tensor:
 
 
 def numbers_of(convention: object) -> int:
-    """How many numbers one rotation takes: 3, 4 or 9.
-
-    Raises:
-        InputError: an unknown convention.
-    """
+    """How many numbers one rotation takes: 3, 4 or 9; InputError for an unknown convention."""
     if isinstance(convention, str) and convention in NUMBERS:
         return NUMBERS[convention]
     if not is_euler(convention):
@@ -77,7 +73,7 @@ ALL_CONVENTIONS = (*NUMBERS, *EULER)
 
 
 def rotation_matrices(values: object, convention: str, *, angle: str = "rad", place: Place = "row {}".format) -> Tensor:
-    """Convert rotations written as rows of numbers.
+    """Rotation matrices (N, 3, 3) of rotations written as rows of numbers.
 
     Args:
         values: (N, k) numbers: three Euler angles in the order of the letters, a rotation vector, a quaternion
@@ -87,15 +83,11 @@ def rotation_matrices(values: object, convention: str, *, angle: str = "rad", pl
         angle: unit of Euler angles and rotation vectors, ``"rad"`` or ``"deg"``; other conventions have no unit.
         place: names a row in messages.
 
-    Returns:
-        (N, 3, 3) rotation matrices.
-
     Raises:
         InputError: unknown convention or unit, another number of columns, values that are not finite, quaternions
             whose length is not 1 or matrices that are not orthonormal to 0.001 (row named).
     """
-    count = numbers_of(convention)
-    _check_unit(angle)
+    count = _numbers_in_unit(convention, angle)
     fix = f"pass the {count} numbers of {convention!r} in every row"
     table = as_tensor(values, "rotations", ("N", count), fix=fix).detach()
     if count == 9:
@@ -118,7 +110,7 @@ def rotation_matrices(values: object, convention: str, *, angle: str = "rad", pl
 
 
 def rotation_numbers(matrices: Tensor, convention: str, *, angle: str = "rad") -> Tensor:
-    """The inverse of :func:`rotation_matrices`: (N, 3, 3) -> (N, k).
+    """The inverse of :func:`rotation_matrices`: (..., 3, 3) -> (..., k), NaN where a matrix holds NaN.
 
     Where a rotation can be written in several ways, quaternions have a non-negative scalar, rotation vectors are no
     longer than pi, and Euler angles are SciPy's choice.
@@ -126,11 +118,15 @@ def rotation_numbers(matrices: Tensor, convention: str, *, angle: str = "rad") -
     Raises:
         InputError: unknown convention or unit, or no rotation matrices.
     """
-    count = numbers_of(convention)
-    _check_unit(angle)
-    exact = nearest_rotations(as_tensor(matrices, "rotations", ("N", 3, 3)).detach())
-    if count == 9:
-        return exact.flatten(1)
+    count, given = _numbers_in_unit(convention, angle), real_tensor(matrices, "rotations").detach()
+    if given.ndim < 3 or given.shape[-2:] != (3, 3):
+        raise InputError.of("`rotations` has the wrong shape", expected="(N, 3, 3)", got=tuple(given.shape))
+    seen = ~given.isnan().flatten(-2).any(-1)
+    found = given.new_full((*seen.shape, count), torch.nan)
+    exact = nearest_rotations(given[seen])
+    if count == 9 or not len(exact):
+        found[seen] = exact.flatten(1)[:, :count]
+        return found
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  # slow to import, needed for poses only
 
     rotation, degrees = Rotation.from_matrix(exact.cpu().numpy()), angle == "deg"
@@ -143,7 +139,8 @@ def rotation_numbers(matrices: Tensor, convention: str, *, angle: str = "rad") -
     else:
         with quiet(UserWarning):  # gimbal lock: SciPy sets the third angle to zero
             numbers = rotation.as_euler(convention, degrees=degrees)
-    return torch.as_tensor(numbers.copy(), dtype=torch.float64, device=exact.device)
+    found[seen] = torch.as_tensor(numbers.copy(), dtype=torch.float64, device=exact.device)
+    return found
 
 
 def nearest_rotations(matrices: Tensor, place: Place = "row {}".format) -> Tensor:
@@ -166,15 +163,14 @@ def nearest_rotations(matrices: Tensor, place: Place = "row {}".format) -> Tenso
 
 
 def rigid_poses(poses: object, place: Place = "`poses`, row {}".format) -> Tensor:
-    """Check poses [[R, t], [0, 0, 0, 1]] and return the nearest rigid ones: (N, 4, 4) -> (N, 4, 4).
+    """The rigid poses nearest to poses [[R, t], [0, 0, 0, 1]]: (N, 4, 4) -> (N, 4, 4).
 
     Raises:
         InputError: wrong shape, values that are not finite, a last row other than [0, 0, 0, 1], or an R that is not a
             rotation.
     """
     frames = as_tensor(poses, "poses", ("N", 4, 4), fix=ONE_POSE).detach()
-    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=frames.device)
-    bad = ((frames[:, 3] - bottom).abs() > TOLERANCE).any(1)
+    bad = ((frames[:, 3] - frames.new_tensor([0.0, 0.0, 0.0, 1.0])).abs() > TOLERANCE).any(1)
     if bad.any():
         row = int(bad.nonzero()[0])
         what, fix = f"{place(row)}: the last row of the transform", "pass [[R, t], [0, 0, 0, 1]], not its transpose"
@@ -183,27 +179,14 @@ def rigid_poses(poses: object, place: Place = "`poses`, row {}".format) -> Tenso
 
 
 def mark_points(poses: Tensor, lever: float) -> Tensor:
-    """The three points that represent a pose, p_k = t + lever R u_k.
-
-    Args:
-        poses: (..., 4, 4) rigid transforms, m.
-        lever: distance of the points from the frame's origin, m.
-
-    Returns:
-        (..., 3, 3) one point per row, m.
-    """
+    """The three points p_k = t + lever R u_k, m, that represent poses: (..., 4, 4) -> (..., 3 points, 3)."""
     return poses[..., None, :3, 3] + _arms(poses, lever)
 
 
 def poses_from_marks(points: Tensor, lever: float) -> Tensor:
-    """The poses whose three points are nearest to the given points, in the sum of squares.
+    """The poses (N, 4, 4), m, whose three points are nearest to points (N, 3, 3), m, in the sum of squares.
 
-    Args:
-        points: (N, 3, 3) points, one per row, m.
-        lever: distance of the points from the frame's origin, m.
-
-    Returns:
-        (N, 4, 4) rigid transforms, m; detached, except inside transforms of torch.func and while a program is recorded.
+    They are detached, except inside transforms of torch.func and while a program is recorded.
 
     Raises:
         InputError: wrong shape, values that are not finite, or points on one line, which have no orientation.
@@ -223,17 +206,11 @@ def poses_from_marks(points: Tensor, lever: float) -> Tensor:
 
 
 def poses_of_triangles(points: Tensor) -> Tensor:
-    """As :func:`poses_from_marks`, in closed form: differentiable by torch, without checks.
+    """The poses (..., 4, 4) of points (..., 3, 3), m, that are not on a line, in closed form, differentiable by torch.
 
     The points' directions u_k have no third coordinate, so that the first two columns of R are the polar factor of
     A = sum_k (p_k - t) u_k^T, (3, 2): A M^-1/2 with M = A^T A, and M^-1/2 = (tr(M) + s - M) / (s sqrt(tr(M) + 2 s)),
     s = sqrt(det M).
-
-    Args:
-        points: (..., 3, 3) points, one per row, m; not on one line.
-
-    Returns:
-        (..., 4, 4) rigid transforms, m.
     """
     centre = points.mean(-2)
     A = (points - centre[..., None, :]).mT @ marks(points.device).to(points.dtype)[:, :2]  # (..., 3, 2)
@@ -247,15 +224,9 @@ def poses_of_triangles(points: Tensor) -> Tensor:
 
 
 def mark_jacobian(poses: Tensor, lever: float) -> Tensor:
-    """Derivatives of the three points by a shift dt and a small rotation dw, dp_k = dt + dw x (p_k - t).
+    """Derivatives (..., 9, 6) of the points of poses (..., 4, 4), m, by a shift dt, m, and a small rotation dw, rad.
 
-    Args:
-        poses: (..., 4, 4) rigid transforms, m.
-        lever: distance of the points from the frame's origin, m.
-
-    Returns:
-        (..., 9, 6): coordinates of a point adjacent; three columns for dt in m, three for dw in rad, about the axes
-        of the measuring frame.
+    dp_k = dt + dw x (p_k - t), about the axes of the measuring frame; coordinates of a point are adjacent.
     """
     eye = torch.eye(3, dtype=poses.dtype, device=poses.device)
     arms = _arms(poses, lever)[..., None, :]  # (..., point, axis of the rotation, 3)
@@ -289,7 +260,9 @@ def _arms(poses: Tensor, lever: float) -> Tensor:
     return lever * (marks(poses.device) @ poses[..., :3, :3].mT)
 
 
-def _check_unit(angle: object) -> None:
+def _numbers_in_unit(convention: str, angle: object) -> int:
+    """Numbers of a rotation; InputError for an unknown unit."""
     if angle not in ANGLE_UNITS:
         fix = "pass the unit of the rotations"
         raise InputError.of("`angle`", expected="'rad' or 'deg'", got=as_written(angle), fix=fix)
+    return numbers_of(convention)

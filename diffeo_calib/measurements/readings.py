@@ -17,15 +17,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, as_written, sentence, warn_user
-from diffeo_calib.measurements.checks import (
-    arrays_sha256,
-    copied,
-    deviations,
-    joint_table,
-    session_numbers,
-    texts_of,
-    tip_names,
-)
+from diffeo_calib.measurements import checks
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.rows import RowTable, set_attributes, value_range, with_attributes
 
@@ -64,7 +56,6 @@ class Readings(RowTable):
 
     BY_ROW = ("q", "values", "std", "device", "payload", "line_numbers", "covariates")
     ALIKE = ("kind", "n", "joint_names", "offset_std", "intrinsics", "payload_at", "covariate_names", "on", "unit")
-
     NUMBERED = "device", "names"
     flattery = FLATTERY
 
@@ -105,15 +96,13 @@ class Readings(RowTable):
 
         Args:
             q: (N, n) joint values, rad or m. lengths: (N,) distances, m, or one for all rows of a ball bar.
-            devices: (N,) name of each row's fixed point; one for all rows by default.
-            joint_names: n names, in the order of the columns of ``q``.
+            devices, joint_names: as in :meth:`of`.
             offset_std: standard deviation in m of a length that all readings of a device lack, as those of an
                 interferometer or a wire with an unknown zero; 0 if they are absolute.
-            std: known standard deviations of the lengths, m: one for all, or (N,).
-            doubt: whether to warn about rows and values that look wrong, as :class:`Measurements` does.
+            std: known standard deviations of the lengths, m: one for all, or (N,). doubt: as in :meth:`of`.
 
         Raises:
-            MeasurementError: wrong shapes, values that are not finite, a length or deviation that is not positive.
+            MeasurementError: as :meth:`of`, or a length that is not positive.
         """
         if isinstance(offset_std, bool) or not isinstance(offset_std, (int, float)) or not 0.0 <= offset_std < inf:
             fix = "pass metres, or 0 for absolute lengths"
@@ -123,7 +112,7 @@ class Readings(RowTable):
         if not offset_std and float(found.values[low]) <= 0.0:
             got, fix = f"{float(found.values[low]):g} m in row {low}", "check the column, or pass `offset_std`"
             raise MeasurementError.of("`lengths`", expected="above 0", got=got, fix=fix)
-        return _doubted(replace(found, offset_std=float(offset_std)), doubt)
+        return replace(found, offset_std=float(offset_std)).doubted(doubt)
 
     @classmethod
     def heights(
@@ -141,13 +130,7 @@ class Readings(RowTable):
         Args:
             q: (N, n) joint values, rad or m. heights: (N,) m, such as those of a dial gauge; 0 where the ball touched,
                 and the height of a gauge block where it touched this on the same plane.
-            devices: (N,) name of each row's plane; one for all rows by default.
-            joint_names: n names, in the order of the columns of ``q``.
-            std: known standard deviations of the heights, m: one for all, or (N,).
-            doubt: whether to warn about rows and values that look wrong, as :class:`Measurements` does.
-
-        Raises:
-            MeasurementError: wrong shapes, values that are not finite, or a deviation that is not positive.
+            devices, joint_names, std [m], doubt, errors: as in :meth:`of`.
         """
         return cls.of("height", q, heights, devices, joint_names, std=std, doubt=doubt, name="heights")
 
@@ -168,19 +151,16 @@ class Readings(RowTable):
 
         Args:
             q: (N, n) joint values, rad or m. pixels: (N, 2) column and row in the image, lens distortion removed.
-            devices: (N,) name of each row's camera; one for all rows by default.
-            joint_names: n names, in the order of the columns of ``q``.
+            devices, joint_names, doubt: as in :meth:`of`.
             focal: focal lengths fx, fy in pixels. centre: principal point cx, cy in pixels. For tangents of angles
                 in place of pixels pass (1, 1) and (0, 0).
             std: known standard deviations, pixels: one for all, (N,) or (N, 2).
-            doubt: whether to warn about rows and values that look wrong, as :class:`Measurements` does.
 
         Raises:
-            MeasurementError: wrong shapes, values that are not finite, focal lengths or deviations that are not
-                positive.
+            MeasurementError: as :meth:`of`, or focal lengths that are not positive.
         """
-        f = copied(focal, "focal", (2,), fix="pass (fx, fy) in pixels")
-        c = copied(centre, "centre", (2,), fix="pass (cx, cy) in pixels")
+        f = checks.copied(focal, "focal", (2,), fix="pass (fx, fy) in pixels")
+        c = checks.copied(centre, "centre", (2,), fix="pass (cx, cy) in pixels")
         if not bool((f > 0).all()):
             raise MeasurementError.of("`focal`", expected="two positive numbers", got=as_written(f.tolist()))
         seen = cls.of("image", q, pixels, devices, joint_names, std=std, doubt=False, name="pixels", numbers=2)
@@ -188,7 +168,8 @@ class Readings(RowTable):
         known = None if seen.std is None else seen.std / f.to(seen.std)
         tangents = (seen.values - c.to(seen.values)) / f.to(seen.values)
         unit = "px", (fx + fy) / 2.0
-        return _doubted(replace(seen, values=tangents, std=known, intrinsics=(fx, fy, cx, cy), unit=unit), doubt)
+        changed = replace(seen, values=tangents, std=known, intrinsics=(fx, fy, cx, cy), unit=unit)
+        return changed.doubted(doubt)
 
     @classmethod
     def of(
@@ -221,26 +202,22 @@ class Readings(RowTable):
         Raises:
             MeasurementError: wrong shapes, values that are not finite, or a deviation that is not positive.
         """
-        angles, joints = joint_table(q, joint_names)
+        angles, joints = checks.joint_table(q, joint_names)
         N = len(angles)
         given = [float(values)] * N if isinstance(values, (int, float)) and not isinstance(values, bool) else values
         shapes = [(N,), (N, 1)] if numbers == 1 else [(N, numbers)]
         fix = f"pass {numbers} per row" + ", in m" * (unit == MILLIMETRES and numbers == 1)
-        read = copied(given, name, *shapes, fix=fix).reshape(N, numbers).to(angles.device)
-        whose, names = session_numbers([ONE_DEVICE] * N if devices is None else devices, N)
+        read = checks.copied(given, name, *shapes, fix=fix).reshape(N, numbers).to(angles.device)
+        whose, names = checks.session_numbers([ONE_DEVICE] * N if devices is None else devices, N)
         if whose is None:
             raise MeasurementError.of("`devices`", expected=f"{N} names, one per row", got="none")
-        known = deviations(std, "std", read)
+        known = checks.deviations(std, "std", read)
         found = cls(kind, angles, read, whose.to(HOST), names, joint_names=joints, std=known, unit=unit)
-        return _doubted(found, doubt)
+        return found.doubted(doubt)
 
     @classmethod
     def joined(cls, parts: Sequence[Any]) -> Any:
-        """The rows of several tables in order: :class:`Readings` of readings of one kind, else :class:`Observations`.
-
-        Raises:
-            MeasurementError: tables that differ in joints or payloads, or whose ball is on several tips.
-        """
+        """The rows of several tables in order: :class:`Readings` of one kind, else :class:`Observations`."""
         return joined_tables(parts)
 
     @property
@@ -268,17 +245,12 @@ class Readings(RowTable):
         """SHA-256 of the file that the rows were read from, or of the arrays if they come from Python."""
         names = {"kind": self.kind.encode(), "names": repr((self.names, self.offset_std)).encode()}
         arrays = {"q": self.q, "values": self.values, "device": self.device, "std": self.std, "payload": self.payload}
-        return self.file_sha256 or arrays_sha256(arrays, names)
+        return self.file_sha256 or checks.arrays_sha256(arrays, names)
 
     @property
     def column_kind(self) -> object:
         """Key that is equal for tables that can be joined into one."""
         return self.kind, self.offset_std, self.intrinsics, self.unit, self.std is None
-
-    @property
-    def device_names(self) -> list[str]:
-        """(N,) name of the device of each row."""
-        return texts_of(self.device, self.names, len(self))
 
     @property
     def ball_tip(self) -> str | None:
@@ -318,19 +290,13 @@ class Readings(RowTable):
 
     def with_tips(self, on: Sequence[str] | None) -> Readings:
         """Return the same readings with their ball on this tip, one name, else MeasurementError."""
-        names = tip_names(on, 1)
+        names = checks.tip_names(on, 1)
         return with_attributes(self, on=None if names is None else names[0])
 
     @property
     def compared(self) -> Tensor:
         """See :class:`RowTable`."""
         return torch.cat([self.q, self.values, self.device[:, None].to(self.q)], 1)
-
-
-def _doubted(data: Readings, doubt: bool) -> Readings:
-    if doubt:
-        data.warn_if_suspicious()
-    return data
 
 
 MARKER, CONTACT = "marker", "contact"

@@ -11,29 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.checks import check_number, check_seed
 from diffeo_calib.common.data_frames import data_frame, table_html
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode, usable
-from diffeo_calib.common.errors import MeasurementError, printable, warn_user
-from diffeo_calib.measurements.checks import (
-    checked_names,
-    chosen_rows,
-    copied,
-    covariates,
-    numbers_of,
-    payloads,
-    unlikely_si_joints,
-)
-from diffeo_calib.measurements.splits import (
-    CONFIGURATIONS,
-    FEWEST_PER_DEVICE,
-    PLACES,
-    REPEAT_TOLERANCE,
-    connected,
-    exact_copies,
-    fold_numbers,
-    in_train,
-    repeat_groups,
-)
+from diffeo_calib.common.errors import MeasurementError, as_written, printable, warn_user
+from diffeo_calib.measurements import checks
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -60,6 +42,12 @@ ON_HOST = ("line_numbers", "session", "socket", "device", "seen_by")
 """Columns of numbers that stay on the host."""
 NO_SOCKET = -1
 """Number of the socket of rows whose positions a device measured."""
+REPEAT_TOLERANCE = 1e-3
+"""Configurations closer than this in every joint [rad or m] are repeats of one another."""
+FEWEST_PER_DEVICE = 8
+"""Rows of a device that reports readings, with which it can be placed."""
+CONFIGURATIONS, PLACES = "distinct configurations", "places with sockets"
+"""Words for what a split keeps together."""
 RANGES = ("column", "from [rad or m]", "to", "degrees")
 """Header of the ranges that notebooks show."""
 
@@ -84,6 +72,9 @@ class RowGroups:
     covariate_names: tuple[str, ...] = ()
     parts: tuple[Any, ...]
     index: tuple[Tensor, ...]
+    device_names: Sequence[str]
+    without_device: bool = True
+    """Whether neither a position nor a pose was measured."""
 
     @property
     def n(self) -> int:
@@ -105,7 +96,7 @@ class RowGroups:
         return (self.rows(i) for i in range(len(self)))
 
     def rows(self, index: object) -> Self:
-        """Return the rows chosen by an integer, slice, list of integers or boolean mask, in that order.
+        """The rows chosen by an integer, slice, list of integers or boolean mask, in that order.
 
         Raises:
             IndexError: an index out of range, or a mask of the wrong length.
@@ -127,7 +118,7 @@ class RowGroups:
         return self.of_each(changed)
 
     def to(self, device: torch.device | str) -> Self:
-        """Return the same rows with their values on a device."""
+        """The same rows with their values on a device."""
         place = usable(device)
 
         def moved(part: Any, _: Tensor) -> Any:
@@ -136,15 +127,11 @@ class RowGroups:
         return self.of_each(moved)
 
     def with_joint_names(self, names: Sequence[str]) -> Self:
-        """Return the same rows under other names of the joints.
-
-        Raises:
-            MeasurementError: a number of names that does not match, or repeated names.
-        """
-        return self.with_columns(joint_names=checked_names(names, "names", self.n, "column of `q`"))
+        """The same rows with n distinct names of the joints, else MeasurementError."""
+        return self.with_columns(joint_names=checks.checked_names(names, "names", self.n, "column of `q`"))
 
     def with_payload(self, payload: object, at: str | None = None) -> Self:
-        """Return the same rows with a payload of known mass, whose sag a calibration then finds.
+        """The same rows with a payload of known mass, whose sag a calibration then finds.
 
         Args:
             payload: masses (N,), or one for all rows, in any unit: 0 without load. None if they are not known.
@@ -153,55 +140,41 @@ class RowGroups:
         Raises:
             MeasurementError: not one per row, negative, or not finite.
         """
-        return self.with_columns(payload=None if payload is None else payloads(payload, self.q), payload_at=at)
+        return self.with_columns(payload=None if payload is None else checks.payloads(payload, self.q), payload_at=at)
 
     def with_covariates(self, *, time: object = None, temperature: object = None) -> Self:
-        """Return the same rows with columns with which device or arm may drift.
+        """The same rows with columns (N,), in any unit, with which device or arm may drift; None if not known.
 
         A calibration looks for drifts in proportion to them; where leave-one-out errors prove one, it becomes part of
         the model, which then holds for the middle of each column's range.
 
-        Args:
-            time, temperature: values (N,), in any unit; None if they are not known.
-
         Raises:
             MeasurementError: not one per row, or not finite.
         """
-        return self.with_columns(**covariates({"time": time, "temperature": temperature}, self.q))
+        return self.with_columns(**checks.covariates({"time": time, "temperature": temperature}, self.q))
 
     def with_load(self, load: Payload) -> Self:
-        """Return the same rows with the masses of a payload, if there is one."""
+        """The same rows with the masses of a payload, if there is one."""
         return self if not load else self.with_payload(load.masses.to(self.q.device), load.link)
 
     def with_line_numbers(self, line_numbers: Sequence[int] | Tensor) -> Self:
-        """Return the same rows with other line numbers (N,), which tell where every row comes from.
-
-        Raises:
-            MeasurementError: not one per row.
-        """
-        lines = copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row")
+        """The same rows with line numbers (N,), which tell where every row comes from, else MeasurementError."""
+        lines = checks.copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row")
         return self.with_columns(line_numbers=lines.to(HOST, torch.int64))
 
-    def with_file_sha256(self, sha256: str | None) -> Self:
-        """Return the same rows as those of the file with this SHA-256."""
-        return self.with_columns(file_sha256=sha256)
-
-    def with_origin(self, origin: object) -> Self:
-        """Return the same rows as those of a table that can be read again."""
-        return self.with_columns(origin=origin)
-
     def copies(self) -> list[tuple[int, int]]:
-        """Return (earlier row, row) for every row that repeats an earlier one of its kind exactly.
-
-        Real repeats differ by noise.
-        """
+        """(earlier row, row) for every row that repeats an earlier one of its kind exactly; real repeats differ."""
         pairs = zip(self.parts, self.index, strict=True)
         found = [sorted(rows[list(pair)].tolist()) for part, rows in pairs for pair in exact_copies(part.compared)]
         return sorted(((first, second) for first, second in found), key=lambda pair: pair[1])
 
     def _repr_html_(self) -> str:
-        ranges = [one for part in self.parts for one in part.ranges]
-        return table_html(repr(self), RANGES, joint_ranges(self.q, self.joint_names) + ranges)
+        ranges = []
+        for joint, values in enumerate(self.q.T):
+            turns = f"{math.degrees(float(values.min())):.1f} to {math.degrees(float(values.max())):.1f} if it turns"
+            name = printable(self.joint_names[joint]) if self.joint_names else f"joint {joint}"
+            ranges.append(value_range(name, values, turns))
+        return table_html(repr(self), RANGES, ranges + [one for part in self.parts for one in part.ranges])
 
     @property
     def masses(self) -> Tensor:
@@ -214,19 +187,14 @@ class RowGroups:
         return {} if self.covariates is None else dict(zip(self.covariate_names, self.covariates.T, strict=True))
 
     @property
-    def places(self) -> Tensor:
-        """(N,) int64, number of the place of each row's socket, -1 for other rows."""
-        return self.socket_numbers
-
-    @property
     def socket_numbers(self) -> Tensor:
         """(N,) int64, number of each row's socket, -1 for other rows."""
         return torch.full((len(self.q),), NO_SOCKET, dtype=torch.int64, device=HOST)
 
     @property
-    def without_device(self) -> bool:
-        """Whether no position was measured."""
-        return True
+    def places(self) -> Tensor:
+        """(N,) int64, number of the place of each row's socket, -1 for other rows."""
+        return self.socket_numbers
 
     @property
     def smallest_inflation(self) -> float:
@@ -234,17 +202,11 @@ class RowGroups:
         return 1.0 if self.without_device else 0.0
 
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
-        """Label repeated configurations: rows with the same label are repeats of one another.
+        """Labels (N,) int64 0, 1, ... of repeated configurations, in the order of first appearance.
 
         The first row without a group leads a new one, which takes all later rows without a group that are within
-        ``tolerance`` of the leader in every joint: rows along a slow trajectory do not chain into a single group.
-        Angles are compared without wrapping.
-
-        Args:
-            tolerance: largest difference from the leader in any joint, rad or m.
-
-        Returns:
-            (N,) int64 labels 0, 1, ... in the order of first appearance.
+        ``tolerance`` [rad or m] of the leader in every joint: rows along a slow trajectory do not chain into a single
+        group. Angles are compared without wrapping.
         """
         return repeat_groups(self.q, tolerance)
 
@@ -254,10 +216,6 @@ class RowGroups:
         Where some positions were measured, these alone are held out: rows in sockets stay in ``train``. Groups of
         repeats are shuffled; each in turn goes to ``train`` if that brings its size nearer to ``round(fraction * N)``
         rows. A device keeps the rows in ``train`` that it needs to be placed. Both parts keep the order of the rows.
-
-        Args:
-            fraction: wanted share of rows in ``train``, between 0 and 1.
-            seed: of the shuffle.
 
         Raises:
             MeasurementError: fraction outside (0, 1), or one configuration or place, so that a part would be empty.
@@ -273,13 +231,9 @@ class RowGroups:
         return self.rows(~test), self.rows(test)
 
     def folds(self, k: int = 5, seed: int = 0) -> list[tuple[Self, Self]]:
-        """Return ``k`` pairs (train, test) whose test parts cover every row once; repeats stay together.
+        """``k`` pairs (train, test) whose test parts cover every row once; repeats stay together.
 
         Where some positions were measured, they cover these: rows in sockets are in every ``train``.
-
-        Args:
-            k: number of folds, at least 2.
-            seed: of the shuffle of the groups of repeats.
 
         Raises:
             MeasurementError: k below 2, or fewer distinct configurations than folds.
@@ -321,15 +275,18 @@ class RowTable(RowGroups):
 
     BY_ROW: ClassVar[tuple[str, ...]] = ()
     """Attributes with a value for each row, all of them tensors (N, ...)."""
-
     ALIKE: ClassVar[tuple[str, ...]] = ()
     """Other attributes in which tables agree that are joined."""
-
     NUMBERED: ClassVar[tuple[str, str]]
     """The column of numbers of set-ups or devices, -1 for none, and the attribute with their names."""
-
     flattery: ClassVar[str] = ""
     """What errors of these rows do not show where no device measured a position."""
+
+    kind: Any
+    compared: Any
+    """(N, c) numbers in which a row that repeats another one equals it."""
+    ranges: Any
+    """Column, smallest and largest value and their unit, of what was measured."""
 
     @property
     def parts(self) -> tuple[Self, ...]:
@@ -344,8 +301,18 @@ class RowTable(RowGroups):
     @property
     def columns(self) -> dict[str, Tensor]:
         """The columns that this table has, by name."""
-        found = {name: getattr(self, name) for name in self.BY_ROW}
-        return {name: values for name, values in found.items() if values is not None}
+        return {name: values for name in self.BY_ROW if (values := getattr(self, name)) is not None}
+
+    @property
+    def column_kind(self) -> object:
+        """Key that is equal for tables that can be joined into one."""
+        return self.kind
+
+    @property
+    def device_names(self) -> list[str]:
+        """(N,) name of the device, or of its set-up, of each row; "" without one."""
+        column, names = self.NUMBERED
+        return checks.texts_of(getattr(self, column), getattr(self, names), len(self))
 
     def beside_images(self) -> list[tuple[Any, Tensor]]:
         """These rows as they stand beside images of a board with the same tool: tables, and row numbers (M,) here."""
@@ -353,7 +320,7 @@ class RowTable(RowGroups):
 
     def rows(self, index: object) -> Self:
         """See :class:`RowGroups`."""
-        chosen = chosen_rows(index, len(self))
+        chosen = checks.chosen_rows(index, len(self))
         return with_attributes(self, **{name: t[chosen.to(t.device)] for name, t in self.columns.items()})
 
     def of_each(self, change: Callable[[Any, Tensor], Any]) -> Self:
@@ -364,10 +331,7 @@ class RowTable(RowGroups):
         """A pandas.DataFrame of the rows, in SI units and pixels, whose index are the line numbers.
 
         Its columns are the joints (q1, q2, ... without names), those of :meth:`measured`, known masses as payload, and
-        covariates.
-
-        Raises:
-            ImportError: pandas is not installed.
+        covariates. ImportError if pandas is not installed.
         """
         names = self.joint_names or [f"q{joint + 1}" for joint in range(self.n)]
         payload = {} if self.payload is None else {"payload": self.payload}
@@ -378,25 +342,16 @@ class RowTable(RowGroups):
         """Name -> values (N,) of every column but joints and payloads: what was measured, in SI units and pixels."""
         raise NotImplementedError
 
-    @property
-    def compared(self) -> Tensor:
-        """(N, c) numbers in which a row that repeats another one equals it."""
-        raise NotImplementedError
-
-    @property
-    def ranges(self) -> list[list[str]]:
-        """Column, smallest and largest value and their unit, of what was measured."""
-        raise NotImplementedError
-
-    def warn_if_suspicious(self) -> None:
-        """Warn about exact copies of rows, and about joint values that look like degrees."""
-        pairs = self.copies()
+    def doubted(self, doubt: bool = True) -> Self:
+        """The same table, after warnings about exact copies of rows and joint values that look like degrees."""
+        pairs = self.copies() if doubt else []
         if pairs:
             where = f"first row {pairs[0][1]}, of row {pairs[0][0]}"
             text = f"{len(pairs)} of {len(self)} rows repeat an earlier row exactly: {where}"
             warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
-        for text in unlikely_si_joints(self.q, self.joint_names):
+        for text in checks.unlikely_si_joints(self.q, self.joint_names) if doubt else ():
             warn_user(text)
+        return self
 
     @classmethod
     def in_one(cls, tables: Sequence[Self]) -> Self:
@@ -416,18 +371,9 @@ class RowTable(RowGroups):
         names = tuple(dict.fromkeys(name for table in tables for name in getattr(table, texts)))
         found = []
         for table in tables:
-            new, numbers = numbers_of([*getattr(table, texts), ""], names), getattr(table, column)
+            new, numbers = checks.numbers_of([*getattr(table, texts), ""], names), getattr(table, column)
             found.append(table if numbers is None else with_attributes(table, **{column: new[numbers], texts: names}))
         return found
-
-
-def joint_ranges(q: Tensor, names: Sequence[str] | None) -> list[list[str]]:
-    """Ranges of joints (N, n) in SI units and, as they may turn, in degrees."""
-    found = []
-    for joint, values in enumerate(q.T):
-        turns = f"{math.degrees(float(values.min())):.1f} to {math.degrees(float(values.max())):.1f} if it turns"
-        found.append(value_range(printable(names[joint]) if names else f"joint {joint}", values, turns))
-    return found
 
 
 def value_range(name: str, values: Tensor, unit: str) -> list[str]:
@@ -443,14 +389,98 @@ def common(values: Sequence[T]) -> T | None:
 
 
 def check_alike(parts: Sequence[RowGroups], by_row: Sequence[str], alike: Sequence[str]) -> None:
-    """Refuse tables that cannot be joined.
-
-    Args:
-        parts: the tables. by_row: columns that all of them have, or none. alike: other attributes that agree.
-    """
+    """MeasurementError for tables that differ in having columns ``by_row``, or in other attributes ``alike``."""
     for part in parts:
         other = [name for name in alike if getattr(part, name, None) != getattr(parts[0], name, None)]
         other += [name for name in by_row if (getattr(part, name) is None) != (getattr(parts[0], name) is None)]
         if other:
             fix = "join rows that were measured in the same way, under the same names"
             raise MeasurementError.of(f"the tables differ in {', '.join(other)}", fix=fix)
+
+
+def repeat_groups(q: Tensor, tolerance: float) -> Tensor:
+    """Labels (N,) of repeated configurations (N, n), see :meth:`RowGroups.groups`."""
+    from scipy.spatial import KDTree  # noqa: PLC0415  # slow to import, not needed to use a model
+
+    check_number(tolerance, "`tolerance`", above=-1e-300)
+    tree = KDTree(q.cpu().numpy())
+    labels = np.full(len(q), -1)
+    count = 0
+    for row in range(len(q)):
+        if labels[row] < 0:
+            near = np.asarray(tree.query_ball_point(tree.data[row], tolerance, p=math.inf))
+            labels[near[labels[near] < 0]] = count
+            count += 1
+    return torch.as_tensor(labels, dtype=torch.int64, device=HOST)
+
+
+def exact_copies(table: Tensor) -> list[tuple[int, int]]:
+    """(earlier row, row) for every row of a table (N, c) that repeats an earlier one exactly, NaN for NaN."""
+    values = np.where(np.isnan(rows := table.cpu().numpy()), np.nan, rows) + 0.0  # one kind of NaN; -0.0 becomes 0.0
+    first: dict[bytes, int] = {}
+    pairs = ((first.setdefault(row.tobytes(), number), number) for number, row in enumerate(values))
+    return [(earlier, number) for earlier, number in pairs if earlier != number]
+
+
+def connected(first: Tensor, second: Tensor) -> Tensor:
+    """(N,) labels of rows that share a label in one of two groupings (N,), or are linked by such rows."""
+    from scipy.sparse import coo_matrix  # noqa: PLC0415  # slow to import, not needed to use a model
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
+    one, other = (labels.unique(return_inverse=True)[1].numpy() for labels in (first, second))
+    count = int(one.max()) + 1
+    size = count + int(other.max()) + 1
+    links = coo_matrix((np.ones(len(one)), (one, count + other)), shape=(size, size))
+    labels = connected_components(links)[1][one]
+    return torch.as_tensor(labels, dtype=torch.int64, device=HOST).unique(return_inverse=True)[1]
+
+
+def in_train(labels: Tensor, fraction: float, seed: int, kind: str = CONFIGURATIONS) -> np.ndarray:
+    """Choose whole groups at random for training: labels (N,) -> boolean (N,).
+
+    Each group, in random order, goes to training if that brings the number of rows nearer to ``round(fraction * N)``.
+
+    Raises:
+        MeasurementError: fraction outside (0, 1), or a single group, so that one part would be empty.
+    """
+    if not isinstance(fraction, (int, float)) or not 0.0 < fraction < 1.0:
+        fix = "pass the share of rows to train on, such as 0.7"
+        raise MeasurementError.of("`fraction`", expected="a number between 0 and 1", got=as_written(fraction), fix=fix)
+    sizes, order = _shuffled(labels, seed, kind, fewest=2, what="cannot split into train and test")
+    target, rows, chosen = round(fraction * len(labels)), 0, []
+    for group in order:
+        after = rows + sizes[group]
+        nearer = abs(after - target) < abs(rows - target)
+        if after < len(labels) and (nearer or not chosen):  # neither part may end up empty
+            rows, chosen = after, [*chosen, group]
+    return np.isin(labels.numpy(), chosen)
+
+
+def fold_numbers(labels: Tensor, k: int, seed: int, kind: str = CONFIGURATIONS) -> np.ndarray:
+    """Distribute whole groups over ``k`` folds of about equal size: labels (N,) -> fold of every row (N,).
+
+    Raises:
+        MeasurementError: k below 2, or fewer groups than folds.
+    """
+    if not isinstance(k, (int, np.integer)) or isinstance(k, bool) or k < 2:
+        raise MeasurementError.of("`k`", expected="at least 2 folds", got=as_written(k), fix="pass 5 or 10")
+    sizes, order = _shuffled(labels, seed, kind, fewest=k, what=f"cannot make {k} folds")
+    largest_first = order[np.argsort(-sizes[order], kind="stable")]
+    load, fold_of = np.zeros(k, dtype=np.int64), np.zeros(len(sizes), dtype=np.int64)
+    for group in largest_first:
+        fold_of[group] = load.argmin()
+        load[fold_of[group]] += sizes[group]
+    return fold_of[labels.numpy()]
+
+
+def _shuffled(labels: Tensor, seed: int, kind: str, fewest: int, what: str) -> tuple[np.ndarray, np.ndarray]:
+    """Sizes (G,) of the groups, and their numbers (G,) in random order."""
+    with checks.of_measurements():
+        checked_seed = check_seed(seed)
+    sizes = np.bincount(labels.numpy())
+    if len(sizes) < fewest:
+        together = "the rows of a place" if kind == PLACES else f"rows within {REPEAT_TOLERANCE} rad or m"
+        got = f"{len(sizes)} (in {len(labels)} rows; {together} stay together)"
+        fix = f"measure more {kind.split()[-1 if kind == CONFIGURATIONS else 0]}, or ask for fewer parts"
+        raise MeasurementError.of(what, expected=f"at least {fewest} {kind}", got=got, fix=fix)
+    return sizes, np.random.default_rng(checked_seed).permutation(len(sizes))

@@ -142,9 +142,7 @@ class SocketTable(RowTable):
     def other_socket(self, row: int, predicted: Tensor, near: float) -> str | None:
         """Why a row in a socket is far from its place, in words; None for rows in no socket.
 
-        Args:
-            row: its number. predicted: (N, P, 3) m, ``points`` being the places of the sockets.
-            near: distance of another socket that fits, m.
+        ``predicted`` (N, P, 3), m, ``points`` being the places of the sockets, of which another fits if ``near``, m.
         """
         if int(self.socket_numbers[row]) == NO_SOCKET:
             return None
@@ -165,11 +163,9 @@ class SocketTable(RowTable):
 
     def socket_rows(self) -> Self:
         """The rows whose ball rested in sockets, with the ball alone; MeasurementError if there are none."""
-        if self.socket is None:
-            raise MeasurementError.of("the rows have no sockets", fix="pass Measurements.from_sockets(...)")
-        if self.without_device and self.markers == 1:
+        if len(self.known_sockets.names) and self.without_device and self.markers == 1:
             return self
-        rows = self.rows(self.socket != NO_SOCKET)
+        rows = self.rows(self.socket_numbers != NO_SOCKET)
         changes = {"points": rows.points[:, -1:], "marker_names": None, "on": None, "std": None}
         return with_attributes(rows, **changes, session=None, session_names=())
 
@@ -225,10 +221,7 @@ class SocketTable(RowTable):
 def socket_numbers(
     names: Sequence[str], rows: int, distances: Distances | None, distance_std: float | None
 ) -> tuple[Tensor, Sockets]:
-    """Numbers (N,) of the sockets of rows, and these in order of first appearance.
-
-    Arguments and errors are those of :meth:`Measurements.from_sockets`.
-    """
+    """Numbers (N,) of the sockets of rows, and these in order of appearance; see :meth:`Measurements.from_sockets`."""
     texts = row_names(names, rows, "`sockets`")
     known = tuple(dict.fromkeys(texts))
     return numbers_of(texts, known), Sockets(known, *_checked_distances(known, distances, distance_std))

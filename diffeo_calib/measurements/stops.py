@@ -85,14 +85,9 @@ class Stop:
 def stops(
     joints: Recording, seen: Recording, limits: StopLimits = LIMITS, offset: float | None = None
 ) -> tuple[list[Stop], float]:
-    """Stops in two recordings.
+    """Stops in two recordings, in order, and the seconds to add to the times of ``seen``, estimated by default.
 
-    Args:
-        seen: places in its first three columns, which tell whether it moves.
-        offset: seconds to add to the times of ``seen``; estimated by default.
-
-    Returns:
-        the stops in order, and the offset.
+    The first three columns of ``seen`` are places, which tell whether it moves.
 
     Raises:
         MeasurementError: recordings of different times, too few motions to tell the offset, or no stop.
@@ -119,10 +114,7 @@ def stops(
 
 
 def rows_of(names: Sequence[str], found: Sequence[Stop]) -> list[dict[str, float]]:
-    """The rows of stops: column -> value, in s, m and rad; ``names`` of the joints.
-
-    Without rotations where they never change: a device that measures none writes such.
-    """
+    """The rows of stops: column -> value, in s, m and rad; without rotations that never change: none were measured."""
     rows, changes = [], (np.ptp([one.seen[3:] for one in found], axis=0) > SAME_TURN).any()
     for one in found:
         turn = one.seen[3:] / np.linalg.norm(one.seen[3:]) if changes else one.seen[:0]
@@ -135,13 +127,9 @@ def rows_of(names: Sequence[str], found: Sequence[Stop]) -> list[dict[str, float
 def pictured(
     joints: Recording, times: Array, limits: StopLimits = LIMITS, offset: float = 0.0
 ) -> tuple[list[tuple[Array, float]], int]:
-    """The image of each stop of the joints.
+    """Joint values (n,), means over each stop, and the time of its image as given; and how many stops have none.
 
-    Args:
-        times: (T,) of the images, s. offset: seconds to add to these.
-
-    Returns:
-        joint values (n,), means over the stop, and the time of its image as given; and the number of stops without one.
+    ``times`` (T,), s, are those of the images, to which ``offset`` is added.
 
     Raises:
         MeasurementError: recordings of different times, or no stop with an image.

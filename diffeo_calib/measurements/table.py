@@ -16,37 +16,11 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few
+from diffeo_calib.measurements import checks, pose_frames
 from diffeo_calib.measurements.bodies import Bodies
-from diffeo_calib.measurements.checks import (
-    arrays_sha256,
-    check_rows,
-    check_size,
-    checked_names,
-    deviations,
-    joint_table,
-    marker_places,
-    of_measurements,
-    seen_markers,
-    session_numbers,
-    texts_of,
-    tip_names,
-)
 from diffeo_calib.measurements.images import ImageTable
 from diffeo_calib.measurements.observations import Observations, joined_tables
-from diffeo_calib.measurements.pose_frames import (
-    POINTS,
-    block_diagonal,
-    by_frame,
-    checked_frames,
-    frame_tips,
-    frames_of_points,
-    inverse_poses,
-    of_frames,
-    points_of_frames,
-    pose_jacobian,
-    visible_rotation_numbers,
-)
-from diffeo_calib.measurements.poses import LEVER
+from diffeo_calib.measurements.poses import LEVER, rotation_numbers
 from diffeo_calib.measurements.readings import Readings, as_readings
 from diffeo_calib.measurements.rows import NO_SOCKET, set_attributes, value_range, with_attributes
 from diffeo_calib.measurements.sockets import ONE_SESSION, Distances, socket_numbers
@@ -104,7 +78,6 @@ class Measurements(ImageTable):
     BY_ROW = (*BY_ROW, "covariates", *ImageTable.BY_IMAGE)
     ALIKE = ("joint_names", "marker_names", "on", "lever", "session_names", "payload_at", "sockets", "n", "markers")
     ALIKE = (*ALIKE, "covariate_names", "cameras", "remounted")
-
     NUMBERED = "session", "session_names"
 
     def __init__(
@@ -118,18 +91,16 @@ class Measurements(ImageTable):
         std: object = None,
         doubt: bool = True,
     ) -> None:
-        angles, joints = joint_table(q, joint_names)
-        places = marker_places(points).to(angles.device)
-        check_rows(angles, places, "points")
-        check_size(places, "points")
-        markers = checked_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
-        known = deviations(std, "std", places)
-        tips = tip_names(on, places.shape[1])
+        angles, joints = checks.joint_table(q, joint_names)
+        places = checks.marker_places(points).to(angles.device)
+        checks.check_rows(angles, places, "points")
+        checks.check_size(places, "points")
+        markers = checks.checked_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
+        known = checks.deviations(std, "std", places)
+        tips = checks.tip_names(on, places.shape[1])
         set_attributes(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
         set_attributes(self, line_numbers=torch.arange(len(angles), device=HOST))
-        if doubt:
-            self.check_every_marker_seen()
-            self.warn_if_suspicious()
+        self.doubted(doubt)
 
     @classmethod
     def from_poses(
@@ -169,38 +140,33 @@ class Measurements(ImageTable):
             MeasurementError: as the constructor; a transform that is not rigid (its row is named); a lever or a
                 standard deviation that is not positive.
         """
-        angles, joints = joint_table(q, joint_names)
-        with of_measurements():
-            frames, board = checked_frames(poses).to(angles.device), None
+        angles, joints = checks.joint_table(q, joint_names)
+        with checks.of_measurements():
+            frames, board = pose_frames.checked_frames(poses).to(angles.device), None
             if camera_on_tool:
                 if frames.shape[1] > 1:
                     what, fix = "poses of a camera on the tool", "calibrate each arm with its own camera, or give the"
                     fix += " poses of the cameras in the board's frame"
                     raise MeasurementError.of(what, expected="one tip", got=frames.shape[1], fix=fix)
-                frames, board = inverse_poses(frames), frames[:, 0, :3, 3]
-            points = points_of_frames(frames, lever)
-        check_rows(angles, frames, "poses")
+                frames, board = pose_frames.inverse_poses(frames), frames[:, 0, :3, 3]
+            points = pose_frames.points_of_frames(frames, lever)
+        checks.check_rows(angles, frames, "poses")
         places = frames[..., :3, 3]
         like = places if places.shape[1] > 1 else places[:, 0]
-        known = deviations(position_std, "position_std", like)
-        std, turns = (
-            known if known is None else known.view(places.shape),
-            deviations(rotation_std, "rotation_std", like),
-        )
+        known = checks.deviations(position_std, "position_std", like)
+        found = {"poses": pose_frames.of_frames(frames), "lever": float(lever), "board": board}
+        found["std"] = known if known is None else known.view(places.shape)
+        found["rotation_std"] = checks.deviations(rotation_std, "rotation_std", like)
         data = cls(angles, points, joints, doubt=False)
-        found = {"poses": of_frames(frames), "lever": float(lever), "board": board, "std": std, "rotation_std": turns}
-        data = with_attributes(data, **found).with_tips(on)
-        if doubt:
-            data.check_every_marker_seen()
-            data.warn_if_suspicious()
-        return data
+        return with_attributes(data, **found).with_tips(on).doubted(doubt)
 
     @classmethod
     def of_points(cls, q: Tensor, points: Tensor, on: Sequence[str] | None, lever: float | None) -> Measurements:
         """Rows of markers (N, P, 3), m, or of the frames that these points stand for with a lever, m; NaN: hidden."""
         if lever is None:
             return cls(q, points, on=on, doubt=False)
-        poses, tips = of_frames(frames_of_points(points, lever)), None if on is None else on[::POINTS]
+        poses = pose_frames.of_frames(pose_frames.frames_of_points(points, lever))
+        tips = None if on is None else on[:: pose_frames.POINTS]
         return cls.from_poses(q, poses, on=tips, lever=lever, doubt=False)
 
     @classmethod
@@ -233,7 +199,7 @@ class Measurements(ImageTable):
             MeasurementError: not one name per row; a distance that is not positive, or between unknown sockets; a
                 distance without a standard deviation, or the other way round; else as the constructor.
         """
-        angles, joints = joint_table(q, joint_names)
+        angles, joints = checks.joint_table(q, joint_names)
         numbers, known = socket_numbers(sockets, len(angles), distances, distance_std)
         nowhere = torch.zeros(len(angles), 1, 3, dtype=torch.float64, device=angles.device)
         data = cls(angles, nowhere, joints, doubt=doubt)
@@ -268,16 +234,17 @@ class Measurements(ImageTable):
         if frames is None or self.lever is None:
             return None if std is None else torch.diag_embed(std.nan_to_num(0.0).flatten(1).square())
         if self.pose_covariance is not None:
-            slopes = pose_jacobian(frames, self.lever, self.board)[:, 0]
+            slopes = pose_frames.pose_jacobian(frames, self.lever, self.board)[:, 0]
             return slopes @ self.pose_covariance @ slopes.mT
         if std is None and rotation_std is None:
             return None
         zero = torch.zeros_like(frames[..., :3, 3])
         position = zero if std is None else std
         rotation = zero if rotation_std is None else rotation_std.view_as(zero)
-        factor = pose_jacobian(frames, self.lever, self.board) * torch.cat([position, rotation], dim=-1)[..., None, :]
+        slopes = pose_frames.pose_jacobian(frames, self.lever, self.board)
+        factor = slopes * torch.cat([position, rotation], dim=-1)[..., None, :]
         factor = factor.nan_to_num(0.0)  # hidden frames
-        return block_diagonal(factor @ factor.mT)
+        return pose_frames.block_diagonal(factor @ factor.mT)
 
     @property
     def sha256(self) -> str:
@@ -290,17 +257,18 @@ class Measurements(ImageTable):
         if self.sockets is not None:
             known = self.sockets.distances, self.sockets.distance_std
             sockets = {"sockets": repr((self.row_sockets, known)).encode()}
-        return self.file_sha256 or arrays_sha256(arrays | {"payload": self.payload, "board": self.board}, sockets)
+        arrays |= {"payload": self.payload, "board": self.board}
+        return self.file_sha256 or checks.arrays_sha256(arrays, sockets)
 
     @property
     def frames(self) -> Tensor | None:
         """(N, T, 4, 4) the measured poses, T = 1 included, m; NaN where hidden; None for points."""
-        return None if self.poses is None else by_frame(self.poses)
+        return None if self.poses is None else pose_frames.by_frame(self.poses)
 
     @property
     def visible(self) -> Tensor:
         """(N, P) boolean: which markers were seen in which rows."""
-        seen = seen_markers(self.points)
+        seen = checks.seen_markers(self.points)
         if self.socket is not None:  # the ball
             seen[:, -1] = self.socket.to(seen.device) != NO_SOCKET
         return seen
@@ -334,8 +302,9 @@ class Measurements(ImageTable):
         """Names of markers or frames in messages, such as "marker 0", "the frame on 'hand'"."""
         if self.lever is None:
             return [f"marker {name}" for name in self.marker_names or range(self.markers)]
-        frames = self.markers // POINTS
-        return ["the frame"] if frames == 1 else [f"the frame on '{tip}'" for tip in frame_tips(self.on, frames)]
+        frames = self.markers // pose_frames.POINTS
+        tips = pose_frames.frame_tips(self.on, frames)
+        return ["the frame"] if frames == 1 else [f"the frame on '{tip}'" for tip in tips]
 
     @property
     def kind(self) -> str:
@@ -343,16 +312,6 @@ class Measurements(ImageTable):
         if self.sockets is not None:
             return "socket" if self.without_device and self.markers == 1 else "mixture"
         return "position" if self.poses is None else "pose"
-
-    @property
-    def column_kind(self) -> object:
-        """Key that is equal for tables that can be joined into one."""
-        return self.kind
-
-    @property
-    def device_names(self) -> list[str]:
-        """(N,) name of the set-up in which each row was measured, "" without one."""
-        return texts_of(self.session, self.session_names, len(self))
 
     @property
     def compared(self) -> Tensor:
@@ -379,7 +338,7 @@ class Measurements(ImageTable):
         """Beginnings of the columns of each marker or frame: none for a single one, else NAME_, TIP_; not of a ball."""
         if self.frames is not None:
             frames = self.frames.shape[1]
-            return [""] if frames == 1 else [f"{tip}_" for tip in frame_tips(self.on, frames)]
+            return [""] if frames == 1 else [f"{tip}_" for tip in pose_frames.frame_tips(self.on, frames)]
         seen = self.markers - (self.sockets is not None)
         plain = [""] if seen == 1 else [f"marker{k + 1}_" for k in range(seen)]
         return plain if self.marker_names is None else [f"{name}_" for name in self.marker_names[:seen]]
@@ -394,7 +353,7 @@ class Measurements(ImageTable):
         names, turns = ([f"{prefix}{name}" for prefix in self.prefixes for name in own] for own in (XYZ, TURNS))
         columns |= zip(names, self.origins.flatten(1).T, strict=False)
         if self.frames is not None:
-            columns |= zip(turns, visible_rotation_numbers(self.frames, "rotvec", "rad").flatten(1).T, strict=False)
+            columns |= zip(turns, rotation_numbers(self.frames[..., :3, :3], "rotvec").flatten(1).T, strict=False)
         for known, own in ((self.std, names), (self.rotation_std, turns)):
             columns |= {} if known is None else zip([f"std_{name}" for name in own], known.flatten(1).T, strict=False)
         return columns if self.session is None else columns | {"session": self.device_names}
@@ -408,8 +367,8 @@ class Measurements(ImageTable):
 
     def with_tips(self, on: Sequence[str] | None) -> Measurements:
         """Return the same measurements with markers or poses on these tips, a name for each, else MeasurementError."""
-        points = 1 if self.poses is None else POINTS
-        return with_attributes(self, on=tip_names(on, self.markers // points, points))
+        points = 1 if self.poses is None else pose_frames.POINTS
+        return with_attributes(self, on=checks.tip_names(on, self.markers // points, points))
 
     def with_sessions(self, names: Sequence[str] | None, *, remounted: bool = False) -> Measurements:
         """Return the same measurements in several set-ups of the measuring device, a name for each row (N,).
@@ -426,11 +385,17 @@ class Measurements(ImageTable):
             MeasurementError: not one name per row, or poses with markers mounted anew, but for those of a camera on the
                 tool; several cameras on the tool, in several set-ups.
         """
-        numbers, known = session_numbers(self.set_ups(names, remounted=remounted), len(self))
+        numbers, known = checks.session_numbers(self.set_ups(names, remounted=remounted), len(self))
         if remounted and self.lever is not None and self.board is None:
             fix = "give their positions alone (leave the rotation out)"
             raise MeasurementError.of("markers that were mounted anew", expected="positions", got="poses", fix=fix)
         return with_attributes(self, session=numbers, session_names=known, remounted=remounted and numbers is not None)
+
+    def doubted(self, doubt: bool = True) -> Measurements:
+        """See :class:`RowTable`; MeasurementError for a marker, or frame, that no row shows."""
+        if doubt:
+            self.check_every_marker_seen()
+        return super().doubted(doubt)
 
     def check_every_marker_seen(self) -> None:
         """Raise MeasurementError for a marker, or frame, that no row shows: nothing can be found out about it."""

@@ -11,12 +11,19 @@ from typing import Any
 
 from diffeo_calib.common.errors import MeasurementError, as_written, listed
 from diffeo_calib.measurements.checks import of_measurements
-from diffeo_calib.measurements.poses import ANGLE_UNITS, CONVENTIONS, LEVER, is_euler, numbers_of
+from diffeo_calib.measurements.poses import ANGLE_UNITS, CONVENTIONS, LEVER, numbers_of
 
 Names = Sequence[str] | Sequence[Sequence[str]]
 """Names of columns: a list, or one for each marker or frame."""
 UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0, "cm": 100.0, "inch": 1 / 0.0254}
 """A length in a file is divided by this."""
+ROTATION_NAMES = {
+    "rotvec": ("rx", "ry", "rz"),
+    "quat_xyzw": ("qx", "qy", "qz", "qw"),
+    "quat_wxyz": ("qw", "qx", "qy", "qz"),
+    "matrix": tuple(f"r{i}{j}" for i in "123" for j in "123"),
+}
+"""Default names of the columns of a rotation that is written; euler1, ... for Euler angles."""
 BESIDE = ("time", "temperature", "payload")
 """Columns with one number a row beside joints and what was measured, which any table may have."""
 
@@ -152,28 +159,34 @@ class TableFormat:
         with of_measurements():
             count = numbers_of(self.convention)
         expected = f"{count} names of columns for {self.convention!r}"
-        rotation = by_frame("rotation", self.rotation, expected, count)
-        std = self.rotation_std
+        rotation, std, unit = (
+            by_frame("rotation", self.rotation, expected, count),
+            self.rotation_std,
+            self.rotation_angle,
+        )
         if std is not None:
             std = by_frame("rotation_std", std, "names of columns: three, or one for all three axes", 1, 3)
-        self._check_rotation_unit(has_angles=count == 3)
+        if unit is None and (count == 3 or std is not None):
+            what = "`rotation_angle` is missing: the unit of " + ("the rotation" if count == 3 else "`rotation_std`")
+            fix = "name it, for it may differ from the unit of the joints"
+            raise MeasurementError.of(what, expected="'rad' or 'deg'", fix=fix)
+        if unit is not None and count != 3 and std is None:
+            what = f"`rotation_angle` beside convention {self.convention!r}, which has no angles"
+            raise MeasurementError.of(what, got=as_written(unit), fix="leave it out")
+        check_choice("rotation_angle", unit or "rad", ANGLE_UNITS)
         return replace(self, rotation=rotation, rotation_std=std)
 
     def for_writing(self, *, rotation_std: bool, prefixes: Sequence[str] = ("",)) -> TableFormat:
         """The same format with defaults for the columns, the convention and the unit of rotations that are written.
 
-        Args:
-            rotation_std: whether standard deviations of the rotations are written, too.
-            prefixes: what the default names of the columns of each frame begin with.
-
-        Raises:
-            MeasurementError: an unknown convention or unit, or a wrong number of names.
+        ``rotation_std``: whether their standard deviations are written, too. ``prefixes``: what the default names of
+        the columns of each frame begin with. MeasurementError for an unknown convention, unit or number of names.
         """
         convention, unit = self.convention or "rotvec", self.rotation_angle or self.angle
         with of_measurements():
             count = numbers_of(convention)
         check_choice("rotation_angle", unit, ANGLE_UNITS)
-        plain = _rotation_names(convention)
+        plain = ROTATION_NAMES.get(convention, ("euler1", "euler2", "euler3"))
         names = by_frame("rotation", self.rotation or _prefixed(prefixes, plain), f"{count} names", count)
         std = self.rotation_std  # of which the writer says that there are no values
         if rotation_std:
@@ -181,19 +194,6 @@ class TableFormat:
             std = by_frame("rotation_std", given, "three names", 3)
         angle = unit if count == 3 or rotation_std else None
         return replace(self, rotation=names, convention=convention, rotation_angle=angle, rotation_std=std)
-
-    def _check_rotation_unit(self, *, has_angles: bool) -> None:
-        """The unit of a rotation must be named where there are angles, and only there."""
-        unit, needed = self.rotation_angle, has_angles or self.rotation_std is not None
-        if unit is None and needed:
-            what = "`rotation_angle` is missing: the unit of " + ("the rotation" if has_angles else "`rotation_std`")
-            fix = "name it, for it may differ from the unit of the joints"
-            raise MeasurementError.of(what, expected="'rad' or 'deg'", fix=fix)
-        if unit is not None and not needed:
-            what = f"`rotation_angle` beside convention {self.convention!r}, which has no angles"
-            raise MeasurementError.of(what, got=as_written(unit), fix="leave it out")
-        if unit is not None:
-            check_choice("rotation_angle", unit, ANGLE_UNITS)
 
 
 def options_of(table: TableFormat) -> list[str]:
@@ -233,11 +233,7 @@ def _prefixed(prefixes: Sequence[str], names: Sequence[str], before: str = "") -
 
 
 def column_names(what: str, names: object, expected: str, counts: Sequence[int]) -> tuple[str, ...]:
-    """Check a list of names of columns.
-
-    Raises:
-        MeasurementError: not a list of strings, or a number of names that is not in ``counts``.
-    """
+    """A checked list of names of columns, of which there are as many as one of ``counts``."""
     given = () if isinstance(names, str) or not isinstance(names, Sequence) else tuple(names)
     strings = all(isinstance(name, str) for name in given)
     if len(given) not in counts or not strings:
@@ -251,11 +247,3 @@ def check_choice(name: str, value: object, allowed: Sequence[str]) -> None:
     if value not in allowed:
         expected = " or ".join(repr(choice) for choice in allowed)
         raise MeasurementError.of(f"`{name}`", expected=expected, got=as_written(value), fix="pass one of these")
-
-
-def _rotation_names(convention: str) -> tuple[str, ...]:
-    """Default names of the columns of a rotation that is written."""
-    if is_euler(convention):
-        return ("euler1", "euler2", "euler3")
-    names = {"rotvec": ("rx", "ry", "rz"), "matrix": tuple(f"r{i}{j}" for i in "123" for j in "123")}
-    return names.get(convention) or tuple(f"q{letter}" for letter in convention.removeprefix("quat_"))

@@ -34,10 +34,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, NumericalError, as_written
-from diffeo_calib.fitting.objective import Objective, Start, tangent
+from diffeo_calib.fitting.objective import Objective, tangent
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.flows.geodesic import energy
-from diffeo_calib.flows.integrators import RK4, Integrator, integrate_alongside
+from diffeo_calib.flows.integrators import RK4, Integrator, Run
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, finite
 from diffeo_calib.maps.nominal import NominalMap
@@ -125,12 +125,11 @@ class EulerianFlow:
         integrator: Integrator,
         task_dim: int,
     ) -> None:
-        self.equations, self.integrator, self.x, self.task_dim = equations, integrator, x, task_dim
+        self.equations, self.x, self.task_dim = equations, x, task_dim
         self.joint_kernel, self.task_kernel = kernels
         self._curvature = start.curvature
-        self._stages: list[Tensor] = []
-        packed = torch.cat([start.value, momenta, start.jacobian.flatten(1)], 1)
-        self.nodes = integrator.nodes(self._recorded, packed)
+        self._run = Run(integrator, self.rates, torch.cat([start.value, momenta, start.jacobian.flatten(1)], 1))
+        self.nodes = self._run.nodes
 
     def __call__(self, start: Kinematics, x: Tensor) -> tuple[Tensor, Tensor]:
         """(20): k1 (M, m) and the transported Dk1 (M, m, n) at points x (M, n), from k0 there (``start``)."""
@@ -141,8 +140,7 @@ class EulerianFlow:
             return torch.cat(self._transport(Kinematics(k, jacobian, start.curvature), x, controls)[:2], 1)
 
         packed = torch.cat([start.value, start.jacobian.flatten(1)], 1)
-        controls = {"stages": self._stages, "controls": self.nodes[0], "control_field": self.rates}
-        end = integrate_alongside(self.integrator, field, packed, **controls)[-1]
+        end = self._run.alongside(field, packed)[-1]
         return end[:, :m], end[:, m:].unflatten(1, start.jacobian.shape[1:])
 
     def unpack(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -155,11 +153,6 @@ class EulerianFlow:
         """L_V v at the points, with the corrected sign -Dk^T P: (N, n)."""
         _, momenta, jacobian = self.unpack(state)
         return self.equations.sign * torch.einsum("imn,im->in", jacobian, momenta)
-
-    def _recorded(self, _: int, state: Tensor) -> Tensor:
-        if self.integrator.replayable:
-            self._stages.append(state)
-        return self.rates(state)
 
     def rates(self, state: Tensor) -> Tensor:
         """Right-hand side of (17) and (19) for a state: (N, 2 m + m n)."""
@@ -235,17 +228,14 @@ class EulerianDeformation(Deformation):
         return self.flow(self._start(x), x)[1]
 
     def field_energies(self) -> tuple[Tensor, Tensor]:
-        """The first two terms of (16), differentiable in P0."""
         return self._energies(self.flow.nodes[0])
 
     @property
     def task_controls(self) -> Tensor:
-        """k0 at the data, as points: (N P, d)."""
         return self.flow.unpack(self.flow.nodes[0])[0].reshape(self.momenta.task.shape)
 
     @property
     def end_momenta(self) -> Tensor:
-        """P at time 1: (N P, d)."""
         return self.flow.unpack(self.flow.nodes[-1])[1].reshape(self.momenta.task.shape)
 
     def coupling_residual(self) -> float:
@@ -258,7 +248,6 @@ class EulerianDeformation(Deformation):
         return abs(end - start) / start if start > 0 else 0.0
 
     def to(self, device: torch.device | str) -> EulerianDeformation:
-        """The same deformation with its flow on a device."""
         moved = self.spec.to(device), self.x.to(device), self.momenta.to(device)
         return EulerianDeformation(*moved, self.integrator, self.equations)
 
@@ -293,10 +282,8 @@ def curvature(nominal: NominalMap, x: Tensor, theta: Tensor) -> Tensor:
     return torch.stack(rows, 1).view(*jacobian.shape, x.shape[1])
 
 
-MAX_SHOTS = 20
-"""Largest number of shooting steps; few suffice where shooting converges."""
-SHORTEST_SHOT = 0.5
-"""Smallest fraction of a shooting step that is tried."""
+MAX_SHOTS = 20  # largest number of shooting steps; few suffice where shooting converges
+SHORTEST_SHOT = 0.5  # smallest fraction of a shooting step that is tried
 
 
 class EulerianProblem(Objective[EulerianDeformation]):
@@ -341,15 +328,12 @@ class EulerianProblem(Objective[EulerianDeformation]):
         return cls(exact, Eulerian(**switches))  # pyright: ignore[reportArgumentType]
 
     def zero(self) -> Momenta:
-        """P0 = 0: k1 = k0."""
         return self.unknowns(self.exact.zero())
 
     def unknowns(self, momenta: Momenta) -> Momenta:
-        """P0 and theta; b is implied."""
         return Momenta(momenta.joint[:0], momenta.task, momenta.theta)
 
     def deform(self, momenta: Momenta, integrator: Integrator) -> EulerianDeformation:
-        """Solve (17) and (19) for these momenta."""
         return EulerianDeformation(self.spec, self.x, momenta, integrator, self.equations)
 
     def preconditioner(self, momenta: Momenta, integrator: Integrator) -> CholeskyRegression:
@@ -365,7 +349,7 @@ class EulerianProblem(Objective[EulerianDeformation]):
     def _conditional(self) -> DataConditional:
         return tangent(self.exact).conditional
 
-    def start(self, integrator: Integrator) -> Start:
+    def start(self, integrator: Integrator) -> tuple[Momenta, int]:
         """Shoot at (12) from P0 = 0 as long as the energy falls."""
         at, evaluations = self.zero(), 1
         deformation = self.deform(at, integrator)
@@ -381,7 +365,7 @@ class EulerianProblem(Objective[EulerianDeformation]):
             if found is None:
                 break
             at, (deformation, best) = trial, found
-        return Start(at, evaluations)
+        return at, evaluations
 
     def _better(self, at: Momenta, integrator: Integrator, best: float) -> tuple[EulerianDeformation, float] | None:
         """The deformation of these momenta and its energy; None unless the energy is below ``best``."""

@@ -22,17 +22,11 @@ from diffeo_calib.common.threads import large_work
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.conditional import (
-    DataConditional,
-    FeatureConditional,
-    Features,
-    diagonal_blocks,
-    of_parameters,
-)
+from diffeo_calib.regression.conditional import DataConditional, Features, diagonal_blocks, of_parameters
 from diffeo_calib.regression.factor import Factor
 
 
-class CholeskyRegression(FeatureConditional, DataConditional):
+class CholeskyRegression(DataConditional):
     """Conditioning by a :class:`Factor` of G + R. Coordinates that were not measured take no part.
 
     Args:

@@ -20,8 +20,7 @@ LinearSolver = Literal["auto", "cholesky", "cg"]
 
 MAX_DENSE = 8_000
 """Largest N m for which `auto` factorises the matrix (0.5 GiB in float64, at the peak four times as much)."""
-COPIES_OF_BLOCK = 5
-"""Matrices of the size of one block of control point equations that exist at a time."""
+COPIES_OF_BLOCK = 5  # matrices of the size of one block of control point equations that exist at a time
 BYTES_PER_FLOAT = 8
 BYTES_PER_GIB = 2.0**30
 

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.linearisation import Linearisation
 
@@ -43,16 +42,40 @@ class Conditional(ABC):
 
     Shifts that rows of the data share are parameters of unit variance after those of the nominal map. Linearisations
     that take part in some have columns for all; others have none.
+
+    Attributes:
+        size: number of measured coordinates or momenta that are conditioned on.
     """
 
+    size: int
+
     @property
-    @abstractmethod
-    def size(self) -> int:
-        """Number of measured coordinates or momenta that are conditioned on."""
+    def inner(self) -> Conditional:
+        """The same with rigid motions, where they are left out."""
+        return self
 
     @abstractmethod
+    def features(self, at: Linearisation) -> Features:
+        """Features of a linearisation, from which covariances between any of its configurations follow cheaply.
+
+        Raises:
+            InputError: the conditional is computed by iteration and has no features.
+        """
+
     def posterior(self, at: Linearisation) -> Tensor:
-        """Posterior covariance at the M configurations of a projected linearisation, all at once: (M, r, r)."""
+        """Posterior covariance at the M configurations of a projected linearisation, all at once: (M, r, r).
+
+        Nothing large cancels in covariances from features.
+        """
+        values, signs = self.features(at)
+        values = values.T.reshape(*at.sensitivity.shape[:2], -1)
+        return at.fields.own_blocks() + (values * signs) @ values.mT
+
+    def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
+        """Posterior covariance of k1 between two linearisations, by default the same: (M m, M' m') in m^2."""
+        mine, signs = self.features(at)
+        theirs = mine if other is None else self.features(other).values
+        return at.fields.gram(None if other is None else other.fields) + (mine.T * signs) @ theirs
 
     def compared(self, points: Tensor, targets: Tensor, fit: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         """Points (M, 3) as they are compared with targets, m: rigid motions are errors like others.
@@ -66,7 +89,6 @@ class Conditional(ABC):
         """Posterior covariance of k1 at the M configurations of a linearisation.
 
         Args:
-            at: linearisation at M configurations.
             directions: (M, r, m) linear functions of k1(x) whose covariance is wanted instead of that of all m
                 coordinates. The fewer, the faster.
 
@@ -83,45 +105,16 @@ class Conditional(ABC):
             blocks.append(self.posterior(at.rows(rows).projected(directions[rows])))
         return torch.cat(blocks)
 
-    @abstractmethod
-    def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
-        """Posterior covariance of k1 between two linearisations, by default the same: (M m, M' m') in m^2."""
-
-    def features(self, at: Linearisation) -> Features:
-        """Features of a linearisation, from which covariances between any of its configurations follow cheaply.
-
-        Raises:
-            InputError: the conditional is computed by iteration and has no features.
-        """
-        what = f"the model has {self.size} measured coordinates, too many for covariances between configurations"
-        raise InputError.of(what, fix="calibrate with fewer control points (`controls=200`)")
-
-
-class FeatureConditional(Conditional):
-    """A conditional whose covariances are those of its :class:`Features`: nothing large cancels in them."""
-
-    def posterior(self, at: Linearisation) -> Tensor:
-        """Posterior covariance at the configurations of a projected linearisation: (M, r, r)."""
-        values, signs = self.features(at)
-        values = values.T.reshape(*at.sensitivity.shape[:2], -1)
-        return at.fields.own_blocks() + (values * signs) @ values.mT
-
-    def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
-        """Posterior covariance between two linearisations, by default the same: (M m, M' m')."""
-        mine, signs = self.features(at)
-        theirs = mine if other is None else self.features(other).values
-        return at.fields.gram(None if other is None else other.fields) + (mine.T * signs) @ theirs
-
 
 class DataConditional(Conditional):
-    """Conditioning with all data as control points; the unknown is mu, the momentum at time 1.
+    """Conditioning with all N data of m numbers as control points; the unknown is mu, the momentum at time 1.
 
     Args:
         linearisation: first-order response of k1 at the data to fields and parameters.
     """
 
     def __init__(self, linearisation: Linearisation) -> None:
-        self.linearisation = linearisation
+        self.linearisation, self.size = linearisation, linearisation.sensitivity.shape[:2].numel()
 
     @abstractmethod
     def solve(self, values: Tensor) -> Tensor:
@@ -138,11 +131,6 @@ class DataConditional(Conditional):
             target: (N, m) measured minus linearised model at zero fields, m.
         """
         return self.linearisation.momenta(self.mu(target))
-
-    @property
-    def size(self) -> int:
-        """N m."""
-        return self.linearisation.sensitivity.shape[:2].numel()
 
     def explained(self, cross: Tensor) -> Tensor:
         """cross (G + R)^-1 cross^T for several matrices: (M, r, N m) -> (M, r, r)."""

@@ -16,26 +16,20 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.errors import NumericalError
+from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.conditional import NOISE_ADVICE, DataConditional, of_parameters
+from diffeo_calib.regression.conditional import NOISE_ADVICE, DataConditional, Features, of_parameters
 
-BLOCK_CONFIGURATIONS = 64
-"""Number of configurations that are drawn together."""
+BLOCK_CONFIGURATIONS = 64  # number of configurations that are drawn together
 NEGLIGIBLE_VARIANCE_RATIO = 0.03
 """Mean unexplained variance, relative to the noise's, at which the factor is accurate enough."""
-ROUNDING_EIGENVALUE_RATIO = 1e-11
-"""Eigenvalues of a block below this fraction of the largest one are rounding errors."""
-MAX_RANK = 3000
-"""Largest rank of the preconditioner."""
-MAX_EXACT_COORDINATES = 8000
-"""Largest number of measured coordinates for which covariances are computed by iteration."""
-CG_TOLERANCE = 1e-11
-"""Default tolerance of the relative residual."""
+ROUNDING_EIGENVALUE_RATIO = 1e-11  # eigenvalues of a block below this fraction of the largest one are rounding errors
+MAX_RANK = 3000  # largest rank of the preconditioner
+MAX_EXACT_COORDINATES = 8000  # largest number of measured coordinates for which covariances are computed by iteration
+CG_TOLERANCE = 1e-11  # default tolerance of the relative residual
 MAX_ITERATIONS = 300
-ACCEPTABLE_RESIDUAL = 1e-6
-"""Relative residual that is accepted where rounding keeps it above the tolerance."""
+ACCEPTABLE_RESIDUAL = 1e-6  # relative residual that is accepted where rounding keeps it above the tolerance
 
 
 def partial_cholesky(linearisation: Linearisation, max_rest: float, rank: int, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -211,14 +205,16 @@ class ConjugateGradientRegression(DataConditional):
             )
         return x
 
+    def features(self, at: Linearisation) -> Features:
+        what = f"the model has {self.size} measured coordinates, too many for covariances between configurations"
+        raise InputError.of(what, fix="calibrate with fewer control points (`controls=200`)")
+
     def posterior(self, at: Linearisation) -> Tensor:
-        """G(x, x) - G(x, data) (G + R)^-1 G(data, x)."""
         at = self._with_shifts(at)
         cross = self.whole.gram(at).T.reshape(*at.sensitivity.shape[:2], -1)
         return at.own_blocks() - self.explained(cross)
 
     def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
-        """G(x, x') - G(x, data) (G + R)^-1 G(data, x')."""
         at, other = self._with_shifts(at), None if other is None else self._with_shifts(other)
         both = [at] if other is None else [at, other]
         cross = torch.cat([self.whole.gram(points) for points in both], 1)
@@ -227,7 +223,7 @@ class ConjugateGradientRegression(DataConditional):
         return at.gram(other) - explained[: split or None, split:]
 
     def explained(self, cross: Tensor) -> Tensor:
-        """cross (G + R)^-1 cross^T; for large problems with the preconditioner's matrix in place of G + R.
+        """The same; for large problems with the preconditioner's matrix in place of G + R.
 
         That matrix treats the part of G that F does not explain as noise: on average at most
         :data:`NEGLIGIBLE_VARIANCE_RATIO` of the noise's variance. Iterating on hundreds of columns would take minutes.

@@ -34,12 +34,11 @@ from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.conditional import NOISE_ADVICE, FeatureConditional, Features, of_parameters
+from diffeo_calib.regression.conditional import NOISE_ADVICE, Conditional, Features, of_parameters
 
 JITTER_RATIO = 1e-13
 """Added to the diagonal of the controls' kernel matrices, relative to its largest entry: the level of rounding."""
-BLOCK_ENTRIES = 1 << 22
-"""Number of entries of A that are computed together (32 MiB)."""
+BLOCK_ENTRIES = 1 << 22  # number of entries of A that are computed together (32 MiB)
 SHARED_ENTRIES = 1 << 24
 """Number of entries of A from which several processes share its blocks: with fewer, some would have nothing to do."""
 STRIPS = 8
@@ -48,7 +47,7 @@ INFORMED_SHARE = 1e-9
 """Directions of the momenta about which the data say less than this share of what they say about the best known."""
 
 
-class ControlPointRegression(FeatureConditional):
+class ControlPointRegression(Conditional):
     """Factorised normal equations around a deformation.
 
     Args:
@@ -69,13 +68,11 @@ class ControlPointRegression(FeatureConditional):
         self.spec: ModelSpec = deformation.spec
         self.deformation, self.like = deformation, deformation.momenta
         self.x, self.noise, self.slopes = x, noise, slopes
-        self.joint, self.task = deformation.momentum_sensitivities()
-        self._roots = [
-            _root(kernel, nodes)
-            for kernel, nodes in ((self.spec.joint_kernel, self.joint), (self.spec.task_kernel, self.task))
-        ]
+        self.controls = deformation.momentum_sensitivities()
+        kernels = self.spec.joint_kernel, self.spec.task_kernel
+        self._roots = [_root(kernel, nodes) for kernel, nodes in zip(kernels, self.controls, strict=True)]
         self._shifts = noise.shared.shape[2]
-        size = sum(t.numel() for t in self.like.tensors) + self._shifts
+        self.size = size = sum(t.numel() for t in self.like.tensors) + self._shifts
         large = len(x) * size * noise.covariance.shape[1] >= SHARED_ENTRIES
         self._ranks = ranks_of(deformation.backends if large else [])
         if self._ranks.count > 1:
@@ -88,7 +85,7 @@ class ControlPointRegression(FeatureConditional):
                 value, white = self._white_rows(rows)
                 _add_square(hessian, white)
                 if residual is not None:
-                    pull += white @ self._white_values(residual(rows, value), rows)
+                    pull += white @ self.noise.whiten(residual(rows, value)[:, :, None], rows).reshape(-1, 1)
             hessian, pull = self._ranks.total([hessian, pull])
             self.core, info = torch.linalg.cholesky_ex(hessian)  # its smallest eigenvalue is 1
         self._pull = None if residual is None else pull
@@ -98,9 +95,9 @@ class ControlPointRegression(FeatureConditional):
 
     def momenta(self, target: Tensor) -> Momenta:
         """H^-1 A^T R^-1 target."""
-        total = target.new_zeros(len(self.core), 1)
-        for rows in self._blocks(len(self.core)):
-            total += self._white_rows(rows)[1] @ self._white_values(target[rows], rows)
+        total = target.new_zeros(self.size, 1)
+        for rows in self._blocks(self.size):
+            total += self._white_rows(rows)[1] @ self.noise.whiten(target[rows, :, None], rows).reshape(-1, 1)
         (total,) = self._ranks.total([total])
         return self._of_white(torch.cholesky_solve(total, self.core))
 
@@ -131,7 +128,7 @@ class ControlPointRegression(FeatureConditional):
         In coordinates in which their prior is white these momenta are u = B^T R^-1/2 (y - k1), whose least-squares
         solution is R^-1/2 (y - k1) = B (B^T B)^+ u.
         """
-        size = len(self.core) - self._shifts
+        size = self.size - self._shifts
         u = self._white_momenta()[:size, 0]
         informed = (self.core @ self.core.T)[:size, :size]
         informed.diagonal().sub_(1.0)
@@ -141,18 +138,13 @@ class ControlPointRegression(FeatureConditional):
         momenta = self._of_white(torch.nn.functional.pad(solved, (0, self._shifts))[:, None])
         return self.noise.own.solve(self.response(momenta))
 
-    @property
-    def size(self) -> int:
-        """Number of momenta, parameters and shared shifts."""
-        return len(self.core)
-
     def features(self, at: Linearisation) -> Features:
         """Part of the fields that the controls can express, and its posterior together with that of the parameters."""
         rows = self._rows(at)
         with large_work(rows.numel()):
             expressed = self._whiten(rows.T)  # (size, M r)
             left = torch.linalg.solve_triangular(self.core, expressed, upper=False)
-        fields = len(self.core) - self.like.theta.numel() - self._shifts  # momenta
+        fields = self.size - self.like.theta.numel() - self._shifts  # momenta
         return Features.of((expressed[:fields], -1), (left, 1))
 
     def _blocks(self, size: int) -> list[Tensor]:
@@ -168,10 +160,7 @@ class ControlPointRegression(FeatureConditional):
     def _rows(self, at: Linearisation) -> Tensor:
         """Rows of A for the configurations of a linearisation: (M m, size)."""
         columns = []
-        for kernel, points, controls in (
-            (self.spec.joint_kernel, at.joint, self.joint),
-            (self.spec.task_kernel, at.task, self.task),
-        ):
+        for (kernel, points), controls in zip(at.sides, self.controls, strict=True):
             terms = [
                 kernel.gram(c.points, c.effect, a.points, a.weight * a.effect).T
                 for a, c in zip(points, controls, strict=True)
@@ -185,10 +174,6 @@ class ControlPointRegression(FeatureConditional):
         a = self._rows(at)
         a[:, a.shape[1] - self._shifts :] = self.noise.shared[rows].flatten(0, 1)
         return value, self._whiten(self.noise.whiten(a.view(len(rows), -1, a.shape[1]), rows).flatten(0, 1).T)
-
-    def _white_values(self, values: Tensor, rows: Tensor) -> Tensor:
-        """R^-1/2 values (M, r) of the data with these row numbers: (M r, 1)."""
-        return self.noise.whiten(values[:, :, None], rows).reshape(-1, 1)
 
     def _white_momenta(self) -> Tensor:
         """L^T of the deformation's momenta, without shared shifts: (size, 1)."""

@@ -28,8 +28,7 @@ CONFIDENCE = 0.95
 SCALES = np.exp(np.linspace(np.log(0.05), np.log(200.0), 120))
 FREEDOMS = np.exp(np.linspace(np.log(2.0), np.log(200.0), 30))
 HALVINGS = 40
-FACTORS = 0.01, 1e4
-"""Between which the factor is sought."""
+FACTORS = 0.01, 1e4  # between which the factor is sought
 
 
 @dataclass(frozen=True)

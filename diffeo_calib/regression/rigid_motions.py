@@ -15,11 +15,11 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.regression.conditional import Conditional
+from diffeo_calib.regression.conditional import Conditional, Features
 
-ROWS_AT_ONCE = 64
-"""Configurations whose covariances with the reference are computed together."""
+ROWS_AT_ONCE = 64  # configurations whose covariances with the reference are computed together
 
 
 class WithoutRigidMotions(Conditional):
@@ -32,17 +32,20 @@ class WithoutRigidMotions(Conditional):
     """
 
     def __init__(self, conditional: Conditional, reference: Linearisation, base: Sequence[int]) -> None:
+        self.size = conditional.size
         self.conditional, self.reference, self.base = conditional, reference, list(base)
         self.fit = torch.linalg.pinv(reference.sensitivity.flatten(0, 1)[:, self.base])  # (6, M m)
         self.motion = self.fit @ conditional.covariance_between(reference) @ self.fit.mT
 
     @property
-    def size(self) -> int:
-        """As of the conditional."""
-        return self.conditional.size
+    def inner(self) -> Conditional:
+        return self.conditional
+
+    def features(self, at: Linearisation) -> Features:
+        what, fix = "covariances without rigid motions have no features", "ask for them, or use the conditional"
+        raise InputError.of(what, fix=fix)
 
     def compared(self, points: Tensor, targets: Tensor, fit: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        """Points (M, 3) after the rigid motion that fits them best."""
         T = fit(points, targets)
         return points @ T[:3, :3].mT + T[:3, 3]
 
@@ -53,13 +56,11 @@ class WithoutRigidMotions(Conditional):
         return torch.cat([part.mT @ self.fit.mT for part in between])
 
     def posterior(self, at: Linearisation) -> Tensor:
-        """Posterior covariance of every configuration of a projected linearisation: (M, r, r)."""
         B = at.sensitivity[..., self.base]  # (M, r, 6)
         cross = self.with_motion(at).view(B.shape) @ B.mT
         return self.conditional.posterior(at) - cross - cross.mT + B @ self.motion @ B.mT
 
     def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
-        """Posterior covariance between two linearisations, by default the same: (M m, M' m')."""
         second = at if other is None else other
         B, B2 = (one.sensitivity.flatten(0, 1)[:, self.base] for one in (at, second))
         first = self.with_motion(at) @ B2.mT

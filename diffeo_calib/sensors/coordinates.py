@@ -16,8 +16,8 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few, listed
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake, rare_names
-from diffeo_calib.measurements.pose_frames import frames_of_points, transforms_of_frames, visible_rotation_numbers
-from diffeo_calib.measurements.poses import angle_between
+from diffeo_calib.measurements.pose_frames import frames_of_points
+from diffeo_calib.measurements.poses import angle_between, rotation_numbers
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.sockets import Sockets
@@ -181,8 +181,7 @@ class Poses(Positions):
         away = measured[..., :3, 3] - frames[..., :3, 3]
         angles = angle_between(frames[..., :3, :3], measured[..., :3, :3])
         angles = angles[:, 0] if angles.shape[1] == 1 else angles
-        turned = transforms_of_frames(measured[..., :3, :3] @ frames[..., :3, :3].mT, 0.0 * away)
-        turns = visible_rotation_numbers(turned, "rotvec", "rad").to(away)
+        turns = rotation_numbers(measured[..., :3, :3] @ frames[..., :3, :3].mT, "rotvec").to(away)
         return replace(whole, errors=away.norm(dim=-1), angles=angles, away=away, turns=turns)
 
 

@@ -22,7 +22,7 @@ from diffeo_calib.measurements.checks import numbers_of, rare_names
 from diffeo_calib.measurements.pose_frames import POINTS, of_frames
 from diffeo_calib.measurements.poses import poses_of_triangles
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
-from diffeo_calib.measurements.splits import FEWEST_PER_DEVICE
+from diffeo_calib.measurements.rows import FEWEST_PER_DEVICE
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import transforms, twist_transform
 

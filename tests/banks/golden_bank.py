@@ -1,6 +1,6 @@
 """Small calibrations of every kind of measurement, as numbers that a change of the code must leave as they are.
 
-The cases come first, then the numbers of a result, one function for each part of it.
+The cases come first, then the numbers of a result.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import numpy as np
 import reading_bank
 import torch
 import two_arms_bank
-from golden_verbs import used
 from mixture_bank import DISTANCES
 from product_bank import simulated_poses, usual_scales
 from simulated_camera import camera_arm
@@ -28,10 +27,9 @@ import diffeo_calib as dc
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.process.scales import GearLine
 from diffeo_calib.robots import SimulatedArm
-from diffeo_calib.robots.se3 import rotation
+from diffeo_calib.robots.se3 import rotation, twist_transform
 
 Rows = dc.Measurements | dc.Readings
-Result = dc.CalibrationResult
 Numbers = dict[str, Tensor]
 ROUNDING = 2.0**-52
 
@@ -204,28 +202,37 @@ def shaken(rows: Rows, seed: int) -> Rows:
     return with_attributes(rows, points=near(rows.points))
 
 
-def numbers(result: Result, rows: Rows, q: Tensor) -> Numbers:
-    """Every part of a result as tensors."""
-    parts = parameters, scales, tails, momenta, noise, values, left_out, certificates, stages
-    found: Numbers = {}
-    for part in parts:
-        found |= part(result)
-    return found | model(result, q) | devices(result) | errors(result, rows)
+def numbers(result: Any, rows: Any, q: Tensor) -> Numbers:
+    """What users see of a result, as tensors."""
+    mean, covariance = result.model.predict(q, noise=False)
+    left_out, geometry = result.leave_one_out, result.model.nominal.geometry
+    theta = result.fit.solution.momenta.theta
+    found = {f"theta, {name}": theta[part] for name, part in geometry.slices.items()}
+    found |= {"theta, gravity": theta[geometry.size :], **scales(result.selection.scales), **devices(result)}
+    wrong = [(one.row, one.marker or 0)[: 1 if result.readings else 2] for one in result.outliers]
+    return found | {
+        "k1": mean,
+        "slope": result.model.jacobian(q),
+        "covariance": covariance,
+        "noise of new rows": result.model.predict(q, noise=True)[1] - covariance,
+        "left out, errors": left_out.errors,
+        "left out, squares": left_out.squares,
+        "outliers": one(*(number for each in wrong for number in each)),
+        "evaluation": one(dc.evaluate(result.model, rows if result.readings else as_one(result, rows)).rms),
+    }
 
 
 def one(*values: float) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-def parameters(result: Result) -> Numbers:
-    """theta by its parts."""
-    theta, geometry = result.fit.solution.momenta.theta, result.model.nominal.geometry
-    found = {f"theta, {name}": theta[part] for name, part in geometry.slices.items()}
-    return {**found, "theta, gravity": theta[geometry.size :]}
+def as_one(result: Any, rows: Any) -> Any:
+    """Rows of all sessions in the frame of the first."""
+    aligned = result.aligned(rows)
+    return aligned.with_sessions(None) if result.sessions else aligned
 
 
-def scales(result: Result) -> Numbers:
-    found = result.selection.scales
+def scales(found: dc.Hyperparameters) -> Numbers:
     names = [name for name in vars(found) if name not in ("lines", "payload", "other_noise")]
     lines = [number for line in found.lines for number in (line.joint, line.frequency, line.amplitude)]
     own = {f"scales, {name}": getattr(found, name) for name in names}
@@ -233,123 +240,43 @@ def scales(result: Result) -> Numbers:
     return {**own, **noise, "scales, lines": one(*lines), "scales, payload": one(found.payload)}
 
 
-def tails(result: Result) -> Numbers:
-    if result.readings:
-        known, rows = result.identification.tails, [found.row for found in result.outliers]
-        return {"outliers": one(*rows), "geometry, weights": known.weights}
-    return {
-        "tails, inverse freedom": one(1 / result.tails.freedom),
-        "tails, weights": result.tails.weights,
-        "geometry, inverse freedom": one(1 / result.identification.tails.freedom),
-        "geometry, weights": result.identification.tails.weights,
-        "outliers": one(*(row for found in result.outliers for row in (found.row, found.marker or 0))),
-    }
-
-
-def momenta(result: Result) -> Numbers:
-    found = result.fit.solution.momenta
-    return {"momenta, b": found.joint, "momenta, p": found.task}
-
-
-def noise(result: Result) -> Numbers:
-    """Blocks of the noise, divided by the weights, and what rows share, whatever columns say it."""
-    found = result.fit.problem.noise
-    seen = found.visible.flatten().nonzero()[:, 0]
-    Z = found.shared.flatten(0, 1)[seen]
-    at = seen.new_tensor(np.random.default_rng(0).integers(0, len(seen), 40)) % len(seen)
-    blocks = found.covariance.diagonal(dim1=1, dim2=2).flatten()[seen]
-    return {"noise of rows": blocks.sqrt(), "noise that rows share": Z[at] @ Z[at].mT}
-
-
-def values(result: Result) -> Numbers:
-    """k1 at the rows of the fit."""
-    return {"k1 at the rows": result.model.map(result.model.map.x).detach()}
-
-
-def model(result: Result, q: Tensor) -> Numbers:
-    """k1, its slopes and posterior covariances."""
-    mean, covariance = result.model.predict(q, noise=False)
-    new = result.model.predict(q, noise=True)[1] - covariance
-    return {"k1": mean, "slope": result.model.jacobian(q), "covariance": covariance, "noise of new rows": new}
-
-
-def left_out(result: Result) -> Numbers:
-    found = result.leave_one_out
-    effective = one(found.effective or 0.0)
-    return {"left out, errors": found.errors, "left out, squares": found.squares, "effective parameters": effective}
-
-
-def certificates(result: Result) -> Numbers:
-    return {"energy": one(result.fit.energy), "field energy": one(result.fit.field_energy)}
-
-
-def stages(result: Result) -> Numbers:
-    """Registration and geometric calibration."""
-    known: Any = result.identification
-    found = {"geometry, theta": known.theta, "geometry, noise": one(known.noise)}
-    if result.readings:
-        return {**found, "rms of stages": one(result.registration.rms, known.rms)}
-    geometry = result.registration.geometry
-    return {
-        **found,
-        "registration, base": geometry.base,
-        "registration, tool": geometry.tool,
-        "geometry, deviations": known.deviations,
-        "rms of stages": one(result.registration.rms, known.rms),
-    }
-
-
-def devices(result: Result) -> Numbers:
+def devices(result: Any) -> Numbers:
     """Sockets, measuring frames, or devices of readings."""
     if result.readings:
-        return reading_devices(result)
+        (own,) = result.readings
+        at = {"devices": own.devices.constants, "devices, deviations": own.known}
+        return {**at, "expected error": one(result.expected.workspace)}
     found: Numbers = {}
     if result.sockets is not None:
-        found |= socket_places(result.sockets)
+        own = result.sockets
+        found |= {"sockets": own.positions, "sockets, covariance": own.covariance}
+        found["sockets left out, spread"] = one(*(place.spread for place in own.left_out))
+        found["expected error"] = one(own.workspace_deviation)
     if result.sessions is not None:
         found["frames of sessions"] = result.sessions.transforms
     return found
 
 
-def socket_places(found: Any) -> Numbers:
-    spreads = one(*(place.spread for place in found.left_out))
-    distances = one(*(error for place in found.left_out for error in place.distance_errors))
-    return {
-        "sockets": found.positions,
-        "sockets, covariance": found.covariance,
-        "sockets left out, spread": spreads,
-        "sockets left out, distances": distances,
-        "expected error": one(found.workspace_deviation),
-    }
+# --- what is done with a calibration --------------------------------------------------------------------------------
 
 
-def reading_devices(result: Result) -> Numbers:
-    (found,), expected = result.readings, result.expected
-    (registered,), (identified,), _ = result.placed.devices_by_stage
-    assert found.known is not None
-    return {
-        "devices": found.devices.constants,
-        "devices, deviations": found.known,
-        "devices, geometry": identified.constants,
-        "devices, registration": registered.constants,
-        "expected error": one(expected.workspace),
-        "size": one(expected.size, expected.size_share),
-    }
+def from_elsewhere(arm: SimulatedArm, rows: int, seed: int) -> dc.Measurements:
+    """New rows of a device that stands in another place."""
+    T = twist_transform(one(0.4, -0.2, 0.3, 0.2, 0.5, -0.3))
+    q, points = arm.measure(rows, seed=seed)
+    return dc.Measurements(q, points @ T[:3, :3].mT + T[:3, 3], arm.nominal.joint_names)
 
 
-def errors(result: Result, rows: Rows) -> Numbers:
-    """What summary and evaluation say."""
-    if isinstance(rows, dc.Readings):
-        own = reading_bank.reading_errors(result, rows)
-        return {"errors": own, "evaluation": one(dc.evaluate(result.model, rows).rms)}
-    summary, parts = result.model.summary, one(*(part.displacement for part in result.parts))
-    assert summary is not None
-    stages = summary.registration_rms, summary.geometry_rms, summary.diffeomorphic_rms, summary.leave_one_out_rms
-    known = (value for value in stages if value is not None)
-    aligned = result.aligned(rows)  # pyright: ignore[reportArgumentType]
-    evaluated = dc.evaluate(result.model, aligned.with_sessions(None) if result.sessions else aligned)
-    return {
-        "rms": one(*known),
-        "parts": parts,
-        "evaluation": one(evaluated.rms),
-    }
+def used(arm: SimulatedArm, result: Any) -> Numbers:
+    """Registered by ten rows, recalibrated by twenty; each with its tool."""
+    q, tool = arm.sample(5, seed=78), torch.eye(4, dtype=torch.float64)
+    tool[2, 3] = 0.1
+    model = result.model.with_tool(tool)
+    again = dc.recalibrate(model, from_elsewhere(arm, 20, seed=12))
+    found: Numbers = {"recalibrated, transform": again.moved.transform}
+    registered = model.registered(from_elsewhere(arm, 10, seed=11))
+    for name, one_model in (("registered", registered), ("recalibrated", again.model)):
+        mean, covariance = one_model.predict(q, noise=False)
+        found |= {f"{name}, k1": mean, f"{name}, covariance": covariance, f"{name}, tool": one_model.tool_poses(q)}
+        found[f"{name}, evaluation"] = one(dc.evaluate(one_model, from_elsewhere(arm, 15, seed=13)).rms)
+    return found

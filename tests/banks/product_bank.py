@@ -183,24 +183,6 @@ def joint_covariance(scales: dc.Hyperparameters, x: Tensor, other: Tensor, perio
     return scales.transmission_amplitude**2 * own + scales.coupled_amplitude**2 * (-every / 2).exp()
 
 
-def prior_covariance(
-    scales: dc.Hyperparameters, geometry: Geometry, deviations: Tensor, x: Tensor, other: Tensor
-) -> Tensor:
-    """G(x, x') = Dk0 K_V Dk0^T + K_W + S Lambda^-1 S^T: (M m, N m), coordinates of one configuration adjacent."""
-    J, L = (geometry.jacobian(at).flatten(1, 2) for at in (x, other))
-    S, T = (geometry.sensitivities(at).flatten(0, 2) * deviations for at in (x, other))
-    y, z = geometry.points(x), geometry.points(other)
-    K = joint_covariance(scales, x, other, geometry.chain.periodic)
-    G = torch.einsum("ial,ijl,jbl->iajb", J, K, L)
-    for k in range(geometry.markers):
-        for h in range(geometry.markers):
-            r2 = (y[:, None, k] - z[None, :, h]).square().sum(-1) / scales.task_lengthscale**2
-            value = scales.task_amplitude**2 * (-r2 / 2).exp()
-            for axis in range(3):
-                G[:, 3 * k + axis, :, 3 * h + axis] += value
-    return G.reshape(S.shape[0], T.shape[0]) + S @ T.T
-
-
 def noise_blocks(scales: dc.Hyperparameters, geometry: Geometry, x: Tensor) -> Tensor:
     """R_i = (sigma^2 + (0.1 um)^2) I + Dk0 diag(s^2) Dk0^T: (N, m, m)."""
     J = geometry.jacobian(x).flatten(1, 2)

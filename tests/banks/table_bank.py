@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from diffeo_calib.common.errors import DiffeoCalibError
 from diffeo_calib.measurements.csv.files import read_observations
 from diffeo_calib.measurements.poses import transforms
 from diffeo_calib.measurements.table import Measurements
@@ -51,6 +53,13 @@ def held(tensor: Tensor | None) -> Tensor:
     """A tensor that must be there."""
     assert tensor is not None
     return tensor
+
+
+def refused(*cases: tuple[str, Callable[[], object]]) -> None:
+    """Each call raises an error of the package whose message matches."""
+    for message, call in cases:
+        with pytest.raises(DiffeoCalibError, match=message):
+            call()
 
 
 def says(*parts: str) -> str:

@@ -1,23 +1,101 @@
-"""The benchmark on real robots: methods, records, and the program."""
+"""The benchmark on real robots: data sets, splits, methods, records, means, and the program."""
 
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import baselines
 import harness
+import learning_curves
+import numpy as np
 import protocols
 import pytest
 import real_robots
 import torch
-from real_robots_bank import arm_data
-from robot_data import RobotData
+from harness import Record
+from robot_data import DESCRIPTOR, RobotData, find, read
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import DiffeoCalibError
+from diffeo_calib.common.errors import DiffeoCalibError, InputError
+from diffeo_calib.measurements.csv.files import write_measurements
+from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import rotation, transforms
 from diffeo_calib.robots.simulated_arm import SimulatedArm
+
+QUARTER = math.pi / 2
+TABLE = [[0.0, QUARTER, 0.3], [0.0, -QUARTER, 0.4], [0.0, 0.0, 0.2, 0.3, "prismatic"], [0.1, QUARTER, 0.1], [0, 0, 0.1]]
+COLUMNS = ["q1", "q2", "q3", "q4", "q5"]
+DH = {
+    "robot": {"dh": TABLE, "convention": "standard"},
+    "csv": "table.csv",
+    "joints": COLUMNS,
+    "position": [["ax", "ay", "az"], ["bx", "by", "bz"]],
+    "length": "mm",
+    "angle": "deg",
+    "sep": ";",
+    "decimal": ",",
+}
+
+
+def sliding() -> tuple[dc.Chain, dc.Measurements]:
+    """A robot with a slide and two markers on its tool."""
+    robot = dc.from_dh(TABLE, names=COLUMNS)
+    rng = np.random.default_rng(0)
+    q = torch.from_numpy(rng.uniform((-2, -2, 0.1, -2, -2), (2, 2, 0.6, 2, 2), (40, 5)))
+    tool = torch.tensor([[0.05, 0.02, 0.1], [-0.04, 0.0, 0.06]], dtype=torch.float64)
+    points = tool @ robot(q)[:, :3, :3].mT + robot(q)[:, None, :3, 3]
+    return robot, dc.Measurements(q, points, COLUMNS)
+
+
+def arm_data(rows: int, **options: int) -> tuple[dc.Chain, dc.Measurements, dc.Measurements]:
+    arm = SimulatedArm(seed=1, **options)
+    q, points = arm.measure(rows + 100, seed=2)
+    return arm.nominal, dc.Measurements(q[:rows], points[:rows]), dc.Measurements(q[rows:], points[rows:])
+
+
+# --- fixtures -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Three data sets: a DH table with two markers, a URDF with columns of other names, and no data set."""
+    robot, data = sliding()
+    for name in ("dh", "urdf", "neither"):
+        (tmp_path / name).mkdir()
+    table = TableFormat("mm", "deg", ";", ",")
+    write_measurements(tmp_path / "dh" / "table.csv", data, table, joints=robot, position=DH["position"])
+    (tmp_path / "dh" / DESCRIPTOR).write_text(json.dumps(DH))
+    arm = SimulatedArm(seed=3)
+    arm.write_urdf(tmp_path / "urdf" / "arm.urdf")
+    columns = [f"angle {k}" for k in range(6)]
+    measured = dc.Measurements(*arm.measure(30))
+    write_measurements(tmp_path / "urdf" / "table.csv", measured, TableFormat("m", "rad"), joints=columns)
+    entries = {
+        "robot": {"urdf": "arm.urdf", "base": "base_link", "tip": "flange"},
+        "csv": "table.csv",
+        "joints": columns,
+        "position": ["x", "y", "z"],
+        "length": "m",
+        "angle": "rad",
+    }
+    (tmp_path / "urdf" / DESCRIPTOR).write_text(json.dumps(entries))
+    return tmp_path
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Learners of little effort."""
+    monkeypatch.setattr(baselines, "RESTARTS", 0)
+    monkeypatch.setattr(baselines, "TREES", baselines.TREES | {"n_estimators": 30})
+    monkeypatch.setattr(baselines, "GRID_TREES", {"max_depth": (3,)})
+    monkeypatch.setattr(baselines, "GRID_NETWORK", {"hidden_layer_sizes": ((8,),), "alpha": (1.0, 10.0)})
+    monkeypatch.setattr(baselines, "NETWORK_STEPS", 50)
+
+
+# --- methods, records, the program ----------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -38,22 +116,6 @@ def test_every_method_on_a_small_arm() -> None:
     assert error["GP alone"] > error["registration"]  # without a robot, 60 poses are few
     assert 0.7 < float(str(records["diffeo_calib"]["coverage_95"])) <= 1.0
     assert set(real_robots.COLUMNS) - set(records["geometry"]) == set()
-
-
-def test_a_failure_is_a_record(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: object) -> baselines.Fitted:
-        raise ValueError("not today")
-
-    def missing(*_: object) -> baselines.Fitted:
-        raise ModuleNotFoundError("No module named 'sklearn'", name="sklearn")
-
-    robot, train, test = arm_data(20)
-    split = protocols.Split("curve", "20", 0, train, test)
-    for method, word in ((broken, "not today"), (missing, "pip install")):
-        monkeypatch.setitem(baselines.METHODS, "geometry", method)
-        record = real_robots.attempt(RobotData("arm", robot, train), split, "geometry")
-        assert word in str(record["note"])
-        assert "rms_mm" not in record
 
 
 def test_errors_of_orientations_are_recorded() -> None:
@@ -92,23 +154,107 @@ def test_the_program(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     out.write_text('{"records": [{"backend": "tiled"}]}')
     with pytest.raises(DiffeoCalibError, match="records of this program"):
         harness.earlier([out], real_robots.KEY)
-    out.write_text("[]")
-    with pytest.raises(DiffeoCalibError, match="cannot be read"):
-        harness.earlier([out], real_robots.KEY)
 
 
-def test_an_unwritable_figure_is_refused_before_the_work(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.argv", ["real_robots.py", "--data", str(folder), "--figure", str(folder / "x" / "y.png")])
-    with pytest.raises(SystemExit, match="error: the figure cannot be written"):
-        harness.guarded(lambda: real_robots.run(real_robots.arguments()))
+# --- data sets ------------------------------------------------------------------------------------------------------
 
 
-def test_unwritable_records_are_refused_before_the_work(tmp_path: Path) -> None:
-    with pytest.raises(DiffeoCalibError, match="cannot be written"):
-        harness.report(iter([]), tmp_path / "none" / "x.json")
+def test_data_sets_of_a_folder(folder: Path) -> None:
+    found = find(folder)
+    assert list(found) == ["dh", "urdf"]
+    robot, data = sliding()
+    two = read(folder / "dh", found["dh"])
+    assert two.robot.kinds == robot.kinds
+    torch.testing.assert_close(two.measurements.points, data.points, rtol=0, atol=1e-12)
+    torch.testing.assert_close(two.measurements.q, data.q, rtol=0, atol=1e-12)
+    arm = read(folder / "urdf", found["urdf"])
+    assert arm.measurements.joint_names == arm.robot.joint_names
+    assert list(find(folder, ["urdf"])) == ["urdf"]
 
 
-def test_quick() -> None:
-    plan = real_robots.arguments(["--quick"])
-    assert (plan.protocol, plan.sizes, plan.seeds) == (["curve"], [60, 150], 1)
-    assert plan.methods == ["registration", "geometry", "diffeo_calib"]
+def test_bad_descriptors(folder: Path) -> None:
+    descriptor = folder / "dh" / DESCRIPTOR
+    changes: tuple[dict[str, object], ...] = (
+        *({"lenght": "mm"}, {"sep": 1}, {"robot": {"dh": []}}, {"robot": {"dh": 3, "convention": "craig"}}),
+        {"rotation": {"columns": []}},
+    )
+    for change in changes:
+        descriptor.write_text(json.dumps(DH | change))
+        with pytest.raises(InputError, match=f"(?=.*dataset.json)(?=.*({next(iter(change))}|'dh' in))"):
+            find(folder)
+    for text in ("{", "[1]", "", json.dumps({name: value for name, value in DH.items() if name != "joints"})):
+        descriptor.write_text(text)
+        with pytest.raises(InputError, match=r"dataset\.json"):
+            find(folder)
+
+
+# --- splits ---------------------------------------------------------------------------------------------------------
+
+
+def repeated() -> dc.Measurements:
+    """50 configurations, each measured twice."""
+    q, points = SimulatedArm(seed=1).measure(50)
+    return dc.Measurements(torch.cat([q, q + 1e-5]), torch.cat([points, points + 1e-6]))
+
+
+def keys(data: dc.Measurements) -> set[tuple[float, ...]]:
+    return {tuple(row) for row in data.q.mul(1e3).round().tolist()}
+
+
+def test_repeats_stay_on_one_side_and_all_rows_are_used() -> None:
+    data = repeated()
+    found = list(protocols.splits(data, protocols.PROTOCOLS, [30, None], seeds=2))
+    assert [(split.protocol, split.size, split.index) for split in found] == [
+        *(("kfold", "all", fold) for fold in range(5)),
+        *(("curve", size, seed) for seed in range(2) for size in ("30", "all")),
+        ("extrapolate", "all", 0),
+    ]
+    for split in found:
+        assert keys(split.train).isdisjoint(keys(split.test))
+        assert len(split.train) == (30 if split.size == "30" else 100 - len(split.test))
+
+
+def test_curves_are_nested_and_drawn_from_the_same_split() -> None:
+    data = repeated()
+    small, large, whole = protocols.curve(data, [60, 30, 5000, None], seed=1)
+    train, test = data.split(0.7, 1)
+    assert [len(split.train) for split in (small, large, whole)] == [30, 60, len(train)]
+    assert keys(small.train) < keys(large.train) <= keys(train)
+    for split in (small, large, whole):
+        assert torch.equal(split.test.q, test.q)
+
+
+# --- peers ----------------------------------------------------------------------------------------------------------
+
+
+def test_joint_offsets_are_recovered() -> None:
+    """A slide and turning joints, two markers; offsets that base and tool can replace are not compared."""
+    robot, data = sliding()
+    truth = torch.tensor([0.02, -0.01, 4e-3, 0.015, -0.03], dtype=torch.float64)
+    true = Geometry.nominal(robot, 2)
+    points = data.points.new_tensor([[0.05, 0.02, 0.1], [-0.04, 0.0, 0.06]])
+    poses = robot(data.q + truth)
+    seen = points @ poses[:, :3, :3].mT + poses[:, None, :3, 3]
+    geometry, offsets = baselines.with_offsets(robot, dc.Measurements(data.q, seen))
+    assert float((geometry.points(data.q) - seen).norm(dim=-1).max()) < 1e-9
+    assert offsets[1:4] == pytest.approx(truth[1:4].numpy(), abs=1e-7)
+    turned = geometry.joint_errors @ torch.linalg.inv(true.joint_errors)
+    assert float(turned[[0, 1, 3, 4], :3, 3].abs().max()) < 1e-12  # nothing but turns about the joints' own axes
+    own = (turned[..., :3, :3] @ robot.axes[..., None])[..., 0]
+    assert float((own - robot.axes).abs().max()) < 1e-12
+
+
+# --- means ----------------------------------------------------------------------------------------------------------
+
+
+def test_means_over_seeds() -> None:
+    same: Record = {"dataset": "arm", "protocol": "curve", "size": "60", "train": 60.0, "test": 60}
+    records = [
+        same | {"method": method, "fold_or_seed": seed, "rms_mm": level * (1 + 0.1 * seed), "note": None}
+        for method, level in (("diffeo_calib", 0.2), ("geometry", 0.4))
+        for seed in range(3)
+    ]
+    failed = same | {"method": "geometry", "fold_or_seed": 3, "note": "failed"}
+    rows = learning_curves.summary([*records, failed])
+    found = [(row["method"], row["runs"], row["failed"], row["rms_mm"]) for row in rows]
+    assert found == [("geometry", 3, 1, pytest.approx(0.44)), ("diffeo_calib", 3, 0, pytest.approx(0.22))]

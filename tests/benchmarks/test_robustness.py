@@ -10,10 +10,9 @@ import model_files
 import pytest
 import tables
 import urdfs
-from fuzzing import Outcome, defects, judged
+from fuzzing import defects
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError, warn_user
 
 pytestmark = pytest.mark.slow  # several calibrations
 
@@ -45,30 +44,6 @@ def test_commands() -> None:
     assert not [one for seed in seeds for one in defects("commands.py", commands.case, range(seed, seed + 1))]
 
 
-def test_outcomes() -> None:
-    """What the programs call a defect."""
-
-    def fail() -> str:
-        raise KeyError("x")
-
-    def refuse() -> str:
-        raise InputError.of("`q`", expected="numbers", got="x")
-
-    def mumble() -> str:
-        raise InputError("two\nlines")
-
-    def warn() -> str:
-        warn_user("Something looks wrong.")
-        return "wrong, but not silently"
-
-    endings = {fail: Outcome.traceback, refuse: Outcome.refused, mumble: Outcome.traceback, warn: Outcome.warned}
-    for work, outcome in endings.items():
-        assert judged(work)[0] is outcome
-    assert judged(lambda: "")[0] is Outcome.right
-    assert judged(lambda: "far off")[0] is Outcome.wrong
-    assert [outcome.name for outcome in Outcome if outcome.defect] == ["traceback", "hang", "wrong"]
-
-
 def test_a_wrong_axis_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pinocchio is the second opinion: a reader that takes every axis for x is found out."""
     honest = dc.load_urdf
@@ -80,9 +55,3 @@ def test_a_wrong_axis_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(dc, "load_urdf", careless)
     assert any("SILENTLY WRONG" in one for one in defects("urdfs.py", urdfs.case, range(20)))
-
-
-def test_a_wrong_unit_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Python's own `csv` and `float` are the second opinion on tables."""
-    monkeypatch.setitem(tables.FACTORS, "mm", 1.0)
-    assert any("SILENTLY WRONG" in one for one in defects("tables.py", tables.case, range(1, 20)))

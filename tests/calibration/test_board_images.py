@@ -1,7 +1,8 @@
-"""A robot by images of a printed board: truth, both places of the camera, and tables that are not what they seem."""
+"""A robot by images of a printed board, alone and beside a tracker or sockets: truth, scale, and what is refused."""
 
 from __future__ import annotations
 
+import copy
 import warnings
 from dataclasses import replace
 from functools import cache
@@ -10,9 +11,12 @@ from typing import Any
 import pytest
 import torch
 from golden_bank import camera_on_tool
-from kind_bank import rigid_rms
-from simulated_camera import HEIGHT, WIDTH, CameraArm, camera_arm, fixed_camera_arm, true_camera
+from kind_bank import kind_named, rigid_rms
+from simulated_camera import BOARD_PRIOR, HEIGHT, WIDTH, CameraArm, camera_arm, true_camera
+from simulated_sockets import rest_in_sockets
+from table_bank import refused
 from torch import Tensor
+from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.placing.place import place
@@ -21,7 +25,11 @@ from diffeo_calib.cameras.images import UNKNOWNS
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.csv.files import read_observations, write_measurements
+from diffeo_calib.measurements.poses import LEVER, mark_points, poses_from_marks
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.se3 import rotation, transforms
+from diffeo_calib.sensors.beside_poses import Contacts, Trackers
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 
@@ -55,9 +63,6 @@ def error_mm(model: Any, seen: CameraArm | None = None) -> float:
     return 1e3 * rigid_rms(model(seen.q).detach(), seen.arm.true_points(seen.q))
 
 
-# --- truth ----------------------------------------------------------------------------------------------------------
-
-
 def test_pixels_are_better_than_poses() -> None:
     camera: Any = data().poses
     poses = dc.Measurements.from_poses(data().q, torch.linalg.inv(camera), data().joint_names, camera_on_tool=True)
@@ -70,46 +75,20 @@ def test_lens_and_board_are_found_with_the_robot() -> None:
     truth, deviations = true_camera().unknowns, camera.deviations
     assert float(((camera.unknowns - truth) / deviations).abs().max()) < 4.5
     before = data().camera
-    assert before is not None
     assert bool((deviations <= 1.001 * before.deviations).all())  # rows of the robot can only add
     assert float(deviations[UNKNOWNS.index("scale")]) < 0.999 * float(before.deviations[UNKNOWNS.index("scale")])
 
 
-def test_a_fixed_camera_sees_the_board_on_the_tool() -> None:
-    seen = fixed_camera_arm(60, seed=2)
-    rows = seen.images(NOISE_PX, on_tool=False)
-    assert rows.board is None
-    found = dc.calibrate(seen.arm.nominal, rows, hyperparameters=SCALES)
-    nominal = error_mm(found.registration.geometry.points, seen)
-    assert error_mm(found.model, seen) < min(0.25 * nominal, 0.3)
-
-
-# --- a table that is not what it seems ------------------------------------------------------------------------------
-
-
 def test_a_mirrored_board_is_the_same_board_from_behind() -> None:
-    corners = data().corners
-    assert corners is not None
+    corners: Any = data().corners
     mirrored = corners.clone()
     mirrored[..., 0] *= -1
     found = dc.calibrate(arm().arm.nominal, of_corners(mirrored), hyperparameters=SCALES)
     assert abs(error_mm(found.model) / error_mm(calibrated().model) - 1) < 0.02
 
 
-@pytest.mark.parametrize("factor", [0.97, 1.04])
-def test_a_board_of_another_size_is_warned_about(factor: float) -> None:
-    corners = data().corners
-    assert corners is not None
-    wrong = corners.clone()
-    wrong[..., :3] *= factor
-    percent = "smaller" if factor < 1 else "larger"
-    with pytest.warns(dc.DiffeoCalibWarning, match=rf"size of the board.*{percent}.*caliper"):
-        place(arm().arm.nominal, of_corners(wrong), silent)
-
-
 def test_a_board_of_nearly_the_right_size_is_named() -> None:
-    corners = data().corners
-    assert corners is not None
+    corners: Any = data().corners
     wrong = corners.clone()
     wrong[..., :3] *= 0.988
     with warnings.catch_warnings(record=True) as caught:
@@ -120,25 +99,28 @@ def test_a_board_of_nearly_the_right_size_is_named() -> None:
     assert not any(line.startswith("not decided") for line in calibrated().placement.sentences())
 
 
-def test_images_in_another_order_are_refused() -> None:
-    corners = data().corners
-    assert corners is not None
-    with pytest.raises(MeasurementError, match="row"):
-        dc.calibrate(arm().arm.nominal, of_corners(corners.roll(1, 0)))
+def test_tables_that_cannot_be() -> None:
+    corners: Any = data().corners
+    small = replace(true_camera(), half_size=0.0, width=640, height=480)
+    refused(
+        ("row", lambda: dc.calibrate(arm().arm.nominal, of_corners(corners.roll(1, 0)))),
+        ("640 x 480", lambda: of_corners(corners, camera=small)),
+        ("640 x 480", lambda: dc.Measurements.from_images(data().q, corners, (640, 480))),
+        (r"corners.*\(N, K, 5\)", lambda: of_corners(torch.zeros(60, 35))),
+        (r"corners.*\(N, K, 5\)", lambda: of_corners(torch.zeros(60, 35, 4))),
+    )
 
 
 def test_joints_that_still_moved_are_warned_about() -> None:
     q = data().q.clone()
     q[1:] = 0.9 * data().q[1:] + 0.1 * data().q[:-1]
-    corners = data().corners
-    assert corners is not None
+    corners: Any = data().corners
     with pytest.warns(dc.DiffeoCalibWarning, match="do not fit this robot"):
         place(arm().arm.nominal, of_corners(corners, q), silent)
 
 
 def test_the_lens_of_another_camera_is_refused() -> None:
     corners, camera = data().corners, true_camera()
-    assert corners is not None
     other = camera.unknowns.clone()
     known = replace(camera, half_size=0.0)
     of_corners(corners, camera=known)
@@ -150,30 +132,6 @@ def test_the_lens_of_another_camera_is_refused() -> None:
         of_corners(corners, camera=replace(known, unknowns=other))
 
 
-def test_a_camera_of_another_image_size_is_refused() -> None:
-    corners = data().corners
-    assert corners is not None
-    known = replace(true_camera(), half_size=0.0, width=640, height=480)
-    with pytest.raises(MeasurementError, match="640 x 480"):
-        of_corners(corners, camera=known)
-
-
-def test_resized_images_are_refused_by_their_corners() -> None:
-    corners = data().corners
-    assert corners is not None
-    with pytest.raises(MeasurementError, match="640 x 480"):
-        dc.Measurements.from_images(data().q, corners, (640, 480))
-
-
-@pytest.mark.parametrize("shape", [(60, 35), (60, 35, 4)])
-def test_corners_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
-    with pytest.raises(MeasurementError, match=r"corners.*\(N, K, 5\)"):
-        of_corners(torch.zeros(shape))
-
-
-# --- files ----------------------------------------------------------------------------------------------------------
-
-
 def test_lines_of_an_image_with_other_joints_are_refused(tmp_path: Any) -> None:
     path = tmp_path / "corners.csv"
     table = write_measurements(path, data(), TableFormat("mm", "deg", camera_on_tool=True))
@@ -183,3 +141,111 @@ def test_lines_of_an_image_with_other_joints_are_refused(tmp_path: Any) -> None:
     path.write_text("\n".join([*lines[:3], ",".join(cells), *lines[4:]]))
     with pytest.raises(MeasurementError, match=r"image '0'.*line 4"):
         read_observations(path, table)
+
+
+# --- beside a tracker, and beside a ball in sockets -------------------------------------------------------------------
+
+
+SCALE = UNKNOWNS.index("scale")
+
+
+def kind() -> Any:
+    return kind_named("images and a tracker")
+
+
+def camera() -> Any:
+    return next(iter(next(own for own in kind().model.placement if own.cameras).cameras.values())).camera
+
+
+def drawn_bodies(rows: int = 12) -> Tensor:
+    draw = torch.randn(rows, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    return transforms(rotation(draw[:, 3:]), 0.4 * draw[:, :3])
+
+
+@cache
+def with_sockets() -> tuple[Any, Any]:
+    """Images, then rows in sockets, and the socket of every such row."""
+    seen, ball = camera_arm(60), SimulatedArm(seed=1)
+    arm = copy.copy(seen.arm)
+    arm.truth = replace(arm.truth, base=torch.eye(4, dtype=torch.float64), tool=ball.truth.tool, on=ball.truth.on)
+    resting = rest_in_sockets(arm, places=2, rows=10)
+    rows = dc.Measurements.from_sockets(resting.q, resting.names, arm.nominal.joint_names)
+    return seen, dc.Observations.joined([seen.images(0.1), rows])  # pyright: ignore
+
+
+def test_a_tracker_is_found_from_poses_of_the_tool() -> None:
+    bodies, B = drawn_bodies(), drawn_bodies(1)[0]
+    B[:3, 3] += 3.0
+    marker = B.new_tensor([0.05, -0.12, 0.1])
+    truth = torch.cat([B[:3].flatten(), marker])
+    values = torch.stack([Trackers.read(truth, body) for body in bodies])
+    assert_close(values, ((bodies[:, :3, :3] @ marker + bodies[:, :3, 3]) @ B[:3, :3].mT) + B[:3, 3])
+    found = Trackers.start(values, bodies)
+    tracker = Trackers(("device",), found[None], found.new_full((9,), 0.1))
+    data = dc.Readings.of("marker", torch.zeros(len(values), 6), values, numbers=3, doubt=False)
+    marks = mark_points(bodies, LEVER).flatten(1)
+    assert_close(tracker.refined(data, marks).constants[0], truth, rtol=0, atol=1e-6)
+
+
+def test_socket_and_ball_are_found_from_poses_of_the_tool() -> None:
+    bodies = drawn_bodies()
+    ball, socket = bodies.new_tensor([0.01, 0.02, 0.15]), bodies.new_tensor([0.6, 0.1, 0.3])
+    bodies[:, :3, 3] = socket - bodies[:, :3, :3] @ ball
+    found = Contacts.start(torch.zeros_like(bodies[:, :3, 3]), bodies)
+    assert_close(found, torch.cat([socket, ball]), rtol=0, atol=1e-9)
+
+
+def test_the_size_comes_from_board_and_tracker() -> None:
+    truth, own = camera_arm(60).camera, camera()
+    assert float(own.deviations[SCALE]) < 0.4 * BOARD_PRIOR.scale
+    assert abs(float(own.unknowns[SCALE] - truth.unknowns[SCALE])) < 4 * float(own.deviations[SCALE])
+    said = " ".join(kind().result.placement.sentences())
+    assert "lengths are its own and the board's" in said
+
+
+def test_the_marker_is_where_it_is_on_the_tool() -> None:
+    placed = next(own for own in kind().model.placement if own.kind == "marker")
+    on_flange = poses_from_marks(camera_arm(60).arm.truth.tool[None], LEVER)[0]
+    marker = torch.linalg.inv(on_flange) @ torch.cat([SimulatedArm(seed=1).truth.tool[0], torch.ones(1)])
+    away = placed.constants[0, 12:] - marker[:3]
+    assert bool((away.abs() < 4 * placed.deviations[0, 6:]).all())
+    assert float(placed.deviations[0, 6:].max()) < 1e-4
+
+
+def test_the_tracker_makes_the_workspace_known() -> None:
+    images: Any = kind().data.parts[0]
+    alone = dc.calibrate(kind().robot, images, hyperparameters=kind().scales)
+    assert kind().result.expected.workspace < 0.5 * alone.expected.workspace
+    q = kind().source.golden.rows.parts[1].q
+    truth = kind().source.truth(q)
+    assert rigid_rms(kind().model(q).detach(), truth) < 0.5 * rigid_rms(alone.model(q).detach(), truth)
+
+
+@pytest.mark.slow
+def test_sockets_are_where_they_are() -> None:
+    rows = with_sockets()[1]
+    found = dc.calibrate(kind().robot, rows, hyperparameters=kind().scales)
+    placed = next(own for own in found.model.placement if own.kind == "contact")
+    assert placed.names == ("0/0", "0/1", "1/0", "1/1")
+    places, std = placed.constants[:, :3], placed.deviations[:, :3].norm(dim=1)
+    for first in (0, 2):  # the sockets of a block are 50 mm apart, which nobody said
+        length = float((places[first] - places[first + 1]).norm())
+        assert abs(length - 0.05) < 4 * float(std[first : first + 2].norm())
+    assert float(std.max()) < 1e-3
+
+
+def test_known_distances_that_are_not_used_are_named() -> None:
+    rows = with_sockets()[1]
+    resting = dc.Measurements.from_sockets(
+        rows.parts[1].q, rows.parts[1].device_names, distances={("0", "1"): 0.05}, distance_std=1e-5
+    )
+    images: Any = camera_arm(60).images(0.1)
+    with pytest.warns(dc.DiffeoCalibWarning, match="distances between sockets"):
+        dc.Observations.joined([images.with_joint_names(rows.joint_names), resting.with_joint_names(rows.joint_names)])
+
+
+def test_too_few_contacts_of_a_socket_are_refused() -> None:
+    rows = with_sockets()[1]
+    few = dc.Observations.joined([rows.parts[0], rows.parts[1].rows(slice(0, 3))])
+    with pytest.raises(MeasurementError, match=r"at least 8 rows of each device"):
+        dc.calibrate(kind().robot, few, hyperparameters=kind().scales)

@@ -44,28 +44,6 @@ def test_rigid_motions_are_errors_of_a_model_in_the_frame_of_a_device_alone(case
         assert found["away"] > 0.03
 
 
-def test_the_workspace_is_drawn_once_within_the_ranges_of_the_rows() -> None:
-    fitted = calibrated(golden_bank.positions()).model.map
-    q = fitted.everywhere
-    assert torch.equal(q, fitted.everywhere)
-    assert bool(((q >= fitted.x.amin(0)) & (q <= fitted.x.amax(0))).all())
-    assert bool((q.amax(0) - q.amin(0) > 0.9 * (fitted.x.amax(0) - fitted.x.amin(0))).all())
-    free = fitted.without_rigid_motions()
-    assert torch.equal(free.workspace, q)
-    less = workspace_deviation(free)
-    assert less < workspace_deviation(fitted)
-    assert free.unregistered is free
-
-
-def test_residual_and_shifts_of_a_fit_leave_its_noise() -> None:
-    """R^-1 (y - h(k1)) = R_i^-1 (y - h(k1) - Z c), for sessions."""
-    fit = calibrated(golden_bank.sessions()).fit
-    noise = fit.problem.noise
-    own = torch.linalg.solve(noise.covariance, (fit.residual - noise.shared @ fit.shifts)[..., None])[..., 0]
-    torch.testing.assert_close(noise.solve(fit.residual), own, rtol=1e-6, atol=1e-6 * float(own.abs().max()))
-    assert float(fit.shifts.norm()) > 0
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["tool never turned"])
 def test_a_marker_that_the_rows_leave_open_is_no_error_of_the_robot(name: str) -> None:

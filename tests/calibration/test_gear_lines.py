@@ -1,12 +1,16 @@
-"""Gear lines of simulated arms: planted ones are found, none where there is none, none where they are ambiguous."""
+"""Gear lines of simulated arms, and scales of other robots of the same type."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from math import pi
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from table_bank import refused
 from tangent_bank import covariance
 from torch import Tensor
 
@@ -14,13 +18,83 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.scales.gear_lines import LIMITS, _fall, _Scan, find_gear_lines
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
+from diffeo_calib.calibration.scales.of_models import scales_of_models
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.process.scales import Hyperparameters
+from diffeo_calib.process.scales import DEVIATIONS, SCALES, Hyperparameters
 from diffeo_calib.process.tails import Tails
-from diffeo_calib.robots.simulated_arm import SimulatedArm
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.dh import from_dh
+
+ROWS = 16
+
+
+def measured(seed: int) -> tuple[SimulatedArm, dc.Measurements]:
+    arm = SimulatedArm(seed=seed)
+    return arm, dc.Measurements(*arm.measure(ROWS))
+
+
+@pytest.fixture(scope="module")
+def first() -> dc.CalibrationResult:
+    arm, data = measured(0)
+    return dc.calibrate(arm.nominal, data)
+
+
+@pytest.fixture(scope="module")
+def second(first: dc.CalibrationResult) -> dc.CalibrationResult:
+    arm, data = measured(1)
+    return dc.calibrate(arm.nominal, data, scales_of=[first.model])
+
+
+def with_scales(model: CalibratedKinematics, scales: torch.Tensor | None) -> CalibratedKinematics:
+    return model._with(scales=scales)
+
+
+def test_scales_are_those_of_the_other_model_but_for_one_factor(
+    first: dc.CalibrationResult, second: dc.CalibrationResult
+) -> None:
+    ours, theirs = second.selection.scales, first.selection.scales
+    factor = float(ours.sensor_noise / theirs.sensor_noise)
+    torch.testing.assert_close(ours.vector, theirs.inflated(factor).vector)
+    assert "1 other model" in second.selection.status
+
+
+def test_scales_survive_the_file_and_its_placing(first: dc.CalibrationResult, tmp_path: Path) -> None:
+    dc.save(first.model, tmp_path / "model.safetensors")
+    loaded = dc.load(tmp_path / "model.safetensors")
+    assert isinstance(loaded, CalibratedKinematics)
+    for model in (first.model, loaded, loaded.with_tool([0.0, 0.0, 0.1])):
+        torch.testing.assert_close(model.scales, first.selection.scales.vector)
+
+
+def test_means_are_quadratic_of_deviations_and_geometric_of_others(first: dc.CalibrationResult) -> None:
+    scales, model = first.selection.scales, first.model
+    larger = with_scales(model, scales.vector * 7.0)
+    mean = scales_of_models([model, larger], scales)
+    for name in SCALES:
+        expected = 5.0 if name in DEVIATIONS else 7.0**0.5
+        torch.testing.assert_close(getattr(mean, name), expected * getattr(scales, name))
+
+
+def test_unusable_models_are_refused(first: dc.CalibrationResult) -> None:
+    arm, data = measured(1)
+    planar, model, wrong = from_dh([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), first.model, "model"
+
+    def calibrated(scales_of: Any, robot: dc.Chain = arm.nominal, **more: Any) -> Callable[[], object]:
+        return lambda: dc.calibrate(robot, data, scales_of=scales_of, **more)
+
+    refused(
+        (r"scales_of.*2 joints.*6 joints", calibrated([model], planar)),
+        (r"model 2.*calibrated robot.*str", calibrated([model, wrong])),
+        (r"scales_of.*list", calibrated(model)),
+        (r"model 1 has no scales", calibrated([with_scales(model, None)])),
+        (r"hyperparameters.*scales_of", calibrated([model], hyperparameters=first.selection.scales)),
+    )
+
+
+# --- gear lines: planted ones are found, none where there is none -----------------------------------------------------
 
 LINES = ((2, 200.3, 1e-4), (0, 121.0, 8e-5))
 
@@ -44,7 +118,9 @@ def drawn(lines: object = LINES, *, q: Tensor | None = None, seed: int = 0) -> t
 
 def test_planted_lines_are_found() -> None:
     data, scales = drawn()
-    found = sorted(find_gear_lines(data, scales), key=lambda line: -line.frequency)
+    lines = find_gear_lines(data, scales)
+    assert find_gear_lines(data.with_gear_lines(lines), replace(scales, lines=lines)) == ()
+    found = sorted(lines, key=lambda line: -line.frequency)
     assert [line.joint for line in found] == [joint for joint, _, _ in LINES]
     for line, (_, frequency, amplitude) in zip(found, LINES, strict=True):
         assert line.frequency == pytest.approx(frequency, abs=0.5)
@@ -53,12 +129,6 @@ def test_planted_lines_are_found() -> None:
 
 def test_no_line_where_there_is_none() -> None:
     assert [find_gear_lines(*drawn((), seed=seed)) for seed in range(3)] == [()] * 3
-
-
-def test_lines_that_were_found_are_not_found_again() -> None:
-    data, scales = drawn()
-    lines = find_gear_lines(data, scales)
-    assert find_gear_lines(data.with_gear_lines(lines), dc.Hyperparameters(**{**vars(scales), "lines": lines})) == ()
 
 
 def test_no_line_where_other_frequencies_explain_the_same() -> None:
@@ -89,20 +159,6 @@ def test_the_scan_is_that_of_least_squares() -> None:
             exact = _fall(*scan._exact(joint, torch.tensor([frequency], dtype=torch.float64)))
             assert float(exact) == pytest.approx(expected, rel=1e-6, abs=1e-6)
             assert float(falls[at]) == pytest.approx(expected, rel=0.02, abs=0.05)
-
-
-def test_the_arm_has_its_lines() -> None:
-    plain, arm = SimulatedArm(2), SimulatedArm(2, lines=[(4, 100.0, 3e-5)])
-    q = arm.sample(400, seed=1)
-    error = arm.components(q).transmission - plain.components(q).transmission
-    assert float(error[:, 4].abs().max()) == pytest.approx(3e-5, rel=1e-3)
-    assert not error[:, [0, 1, 2, 3, 5]].any()
-    turn = torch.zeros(1, 6, dtype=torch.float64)
-    turn[0, 4] = 2 * pi / 100.0
-    repeated = arm.components(q + turn).transmission - plain.components(q + turn).transmission
-    torch.testing.assert_close(repeated, error, rtol=0, atol=1e-12)
-    with pytest.raises(InputError, match="lines"):
-        SimulatedArm(2, lines=[(6, 100.0, 3e-5)])
 
 
 @pytest.mark.slow

@@ -1,14 +1,18 @@
-"""Markers that are hidden in some rows: the same results as a second implementation that drops their coordinates."""
+"""Hidden markers: the same as a second implementation that drops their coordinates, and from table to report."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from functools import cache
 from math import log, nan, pi
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from command_bank import leave_undrawn
 from tangent_bank import Setting, noise_covariance, shaken, tangent_covariance
 from torch import Tensor
 from torch.testing import assert_close
@@ -26,6 +30,7 @@ from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.process.tails import Tails
+from diffeo_calib.reports.analysis.predictions import FitRows, Predictions
 from diffeo_calib.robots import SimulatedArm
 
 MARKERS, ROWS = 3, 24
@@ -119,7 +124,6 @@ def test_likelihood_is_that_of_the_seen_coordinates_alone(known: bool) -> None:
         K, r = (G + R)[one.seen][:, one.seen], one.target()[one.seen]
         expected = -0.5 * float(r @ torch.linalg.solve(K, r) + torch.logdet(K)) - 0.5 * len(r) * log(2 * pi)
         found = log_posterior(other.scales.logarithms(), one.scales, one.data)
-        assert found is not None
         assert found.likelihood == pytest.approx(expected, abs=1e-5, rel=1e-8)
 
 
@@ -188,20 +192,6 @@ def test_exact_model_is_conditioned_on_the_seen_coordinates_alone() -> None:
     assert_close(measured.flatten()[seen], problem.y.flatten()[seen], rtol=0, atol=1e-8)
 
 
-def test_registration_and_geometry_use_what_was_seen() -> None:
-    arm = SimulatedArm(seed=3, markers=MARKERS, transmission=0.0, gravity=0.0, noise=0.0)
-    data = hidden(dc.Measurements(*arm.measure(ROWS, seed=4)))
-    bare = SimulatedArm(seed=3, markers=MARKERS, geometry=0.0, transmission=0.0, gravity=0.0, noise=0.0)
-    exact = hidden(dc.Measurements(*bare.measure(ROWS, seed=4)))
-    registration = register(bare.nominal, exact.q, exact.points)
-    assert registration.rms < 1e-9
-    assert_close(registration.geometry.tool, bare.truth.tool, rtol=0, atol=1e-8)
-    first = register(arm.nominal, data.q, data.points)
-    assert identify(first.geometry, data.q, data.points).rms < 2e-6
-    # Rows of one marker each: the same as three tables of one marker on one tool.
-    assert first.tails.weights.shape == (ROWS, MARKERS)
-
-
 def test_identification_ignores_hidden_markers_exactly() -> None:
     """With half of the rows entirely doubled but hidden, nothing changes."""
     arm = SimulatedArm(seed=3, markers=2)
@@ -227,3 +217,85 @@ def test_marker_that_no_row_shows_is_refused() -> None:
         dc.calibrate(arm.nominal, data.rows(slice(10, None)))
     with pytest.raises(MeasurementError, match="never show marker 1"):
         register(arm.nominal, q[10:], points[10:])
+
+
+# --- from the table to the report -------------------------------------------------------------------------------------
+
+COUNT, WRONG_ROW = 40, 7
+INSIDE_95 = 7.8147
+
+
+def three_markers(*, worn: float = 1.0) -> SimulatedArm:
+    return SimulatedArm(seed=0, markers=3).worn(2, worn)
+
+
+def with_gaps(data: dc.Measurements, seed: int, share: float = 0.3) -> dc.Measurements:
+    """The same rows without some markers."""
+    gone = torch.rand(data.points.shape[:2], generator=torch.Generator().manual_seed(seed)) < share
+    gone[gone.all(1), 0] = False
+    return dc.Measurements(data.q, data.points.masked_fill(gone[..., None], nan), data.joint_names)
+
+
+def rows(count: int, seed: int, robot: SimulatedArm | None = None) -> dc.Measurements:
+    robot = robot or three_markers()
+    return dc.Measurements(*robot.measure(count, seed=seed), robot.nominal.joint_names)
+
+
+@pytest.fixture(scope="module")
+def some() -> dc.Measurements:
+    """Rows with gaps, one of them with a wrong marker beside a hidden one."""
+    data = with_gaps(rows(COUNT, 1), 0)
+    points = data.points.clone()
+    points[WRONG_ROW] = rows(COUNT, 1).points[WRONG_ROW]
+    points[WRONG_ROW, 0], points[WRONG_ROW, 2, 1] = nan, points[WRONG_ROW, 2, 1] + 2e-3
+    return dc.Measurements(data.q, points, data.joint_names)
+
+
+@pytest.fixture(scope="module")
+def result(some: dc.Measurements) -> Any:
+    return dc.calibrate(three_markers().nominal, some)
+
+
+def squares(model: dc.CalibratedKinematics, test: dc.Measurements) -> Tensor:
+    mean, covariance = model.predict(test.q)
+    away = (test.points - mean)[..., None]
+    return (away.mT @ torch.linalg.solve(covariance, away)).flatten()
+
+
+@pytest.mark.slow
+def test_calibration_with_gaps_is_nearly_as_good_as_without(some: dc.Measurements, result: Any) -> None:
+    test = rows(100, 9)
+    errors = {"hidden": dc.evaluate(result.model, test).rms}
+    scales = result.selection.scales
+    for name, given in (("all", rows(COUNT, 1)), ("whole rows", some.rows(some.visible.all(1)))):
+        errors[name] = dc.evaluate(dc.calibrate(three_markers().nominal, given, hyperparameters=scales).model, test).rms
+    assert errors["hidden"] < 1.3 * errors["all"] < 0.5 * errors["whole rows"]
+    assert float((squares(result.model, test) < INSIDE_95).double().mean()) > 0.93
+
+
+@pytest.mark.slow
+def test_only_the_wrong_marker_loses_its_weight(result: Any) -> None:
+    (found,) = result.outliers
+    assert (found.row, found.marker) == (WRONG_ROW, 2)
+    assert "marker 2 alone is off" in found.reason
+    weights = result.tails.weights[WRONG_ROW]
+    assert float(weights[2]) < 0.1 < float(weights[1])
+    assert float(weights[0]) == 1.0
+
+
+@pytest.mark.slow
+def test_model_file_knows_what_was_hidden(
+    some: dc.Measurements, result: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dc.save(result.model, tmp_path / "model.safetensors")
+    loaded = dc.load(tmp_path / "model.safetensors")
+    assert isinstance(loaded, dc.CalibratedKinematics)
+    fit_rows = FitRows(loaded)
+    assert_close(fit_rows.points, some.points, rtol=0, atol=1e-8, equal_nan=True)
+    predictions = Predictions.of_fit(fit_rows)
+    assert bool((predictions.squares.isnan() == ~some.visible).all())
+    assert 0.9 < predictions.coverage() <= 1.0
+    leave_undrawn(monkeypatch)
+    for name, rows_of in (("report.html", (with_gaps(rows(20, 5), 2),)), ("fit.html", ())):
+        dc.write_report(loaded, tmp_path / name, *rows_of)
+        assert not re.search("NaN|>nan", (tmp_path / name).read_text(encoding="utf-8"))

@@ -67,9 +67,6 @@ def test_noise_of_few_poses_is_not_underestimated() -> None:
     assert sum(levels) / len(levels) == pytest.approx(5e-5, rel=0.07)
 
 
-# --- noise, tails and prior are estimated too ---------------------------------------------------------------------
-
-
 def test_clean_data_have_no_tails() -> None:
     arm = SimulatedArm(seed=2, transmission=0, gravity=0, noise=5e-5)
     q, points = arm.measure(150)
@@ -156,14 +153,6 @@ def test_what_is_given_stays() -> None:
     assert found.noise == pytest.approx(3e-4)
     assert torch.equal(found.tails.weights, torch.ones(40, 1, dtype=torch.float64))
     assert found.tails.freedom == inf
-
-
-def test_parameters_are_those_that_were_absorbed() -> None:
-    q, points = ARM.measure(40)
-    start = register(ARM.nominal, q, points).geometry
-    found = identify(start, q, points)
-    torch.testing.assert_close(found.geometry.points(q), start.points(q, found.theta), rtol=0, atol=1e-12)
-    assert found.rms == pytest.approx(rms(found.geometry, q, points))
 
 
 def test_the_prior_decides_where_the_data_do_not() -> None:

@@ -1,4 +1,4 @@
-"""Outliers: errors under the posterior, weights of outliers and inliers, and leave-one-out by refitting."""
+"""Rows and folds that are left out: weights, errors and deviations outside of the fit, by closed forms and refits."""
 
 from __future__ import annotations
 
@@ -9,11 +9,20 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import chi2
-from tangent_bank import Setting, covariance, posed
+from tangent_bank import Setting, built, covariance, normal
+from tangent_bank import weighted as weighted_setting
 from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.scales.cross_validation import (
+    FoldLimits,
+    cross_validated_inflation,
+    left_out_squares,
+    motions,
+    noise_of_new_rows,
+    random_folds,
+)
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, estimate_tails, leave_one_out, random_blocks
 from diffeo_calib.calibration.scales.selection import SearchLimits, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -62,23 +71,12 @@ def pair() -> Chosen:
 
 @pytest.fixture(scope="module")
 def framed() -> Chosen:
-    return chosen(posed())
+    return chosen(built("posed"))
 
 
 def weighted(data: TangentData, seed: int = 0) -> TangentData:
     weights = np.random.default_rng(seed).uniform(0.05, 1.5, tuple(data.tails.weights.shape))
     return data.with_tails(Tails(4.0, torch.from_numpy(weights)))
-
-
-# --- weights ------------------------------------------------------------------------------------------------------
-
-
-def test_clean_measurements_keep_their_weight(clean: Chosen) -> None:
-    tails = estimate_tails(clean.data, clean.scales)
-    assert tails.weights.shape == (60, 1)
-    assert tails.freedom > 8
-    assert float(tails.weights.min()) > 0.3
-    assert float(tails.weights.median()) == pytest.approx(1.0, abs=0.2)
 
 
 @pytest.mark.parametrize("by", [5e-4, 5e-2])
@@ -93,38 +91,6 @@ def test_wrong_rows_lose_their_weight(clean: Chosen, by: float) -> None:
     assert float(tails.weights[good].min()) > 0.2
     errors = leave_one_out(data.with_tails(tails), clean.scales)
     assert sorted(errors.squares[:, 0].topk(4).indices.tolist()) == bad
-
-
-def test_a_wrong_marker_takes_no_other_with_it(pair: Chosen) -> None:
-    tails = estimate_tails(pair.moved(9, slice(3, 6), 2e-3), pair.scales)
-    assert tails.weights.shape == (40, 2)
-    assert float(tails.weights[9, 1]) < 0.05
-    tails.weights[9, 1] = 1.0
-    assert float(tails.weights.min()) > 0.2
-
-
-def test_a_wrong_orientation_is_found(framed: Chosen) -> None:
-    """The frame turned by five mrad where it is."""
-    data = framed.data
-    assert data.noise_model.modes is not None
-    y = data.y.clone()
-    y[5] += data.noise_model.modes[5, 0] @ torch.tensor([0, 0, 0, 5e-3, 0, 0], dtype=torch.float64)
-    tails = estimate_tails(replace(data, y=y), framed.scales)
-    assert tails.weights.shape == (12, 1)
-    assert int(tails.weights.argmin()) == 5
-    assert float(tails.weights[5]) < 0.05
-
-
-def test_tails_do_not_depend_on_where_the_search_starts(clean: Chosen) -> None:
-    data = clean.moved(3, slice(0, 3), 1e-3)
-    first = estimate_tails(data, clean.scales)
-    down = data.with_tails(Tails(inf, torch.full((60, 1), 0.5, dtype=torch.float64)))
-    again = estimate_tails(down, clean.scales)
-    assert again.freedom == pytest.approx(first.freedom, rel=0.1)
-    assert_close(again.weights, first.weights, rtol=0, atol=0.05)
-
-
-# --- errors under the posterior -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["pair", "framed"])
@@ -143,9 +109,6 @@ def test_weights_are_those_of_the_errors_under_the_posterior(name: str, request:
     actual = estimate_tails(data, case.scales, rounds=1)
     assert actual.freedom == expected.freedom < inf
     assert_close(actual.weights, expected.weights, rtol=1e-6, atol=1e-7)
-
-
-# --- leave one out ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["clean", "pair", "framed"])
@@ -170,32 +133,11 @@ def test_leave_one_out_is_refitting_without_the_row(name: str, request: pytest.F
         sensor = data.noise_model.rows(torch.tensor([row]))
         expected = sensor.squares(predicted[None], torch.outer(error, error)[None])
         assert_close(found.squares[row], expected[0], rtol=1e-7, atol=1e-8)
+    trace = float(torch.linalg.solve(total, G).trace())  # of the matrix that makes fitted values from measured ones
+    assert found.effective == pytest.approx(trace, rel=1e-6)
 
 
-@pytest.mark.parametrize("name", ["clean", "pair", "framed"])
-def test_effective_number_of_parameters(name: str, request: pytest.FixtureRequest) -> None:
-    """The trace of the matrix that makes fitted values from measured ones."""
-    case: Chosen = request.getfixturevalue(name)
-    data = case.conditioned().told
-    G, total = data.linearisation(case.scales).gram(), covariance(data, case.scales)
-    expected = float(torch.linalg.solve(total, G).trace())
-    assert leave_one_out(data, case.scales).effective == pytest.approx(expected, rel=1e-6)
-    assert 5 < expected < data.y.numel()
-
-
-def test_leave_one_out_judges_the_scales(clean: Chosen) -> None:
-    found = leave_one_out(clean.data, clean.scales)
-    assert 0.4 < float(found.squares.median()) / 2.37 < 2.5
-    quiet = replace(
-        clean.scales, sensor_noise=clean.scales.sensor_noise * 0.1, joint_noise=clean.scales.joint_noise * 0
-    )
-    assert float(leave_one_out(clean.data, quiet).squares.median()) > float(found.squares.median())
-
-
-# --- blocks -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("coordinates", "count"), [(180, 1), (179, 2), (60, 3), (50, 4), (26, 7), (3, 60)])
+@pytest.mark.parametrize(("coordinates", "count"), [(180, 1), (179, 2), (26, 7), (3, 60)])
 def test_blocks_cover_every_row_once(coordinates: int, count: int, clean: Chosen) -> None:
     blocks = random_blocks(clean.data, 0, coordinates)
     assert len(blocks) == count
@@ -214,36 +156,14 @@ def test_several_blocks_are_predicted_one_by_one(pair: Chosen) -> None:
         assert_close(found.squares[rows], alone.squares, rtol=1e-5, atol=1e-7)
     assert bool(torch.isfinite(found.errors).all())
     assert found.effective is None  # that of no single fit
-    assert whole.effective is not None
     again, other = (leave_one_out(data, pair.scales, seed=seed, block_coordinates=130) for seed in (3, 4))
     assert torch.equal(again.errors, found.errors)
     assert not torch.allclose(other.errors, found.errors, rtol=1e-3, atol=0)
     assert float(found.errors.square().mean()) > 0.8 * float(whole.errors.square().mean())  # fewer rows predict worse
 
 
-def test_outliers_are_found_in_blocks_too(clean: Chosen) -> None:
-    data = moved(clean.moved(3, slice(0, 1), 3e-2), 40, slice(1, 2), -3e-2)
-    for seed in (0, 1):
-        tails = estimate_tails(data, clean.scales, seed, block_coordinates=90)
-        assert float(tails.weights[[3, 40]].max()) < 1e-2
-        assert sorted(tails.weights[:, 0].topk(2, largest=False).indices.tolist()) == [3, 40]
-
-
 def doubled(values: Tensor) -> Tensor:
     return torch.cat([values, values])
-
-
-def test_repeats_predict_each_other(clean: Chosen) -> None:
-    """Every pose measured twice: the row that is left out is known from its repeat up to noise."""
-    data = clean.data
-    twice = replace(
-        data,
-        x=doubled(data.x),
-        y=doubled(data.y),
-        tails=Tails.none(120, 1),
-    )
-    once, again = leave_one_out(data, clean.scales), leave_one_out(twice, clean.scales)
-    assert float(again.errors.square().mean()) < 0.5 * float(once.errors.square().mean())
 
 
 def test_few_data_inflate_the_regions_as_student_s_t_does() -> None:
@@ -261,3 +181,116 @@ def test_few_data_inflate_the_regions_as_student_s_t_does() -> None:
     assert exhausted.inflation(30) == LeaveOneOut(errors, errors[:, :1], effective=82.0).inflation(30)
     twice = LeaveOneOut(doubled(errors), doubled(errors[:, :1]), effective=70.0)
     assert twice.inflation(30) == LeaveOneOut(errors, errors[:, :1], effective=70.0).inflation(30)
+
+
+# --- folds ------------------------------------------------------------------------------------------------------------
+
+BRIEF = FoldLimits(iterations=1)
+
+
+def narrow(setting: Setting) -> TangentData:
+    """With weights of any size, and a narrow prior of the base: G + R spans eight powers of ten with the usual."""
+    return replace(weighted_setting(setting), place_deviation=1e-3)
+
+
+def groups(data: TangentData) -> Tensor:
+    return torch.arange(len(data.x))
+
+
+def parted(data: TangentData, *parts: Tensor) -> Tensor:
+    """(N,) the number of each row's part, negative for none."""
+    numbers = torch.full((len(data.x),), -1, dtype=torch.int64)
+    for number, rows in enumerate(parts):
+        numbers[rows] = number
+    return numbers
+
+
+def test_folds_are_predicted_from_all_other_rows(setting: Setting) -> None:
+    """By the formulas for conditional Gaussians, one marker or pose after the other."""
+    whole, scales, rows = narrow(setting), setting.scales, torch.tensor([1, 4, 7])
+    data, new = whole.told, whole.blocks_in_numbers(noise_of_new_rows(whole, scales))
+    m = data.y.shape[1]
+    inside = torch.isin(torch.arange(data.y.numel()) // m, rows)
+    K, y = covariance(data, scales), data.target.flatten()
+    gain = torch.linalg.solve(K[~inside][:, ~inside], K[~inside][:, inside]).T
+    errors = (y[inside] - gain @ y[~inside]).view(3, m, 1)
+    spread = (K[inside][:, inside] - gain @ K[~inside][:, inside]).view(3, m, 3, m)
+    own = torch.stack([spread[k, :, k] for k in range(3)])
+    part = data.rows(rows)
+    predicted = own - part.weighted_noise(scales) + new[rows]
+    expected = part.noise_model.squares(predicted, errors @ errors.mT)
+    found = left_out_squares(whole, scales, parted(whole, rows))
+    assert_close(found[rows], expected, rtol=1e-4, atol=1e-6)
+    assert bool(found[[0, 2, 3]].isnan().all())
+
+
+def test_rows_along_motions_and_repeats_belong_together() -> None:
+    rng = np.random.default_rng(0)
+    starts, steps = rng.uniform(-1, 1, (8, 1, 6)), 0.01 * rng.standard_normal((8, 1, 6)) * np.arange(5)[:, None]
+    along, alone = torch.from_numpy((starts + steps).reshape(40, 6)), torch.from_numpy(rng.uniform(-1, 1, (30, 6)))
+    x = torch.cat([along, alone, along[:1]])
+    labels = torch.cat([torch.arange(70), torch.zeros(1, dtype=torch.int64)])
+    found = motions(x, labels)
+    assert found[:40].view(8, 5).unique(dim=1).shape == (8, 1)
+    assert len(found.unique()) == 38
+    assert found[-1] == found[0]
+    few = motions(along[:20], torch.arange(20))  # four motions are too few to leave one out
+    assert len(few.unique()) == 20
+
+
+def test_repeats_stay_in_one_fold() -> None:
+    labels = torch.tensor([0, 1, 2, 0, 3, 4, 2, 5, 6, 0])
+    for seed in range(3):
+        folds = random_folds(labels, 3, seed)
+        assert len(folds) == 3
+        assert sorted(torch.cat([inside for _, inside in folds]).tolist()) == list(range(10))
+        for outside, inside in folds:
+            assert sorted([*outside.tolist(), *inside.tolist()]) == list(range(10))
+            assert not set(labels[outside].tolist()) & set(labels[inside].tolist())
+            assert 2 <= len(set(labels[inside].tolist())) <= 3
+    assert len(random_folds(labels, 50, 0)) == 7
+    first, same, other = (random_folds(labels, 3, seed)[0][1].tolist() for seed in (0, 0, 1))
+    assert first == same != other
+
+
+def drawn(setting: Setting, seed: int) -> TangentData:
+    """Measurements of a robot that the scales describe exactly."""
+    data = setting.tangent_data
+    factor = torch.linalg.cholesky(covariance(data, setting.scales))
+    target = (factor @ normal(data.y.numel(), seed=seed)).view_as(data.y)
+    return replace(data, y=data.y + target - data.target)
+
+
+def test_right_scales_predict_folds_with_errors_as_large_as_the_measured_ones() -> None:
+    setting, ratios = built("sliding"), []
+    for seed in range(20):
+        data = drawn(setting, seed)
+        for _, rows in random_folds(groups(data), 5, seed):
+            ratios.append(float(left_out_squares(data, setting.scales, parted(data, rows))[rows].mean()) / 3)
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.08)
+
+
+def test_right_scales_are_hardly_widened() -> None:
+    """By the uncertainty of the factor, and by what a search changes that sees fewer rows."""
+    setting, found = built("sliding"), []
+    for seed in range(5):
+        data = drawn(setting, seed)
+        factor = cross_validated_inflation(setting.scales, setting.scales, data, groups(data), seed=seed, limits=BRIEF)
+        found.append(factor or 0.0)
+    assert min(found) > 0.5
+    assert 0.9 < np.median(found) < 1.7, found
+
+
+@pytest.mark.slow
+def test_coverage_with_few_poses() -> None:
+    """The 95 % regions of new measurements, two arms with 30 poses."""
+    found = []
+    for seed in range(2):
+        arm = SimulatedArm(seed=seed)
+        q, points = arm.measure(330, seed)
+        model = dc.calibrate(arm.nominal, dc.Measurements(q[:30], points[:30])).model
+        mean, covariance = model.predict(q[30:])
+        errors = (points[30:] - mean)[..., None]
+        squares = (errors.mT @ torch.linalg.solve(covariance, errors)).flatten()
+        found.append(float((squares < chi2.ppf(0.95, 3)).double().mean()))
+    assert 0.9 < np.mean(found) < 0.995, found

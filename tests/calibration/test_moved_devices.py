@@ -1,30 +1,177 @@
-"""Change points: something moved during the measurements. Against the definition, and on calibrations."""
+"""Lengths against descriptions, rows that no robot was measured for, and something that moved during them."""
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from golden_bank import sockets
+from math_bank import normal
 from product_bank import Case, simulated, simulated_poses, ur10_measurements, ur10_scales
-from reading_bank import scales
-from tangent_bank import Setting, built, covariance, normal
+from reading_bank import readings, scales
+from tangent_bank import Setting, built, covariance
 from torch import Tensor
+from torch.distributions import MultivariateNormal
 from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.gates import CHANGE_ROWS
-from diffeo_calib.calibration.diagnostics.hypotheses import opened
+from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
 from diffeo_calib.calibration.diagnostics.moved_devices import chance_of_jump, changes_of, findings
-from diffeo_calib.common.errors import DiffeoCalibWarning
+from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.sensors.devices import Hypothesis
 
-MOVED = r"seems to have moved by about ([\d.]+) mm near row (\d+)"
+ARM = SimulatedArm(2)
+ROWS = 80
+
+
+def warned(data: dc.Measurements | dc.Readings) -> tuple[dc.CalibrationResult, list[str]]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", DiffeoCalibWarning)
+        result = dc.calibrate(ARM.nominal, data, hyperparameters=scales())
+    return result, [str(one.message) for one in caught if "seems to differ" in str(one.message)]
+
+
+@cache
+def clean() -> tuple[dc.CalibrationResult, list[str]]:
+    return warned(dc.Measurements(*ARM.measure(ROWS, seed=1)))
+
+
+@pytest.mark.parametrize(
+    ("factors", "name", "percent"),
+    [((1.01,) * 3, "the size of the robot", 1.0), ((1.0, 1.001, 1.0), "the scale of the measuring frame along y", 0.1)],
+)
+def test_a_wrong_scale_is_named_with_its_size(factors: tuple[float, ...], name: str, percent: float) -> None:
+    q, y = ARM.measure(ROWS, seed=1)
+    result, (text,) = warned(dc.Measurements(q, y * torch.tensor(factors, dtype=torch.float64)))
+    found = re.match(rf"{name} seems to differ by \+([\d.]+) %", text)
+    assert found is not None, text
+    assert float(found[1]) == pytest.approx(percent, rel=0.25)
+    wrong = (y - y.mean((0, 1))) * (torch.tensor(factors, dtype=torch.float64) - 1)
+    assert result.expected.workspace == pytest.approx(float(wrong.square().sum(-1).mean().sqrt()), rel=0.3)
+
+
+def test_right_scales_are_not_warned_about() -> None:
+    result, texts = clean()
+    assert texts == []
+    assert abs(result.lengths[0].value) < 3 * result.lengths[0].deviation < 0.004
+
+
+@pytest.mark.parametrize(("share", "noticed"), [(0.6, False), (1.5, True)])
+def test_the_result_tells_which_scales_pass_without_a_warning(share: float, noticed: bool) -> None:
+    """The size that is told apart from none, of the clean rows: rows in a tracker's wrong scale are judged by it."""
+    q, y = ARM.measure(ROWS, seed=1)
+    found = clean()[0].lengths[0]
+    wrong, texts = warned(dc.Measurements(q, y * (1 + share * found.unnoticed - found.value)))
+    assert bool(texts) == noticed
+    moved = (y - y.mean((0, 1))).square().sum(-1).mean().sqrt() * found.unnoticed
+    assert found.unnoticed * found.motion * 3**0.5 == pytest.approx(float(moved), rel=0.15)
+    assert "may be wrong without a warning" in str(wrong.lengths[0])
+
+
+def test_sockets_without_a_known_distance_show_no_size() -> None:
+    """Neither another one nor a change: what the ball differs within a socket is no motion."""
+    golden = sockets()
+    table: Any = golden.rows
+    table = table.rows(slice(0, 48))
+    table = with_attributes(table, sockets=replace(table.sockets, distances=(), distance_std=None))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", DiffeoCalibWarning)
+        result = dc.calibrate(golden.robot, table, hyperparameters=golden.scales)
+    assert len(caught) == 1
+    assert "no distance between sockets is known" in str(caught[0].message)
+    size = result.lengths[0]
+    assert abs(size.value) < size.deviation
+    assert size.deviation > 0.01
+
+
+def test_the_scale_of_a_wire_is_checked_in_the_same_way() -> None:
+    data = readings(ARM, "distance", ROWS, zero=0.02)
+    wrong = dc.Readings.distances(
+        data.q, 1.01 * data.values[:, 0], [data.names[k] for k in data.device.tolist()], offset_std=0.1
+    )
+    _, (text,) = warned(wrong)
+    found = re.match(r"the size of the robot seems to differ by \+([\d.]+) %", text)
+    assert found is not None, text
+    assert float(found[1]) == pytest.approx(1.0, rel=0.2)
+    assert warned(data)[1] == []
+
+
+@pytest.mark.parametrize("step", [0.0, 1e-6, 1e-4])
+def test_the_controllers_own_positions_are_warned_about(step: float) -> None:
+    q = ARM.sample(ROWS, 1)
+    y = ARM.nominal(q)[:, None, :3, 3] + torch.tensor([0.5, 0.2, 0.1], dtype=torch.float64)
+    y = (y / step).round() * step if step else y
+    poses = ARM.nominal(q)
+    poses[:, :3, 3] = y[:, 0]
+    posed = dc.Measurements.from_poses(q, poses, doubt=False)
+    for data in (dc.Measurements(q, y, doubt=False), posed)[: 1 + (step == 1e-4)]:
+        with pytest.warns(DiffeoCalibWarning, match="show no errors of the robot.*if they were computed"):
+            dc.calibrate(ARM.nominal, data, hyperparameters=scales())
+
+
+def test_rounded_positions_of_a_real_robot_are_not_refused() -> None:
+    q, y = ARM.measure(ROWS, seed=1)
+    data = dc.Measurements(q, (y / 1e-4).round() * 1e-4, doubt=False)
+    assert math.isfinite(dc.calibrate(ARM.nominal, data, hyperparameters=scales()).left_out_rms)
+
+
+def test_a_robot_without_errors_is_said_to_have_none() -> None:
+    perfect = SimulatedArm(2, geometry=0, transmission=0, gravity=0)
+    with pytest.warns(DiffeoCalibWarning, match="show no errors of the robot"):
+        dc.calibrate(perfect.nominal, dc.Measurements(*perfect.measure(ROWS)), hyperparameters=scales())
+
+
+@pytest.mark.parametrize("lever", [10.0, 1e-4])
+def test_levers_in_another_unit_are_refused(lever: float) -> None:
+    q = ARM.sample(ROWS, 1)
+    data = dc.Measurements.from_poses(q, ARM.truth.poses(q), lever=lever)
+    with pytest.raises(MeasurementError, match=rf"lever.* got {1e3 * lever:g} mm"):
+        dc.calibrate(ARM.nominal, data)
+
+
+# --- evidence for unknowns, against dense Gaussians and least squares -------------------------------------------------
+
+OPENED, UNKNOWNS = 12, 2
+ROOT = normal(OPENED, OPENED, seed=1)
+K = ROOT @ ROOT.mT + torch.eye(OPENED, dtype=torch.float64)
+E, R = normal(OPENED, UNKNOWNS, seed=2), 5.0 * normal(OPENED, seed=3)
+FOUND = Evidence.by(E, R, torch.linalg.cholesky(K))
+
+
+def test_sizes_are_those_of_weighted_least_squares() -> None:
+    white = torch.linalg.solve(torch.linalg.cholesky(K), torch.cat([E, R[:, None]], 1))
+    expected = torch.linalg.lstsq(white[:, :UNKNOWNS], white[:, UNKNOWNS:]).solution[:, 0]
+    left = white[:, UNKNOWNS] - white[:, :UNKNOWNS] @ expected
+    assert_close(FOUND.size, expected, rtol=1e-6, atol=0)
+    assert float(FOUND.gain) == pytest.approx(float(white[:, UNKNOWNS].square().sum() - left.square().sum()))
+    assert FOUND.excess == pytest.approx(float(left.square().mean()))
+    assert FOUND.excess > 1.0
+
+
+def test_errors_that_are_smaller_than_expected_are_no_excess() -> None:
+    assert Evidence.by(E, 1e-3 * R, torch.linalg.cholesky(K)).excess == 1.0
+
+
+@pytest.mark.parametrize("variance", [1e-3, 1.0, 1e3])
+def test_odds_are_the_ratio_of_the_densities(variance: float) -> None:
+    zero = torch.zeros(OPENED, dtype=torch.float64)
+    without, beside = (MultivariateNormal(zero, one).log_prob(R) for one in (K, K + variance * E @ E.mT))
+    (odds,) = FOUND.log_odds(torch.tensor([variance], dtype=torch.float64)).tolist()
+    assert odds == pytest.approx(float(beside - without), rel=1e-6)
+
+
+# --- changes ----------------------------------------------------------------------------------------------------------
 
 
 def from_row(points: Tensor, row: int, change: Tensor) -> Tensor:
@@ -33,39 +180,19 @@ def from_row(points: Tensor, row: int, change: Tensor) -> Tensor:
     return changed
 
 
-def found(robot: dc.Chain, data: dc.Measurements, what: str) -> tuple[float, int]:
-    """Distance in mm and row, as the warning reports them, which points at the caller."""
-    with pytest.warns(DiffeoCalibWarning, match=MOVED) as caught:
-        dc.calibrate(robot, data)
-    assert {w.filename for w in caught} == {__file__}
-    (text,) = [str(w.message) for w in caught if "moved by" in str(w.message)]
-    assert text.startswith(what)
-    words = text.split()
-    return float(words[words.index("mm") - 1]), int(words[words.index("row") + 1].rstrip(":"))
-
-
 @pytest.mark.slow
 def test_a_tracker_that_was_knocked_is_noticed(arm: Case) -> None:
     """0.5 mm from one of 60 rows on, in the order of their numbers; the error of the calibration is 0.04 mm."""
     change = torch.tensor([3e-4, 0.0, 4e-4], dtype=torch.float64)
     data = dc.Measurements(arm.train.q, from_row(arm.train.points, 25, change))
     mixed = data[torch.from_numpy(np.random.default_rng(0).permutation(len(data)))]
-    size, row = found(arm.robot, mixed, "the measuring device")
-    assert size == pytest.approx(0.5, rel=0.3)
-    assert abs(row - 25) <= 1
-
-
-@pytest.mark.slow
-def test_a_marker_that_was_knocked_is_noticed(arm: Case) -> None:
-    data = arm.train
-    shift = arm.result.registration.geometry.poses(data.q)[:, :3, :3] @ torch.tensor(
-        [0.0, 1e-3, 0.0], dtype=torch.float64
-    )
-    points = data.points.clone()
-    points[40:, 0] += shift[40:]
-    size, row = found(arm.robot, dc.Measurements(data.q, points), "a marker")
-    assert size == pytest.approx(1.0, rel=0.3)
-    assert abs(row - 40) <= 1
+    with pytest.warns(DiffeoCalibWarning, match="moved by") as caught:
+        dc.calibrate(arm.robot, mixed)
+    assert {w.filename for w in caught} == {__file__}  # it points at the caller
+    (found,) = (re.match(r"the measuring device.* about ([\d.]+) mm near row (\d+)", str(w.message)) for w in caught)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(0.5, rel=0.3)
+    assert abs(int(found[2]) - 25) <= 1
 
 
 def test_the_gain_is_that_of_the_definition() -> None:
@@ -86,18 +213,6 @@ def test_the_gain_is_that_of_the_definition() -> None:
     assert jump.row == CHANGE_ROWS + int(np.argmax(gains))
     left = (float(r @ inverse @ r) - max(gains)) / len(r)
     assert jump.gain == pytest.approx(max(gains) / max(1.0, left), rel=1e-5)
-
-
-def test_what_was_opened_explains_any_size() -> None:
-    """Hardly anything of the effects is left in K^-1."""
-    arm, measurements, _ = simulated(24)
-    setting = Setting(arm.nominal, measurements)
-    process = setting.tangent_data.process(setting.scales)
-    E = process.numbers.of_table(normal(24, 3, 2, seed=1))
-    inverse, other = process.inverse, opened(process, E)
-    left = inverse - inverse @ E @ torch.linalg.solve(E.T @ inverse @ E, E.T @ inverse)
-    assert_close(other.inverse, left, rtol=0, atol=1e-4 * float(inverse.max()))
-    assert float((E.T @ other.mu).abs().max()) < 1e-3 * float((E.T @ process.mu).abs().max())
 
 
 def test_errors_that_the_scales_understate_are_no_evidence() -> None:
@@ -151,7 +266,6 @@ def test_a_joint_that_jumps_is_named_with_row_and_size(joint: int, size: float) 
     after = q.clone()
     after[30:, joint] += size
     text = told(arm, q, points + arm.true_points(after) - arm.true_points(q))
-    assert text is not None
     found = re.match(rf"{arm.nominal.joint_names[joint]} seems to have changed by about ([\d.]+) mrad", text)
     assert found is not None, text
     assert float(found[1]) == pytest.approx(1e3 * size, rel=0.3)
@@ -164,7 +278,6 @@ def test_a_slow_drift_is_told_from_a_jump() -> None:
     q, points = arm.measure(80, seed=1)
     ramp = torch.linspace(0, 1, 80, dtype=torch.float64)[:, None, None]
     drift = told(arm, q, points + 5e-4 * ramp * torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64))
-    assert drift is not None
     found = re.match(
         r"the measuring device or the robot's base seems to drift by about ([\d.]+) mm over the rows", drift
     )
@@ -176,12 +289,10 @@ def test_a_slow_drift_is_told_from_a_jump() -> None:
 def test_a_scale_that_changes_is_seen_in_poses() -> None:
     """It moves poses apart and turns none. 2000 ppm from row 30 of 80 on."""
     arm, data, _ = simulated_poses(80)
-    assert data.poses is not None
     poses = data.poses.clone()
     middle = poses[:, :3, 3].mean(0)
     poses[30:, :3, 3] = middle + 1.002 * (poses[30:, :3, 3] - middle)
     text = said(arm.nominal, dc.Measurements.from_poses(data.q, poses))
-    assert text is not None
     found = re.match(r"the scale of the device .* changed by about ([\d.e+]+) ppm.* near row (\d+)", text)
     assert found is not None, text
     assert float(found[1]) == pytest.approx(2000, rel=0.3)
@@ -195,7 +306,6 @@ def test_three_set_ups_are_no_drift() -> None:
     q, points = arm.measure(90, seed=1)
     steps = (torch.arange(90, dtype=torch.float64) // 30)[:, None, None]
     text = told(arm, q, points + 4e-4 * steps * torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64), given=False)
-    assert text is not None
     found = re.search(r"moved more than once, near rows (\d+) and (\d+)", text)
     assert found is not None, text
     assert [int(row) for row in found.groups()] == pytest.approx([30, 60], abs=3)

@@ -1,9 +1,8 @@
-"""Outliers: they must not spoil the fit, and the result names them with a probable cause.
-
-One wrong row and three markers show that the choice of scales is not disturbed; elsewhere the scales are given.
-"""
+"""Outliers: they must not spoil the fit, and the result names them with a probable cause; few fits choose scales."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,26 +30,22 @@ def aside(size: float, seed: int) -> Tensor:
     return torch.from_numpy(size * direction / np.linalg.norm(direction))
 
 
-def flagged(result: dc.CalibrationResult) -> dict[tuple[int, int | None], Outlier]:
+def flagged(result: Any) -> dict[tuple[int, int | None], Outlier]:
     return {(outlier.row, outlier.marker): outlier for outlier in result.outliers}
 
 
-def kept_all(result: dc.CalibrationResult, data: dc.Measurements) -> None:
+def kept_all(result: Any, data: dc.Measurements) -> None:
     """No row is dropped: each has a weight, and the model knows all configurations."""
     weights = result.tails.weights
     assert weights.shape == (len(data), 1 if data.poses is not None else data.markers)
     assert bool((weights > 0).all())
     assert torch.equal(result.model.configurations, data.q)
-    assert result.model.summary is not None
     assert result.model.summary.outliers == len(result.outliers)
     assert result.outliers == sorted(result.outliers, key=lambda outlier: -outlier.distance)
     for outlier in result.outliers:
         assert outlier.number == int(data.line_numbers[outlier.row])
         assert outlier.weight == float(weights[outlier.row, outlier.marker or 0])
         assert outlier.weight < 0.25
-
-
-# --- clean data -----------------------------------------------------------------------------------------------------
 
 
 def test_clean_data_have_no_outliers(arm: Case, pair: Case, posed: Case, slider: Case) -> None:
@@ -61,16 +56,13 @@ def test_clean_data_have_no_outliers(arm: Case, pair: Case, posed: Case, slider:
         kept_all(case.result, case.train)
 
 
-# --- one marker -----------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def clean(arm: Case) -> float:
     """Held-out error of the arm calibrated with the same 60 rows, none of them wrong, m."""
     return arm.held_out()[2]
 
 
-def held_out(result: dc.CalibrationResult, test: dc.Measurements) -> float:
+def held_out(result: Any, test: dc.Measurements) -> float:
     return dc.evaluate(result.model, test).rms
 
 
@@ -81,12 +73,12 @@ def with_row_7_wrong(arm: Case) -> dc.Measurements:
 
 
 @pytest.fixture(scope="module")
-def fifty(arm: Case) -> dc.CalibrationResult:
+def fifty(arm: Case) -> Any:
     """The arm with one row wrong by 50 mm."""
     return dc.calibrate(arm.robot, with_row_7_wrong(arm))
 
 
-def test_one_row_wrong_by_50_mm(fifty: dc.CalibrationResult, arm: Case, clean: float) -> None:
+def test_one_row_wrong_by_50_mm(fifty: Any, arm: Case, clean: float) -> None:
     """The row keeps the number of the table that it is from."""
     result = fifty
     assert held_out(result, arm.test) < 1.1 * clean
@@ -99,7 +91,7 @@ def test_one_row_wrong_by_50_mm(fifty: dc.CalibrationResult, arm: Case, clean: f
     kept_all(result, with_row_7_wrong(arm))
 
 
-def test_predictions_next_to_one_row_wrong_by_50_mm(fifty: dc.CalibrationResult, arm: Case) -> None:
+def test_predictions_next_to_one_row_wrong_by_50_mm(fifty: Any, arm: Case) -> None:
     """The model is nearly as certain; a new measurement may be an outlier too, which costs a factor of 2."""
     for noise, most in ((False, 1.5), (True, 5.0)):
         dirty, good = (model.predict(arm.test.q, noise=noise)[1] for model in (fifty.model, arm.model))
@@ -143,7 +135,6 @@ def test_wrong_joint_reading_and_wrong_pairings(arm: Case, clean: float) -> None
     kept_all(result, data)
 
 
-@pytest.mark.slow
 def test_an_outlier_among_repeats_is_recognised(clean: float) -> None:
     robot, train, test = simulated(60)
     q = torch.cat([train.q, train.q[:20]])
@@ -156,9 +147,6 @@ def test_an_outlier_among_repeats_is_recognised(clean: float) -> None:
     assert [outlier.row for outlier in result.outliers] == [5]
     assert "repeated measurements of this pose agree with the model" in result.outliers[0].reason
     assert held_out(result, test) < 1.1 * clean
-
-
-# --- several markers ------------------------------------------------------------------------------------------------
 
 
 def test_reasons_with_three_markers() -> None:
@@ -183,12 +171,8 @@ def test_reasons_with_three_markers() -> None:
     assert held_out(result, test) < 0.4 * geometry
 
 
-# --- poses ----------------------------------------------------------------------------------------------------------
-
-
 def test_poses_that_are_wrong_in_position_or_orientation(posed: Case) -> None:
     """A pose is one measurement: it has one weight."""
-    assert posed.train.poses is not None
     poses = posed.train.poses.clone()
     poses[4, :3, :3] = rotation(torch.tensor([0.0, 0.02, 0.0], dtype=torch.float64)) @ poses[4, :3, :3]
     poses[11, :3, 3] += aside(0.005, 11)
@@ -203,26 +187,11 @@ def test_poses_that_are_wrong_in_position_or_orientation(posed: Case) -> None:
     assert (errors.angle_rms or 9.0) < 1.5 * (before.angle_rms or 0.0)
 
 
-# --- a real robot ---------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
 def test_a_clean_ur10(ur10_150: Case) -> None:
     assert ur10_150.result.outliers == []
     assert 1e3 * ur10_150.held_out()[2] < 0.18
 
 
-@pytest.mark.slow
-def test_one_row_of_a_ur10_wrong_by_50_mm(ur10_150: Case) -> None:
-    points = ur10_150.train.points.clone()
-    points[7] += aside(0.05, 7)
-    scales = ur10_150.result.selection.scales
-    result = dc.calibrate(ur10_150.robot, dc.Measurements(ur10_150.train.q, points), hyperparameters=scales)
-    assert list(flagged(result)) == [(7, None)]
-    assert held_out(result, ur10_150.test) < 1.05 * ur10_150.held_out()[2]
-
-
-@pytest.mark.slow
 def test_a_wrong_joint_reading_in_a_row_that_alone_places_the_marker(ur10_150: Case) -> None:
     """The tool turns by only 0.5 mrad in these rows: 0.02 rad in one of them outweigh all other rows."""
     q = ur10_150.train.q.clone()
@@ -232,7 +201,6 @@ def test_a_wrong_joint_reading_in_a_row_that_alone_places_the_marker(ur10_150: C
     assert held_out(result, ur10_150.test) < 1.1 * ur10_150.held_out()[2]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.05, 0.2])
 def test_regions_of_the_robot_hold_beside_gross_rows(share: float) -> None:
     """With Student's t a third of the true places was inside at 5 %."""

@@ -1,13 +1,17 @@
 """Calibration with payloads of known mass: the sag under any other payload is predicted."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from product_bank import with_usual_scales
+from table_bank import refused
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError
+from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.robots import SimulatedArm
 
 pytestmark = pytest.mark.slow  # several calibrations
@@ -32,7 +36,7 @@ def rows(arm: SimulatedArm) -> dc.Measurements:
 
 
 @pytest.fixture(scope="module")
-def result(arm: SimulatedArm, rows: dc.Measurements) -> dc.CalibrationResult:
+def result(arm: SimulatedArm, rows: dc.Measurements) -> Any:
     return dc.calibrate(arm.nominal, rows)
 
 
@@ -44,23 +48,17 @@ def other(arm: SimulatedArm) -> dc.Measurements:
     return dc.Measurements(q, arm.true_points(q, masses)).with_payload(masses)
 
 
-def test_masses_beyond_the_fit(result: dc.CalibrationResult, other: dc.Measurements) -> None:
+def test_masses_beyond_the_fit(result: Any, other: dc.Measurements) -> None:
     with pytest.warns(DiffeoCalibWarning, match="a payload of 20 is beyond the 0 to 10 in the measurements of the fit"):
         result.model.with_payload(20.0)
     with pytest.warns(DiffeoCalibWarning, match="a payload of 30 is beyond"):
         dc.evaluate(result.model, other.with_payload(30.0))
-    with pytest.raises(
-        InputError, match="expected 0 to 10 in the measurements of the fit, got 1e\\+300; check its unit"
-    ):
-        result.model.with_payload(1e300)
-    with pytest.raises(InputError, match="expected a number of 0 or more"):
-        result.model.with_payload(10**400)
     for mass in (np.int64(4), np.float32(4), torch.tensor(4.0)):
         assert result.model.with_payload(mass).payload == 4.0  # pyright: ignore[reportArgumentType]
 
 
 def test_sag_under_other_payloads_is_predicted(
-    arm: SimulatedArm, rows: dc.Measurements, result: dc.CalibrationResult, other: dc.Measurements
+    arm: SimulatedArm, rows: dc.Measurements, result: Any, other: dc.Measurements
 ) -> None:
     assert result.fit.converged
     without = dc.calibrate(arm.nominal, rows.with_payload(None))
@@ -72,17 +70,15 @@ def test_sag_under_other_payloads_is_predicted(
     assert {part.name: part.displacement for part in result.parts}["payload"] > 1e-4
 
 
-def test_every_row_is_predicted_with_its_own_payload(result: dc.CalibrationResult, other: dc.Measurements) -> None:
+def test_every_row_is_predicted_with_its_own_payload(result: Any, other: dc.Measurements) -> None:
     found = dc.evaluate(result.model, other)
-    assert other.payload is not None
-    assert found.away is not None
     for mass in (1.0, 6.0, 8.5):
         own = other.payload == mass
         expected = other.points[own] - result.model.with_payload(mass)(other.q[own])
         torch.testing.assert_close(found.away[own], expected, rtol=0, atol=1e-12)
 
 
-def test_queries_of_a_laden_model_agree(result: dc.CalibrationResult, other: dc.Measurements) -> None:
+def test_queries_of_a_laden_model_agree(result: Any, other: dc.Measurements) -> None:
     """Values by NumPy and by torch, derivatives, covariances and compensation, under another payload."""
     model, q = result.model.with_payload(7.5), other.q[:5]
     assert model.payload == 7.5
@@ -98,7 +94,7 @@ def test_queries_of_a_laden_model_agree(result: dc.CalibrationResult, other: dc.
     torch.testing.assert_close(found.q, q, rtol=0, atol=1e-9)
 
 
-def test_predicted_deviations_hold(result: dc.CalibrationResult, other: dc.Measurements) -> None:
+def test_predicted_deviations_hold(result: Any, other: dc.Measurements) -> None:
     inside = []
     for mass in (1.0, 6.0, 8.5):
         own = other.payload == mass
@@ -108,46 +104,27 @@ def test_predicted_deviations_hold(result: dc.CalibrationResult, other: dc.Measu
     assert float(torch.cat(inside).double().mean()) > 0.85
 
 
-def test_registration_finds_the_device_under_one_payload(
-    arm: SimulatedArm, result: dc.CalibrationResult, other: dc.Measurements
-) -> None:
-    shift = torch.tensor([0.3, -0.1, 0.2], dtype=torch.float64)
-    some = other.q[:12]
-    moved = dc.Measurements(some, arm.true_points(some, 9.0) + shift).with_payload(9.0)
-    found = result.model.registered(moved)
-    assert found.payload == result.model.payload
-    truth = dc.Measurements(other.q, other.points + shift).with_payload(other.payload)
-    assert dc.evaluate(found, truth).rms < 2.0 * dc.evaluate(result.model, other).rms
-
-
-def test_payloads_must_be_on_both_sides(
-    arm: SimulatedArm, result: dc.CalibrationResult, other: dc.Measurements
-) -> None:
-    with pytest.raises(MeasurementError, match="calibrated with payloads, the measurements have none"):
-        dc.evaluate(result.model, other.with_payload(None))
-    few = dc.Measurements(*arm.measure(11, seed=3))
+def test_payloads_that_cannot_be(arm: SimulatedArm, rows: dc.Measurements, result: Any, other: dc.Measurements) -> None:
+    few, loaded = dc.Measurements(*arm.measure(11, seed=3)), result.model
     with pytest.warns(DiffeoCalibWarning):
         plain = dc.calibrate(arm.nominal, few).model
-    assert plain.payload is None
-    with pytest.raises(MeasurementError, match="the measurements have payloads, the model was calibrated without"):
-        dc.evaluate(plain, few.with_payload(3.0))
-    with pytest.raises(InputError, match="calibrated without payloads"):
-        plain.with_payload(3.0)
-    with pytest.raises(InputError, match="`mass` of the payload: expected a number of 0 or more, got -1"):
-        result.model.with_payload(-1.0)
 
+    def calibrated(data: Any, **options: Any) -> Callable[[], object]:
+        return lambda: dc.calibrate(arm.nominal, data, **options)
 
-def test_payloads_that_cannot_be(arm: SimulatedArm, rows: dc.Measurements) -> None:
-    with pytest.raises(MeasurementError, match="all payloads are 0"):
-        dc.calibrate(arm.nominal, rows.with_payload(0.0))
-    with pytest.raises(InputError, match="`controls` of measurements with payloads: expected 'all', got 20"):
-        dc.calibrate(arm.nominal, rows, controls=20)
-    with pytest.raises(InputError, match=r"the link of the payload.*flange.*got wrist"):
-        dc.calibrate(arm.nominal, rows.with_payload(1.0, at="wrist"))
-    with pytest.raises(MeasurementError, match="`payload`, row 1: expected a mass of 0 or more, got -2"):
-        rows[:2].with_payload([1.0, -2.0])
-    with pytest.raises(MeasurementError, match="payload"):
-        rows.with_payload([1.0, 2.0])
+    refused(
+        ("calibrated with payloads, the measurements have none", lambda: dc.evaluate(loaded, other.with_payload(None))),
+        ("have payloads, the model was calibrated without", lambda: dc.evaluate(plain, few.with_payload(3.0))),
+        ("calibrated without payloads", lambda: plain.with_payload(3.0)),
+        ("`mass` of the payload: expected a number of 0 or more, got -1", lambda: loaded.with_payload(-1.0)),
+        ("expected a number of 0 or more", lambda: loaded.with_payload(10**400)),
+        (r"expected 0 to 10 in .* of the fit, got 1e\+300; check its unit", lambda: loaded.with_payload(1e300)),
+        ("all payloads are 0", calibrated(rows.with_payload(0.0))),
+        ("`controls` of measurements with payloads: expected 'all', got 20", calibrated(rows, controls=20)),
+        (r"the link of the payload.*flange.*got wrist", calibrated(rows.with_payload(1.0, at="wrist"))),
+        ("row 1: expected a mass of 0 or more, got -2", lambda: rows[:2].with_payload([1.0, -2.0])),
+        ("payload", lambda: rows.with_payload([1.0, 2.0])),
+    )
 
 
 def test_one_payload_in_all_rows_is_warned_about(arm: SimulatedArm) -> None:

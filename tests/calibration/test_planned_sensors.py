@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -9,17 +12,23 @@ import pytest
 import reading_bank
 import torch
 import two_arms_bank
-from kind_bank import kind_named, marked, rigid_rms
+from kind_bank import Kind, kind_named, marked, rigid_rms
+from simulated_camera import BOARD_PRIOR, HEIGHT, WIDTH, camera_arm, fixed_camera_arm, seen_corners, true_camera
+from table_bank import refused
 from torch import Tensor
+from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.planning.candidates import Tracker
-from diffeo_calib.calibration.planning.knowledge import of_model
-from diffeo_calib.calibration.planning.plan import drawn
-from diffeo_calib.calibration.planning.sensors import DeviceReadings
+from diffeo_calib.calibration.planning.board_images import BoardImages
+from diffeo_calib.calibration.planning.candidates import candidates
 from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
+from diffeo_calib.cameras.images import Images, sees, shown, sighted
+from diffeo_calib.cameras.images import expected as expected_errors
+from diffeo_calib.measurements.pose_frames import inverse_poses
+from diffeo_calib.measurements.poses import LEVER, poses_from_marks
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.sensors.set_ups import frame_slopes
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
@@ -110,22 +119,20 @@ def test_planned_rows_beat_random_rows_for_the_same_devices(kind: str) -> None:
     assert tracker.devices == ()
 
 
-def test_the_tracker_of_a_model_without_device_stands_anywhere() -> None:
-    """Its first two rows say where it stands; nothing was known about that."""
-    q = ARM.sample(60, seed=8)
-    rms = dc.plan(fitted("distance").model, q, 12, sensor=dc.Sensor.positions()).expected_rms
+ANYWHERE = [
+    ("distances", dc.Sensor.positions(), 0.6),
+    pytest.param("images of a board", dc.Sensor.positions(), 0.95, marks=pytest.mark.slow),
+    pytest.param("two cameras", dc.Sensor.poses(), 0.95, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("name", "sensor", "most"), ANYWHERE)
+def test_a_tracker_that_measured_no_row_of_the_fit_stands_anywhere(name: str, sensor: Any, most: float) -> None:
+    """Its first rows say where it stands; nothing was known about that."""
+    kind = kind_named(name)
+    rms = dc.plan(kind.model, kind.q(60), 12, sensor=sensor).expected_rms
     assert float(rms[1]) > 0.999 * float(rms[0])
-    assert float(rms[12]) < 0.6 * float(rms[0])
-
-
-@pytest.mark.parametrize("kind", ["distance", "height", "image"])
-def test_first_poses_for_devices(kind: str) -> None:
-    arm = SimulatedArm(seed=1)
-    plan = dc.plan(arm.nominal, arm.sample(100, seed=8), 30, sensor=NEW[kind])
-    assert set(plan.devices) <= {f"{kind} {number}" for number in (1, 2, 3)}
-    assert len(set(plan.rows.tolist())) == 30
-    assert float(plan.expected_rms[30]) < 2e-3 < float(plan.expected_rms[5])
-    assert float(dc.plan(arm.nominal, arm.sample(100, seed=8), 30).expected_rms[30]) < float(plan.expected_rms[30])
+    assert float(rms[12]) < most * float(rms[0])
 
 
 def test_a_camera_measures_what_it_sees() -> None:
@@ -158,24 +165,7 @@ def test_expected_errors_of_distances_come_true() -> None:
         assert 0.4 < rigid_rms(model(q).detach(), ARM.true_points(q)) / float(expected) < 1.6
 
 
-@pytest.mark.parametrize("name", marked("heights", "images and a tracker", "several kinds", "inclinations"))
-def test_devices_of_a_fit_have_the_noise_of_their_rows(name: str) -> None:
-    """Not that of rows of another kind: of images of a board, in which its origin is uncertain by a millimetre."""
-    model = kind_named(name).model
-    noise, start = model.map.noise, of_model(model, model.configurations, None)
-    sensors: Any = {own.devices.names: own for own in sensor_of(model) if isinstance(own, DeviceReadings)}
-    placed = [(own, k, word) for own in model.placement if own.devices is not None for k, word in enumerate(own.names)]
-    assert len(sensors) == len(placed)
-    for own, number, word in placed:
-        rows = own.rows[own.device == number]
-        (sensor,) = (one for (key,), one in sensors.items() if key in (word, f"{own.kind} {word}"))
-        seen = noise.visible[rows[0]]
-        known = noise.covariance[rows][:, seen][:, :, seen].diagonal(dim1=1, dim2=2).mean().sqrt()
-        planned = sensor.options(start.scene).noise.diagonal(dim1=1, dim2=2).mean().sqrt()
-        assert 0.8 < float(planned / known) < 1.25
-
-
-AGAIN = ("heights", "distances", "images", "mixture", "several kinds", "two cameras", "two cameras on the tool")
+AGAIN = ("heights", "mixture", "several kinds", "two cameras on the tool")
 
 
 @pytest.mark.parametrize("name", marked(*AGAIN))
@@ -189,36 +179,6 @@ def test_recalibrated_and_registered_models_plan_for_their_devices(name: str) ->
         found = dc.plan(model, kind.q(30), 3)
         assert set(found.devices) <= names
         assert float(found.expected_rms[3]) <= float(found.expected_rms[0]) < 2.5 * before
-
-
-@pytest.mark.parametrize("name", marked("heights", "distances", "images"))
-def test_devices_of_new_rows_are_found_again(name: str) -> None:
-    """What the new rows of a recalibration left open of a device is what a planned reading of it shares with them."""
-    kind = kind_named(name)
-    model = dc.recalibrate(kind.model, kind.new).model
-    first, shared = len(kind.data), model.map.noise.shared
-    for sensor in sensor_of(model):
-        assert isinstance(sensor, DeviceReadings)
-        assert sensor.fitted is not None
-        assert sensor.fitted.columns is not None
-        mine = [k for k, own in enumerate(kind.new.device_names) if own == sensor.devices.names[0]]
-        assert torch.equal(sensor.fitted.columns, (shared[[first + k for k in mine]] != 0).any(1).any(0))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["images of a board", "two cameras"])
-@pytest.mark.parametrize("sensor", [dc.Sensor.positions(), dc.Sensor.poses()])
-def test_a_tracker_beside_cameras_stands_anywhere(name: str, sensor: Any) -> None:
-    """No row of the fit was measured by it: its first says where it is."""
-    kind = kind_named(name)
-    rms = dc.plan(kind.model, kind.q(30), 12, sensor=sensor).expected_rms
-    assert float(rms[1]) > 0.999 * float(rms[0])
-    assert float(rms[12]) < 0.95 * float(rms[0])
-
-
-def test_noise_of_a_stated_deviation(arm: Any) -> None:
-    found = dc.plan(arm.model, arm.train.q, 2, sensor=dc.Sensor.positions(1e-4))
-    assert found.noise_rms == pytest.approx(3**0.5 * 1e-4)
 
 
 def test_poses_of_a_ball_in_sockets() -> None:
@@ -264,43 +224,173 @@ def test_payload_of_the_plan() -> None:
 
 
 def test_mistakes_about_sensors_are_one_sentence(arm: Any) -> None:
-    q = arm.train.q
-    for sensor, message in (
-        ("tracker", "`sensor`: expected a dc.Sensor"),
-        (dc.Sensor.poses(), "poses of a robot that is known by markers"),
-        (dc.Sensor.distances([[5.0, 0.0, 0.0]], 1e-5), None),
-    ):
-        if message is None:
-            assert len(dc.plan(arm.model, q, 3, sensor=sensor)) == 3
-            continue
-        with pytest.raises(dc.DiffeoCalibError, match=message):
-            dc.plan(arm.model, q, 3, sensor=sensor)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(dc.DiffeoCalibError, match="NX,NY,NZ,D"):
-        dc.Sensor.heights([[0.0, 0.0, 1.0]])
-    with pytest.raises(dc.DiffeoCalibError, match="with a direction"):
-        dc.Sensor.heights([[0.0, 0.0, 0.0, 1.0]])
-    with pytest.raises(dc.DiffeoCalibError, match="`std` of a sensor"):
-        dc.Sensor.positions(-1.0)
-    two = [dc.Sensor.positions(), dc.Sensor.distances([[5.0, 0.0, 0.0]])]
-    with pytest.raises(dc.DiffeoCalibError, match="`measured`: expected configurations that one device"):
-        dc.plan(arm.model, q, 3, sensor=two, measured=q[:2])
+    q, tracker = arm.train.q, dc.Sensor.positions()
+    found = dc.Sensor.distances([[5.0, 0.0, 0.0]], 1e-5)
+    assert len(dc.plan(arm.model, q, 3, sensor=found)) == 3
+    assert dc.plan(arm.model, q, 2, sensor=dc.Sensor.positions(1e-4)).noise_rms == pytest.approx(3**0.5 * 1e-4)
+
+    def planned(sensor: Any, **more: Any) -> Callable[[], object]:
+        return lambda: dc.plan(arm.model, q, 3, sensor=sensor, **more)
+
+    refused(
+        ("`sensor`: expected a dc.Sensor", planned("tracker")),
+        ("poses of a robot that is known by markers", planned(dc.Sensor.poses())),
+        ("`measured`: expected configurations that one device", planned([tracker, found], measured=q[:2])),
+        ("NX,NY,NZ,D", lambda: dc.Sensor.heights([[0.0, 0.0, 1.0]])),
+        ("with a direction", lambda: dc.Sensor.heights([[0.0, 0.0, 0.0, 1.0]])),
+        ("`std` of a sensor", lambda: dc.Sensor.positions(-1.0)),
+    )
 
 
-def test_sensors_share_the_configurations_that_are_drawn() -> None:
-    """Half of them bring the ball to its sockets; those of the tracker show it the marker; all keep their ranges."""
-    robot, markers = SimulatedArm(0).nominal, torch.tensor([[0.0, 0.1, 0.1], [0.05, 0.0, 0.1]], dtype=torch.float64)
-    places = torch.tensor([[0.6, 0.1, 0.4], [0.5, -0.3, 0.5]], dtype=torch.float64)
-    sensors, first = [dc.Sensor.positions(), dc.Sensor.sockets(places)], robot.joint_names[0]
-    how: dict[str, Any] = {"ranges": {first: (-1.0, 1.0)}, "keep": lambda q: q[:, 1] > -0.5, "seed": 3}
-    q = drawn(robot, sensors, 20, markers, **how)
-    assert len(q) == 20
-    assert bool((q[:, 0].abs() <= 1.0).all())
-    assert bool((q[:, 1] > -0.5).all())
-    tips = robot.tip_poses(q)[:, 0]
-    ball = tips[:, :3, :3] @ markers[-1] + tips[:, :3, 3]
-    near = torch.cdist(ball, places).amin(1) < 1e-3
-    assert near.tolist() == [False] * 10 + [True] * 10
-    tracker = Tracker((3.0, 0.0, 1.0))
-    tips = robot.tip_poses(drawn(robot, sensors[:1], 20, markers, tracker=tracker, **how))[:, 0]
-    line = torch.tensor(tracker.position, dtype=torch.float64) - (tips[:, :3, :3] @ markers.mean(0) + tips[:, :3, 3])
-    assert bool(((line * tips[:, :3, 2]).sum(1) >= 0.7 * line.norm(dim=1)).all())
+# --- images of a board ------------------------------------------------------------------------------------------------
+
+
+FEWEST = 4
+
+
+def wrist() -> Kind:
+    return kind_named("images of a board")
+
+
+def cameras(kind: Kind) -> list[Any]:
+    return [one for one in sensor_of(kind.model) if isinstance(one, BoardImages)]
+
+
+@cache
+def drawn(kind: str) -> Tensor:
+    """Half of them where a camera sees the board, half anywhere."""
+    model, q = kind_named(kind).model, []
+    for one in cameras(kind_named(kind)):
+        where = one.where(model)
+        q.append(candidates(model.robot, 40, keep=where.keep, ranges=where.ranges))
+    return torch.cat([*q, candidates(model.robot, 40)])
+
+
+def corners_in_truth(q: Tensor, arm: Any, *, on_tool: bool) -> Tensor:
+    """(N,) corners of the real board that the real camera sees from its front."""
+    poses = poses_from_marks(arm.arm.true_points(q), LEVER)
+    boards = inverse_poses(poses) if on_tool else poses
+    from_above = inverse_poses(boards)[:, 2, 3] > 0
+    return (~seen_corners(boards, 0.0, camera=arm.camera)[..., 3].isnan()).sum(1) * from_above * (boards[:, 2, 3] > 0)
+
+
+SEEN: dict[str, tuple[Any, tuple[str, ...]]] = {
+    "images of a board": (lambda second: camera_arm(60), ("camera",)),
+    "two cameras": (lambda second: fixed_camera_arm(70, second=second), ("left", "right")),
+    "two cameras on the tool": (lambda second: camera_arm(70, second=second), ("left", "right")),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SEEN)
+def test_the_camera_sees_the_board_in_the_poses_that_are_planned_for_it(name: str) -> None:
+    model, (arm_of, names) = kind_named(name).model, SEEN[name]
+    arms = {own: arm_of(own == "right") for own in names}
+    plan = dc.plan(model, drawn(name), 12)
+    for own, q in zip(plan.devices or 12 * names, plan.q, strict=True):
+        assert int(corners_in_truth(q[None], arms[own], on_tool=name != "two cameras")) >= FEWEST
+    last = cameras(kind_named(name))[-1]
+    alone = dc.plan(model, drawn(name), 6, sensor=last)
+    assert int(corners_in_truth(alone.q, arms[last.name or names[-1]], on_tool=name != "two cameras").min()) >= FEWEST
+
+
+@pytest.mark.slow
+def test_candidates_that_no_camera_sees_are_refused() -> None:
+    q = candidates(wrist().robot, 40)
+    with pytest.raises(dc.DiffeoCalibError, match=r"candidates that can be measured: expected at least 5.*its board"):
+        dc.plan(wrist().model, q, 5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["images of a board", "two cameras", "two cameras on the tool"])
+def test_images_of_the_fit_are_what_they_were(kind: str) -> None:
+    """Their noise and what lens and board do to them, by the poses of the model alone."""
+    model = kind_named(kind).model
+    placed = next(own for own in model.placement if own.cameras)
+    for number, one in enumerate(cameras(kind_named(kind))):
+        rows = placed.rows[placed.device == number]
+        points = model(model.configurations[rows]).detach().flatten(1)
+        assert float(sees(one.camera, one.boards(points)).double().mean()) > 0.9
+        known, by_lens = one.tells(points)
+        shared = model.map.noise.shared[rows].clone()
+        if one.set_up.columns is not None:
+            shared[..., one.set_up.columns] = 0.0
+        assert float((by_lens @ one.effects - shared).norm() / shared.norm()) < 0.02
+        sizes = [each.diagonal(dim1=1, dim2=2).sum(1) for each in (known, model.map.noise.covariance[rows])]
+        assert 0.7 < float((sizes[0] / sizes[1]).median()) < 1.0
+
+
+@pytest.mark.slow
+def test_an_image_tells_what_its_pose_shows() -> None:
+    """Against poses and effects that are found from corners."""
+    arm = camera_arm(60)
+    corners = arm.shown(0.1)[1]
+    whole = (~corners[..., 3].isnan()).all(1)
+    found = sighted(Images(corners[whole, :, :3], corners[whole, :, 3:], WIDTH, HEIGHT), None, BOARD_PRIOR)
+    covariance, effects = expected_errors(found.camera, found.poses)
+    ratio = covariance.diagonal(dim1=1, dim2=2) / found.covariance.diagonal(dim1=1, dim2=2)
+    assert 0.6 < float(ratio.median()) < 1.6  # an image's noise is its own
+    assert_close(effects @ found.camera.root, found.shared, rtol=0, atol=0.02 * float(found.shared.abs().max()))
+
+
+@pytest.mark.slow
+def test_views() -> None:
+    """Too near, too far, too flat, from behind, behind the camera, outside of the image, and folded back into it."""
+    camera, arm = true_camera(), camera_arm(60)
+    points, pixels = arm.shown(0.1)[1].split([3, 2], 2)
+    images = Images(points, pixels, WIDTH, HEIGHT)
+    view = sighted(images, None, BOARD_PRIOR).camera.view
+    assert (len(view.points), view.fewest) == (35, int(images.seen.sum(1).min()))
+    camera = replace(camera, view=replace(view, near=0.3, far=0.6, facing=-0.4))
+    ahead = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    ahead[2, 3] = 0.4
+    assert sees(camera, ahead[None]).tolist() == [True]
+
+    def seen(shift: tuple[float, float, float] = (0.0, 0.0, 0.0), turn: float = 0.0) -> bool:
+        pose = ahead.clone()
+        pose[:3, :3] = rotation(pose.new_tensor([[turn, 0.0, 0.0]]))[0] @ pose[:3, :3]
+        pose[:3, 3] += pose.new_tensor(shift)
+        return bool(sees(camera, pose[None]))
+
+    away = [seen((0.0, 0.0, z)) for z in (-0.12, 0.25, -0.8)] + [seen((0.3, 0.0, 0.0)), seen(turn=1.3), seen(turn=3.1)]
+    assert not any(away)
+    assert seen(turn=1.0)
+    folding = replace(camera, unknowns=camera.unknowns.clone(), view=replace(camera.view, far=9.0, facing=-0.1))  # pyright: ignore
+    folding.unknowns[4:9] = torch.tensor([-0.3, 0.0, 0.0, 0.0, 0.0])
+    aside = ahead.clone()
+    aside[0, 3] = 0.4 * 1.8  # tangent 1.8 comes back to 0.05
+    assert not bool(shown(folding, aside[None]).any())
+
+
+@pytest.mark.slow
+def test_planned_images_come_true() -> None:
+    """Ten more images, measured in simulation and fitted, at those that are planned."""
+    arm, kind = camera_arm(60), wrist()
+    q = drawn("images of a board")
+    plan = dc.plan(kind.model, q, 10)
+    boards = inverse_poses(poses_from_marks(arm.arm.true_points(plan.q), LEVER))
+    corners = seen_corners(boards, 0.1, 3, arm.camera)
+    first_q, first = arm.shown(0.1)
+    count = len(first) * 3 // 4
+    known: Any = {"board": BOARD_PRIOR, "camera_on_tool": True}
+    both = dc.Measurements.from_images(
+        torch.cat([first_q[:count], plan.q]), torch.cat([first[:count], corners]), (WIDTH, HEIGHT), **known
+    )
+    model = dc.calibrate(kind.robot, both, hyperparameters=kind.scales).model
+    expected_mm, true_mm = 1e3 * float(plan.expected_rms[-1]), kind.error_mm(model(q).detach(), q)
+    assert true_mm < 1.6 * expected_mm
+
+
+@pytest.mark.slow
+def test_a_campaign_proposes_what_its_camera_sees() -> None:
+    arm = camera_arm(60)
+    rows: Any = arm.images(0.1).rows(slice(0, 14))
+    campaign = dc.Campaign(wrist().robot, seed=1)
+    campaign.add(rows)
+    found = campaign.next(5)
+    assert len(found.q) == 5
+    assert int(corners_in_truth(found.q, arm, on_tool=True).min()) >= FEWEST
+    given = dc.Campaign(wrist().robot, candidates=torch.cat([rows.q[:3], candidates(wrist().robot, 20)]), seed=1)
+    given.add(rows)
+    proposed = given.next(5)
+    assert sorted(proposed.rows) == [0, 1, 2]

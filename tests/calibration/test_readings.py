@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import as_readings
 import pytest
 import torch
 from product_bank import ur10_measurements
 from reading_bank import AXES, POINTS, cameras, in_base, reading_errors, readings, scales
+from table_bank import refused
 from tangent_bank import built, normal, shaken, tangent_covariance
 from torch import Tensor
 from torch.testing import assert_close
@@ -20,7 +23,7 @@ from diffeo_calib.calibration.placing.readings import FoundReadings, identify_re
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.errors import InputError, MeasurementError, RobotError
+from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.maps.observation import Distances
 from diffeo_calib.process.scales import SCALES
 from diffeo_calib.robots import Geometry, SimulatedArm
@@ -73,30 +76,6 @@ def test_likelihood_and_its_slope_of_distances() -> None:
         plus, minus, middle = (value for value in values if value is not None)
         change = (plus.likelihood + plus.prior - minus.likelihood - minus.prior) / 2e-4
         assert float(middle.gradient @ direction) == pytest.approx(change, rel=1e-4)
-
-
-@pytest.mark.slow
-def test_distances_find_the_robot() -> None:
-    """As good as positions nearly; predicted covariances hold after a rigid motion."""
-    arm = SimulatedArm(0)
-    data = readings(arm, "distance", 120, noise=2e-5)
-    result = dc.calibrate(arm.nominal, data.rows(slice(0, 100)))
-    q = arm.sample(300, 9)
-    truth = in_base(arm, q)
-
-    def rms(points: Tensor) -> float:
-        T = rigid_fit(points, truth)
-        return float((points @ T[:3, :3].mT + T[:3, 3] - truth).square().sum(1).mean().sqrt())
-
-    before = rms(result.identification.geometry.points(q)[:, 0])
-    assert rms(result.model(q).detach()[:, 0]) < 0.35 * before
-    assert result.fit.converged
-    assert max(result.fit.coupling_residual, result.fit.end_residual) < 1e-4
-    assert float(reading_errors(result, data.rows(slice(100, 120))).square().mean().sqrt()) < 0.25 * before
-    tracker = dc.Measurements(q, arm.true_points(q), arm.nominal.joint_names)  # in another frame than the robot's base
-    with pytest.warns(dc.DiffeoCalibWarning, match="no longer knows the devices"):
-        registered = result.model.registered(tracker.rows(slice(0, 100)))
-    assert dc.evaluate(registered, tracker.rows(slice(100, 300))).rms < 0.4 * before
 
 
 def errors_after_similarity(found: Tensor, truth: Tensor) -> tuple[float, float]:
@@ -220,24 +199,25 @@ def test_lengths_from_another_zero_are_refused_or_warned_about() -> None:
 
 
 def test_what_is_refused() -> None:
-    arm = SimulatedArm(2)
-    good = readings(arm, "distance", 60)
-    with pytest.raises(MeasurementError, match="at least 40 rows"):
-        dc.calibrate(arm.nominal, good.rows(slice(0, 30)))
+    arm, data = SimulatedArm(2), readings(SimulatedArm(2), "distance", 60)
     with pytest.warns(dc.DiffeoCalibWarning, match="no place of ball and devices explains"):
-        identified(arm.nominal, dc.Readings.distances(good.q, good.values))  # three devices as one
-    kept = good.rows(good.device != 1)
+        identified(arm.nominal, dc.Readings.distances(data.q, data.values))  # three devices as one
+    kept = data.rows(data.device != 1)
     assert kept.names == ("device 0", "device 2")
     assert set(kept.device.tolist()) == {0, 1}
-    names = ["rare"] * 3 + ["often"] * 57
-    with pytest.raises(MeasurementError, match="'rare' in 3 rows"):
-        dc.calibrate(arm.nominal, dc.Readings.distances(good.q, good.values, names))
-    with pytest.raises(MeasurementError, match="above 0"):
-        dc.Readings.distances(good.q, -good.values)
-    with pytest.raises(MeasurementError, match="60 names"):
-        dc.Readings.heights(good.q, 0.0, ["table"])
-    with pytest.raises(InputError, match="Readings"):
-        dc.calibrate(arm.nominal, good.q)  # pyright: ignore[reportCallIssue, reportArgumentType]
-    swapped = dc.Readings.distances(good.q, good.values, joint_names=list(reversed(arm.nominal.joint_names)))
-    with pytest.raises(RobotError, match="joints are not those of robot"):
-        dc.calibrate(arm.nominal, swapped)
+
+    def calibrated_by(rows: Any) -> Callable[[], object]:
+        return lambda: dc.calibrate(arm.nominal, rows)
+
+    names, swapped = ["rare"] * 3 + ["often"] * 57, list(reversed(arm.nominal.joint_names))
+    refused(
+        ("at least 40 rows", calibrated_by(data.rows(slice(0, 30)))),
+        ("'rare' in 3 rows", calibrated_by(dc.Readings.distances(data.q, data.values, names))),
+        (
+            "joints are not those of robot",
+            calibrated_by(dc.Readings.distances(data.q, data.values, joint_names=swapped)),
+        ),
+        ("Readings", calibrated_by(data.q)),
+        ("above 0", lambda: dc.Readings.distances(data.q, -data.values)),
+        ("60 names", lambda: dc.Readings.heights(data.q, 0.0, ["table"])),
+    )

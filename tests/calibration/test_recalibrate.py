@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import copy
+import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from product_bank import Case, simulated, simulated_poses
+from product_bank import Case, simulated, simulated_poses, ur10_measurements, ur10_scales
 from recorded_bank import made
+from table_bank import refused
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.recalibration.recalibrate import place_again, weighed
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError
-from diffeo_calib.interop.numpy_model import load_numpy
-from diffeo_calib.measurements.poses import poses_from_marks
+from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation, transforms
-from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 pytestmark = pytest.mark.slow  # fits by the dozen
 NEW_ROWS = 20
@@ -72,19 +74,6 @@ def test_new_rows_add_to_what_the_old_model_knew(arm: Case, again: tuple[dc.Reca
     assert "no change was found" in found.status
     torch.testing.assert_close(found.moved.transform, elsewhere(), rtol=0.0, atol=1e-3)
     assert found.left_out_rms == pytest.approx(recalibrated, rel=0.6)
-
-
-def test_the_model_is_one_like_any_other(again: tuple[dc.Recalibration, dc.Measurements], tmp_path: Path) -> None:
-    found, test = again
-    assert len(found.model.configurations) == 60 + NEW_ROWS
-    dc.save(found.model, tmp_path / "model.safetensors")
-    loaded = dc.load(tmp_path / "model.safetensors")
-    assert torch.equal(loaded(test.q), found.model(test.q))
-    torch.testing.assert_close(loaded.predict(test.q[:9])[1], found.model.predict(test.q[:9])[1])
-    numpy = load_numpy(tmp_path / "model.safetensors")(test.q.numpy())
-    np.testing.assert_allclose(numpy, found.model(test.q).numpy(), atol=1e-12)
-    back = dc.compensate(found.model, found.model.tool_poses(test.q[:3]), start=test.q[:3])
-    torch.testing.assert_close(back.q, test.q[:3], rtol=0.0, atol=1e-7)
 
 
 def test_recalibrated_once_more(again: tuple[dc.Recalibration, dc.Measurements]) -> None:
@@ -166,39 +155,6 @@ def test_another_marker(arm: Case) -> None:
     assert 0.9 < within_region(found.model, test) <= 1.0
 
 
-def test_poses(posed: Case) -> None:
-    robot = simulated_poses(1)[0]
-    lever, T = posed.model.lever, elsewhere()
-    assert lever is not None
-
-    def poses(rows: int, seed: int) -> dc.Measurements:
-        q, points = robot.measure(rows, seed=seed)
-        frames = T @ dc.Measurements.from_poses(q, poses_from_marks(points, lever), lever=lever).poses
-        return dc.Measurements.from_poses(q, frames, lever=0.2)
-
-    new, test = poses(NEW_ROWS, 5), poses(60, 6)
-    found = dc.recalibrate(posed.model, new, drift="none")
-    registered, again = dc.evaluate(posed.model.registered(new, learn=False), test), dc.evaluate(found.model, test)
-    assert again.rms < 0.9 * registered.rms
-    assert again.angles.square().mean() < registered.angles.square().mean()
-
-
-def test_old_models_with_control_points(arm: Case) -> None:
-    scales = arm.result.selection.scales
-    coarse = dc.calibrate(arm.robot, arm.train, hyperparameters=scales, controls=30).model
-    robot = simulated(1)[0]
-    new, test = measured(robot, NEW_ROWS, 5), measured(robot, 100, 6)
-    found = dc.recalibrate(coarse, new, drift="none")
-    assert len(found.model.configurations) == 60 + NEW_ROWS
-    assert dc.evaluate(found.model, test).rms < dc.evaluate(coarse.registered(new, learn=False), test).rms
-
-
-def test_a_model_and_itself_do_not_differ(arm: Case) -> None:
-    found = dc.compare(arm.model, arm.model)
-    assert found.rms < 1e-6
-    assert not found.changes.found
-
-
 def test_models_of_a_robot_before_and_after_wear(arm: Case) -> None:
     """Whatever frame they are in: what differs is the joint."""
     robot = worn(2, 3.0)
@@ -226,28 +182,111 @@ def test_rows_outside_of_the_old_range_say_nothing_about_change(arm: Case) -> No
     assert "changes were not tested" in str(found)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"marker": "glued"}, "`marker`"),
-        ({"drift": "all"}, "`drift`"),
-        ({"seed": -1}, "seed"),
-        ({"new": "table.csv"}, "the new rows: expected dc.Measurements"),
-        ({"model": "model.safetensors"}, "`model`"),
-    ],
-)
-def test_bad_arguments(arm: Case, change: dict[str, object], message: str) -> None:
-    given = {"model": arm.model, "new": measured(simulated(1)[0], 8, 5)} | change
-    with pytest.raises(InputError, match=message):
-        dc.recalibrate(**given)
+def noisy(data: dc.Measurements, metres: float, std: float | None = None) -> dc.Measurements:
+    generator = torch.Generator().manual_seed(3)
+    noise = metres * torch.randn(data.points.shape, generator=generator, dtype=torch.float64)
+    return dc.Measurements(data.q, data.points + noise, std=std)
 
 
-def test_another_kind_of_measurements_is_refused(arm: Case) -> None:
-    for (_, new, _), got in ((simulated(9, markers=2), "2 marker"), (simulated_poses(9), "poses")):
-        with pytest.raises(InputError, match=f"expected 1 marker\\(s\\), got {got}.*register"):
-            dc.recalibrate(arm.model, new)
+@pytest.fixture(scope="module")
+def new() -> dc.Measurements:
+    return measured(simulated(1)[0], 20, 5)
 
 
-def test_models_of_other_robots_are_not_compared(arm: Case) -> None:
-    with pytest.raises(InputError, match="models of one robot"):
-        dc.compare(arm.model, made("slides"))
+def test_rows_that_a_registration_learnt_from_would_count_twice(
+    arm: Case, new: dc.Measurements, tmp_path: Path
+) -> None:
+    dc.save(arm.model.registered(new), tmp_path / "model")
+    with pytest.raises(InputError, match="fitted to 20 of these 20 measurements: they would count twice; pass rows"):
+        dc.recalibrate(dc.load(tmp_path / "model"), new)  # pyright: ignore[reportArgumentType]
+    other = measured(simulated(1)[0], 15, 6)
+    again = arm.model.registered(new).registered(other, learn=False)
+    with pytest.raises(InputError, match="they would count twice"):
+        dc.recalibrate(again, new)
+
+
+def test_a_device_of_another_scale_is_warned_about(arm: Case, new: dc.Measurements) -> None:
+    with pytest.warns(DiffeoCalibWarning, match=r"are 1\.00\d\d times those that the model predicts; check the scale"):
+        dc.compare(arm.model, dc.Measurements(new.q, 1.006 * new.points))
+
+
+def test_rows_of_which_half_contradict_the_model_are_warned_about(arm: Case, new: dc.Measurements) -> None:
+    for rows in (noisy(new, 5e-3), measured(SimulatedArm(seed=9), 20, 5)):
+        with pytest.warns(DiffeoCalibWarning) as caught:
+            dc.recalibrate(arm.model, rows, drift="none")
+        assert any(re.search("of 20 new rows contradict .*belongs to this robot", str(one.message)) for one in caught)
+
+
+def test_known_noise_of_the_new_rows_counts(arm: Case, new: dc.Measurements) -> None:
+    rows = noisy(new, 1e-3, std=1e-3)
+    found = dc.recalibrate(arm.model, rows, drift="none")
+    test = measured(simulated(1)[0], 200, 6)
+    assert found.outliers == ()
+    assert within_region(found.model, test) > 0.9
+
+
+def test_markers_that_moved_although_they_are_said_to_be_the_same(arm: Case, new: dc.Measurements) -> None:
+    T = elsewhere() @ arm.model.geometry.base @ arm.robot(new.q)
+    shift = (T[:, :3, :3] @ torch.tensor([1e-3, 0.0, 0.0], dtype=torch.float64))[:, None]
+    with pytest.warns(DiffeoCalibWarning, match=r'markers have moved by .* mm, although marker="same"'):
+        dc.compare(arm.model, dc.Measurements(new.q, new.points + shift), marker="same")
+
+
+def test_interrupted_work_leaves_no_model(arm: Case, new: dc.Measurements) -> None:
+    def interrupt(task: str, done: int, total: int) -> None:
+        if task == "Gauss-Newton":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        dc.recalibrate(arm.model, new, drift="none", progress=interrupt)
+
+
+def test_variances_grow_where_the_old_scales_do_not_hold(arm: Case, new: dc.Measurements) -> None:
+    """By the squares of the errors that rows left out would have, if these are larger than expected."""
+    rows = weighed(place_again(arm.model, new), "same")
+    usual = rows.inflation
+    assert 1.0 <= usual < 1.5
+    worse, better = rows.changed(), rows.changed()
+    vars(worse)["residual"], vars(better)["residual"] = 3.0 * rows.residual, 0.1 * rows.residual
+    assert 2.0 < worse.inflation < 9.0 * usual
+    assert better.inflation == 1.0
+
+
+def test_a_ur10_measured_again(ur10_folder: Path) -> None:
+    """Two series of one robot, in different set-ups and joint ranges: regions of 95 % nearly hold in the other one."""
+    robot, data = ur10_measurements(ur10_folder)
+    columns = [f"measurement_{axis}" for axis in "xyz"]
+    units = {"length": "mm", "angle": "rad", "sep": ";", "decimal": ","}
+    before = dc.read_measurements(ur10_folder / "measurements_grid_900.csv", robot, columns, **units)  # pyright: ignore[reportArgumentType]
+    old = dc.calibrate(robot, before[::8], hyperparameters=ur10_scales()).model
+    new, test = data.split(30 / len(data), seed=0)
+    found = dc.recalibrate(old, new)
+    assert dc.evaluate(found.model, test).rms < 0.9 * dc.evaluate(old.registered(new, learn=False), test).rms
+    assert within_region(found.model, test) > 0.83
+
+
+def test_what_is_refused(arm: Case, new: dc.Measurements) -> None:
+    model: Any = arm.model
+    still = dc.Measurements(new.q[:1].repeat(8, 1), new.points[:1].repeat(8, 1, 1), doubt=False)
+
+    def again(rows: Any = new, old: Any = model, **options: Any) -> Callable[[], object]:
+        return lambda: dc.recalibrate(old, rows, **options)
+
+    def of_size(factor: float) -> dc.Measurements:
+        return dc.Measurements(new.q, factor * new.points, doubt=False)
+
+    refused(
+        ("fitted to 60 of these 60 measurements: they would count twice; pass rows", again(arm.train)),
+        ("`marker`", again(marker="glued")),
+        ("`drift`", again(drift="all")),
+        ("seed", again(seed=-1)),
+        ("the new rows: expected dc.Measurements", again("table.csv")),
+        ("`model`", again(old="model.safetensors")),
+        (r"expected 1 marker\(s\), got 2 marker.*register", again(simulated(9, markers=2)[1])),
+        (r"expected 1 marker\(s\), got poses.*register", again(simulated_poses(9)[1])),
+        (r"the new rows do not have the robot's size.*check `length`", again(of_size(1e3))),
+        (r"the new rows do not have the robot's size.*check `length`", again(of_size(1e-3))),
+        (r"do not tell where the measuring device stands.*several joints", again(still)),
+        (r"do not tell where the measuring device stands.*several joints", lambda: dc.compare(model, still)),
+        ("models of one robot", lambda: dc.compare(model, made("slides"))),
+    )

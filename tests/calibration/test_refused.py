@@ -1,138 +1,79 @@
-"""Measurements that cannot belong to the robot are refused, with the likely mistake."""
+"""Rows that cannot belong to the robot: refused if a mistake explains them, else calibrated with a warning."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import re
+import warnings
+from collections.abc import Callable
+from math import inf, pi
+from typing import Any
 
 import pytest
 import torch
 from kind_bank import kind_named
-from product_bank import simulated, simulated_poses
+from product_bank import Case, simulated, simulated_poses, with_usual_scales
+from table_bank import refused
+from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import MeasurementError, RobotError
+from diffeo_calib.calibration.diagnostics.plausibility import check_identification, check_joints, check_limits
+from diffeo_calib.calibration.identification.identification import identify
+from diffeo_calib.calibration.identification.registration import register_inliers
+from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.robots import Joint, SimulatedArm
 
 NOT_THIS_ROBOT = "the measurements do not fit this robot"
+ARM, ROWS, _ = simulated(30)
+ROBOT, Q, POINTS = ARM.nominal, ROWS.q, ROWS.points
 
 
-@dataclass(frozen=True)
-class Few:
-    """A robot and some of its rows: nothing here is fitted to the end."""
-
-    robot: dc.Chain
-    rows: dc.Measurements
+def normal(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-@pytest.fixture(scope="module")
-def arm() -> Few:
-    arm, train, _ = simulated(30)
-    return Few(arm.nominal, train)
+# --- refused ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-def test_units_and_pairings_that_cannot_be_right_are_refused(arm: Few) -> None:
-    q, points = arm.rows.q, arm.rows.points
-    for wrong, message in (
-        (dc.Measurements(q, 1e3 * points), "do not fit this robot.*positions seem to be 1000 times too large"),
-        (dc.Measurements(q, 1e-3 * points), "do not fit this robot.*positions seem to be 1000 times too small"),
-        (dc.Measurements(q.deg2rad(), points), "do not fit this robot.*radians that were converted.*angle unit"),
-        (dc.Measurements(q, points.roll(1, 0)), "do not fit this robot.*one row too late: pair every configuration"),
-    ):
-        with pytest.raises(MeasurementError, match=message):
-            dc.calibrate(arm.robot, wrong)
+def with_joint(joint: int, factor: float = 1.0, offset: float = 0.0) -> Tensor:
+    q = Q.clone()
+    q[:, joint] = factor * q[:, joint] + offset
+    return q
 
 
-def test_points_that_never_move_are_refused(arm: Few) -> None:
-    """As of two hands that hold one tool."""
-    still = dc.Measurements(arm.rows.q, arm.rows.points[:1].expand_as(arm.rows.points).clone())
-    with pytest.raises(MeasurementError, match=r"never move.* got 0 m; .*a ball in one hand that rests in sockets"):
-        dc.calibrate(arm.robot, still)
-
-
-def test_another_number_or_order_of_joints_is_refused(arm: Few) -> None:
-    q, points = arm.rows.q, arm.rows.points
-    with pytest.raises(MeasurementError, match=r"expected 6 joints .waist_joint.*, got 5; check the base and tip"):
-        dc.calibrate(arm.robot, dc.Measurements(q[:, :5], points))
-    with pytest.raises(RobotError, match="put the columns in the robot's order"):
-        dc.calibrate(arm.robot, dc.Measurements(q, points, joint_names=arm.robot.joint_names[::-1]))
-    with pytest.raises(RobotError, match=r"got \S*q1.*joints=.*from_dh\(\.\.\., names="):
-        dc.calibrate(arm.robot, dc.Measurements(q, points, joint_names=[f"q{k}" for k in range(1, 7)]))
-
-
-@pytest.mark.parametrize("rows", [1, 2])
-def test_too_few_rows_to_register(rows: int, arm: Few) -> None:
-    with pytest.raises(MeasurementError, match=r"at least 3 poses, got .*measure more poses"):
-        dc.calibrate(arm.robot, arm.rows.rows(slice(rows)))
-
-
-def test_one_configuration_measured_many_times_is_refused_for_what_it_is(arm: Few) -> None:
-    q = arm.rows.q[:1].repeat(30, 1)
-    noise = 1e-5 * torch.randn(30, 1, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    with pytest.raises(MeasurementError, match=r"same configuration|does not move"):
-        dc.calibrate(arm.robot, dc.Measurements(q, arm.rows.points[:1] + noise))
+MISTAKES = {
+    "mm for m": (Q, 1e3 * POINTS, "positions seem to be 1000 times too large"),
+    "m for mm": (Q, 1e-3 * POINTS, "positions seem to be 1000 times too small"),
+    "radians converted": (Q.deg2rad(), POINTS, "radians that were converted.*angle unit"),
+    "degrees": (180 / pi * Q, POINTS, "the joint values seem to be degrees.*check the angle unit"),
+    "a row late": (Q, POINTS.roll(1, 0), "one row too late: pair every configuration"),
+    "a left-handed frame": (Q, POINTS[..., [1, 0, 2]], ".* seems to be left-handed"),
+    "columns swapped": (Q[:, [0, 1, 4, 3, 2, 5]], POINTS, "the rows fit, in degrees and mm, with joints='waist_joint,sh"
+                        "oulder_joint,wrist_bend_joint,"),
+    "sign of joint 2": (with_joint(1, -1.0), POINTS, "the rows fit, .*-.shoulder_joint."),
+    "sign of joint 6": (with_joint(5, -1.0), POINTS, "the rows fit, .*-.wrist_roll_joint."),
+    "another zero": (with_joint(2, offset=pi / 2), POINTS, "the rows fit, .*,.elbow_joint.-90,"),
+    "two signs": (Q * torch.tensor([1, 1, -1, 1, -1, 1]), POINTS, "the rows fit, in degrees and mm, with joints=.*"
+                  r"-\{elbow_joint\}"),
+    "points of other rows": (Q, torch.cat([POINTS[:15].roll(1, 0), POINTS[15:]]), ""),
+}  # fmt: skip
 
 
 @pytest.mark.slow
-def test_two_joint_columns_swapped(arm: Few) -> None:
-    order = list(range(6))
-    first, second = 2, 4
-    order[first], order[second] = second, first
-    words = "the rows fit, in degrees and mm, with joints='waist_joint,shoulder_joint,wrist_bend_joint,"
-    with pytest.raises(MeasurementError, match=rf"{NOT_THIS_ROBOT}.*; {words}"):
-        dc.calibrate(arm.robot, dc.Measurements(arm.rows.q[:, order], arm.rows.points))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("joint", [1, 5])
-def test_a_joint_with_the_opposite_sign(joint: int, arm: Few) -> None:
-    """The first joint's is another frame of the device and cannot be noticed but by its mirrored errors."""
-    q = arm.rows.q.clone()
-    q[:, joint] *= -1
-    words = f"-.{arm.robot.joint_names[joint]}."
-    with pytest.raises(MeasurementError, match=f"{NOT_THIS_ROBOT}.*; the rows fit, .*{words}"):
-        dc.calibrate(arm.robot, dc.Measurements(q, arm.rows.points))
-
-
-@pytest.mark.slow
-def test_points_in_a_left_handed_frame(arm: Few) -> None:
-    points = arm.rows.points[..., [1, 0, 2]]
-    with pytest.raises(MeasurementError, match=f"{NOT_THIS_ROBOT}.*; .* seems to be left-handed"):
-        dc.calibrate(arm.robot, dc.Measurements(arm.rows.q, points))
-
-
-@pytest.mark.slow
-def test_a_joint_offset_of_a_right_angle(arm: Few) -> None:
-    q = arm.rows.q.clone()
-    q[:, 2] += math.pi / 2
-    with pytest.raises(MeasurementError, match=rf"{NOT_THIS_ROBOT}.*; the rows fit, .*,.elbow_joint.-90,"):
-        dc.calibrate(arm.robot, dc.Measurements(q, arm.rows.points))
-
-
-@pytest.mark.slow
-def test_degrees_instead_of_radians(arm: Few) -> None:
-    data = dc.Measurements(180 / math.pi * arm.rows.q, arm.rows.points, doubt=False)
-    words = "the joint values seem to be degrees.*check the angle unit"
-    with pytest.raises(MeasurementError, match=f"{NOT_THIS_ROBOT}.*; {words}"):
-        dc.calibrate(arm.robot, data)
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_that_explains_the_rows_is_named(name: str) -> None:
+    """A sign of the first joint is another frame of the device, and cannot be noticed."""
+    q, points, words = MISTAKES[name]
+    with pytest.raises(MeasurementError, match=f"{NOT_THIS_ROBOT}.*{words}"):
+        dc.calibrate(ROBOT, dc.Measurements(q, points, doubt=False))
 
 
 @pytest.mark.slow
 def test_inverted_poses() -> None:
     posed, train, _ = simulated_poses(30)
-    poses = train.poses
-    assert poses is not None
-    data = dc.Measurements.from_poses(train.q, torch.linalg.inv(poses))
+    data = dc.Measurements.from_poses(train.q, torch.linalg.inv(train.frames[:, 0]))  # pyright: ignore
     with pytest.raises(MeasurementError, match=f"{NOT_THIS_ROBOT}.*; the poses seem to be those .* seen from the tool"):
         dc.calibrate(posed.nominal, data)
-
-
-@pytest.mark.slow
-def test_many_rows_with_the_points_of_others(arm: Few) -> None:
-    points = arm.rows.points.clone()
-    points[:15] = points[:15].roll(1, 0)
-    with pytest.raises(MeasurementError, match=NOT_THIS_ROBOT):
-        dc.calibrate(arm.robot, dc.Measurements(arm.rows.q, points))
 
 
 @pytest.mark.parametrize("name", ["poses", "several tips"])
@@ -146,3 +87,174 @@ def test_poses_in_another_unit_of_lengths_are_told_so(name: str) -> None:
     data = dc.Measurements.from_poses(kind.data.q, poses, kind.data.joint_names, on=on)
     with pytest.raises(MeasurementError, match=r"positions seem to be 1000 times too small.*check their unit"):
         dc.calibrate(kind.robot, data, hyperparameters=kind.scales)
+
+
+def test_rows_that_cannot_be_those_of_the_robot_are_refused() -> None:
+    def calibrated(q: Tensor, points: Tensor, **names: Any) -> Callable[[], object]:
+        return lambda: dc.calibrate(ROBOT, dc.Measurements(q, points, **names))
+
+    still, numbered = POINTS[:1].expand_as(POINTS).clone(), [f"q{k}" for k in range(1, 7)]
+    refused(
+        (r"never move.* got 0 m; .*a ball in one hand that rests in sockets", calibrated(Q, still)),
+        (r"expected 6 joints .waist_joint.*, got 5; check the base and tip", calibrated(Q[:, :5], POINTS)),
+        ("put the columns in the robot's order", calibrated(Q, POINTS, joint_names=ROBOT.joint_names[::-1])),
+        (r"got \S*q1.*joints=.*from_dh\(\.\.\., names=", calibrated(Q, POINTS, joint_names=numbered)),
+        (r"at least 3 poses, got .*measure more poses", calibrated(Q[:1], POINTS[:1])),
+        (r"at least 3 poses, got .*measure more poses", calibrated(Q[:2], POINTS[:2])),
+        (r"same configuration|does not move", calibrated(Q[:1].repeat(30, 1), POINTS[:1] + 1e-5 * normal(30, 1, 3))),
+    )
+
+
+# --- doubtful rows ----------------------------------------------------------------------------------------------------
+
+
+def rounded(values: Tensor, step: float) -> Tensor:
+    return (values / step).round() * step
+
+
+@pytest.mark.filterwarnings("ignore:rail. never moved")
+def test_a_rail_that_stands_still_is_calibrated() -> None:
+    """Its values, near zero, are near a multiple of any step."""
+    q, y = ARM.measure(40, seed=2)
+    rail = Joint("rail", "prismatic", torch.eye(4, dtype=torch.float64), lower=-1.0, upper=1.0)
+    robot = dc.Chain("on a rail", "ground", ROBOT.tip, [rail, *ROBOT.joints])
+    places = 1e-6 * torch.arange(40, dtype=torch.float64).remainder(53)
+    data = dc.Measurements(torch.cat([places[:, None], q], 1), rounded(y, 1e-6))
+    assert with_usual_scales(robot, data).left_out_rms < 2e-4
+
+
+def test_poses_commanded_in_whole_degrees_are_calibrated() -> None:
+    """An elastic arm that errs by a millimetre, which steps of 1 degree would explain if they were reported so."""
+    arm = SimulatedArm(seed=1, gravity=2.0)
+    q = rounded(arm.sample(40, 3).rad2deg(), 1.0).deg2rad()
+    points = rounded(arm.true_points(q) + arm.noise * normal(40, 1, 3), 1e-6)
+    result = with_usual_scales(arm.nominal, dc.Measurements(q, points))
+    assert 5e-4 < result.registration.rms < 5e-3
+    assert result.left_out_rms < 0.3 * result.registration.rms
+    assert math.isfinite(result.expected.workspace)
+
+
+def test_a_slide_moves_relative_to_its_stroke() -> None:
+    robot = limited(("revolute", -1.0, 1.0), ("prismatic", 0.0, 0.084))
+    angles, places = torch.linspace(-1, 1, 9, dtype=torch.float64), torch.zeros(9, 1, 3, dtype=torch.float64)
+    moved, hardly = (dc.Measurements(torch.stack([angles, 0.02 + s * angles], 1), places) for s in (0.016, 0.001))
+    check_joints(robot, moved)  # a warning fails this test
+    with pytest.warns(DiffeoCalibWarning, match="^j1: hardly moved"):
+        check_joints(robot, hardly)
+
+
+@pytest.mark.slow
+def test_rows_that_no_reading_explains_are_warned_about() -> None:
+    """A tip before the joint that carries the marker."""
+    short = dc.Chain("short", "base_link", "wrist_link", ROBOT.joints[:-2])
+    data = dc.Measurements(Q[:, :5], POINTS)
+    start = register_inliers(short, data)[0].geometry
+    with pytest.warns(DiffeoCalibWarning, match=r"do not fit this robot, even with .* the tip link or DH convention"):
+        check_identification(data, identify(start, data.q, data.points))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("points", "words"),
+    [
+        (POINTS[torch.randperm(30, generator=torch.Generator().manual_seed(0))], f"{NOT_THIS_ROBOT}, even with geo"),
+        (ROBOT(Q)[:, None, :3, 3].contiguous(), "show no errors of the robot"),
+    ],
+)
+def test_doubtful_rows_are_calibrated(points: Tensor, words: str) -> None:
+    with pytest.warns(DiffeoCalibWarning) as caught:
+        result = with_usual_scales(ROBOT, dc.Measurements(Q, points))
+    assert math.isfinite(result.left_out_rms)
+    assert any(words in str(one.message) for one in caught)
+
+
+@pytest.mark.slow
+def test_a_joint_offset_is_reported_and_calibrated(arm: Case) -> None:
+    """Far larger than geometric errors are expected to be: the accuracy hardly suffers."""
+    shift = torch.zeros(6, dtype=torch.float64)
+    shift[4] = math.radians(-30)
+    words = r"^joint offsets are far .*: wrist_bend_joint by (-?\d+\.\d) degrees: got"
+    with pytest.warns(DiffeoCalibWarning, match=words):
+        result = with_usual_scales(arm.robot, dc.Measurements(arm.train.q + shift, arm.train.points))
+    held_out = dc.evaluate(result.model, dc.Measurements(arm.test.q + shift, arm.test.points)).rms
+    assert held_out < 1.7 * arm.held_out()[-1]
+    shift = torch.tensor([0.0, 0.04, -0.04, 0.0, 0.03, 0.0], dtype=torch.float64)
+    with pytest.warns(DiffeoCalibWarning, match="joint offsets are far.*: shoulder_joint by .*elbow_joint by .* degr"):
+        with_usual_scales(arm.robot, dc.Measurements(arm.train.q + shift, arm.train.points))
+
+
+@pytest.mark.slow
+def test_a_joint_that_never_moves_is_predicted_where_it_stands() -> None:
+    """Its warning names it, and the model does not invent errors of it."""
+    arm, train, test = simulated(40)
+    q, other = train.q.clone(), test.q.clone()
+    q[:, 5], other[:, 5] = -0.7, -0.7
+    with pytest.warns(DiffeoCalibWarning, match=r"^wrist_roll_joint: never moved in these measurements") as caught:
+        result = dc.calibrate(arm.nominal, dc.Measurements(q, arm.true_points(q) + 2e-5 * normal(40, 1, 3, seed=1)))
+    assert len(caught) == 1
+    there = dc.Measurements(other, arm.true_points(other))
+    geometry = dc.evaluate(result.identification.geometry.points, there).rms
+    assert dc.evaluate(result.model, there).rms < 0.25 * geometry
+    (part,) = [part for part in result.parts if part.name == "transmission of wrist_roll_joint"]
+    assert part.displacement < 1e-4
+
+
+def limited(*limits: tuple[str, float, float]) -> dc.Chain:
+    origin = torch.eye(4, dtype=torch.float64)
+    joints = [Joint(f"j{k}", kind, origin, lower=low, upper=high) for k, (kind, low, high) in enumerate(limits)]
+    return dc.Chain("r", "a", "b", joints)
+
+
+def test_joints_far_beyond_their_limits_are_warned_about_in_their_own_unit() -> None:
+    robot = limited(("revolute", -1.0, 1.0), ("prismatic", 0.0, 0.6), ("revolute", 0.0, 0.0), ("revolute", -inf, inf))
+    for q, words in (
+        ([7.48, 0.7, 3.0, 9.0], ""),  # 1.2 and a turn
+        ([0.0, 8.0, 0.0, 0.0], r"^j1: far beyond .*: expected 0 to 0.6 m, got 8 to 8 m; .*not in millimetres"),
+        ([9.0, 0.1, 0.0, 0.0], r"^j0: far beyond .*: expected -1 to 1 rad, got 2.72 to 2.72 rad; .*not in degrees"),
+    ):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            check_limits(robot, dc.Measurements([q], [[0.0, 0.0, 0.0]]))
+        assert len(caught) == bool(words)
+        assert all(re.search(words, str(one.message)) for one in caught)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:a marker or the tool")
+def test_markers_that_are_exchanged_in_half_of_the_rows(pair: Case) -> None:
+    points = pair.train.points.clone()
+    points[:20] = points[:20, [1, 0]]
+    with pytest.warns(DiffeoCalibWarning, match=r"rows are outliers.*markers (0 and 1|1 and 0) seem to be exchanged"):
+        dc.calibrate(pair.robot, dc.Measurements(pair.train.q, points))
+
+
+def with_an_offset(arm: Case) -> dc.Measurements:
+    """Of the elbow; and a wrist that never moves."""
+    q = arm.train.q[:16].clone()
+    q[:, 5] = 0.1
+    points = arm.result.registration.geometry.points(q)
+    q[:, 2] += 0.3
+    return dc.Measurements(q, points)
+
+
+def overstated(std: float) -> Callable[[Case], dc.Measurements]:
+    return lambda arm: dc.Measurements(arm.train.q[:30], arm.train.points[:30], std=std)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda arm: arm.train.rows(slice(8)), ["too few"]),
+        (with_an_offset, ["never moved", "joint offsets"]),
+        (overstated(1e-3), ["leave-one-out errors contradict the selected scales", "check `std`"]),
+        (overstated(2e-2), ["leave-one-out errors contradict the selected scales", "check `std`"]),  # mm given as m
+    ],
+)
+def test_warnings_point_at_the_caller(spoil: Callable[[Case], dc.Measurements], words: list[str], arm: Case) -> None:
+    """However deep in the package they are found."""
+    with pytest.warns(DiffeoCalibWarning) as caught:
+        dc.calibrate(arm.robot, spoil(arm))
+    messages = [str(w.message) for w in caught]
+    assert all(any(word in message for message in messages) for word in words), messages
+    assert [(str(w.message), w.filename) for w in caught if w.filename != __file__] == []

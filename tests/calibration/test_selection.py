@@ -1,4 +1,4 @@
-"""The search for scales: better than its starts, repeatable, safe to interrupt, and right about known robots."""
+"""Scales: their defaults, the log posterior against scipy and formulas, and the search for the best ones."""
 
 from __future__ import annotations
 
@@ -7,22 +7,217 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from product_bank import Case, noise_blocks
-from tangent_bank import Setting, built, gravity_covariance, normal, shaken
+from tangent_bank import (
+    Setting,
+    built,
+    gravity_covariance,
+    noise_covariance,
+    normal,
+    shaken,
+    tangent_covariance,
+    weighted,
+)
 from torch import Tensor
+from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.scales.selection import (
+    LARGEST_AMPLITUDE_RATIO,
     SEARCH_LIMITS,
-    TRANSMISSION_STARTS_RAD,
     SearchLimits,
     Selection,
+    defaults,
     log_posterior,
     select,
 )
-from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.process.scales import AMPLITUDES, SCALES
+from diffeo_calib.robots import Chain, Geometry, Joint, SimulatedArm
+
+# --- defaults ---------------------------------------------------------------------------------------------------------
+
+
+def test_defaults_are_usable_scales(setting: Setting) -> None:
+    scales, noise = setting.scales, setting.identification.noise
+    assert bool(torch.isfinite(scales.logarithms()).all())
+    assert float(scales.sensor_noise) < noise
+    assert noise / 2.0 < 10 * float(scales.transmission_amplitude.max())
+    ratio = float(scales.transmission_amplitude.max() / scales.transmission_amplitude.min())
+    assert ratio <= LARGEST_AMPLITUDE_RATIO * 1.001
+    moving = setting.nominal.geometry.chain.moving
+    assert scales.compliance.shape == scales.lateral_compliance.shape == (moving,)
+
+
+def test_every_part_moves_the_markers_by_less_than_the_residual_at_first(setting: Setting) -> None:
+    """The defaults of gravity: the sag of one joint has the size of the geometric residual."""
+    scales, data, noise = setting.scales, setting.tangent_data, setting.identification.noise
+    nominal = data.nominal
+    for joint in range(nominal.geometry.chain.moving):
+        off = torch.zeros_like(scales.compliance)
+        for name, share in (("compliance", 0.3), ("lateral_compliance", 0.1)):
+            alone = off.clone()
+            alone[joint] = getattr(scales, name)[joint]
+            other = {"compliance": off, "lateral_compliance": off} | {name: alone}
+            covariance = gravity_covariance(replace(scales, **other), nominal, data.theta, data.x)
+            assert float(covariance.diagonal().mean().sqrt()) <= 1.001 * share * noise
+    total = gravity_covariance(scales, nominal, data.theta, data.x)
+    assert float(total.diagonal().mean().sqrt()) > 0.3 * noise
+
+
+def test_the_unit_of_length_does_not_matter() -> None:
+    """The same robot ten times as large: lengths of the scales grow tenfold, angles stay."""
+    setting = built("sliding")
+    data, big = setting.tangent_data, torch.tensor([1, 1, 10.0, 1, 1, 1], dtype=torch.float64)
+    noise, prior = setting.identification.noise, setting.identification.prior
+
+    class Grown(GeometryMap):
+        def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
+            return 10.0 * super().__call__(x / big, theta)
+
+        def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
+            return 10.0 * super().jacobian(x / big, theta) / big
+
+    geometry = setting.nominal.geometry
+    large = replace(data, nominal=Grown(geometry), theta=data.theta[: geometry.size], x=data.x * big)
+    grown = defaults(large, 10 * noise, prior)
+    assert_close(grown.coupled_lengthscale, setting.scales.coupled_lengthscale * big)
+    assert_close(grown.transmission_lengthscale, setting.scales.transmission_lengthscale * big)
+    assert_close(grown.task_lengthscale, 10 * setting.scales.task_lengthscale)
+    assert_close(grown.sensor_noise, 10 * setting.scales.sensor_noise)
+    assert_close(grown.rotation_noise, setting.scales.rotation_noise)
+    assert_close(grown.task_amplitude, 10 * setting.scales.task_amplitude)
+    assert bool((grown.joint_noise > 0).all())
+
+
+def test_a_joint_without_motion_or_lever_has_finite_scales() -> None:
+    setting = built("sliding")
+    data, x, prior = setting.tangent_data, setting.data.q.clone(), setting.identification.prior
+    x[:, 2] = 0.3
+    scales = defaults(replace(data, x=x), 1e-4, prior)
+    assert bool(torch.isfinite(scales.logarithms()).all())
+    levers = data.nominal.jacobian(x, data.theta)
+    levers[..., 5] = 0.0  # no lever at all
+
+    class Blind(GeometryMap):
+        def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
+            return levers
+
+    blind = replace(data, nominal=Blind(setting.nominal.geometry, elastic=True), x=x)
+    amplitude = defaults(blind, 1e-4, prior).transmission_amplitude
+    assert float(amplitude[5]) <= 3.01 * float(amplitude.min())
+
+
+def test_a_robot_that_cannot_bend_has_finite_scales() -> None:
+    """Without gravity sag, and with one that has no features: all axes meet at the tip."""
+    origin = torch.eye(4, dtype=torch.float64)
+    joints = [
+        Joint("a", "revolute", origin),
+        Joint("b", "revolute", origin, torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)),
+    ]
+    arm = Chain("ball", "floor", "hand", joints)
+    geometry = replace(Geometry.nominal(arm), tool=torch.tensor([[0.1, 0.2, 0.3]], dtype=torch.float64))
+    setting = built("sliding")
+    for elastic in (False, True):
+        nominal = GeometryMap(geometry, elastic=elastic)
+        theta = torch.zeros(nominal.parameters, dtype=torch.float64)
+        data = replace(setting.tangent_data, nominal=nominal, theta=theta, x=normal(10, 2, seed=1))
+        scales = defaults(data, 1e-4, setting.identification.prior)
+        assert bool(torch.isfinite(scales.logarithms()).all())
+        assert scales.prior_variance(nominal).shape == (nominal.parameters,)
+
+
+# --- log posterior ----------------------------------------------------------------------------------------------------
+
+
+def log_prior(scales: dc.Hyperparameters, centre: dc.Hyperparameters) -> float:
+    """Log-normal, entry by entry: amplitudes may grow a little and shrink a lot."""
+    total = 0.0
+    for name in SCALES:
+        away = (getattr(scales, name) / getattr(centre, name)).log().flatten().tolist()
+        for a in away:
+            width = 1.0
+            if name in AMPLITUDES:
+                width = 1.0 if a > 0 else 2.0
+            total -= 0.5 * (a / width) ** 2
+    return total
+
+
+def log_density(matrix: Tensor, target: Tensor) -> float:
+    """Of a Gaussian with mean 0, by numpy."""
+    (_, size), square = (
+        np.linalg.slogdet(matrix.numpy()),
+        target.numpy() @ np.linalg.solve(matrix.numpy(), target.numpy()),
+    )
+    return float(-0.5 * (square + size + len(target) * np.log(2 * np.pi)))
+
+
+@pytest.mark.parametrize("seed", [2])
+def test_posterior_is_likelihood_times_prior(setting: Setting, seed: int) -> None:
+    scales, data = shaken(setting.scales, seed), weighted(setting, seed)
+    nominal, theta, x = data.told.nominal, data.theta, data.x
+    total = tangent_covariance(scales, nominal, theta, x)
+    total += torch.block_diag(*noise_covariance(scales, setting, theta, data.tails.weights))
+    target = (data.y - nominal(x, theta) + nominal.sensitivities(x, theta) @ theta).flatten()
+    if data.basis is not None:  # six numbers of every pose
+        basis = torch.block_diag(*data.basis)
+        total, target = basis.T @ total @ basis, basis.T @ target
+    found = log_posterior(scales.logarithms(), setting.scales, data)
+    assert found.likelihood == pytest.approx(log_density(total, target), rel=1e-6)
+    assert found.prior == pytest.approx(log_prior(scales, setting.scales), rel=1e-9)
+
+
+@pytest.mark.slow
+def test_gradient_against_central_differences(setting: Setting) -> None:
+    data = weighted(setting).rows(torch.arange(0, len(setting.data), 2))
+    point, h = shaken(setting.scales, 2).logarithms(), 0.02  # long steps: the prior of the base is wide
+
+    def value(at: Tensor) -> float:
+        found = log_posterior(at, setting.scales, data)
+        return found.likelihood + found.prior
+
+    def change(step: Tensor) -> float:
+        return value(point + step) - value(point - step)
+
+    found = log_posterior(point, setting.scales, data)
+    start = 0
+    for name in SCALES:  # along one direction for every kind of scale
+        size = getattr(setting.scales, name).numel()
+        step = torch.zeros_like(point)
+        step[start : start + size] = h * normal(size, seed=start)
+        start += size
+        expected, scale = (8 * change(step) - change(2 * step)) / 12, float(found.gradient.abs().max())
+        assert float(found.gradient @ step) == pytest.approx(expected, rel=1e-4, abs=1e-6 * scale)
+
+
+def test_a_singular_covariance_has_no_posterior() -> None:
+    setting = built("two markers")
+    scales = setting.scales
+    # next to no noise and an amplitude of e^25 defaults: G + R is singular in float64
+    mute = replace(
+        scales,
+        sensor_noise=scales.sensor_noise * 1e-9,
+        joint_noise=scales.joint_noise * 1e-9,
+        task_amplitude=scales.task_amplitude * math.exp(25),
+        task_lengthscale=scales.task_lengthscale * 1e4,
+    )
+    assert log_posterior(mute.logarithms(), scales, setting.tangent_data) is None
+
+
+def test_a_wide_prior_costs_no_digits(setting: Setting) -> None:
+    """Of metres or of kilometres: the likelihood then falls by the logarithm of the prior alone, the gradient stays."""
+    scales = setting.scales
+    wide = [
+        log_posterior(scales.logarithms(), scales, replace(weighted(setting), place_deviation=d)) for d in (1e1, 1e3)
+    ]
+    assert wide[0] is not None
+    assert wide[1] is not None
+    free = (wide[0].likelihood - wide[1].likelihood) / math.log(1e2)
+    assert free == pytest.approx(round(free), abs=1e-2)
+    torch.testing.assert_close(wide[0].gradient, wide[1].gradient, rtol=1e-4, atol=1e-4)
 
 
 def brief(iterations: int = 5, **others: int) -> SearchLimits:
@@ -34,7 +229,6 @@ def brief(iterations: int = 5, **others: int) -> SearchLimits:
 def value(setting: Setting, scales: dc.Hyperparameters) -> float:
     """Log posterior, up to a constant."""
     found = log_posterior(scales.logarithms(), setting.scales, setting.tangent_data)
-    assert found is not None
     return found.likelihood + found.prior
 
 
@@ -50,29 +244,16 @@ def interrupting(calls: int) -> Callable[..., None]:
     return progress
 
 
-# --- the search ---------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_select_is_better_than_the_default_and_reports_its_likelihood(setting: Setting) -> None:
     selection = select(setting.scales, setting.tangent_data)
     assert value(setting, selection.scales) > value(setting, setting.scales) + 1.0
     found = log_posterior(selection.scales.logarithms(), setting.scales, setting.tangent_data)
-    assert found is not None
     assert selection.likelihood == pytest.approx(found.likelihood, rel=1e-9)
     assert f"likelihood {found.likelihood:.1f} on {len(setting.data)} poses" in selection.status
     assert not selection.interrupted
     moved = selection.scales.logarithms() - setting.scales.logarithms()
     assert float(moved.abs().max()) <= SEARCH_LIMITS.log_range + 1e-9
-
-
-def test_same_seed_same_scales() -> None:
-    setting, limits = built("sliding"), brief(poses=15)
-    first, same, other = (select(setting.scales, setting.tangent_data, seed=seed, limits=limits) for seed in (0, 0, 1))
-    assert torch.equal(first.scales.logarithms(), same.scales.logarithms())
-    assert first.status == same.status
-    assert "on 15 poses" in first.status
-    assert not torch.equal(first.scales.logarithms(), other.scales.logarithms())
 
 
 def test_a_given_start_is_where_the_search_begins() -> None:
@@ -85,48 +266,6 @@ def test_a_given_start_is_where_the_search_begins() -> None:
     assert value(setting, climbed.scales) > value(setting, start)
 
 
-def test_without_a_start_there_is_one_for_every_length_scale_of_the_transmissions() -> None:
-    setting, began = built("mimic joint"), []
-
-    def progress(_: str, done: int, total: int) -> None:
-        began.extend([total] * (done in (1, len(TRANSMISSION_STARTS_RAD) + 1)))  # two iterations each
-
-    selection = select(setting.scales, setting.tangent_data, limits=brief(2), progress=progress)
-    assert began == [4, 4]
-    for lengthscale in TRANSMISSION_STARTS_RAD:
-        other = setting.scales.transmission_lengthscale * lengthscale / TRANSMISSION_STARTS_RAD[0]
-        start = replace(setting.scales, transmission_lengthscale=other)
-        assert value(setting, selection.scales) > value(setting, start)
-    began.clear()
-    select(setting.scales, setting.tangent_data, start=setting.scales, limits=brief(2), progress=progress)
-    assert began == [2]
-
-
-def test_progress_counts_up_to_the_total() -> None:
-    seen: list[tuple[str, int, int]] = []
-    setting = built("mimic joint")
-    select(setting.scales, setting.tangent_data, limits=brief(3), progress=lambda *news: seen.append(news))
-    assert {task for task, _, _ in seen} == {"hyper-parameters"}
-    assert all(1 <= done <= total for _, done, total in seen)
-
-
-def test_few_measurements_are_searched_longer_than_many() -> None:
-    assert [SEARCH_LIMITS.first_iterations(count) for count in (30, 270, 450, 900)] == [60, 55, 20, 15]
-
-
-# --- Ctrl-C -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("given", [False, True])
-def test_interrupted_at_once_keeps_the_defaults_or_a_given_start(given: bool) -> None:
-    setting = built("mimic joint")
-    start = shaken(setting.scales, 6) if given else None
-    selection = select(setting.scales, setting.tangent_data, start=start, progress=interrupting(1))
-    assert selection.interrupted
-    assert "interrupted" in selection.status
-    assert torch.equal(selection.scales.logarithms(), (start or setting.scales).logarithms())
-
-
 def test_interrupted_later_keeps_the_best_so_far() -> None:
     """The line search overshoots at times; the scales that are kept never get worse."""
     setting, kept = built("two markers"), []
@@ -137,9 +276,6 @@ def test_interrupted_later_keeps_the_best_so_far() -> None:
     assert kept == sorted(kept)
     assert kept[-1] > kept[0] + 1.0
     assert len(set(kept)) < len(kept)  # some evaluations were no improvement
-
-
-# --- failed factorisations ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("every", [1, 2, 3])
@@ -165,9 +301,6 @@ def test_a_failed_factorisation_is_a_rejected_step(every: int, monkeypatch: pyte
     assert value(setting, selection.scales) >= value(setting, setting.scales)
 
 
-# --- results on known robots --------------------------------------------------------------------------------------
-
-
 def found_in(arm: SimulatedArm, rows: int) -> tuple[Setting, Selection]:
     setting = Setting(arm.nominal, dc.Measurements(*arm.measure(rows, seed=2)))
     return setting, select(setting.scales, setting.tangent_data, limits=brief(15))
@@ -186,13 +319,6 @@ def test_gravity_that_is_not_there_shrinks_and_gravity_that_is_stays() -> None:
     assert gravity_effect(setting, without.scales) < 0.3 * setting.identification.noise
     setting, with_it = found_in(SimulatedArm(seed=2, gravity=2.0, transmission=0), 60)
     assert gravity_effect(setting, with_it.scales) > 0.8 * setting.identification.noise
-
-
-def test_pure_noise_is_called_noise() -> None:
-    arm = SimulatedArm(seed=5, geometry=0, transmission=0, gravity=0)
-    setting, selection = found_in(arm, 40)
-    noise = setting.tangent_data.noise(selection.scales)
-    assert float(noise.diagonal(dim1=1, dim2=2).mean().sqrt()) == pytest.approx(arm.noise, rel=0.35)
 
 
 @pytest.mark.slow

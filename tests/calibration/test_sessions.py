@@ -1,11 +1,10 @@
 """Campaigns in several set-ups of the measuring device: found, fitted, saved, and as accurate as in one."""
 
 import json
-from copy import copy
+import re
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 import pytest
 import torch
@@ -15,9 +14,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.cli import record
-from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegression
+from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 
@@ -53,15 +50,14 @@ def campaign(arm: SimulatedArm, *, shuffled: bool, moved: bool = True) -> dc.Mea
 
 
 @pytest.fixture(scope="module")
-def result(arm: SimulatedArm) -> dc.CalibrationResult:
+def result(arm: SimulatedArm) -> Any:
     return with_usual_scales(arm.nominal, campaign(arm, shuffled=True))
 
 
-def test_as_accurate_as_in_one_set_up(arm: SimulatedArm, result: dc.CalibrationResult) -> None:
+def test_as_accurate_as_in_one_set_up(arm: SimulatedArm, result: Any) -> None:
     q = arm.sample(500, seed=9)
     still = campaign(arm, shuffled=True, moved=False).with_sessions(None)
     one = dc.calibrate(arm.nominal, still, hyperparameters=result.selection.scales).model
-    assert result.sessions is not None
     reference = frames()[NAMES.index(result.sessions.names[result.sessions.reference])]
     truth = arm.true_points(q) @ reference[:3, :3].mT + reference[:3, 3]
     ours, theirs = ((model - points).norm(dim=-1).square().mean().sqrt() for model, points in (
@@ -69,32 +65,17 @@ def test_as_accurate_as_in_one_set_up(arm: SimulatedArm, result: dc.CalibrationR
     assert float(ours) < 1.25 * float(theirs)
 
 
-def test_the_frames_are_found(result: dc.CalibrationResult) -> None:
+def test_the_frames_are_found(result: Any) -> None:
     sessions = result.sessions
-    assert sessions is not None
     truth = torch.stack([frames()[NAMES.index(name)] for name in sessions.names])
     expected = truth @ torch.linalg.inv(truth[sessions.reference])
     centre = torch.tensor([0.0, 0.0, 0.5, 1.0], dtype=torch.float64)
-    torch.testing.assert_close(sessions.transforms[:, :3, :3], expected[:, :3, :3], rtol=0, atol=1e-4)
-    torch.testing.assert_close(sessions.transforms @ centre, expected @ centre, rtol=0, atol=3e-4)
+    assert_close(sessions.transforms[:, :3, :3], expected[:, :3, :3], rtol=0, atol=1e-4)
+    assert_close(sessions.transforms @ centre, expected @ centre, rtol=0, atol=3e-4)
     assert len(sessions.sentences()) == len(NAMES) - 1
 
 
-def test_the_frames_are_known_as_well_where_the_rows_are_many(result: dc.CalibrationResult) -> None:
-    """Where conjugate gradients take the place of a factor of all rows."""
-    fitted = result.model.map
-    expected, many = fitted.shift_covariance(), copy(fitted)
-    at = fitted.geodesic.linearise(None)
-    vars(many)["conditional"] = ConjugateGradientRegression(at, fitted.noise)
-    assert len(expected) > 6
-    assert_close(many.shift_covariance(), expected, rtol=1e-3, atol=1e-3 * float(expected.diagonal().min()))
-    with pytest.raises(InputError, match="too many"):
-        many.with_shifts(at, fitted.noise.shared, torch.ones(len(expected), dtype=torch.bool))
-
-
-def test_new_rows_of_a_session_are_brought_into_the_model_frame(
-    arm: SimulatedArm, result: dc.CalibrationResult
-) -> None:
+def test_new_rows_of_a_session_are_brought_into_the_model_frame(arm: SimulatedArm, result: Any) -> None:
     q, T = arm.sample(50, seed=8), frames()[1]
     seen = dc.Measurements(q, arm.true_points(q) @ T[:3, :3].mT + T[:3, 3], arm.nominal.joint_names)
     aligned = result.aligned(seen.with_sessions(["Tuesday"] * 50))
@@ -103,9 +84,7 @@ def test_new_rows_of_a_session_are_brought_into_the_model_frame(
         result.aligned(seen.with_sessions(["Sunday"] * 50))
 
 
-def test_rows_of_several_set_ups_are_not_compared_with_a_model(
-    arm: SimulatedArm, result: dc.CalibrationResult, tmp_path: Path
-) -> None:
+def test_rows_of_several_set_ups_are_not_compared_with_a_model(arm: SimulatedArm, result: Any, tmp_path: Path) -> None:
     q, points = arm.measure(6, seed=9)
     data = dc.Measurements(q, points, arm.nominal.joint_names).with_sessions(["a", "b"] * 3)
     for judge in (dc.evaluate, lambda model, rows: dc.write_report(model, tmp_path / "page.html", rows)):
@@ -115,12 +94,12 @@ def test_rows_of_several_set_ups_are_not_compared_with_a_model(
         dc.evaluate(result.model, data.rows([0, 2, 4]))
 
 
-@pytest.mark.parametrize("names", [5, "abcdef", ["a", None, "b", "b", "a", "a"], ["a", " ", "b", "b", "a", "a"]])
-def test_names_of_sessions(names: Any) -> None:
+def test_names_of_sessions() -> None:
     q = torch.zeros(6, 2, dtype=torch.float64)
-    data = dc.Measurements(q, torch.zeros(6, 3, dtype=torch.float64), doubt=False)
-    with pytest.raises(MeasurementError, match=r"the names of sessions: (expected 6 names|1 row\(s\))"):
-        data.with_sessions(names)
+    data: Any = dc.Measurements(q, torch.zeros(6, 3, dtype=torch.float64), doubt=False)
+    for names in (5, "abcdef", ["a", "b"], ["a", None, "b", "b", "a", "a"], ["a", " ", "b", "b", "a", "a"]):
+        with pytest.raises(MeasurementError, match=r"the names of sessions: (expected 6 names|1 row\(s\))"):
+            data.with_sessions(names)
     assert data.with_sessions([" a", "a "] * 3).session_names == ("a",)
 
 
@@ -134,8 +113,7 @@ def test_poses_in_several_sessions(arm: SimulatedArm) -> None:
     data = dc.Measurements.from_poses(q, poses, arm.nominal.joint_names)
     data = data.with_sessions(["a"] * 40 + ["b"] * 40)
     found = dc.calibrate(arm.nominal, data, hyperparameters=usual_scales(arm.nominal)).sessions
-    assert found is not None
-    torch.testing.assert_close(found.transforms[1], T, rtol=0, atol=1e-3)
+    assert_close(found.transforms[1], T, rtol=0, atol=1e-3)
 
 
 def test_deviations_turn_with_the_frame(arm: SimulatedArm) -> None:
@@ -143,17 +121,14 @@ def test_deviations_turn_with_the_frame(arm: SimulatedArm) -> None:
     quarter[:2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
     data = dc.Measurements(q, arm.true_points(q), std=torch.tensor([1.0, 2.0, 3.0]).mul(1e-4).expand(5, 2, 3))
     turned = data.in_frames(quarter.expand(5, 4, 4))
-    assert turned.std is not None
-    torch.testing.assert_close(turned.std[0, 0], torch.tensor([2e-4, 1e-4, 3e-4], dtype=torch.float64))
-    torch.testing.assert_close(turned.in_frames(torch.linalg.inv(quarter).expand(5, 4, 4)).points, data.points)
+    assert_close(turned.std[0, 0], torch.tensor([2e-4, 1e-4, 3e-4], dtype=torch.float64))
+    assert_close(turned.in_frames(torch.linalg.inv(quarter).expand(5, 4, 4)).points, data.points)
 
 
 def test_too_few_rows_of_a_session_are_refused(arm: SimulatedArm) -> None:
     data = campaign(arm, shuffled=False)
     with pytest.raises(MeasurementError, match="session 'b': expected 4 rows, got 'b' in 3 rows"):
         dc.calibrate(arm.nominal, data.with_sessions(["a"] * (ROWS - 3) + ["b"] * 3))
-    with pytest.raises(MeasurementError, match="the names of sessions: expected 105 names, one per row, got 2"):
-        data.with_sessions(["a", "b"])
 
 
 @pytest.fixture
@@ -172,77 +147,34 @@ def table(arm: SimulatedArm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 TABLE = ["--position", "x,y,z", "--position", "u,v,w", "--length", "m", "--angle", "rad"]
 
 
-@pytest.mark.usefixtures("given_scales")
-def test_a_column_of_the_table(table: dc.Measurements, command: Command) -> None:
-    assert set(table.session_names) == set(NAMES)
-    robot = ["--robot", "arm.urdf", "--base", "base_link", "--tip", "flange"]
-    options = ["fit", "t.csv", *robot, *TABLE, "-o", "m", "--holdout", "0.2"]
-    done = command(*options, "--session", "day")
-    assert done.code == 0, done.err
-    assert "its frame is" in done.out
-    wrong = command(*options, "--session", "night")
-    assert "no column ['night']" in wrong.err
-
-
-def test_sessions_of_the_fit_are_evaluated_where_it_found_them(
-    table: dc.Measurements, result: dc.CalibrationResult, command: Command
-) -> None:
-    dc.save(result.model, "m.safetensors")
-    words = ["evaluate", "m.safetensors", "t.csv", *TABLE, "--session", "day"]
-    done = command(*words, "--json", "e.json")
-    assert "found from these rows" not in done.out
-    written = json.loads(Path("e.json").read_text())["results"]["errors"]["all"]["rms_m"]
-    assert written == pytest.approx(dc.evaluate(result.model, result.aligned(table)).rms, rel=1e-6)
-    both = command(*words, "--register")
-    assert both.code == 0
-    assert both.out.count("session '") == len(NAMES)
-
-
 def other_names(text: str) -> str:
     """A table whose sessions the model does not know."""
-    for name in NAMES:
-        text = text.replace(name, f"new {name}")
-    return text
+    return re.sub("Monday|Tuesday|Friday", lambda found: f"new {found[0]}", text)
 
 
-def test_every_other_session_is_evaluated_where_it_fits_best(
-    table: dc.Measurements, result: dc.CalibrationResult, command: Command
-) -> None:
+def test_every_other_session_is_evaluated_where_it_fits_best(table: Any, result: Any, command: Command) -> None:
     dc.save(result.model, "m.safetensors")
     Path("t.csv").write_text(other_names(Path("t.csv").read_text()))
-    evaluate = ["evaluate", "m.safetensors", "t.csv", *TABLE]
-    done = command(*evaluate, "--session", "day", "--json", "e.json", "--residuals", "r.csv")
+    done = command("evaluate", "m.safetensors", "t.csv", *TABLE, "--session", "day", "--json", "e.json")
     assert done.code == 0, done.err
     assert not done.warnings
     assert "the frames of 3 sessions were found from these rows, 18 numbers in all" in " ".join(done.out.split())
-    written = json.loads(Path("e.json").read_text())
-    jsonschema.validate(written, json.loads((Path(record.__file__).parent / "result.schema.json").read_text()))
-    assert result.sessions is not None
-    found = written["results"]["session_transforms"]
-    reference = other_names(result.sessions.names[result.sessions.reference])
+    found = json.loads(Path("e.json").read_text())["results"]
+    reference = frames()[NAMES.index(result.sessions.names[result.sessions.reference])]
     centre = torch.tensor([0.0, 0.0, 0.5, 1.0], dtype=torch.float64)
-    truth = dict(zip(map(other_names, NAMES), frames(), strict=True))
-    for name, T in found.items():
-        expected = truth[name] @ torch.linalg.inv(truth[reference])
-        torch.testing.assert_close(torch.tensor(T, dtype=torch.float64) @ centre, expected @ centre, rtol=0, atol=3e-4)
-    rms = written["results"]["errors"]["all"]["rms_m"]
+    for name, T in zip(NAMES, frames(), strict=True):
+        own = torch.tensor(found["session_transforms"][f"new {name}"], dtype=torch.float64)
+        assert_close(own @ centre, T @ torch.linalg.inv(reference) @ centre, rtol=0, atol=3e-4)
+        assert found["errors"]["in_sessions"][f"new {name}"]["rows"] == ROWS // 3
     aligned = dc.evaluate(result.model, result.aligned(table)).rms
-    assert rms <= aligned * (1 + 1e-9)  # the places fit these rows best
-    assert rms > 0.5 * aligned
-    rows = {name: each["rows"] for name, each in written["results"]["errors"]["in_sessions"].items()}
-    assert rows == dict.fromkeys(truth, ROWS // 3)
-    sizes = np.loadtxt("r.csv", delimiter=",", skiprows=1, usecols=8)
-    assert float(np.sqrt(np.square(sizes).mean())) == pytest.approx(rms, rel=1e-6)
+    assert 0.5 * aligned < found["errors"]["all"]["rms_m"] <= aligned * (1 + 1e-9)  # the places fit these rows best
 
 
-def test_rows_of_other_sessions_in_one_frame_are_named(
-    table: dc.Measurements, result: dc.CalibrationResult, command: Command
-) -> None:
+def test_rows_of_other_sessions_in_one_frame_are_named(table: dc.Measurements, result: Any, command: Command) -> None:
     dc.save(result.model, "m.safetensors")
     done = command("evaluate", "m.safetensors", "t.csv", *TABLE)
     assert "70 rows of the fit were measured in another set-up than that of the model" in " ".join(done.err.split())
     assert "name the column of the set-ups (--session)" in " ".join(done.err.split())
-    assert result.sessions is not None
     lines = Path("t.csv").read_text().split("\n")
     own = [line for line in lines[1:] if line.endswith(result.sessions.names[result.sessions.reference])]
     Path("own.csv").write_text("\n".join([lines[0], *own]))

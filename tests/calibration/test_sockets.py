@@ -1,20 +1,28 @@
-"""Calibration with a ball in sockets: accuracy where the truth is known, laws of the gauge, held-out places."""
+"""Calibration with a ball in sockets: accuracy, laws of the gauge, held-out places, and rows that cannot be right."""
+
+from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
+from product_bank import with_usual_scales
 from reading_bank import scales
 from simulated_sockets import SocketRows, rest_in_sockets
+from table_bank import refused
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.diagnostics.socket_plausibility import check_registration, check_sockets
 from diffeo_calib.calibration.identification.identification import Prior, identify
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.placing.readings import held_parameters
-from diffeo_calib.calibration.placing.sockets import SocketDevices
+from diffeo_calib.calibration.placing.sockets import SocketDevices, stages_by_sockets
+from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.rows import with_attributes
@@ -43,7 +51,7 @@ def data(arm: SimulatedArm, rows: SocketRows) -> dc.Measurements:
 
 
 @pytest.fixture(scope="module")
-def result(arm: SimulatedArm, data: dc.Measurements) -> dc.CalibrationResult:
+def result(arm: SimulatedArm, data: dc.Measurements) -> Any:
     return dc.calibrate(arm.nominal, data)
 
 
@@ -59,9 +67,7 @@ def gauge(model: dc.CalibratedKinematics) -> WithoutRigidMotions:
     return found
 
 
-def test_far_more_accurate_than_geometry_and_as_accurate_as_predicted(
-    arm: SimulatedArm, result: dc.CalibrationResult
-) -> None:
+def test_far_more_accurate_than_geometry_and_as_accurate_as_predicted(arm: SimulatedArm, result: Any) -> None:
     q = arm.sample(500, seed=9)
     truth = arm.true_points(q)[:, 0]
     rms = {name: float(aligned(k(q)[:, 0].detach(), truth).norm(dim=1).square().mean().sqrt())
@@ -74,9 +80,8 @@ def test_far_more_accurate_than_geometry_and_as_accurate_as_predicted(
     assert result.fit.converged
 
 
-def test_the_sockets_are_where_they_are(result: dc.CalibrationResult, rows: SocketRows) -> None:
+def test_the_sockets_are_where_they_are(result: Any, rows: SocketRows) -> None:
     found = result.sockets
-    assert found is not None
     truth = torch.stack([rows.positions[name] for name in found.names])
     errors = aligned(found.positions, truth)
     assert float(errors.norm(dim=1).square().mean().sqrt()) < 6e-5
@@ -85,14 +90,7 @@ def test_the_sockets_are_where_they_are(result: dc.CalibrationResult, rows: Sock
     assert abs(float((first - second).norm()) - 0.05) < 2e-5  # known to 1e-5
 
 
-def test_no_rigid_motion_is_left_in_the_covariances(result: dc.CalibrationResult) -> None:
-    found = gauge(result.model)
-    covariance = found.covariance_between(found.reference)
-    rest = found.fit @ covariance @ found.fit.mT
-    assert float(rest.abs().max()) < 1e-9 * float(found.motion.abs().max())
-
-
-def test_covariances_by_the_projection_written_out(arm: SimulatedArm, result: dc.CalibrationResult) -> None:
+def test_covariances_by_the_projection_written_out(arm: SimulatedArm, result: Any) -> None:
     model, q = result.model, arm.sample(4, seed=3)
     found, at = gauge(model), model.map.geodesic.linearise(q)
     both = model.map.geodesic.linearise(torch.cat([q, found.reference.joint[0].points]))
@@ -106,7 +104,7 @@ def test_covariances_by_the_projection_written_out(arm: SimulatedArm, result: dc
     torch.testing.assert_close(model.predict(q, noise=False)[1][:, 0], blocks, rtol=1e-3, atol=1e-12)
 
 
-def test_covariances_do_not_depend_on_what_is_held(result: dc.CalibrationResult) -> None:
+def test_covariances_do_not_depend_on_what_is_held(result: Any) -> None:
     """Free base and first joint add rigid motions to the prior, and these alone."""
     fitted = result.model.map
     variance = fitted.geodesic.spec.prior_variance.clone()
@@ -114,7 +112,6 @@ def test_covariances_do_not_depend_on_what_is_held(result: dc.CalibrationResult)
     free = FittedMap(fitted.geodesic.with_prior(variance), fitted.noise, None, fitted.new_noise, fitted.workspace)
     held, other = (one.posterior(fitted.x[:5], noise=False)[1] for one in (fitted, free))
     torch.testing.assert_close(held, other, rtol=2e-2, atol=1e-11)
-    assert fitted.workspace is not None
     measured = FittedMap(fitted.geodesic.with_prior(variance), fitted.noise, None, fitted.new_noise)
     assert float((measured.posterior(fitted.x[:5], noise=False)[1] - held).diagonal(dim1=1, dim2=2).amin()) > 1e-8
 
@@ -129,7 +126,6 @@ def test_places_left_out_by_leaving_them_out(data: dc.Measurements, arm: Simulat
     tangent, devices = placed.tangent_data(), placed.placement.one(SocketDevices)
     scales = defaults(tangent, placed.identification.noise, placed.identification.prior)
     chosen = ChosenScales(Selection(scales, "defaults"), tangent, leave_one_out(tangent, scales))
-    assert devices is not None
     socket, own = devices.socket, devices.sockets.place[devices.socket] == 2
     rest, gone = (flags.nonzero()[:, 0] for flags in (~own, own))
     mu = tangent.rows(rest).process(scales).mu.view(-1, 3)
@@ -154,8 +150,6 @@ def test_deviations_grow_where_places_contradict_each_other(data: dc.Measurement
     placed = place(arm.nominal, data, silent)
     tangent, found = placed.tangent_data(), placed.identification
     scales = defaults(tangent, 0.3 * found.noise, found.prior)
-    assert data.socket is not None
-    assert data.places is not None
     K, r, total = covariance(tangent, scales), tangent.target.flatten(), 0.0
     for number in range(6):
         own = (data.places == number).repeat_interleave(3)
@@ -224,7 +218,7 @@ def test_registration_survives_rows_in_wrong_sockets(arm: SimulatedArm, rows: So
     torch.testing.assert_close(found.positions, clean.positions, rtol=0, atol=5e-4)
 
 
-def test_evaluation_of_rows_in_sockets(result: dc.CalibrationResult, data: dc.Measurements) -> None:
+def test_evaluation_of_rows_in_sockets(result: Any, data: dc.Measurements) -> None:
     some = data.rows(data.socket < 3)  # type: ignore[operator]
     found = dc.evaluate(result.model, some)
     points = result.model(some.q)[:, 0]
@@ -236,27 +230,128 @@ def test_evaluation_of_rows_in_sockets(result: dc.CalibrationResult, data: dc.Me
     assert distance.error == pytest.approx(float((middles[0] - middles[1]).norm()) - 0.05, abs=1e-12)
 
 
-def test_tools_without_rigid_motions(result: dc.CalibrationResult, arm: SimulatedArm) -> None:
-    """The robot's base is the measuring frame: a tool is known as well in both."""
-    q, ball = arm.sample(5, seed=6), result.model.geometry.tool[0]
-    base, measuring = (result.model.predict_tool_poses(q, ball, frame=frame)[1] for frame in ("base", "measuring"))
-    torch.testing.assert_close(base, measuring, rtol=1e-6, atol=1e-15)
-    assert float(base[:, :3, :3].diagonal(dim1=1, dim2=2).amax()) < 2e-6
+# --- rows that cannot be right ----------------------------------------------------------------------------------------
+
+PAIR = ("0", "1")
 
 
-@pytest.mark.slow
-def test_few_control_points(arm: SimulatedArm, data: dc.Measurements, result: dc.CalibrationResult) -> None:
-    scales = result.selection.scales
-    coarse = dc.calibrate(arm.nominal, data, controls=100, hyperparameters=scales).sockets
-    whole = dc.calibrate(arm.nominal, data, hyperparameters=scales).sockets
-    assert coarse is not None
-    assert whole is not None
-    torch.testing.assert_close(coarse.positions, whole.positions, rtol=0, atol=5e-5)
-    torch.testing.assert_close(coarse.deviations, whole.deviations, rtol=1e-2, atol=1e-7)
+@pytest.fixture(scope="module")
+def plain() -> SimulatedArm:
+    return SimulatedArm(seed=2)
 
 
-def test_registered_where_a_tracker_stands(arm: SimulatedArm, result: dc.CalibrationResult) -> None:
-    q, points = arm.measure(40, seed=7)
-    names = arm.nominal.joint_names
-    seen = result.model.registered(dc.Measurements(q[:10], points[:10], names))
-    assert dc.evaluate(seen, dc.Measurements(q[10:], points[10:], names)).rms < 7e-4
+@pytest.fixture(scope="module")
+def some(plain: SimulatedArm) -> SocketRows:
+    return rest_in_sockets(plain, seed=2, places=3, rows=6)
+
+
+def table(rows: SocketRows, names: tuple[str, ...] | None = None, **options: object) -> dc.Measurements:
+    given = {"distances": DISTANCES, "distance_std": 3e-5} | options
+    return dc.Measurements.from_sockets(rows.q, names or rows.names, **given)  # pyright: ignore[reportArgumentType]
+
+
+def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows) -> None:
+    bare: Any = {"distances": None, "distance_std": None}
+
+    def staged(data: dc.Measurements) -> Callable[[], object]:
+        return lambda: stages_by_sockets(plain.nominal, data)
+
+    refused(
+        (r"at least 2 rows in every socket.*, got '2/1' in 1 row", staged(table(some).rows(slice(0, 31)))),
+        ("sockets: expected at least 9, got 6", staged(table(some, **bare).rows([0, 1, 6, 7, 12, 13]))),
+        (r"expected about (49|50)\..* mm, by the robot, got 5e\+04 mm", staged(table(some, distances={PAIR: 50.0}))),
+        ("check the unit of `distances`", staged(table(some, distances={PAIR: 5e-5}))),
+    )
+    for options, words in (
+        (bare, "the size of the robot rests on its description"),
+        ({"distances": {PAIR: 0.06}}, "check between which sockets it is"),
+    ):
+        with pytest.warns(dc.DiffeoCalibWarning, match=words):
+            stages_by_sockets(plain.nominal, table(some, **options))
+
+
+def test_rows_in_a_wrong_socket_are_named(plain: SimulatedArm, some: SocketRows) -> None:
+    names = list(some.names)
+    names[3], names[20] = "0/1", "0/0"
+    with pytest.warns(dc.DiffeoCalibWarning, match=r"2 of 36 rows .* row 3 fits '0/0', row 20 fits '1/1'"):
+        stages_by_sockets(plain.nominal, table(some, tuple(names)))
+
+
+@pytest.mark.filterwarnings("ignore:the known distance")
+def test_names_that_say_nothing_are_warned_about(plain: SimulatedArm, some: SocketRows) -> None:
+    names = tuple(some.names[(7 * row) % 36] for row in range(36))
+    with pytest.warns(dc.DiffeoCalibWarning, match="the ball is in no socket"):
+        stages_by_sockets(plain.nominal, table(some, names))
+
+
+def turned(some: SocketRows, plain: SimulatedArm, change: Callable[[torch.Tensor], torch.Tensor]) -> dc.Measurements:
+    """Rows that differ in the last joints alone: how the tool turns is then known."""
+    return dc.Measurements.from_sockets(change(some.q[:1].repeat(12, 1)), ["a"] * 12)
+
+
+def test_a_tool_that_never_turns_or_tilts(plain: SimulatedArm, some: SocketRows) -> None:
+    def still(q: torch.Tensor) -> torch.Tensor:
+        return q + 1e-4 * torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype)
+
+    def upright(q: torch.Tensor) -> torch.Tensor:
+        q[:, 0] += torch.linspace(-0.8, 0.8, 12, dtype=q.dtype)
+        return q
+
+    for change, expect in ((still, pytest.raises(MeasurementError, match="the tool hardly turns")),
+                           (upright, pytest.warns(dc.DiffeoCalibWarning, match="never tilted"))):  # fmt: skip
+        data = turned(some, plain, change)
+        with expect:
+            check_registration(plain.nominal, data, register_sockets(plain.nominal, data.q, data.socket))
+
+
+def test_tables_that_cannot_be_made(some: SocketRows) -> None:
+    wrong: Any = table
+    refused(
+        ("`sockets`: expected 36 names, one per row, got 1", lambda: wrong(some, ("0/0",))),
+        (r"18 row\(s\) have no name, the first is row 1", lambda: wrong(some, ("0/0", " ") * 18)),
+        (r"1 row\(s\) have no name", lambda: wrong(some, [None, *some.names[1:]])),
+        ("expected 36 names, one per row, got 'abcd'", lambda: wrong(some, "abcd")),
+        ("expected 36 names, one per row, got 5", lambda: wrong(some, 5)),
+        ("`distances`: expected a dictionary, got .*0.05", lambda: wrong(some, distances=[("0", "1", 0.05)])),
+        ("`distance_std` without `distances`", lambda: wrong(some, distances=None)),
+        ("`distance_std`: expected a positive number in m, got None", lambda: wrong(some, distance_std=None)),
+        ("`distance_std`: expected a positive number", lambda: wrong(some, distance_std=-1.0)),
+        ("the distance of .* expected metres above 0", lambda: wrong(some, distances={("0", "1"): 0.0})),
+        ("expected names of two sockets, got .*'0/0', '0/1'", lambda: wrong(some, distances={("0", "7"): 0.1})),
+        ("a known distance: expected names of two sockets", lambda: wrong(some, distances={("0", "0"): 0.1})),
+        ("expected one value", lambda: wrong(some, distances={("0", "1"): 0.05, ("0/0", "0/1"): 0.06})),
+    )
+
+
+def test_distances_by_name(some: SocketRows) -> None:
+    known: Any = table(some, distances={("0", "1"): 0.05, ("0/0", "2/1"): 0.7}).sockets
+    assert known.distances == ((0, 1, 0.05), (2, 3, 0.05), (4, 5, 0.05), (0, 5, 0.7))
+    assert known.place_names == ("0", "1", "2")
+
+
+def test_splits_hold_out_whole_places(some: SocketRows) -> None:
+    data = table(some)
+    train, test = data.split(0.7, seed=1)
+    assert (len(train), len(test)) == (24, 12)
+    names = {data.sockets.names[k].split("/")[0] for k in test.socket.tolist()}  # pyright: ignore
+    assert len(names) == 1
+    assert sorted(len(held) for _, held in data.folds(3)) == [12, 12, 12]
+    with pytest.raises(MeasurementError, match="expected at least 4 places with sockets, got 3"):
+        data.folds(4)
+
+
+def test_no_position_is_made_up(plain: SimulatedArm, some: SocketRows, tmp_path: object) -> None:
+    data = table(some)
+    assert bool(data.points.isnan().all())
+    assert "6 sockets" in repr(data)
+    assert data.sha256 != table(some, distance_std=1e-5).sha256
+    names = tuple(reversed(some.names))
+    assert data.sha256 != table(some, names).sha256
+    tracked = with_usual_scales(plain.nominal, dc.Measurements(*plain.measure(15, seed=2))).model
+    for verb in (dc.evaluate, dc.CalibratedKinematics.registered):
+        with pytest.raises(InputError, match="calibrated with measured positions"):
+            verb(tracked, data)
+    with pytest.raises(MeasurementError, match="rows with sockets: expected no sessions"):
+        dc.calibrate(plain.nominal, data.with_sessions(["a"] * 18 + ["b"] * 18))
+    with pytest.raises(MeasurementError, match="rows with sockets: expected no payloads"):
+        check_sockets(plain.nominal, data.with_payload(2.0))

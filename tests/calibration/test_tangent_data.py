@@ -1,26 +1,24 @@
-"""Tangent data: covariances against formulas written a second time, subsets, and a single linearisation."""
+"""Tangent data: covariances against formulas written a second time, subsets, and six numbers of a pose."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
-from product_bank import simulated
-from tangent_bank import Setting, built, covariance, noise_covariance, shaken, tangent_covariance, weighted
+from tangent_bank import Setting, built, covariance, noise_covariance, normal, shaken, tangent_covariance, weighted
 from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales import tangent_data
+from diffeo_calib.calibration.choose_scales import robot_problem
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.process.tails import Tails
+from diffeo_calib.fitting.fit import fit
+from diffeo_calib.fitting.gauss_newton import GaussNewton
+from diffeo_calib.kinematics.nominal import rigid_motions
+from diffeo_calib.measurements.poses import mark_jacobian
 from diffeo_calib.robots import SimulatedArm
-
-# --- covariances --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -44,9 +42,6 @@ def test_noise_is_that_written_out(setting: Setting) -> None:
         assert_close(actual, expected, rtol=1e-6, atol=1e-7 * float(expected.abs().max()))
 
 
-# --- parts and variants -------------------------------------------------------------------------------------------
-
-
 def test_rows_are_those_of_the_whole(setting: Setting) -> None:
     data, rows = weighted(setting), torch.tensor([5, 0, 7])
     some, m = data.rows(rows), data.y.shape[1]
@@ -54,17 +49,6 @@ def test_rows_are_those_of_the_whole(setting: Setting) -> None:
     whole, part = covariance(data, setting.scales), covariance(some, setting.scales)
     assert_close(part, whole[index][:, index], rtol=0, atol=1e-13 * float(whole.abs().max()))
     assert_close(some.target, data.target[rows], rtol=0, atol=1e-14)
-
-
-def test_other_measured_coordinates_and_weights_reach_the_target_and_the_noise(setting: Setting) -> None:
-    data = setting.tangent_data
-    target = data.target
-    moved = replace(data, y=data.y + 1e-3)
-    assert_close(moved.target, target + 1e-3, rtol=0, atol=1e-14)
-    assert_close(moved.told.noise(setting.scales), data.told.noise(setting.scales), rtol=0, atol=0)
-    halved = data.with_tails(Tails(4.0, torch.full_like(data.tails.weights, 0.5)))
-    assert_close(halved.weighted_noise(setting.scales), 2 * data.noise(setting.scales))
-    assert_close(halved.target, target, rtol=0, atol=0)
 
 
 def test_samples_are_drawn_by_the_seed() -> None:
@@ -75,96 +59,11 @@ def test_samples_are_drawn_by_the_seed() -> None:
     assert len(torch.unique(first, dim=0)) == 150
     assert torch.equal(first, same)
     assert not torch.equal(first, other)
-    assert len(data.sample(150, 90, 0)[1].x) == 30
-    assert len(data.sample(150, 1, 0)[1].x) == 1
-    rows, whole = data.sample(500, 900000, 3)
-    assert torch.equal(rows, torch.arange(200))
-    assert torch.equal(whole.x, data.x)
+    assert [len(data.sample(150, most, 0)[1].x) for most in (90, 1)] == [30, 1]
+    assert torch.equal(data.sample(500, 900000, 3)[0], torch.arange(200))
     rows, some = data.sample(20, 900, 4)
     assert torch.equal(some.x, data.x[rows])
     assert rows.tolist() == sorted(rows.tolist())
-
-
-# --- how often k0 is linearised -----------------------------------------------------------------------------------
-
-
-class CountingMap(GeometryMap):
-    """Counts the configurations at which each method is called."""
-
-    def __init__(self, nominal: GeometryMap) -> None:
-        super().__init__(nominal.geometry, elastic=nominal.elasticity is not None)
-        self.count: Counter[str] = Counter()
-
-    def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
-        self.count["values"] += len(x)
-        return super().__call__(x, theta)
-
-    def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
-        self.count["jacobian"] += len(x)
-        return super().jacobian(x, theta)
-
-    def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
-        self.count["sensitivities"] += len(x)
-        return super().sensitivities(x, theta)
-
-
-def counting(setting: Setting) -> tuple[TangentData, Counter[str]]:
-    nominal = CountingMap(setting.nominal)
-    return replace(setting.tangent_data, nominal=nominal), nominal.count
-
-
-ONCE = ("values", "jacobian", "sensitivities")
-
-
-def test_k0_is_linearised_once() -> None:
-    setting = built("two markers")
-    data, count = counting(setting)
-    for scales in (setting.scales, shaken(setting.scales, 1)):
-        data.process(scales)
-        data.noise(scales)
-        part = data.rows(torch.tensor([3, 1]))
-        part.process(scales)
-        data.with_tails(Tails.none(*data.tails.weights.shape)).process(scales)
-        data.sample(5, 900, 0)[1].process(scales)
-    assert count == dict.fromkeys(ONCE, len(data.x))
-
-
-def test_rows_before_the_whole_is_needed_linearise_these_rows_only() -> None:
-    data, count = counting(built("two markers"))
-    some = data.rows(torch.tensor([3, 1]))
-    assert not count
-    some.process(built("two markers").scales)
-    assert count == dict.fromkeys(ONCE, 2)
-
-
-def test_a_calibration_linearises_every_pose_once_before_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Around the geometric calibration; the exact fit needs derivatives elsewhere too."""
-    arm, train, _ = simulated(14)
-    seen: Counter[str] = Counter()
-
-    def watched(name: str, real: Callable[..., Tensor]) -> Callable[..., Tensor]:
-        def method(self: GeometryMap, x: Tensor, theta: Tensor) -> Tensor:
-            seen[name] += len(x)
-            return real(self, x, theta)
-
-        return method
-
-    class Enough(Exception):
-        pass
-
-    def stop(task: str, *_: object) -> None:
-        if task == "Gauss-Newton":
-            raise Enough
-
-    for name in ("jacobian", "sensitivities"):
-        monkeypatch.setattr(GeometryMap, name, watched(name, getattr(GeometryMap, name)))
-    with pytest.raises(Enough):
-        dc.calibrate(arm.nominal, train, progress=stop)
-    assert seen["sensitivities"] <= 2 * len(train)  # by the tangent data, and by the test of changes
-    assert seen["jacobian"] <= 3 * len(train)  # once by the tangent data, once at the start of the fit
-
-
-# --- what is kept ---------------------------------------------------------------------------------------------------
 
 
 def test_what_is_kept_is_that_of_its_scales_and_weights(setting: Setting) -> None:
@@ -178,18 +77,71 @@ def test_what_is_kept_is_that_of_its_scales_and_weights(setting: Setting) -> Non
         assert_close(data.process(scales).mu, replace(data).process(scales).mu, rtol=1e-9, atol=0)
 
 
-def test_what_few_rows_say_is_computed_once(setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
-    scales, data = setting.scales, replace(setting.tangent_data)
-    assert data.process(scales) is data.process(scales)
-    assert data.with_tails(weighted(setting).tails).expected(scales) is data.expected(scales)
-    assert data.process(scales.inflated(1.0)) is not data.process(scales)
-    monkeypatch.setattr(tangent_data, "KEPT_COORDINATES", 1)
-    many = replace(data)
-    assert many.process(scales) is not many.process(scales)
+# --- six numbers of a pose in place of nine coordinates ---------------------------------------------------------------
+
+OPEN_M = 1e-3
+"""Noise of what bends the points of a pose, that tells nothing: a thousand times what the fields bend."""
 
 
-def test_a_sample_of_all_rows_is_the_data_themselves(setting: Setting) -> None:
-    data = setting.tangent_data
-    rows, some = data.sample(len(data.x), data.y.numel(), 0)
-    assert rows.tolist() == list(range(len(data.x)))
-    assert some is data
+@pytest.fixture(scope="module")
+def posed() -> Setting:
+    return built("posed")
+
+
+def naive(setting: Setting, data: TangentData) -> tuple[Tensor, Tensor]:
+    """G and R of nine coordinates a pose, of which motions that bend its points are hardly known: (9 N, 9 N) each."""
+    frames = setting.data.frames
+    moves = mark_jacobian(frames[:, 0], setting.data.bodies.pose_lever())  # (N, 9, 6)
+    bent = torch.eye(9, dtype=torch.float64) - moves @ torch.linalg.pinv(moves)
+    R = noise_covariance(setting.scales, setting, data.theta, data.tails.weights) + OPEN_M**2 * bent
+    G = tangent_covariance(setting.scales, data.told.nominal, data.theta, data.x)
+    return G, torch.block_diag(*R)
+
+
+def test_six_numbers_say_what_nine_coordinates_do(posed: Setting) -> None:
+    """Mean and covariance of k1 at the rows, by numpy with nine coordinates a pose."""
+    data = replace(posed.tangent_data, y=posed.tangent_data.y + 1e-5 * normal(12, 9, seed=3))
+    G, R = naive(posed, data)
+    nominal, S = data.told.nominal, data.told.nominal.sensitivities(data.x, data.theta)
+    target = (data.y - nominal(data.x, data.theta) + S @ data.theta).flatten()
+    solved = np.linalg.solve((G + R).numpy(), np.column_stack([target.numpy(), G.numpy()]))
+    mean, covariance = (torch.from_numpy(G.numpy() @ part) for part in (solved[:, 0], solved[:, 1:]))
+
+    told, at = data.told, data.told.linearisation(posed.scales)
+    basis = torch.block_diag(*data.basis) if data.basis is not None else torch.eye(len(target), dtype=torch.float64)
+    process, gram = told.process(posed.scales), at.gram()
+    found = gram @ process.mu
+    assert_close(found, basis.T @ mean, rtol=0, atol=1e-4 * float(mean.abs().max()))
+    left = process.expected(told.numbers).covariance
+    assert_close(left, gram - basis.T @ covariance @ basis, rtol=0, atol=1e-3 * float(left.abs().max()))
+
+
+def test_the_fit_of_six_numbers_is_that_of_nine(posed: Setting) -> None:
+    """Nine coordinates keep the points rigid by the slack, which is worth a small part of the noise of a pose."""
+    data, scales = posed.tangent_data, posed.scales
+    problem = robot_problem(data, scales)
+    maps = [fit(each, GaussNewton(tolerance=1e-6)).model for each in (problem, problem.whole)]
+    x = data.x + 0.3
+    (six, covariance), (nine, _) = (each.predict(x, noise=False) for each in maps)
+    deviation = covariance.diagonal(dim1=1, dim2=2).sqrt()
+    assert float((six - nine).abs().max() / deviation.mean()) < 0.05
+    assert maps[0].slopes is None
+    assert maps[0].noise.covariance.shape == (12, 9, 9)
+
+
+def test_nothing_bends_the_tool(posed: Setting) -> None:
+    model = fit(robot_problem(posed.tangent_data, posed.scales), GaussNewton(tolerance=1e-6)).model
+    geometry = posed.nominal.geometry
+    tool = geometry.tool + model.deformation.momenta.theta[geometry.slices["tool"]].view(-1, 3)
+    before, after = (torch.pdist(points) for points in (geometry.tool, tool))
+    assert_close(after, before, rtol=1e-6, atol=0)
+
+
+def test_what_bends_a_pose_is_no_turn_of_it(posed: Setting) -> None:
+    """However far the measured pose is turned against that of k0: else a column has the error of its own row in it."""
+    data = posed.tangent_data
+    rigid = rigid_motions(data.points)
+    bent = torch.eye(9, dtype=torch.float64) - (rigid @ rigid.mT)[:, 0]
+    assert float((data.basis.mT @ bent).abs().max()) > 1e-6
+    assert float(data.motions_in_numbers(bent).abs().max()) < 1e-12
+    assert_close(data.motions_in_numbers(rigid[:, 0]), data.basis.mT @ rigid[:, 0])

@@ -1,22 +1,20 @@
 """Calibrations of robots with branches: several tips, loads, and everything that follows from a fitted model."""
 
-import copy
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from product_bank import usual_scales
 from simulated_body import HANDS, SimulatedUpperBody
+from table_bank import refused
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register
-from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError
-from diffeo_calib.interop.numpy_model import load_numpy
-from diffeo_calib.interop.rigid import nominal_kinematics, rigid_kinematics
-from diffeo_calib.interop.torch_program import TorchProgram
+from diffeo_calib.common.errors import DiffeoCalibWarning, InputError
 
 pytestmark = pytest.mark.slow  # several calibrations
 
@@ -81,32 +79,6 @@ def ignored_branches(body: SimulatedUpperBody) -> dc.Chain:
         return body.robot(HANDS[:1])
 
 
-def test_everything_is_saved(model: dc.CalibratedKinematics, q: Tensor, tmp_path: Path) -> None:
-    with_tool = model.with_tool((0.01, 0.02, 0.1), tip="right_hand")
-    dc.save(with_tool, tmp_path / "body.safetensors")
-    again = dc.load(tmp_path / "body.safetensors")
-    assert again.on == HANDS
-    torch.testing.assert_close(again(q), model(q), rtol=0, atol=0)
-    torch.testing.assert_close(again.tool_poses(q), with_tool.tool_poses(q), rtol=0, atol=0)
-    plain = load_numpy(tmp_path / "body.safetensors")
-    np.testing.assert_allclose(plain(q.numpy()), model(q).numpy(), rtol=0, atol=1e-11)
-    expected = with_tool.tool_poses(q, tip="left_hand").numpy()
-    np.testing.assert_allclose(plain.tool_poses(q.numpy(), tip="left_hand"), expected, rtol=0, atol=1e-11)
-
-
-def test_programs_agree_with_the_flows(model: dc.CalibratedKinematics, q: Tensor) -> None:
-    """The NumPy program, the torch program and the flows are three implementations of values and derivatives."""
-    few = q[:10]
-    exact = model.map.deformation(few).unflatten(1, (-1, 3))
-    torch.testing.assert_close(model(few), exact, rtol=0, atol=1e-12)
-    torch.testing.assert_close(TorchProgram(model)(few), exact, rtol=0, atol=1e-11)
-    slopes = torch.func.vmap(torch.func.jacrev(lambda row: model(row[None])[0]))(few)
-    torch.testing.assert_close(model.jacobian(few), slopes, rtol=0, atol=1e-10)
-    tool = model.with_tool(None, tip="left_hand")
-    poses = TorchProgram(tool, "tool_poses")(few)
-    torch.testing.assert_close(tool.tool_poses(few), poses, rtol=0, atol=1e-11)
-
-
 def test_a_tool_needs_its_tip(model: dc.CalibratedKinematics, q: Tensor) -> None:
     with pytest.raises(InputError, match=r"has several tips; name its `tip`.*model.with_tool\(tool, tip="):
         model.tool_poses(q)
@@ -131,61 +103,21 @@ def test_commands_of_one_arm_leave_the_other_alone(model: dc.CalibratedKinematic
     assert float((missed.q - start)[:, right].abs().max()) < 1e-6
 
 
-def test_new_rows_and_new_devices(body: SimulatedUpperBody, model: dc.CalibratedKinematics, q: Tensor) -> None:
-    moved = copy.copy(body)
-    twist = torch.zeros(body.truth.size, dtype=torch.float64)
-    twist[:6] = torch.tensor([0.3, -0.1, 0.2, 0.1, 0.5, -0.4], dtype=torch.float64)
-    moved.truth = body.truth.absorb(twist)
-    new = dc.Measurements(*moved.measure(15, seed=5), body.nominal.joint_names, on=HANDS)
-    own = rms(model(q) - body.true_points(q))
-    again = model.registered(new)
-    assert rms(again(q) - moved.true_points(q)) < 1.5 * own
-    better = dc.recalibrate(model, new).model
-    assert rms(better(q) - moved.true_points(q)) < 1.3 * own
-
-
-def test_urdf_of_both_arms(model: dc.CalibratedKinematics, tmp_path: Path) -> None:
-    dc.interop.write_urdf(model, tmp_path / "body.urdf")
-    robot = dc.load_urdf(tmp_path / "body.urdf", "pelvis", list(HANDS))
-    rigid, q = rigid_kinematics(model), model.configurations
-    expected = torch.linalg.inv(rigid.geometry.base) @ rigid.geometry.poses(q)
-    torch.testing.assert_close(robot(q), expected, rtol=0, atol=1e-12)
-    assert rigid.rms < 0.8 * nominal_kinematics(model).rms
-
-
 @pytest.mark.parametrize("export", [dc.interop.write_c, dc.interop.write_dh])
 def test_serial_formats_need_a_tip(export: object, model: dc.CalibratedKinematics, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has several tips; name its `tip`"):
         export(model, tmp_path / "body.c")  # pyright: ignore[reportCallIssue]
 
 
-def test_dh_table_of_one_arm(model: dc.CalibratedKinematics) -> None:
-    geometry, q = rigid_kinematics(model).geometry, model.configurations[:5]
-    for number, tip in enumerate(HANDS):
-        table = dc.interop.dh_table(geometry, tip=tip)
-        own = [model.robot.joint_names.index(name) for name in table.chain().joint_names]
-        expected = torch.linalg.inv(geometry.base) @ geometry.poses(q)[:, number]
-        torch.testing.assert_close(table.poses(q[:, own]), expected, rtol=0, atol=1e-12)
+def test_markers_say_on_which_tip_they_are(body: SimulatedUpperBody, data: Any, model: Any) -> None:
+    def calibrated(on: Any) -> Callable[[], object]:
+        return lambda: dc.calibrate(body.nominal, data.with_tips(on))
 
-
-# --- bad input ----------------------------------------------------------------------------------------------------
-
-
-def test_markers_say_on_which_tip_they_are(body: SimulatedUpperBody, data: dc.Measurements) -> None:
-    with pytest.raises(MeasurementError, match=r"has 2 tips .* do not say on which .* pass Measurements\(..., on="):
-        dc.calibrate(body.nominal, data.with_tips(None))
-    with pytest.raises(MeasurementError, match=r"expected names among .*, got \['left_hand', 'tail'\]"):
-        dc.calibrate(body.nominal, data.with_tips(["left_hand", "tail"]))
-    with pytest.raises(MeasurementError, match="`on`: expected 2 names, got 1"):
-        data.with_tips(["left_hand"])
-
-
-def test_exchanged_hands_are_found(body: SimulatedUpperBody, data: dc.Measurements) -> None:
-    with pytest.raises(MeasurementError, match="the markers on 'left_hand' and 'right_hand' seem to be exchanged"):
-        dc.calibrate(body.nominal, data.with_tips(HANDS[::-1]))
-
-
-def test_evaluation_on_other_tips_is_refused(model: dc.CalibratedKinematics, data: dc.Measurements) -> None:
-    with pytest.raises(MeasurementError, match="on other tips than the model's"):
-        dc.evaluate(model, data.with_tips(HANDS[::-1]))
+    refused(
+        (r"has 2 tips .* do not say on which .* pass Measurements\(..., on=", calibrated(None)),
+        (r"expected names among .*, got \['left_hand', 'tail'\]", calibrated(["left_hand", "tail"])),
+        ("the markers on 'left_hand' and 'right_hand' seem to be exchanged", calibrated(HANDS[::-1])),
+        ("`on`: expected 2 names, got 1", lambda: data.with_tips(["left_hand"])),
+        ("on other tips than the model's", lambda: dc.evaluate(model, data.with_tips(HANDS[::-1]))),
+    )
     assert dc.evaluate(model, data.with_tips(None)).rms == dc.evaluate(model, data).rms

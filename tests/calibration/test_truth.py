@@ -8,38 +8,29 @@ first harmonic of its transmission error are both sines of the same angle.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from product_bank import Case, calibrated, simulated, ur10_measurements, ur10_scales
+from table_bank import refused
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.registration import register
-from diffeo_calib.common.errors import InputError
-from diffeo_calib.robots.simulated_arm import SimulatedArm
+from diffeo_calib.robots import SimulatedArm
 
 pytestmark = pytest.mark.slow  # calibrations by the dozen
 
 FINE = 5e-6
 """Noise of a coordinate with which transmission errors of single joints are compared, m."""
-SHOULDER = 1
 
 
 @pytest.fixture(scope="module")
 def only_transmission() -> Case:
     return calibrated(60, geometry=0, gravity=0, noise=FINE)
-
-
-@pytest.fixture(scope="module")
-def only_gravity() -> Case:
-    return calibrated(40, geometry=0, transmission=0)
-
-
-@pytest.fixture(scope="module")
-def only_geometry() -> Case:
-    return calibrated(40, transmission=0, gravity=0)
 
 
 def truth(**errors: float) -> SimulatedArm:
@@ -96,9 +87,6 @@ def missed(case: Case, arm: SimulatedArm, joint: int, *, forget: int = 0) -> flo
     return float(rest(found - true).norm() / rest(true).norm())
 
 
-# --- parts --------------------------------------------------------------------------------------------------------
-
-
 def test_parts_with_every_source_of_error(arm: Case) -> None:
     """60 poses, noise 0.02 mm; the bounds are those of the sizes, gravity and shoulder share what both explain."""
     source, found, q = truth(), sizes(arm), arm.train.q
@@ -122,13 +110,6 @@ def test_parts_with_every_source_of_error(arm: Case) -> None:
     assert rms(moved.flatten(1) - pushed(source, q, joints)) < 0.4 * rms(pushed(source, q, joints))
 
 
-def test_transmission_errors_of_joints_next_to_all_others(arm: Case) -> None:
-    source = truth()
-    bounds = (0.3, 0.3, 0.15, 0.5, 0.3, 0.6)  # of the joints with little lever arm noise leaves half
-    for joint, bound in enumerate(bounds):
-        assert missed(arm, source, joint, forget=1 if joint == SHOULDER else 0) < bound, joint
-
-
 def test_transmission_alone(only_transmission: Case) -> None:
     """Every curve within 15 % (wrist roll 30 %: 0.1 m of lever arm) from 60 poses with noise 0.005 mm."""
     source, found = truth(geometry=0, gravity=0), sizes(only_transmission)
@@ -140,49 +121,25 @@ def test_transmission_alone(only_transmission: Case) -> None:
     assert only_transmission.held_out()[2] < 0.03 * 1e-3
 
 
-@pytest.mark.slow
-def test_transmission_alone_within_10_percent() -> None:
-    """Arm of seed 1, 150 poses of seed 2, noise 0.005 mm: every joint."""
-    case, source = calibrated(150, geometry=0, gravity=0, noise=FINE), truth(geometry=0, gravity=0)
-    assert [missed(case, source, joint) < 0.1 for joint in range(6)] == [True] * 6
-
-
-def test_angles_of_the_report_are_those_of_the_curves(only_transmission: Case) -> None:
-    q = only_transmission.train.q
-    angles = {part.name: part.angle for part in only_transmission.result.parts}
-    for joint, name in enumerate(only_transmission.robot.joint_names):
-        curve = only_transmission.model.transmission(name, q[:, joint])
-        assert angles[f"transmission of {name}"] == pytest.approx(float(curve.std(correction=0)), rel=1e-9)
-    assert [name for name, angle in angles.items() if angle is None] == [
-        *("geometry", "gravity on joints", "gravity on links", "coupled joint errors", "task space")
-    ]
-
-
-def test_gravity_alone(only_gravity: Case) -> None:
-    source, found, q = truth(geometry=0, transmission=0), sizes(only_gravity), only_gravity.train.q
-    deflected = rms(pushed(source, q, source.components(q).gravity))
-    assert deflected > 0.5
-    assert found["gravity on joints"] == pytest.approx(deflected, rel=0.05)
-    assert sum(transmissions(only_gravity).values()) < 0.02
+@pytest.mark.parametrize("name", ["gravity", "geometry"])
+def test_one_source_of_error_alone(name: str) -> None:
+    other = "geometry" if name == "gravity" else "gravity"
+    case, source = calibrated(40, transmission=0, **{other: 0}), truth(transmission=0, **{other: 0})
+    found, q = sizes(case), case.train.q
+    if name == "gravity":
+        deflected = rms(pushed(source, q, source.components(q).gravity))
+        assert deflected > 0.5
+        assert found["gravity on joints"] == pytest.approx(deflected, rel=0.05)
+    else:
+        beyond_registration = 1e3 * register(source.nominal, q, source.truth.points(q)).rms
+        assert found["geometry"] == pytest.approx(beyond_registration, rel=0.02)
+        assert found["gravity on joints"] < 0.015
+    assert sum(transmissions(case).values()) < 0.02
     for nothing in ("gravity on links", "coupled joint errors", "task space"):
-        assert found[nothing] < 0.01, nothing
-    assert wrong_geometry(only_gravity, source) < 0.04
-    assert only_gravity.held_out()[2] < 0.06e-3
-
-
-def test_geometry_alone(only_geometry: Case) -> None:
-    source, found, q = truth(transmission=0, gravity=0), sizes(only_geometry), only_geometry.train.q
-    beyond_registration = 1e3 * register(source.nominal, q, source.truth.points(q)).rms
-    assert found["geometry"] == pytest.approx(beyond_registration, rel=0.02)
-    assert sum(transmissions(only_geometry).values()) < 0.02
-    for nothing in ("gravity on joints", "gravity on links", "coupled joint errors", "task space"):
         assert found[nothing] < 0.015, nothing
-    assert wrong_geometry(only_geometry, source) < 0.04
-    _, geometry, diffeomorphic = only_geometry.held_out()
-    assert diffeomorphic < 1.05 * geometry
-
-
-# --- transmission of a joint ----------------------------------------------------------------------------------------
+    assert wrong_geometry(case, source) < 0.04
+    _, geometry, diffeomorphic = case.held_out()
+    assert diffeomorphic < (0.06e-3 if name == "gravity" else 1.05 * geometry)
 
 
 def test_transmission_is_what_moves_the_markers(arm: Case) -> None:
@@ -210,22 +167,20 @@ def test_transmission_of_a_slide_is_in_metres(slider: Case) -> None:
 
 
 def test_transmission_of_no_joint_or_of_nonsense(arm: Case) -> None:
-    for name in ("elbow", "", 2, None):
-        with pytest.raises(InputError, match=r"`joint`: expected waist_joint, shoulder_joint, .*got"):
-            arm.model.transmission(name, [0.0])  # pyright: ignore[reportArgumentType]
-    for values in ([[0.0, 1.0]], 0.3, torch.zeros(2, 6)):
-        with pytest.raises(InputError, match="`values` has the wrong shape"):
-            arm.model.transmission("elbow_joint", values)
-    for values in ([float("nan")], [0.0, float("inf")]):
-        with pytest.raises(InputError, match=r"`values` has 1 value\(s\) that are not finite"):
-            arm.model.transmission("elbow_joint", values)
-    with pytest.raises(InputError, match="`values` cannot be read as numbers"):
-        arm.model.transmission("elbow_joint", "home")
+    def of(values: Any, joint: Any = "elbow_joint") -> Callable[[], object]:
+        return lambda: arm.model.transmission(joint, values)
+
+    refused(
+        *(
+            (r"`joint`: expected waist_joint, shoulder_joint, .*got", of([0.0], joint))
+            for joint in ("elbow", "", 2, None)
+        ),
+        *(("`values` has the wrong shape", of(values)) for values in ([[0.0, 1.0]], 0.3, torch.zeros(2, 6))),
+        *((r"1 value\(s\) that are not finite", of(values)) for values in ([math.nan], [0.0, math.inf])),
+        ("`values` cannot be read as numbers", of("home")),
+    )
     assert arm.model.transmission("elbow_joint", []).shape == (0,)
     assert arm.model.transmission("elbow_joint", [0, 1]).dtype == torch.float64
-
-
-# --- beyond the data ------------------------------------------------------------------------------------------------
 
 
 def split_by_first_joint(data: dc.Measurements) -> tuple[dc.Measurements, dc.Measurements]:
@@ -244,7 +199,6 @@ def test_beyond_the_measured_range_of_the_first_joint_geometry_is_not_lost() -> 
     assert diffeomorphic < 0.35 * geometry
 
 
-@pytest.mark.slow
 def test_beyond_the_measured_range_of_the_first_joint_of_a_ur10(ur10_folder: Path) -> None:
     robot, data = ur10_measurements(ur10_folder)
     inside, outside = split_by_first_joint(data)

@@ -1,31 +1,38 @@
-"""Unusual but sound measurements: few poses, many repeats, known deviations, poses, other robots."""
+"""Unusual but sound measurements: few poses, very many, repeats, known deviations, poses, other robots."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
-from math import inf
 
 import numpy as np
 import pytest
 import torch
-from product_bank import Case, simulated, usual_scales, with_usual_scales
+from product_bank import Case, simulated, with_usual_scales
 from torch import Tensor
+from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration import calibrate, choose_scales
+from diffeo_calib.calibration.identification import identification
+from diffeo_calib.calibration.identification.identification import Identification, identify
+from diffeo_calib.calibration.identification.registration import register
+from diffeo_calib.calibration.placing.place import place
+from diffeo_calib.calibration.scales.leave_one_out import estimate_tails, random_blocks
+from diffeo_calib.calibration.scales.selection import defaults
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.common.device import seeded
 from diffeo_calib.common.errors import DiffeoCalibWarning
-from diffeo_calib.robots.geometry import Geometry
-
-pytestmark = pytest.mark.slow  # calibrations by the dozen
+from diffeo_calib.fitting import fit as fitting
+from diffeo_calib.fitting.result import silent
+from diffeo_calib.robots import Geometry, SimulatedArm
 
 
 def held_out(result: dc.CalibrationResult, test: dc.Measurements) -> float:
     return dc.evaluate(result.model, test).rms
 
 
-# --- few and many ---------------------------------------------------------------------------------------------------
-
-
+@pytest.mark.slow
 def test_few_poses_with_many_repeats_are_few_poses() -> None:
     """Repeats determine the noise, not the robot: its 95 % regions have to stay wide."""
     arm, train, test = simulated(8)
@@ -49,6 +56,7 @@ def repeated(rows: int, times: int) -> tuple[dc.Chain, dc.Measurements, dc.Measu
     return arm.nominal, train, dc.Measurements(read, points), test
 
 
+@pytest.mark.slow
 def test_repeats_do_not_break_the_fit() -> None:
     robot, _, often, test = repeated(15, 3)
     many = dc.calibrate(robot, often)
@@ -59,18 +67,6 @@ def test_repeats_do_not_break_the_fit() -> None:
     assert float(noise) == pytest.approx(2e-5, rel=0.3)
 
 
-def test_100_rows_of_20_poses() -> None:
-    robot, once, often, test = repeated(20, 5)
-    assert len(often) == 100
-    result = with_usual_scales(robot, often)
-    assert result.fit.converged
-    assert len(result.outliers) <= 1
-    assert held_out(result, test) < held_out(with_usual_scales(robot, once), test)
-
-
-# --- known standard deviations --------------------------------------------------------------------------------------
-
-
 def mixed() -> tuple[dc.Chain, Tensor, Tensor, Tensor, dc.Measurements]:
     """Every other row measured fifty times worse: robot, q, points, standard deviations, test."""
     arm, train, test = simulated(44)
@@ -79,30 +75,22 @@ def mixed() -> tuple[dc.Chain, Tensor, Tensor, Tensor, dc.Measurements]:
     return arm.nominal, train.q, arm.true_points(train.q) + std[:, None, None] * draw, std, test
 
 
-@pytest.fixture(scope="module")
-def given() -> dc.CalibrationResult:
-    """The mixed rows with their known deviations."""
-    robot, q, points, std, _ = mixed()
-    return dc.calibrate(robot, dc.Measurements(q, points, std=std), hyperparameters=usual_scales(robot))
-
-
-def test_known_deviations_weigh_the_rows(given: dc.CalibrationResult) -> None:
-    robot, q, points, _, test = mixed()
+@pytest.mark.slow
+def test_known_deviations_weigh_the_rows() -> None:
+    """Rows that are known to be bad do no harm."""
+    robot, q, points, std, test = mixed()
+    given = with_usual_scales(robot, dc.Measurements(q, points, std=std))
     unknown = dc.calibrate(robot, dc.Measurements(q, points))
     assert held_out(given, test) < 0.8 * held_out(unknown, test)
+    good = with_usual_scales(robot, dc.Measurements(q[1::2], points[1::2]))
+    assert held_out(given, test) < 1.1 * held_out(good, test)
     assert given.outliers == []
     noise = given.model.map.noise.covariance.diagonal(dim1=1, dim2=2).mean(1).sqrt()
     assert float(noise[::2].min()) > 0.9e-3
     assert float(noise[1::2].max()) < 2e-4
 
 
-def test_rows_that_are_known_to_be_bad_do_no_harm(given: dc.CalibrationResult) -> None:
-    robot, q, points, _, test = mixed()
-    scales = given.selection.scales
-    good = dc.calibrate(robot, dc.Measurements(q[1::2], points[1::2]), hyperparameters=scales)
-    assert held_out(given, test) < 1.1 * held_out(good, test)
-
-
+@pytest.mark.slow
 def test_known_deviations_that_are_too_small_leave_the_rest_to_be_estimated(arm: Case) -> None:
     data = dc.Measurements(arm.train.q, arm.train.points, std=1e-9)
     result = dc.calibrate(arm.robot, data)
@@ -110,6 +98,7 @@ def test_known_deviations_that_are_too_small_leave_the_rest_to_be_estimated(arm:
     assert float(result.selection.scales.sensor_noise) > 5e-6
 
 
+@pytest.mark.slow
 def test_deviations_of_each_coordinate(arm: Case) -> None:
     """A device that sees depth badly: x is known to 0.5 mm only."""
     std = torch.tensor([5e-4, 2e-5, 2e-5], dtype=torch.float64).expand(60, 1, 3)
@@ -124,24 +113,13 @@ def test_deviations_of_each_coordinate(arm: Case) -> None:
     assert float(noise[:, 1:].max()) < 2e-4**2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [3, 5])
 def test_few_poses_with_honest_deviations_are_not_refused(rows: int) -> None:
     """Base and marker alone fit three poses exactly, which does not contradict the deviations."""
     arm, train, _ = simulated(rows)
     with pytest.warns(DiffeoCalibWarning, match="too few to select scales"):
         dc.calibrate(arm.nominal, dc.Measurements(train.q, train.points, std=2e-5))
-
-
-# --- poses, other robots, other ways --------------------------------------------------------------------------------
-
-
-def test_orientation_errors_fall_below_those_of_geometry(posed: Case) -> None:
-    errors = [dc.evaluate(stage, posed.test) for stage in posed.result.stages.values()]
-    assert errors[2].rms < 0.2 * errors[1].rms < 0.2 * errors[0].rms
-    angles = [inf if found.angle_rms is None else found.angle_rms for found in errors]
-    assert angles[2] < 0.4 * angles[1] <= 0.4 * angles[0] < inf
-    assert angles[2] < 0.03  # the noise of three points with 0.02 mm at 0.1 m is 0.016 deg
-    assert 1e-5 < float(posed.result.selection.scales.rotation_noise) < 5e-4
 
 
 def random_chain(joints: int) -> dc.Chain:
@@ -162,10 +140,8 @@ def random_measurements(robot: dc.Chain, rows: int, seed: int) -> dc.Measurement
     return dc.Measurements(q, points + 2e-5 * torch.from_numpy(rng.standard_normal((rows, 1, 3))), robot.joint_names)
 
 
-@pytest.mark.parametrize(
-    ("joints", "rows", "gain"),
-    [(11, 60, 0.5), (3, 40, 0.9)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("joints", "rows", "gain"), [(11, 60, 0.5), (3, 40, 0.9), (1, 20, 1.0)])
 def test_other_numbers_of_joints(joints: int, rows: int, gain: float) -> None:
     robot = random_chain(joints)
     train, test = random_measurements(robot, rows, 1), random_measurements(robot, 300, 5)
@@ -176,12 +152,7 @@ def test_other_numbers_of_joints(joints: int, rows: int, gain: float) -> None:
     assert held_out(result, test) < gain * geometry
 
 
-def test_a_single_joint() -> None:
-    robot = random_chain(1)
-    result = dc.calibrate(robot, random_measurements(robot, 20, 1))
-    assert held_out(result, random_measurements(robot, 100, 5)) < 6e-5
-
-
+@pytest.mark.slow
 def test_fewer_control_points_give_the_same_model(arm: Case) -> None:
     scales = arm.result.selection.scales
     coarse = dc.calibrate(arm.robot, arm.train, hyperparameters=scales, controls=40)
@@ -193,3 +164,84 @@ def test_fewer_control_points_give_the_same_model(arm: Case) -> None:
     for mine, full in zip(coarse.parts, arm.result.parts, strict=True):
         assert mine.displacement == pytest.approx(full.displacement, rel=0.2, abs=5e-6)
     assert bool(torch.isfinite(coarse.model.predict(arm.test.q[:3])[1]).all())
+
+
+# --- many rows, for which a sample stands but where each counts by itself ---------------------------------------------
+
+ARM = SimulatedArm(seed=4)
+ROWS, SAMPLED, WRONG = 240, 60, 5
+
+
+@pytest.fixture(scope="module")
+def data() -> dc.Measurements:
+    """Rows of which one that is in no sample is wrong by 20 mm."""
+    q, points = ARM.measure(ROWS, seed=5)
+    points[WRONG, 0, 0] += 0.02
+    assert WRONG not in torch.randperm(ROWS, generator=seeded(0))[:SAMPLED]
+    return dc.Measurements(q, points)
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Samples of a few rows."""
+    for module in (identification, choose_scales):
+        monkeypatch.setattr(module, "LIMITS", replace(module.LIMITS, coordinates=3 * SAMPLED))
+    monkeypatch.setattr(fitting, "SAMPLE_COORDINATES", 3 * SAMPLED)
+    monkeypatch.setattr(calibrate, "MAX_DENSE", 3 * SAMPLED)
+    monkeypatch.setattr(calibrate, "AUTO_CONTROLS", 40)
+
+
+def identified(data: dc.Measurements) -> Identification:
+    return identify(register(ARM.nominal, data.q, data.points).geometry, data.q, data.points)
+
+
+@pytest.mark.usefixtures("few")
+def test_geometry_of_a_sample_weighs_all_rows(data: dc.Measurements, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = identified(data)
+    assert found.tails.weights.shape == (ROWS, 1)
+    assert int(found.tails.weights.argmin()) == WRONG
+    monkeypatch.undo()
+    whole = identified(data)
+    assert found.noise == pytest.approx(whole.noise, rel=0.5)
+    assert not torch.equal(found.theta, whole.theta)
+    others = ARM.sample(200, seed=9)
+    apart = (found.geometry.points(others) - whole.geometry.points(others)).norm(dim=-1)
+    assert float(apart.square().mean().sqrt()) < whole.rms
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("few")
+def test_calibration_of_many_rows(data: dc.Measurements) -> None:
+    """All rows are fitted, weighed and judged, and the wrong one is found although the sample is without it."""
+    result = dc.calibrate(ARM.nominal, data, hyperparameters=scales(data))
+    assert len(result.model.map.deformation.x) == 40
+    assert torch.equal(result.model.configurations, data.q)
+    assert result.leave_one_out.errors.shape == (ROWS, 3)
+    assert result.tails.weights.shape == (ROWS, 1)
+    assert [one.row for one in result.outliers] == [WRONG]
+    assert result.fit.converged
+    others = ARM.sample(300, seed=9)
+    errors, covariance = (ARM.true_points(others) - result.model(others))[:, 0], result.model.predict(others)[1][:, 0]
+    geometry = ARM.true_points(others) - result.identification.geometry.points(others)
+    assert float(errors.square().mean()) < 0.05 * float(geometry.square().mean())
+    squares = (errors[:, None] @ torch.linalg.solve(covariance, errors[:, :, None])).flatten()
+    assert float((squares < 7.8147).double().mean()) > 0.9
+
+
+def tangent_data(data: dc.Measurements) -> TangentData:
+    return place(ARM.nominal, data, silent).tangent_data()
+
+
+def scales(data: dc.Measurements) -> dc.Hyperparameters:
+    found = identified(data)
+    return defaults(tangent_data(data), found.noise, found.prior)
+
+
+def test_a_wrong_row_of_one_block_among_several_is_weighed(data: dc.Measurements) -> None:
+    some, chosen = tangent_data(data), scales(data)
+    assert len(random_blocks(some, 0, 3 * SAMPLED)) == ROWS // SAMPLED
+    found, whole = (estimate_tails(some, chosen, block_coordinates=3 * size) for size in (SAMPLED, ROWS))
+    assert found.gross
+    assert whole.gross
+    assert int(found.weights.argmin()) == WRONG
+    assert_close(found.weights, whole.weights, rtol=0.3, atol=0)

@@ -163,28 +163,21 @@ def test_a_wide_lens_is_no_other_layout() -> None:
 # --- reasons --------------------------------------------------------------------------------------------------------
 
 
-def test_a_mirrored_print_is_named() -> None:
-    with pytest.raises(InputError, match="mirrored"):
-        FOUND.corners(np.ascontiguousarray(image()[:, ::-1]))
+ALONG = np.zeros((7, 7), np.float32)
+ALONG[3] = 1 / 7
+REASONS = {
+    "mirrored": lambda grey: np.ascontiguousarray(grey[:, ::-1]),
+    "two boards": lambda grey: np.concatenate([grey, grey], 1),
+    "blurred": lambda grey: cv2.GaussianBlur(grey, (0, 0), 2.2),
+    "moved": lambda grey: cv2.filter2D(grey, -1, ALONG),
+    "none": lambda grey: np.full((200, 300), 90, np.uint8),
+}
 
 
-def test_two_boards_are_named() -> None:
-    with pytest.raises(InputError, match="two boards"):
-        FOUND.corners(np.concatenate([image(), image()], 1))
-
-
-def test_blurred_and_moved_images_are_named() -> None:
-    with pytest.raises(InputError, match="blurred"):
-        FOUND.corners(cv2.GaussianBlur(image(), (0, 0), 2.2))
-    along = np.zeros((7, 7), np.float32)
-    along[3] = 1 / 7
-    with pytest.raises(InputError, match="moved"):
-        FOUND.corners(cv2.filter2D(image(), -1, along))
-
-
-def test_an_empty_image_is_named() -> None:
-    with pytest.raises(InputError, match="none"):
-        FOUND.corners(np.full((200, 300), 90, np.uint8))
+@pytest.mark.parametrize("reason", REASONS)
+def test_refused_images_are_named(reason: str) -> None:
+    with pytest.raises(InputError, match=reason):
+        FOUND.corners(REASONS[reason](image()))
 
 
 # --- folders --------------------------------------------------------------------------------------------------------

@@ -246,7 +246,7 @@ def test_lenses_that_files_leave_open_are_said(tmp_path: Path) -> None:
             read_camera(path)
 
 
-@pytest.mark.parametrize("text", ["", "image_width: 10\nimage_height: 5\n", "camera_matrix:\n  data: [1, x]\n"])
+@pytest.mark.parametrize("text", ["", "camera_matrix:\n  data: [1, x]\n"])
 @pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")
 def test_other_files_are_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "camera.yaml"
@@ -258,7 +258,6 @@ def test_other_files_are_refused(tmp_path: Path, text: str) -> None:
 FILE = camera_text(FOUND.camera)
 DAMAGED = {
     "a number that is none": (r"image_width: \d+", "image_width: e", "image_width"),
-    "an endless number": (r"image_width: \d+", "image_width: 1e999", "image_width"),
     "a negative size": (r"image_height: \d+", "image_height: -5", "image_height"),
     "no row of the root": (r"root:(.*)data: \[[^,]*, ", r"root:\1data: [", "root"),
     "no root": (r"root:(.*)data: \[.*\]", r"root:\1data: []", "root"),

@@ -105,7 +105,7 @@ def other_entries() -> Iterator[bytes]:
 
 
 def test_what_is_no_journal_is_left_as_it_is(tmp_path: Path) -> None:
-    """Also through a link."""
+    """Also through a link; nor is a pipe, which was waited for, a device without an end, or a folder."""
     path, link = tmp_path / "other", tmp_path / "run.csv.journal"
     link.symlink_to(path)
     whole = b"".join(as_line(one) for one in ENTRIES)
@@ -115,13 +115,8 @@ def test_what_is_no_journal_is_left_as_it_is(tmp_path: Path) -> None:
             Journal(link)
         assert path.read_bytes() == content
     assert link.is_symlink()
-
-
-def test_a_pipe_or_a_folder_is_no_journal(tmp_path: Path) -> None:
-    """A pipe was waited for; so were devices without an end."""
-    (tmp_path / "folder").mkdir()
     os.mkfifo(tmp_path / "pipe")
-    for path in (tmp_path / "folder", tmp_path / "pipe", Path("/dev/zero")):
+    for path in (tmp_path, tmp_path / "pipe", Path("/dev/zero")):
         with pytest.raises(InputError, match="not the journal"):
             Journal(path)
 
@@ -158,14 +153,6 @@ def test_what_cannot_be_appended_whole_is_taken_back(tmp_path: Path, monkeypatch
     assert path.read_text() == "a\n1\n"
     table.append(*table.written({"a": 3}))
     assert table.new_lines() == [b"1\n", b"3\n"]
-
-
-def test_words_and_numbers_of_two_lines(tmp_path: Path) -> None:
-    table = GrowingTable(tmp_path / "run.csv", ";", ",")
-    assert table.same(b"a;1,50;;-2e-05\n", b"a;1,5;;-0,00002\r\n")
-    for other in (b"b;1,5;;0\n", b"a;1,5001;;0\n", b"a;1,5;0;0\n", b"a;1.5;;0\n"):
-        assert not table.same(b"a;1,5;;0\n", other)
-    assert table.cells(b'"' + 200_000 * b"x") == []
 
 
 def test_half_a_line_waits_for_its_end(tmp_path: Path) -> None:
@@ -213,32 +200,25 @@ def test_rows_are_appended_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     with pytest.raises(InputError, match="columns c"):
         table.written({"a": 1, "c": 2})
     assert path.read_text() == "a;b\n1,5;s\n-2e-05;t\n;3\n"
+    assert table.same(b"a;1,50;;-2e-05\n", b"a;1,5;;-0,00002\r\n")
+    for other in (b"b;1,5;;0\n", b"a;1,5001;;0\n", b"a;1,5;0;0\n", b"a;1.5;;0\n"):
+        assert not table.same(b"a;1,5;;0\n", other)
+    assert table.cells(b'"' + 200_000 * b"x") == []
 
 
-DEEP = 5000 * b"[" + b"\n"
-HUGE = b'{"a": ' + 5000 * b"1" + b"}\n"
-
-
-@pytest.mark.parametrize("bad", [b'{"a": 1', b'{"a": 1}', b"[1]\n", b"1\n", b"\xff\n", DEEP, HUGE])
-def test_lines_that_are_no_rows(bad: bytes) -> None:
-    with pytest.raises(InputError, match="a line of JSON"):
-        parsed(bad)
+def test_lines_that_are_no_rows() -> None:
+    deep, huge = 5000 * b"[" + b"\n", b'{"a": ' + 5000 * b"1" + b"}\n"
+    for bad in (b'{"a": 1', b'{"a": 1}', b"[1]\n", b"1\n", b"\xff\n", deep, huge):
+        with pytest.raises(InputError, match="a line of JSON"):
+            parsed(bad)
     assert parsed(b'{"a": 1.5, "b": null, "c": "x"}\n') == {"a": 1.5, "b": None, "c": "x"}
-
-
-@pytest.mark.parametrize(
-    "value", ["NaN", "1e999", "-Infinity", "true", "[1]", "{}", '"x\\n"', f'"{999 * "x"}"', 400 * "9"]
-)
-def test_values_that_are_no_cells(value: str) -> None:
-    with pytest.raises(InputError, match=r"'a' of a row: expected a finite number"):
-        check_cells(parsed(f'{{"a": {value}}}\n'.encode()))
+    for value in ("NaN", "1e999", "-Infinity", "true", "[1]", "{}", '"x\\n"', f'"{999 * "x"}"', 400 * "9"):
+        with pytest.raises(InputError, match=r"'a' of a row: expected a finite number"):
+            check_cells(parsed(f'{{"a": {value}}}\n'.encode()))
+    for value in (None, "", " "):
+        with pytest.raises(InputError, match="leave it out"):
+            check_cells({"id": value})
     check_cells({"a": -1e299, "b": None, "c": "word", "": 7, "id": 0})
-
-
-@pytest.mark.parametrize("value", ["null", '""', '" "'])
-def test_ids_that_are_none(value: str) -> None:
-    with pytest.raises(InputError, match="leave it out"):
-        check_cells(parsed(f'{{"id": {value}}}\n'.encode()))
 
 
 def test_the_command_ends_at_its_target_and_goes_on(tmp_path: Path, lines: list[str], command: Command) -> None:

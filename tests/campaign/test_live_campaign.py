@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from kind_bank import KINDS, kind_named, marked
+from kind_bank import kind_named, marked
 from product_bank import usual_scales
 from torch import Tensor
 from torch.testing import assert_close
@@ -182,26 +182,6 @@ def test_a_row_to_be_repeated_is_left_out_and_its_pose_comes_first(running: dc.C
     assert_close(found.q, q[1:2])
 
 
-def test_rows_are_named_by_their_lines_which_go_on() -> None:
-    campaign, (q, y) = dc.Campaign(ARM.nominal), ARM.measure(3, seed=1)
-    rows = dc.Measurements(q, y, doubt=False)
-    for table in (rows.with_line_numbers([2, 3, 7]), rows, rows.with_line_numbers([20, 21, 22])):
-        campaign.add(table)
-    assert [one.line for one in campaign.verdicts] == [2, 3, 7, 8, 9, 10, 20, 21, 22]
-    assert [one.row for one in campaign.verdicts] == list(range(9))
-    assert str(campaign.verdicts[2]).startswith("row 7: ")
-
-
-def test_a_thread_makes_the_same_models(measured: tuple[Tensor, Tensor]) -> None:
-    campaign = dc.Campaign(ARM.nominal, background=True)
-    for q, y in zip(*(part[:20] for part in measured), strict=True):
-        campaign.add(q, y)
-    campaign.wait()
-    assert campaign.models > 0
-    assert campaign.expected_error is not None
-    assert campaign.accepted == list(range(20))
-
-
 def test_bad_input_is_refused_and_nothing_is_lost(running: dc.Campaign) -> None:
     campaign = copy.deepcopy(running)
     for mistake in (lambda: campaign.add(5), lambda: campaign.reject(ROWS), lambda: dc.Campaign(3)):  # pyright: ignore
@@ -215,7 +195,10 @@ def test_bad_input_is_refused_and_nothing_is_lost(running: dc.Campaign) -> None:
         dc.Campaign(ARM.nominal).result()
 
 
-@pytest.mark.parametrize("name", marked(*KINDS))
+BESIDE = ("positions", "poses", "several tips", "markers mounted anew", "mixture", "images of a board", "several kinds")
+
+
+@pytest.mark.parametrize("name", marked(*BESIDE))
 def test_rows_beside_known_devices_are_those_of_the_calibration(name: str) -> None:
     """Taken for other rows, the rows of a calibration are what they were in it."""
     kind = kind_named(name)
@@ -247,19 +230,6 @@ def test_other_kinds_of_rows(name: str) -> None:
     found = campaign.next(2)
     assert found is not None
     assert found.expected[2] < found.expected[0]
-
-
-def test_rows_before_a_model_say_what_is_missing() -> None:
-    """Devices of readings are placed by 40 rows; then nothing is missing any more."""
-    kind = kind_named("heights")
-    campaign = dc.Campaign(kind.robot, candidates=kind.q(20), target=kind.q(10))
-    assert all(one.cause == "" for one in campaign.add(kind.data.rows(slice(0, 11))))
-    (last,) = campaign.add(kind.data.rows([11]))
-    assert last.fits is None
-    assert "at least 40 rows" in str(last)
-    campaign.add(kind.data.rows(slice(12, 41)))
-    assert campaign.models == 1
-    assert all(one.cause == "" for one in campaign.verdicts)
 
 
 def test_set_ups_come_one_after_the_other(measured: tuple[Tensor, Tensor]) -> None:

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
-from command_bank import Outcome, Site, make_site, run_process
+from command_bank import Command, Outcome, Site, make_site, run_process
 from server_bank import Server
 
 import diffeo_calib as dc
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 
 @pytest.fixture(scope="session")
@@ -59,3 +66,16 @@ def sound_path(small_site: Site, sound: bytes) -> Path:
     """The model file of the small site."""
     assert sound
     return small_site.folder / "sound.safetensors"
+
+
+@pytest.fixture
+def init(command: Command, tmp_path: Path) -> Callable[..., tuple[dict[str, Any], str]]:
+    """The campaign that `init` writes for a table and a robot: its entries, and its text with the remarks."""
+
+    def proposed(*words: object, name: str = "c.toml") -> tuple[dict[str, Any], str]:
+        done = command("init", *words, "-o", tmp_path / name, "--force")
+        assert done.code == 0, done.err
+        text = (tmp_path / name).read_text(encoding="utf-8")
+        return tomllib.loads(text), text
+
+    return proposed

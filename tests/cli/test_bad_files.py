@@ -6,14 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_bank import (
-    TABLE,
-    Command,
-    Site,
-    edited,
-    rows_of,
-    set_cell,
-)
+from command_bank import TABLE, Command, Site, edited, set_cell
 
 import diffeo_calib as dc
 
@@ -67,18 +60,6 @@ def test_a_model_s_joints_missing_in_the_table(
 PLACES = [("none/file.png", "No such file or directory"), ("here.png", "Is a directory")]
 
 
-@pytest.mark.parametrize("case", PLACES)
-def test_predictions_that_cannot_be_written(
-    case: tuple[str, str], small_site: Site, sound: bytes, command: Command, tmp_path: Path
-) -> None:
-    place, message = case
-    (tmp_path / "model").write_bytes(sound)
-    (tmp_path / "here.png").mkdir()
-    done = command("predict", tmp_path / "model", small_site.csv, *TABLE[2:], "-o", tmp_path / place)
-    assert done.code == 1
-    assert f"file '{tmp_path / place}' cannot be written ({message})" in done.error
-
-
 @pytest.mark.parametrize("case", [(option, *place) for option in ("-o", "--figure") for place in PLACES])
 def test_outputs_are_checked_before_the_fit(
     case: tuple[str, str, str], small_site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -89,21 +70,6 @@ def test_outputs_are_checked_before_the_fit(
     done = command(*small_site.fit(small_site.csv, tmp_path / "model"), option, tmp_path / place)
     assert done.code == 1
     assert f"file '{tmp_path / place}' cannot be written ({message})" in done.error
-
-
-def test_options_that_do_not_belong_together_leave_the_model(sound: bytes, command: Command, tmp_path: Path) -> None:
-    model = tmp_path / "model"
-    model.write_bytes(sound)
-    done = command("report", model, "-o", tmp_path / "r.html", "--against", "temperature", "--json", model)
-    assert done.code in (1, 2)
-    assert model.read_bytes() == sound
-
-
-def test_a_figure_of_an_unknown_format(small_site: Site, command: Command, tmp_path: Path) -> None:
-    csv = edited(small_site, tmp_path / "t.csv", rows_of(*range(12)))
-    done = command(*small_site.fit(csv, tmp_path / "model", "--holdout", 0, "--figure", tmp_path / "errors.xyz"))
-    assert done.code == 1
-    assert "errors" in done.error
 
 
 def test_a_urdf_in_place_of_a_model(small_site: Site, command: Command) -> None:

@@ -7,15 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_bank import (
-    ROTATION,
-    TABLE,
-    Command,
-    Site,
-    edited,
-    run_process,
-)
-from server_bank import Server
+from command_bank import ROTATION, TABLE, Command, Site, edited
 
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -94,10 +86,7 @@ def test_wrong_options(options: list[str], message: str, small_site: Site, comma
         (["--std", "a,b"], r"--std: expected names of columns: one, one per marker or three per marker"),
         (["--std", "s"], r"no column \['s'\]"),
         (["--std", "k"], r"line 2, column 'k'.*: expected a positive standard deviation, got '0'"),
-        (
-            ["--rotation", "i,j,k,l", "--convention", "quat_xyzw"],
-            r"line 2, columns i, j, k, l: .*quaternion",
-        ),
+        (["--rotation", "i,j,k,l", "--convention", "quat_xyzw"], r"line 2, columns i, j, k, l: .*quaternion"),
         (["--rotation", "i,j,k", *ROTATION[2:], "--lever", "-5"], r"`lever`.*above 0, got -0.005"),
     ],
 )
@@ -109,18 +98,6 @@ def test_wrong_rotations(options: list[str], message: str, small_site: Site, com
     assert done.code == 1
     assert re.search(message, done.error), done.error
     assert not (tmp_path / "model").exists()
-
-
-def test_rotations_in_the_wrong_unit_cause_a_warning(small_site: Site, command: Command, tmp_path: Path) -> None:
-    csv = edited(
-        small_site, tmp_path / "t.csv", lambda cells: [cells[0] + list("ijk"), *([*r, *"123"] for r in cells[1:])]
-    )
-    done = command(
-        "fit", csv, *small_site.fit(csv, tmp_path / "model")[2:], "--rotation", "i,j,k", *ROTATION[2:], "--lever", "0"
-    )
-    assert done.code == 1
-    assert "rotations reach only 3 deg" in done.warnings[0]
-    assert "pass --rotation-angle 'rad'" in done.warnings[0]
 
 
 def test_rotations_for_a_model_of_points(small_site: Site, sound: bytes, command: Command, tmp_path: Path) -> None:
@@ -136,17 +113,3 @@ def test_rotations_for_a_model_of_points(small_site: Site, sound: bytes, command
         assert done.code == 1
         assert "this model has none" in done.error
         assert not (tmp_path / "p.csv").exists()
-
-
-def test_one_warning_and_one_sentence(small_site: Site, server: Server, tmp_path: Path) -> None:
-    done = server(small_site.fit(small_site.csv, tmp_path / "model", "--length", "m"))
-    assert done.code == 1
-    assert len(done.warnings) == 1
-    assert "positions seem to be 1000 times too large" in done.error
-
-
-@pytest.mark.slow
-def test_a_real_process_used_wrongly() -> None:
-    done = run_process("fit", "--surprise")
-    assert done.code == 2
-    assert "Traceback" not in done.err

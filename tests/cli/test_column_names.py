@@ -5,13 +5,7 @@ from __future__ import annotations
 import pytest
 
 from diffeo_calib.cli.column_names import column
-from diffeo_calib.cli.guesses import (
-    guess_joints,
-    guess_matrix,
-    guess_positions,
-    guess_rotation,
-    joints_without_column,
-)
+from diffeo_calib.cli.guesses import guess_joints, guess_matrix, guess_positions, guess_rotation, joints_without_column
 
 SIX = [f"joint_{k}" for k in range(1, 7)]
 SO_100 = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"]
@@ -150,10 +144,6 @@ def test_two_markers_stay_two() -> None:
     for names in ("left_{}", "{}1", "target 1 {}", "m{}"):
         both = [triple("b_{}"), triple(names)]
         assert guess_positions([*both[0], *both[1]]) == (both, [])
-
-
-def test_wished_places_alone_are_none() -> None:
-    assert guess_positions(triple("goal_{}")) == ([], [(triple("goal_{}"), "wished places")])
 
 
 @pytest.mark.parametrize("other", ["v{}", "gyro_{}", "rot_{}", "d{}", "force {} [N]", "sigma_{}", "q_{}"])

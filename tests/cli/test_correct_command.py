@@ -22,7 +22,6 @@ from diffeo_calib.cli import record
 from diffeo_calib.cli.options import Targets
 from diffeo_calib.cli.tables import ProgramTable
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.kinematics.tool import tool_transform
 from diffeo_calib.measurements.poses import angle_between, rotation_matrices, transforms
 from diffeo_calib.measurements.table_format import TableFormat
 
@@ -211,14 +210,6 @@ def test_wrong_options(options: list[str], message: str, site: Site, program: Pa
     assert not output.exists()
 
 
-def test_a_program_is_not_corrected_twice(site: Site, program: Path, tmp_path: Path, command: Command) -> None:
-    path = site.folder / "model.safetensors"
-    assert command("correct", path, program, *UNITS, "-o", tmp_path / "once.csv").code == 0
-    done = command("correct", path, tmp_path / "once.csv", *UNITS, "-o", tmp_path / "twice.csv")
-    assert done.code == 1
-    assert "already has the column(s) ['command_x'" in done.error
-
-
 def recorded_misses(path: Path) -> dict[str, Any]:
     """Of a file of --json, which is as its schema says."""
     written = json.loads(path.read_text())
@@ -236,37 +227,6 @@ def both_arms(folder: Path) -> tuple[dc.CalibratedKinematics, Path, Path]:
     arms = made_with(two_arms(folder), dc.RK4(1))
     dc.save(arms, folder / "arms.safetensors")
     return arms, folder / "both.csv", folder / "out.csv"
-
-
-def test_both_hands(tmp_path: Path, command: Command) -> None:
-    """Nominal poses of both as targets."""
-    arms, program, output = both_arms(tmp_path)
-    path = tmp_path / "arms.safetensors"
-    names, q = arms.robot.joint_names, np.random.default_rng(3).uniform(-1, 1, (6, 5))
-    program.write_text("\n".join([",".join(names), *(",".join(map(repr, row)) for row in q.tolist())]))
-    written = ["-o", output, "--json", tmp_path / "out.json"]
-    done = command("correct", path, program, *UNITS_OF_HANDS, *TOOLS, *written)
-    assert done.code == 0
-    assert "a robot with 5 joints cannot hold every orientation of 2 tools" in done.err
-    rows = read(output)
-    assert [name for name in rows[0] if name.startswith(("command_left", "miss", "angle_miss"))] == [
-        *(f"command_left_{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz")),
-        *("miss_left_mm", "angle_miss_left_rad", "miss_right_mm", "angle_miss_right_rad"),
-    ]
-    nominal = arms.robot(torch.from_numpy(q))
-    goals = torch.stack([nominal[:, k] @ tool_transform(PLACES[k]) for k in range(2)], dim=1)
-    expected = dc.compensate(arms, goals, q, tool=PLACES, bound=np.radians(20.0))
-    np.testing.assert_allclose(table(rows, list(names)), expected.q.numpy(), rtol=0, atol=1e-12)
-    misses = table(rows, ["miss_left_mm", "miss_right_mm"])
-    np.testing.assert_allclose(misses, 1e3 * expected.miss.numpy(), rtol=1e-9, atol=1e-9)
-    for k, hand in enumerate(HANDS):
-        recorded = recorded_misses(tmp_path / "out.json")[hand]
-        np.testing.assert_allclose(recorded["miss_m"], expected.miss[:, k].numpy(), rtol=1e-9, atol=1e-12)
-        turned = np.degrees(table(rows, [f"angle_miss_{hand}_rad"])[:, 0])
-        np.testing.assert_allclose(recorded["angle_miss_deg"], turned, rtol=1e-9, atol=1e-9)
-    assert "tool on left, mm" in done.out
-    assert "left misses by" in done.out
-    assert done.out.count("which knows the tool on") == 2
 
 
 def test_targets_of_both_hands(tmp_path: Path, command: Command) -> None:

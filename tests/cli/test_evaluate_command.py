@@ -7,13 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command_bank import (
-    FORMAT,
-    TABLE,
-    Command,
-    Outcome,
-    Site,
-)
+from command_bank import FORMAT, TABLE, Command, Outcome, Site
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -132,37 +126,6 @@ def test_predict(fitted: Outcome, site: Site, model: dc.CalibratedKinematics, co
     np.testing.assert_allclose(values[:, 9:], 1e3 * deviations, rtol=1e-6)
 
 
-@pytest.mark.parametrize("verb", ["predict", "correct"])
-def test_joints_in_another_unit_are_warned_about(
-    verb: str, fitted: Outcome, site: Site, command: Command, tmp_path: Path
-) -> None:
-    assert fitted.code == 0
-    names, q = site.arm.nominal.joint_names, site.data.q[:12]
-    path = tmp_path / "joints.csv"
-    path.write_text("\n".join([",".join(names), *(",".join(map(str, row)) for row in q.tolist())]))
-    words = ["--length", "mm", "--angle", "deg", "-o", tmp_path / "out.csv"]
-    done = command(verb, site.folder / "model.safetensors", path, *words)
-    assert done.code == 0
-    assert any("seem to be radians that were converted; check the angle unit" in text for text in done.warnings)
-
-
-def test_predict_in_metres_from_joints_alone(
-    fitted: Outcome, site: Site, model: dc.CalibratedKinematics, command: Command, tmp_path: Path
-) -> None:
-    assert fitted.code == 0
-    q = site.data.q[:3]
-    lines = [",".join(f"q{i}" for i in range(6)), *(",".join(map(repr, row)) for row in q.tolist())]
-    (tmp_path / "path.csv").write_text("\n".join(lines))
-    names = ["--joints", "q0,q1,q2,q3,q4,q5", "--length", "m", "--angle", "rad"]
-    done = command(
-        "predict", site.folder / "model.safetensors", tmp_path / "path.csv", *names, "-o", tmp_path / "p.csv"
-    )
-    assert done.code == 0
-    values = np.loadtxt(tmp_path / "p.csv", delimiter=",", skiprows=1)
-    assert np.array_equal(values[:, :6], q.numpy())
-    assert np.array_equal(values[:, 6:9], model.predict(q)[0][:, 0].numpy())  # all digits are written
-
-
 def test_blocks_do_not_change_predictions_or_errors(
     fitted: Outcome, site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -170,7 +133,7 @@ def test_blocks_do_not_change_predictions_or_errors(
     path, names = site.folder / "model.safetensors", ("whole.csv", "blocks.csv")
     printed = []
     for name, rows in zip(names, (2048, 7), strict=True):
-        monkeypatch.setattr("diffeo_calib.measurements.csv.tables.ROWS_AT_ONCE", rows)
+        monkeypatch.setattr("diffeo_calib.cli.commands.predict.ROWS_AT_ONCE", rows)
         assert command("predict", path, site.csv, *TABLE[2:], "-o", tmp_path / name).code == 0
         printed.append(command("evaluate", path, site.csv, *TABLE).out)
     whole, blocks = (
@@ -180,23 +143,6 @@ def test_blocks_do_not_change_predictions_or_errors(
     assert whole.shape == (40, 12)
     np.testing.assert_allclose(blocks, whole, rtol=1e-9)
     assert printed[0] == printed[1]
-
-
-def test_a_mistake_in_the_last_row_is_found_before_the_first_is_used(
-    fitted: Outcome, site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert fitted.code == 0
-    monkeypatch.setattr("diffeo_calib.measurements.csv.tables.ROWS_AT_ONCE", 7)
-    monkeypatch.setattr(dc.CalibratedKinematics, "predict", lambda *_: pytest.fail("the work has begun"))
-    (tmp_path / "old.csv").write_text("old")
-    (tmp_path / "bad.csv").write_text(site.csv.read_text() + "1;2;far;4;5;6;7;8;9\n")
-    done = command(
-        "predict", site.folder / "model.safetensors", tmp_path / "bad.csv", *TABLE[2:], "-o", tmp_path / "old.csv"
-    )
-    assert done.code == 1
-    assert "bad.csv', line 42, column " in done.error
-    assert (tmp_path / "old.csv").read_text() == "old"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.csv", "old.csv"]
 
 
 def test_an_acceptance_limit_has_an_exit_code(fitted: Outcome, site: Site, command: Command) -> None:

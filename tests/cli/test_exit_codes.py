@@ -6,10 +6,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from command_bank import (
-    Command,
-    Site,
-)
+from command_bank import Command, Site
 
 import diffeo_calib as dc
 from diffeo_calib.measurements.csv.files import write_measurements

@@ -46,16 +46,6 @@ def test_a_corrected_urdf(path: Path, model: dc.CalibratedKinematics, command: C
     assert f"their robot base in the measuring frame: {place} mm" in done.out
 
 
-def test_what_it_promises_for_new_measurements_holds(path: Path, site: Site, command: Command, tmp_path: Path) -> None:
-    """On the rows that `fit` held out."""
-    done = command("export", path, "--urdf", tmp_path / "new.urdf")
-    model = dc.load(path)
-    assert isinstance(model, dc.CalibratedKinematics)
-    _, test = site.data.split(0.7, seed=0)
-    found = dc.evaluate(dc.interop.rigid_kinematics(model).geometry.points, test).rms
-    assert row(done, "--urdf")[3] == pytest.approx(1e3 * found, rel=0.3)
-
-
 @pytest.mark.slow
 def test_all_files_of_one_command(path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
     """The same bytes as the Python functions write, and one row for each in the printed table."""
@@ -82,23 +72,6 @@ def test_all_files_of_one_command(path: Path, model: dc.CalibratedKinematics, co
     for words in ("reading + offset is the joint value", "a controller adds the correction", "nothing is known beyond"):
         assert words in done.out
     assert "DH rows with Hayati's beta, next to parallel axes: elbow_joint" in done.out
-
-
-@pytest.mark.slow
-def test_rigid_kinematics_for_use_with_tables(
-    path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path
-) -> None:
-    urdf, tables = ["--urdf", tmp_path / "a.urdf"], ["--correction-tables", tmp_path / "t.csv"]
-    done = command("export", path, *urdf, *tables, "--with-tables")
-    assert (done.code, done.err.strip()) == (0, "")
-    made = dc.interop.rigid_kinematics(model, transmission=True)
-    chain = dc.load_urdf(tmp_path / "a.urdf", "base_link", "flange")
-    q = configurations(chain)
-    torch.testing.assert_close(chain(q), own_poses(made.geometry, q), rtol=0, atol=1e-12)
-    together, alone = row(done, "--urdf and --correction-tables"), row(done, "--urdf alone")
-    assert together[0] == pytest.approx(1e3 * made.rms, abs=1e-4)
-    assert together[0] < row(command("export", path, *urdf, *tables), "--urdf and --correction-tables")[0]
-    assert alone[0] > row(command("export", path, *urdf), "--urdf")[0]
 
 
 def test_only_universal_robots_have_their_file(path: Path, command: Command, tmp_path: Path) -> None:
@@ -135,28 +108,6 @@ def test_old_files_need_the_urdf(site: Site, command: Command, tmp_path: Path) -
     assert (done.code, done.err.strip()) == (0, "")
     assert "from the projection of the model" in done.out
     assert dc.load_urdf(new, "base_link", "flange").n == 6
-
-
-def test_wrong_robots_and_places(path: Path, site: Site, command: Command, tmp_path: Path) -> None:
-    other, new = tmp_path / "other.urdf", tmp_path / "new.urdf"
-    other.write_text(site.urdf.read_text().replace("elbow_joint", "knee_joint"))
-    done = command("export", path, "--urdf", new, "--robot", other)
-    assert done.code == 1
-    assert "got waist_joint, shoulder_joint, knee_joint" in done.error
-    for target, words in (
-        (other, "is the file of --robot"),
-        (path, "is the file of MODEL"),
-        (tmp_path, "cannot be written"),
-        (tmp_path / "none" / "new.urdf", "make its folder first"),
-    ):
-        done = command("export", path, "--urdf", target, "--robot", other)
-        assert done.code == 1
-        assert words in done.error
-    before = other.read_bytes()
-    assert other.read_bytes() == before
-    assert command("export", tmp_path / "no_model", "--urdf", new).code == 1
-    assert command("export", path, "--urdf", new, "--robot", tmp_path / "none.urdf").code == 1
-    assert not new.exists()
 
 
 def test_at_least_one_file(path: Path, command: Command) -> None:

@@ -8,24 +8,15 @@ from typing import Any
 
 import pytest
 import torch
-from command_bank import (
-    FORMAT,
-    STAGES,
-    Command,
-    Outcome,
-    Site,
-    make_site,
-)
+from command_bank import FORMAT, STAGES, Command, Outcome, Site
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.findings import Outlier, parts
-from diffeo_calib.cli.commands import fit
 from diffeo_calib.cli.printed import outlier_lines
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
-from diffeo_calib.sensors.errors import Evaluation
 
 VERDICT = (STAGES[2], 0), (STAGES[2], 2), (STAGES[1], 0)
 """Stage and place of the numbers of the first line."""
@@ -82,12 +73,6 @@ def test_fit_with_the_scales_of_another_robot(
     assert float(ratios.min()) == pytest.approx(1.0) or float(ratios.max()) == pytest.approx(1.0)
 
 
-def test_scales_of_what_is_no_model_are_refused(site: Site, command: Command, tmp_path: Path) -> None:
-    done = command(*site.fit(site.csv, tmp_path / "own.safetensors", "--scales-of", site.csv))
-    assert done.code == 1
-    assert "measured.csv" in done.err
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("given_scales")
 def test_outliers_are_named_by_their_lines_in_the_file(site: Site, command: Command, tmp_path: Path) -> None:
@@ -132,22 +117,6 @@ def test_many_outliers_are_cut_short() -> None:
 
 
 @pytest.mark.slow
-def test_fit_equals_calibrate(site: Site, model: dc.CalibratedKinematics) -> None:
-    train, test = site.data.split(0.7, seed=0)
-    expected = dc.calibrate(site.arm.nominal, train).model
-    # The CSV's last digit is not the same, and the search for scales ends a little elsewhere.
-    torch.testing.assert_close(model(test.q), expected(test.q), rtol=0, atol=1e-5)
-    assert expected.report["rows"] == model.report["rows"]
-    assert expected.report.keys() == model.report.keys()
-
-
-def test_fit_draws_a_figure(fitted: Outcome, site: Site) -> None:
-    assert fitted.code == 0
-    assert (site.folder / "errors.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-    assert "figure: " in fitted.out
-
-
-@pytest.mark.slow
 @pytest.mark.usefixtures("given_scales")
 def test_holdout_zero_and_other_names(site: Site, command: Command, tmp_path: Path) -> None:
     """All rows in training; joint columns with names of their own; points and commas of the other kind."""
@@ -174,52 +143,6 @@ def test_holdout_zero_and_other_names(site: Site, command: Command, tmp_path: Pa
     assert "20 training rows, no row was held out" in (tmp_path / "all.svg").read_text()
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("given_scales")
-def test_two_markers(command: Command, tmp_path: Path) -> None:
-    site = make_site(tmp_path, rows=16, markers=2)
-    table = ["--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
-    markers = ["--position", "x0,y0,z0", "--position", "x1, y1 ,z1"]
-    path = tmp_path / "two.safetensors"
-    done = command("fit", site.csv, *site.robot(), *markers, *table, "-o", path, "--holdout", 0)
-    assert (done.code, done.err.strip()) == (0, "")
-    evaluated = command("evaluate", path, site.csv, *markers, *table)
-    assert evaluated.numbers("in all") == pytest.approx(done.numbers("calibrated", "training"), abs=1.01e-4)
-    predicted = command("predict", path, site.csv, *table, "-o", tmp_path / "p.csv")
-    assert predicted.code == 0
-    header = (tmp_path / "p.csv").read_text().splitlines()[0].split(";")
-    kinds = [f"{kind}{axis}" for kind in ("", "std_") for axis in "xyz"]
-    assert header == [*site.arm.nominal.joint_names, *(f"marker{k}_{kind}" for k in (1, 2) for kind in kinds)]
-    crossed = command("evaluate", path, site.csv, *reversed_markers(markers), *table)
-    assert crossed.numbers("in all")[0] > 10.0  # markers in the wrong order are not the same markers
-    assert len(crossed.warnings) == 1
-    fewer = command("evaluate", path, site.csv, *markers[:2], *table)
-    assert fewer.code == 1
-    assert "do not have the same markers" in fewer.error
-
-
-def reversed_markers(markers: list[str]) -> list[str]:
-    return [*markers[2:], *markers[:2]]
-
-
-def test_standard_deviations_of_points(
-    site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: list[dc.Measurements] = []
-
-    def look(_: Any, data: dc.Measurements, **__: Any) -> None:
-        seen.append(data)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", look)
-    data = dc.Measurements(site.data.q, site.data.points, site.data.joint_names, std=3e-5)
-    write_measurements(tmp_path / "t.csv", data, TableFormat("mm", "deg"))
-    table = ["--position", "x,y,z", "--length", "mm", "--angle", "deg", "--std", "std_x,std_y,std_z", "--holdout", 0]
-    assert command("fit", tmp_path / "t.csv", *site.robot(), *table, "-o", tmp_path / "m").code == 130
-    torch.testing.assert_close(seen[0].std, data.std, rtol=1e-12, atol=0)
-    assert seen[0].poses is None
-
-
 def test_a_device_that_moved_half_way_fails_the_fit(tmp_path: Path, command: Command) -> None:
     arm = SimulatedArm(seed=0)
     q, points = arm.measure(90, seed=3)
@@ -235,15 +158,3 @@ def test_a_device_that_moved_half_way_fails_the_fit(tmp_path: Path, command: Com
     assert any("near row 57" in line for line in done.warnings)
     assert "from the model" in done.error
     assert "session" in done.error
-
-
-@pytest.mark.parametrize("wrong", [False, True])
-def test_no_held_out_row_is_called_wrong_without_an_outlier(wrong: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """However the errors are distributed: with few rows a larger RMS and a smaller median are no proof."""
-    said: list[str] = []
-    monkeypatch.setattr(fit, "say", said.append)
-    geometry, model = (Evaluation(1e-3 * torch.tensor([[a], [a], [b]])) for a, b in ((0.05, 0.06), (0.04, 0.09)))
-    assert model.rms > geometry.rms
-    assert model.median < geometry.median
-    fit._show_verdict(geometry, model, wrong=wrong)
-    assert ("wrong" in " ".join(said)) == wrong

@@ -59,11 +59,3 @@ def test_the_model_is_written_although_there_is_no_room_for_its_figure(
     assert isinstance(dc.load(model), dc.CalibratedKinematics)
     assert figure.read_bytes() == OLD
     assert sorted(path.name for path in tmp_path.iterdir()) == ["figure.png", "model.safetensors"]
-
-
-def test_devices(server: Server, small_site: Site, sound_path: Path) -> None:
-    done = server(["predict", sound_path, small_site.csv, *TABLE[2:], "-o", "/dev/full"])
-    assert done.code == 1
-    assert done.error.endswith("'/dev/full' cannot be written (No space left on device); free some space, or name a "
-                               "file on another disk.")  # fmt: skip
-    assert server(["predict", sound_path, small_site.csv, *TABLE[2:], "-o", "/dev/null"]).code == 0

@@ -13,7 +13,6 @@ from kind_bank import kind_named
 
 import diffeo_calib as dc
 from diffeo_calib.cameras.files import camera_text
-from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
@@ -151,15 +150,6 @@ def test_a_robot_in_macros_and_a_folder_of_images_are_told_what_to_do(tmp_path: 
         assert message in asked.error
 
 
-def test_a_chain_with_one_end_needs_no_links(tmp_path: Path) -> None:
-    write_arm(tmp_path, [])
-    robot = dc.load_urdf(tmp_path / "arm.urdf")
-    assert (robot.base, robot.tip) == ("base_link", "flange")
-    write_arm(tmp_path, GRIPPER)
-    with pytest.raises(InputError, match=r"`tip` of .* expected one link at this end, got left_jaw, right_jaw"):
-        dc.load_urdf(tmp_path / "arm.urdf")
-
-
 ROWS = [(0.07, -pi / 2, 0.41, 0.0), (0.5, 0.0, 0.0, -pi / 2), (0.04, -pi / 2, 0.0, 0.0)]
 ROWS += [(0.0, pi / 2, 0.45, 0.0), (0.0, -pi / 2, 0.0, 0.0), (0.0, 0.0, 0.09, pi)]
 
@@ -202,35 +192,6 @@ def test_the_convention_that_explains_the_rows(convention: str, scale: float, tm
         tmp_path / "m.safetensors",
     )
     assert "--dh-convention; `init` finds the one that fits" in fitted.error
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("given_scales")
-def test_the_proposal_for_a_dh_table_runs(tmp_path: Path, command: Command) -> None:
-    write_dh_arm(tmp_path, "craig", 1e3, "joint_{}", TableFormat("m", "rad"))
-    assert command("init", tmp_path / "t.csv", tmp_path / "arm.csv", "-o", tmp_path / "c.toml").code == 0
-    done = command("fit", tmp_path / "c.toml", "--holdout", "0")
-    assert done.code == 0, done.err
-    model = dc.load(tmp_path / "t.safetensors")
-    assert (model.robot.name, model.robot.joint_names[0], len(model.configurations)) == ("arm", "joint_1", 40)
-    planned = command(
-        "plan",
-        "-n",
-        "6",
-        "--robot",
-        tmp_path / "arm.csv",
-        "--dh-convention",
-        "craig",
-        "--draw",
-        "50",
-        "--length",
-        "mm",
-        "--angle",
-        "deg",
-        "-o",
-        tmp_path / "plan.csv",
-    )
-    assert planned.code == 0, planned.err
 
 
 def test_a_last_row_without_a_joint_and_options_that_do_not_belong(tmp_path: Path, command: Command) -> None:

@@ -10,16 +10,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from command_bank import (
-    Command,
-    Outcome,
-    Site,
-    environment,
-    make_site,
-    run_process,
-)
+from command_bank import Command, Outcome, Site, environment, make_site
 
 import diffeo_calib as dc
 from diffeo_calib.cli.console import Interrupts
@@ -146,54 +138,3 @@ def test_ctrl_c_in_a_real_process_writes_the_model(moment: str, tmp_path: Path) 
         1e3 * dc.evaluate(model, test).rms, abs=1.01e-4
     )
     assert done.numbers("calibrated", "24 held out")[0] < done.numbers("geometric", "24 held out")[0]
-
-
-CUT_SHORT = """
-import os, signal, sys
-from importlib import import_module
-from diffeo_calib.__main__ import main
-
-module, name = import_module(sys.argv.pop(1)), sys.argv.pop(1)
-called = getattr(module, name)
-
-def cut_short(*given, **options):
-    print("reached", flush=True)
-    os.kill(os.getpid(), signal.SIGINT)
-    return called(*given, **options)
-
-setattr(module, name, cut_short)
-main()
-"""
-
-
-def assert_cut_short(place: tuple[str, str], *words: object, outputs: dict[Path, bool]) -> None:
-    """Ctrl-C where a function is called: one sentence, and files as they were.
-
-    Args:
-        outputs: files, and whether each was there before.
-    """
-    stale = b"of another day"
-    for path, there in outputs.items():
-        if there:
-            path.write_bytes(stale)
-    before = {path: set(path.parent.iterdir()) for path in outputs}
-    done = run_process(*place, *words, program=("-c", CUT_SHORT))
-    assert (done.code, done.out.splitlines()[-1:]) == (130, ["reached"]), done.err
-    assert done.err.count("\n") == 1
-    assert "interrupted" in done.err
-    for path, there in outputs.items():
-        assert set(path.parent.iterdir()) == before[path]
-        assert not there or path.read_bytes() == stale
-
-
-@pytest.mark.slow
-def test_ctrl_c_among_images_leaves_the_files_as_they_were(tmp_path: Path) -> None:
-    cv2 = pytest.importorskip("cv2")
-    (tmp_path / "board").mkdir()
-    for number in range(3):
-        cv2.imwrite(str(tmp_path / "board" / f"{number}.png"), np.zeros((48, 64), np.uint8))
-    (tmp_path / "joints.csv").write_text("a,b\n1,2\n3,4\n5,6\n")
-    words = ["images", tmp_path / "board", tmp_path / "joints.csv", "--board", "chessboard:5x4:0.03", "--length", "m"]
-    files = {tmp_path / "corners.csv": True, tmp_path / "corners.yaml": True, tmp_path / "page.html": False}
-    more = ["-o", tmp_path / "corners.csv", "--overview", tmp_path / "page.html"]
-    assert_cut_short(("diffeo_calib.cameras.folder", "_seen"), *words, *more, outputs=files)

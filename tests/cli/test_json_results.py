@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 import jsonschema
 import pytest
-import torch
-from command_bank import Command, run_process
+from command_bank import Command
 from product_bank import Case
 
 import diffeo_calib as dc
@@ -73,34 +71,6 @@ def test_commands_that_apply_a_model(folder: Path, command: Command) -> None:
     assert exported["files"] == {"dh": str(folder / "dh.csv")}
 
 
-@pytest.mark.slow
-def test_commands_of_a_robot_that_is_measured_again(folder: Path, command: Command) -> None:
-    model = "arm.safetensors"
-    compared = ran(command, folder, "compare", model, "new.csv", *TABLE)["results"]
-    assert compared["changes"] == []
-    torch.testing.assert_close(torch.tensor(compared["transform"]), torch.eye(4), atol=2e-3, rtol=0)
-    models = ran(command, folder, "compare", model, model)["results"]
-    assert models["errors"]["found"]["rms_m"] < 1e-6
-    assert models["changes"] == []
-    again = ran(command, folder, "recalibrate", model, "new.csv", *TABLE, "-o", "again.safetensors")["results"]
-    assert again["converged"] is True
-    assert again["files"] == {"model": str(folder / "again.safetensors")}
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("given_scales", "undrawn")
-def test_fit(folder: Path, command: Command) -> None:
-    written = ran(command, folder, "demo", "-o", folder / "demo", "--rows", 40)["results"]
-    assert set(written["errors"]) == {"training", "held_out"}
-    assert written["errors"]["held_out"]["calibrated"]["rows"] == 12
-    assert set(written["files"]) == {"model", "figure", "report"}
-    model = dc.load(folder / "demo" / "model.safetensors")
-    torch.testing.assert_close(torch.tensor(written["base"], dtype=torch.float64), model.geometry.base)
-    assert model.provenance is not None
-    assert model.provenance.command.startswith("diffeo-calib fit ")
-    assert "--report" in model.provenance.command
-
-
 def test_an_error_is_written_too(folder: Path, command: Command) -> None:
     written = ran(command, folder, "evaluate", "none.safetensors", "new.csv", *TABLE, code=1)
     assert "none.safetensors" in written["error"]
@@ -117,14 +87,6 @@ def test_a_place_that_is_taken_is_refused(folder: Path, command: Command) -> Non
     assert done.code == 1
     assert command("export", model, "--dh", folder / "d.csv", "--json", folder / "none" / "x.json").code == 1
     assert model.read_bytes() == before
-
-
-def test_the_command_that_made_a_model_is_kept_and_old_files_have_none(arm: Case, tmp_path: Path) -> None:
-    assert arm.model.provenance is not None
-    assert arm.model.provenance.command == ""
-    entries = arm.model.provenance.to_dict()
-    del entries["command"]
-    assert type(arm.model.provenance).from_dict(entries) == arm.model.provenance
 
 
 STALE = '{"format": "diffeo_calib result", "exit_code": 0}'
@@ -165,16 +127,3 @@ def test_other_files_and_questions_remove_nothing(folder: Path, command: Command
     assert command("predict", "--json", out, "--help").code == 0
     assert other.read_text(encoding="utf-8") == '{"mine": 1}'
     assert out.exists()
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
-def test_an_early_ctrl_c_leaves_no_earlier_result(folder: Path) -> None:
-    out = folder / "out.json"
-    out.write_text(STALE, encoding="utf-8")
-    words = ["report", folder / "arm.safetensors", "-o", folder / "r.html", "--json", out]
-    program = "import diffeo_calib.reports.report as r, os, signal\n" + (
-        "r.find = lambda *a, **k: os.kill(os.getpid(), signal.SIGINT)\nfrom diffeo_calib.__main__ import main\nmain()"
-    )
-    assert run_process(*words, program=("-c", program)).code == 130
-    assert not out.exists()

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
-import torch
 from command_bank import Command
-from torch.testing import assert_close
 
+from diffeo_calib.cli.guesses import with_places
 from diffeo_calib.cli.options import Places, Rows, Units
-from diffeo_calib.cli.row_columns import with_places
-from diffeo_calib.cli.tables import as_at_the_fit, measured_table, rows_in_table
+from diffeo_calib.cli.tables import as_at_the_fit
 from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.writing import write_rows
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 FIT = "diffeo-calib fit t.csv --position x,y,z --length mm --angle deg --places p.csv --by name -o m"
-UNITS = Units(length="mm", angle="deg")
 ARM = SimulatedArm(seed=2, markers=3)
 ROWS = 30
 
@@ -66,39 +63,17 @@ def test_the_file_of_places_is_that_of_its_table() -> None:
     assert rows == Rows(position=["x,y,z"], places=Path("new.csv"), by="name")
 
 
-def test_two_files_are_read_as_one(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    rows = Rows(position=["x,y,z"], marker="reflector=front,left,top")
-    whole = measured_table(files.whole, rows, UNITS).read(ARM.nominal)
-    rows = Rows(position=["x,y,z"], marker="reflector=front,left,top", places=files.places, by="name")
-    assert rows_in_table(files.joints, rows, UNITS) == (rows, [])
-    both = measured_table(files.joints, rows, UNITS).read(ARM.nominal)
-    back = torch.arange(ROWS - 2, -1, -1)
-    assert_close(both.q, whole.q[back], rtol=0, atol=0)
-    assert_close(both.points, whole.points[back], rtol=0, atol=0, equal_nan=True)
-    assert both.line_numbers.tolist() == [*range(2, ROWS + 1)]
-    assert "1 of joints.csv (P29)" in capsys.readouterr().out
+def test_init_finds_the_column_of_the_markers(files: Files, init: Any) -> None:
+    written, text = init(files.whole, files.urdf)
+    assert 'marker = "reflector"  # names the marker of each row: 3 values between which the points jump' in text
+    assert written["length"] == "mm"
 
 
-def test_init_finds_the_column_of_the_markers(files: Files, tmp_path: Path, command: Command) -> None:
-    done = command("init", files.whole, files.urdf, "-o", tmp_path / "c.toml")
-    assert done.code == 0, done.err
-    assert 'marker = "reflector"  # names the marker of each row: 3 values between which the points jump' in done.out
-    assert 'length = "mm"' in done.out
-
-
-def test_init_joins_two_files(files: Files, tmp_path: Path, command: Command) -> None:
-    done = command("init", files.joints, files.urdf, "--places", files.places, "-o", tmp_path / "c.toml")
-    assert done.code == 0, done.err
-    assert (
-        'by = "name"  # 29 lines of places.csv are joined with lines of joints.csv by name; lines without' in done.out
-    )
-    for words in (
-        'places.csv"  # the measured places',
-        'marker = "reflector"',
-        'length = "mm"',
-        "# all columns are used",
-    ):
-        assert words in done.out
+def test_init_joins_two_files(files: Files, tmp_path: Path, command: Command, init: Any) -> None:
+    _, text = init(files.joints, files.urdf, "--places", files.places)
+    assert 'by = "name"  # 29 lines of places.csv are joined with lines of joints.csv by name; lines without' in text
+    for words in ('places.csv"  # the measured', 'marker = "reflector"', 'length = "mm"', "# all columns are used"):
+        assert words in text
     assert command("fit", tmp_path / "c.toml", "--position", "x").err.endswith("expected three columns X,Y,Z, got x\n")
 
 
@@ -142,9 +117,9 @@ def test_options_that_do_not_go_together(words: list[str], message: str, files: 
 
 
 @pytest.mark.slow
-def test_a_model_knows_its_markers(files: Files, tmp_path: Path, command: Command) -> None:
+def test_a_model_knows_its_markers(files: Files, tmp_path: Path, command: Command, init: Any) -> None:
     """From two files to a model, and to the errors of a table of some markers in another order."""
-    assert command("init", files.joints, files.urdf, "--places", files.places, "-o", tmp_path / "c.toml").code == 0
+    init(files.joints, files.urdf, "--places", files.places)
     done = command("fit", tmp_path / "c.toml", "-o", tmp_path / "m.safetensors", "--holdout", 0)
     assert done.code == 0, done.err
     header, *lines = files.whole.read_text().splitlines()

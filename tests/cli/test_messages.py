@@ -66,9 +66,3 @@ def test_a_device_without_line_ends(small_site: Site, command: Command, tmp_path
     assert "no text but binary" in command(*small_site.fit(zero, model)).error
     assert "is no file" in command(*small_site.fit(small_site.csv, model, "--robot", zero)).error
     assert "there is no model file /dev/zero" in command("evaluate", zero, small_site.csv, *TABLE).error
-
-
-def test_a_unit_that_does_not_exist(small_site: Site, command: Command, tmp_path: Path) -> None:
-    done = command(*small_site.fit(small_site.csv, tmp_path / "model", "--length", "km"))
-    assert done.code == 2
-    assert "Invalid value for '--length': 'km' is not one of 'm', 'mm', 'cm', 'inch'." in done.err

@@ -47,41 +47,6 @@ def read(path: Path | str = "t.csv", **options: object) -> dc.Measurements:
     return dc.read_measurements(path, robot, ["x", "y", "z"], **given)  # pyright: ignore[reportArgumentType]
 
 
-def test_fit_and_evaluate(folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
-    fitted = command("fit", "t.csv", *ROBOT, *POSITION, *SOCKETS, "-o", "m.safetensors", "--json", "m.json")
-    assert fitted.code == 0, fitted.err
-    assert "Position errors in mm by stage" in fitted.out
-    assert "8 training" in fitted.out
-    assert "3 held out" in fitted.out
-    assert "mm in the measuring frame" in fitted.out
-    assert "marker in the frame of 'flange'" in fitted.out
-    assert "ball in the frame of 'flange'" in fitted.out
-    assert "2 to 6 times" not in fitted.out
-    results = json.loads((folder / "m.json").read_text())["results"]
-    assert len(results["sockets"]["positions_m"]) == 4
-    assert results["errors"]["training"]["calibrated"]["rows"] == 8
-    done = command("evaluate", "m.safetensors", "t.csv", *POSITION, *SOCKETS, *UNITS, "--json", "e.json")
-    assert done.code == 0, done.err
-    assert "3 not used in the fit" in done.out
-    assert "12 in all" in done.out
-    assert done.out.count("known 50.000") == 2
-    model = dc.load("m.safetensors")
-    assert isinstance(model, dc.CalibratedKinematics)
-    rms = json.loads(Path("e.json").read_text())["results"]["errors"]["all"]["rms_m"]
-    data = read()
-    assert dc.evaluate(model, data).rms == pytest.approx(rms, rel=1e-9)
-    spread = json.loads(Path("e.json").read_text())["results"]["kinds"]["socket"]["all"]
-    assert (spread["rows"], spread["what"], spread["unit"]) == (12, "spread", "mm")
-    assert spread["rms"] == pytest.approx(1e3 * dc.evaluate(model, data.socket_rows()).rms, rel=1e-9)
-    (folder / "tracked.csv").write_text(
-        "\n".join(line for line in (folder / "t.csv").read_text().split("\n") if not line.startswith("spot"))
-    )
-    alone = command("evaluate", "m.safetensors", "tracked.csv", *POSITION, *UNITS, "--json", "a.json")
-    assert alone.code == 0, alone.err
-    assert json.loads(Path("a.json").read_text())["results"]["errors"]["all"]["rms_m"] == pytest.approx(rms, rel=1e-9)
-
-
 def test_other_commands_name_the_ball_and_what_was_measured(
     folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -107,15 +72,6 @@ def test_other_commands_name_the_ball_and_what_was_measured(
     assert 0 < float(said[2]) < 0.5 * float(said[1])
 
 
-def test_rows_in_the_order_of_the_file(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
-    data = read()
-    assert data.line_numbers.tolist() == list(range(2, 25))
-    assert data.places is not None
-    assert (data.places >= 0).nonzero()[:, 0].tolist() == list(range(3, 15))
-    assert len(data.device_rows()) == TRACKED
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -134,16 +90,6 @@ def test_lines_of_one_kind(
         read("wrong.csv")
 
 
-def test_tables_of_one_kind_alone(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
-    header, *lines = (folder / "t.csv").read_text().split("\n")
-    for start, message in (("", "no line holds a socket"), ("spot", "columns x, y, z: empty in all 12 lines")):
-        kept = [line for line in lines if line.startswith("spot") == bool(start)]
-        (folder / "one.csv").write_text("\n".join([header, *kept]))
-        with pytest.raises(MeasurementError, match=message):
-            read("one.csv")
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -160,17 +106,6 @@ def test_refused_options(
     assert message in " ".join(done.err.split())
     done = command("fit", "t.csv", *ROBOT, *POSITION, *SOCKETS[:-2], "-o", "none.safetensors")
     assert "--distance without --distance-std" in done.err
-
-
-def test_set_ups_of_the_measured_rows(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
-    header, *lines = (folder / "t.csv").read_text().split("\n")
-    days = ["" if line.startswith("spot") else "ab"[number % 2] for number, line in enumerate(lines)]
-    with_days = [f"{line},{day}" for line, day in zip(lines, days, strict=True)]
-    (folder / "days.csv").write_text("\n".join([f"{header},day", *with_days]))
-    data = read("days.csv", session="day")
-    assert data.session is not None
-    assert [data.session_names[k] if k >= 0 else "" for k in data.session.tolist()] == days
 
 
 def test_set_ups_are_evaluated_each_in_its_place(

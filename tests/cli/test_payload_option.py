@@ -11,7 +11,6 @@ from product_bank import with_usual_scales
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning
-from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
@@ -49,30 +48,6 @@ def test_fit_takes_the_column(folder: Path, tmp_path: Path, command: Command) ->
     refused = command(*report)
     assert refused.code == 1
     assert "calibrated with payloads" in refused.err
-
-
-def test_the_table_reads_back(folder: Path) -> None:
-    arm = SimulatedArm(seed=2).nominal
-    data = dc.read_measurements(folder / "t.csv", arm, ["x", "y", "z"], length="mm", angle="deg", payload="kg")
-    assert data.payload is not None
-    assert set(data.payload.tolist()) == {0.0, 5.0, 10.0}
-    assert data[3:5].payload is not None
-    assert data.to_frame()["payload"].tolist() == data.payload.tolist()
-
-
-def test_the_file_keeps_the_payloads(folder: Path) -> None:
-    model = dc.load(folder / "m.safetensors")
-    assert isinstance(model, dc.CalibratedKinematics)
-    q = SimulatedArm(seed=2).sample(7, seed=9)
-    dc.save(model.with_payload(8.0), folder / "laden.safetensors")
-    again = dc.load(folder / "laden.safetensors")
-    assert isinstance(again, dc.CalibratedKinematics)
-    assert again.payload == 8.0
-    torch.testing.assert_close(again(q), model.with_payload(8.0)(q), rtol=0, atol=1e-12)
-    torch.testing.assert_close(again.predict(q)[1], model.with_payload(8.0).predict(q)[1], rtol=1e-6, atol=1e-16)
-    without_torch = load_numpy(folder / "laden.safetensors")
-    np.testing.assert_allclose(without_torch(q.numpy()), again(q).numpy(), rtol=0, atol=1e-12)
-    assert float((again(q) - model.with_payload(0.0)(q)).norm(dim=-1).max()) > 1e-4
 
 
 def test_evaluate_and_predict_take_the_column(folder: Path, command: Command) -> None:

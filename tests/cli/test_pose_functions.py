@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import runpy
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from command_bank import Command
-from commanded_bank import cells, drawn, flange, without_frames, write_columns
+from commanded_bank import cells, without_frames, write_columns
 from documentation_bank import write_commanded_tables
 from torch.testing import assert_close
-
-from diffeo_calib.measurements.csv import joints
-from diffeo_calib.measurements.csv.joints import PoseColumns
-from diffeo_calib.robots.cartesian import cartesian
 
 if sys.version_info >= (3, 11):
     pass
@@ -47,6 +42,8 @@ def test_a_function_in_place_of_a_robot(
     assert "type it again, a model file starts no program: --robot-pose q1,q2,q3=my_delta.py:kinematics" in done.error
     done = command("predict", model, "delta.csv", *pose, "-o", tmp_path / "p.csv")
     assert done.code == 0, done.error
+    done = command("predict", model, "delta.csv", "--robot-pose", "q1,q2,q3", "-o", tmp_path / "q.csv")
+    assert "type it again, a model file starts no program" in done.error  # joint values are no places
     (header, *rows), (_, *measured) = cells(tmp_path / "p.csv"), cells(delta / "delta.csv")
     assert header[:6] == ["x", "y", "z", "predicted_x", "predicted_y", "predicted_z"]
     found = torch.tensor([[float(cell) for cell in row[:6]] for row in rows], dtype=torch.float64)
@@ -69,30 +66,6 @@ def test_a_function_in_place_of_a_robot(
     wanted = nominal[:5] - nominal[:5].mean(0)
     away = torch.tensor(reached, dtype=torch.float64)
     assert without_frames(wanted, away) < 0.05  # of the frame of the device
-
-
-def test_a_function_that_returns_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    joints._module.cache_clear()
-    commanded = flange()
-    torch.save(commanded, tmp_path / "frames.pt")
-    text = "import torch\n\ndef kinematics(cells):\n    return torch.load('frames.pt')\n"
-    (tmp_path / "own.py").write_text(text, encoding="utf-8")
-    own = PoseColumns.of("a,b=own.py:kinematics")
-    machine = cartesian(own.poses(drawn(len(commanded), 2, seed=0)))
-    told = replace(own, robot=machine)
-    assert_close(machine(told.values(drawn(len(commanded), 2, seed=0))), commanded, rtol=0, atol=1e-12)
-    assert told.written.columns == ("x", "y", "z", "rx", "ry", "rz")
-    assert_close(
-        told.written.poses(told.written.cells(told.values(drawn(24, 2, seed=0)))), commanded, rtol=0, atol=1e-9
-    )
-
-
-def test_a_function_is_named_with_its_columns(tmp_path: Path, command: Command) -> None:
-    table = write_columns(tmp_path / "t.csv", q1_q2_q3=drawn(9, 3, seed=1), x_y_z=drawn(9, 3, seed=2))
-    done = command("fit", table, "--robot", "own.py:f", *MEASURED, "-o", tmp_path / "m")
-    assert done.code == 1
-    assert "--robot-pose A,B,...=own.py:f" in done.error
 
 
 def test_a_campaign_file_names_a_function_beside_it(delta: Path, tmp_path: Path, command: Command) -> None:

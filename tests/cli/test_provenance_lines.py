@@ -42,9 +42,3 @@ def test_commands_say_where_the_model_comes_from(
         done = command(*arguments)
         assert (done.code, done.err.strip()) == (0, "")
         assert line in done.out
-
-
-def test_models_of_earlier_versions_say_nothing(site: Site, command: Command) -> None:
-    old = Path(__file__).parents[1] / "interop" / "data" / "robot_format_3.safetensors"
-    done = command("evaluate", old, site.csv, *TABLE)
-    assert "fitted 20" not in done.out

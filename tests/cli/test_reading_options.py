@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-import jsonschema
 import pytest
 from command_bank import Command
 from trackerless_bank import write_wire_table
 
 import diffeo_calib as dc
-from diffeo_calib.cli import record
 from diffeo_calib.cli.options import Rows, Units
 from diffeo_calib.cli.tables import measured_table
 from diffeo_calib.measurements.csv.sensors import ReadingColumns
@@ -32,46 +29,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     more = [f"{line},{-7 if number == 1 else 5},{'' if number == 1 else 'A'}" for number, line in enumerate(lines)]
     (where / "t.csv").write_text("\n".join([f"{header},signed,gaps", *more]))
     return where
-
-
-@pytest.mark.usefixtures("given_scales")
-def test_from_a_wire_to_positions(folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
-    fitted = command("fit", "t.csv", *ROBOT, *UNITS, *WIRE, "-o", "m.safetensors", "--json", "m.json")
-    assert fitted.code == 0, fitted.err
-    assert "Errors of distances in mm by stage" in fitted.out
-    assert "fixed point 'A': 1200." in " ".join(fitted.out.split()).replace("1199.", "1200.")
-    assert "expected absolute error" in fitted.out
-    assert "errors of readings are smaller than the true error" in fitted.out
-    written = json.loads((folder / "m.json").read_text())
-    jsonschema.validate(written, json.loads((Path(record.__file__).parent / "result.schema.json").read_text()))
-    found = written["results"]
-    assert set(found["devices"]["constants"]) == {"A", "B"}
-    expected = found["expected_error_by_stage_m"]
-    assert expected["calibrated"] < expected["geometric"] < expected["nominal"]
-    first = f"nominal {1e3 * expected['nominal']:.3f}"
-    assert f"expected absolute error by stage, in mm: {first}" in " ".join(fitted.out.split())
-    held_out = found["kinds"]["distance"]["held_out"]
-    assert held_out["calibrated"]["rms"] < held_out["geometric"]["rms"]
-    assert held_out["calibrated"]["unit"] == "mm"
-    done = command("evaluate", "m.safetensors", "t.csv", *WIRE, *UNITS, "--json", "e.json")
-    assert done.code == 0, done.err
-    assert "19 not used in the fit" in done.out
-    model = dc.load("m.safetensors")
-    assert isinstance(model, dc.CalibratedKinematics)
-    assert model.provenance is not None
-    assert model.provenance.command.startswith("diffeo-calib fit t.csv")
-    rms = json.loads(Path("e.json").read_text())["results"]["kinds"]["distance"]["all"]["rms"]
-    assert 0 < rms < held_out["nominal"]["rms"]
-    strict = command("evaluate", "m.safetensors", "t.csv", *WIRE, *UNITS, "--fail-above", "0.01um")
-    assert strict.code == 4
-    assert command("predict", "m.safetensors", "t.csv", *UNITS, "-o", "p.csv").code == 0
-    assert (
-        Path("p.csv")
-        .read_text()
-        .splitlines()[0]
-        .endswith("x,y,z,std_x,std_y,std_z,distance_A,std_distance_A,distance_B,std_distance_B")
-    )
 
 
 @pytest.mark.parametrize(

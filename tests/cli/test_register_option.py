@@ -60,13 +60,6 @@ def test_a_moved_marker_is_named(fitted: Outcome, site: Site, command: Command, 
     assert float(found[2]) > 99.0
 
 
-def test_nothing_is_named_where_nothing_moved(fitted: Outcome, site: Site, command: Command, tmp_path: Path) -> None:
-    assert fitted.code == 0
-    path = table(site, tmp_path / "a", torch.eye(4, dtype=torch.float64), 12)
-    done = command("evaluate", site.folder / "model.safetensors", path, *TABLE)
-    assert "moving " not in done.out
-
-
 def test_register_prints_and_writes_the_registered_model(
     fitted: Outcome, site: Site, model: dc.CalibratedKinematics, command: Command, tmp_path: Path
 ) -> None:

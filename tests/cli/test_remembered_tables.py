@@ -5,57 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import pytest
 from command_bank import Command
-from kind_bank import Kind, kind_named
-from torch.testing import assert_close
+from kind_bank import kind_named
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
-from diffeo_calib.cli.commands.correct import REASONS
 from diffeo_calib.cli.options import Rows, Units
 from diffeo_calib.cli.tables import rows_in_table
-from diffeo_calib.sensors.set_ups import MeasuringFrames
 
 UNITS = Units(length="mm", angle="deg")
-
-
-def of_session(kind: Kind, name: str) -> Any:
-    rows: Any = kind.source.golden.rows
-    return rows.rows([row for row, own in enumerate(rows.device_names) if own == name])
-
-
-def test_rows_of_one_session_are_judged_in_its_frame() -> None:
-    """Nothing is found from the rows: the model knows where the device stood; of a new session 6 numbers are."""
-    kind = kind_named("sessions")
-    frames = MeasuringFrames.of_model(kind.model, None)
-    assert len(frames.names) == 2
-    assert float((frames.constants - frames.same).abs().max()) > 1e-3
-    for name in frames.names:
-        rows = of_session(kind, name)
-        found = dc.evaluate(kind.model, rows)
-        assert found.numbers == 0
-        assert 1e3 * found.rms < kind.source.worst_mm
-        new = dc.evaluate(kind.model, rows.with_sessions(["new"] * len(rows)))
-        assert new.numbers == 6
-        assert new.rms < 1.2 * found.rms
-
-
-def test_devices_of_readings_are_no_sessions() -> None:
-    kind = kind_named("several kinds")
-    same = kind.result.aligned(kind.data)
-    assert [part.kind for part in same.parts] == [part.kind for part in kind.data.parts]
-    assert_close(same.parts[0].points, kind.data.parts[0].points, rtol=0, atol=0)
-
-
-@pytest.mark.parametrize("name", ["distances", "several kinds"])
-def test_plans_keep_the_names_of_devices(name: str) -> None:
-    """Of two kinds with the same names the kind is said too."""
-    model = kind_named(name).model
-    names = [one for sensor in sensor_of(model) for one in getattr(getattr(sensor, "devices", None), "names", ())]
-    own = [(placed.kind, one) for placed in model.placement for one in placed.names]
-    expected = [one if name == "distances" else f"{kind} {one}" for kind, one in own]
-    assert sorted(names) == sorted(expected)
 
 
 def test_kinds_without_columns_are_left_out(tmp_path: Any) -> None:
@@ -72,10 +29,6 @@ def test_kinds_without_columns_are_left_out(tmp_path: Any) -> None:
     assert rows_in_table(path, rows, UNITS)[0] == Rows(reading=["image=u,v,9,9,1,1"], session="day")
     path.write_text("q1,a\n1,2\n")
     assert rows_in_table(path, rows, UNITS) == (rows, [])  # a table of other columns: the reader says so
-
-
-def test_a_correction_that_the_limit_refuses_is_named() -> None:
-    assert all("--limit" in REASONS[status] for status in ("singular", "unreachable"))
 
 
 def test_programs_are_read_in_the_units_of_the_fit(command: Command, tmp_path: Any) -> None:

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from command_bank import PROGRAM, TABLE, Command, Site, edited, environment, rows_of
+from command_bank import PROGRAM, TABLE, Site, edited, environment, rows_of
 from server_bank import Server
 
 import diffeo_calib as dc
@@ -25,15 +25,6 @@ def quick_fit(small_site: Site, tmp_path: Path) -> list[object]:
     """Arguments of a fit that writes model.safetensors."""
     few = edited(small_site, tmp_path / "few.csv", rows_of(*range(13)))
     return small_site.fit(few, tmp_path / "model.safetensors")
-
-
-@pytest.mark.slow
-def test_the_model_is_written_although_a_shell_cuts_the_output(quick_fit: list[object], tmp_path: Path) -> None:
-    done = in_a_shell(quick_fit, "| head -n 1")
-    assert "Traceback" not in done.stderr
-    assert "Exception" not in done.stderr
-    assert done.returncode == 0, done.stderr
-    assert isinstance(dc.load(tmp_path / "model.safetensors"), dc.CalibratedKinematics)
 
 
 @pytest.mark.slow
@@ -115,12 +106,3 @@ def test_work_is_done_whatever_happens_to_the_output(
         assert "Traceback" not in done.err
         wanted.append(path.read_bytes() if name != "evaluate" else b"")
     assert len(set(wanted)) == 1
-
-
-def test_base_and_markers_are_printed(small_site: Site, command: Command, tmp_path: Path) -> None:
-    done = command(*small_site.fit(small_site.csv, tmp_path / "model.safetensors"))
-    geometry = dc.load(tmp_path / "model.safetensors").geometry  # pyright: ignore[reportAttributeAccessIssue]
-    base = " ".join(f"{1e3 * float(value):.3f}" for value in geometry.base[:3, 3])
-    marker = " ".join(f"{1e3 * float(value):.3f}" for value in geometry.tool[0])
-    assert f"robot base in the measuring frame: {base} mm, rotation vector " in done.out
-    assert f"marker in the frame of 'flange': {marker} mm" in done.out

@@ -16,8 +16,6 @@ from diffeo_calib.cli.options import Rows, Units
 from diffeo_calib.cli.printed import ErrorTable
 from diffeo_calib.cli.tables import as_at_the_fit, measured_table, rows_in_table, table_format
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.measurements.csv.files import write_measurements
-from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.sensors.errors import Evaluation
 
 FIT = (
@@ -99,22 +97,6 @@ def test_model_and_table_are_enough(
     assert (tmp_path / "plan.csv").read_text().startswith("A;B;C;D;E;F;rank")
     refused = command("evaluate", sound_path, site.csv)
     assert "--length and --angle missing" in refused.error
-
-
-def test_tables_read_in_python(site: Site, tmp_path: Path) -> None:
-    """The options that a table of poses keeps read the same rows."""
-    poses = dc.Measurements.from_poses(site.data.q, site.arm.nominal(site.data.q), site.data.joint_names, lever=0.05)
-    plain = TableFormat("mm", "deg", ";", ",", rotation=["a", "b", "c"], convention="XYZ", rotation_angle="deg")
-    write_measurements(tmp_path / "t.csv", poses, plain)
-    given = {"length": "mm", "angle": "deg", "sep": ";", "decimal": ",", "lever": 0.05, "rotation": ["a", "b", "c"]}
-    read = dc.read_measurements(
-        tmp_path / "t.csv", site.arm.nominal, ["x", "y", "z"], convention="XYZ", rotation_angle="deg", **given
-    )
-    rows, units = as_at_the_fit(read.origin.options, Rows(), Units())  # pyright: ignore
-    again = measured_table(tmp_path / "t.csv", rows, units).read(site.arm.nominal)
-    assert again.sha256 == read.sha256
-    assert again.lever == pytest.approx(0.05, rel=1e-15)
-    assert (again.poses == read.poses).all()
 
 
 @pytest.mark.parametrize(("width", "tables"), [(80, 2), (160, 1)])

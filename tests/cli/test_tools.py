@@ -11,7 +11,6 @@ from command_bank import Command
 from product_bank import Case
 
 import diffeo_calib as dc
-from diffeo_calib.interop.torch_program import TorchProgram
 
 TOOL = [0.03, -0.02, 0.15]
 
@@ -46,30 +45,6 @@ def test_from_the_measured_frame(posed: Case, files: Path, command: Command) -> 
     assert int(reached.sum()) >= 5
     expected = (posed.model.robot(posed.test.q[:8]) @ tool)[reached]
     torch.testing.assert_close(model.tool_poses(q, tool)[reached], expected, rtol=0, atol=1e-8)
-
-
-def test_measured_frame_is_that_of_the_measurements(posed: Case) -> None:
-    """In the measuring frame the poses of the measured frame as a tool are those of the model."""
-    model, q = posed.model, posed.test.q[:8]
-    poses = model.tool_poses(q, model.measured_frame, "measuring")
-    assert float((poses - model.poses(q)).abs().max()) < 1e-6  # both nearest to slightly bent triangles
-
-
-@pytest.mark.slow
-def test_exported_programs(posed: Case, files: Path, command: Command) -> None:
-    text, model = ",".join(map(str, TOOL)), str(files / "model.safetensors")
-    wanted = ["--torch", str(files / "m.pt2"), "--c", str(files / "m.c")]
-    done = command("export", model, *wanted, "--tool", text, "--tool-from", "measured", "--frame", "measuring")
-    assert done.code == 0, done.err
-    assert "poses of the tool in the frame 'measuring'" in done.out
-    assert "m_tool_pose" in (files / "m.h").read_text()
-    tool = torch.eye(4, dtype=torch.float64)
-    tool[:3, 3] = torch.tensor(TOOL, dtype=torch.float64)
-    q, placed = posed.test.q[:5], posed.model.measured_frame @ tool
-    program = torch.export.load(files / "m.pt2").module()
-    expected = TorchProgram(posed.model, "tool_poses", tool=placed, frame="measuring")(q)
-    torch.testing.assert_close(program(q), expected, rtol=0, atol=1e-12)
-    torch.testing.assert_close(expected, posed.model.tool_poses(q, placed, "measuring"), rtol=0, atol=1e-12)
 
 
 def test_bad_tools(arm: Case, files: Path, command: Command) -> None:

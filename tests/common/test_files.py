@@ -39,14 +39,6 @@ def test_replaces_and_keeps_permissions(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["a.csv"]
 
 
-def test_follows_links(tmp_path: Path) -> None:
-    (tmp_path / "a").write_bytes(b"old")
-    (tmp_path / "link").symlink_to(tmp_path / "a")
-    write_whole(tmp_path / "link", b"new")
-    assert (tmp_path / "a").read_bytes() == b"new"
-    assert (tmp_path / "link").is_symlink()
-
-
 def test_the_content_is_on_the_disk_before_the_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     done, fsync, replace = list[str](), os.fsync, os.replace
     monkeypatch.setattr(os, "fsync", lambda file: (done.append("fsync"), fsync(file)))
@@ -178,13 +170,6 @@ def test_a_pipe_is_written_directly() -> None:
     os.close(write)
     with os.fdopen(read, "rb") as file:
         assert file.read() == b"content"
-
-
-def test_new_files_have_the_usual_permissions_and_long_names(tmp_path: Path) -> None:
-    for path in (tmp_path / "a", tmp_path / ("b" * 250)):
-        write_whole(path, b"")
-        (tmp_path / "usual").touch()
-        assert path.stat().st_mode == (tmp_path / "usual").stat().st_mode
 
 
 @pytest.mark.parametrize("place", ["folder", "missing/a", "loop", "file/a", "c" * 300, "dangling"])

@@ -17,7 +17,6 @@ import diffeo_calib as dc
 from diffeo_calib.common.threads import (
     LARGE_MATRIX,
     allowed_threads,
-    belongs_to_torch,
     in_parallel,
     large_work,
     small_work,
@@ -47,13 +46,6 @@ def test_one_thread_inside_and_as_many_as_before_outside() -> None:
     assert 2 in before
 
 
-def test_libraries_of_torch_are_recognised_by_their_folder() -> None:
-    at = "/home/torch/torch-env/lib/python3.11/site-packages"
-    assert belongs_to_torch({"filepath": f"{at}/torch/lib/libopenblas.so"})
-    assert belongs_to_torch({"filepath": f"{at}/torch.libs/libopenblas.so"})
-    assert not belongs_to_torch({"filepath": f"{at}/numpy.libs/libopenblas.so"})
-
-
 # --- torch -------------------------------------------------------------------------------------------------------
 
 
@@ -80,11 +72,6 @@ def test_the_setting_is_restored_after_an_error() -> None:
         assert torch.get_num_threads() == 3
 
 
-def test_one_thread_stays_one_thread() -> None:
-    with torch_threads(1), small_work(), large_work(LARGE_MATRIX):
-        assert torch.get_num_threads() == allowed_threads() == 1
-
-
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_parts_run_on_one_thread_each_and_come_back_in_order(count: int) -> None:
     with torch_threads(count):
@@ -92,13 +79,6 @@ def test_parts_run_on_one_thread_each_and_come_back_in_order(count: int) -> None
     assert [part for part, _, _ in found] == list(range(40))
     assert {inside for _, inside, _ in found} == {1}
     assert len({thread for _, _, thread in found}) <= count
-
-
-def test_threads_that_start_later_have_the_users_setting() -> None:
-    with torch_threads(2):
-        list(in_parallel(str, range(4)))
-        with ThreadPoolExecutor(1) as other:
-            assert other.submit(torch.get_num_threads).result() == 2
 
 
 def _squares(queue: multiprocessing.Queue) -> None:

@@ -3,11 +3,10 @@
 from itertools import pairwise
 from math import pi
 
-import numpy as np
 import pytest
 import torch
 from fit_bank import stop_at
-from math_bank import K_V, K_W, normal, rr_problem, spatial_markers, uniform
+from math_bank import K_V, K_W, normal, rr_problem, uniform
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -16,12 +15,6 @@ from diffeo_calib.fitting import fit as fitting
 from diffeo_calib.fitting.fit import choose_controls
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.robots import elastic_rr
-
-
-def test_control_points_that_are_the_data_change_nothing() -> None:
-    problem = rr_problem(6)
-    full, same = (dc.fit(problem, integrator=dc.RK4(4), controls=c) for c in (None, problem.x.clone()))
-    assert same.energy == pytest.approx(full.energy, rel=1e-7)
 
 
 @pytest.mark.slow
@@ -54,12 +47,6 @@ def test_interrupting_the_start_of_a_coarse_fit_keeps_it() -> None:
     assert fit.solution.interrupted
     assert len(fit.model.deformation.x) == 20
     assert "interrupted after 2 iterations" in fit.status
-
-
-def test_a_start_of_another_size_is_refused() -> None:
-    problem = rr_problem(5)
-    with pytest.raises(InputError, match=r"the momenta of `start`: expected shapes .*\(20, 2\).*got .*\(25, 2\)"):
-        dc.fit(problem, controls=20, start=problem.zero())
 
 
 @pytest.mark.parametrize(
@@ -107,26 +94,6 @@ def test_a_coarse_fit_that_stops_before_the_optimum_says_how_to_continue() -> No
     assert better.energy < 0.9 * stopped.energy
 
 
-def test_three_dimensional_markers_with_few_controls() -> None:
-    x = uniform(30, 3, seed=7)
-    problem = Problem(
-        spatial_markers,
-        x,
-        spatial_markers(x) + 0.01 * normal(*spatial_markers(x).shape, seed=8),
-        joint_kernel=dc.VonMises(1.0, 0.01),
-        task_kernel=dc.Gaussian(1.0, 0.01),
-        noise=0.01,
-        markers=spatial_markers(x).shape[1] // 3,
-    )
-    fit = dc.fit(problem, integrator=dc.RK4(1), controls=12)
-    assert fit.converged
-    assert fit.model.predict(x)[1].shape == (30, problem.y.shape[1], problem.y.shape[1])
-
-
-def test_the_number_of_controls_may_be_a_numpy_integer() -> None:
-    assert len(dc.fit(rr_problem(5), integrator=dc.RK4(1), controls=np.int64(20)).model.deformation.x) == 20
-
-
 def small_deformations(rows: int = 120) -> Problem:
     """An arm with a fiftieth of the errors of the paper's."""
     x = uniform(rows, 2, seed=3)
@@ -149,14 +116,6 @@ def test_many_rows_start_from_a_sample_of_them(monkeypatch: pytest.MonkeyPatch) 
     same = dc.fit(problem, integrator=fit.integrator, controls=problem.x[chosen])  # without a sample
     assert fit.energy == pytest.approx(same.energy, rel=1e-6)
     assert fit.model.x is problem.x
-
-
-def test_more_controls_than_the_sample_has_are_chosen_from_all_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    problem = rr_problem(6)
-    monkeypatch.setattr(fitting, "SAMPLE_COORDINATES", 20)
-    assert len(set(choose_controls(problem, 25).tolist())) == 25
-    monkeypatch.setattr(fitting, "SAMPLE_COORDINATES", 10**6)
-    assert fitting.sample(problem) is None
 
 
 def test_a_fit_ends_when_the_linearised_problem_was_right() -> None:

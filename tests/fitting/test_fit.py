@@ -11,7 +11,7 @@ from math_bank import few_points, rr_problem, two_marker_problem, uniform
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.problem import Problem
-from diffeo_calib.kernels.reductions.fused.sums import FUSED
+from diffeo_calib.kernels.reductions.fused import FUSED
 from diffeo_calib.regression import choose
 
 

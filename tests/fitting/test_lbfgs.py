@@ -64,13 +64,6 @@ def test_lbfgs_keeps_its_best_evaluation(monkeypatch: pytest.MonkeyPatch) -> Non
     assert energies[-1] < energies[0]
 
 
-def test_lbfgs_falls_on_the_test_bed(small: Fit) -> None:
-    fit = dc.fit(small.problem, dc.LBFGS(max_iterations=20), dc.RK4(1))
-    assert all(after <= before for before, after in pairwise(fit.history))
-    assert fit.history[-1] < 0.5 * fit.history[0]
-    assert fit.energy == pytest.approx(fit.history[-1], rel=1e-12)
-
-
 @pytest.mark.slow
 def test_overflowing_steps_of_lbfgs_are_shortened(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the flows overflow, the line search turns back and the descent continues."""
@@ -90,12 +83,3 @@ def test_overflowing_steps_of_lbfgs_are_shortened(monkeypatch: pytest.MonkeyPatc
     fit = dc.fit(problem, solver, dc.RK4(1), start=start)
     assert calls[0] > 6
     assert fit.energy == pytest.approx(expected, rel=1e-6)
-
-
-@pytest.mark.slow
-def test_preconditioning_of_lbfgs_pays() -> None:
-    problem = rr_problem(6)
-    plain, better = (
-        dc.fit(problem, dc.LBFGS(max_iterations=20, preconditioned=p), dc.RK4(1)).energy for p in (False, True)
-    )
-    assert better < plain

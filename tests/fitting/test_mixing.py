@@ -50,23 +50,10 @@ def test_a_linear_iteration_ends_after_one_step_for_each_rate(rates: list[float]
     assert_close(point.theta, point.task.sum(0), rtol=1e-9, atol=1e-9)
 
 
-def test_it_does_not_end_earlier() -> None:
-    point, fixed = iterates([0.9, 0.4, -0.2], 3)
-    assert float((point.task.flatten() - fixed).norm()) > 1e-3
-
-
 def test_a_converged_iteration_stays() -> None:
     """Also after more steps than are kept: differences of steps are rounding then."""
     point, fixed = iterates([0.5, 0.2], 2 * MIXING_DEPTH)
     assert_close(point.task.flatten(), fixed, rtol=1e-9, atol=1e-9)
-
-
-def test_one_step_or_equal_steps_say_nothing() -> None:
-    mixing, here, there = Mixing(), momenta(torch.zeros(2, 3).double()), momenta(torch.ones(2, 3).double())
-    assert mixing.mixed(here, there) is None
-    assert mixing.mixed(here, there) is None
-    mixing.forget()
-    assert mixing.mixed(here, momenta(torch.full((2, 3), 2.0).double())) is None
 
 
 def fitted(monkeypatch: pytest.MonkeyPatch, below: float) -> Fit:

@@ -129,18 +129,6 @@ def _gradient(problem: Problem, found: dc.Fit | None) -> Tensor:
     return torch.autograd.grad(total, at)[0]
 
 
-def test_few_control_points() -> None:
-    problem = problem_of(observations()["distance"], noise=0.01)
-    some = dc.fit(problem, integrator=dc.RK4(2), controls=ROWS // 2)
-    every = dc.fit(problem, integrator=dc.RK4(2))
-    assert every.energy <= some.energy
-    truth = elastic_rr.real(problem.x)
-    assert float((some.model(problem.x) - truth).norm()) < 0.5 * float((elastic_rr.nominal(problem.x) - truth).norm())
-    assert some.model.predict(configurations())[1].shape == (ROWS, 2, 2)
-    descended = dc.fit(problem, dc.LBFGS(max_iterations=5), dc.RK4(2), controls=problem.x[:20])
-    assert descended.model(problem.x).shape == (ROWS, 2)
-
-
 def test_an_unknown_constant_is_a_shift_that_rows_share() -> None:
     """A plane of unknown height, marginalised, against the same with the height as a parameter of a large grid."""
     observe = LinearFunctionals(torch.tensor([[[0.0, 1.0]]]).double().repeat(ROWS, 1, 1), torch.zeros(ROWS, 1).double())

@@ -95,34 +95,6 @@ def test_residuals_by_their_definitions(problem: Problem) -> None:
     assert problem.end_residual(deformation) == pytest.approx(float(gap.norm() / p_end.norm()), rel=1e-10)
 
 
-def test_residuals_without_any_momentum() -> None:
-    problem = rr_problem(4, noise=0.01)
-    deformation = problem.deform(problem.zero(), RK4(1))
-    assert problem.coupling_residual(deformation) == 0.0
-    force = (problem.y - elastic_rr.nominal(problem.x)).norm() / 0.01**2
-    assert problem.end_residual(deformation) == pytest.approx(float(force), rel=1e-12)
-
-
-def test_noise_blocks_of_a_scalar_are_the_scalar() -> None:
-    x, block = uniform(12, 2, seed=3), 0.02**2 * torch.eye(4, dtype=torch.float64)
-    one, two = two_marker_problem(x, 0.02), two_marker_problem(x, block.repeat(12, 1, 1))
-    torch.testing.assert_close(one.noise.covariance, two.noise.covariance, rtol=1e-14, atol=0)
-    residual = normal(12, 4, seed=1)
-    torch.testing.assert_close(one.noise.solve(residual), residual / 0.02**2, rtol=1e-13, atol=0)
-
-
-def test_noise_is_added_on_the_block_diagonal() -> None:
-    covariance, gram = noise_blocks(3, 4), normal(12, 12, seed=1)
-    noise = two_marker_problem(uniform(3, 2, seed=3), covariance).noise
-    untouched = gram.clone()
-    torch.testing.assert_close(noise.add_to(gram), gram + torch.block_diag(*covariance), rtol=0, atol=1e-16)
-    torch.testing.assert_close(gram, untouched, rtol=0, atol=0)
-    residual = normal(3, 4, seed=2)
-    torch.testing.assert_close(
-        (covariance @ noise.solve(residual)[:, :, None])[:, :, 0], residual, rtol=1e-9, atol=1e-10
-    )
-
-
 def test_problem_takes_arrays_and_lists() -> None:
     x, problem = elastic_rr.grid(4), rr_problem(4)
     for kind in (np.asarray, Tensor.tolist, lambda t: t.requires_grad_()):

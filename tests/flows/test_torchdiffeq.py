@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from typing import Any
 
 import pytest
 import torch
-from math_bank import Case, case_named, central_difference, inverse_of, normal, rows_jacobian, slopes, tensor
+from math_bank import Case, case_named, central_difference, normal, rows_jacobian, slopes, tensor
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, NumericalError
-from diffeo_calib.flows.geodesic import Flow, geodesic_field
+from diffeo_calib.flows.geodesic import Flow
 from diffeo_calib.flows.integrators import RK4, Integrator
 from diffeo_calib.flows.torchdiffeq import ADAPTIVE, FIXED, TorchDiffEq
 
@@ -82,23 +81,6 @@ def test_order_of_fixed_steps(case: Case, method: str, order: int) -> None:
 def test_adaptive_steps_keep_their_tolerance(case: Case, method: str, rtol: float) -> None:
     integrator = TorchDiffEq(method, step_size=1.0, rtol=rtol, atol=1e-3 * rtol)
     assert distance(flow_of(case, integrator).end, exact(case).end) <= 10.0 * rtol
-
-
-@every_adaptive
-@pytest.mark.parametrize("looser", [{"rtol": 1e-3}, {"atol": 1e-3}], ids=["rtol", "atol"])
-def test_looser_tolerances_take_fewer_evaluations(method: str, looser: dict[str, float]) -> None:
-    tight = TorchDiffEq(method, step_size=1.0, rtol=1e-10, atol=1e-13)
-    counts = []
-    for integrator in (replace(tight, **looser), tight):
-        stages = []
-
-        def field(stage: int, y: Tensor, stages: list[int] = stages) -> Tensor:
-            stages.append(stage)
-            return geodesic_field(CASES[0].kernel, y)
-
-        integrator.nodes(field, start(CASES[0]))
-        counts.append(len(stages))
-    assert counts[0] < counts[1]
 
 
 @every_method
@@ -187,31 +169,6 @@ def test_passive_points_and_their_jacobians(case: Case, method: str) -> None:
     torch.testing.assert_close((jacobian @ dx[:, :, None])[:, :, 0], difference, rtol=0, atol=1e3 * own)
 
 
-@pytest.mark.slow
-@some_methods
-def test_controls_follow_their_own_flow(case: Case, method: str) -> None:
-    flow = flow_of(case, TorchDiffEq(method, rtol=1e-8))
-    points, jacobians = flow.path(start(case)[0])
-    assert len(jacobians) == len(points) == len(flow.nodes)
-    torch.testing.assert_close(jacobians[0], torch.eye(case.dim).double().expand(N, -1, -1), rtol=0, atol=0)
-    for point, node in zip(points, flow.nodes, strict=True):
-        torch.testing.assert_close(point, node[0], rtol=0, atol=1e-13 if method in FIXED else 1e-7)
-
-
-@pytest.mark.parametrize(("case", "method"), [(CASES[0], "rk4"), (CASES[1], "dopri5")], ids=["rk4", "dopri5"])
-def test_flow_is_invertible(case: Case, method: str) -> None:
-    flow, x = flow_of(case, TorchDiffEq(method)), case.points(M, seed=1)
-    torch.testing.assert_close(inverse_of(flow, flow(x)), x, rtol=0, atol=1e-11 if method in FIXED else 1e-6)
-
-
-def test_blocks_and_no_passive_points() -> None:
-    case = CASES[1]
-    flow, x = flow_of(case, TorchDiffEq()), case.points(M, seed=1)
-    assert flow(x[:0]).shape == (0, case.dim)
-    assert [t.shape for t in flow.with_jacobian(x[:0])] == [(0, case.dim), (0, case.dim, case.dim)]
-    torch.testing.assert_close(flow(x[2:3]), flow(x)[2:3], rtol=0, atol=1e-14)
-
-
 @pytest.mark.parametrize("adjoint", [False, True])
 def test_gradients_pass_through_flow_and_momenta(adjoint: bool) -> None:
     case = CASES[0]
@@ -224,15 +181,6 @@ def test_gradients_pass_through_flow_and_momenta(adjoint: bool) -> None:
     assert torch.autograd.gradcheck(
         transported, (a.requires_grad_(), x.requires_grad_()), eps=1e-5, atol=1e-5, fast_mode=True
     )
-
-
-def test_right_hand_side_alone() -> None:
-    """nodes() integrates any field of any shape; without replay the stage number has no meaning."""
-    end = TorchDiffEq("dopri8").nodes(lambda stage, y: -y, tensor([[1.0, 2.0]]))[-1]
-    torch.testing.assert_close(end, tensor([[1.0, 2.0]]) * torch.exp(tensor(-1.0)), rtol=0, atol=1e-9)
-    case = CASES[0]
-    nodes = TorchDiffEq().nodes(lambda stage, y: geodesic_field(case.kernel, y), start(case))
-    torch.testing.assert_close(nodes[-1], flow_of(case, TorchDiffEq()).end, rtol=0, atol=0)
 
 
 # --- Mistakes ---------------------------------------------------------------------------------------------------
@@ -263,11 +211,6 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
 def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=f"^{message}$"):
         TorchDiffEq(**arguments)
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 7, 10, 49])
-def test_every_whole_number_of_steps_is_a_step_size(count: int) -> None:
-    assert TorchDiffEq(step_size=1 / count).intervals == count
 
 
 @every_adaptive

@@ -5,9 +5,9 @@ After a change that is meant to change numbers: ``python tests/golden/write.py``
 
 from __future__ import annotations
 
-import golden_file
 import pytest
 import torch
+import write as golden_file
 from golden_bank import CASES, golden
 
 

@@ -92,7 +92,7 @@ def test_a_killed_rank_is_an_error_in_the_other(tmp_path: Path) -> None:
 def test_ranks_with_other_data_are_refused(tmp_path: Path) -> None:
     for code, said in ended(started("differ", tmp_path, count=3)):
         assert code == 7
-        assert "the points of a kernel sum (Field) of rank 1, 2 differ from those of rank 0" in said
+        assert "the points of a kernel sum (field) of rank 1, 2 differ from those of rank 0" in said
 
 
 # --- In one process ----------------------------------------------------------------------------------------------

@@ -13,10 +13,9 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.flows.geodesic import Flow
 from diffeo_calib.kernels.profiles import PROFILES, CauchyProfile, GaussianProfile, MaternProfile, Profile
 from diffeo_calib.kernels.reductions import backends, fourier
-from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Field, Formula, Points
+from diffeo_calib.kernels.reductions.formulas import FIELD, HESSIAN_PRODUCT, Formula, Points
 
 ACCURACIES = (1e-2, 1e-4, 1e-7)
 COUNT = 4000
@@ -34,7 +33,7 @@ def cloud(count: int, dim: int, side: float, seed: int, outputs: int = 2) -> Poi
 
 def scales(formula: Formula, columns: Points) -> float:
     """The sum of absolute momenta, times the number of terms that a result adds up."""
-    terms = 1.0 if type(formula) is Field else 2.0 * columns.momenta.shape[1] * columns.features.shape[1]
+    terms = 1.0 if formula is FIELD else 2.0 * columns.momenta.shape[1] * columns.features.shape[1]
     return terms * len(columns.features)
 
 
@@ -52,16 +51,6 @@ def test_errors_stay_below_the_accuracy(
     if found is not None:
         exact = backends.evaluate(formula, profile, rows, columns, backend="tiled")
         assert_same(found, exact, accuracy * scales(formula, columns))
-
-
-@every_formula
-def test_three_dimensions(formula: Formula) -> None:
-    """A lattice used directly, since small clouds do not need one."""
-    rows, columns = cloud(60, 3, 1.0, 1, 3), cloud(50, 3, 1.0, 2, 3)
-    waves = fourier.Lattice.of(GaussianProfile(), columns.features.new_ones(3), 1e-7)
-    assert waves is not None
-    found = fourier.RESULTS[type(formula)](waves, rows, columns)
-    assert_same(found, backends.evaluate(formula, GaussianProfile(), rows, columns, backend="dense"), 1e-6)
 
 
 @smooth
@@ -103,13 +92,6 @@ def test_kernels_with_an_accuracy(kernel: dc.Kernel) -> None:
     assert all("within 0.001" in name for name in within.backends(COUNT, q.device))
 
 
-def test_exact_sums_without_an_accuracy() -> None:
-    q, a = normal(COUNT, 2, seed=1), normal(COUNT, 2, seed=2)
-    torch.testing.assert_close(
-        dc.Gaussian(0.5).field(None, q, a), dc.Gaussian(0.5).using("dense").field(None, q, a), rtol=1e-12, atol=1e-12
-    )
-
-
 @pytest.mark.parametrize(
     ("profile", "count", "dim"),
     [(GaussianProfile(), 100, 2), (CauchyProfile(), COUNT, 2), (GaussianProfile(), COUNT, 6)],
@@ -145,13 +127,6 @@ def test_points_that_are_not_finite(value: float, lengthscale: float) -> None:
     assert torch.equal(found.isnan(), exact.isnan())
 
 
-def test_points_at_one_place() -> None:
-    columns = Points(torch.ones(COUNT, 2, dtype=torch.float64), torch.ones(COUNT, 2, dtype=torch.float64))
-    found = fourier.sums(GRADIENT, GaussianProfile(), None, columns, 1e-4)
-    assert found is not None
-    assert_same(found, backends.evaluate(GRADIENT, GaussianProfile(), None, columns, backend="tiled"), 1e-4 * COUNT)
-
-
 def test_threads_do_not_matter() -> None:
     columns = cloud(COUNT, 2, 3.0, 1)
     before = torch.get_num_threads()
@@ -163,14 +138,6 @@ def test_threads_do_not_matter() -> None:
     assert found[0] is not None
     assert found[1] is not None
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
-
-
-def test_a_flow_of_many_landmarks() -> None:
-    """Velocities are errors of single sums; through a flow they stay as small."""
-    q, p = normal(3000, 2, seed=1).clamp(-2, 2), normal(3000, 2, seed=2) / 3000
-    kernel = dc.Gaussian(1.0)
-    exact, within = (Flow(k, q, p, dc.RK4(2)).end for k in (kernel, kernel.using("tiled", accuracy=1e-5)))
-    assert_same(within, exact, 1e-5 * float(p.abs().sum()))
 
 
 @pytest.mark.parametrize("accuracy", [0.0, 1.0, -1e-3, 1e-15, float("nan"), True, "1e-6", [1e-6], 1e-6 + 0j])

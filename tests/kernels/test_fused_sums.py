@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import sys
 import threading
@@ -16,19 +15,17 @@ from typing import Any
 import pytest
 import torch
 from math_bank import normal, torch_threads
-from sum_bank import Formulated, assert_same, every_formula, every_profile, mapped, points
+from sum_bank import Formulated, assert_same, every_formula, every_profile, points
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile, Profile
-from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kernels.reductions import backends, keops
-from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Dense, Field, Formula, Points
-from diffeo_calib.kernels.reductions.fused import sums
-from diffeo_calib.kernels.reductions.fused.loops import Program
-from diffeo_calib.kernels.reductions.fused.sums import Fused
-from diffeo_calib.kernels.reductions.fused.symbols import Vector
+from diffeo_calib.kernels.reductions import fused as sums
+from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Dense, Formula, Points
+from diffeo_calib.kernels.reductions.fused import Fused
+from diffeo_calib.kernels.reductions.loops import Program
 from diffeo_calib.kernels.reductions.tiled import Tiled
 
 pytest.importorskip("llvmlite")
@@ -81,13 +78,6 @@ def test_shares_of_processes_add_up() -> None:
     for rows in (None, i):
         shares = [program.totals(rows, j, lambda tiles, k=k: list(tiles)[k::2]) for k in range(2)]
         torch.testing.assert_close(shares[0] + shares[1], program.totals(rows, j), rtol=1e-13, atol=1e-10)
-
-
-def test_points_of_other_types_go_elsewhere() -> None:
-    j = points(40, 2)
-    for other in (j._replace(momenta=j.momenta.float()), mapped(j, Tensor.float)):
-        assert Fused().reduce(FIELD, GaussianProfile(), None, other) is None
-    assert Fused().reduce(FIELD, GaussianProfile(), mapped(j, Tensor.float), j) is None
 
 
 # --- The exponential ---------------------------------------------------------------------------------------------
@@ -145,25 +135,6 @@ class Decorated(Own):
 
     def derivative(self, r2: Any, order: int) -> Any:
         return super().derivative(r2, order) * torch.cos(r2 * 0.0)
-
-
-def test_a_profile_of_the_user() -> None:
-    j = points(50, 2)
-    for alpha in (0.4, 0.9, torch.tensor(0.3, dtype=torch.float64)):
-        profile = Own(alpha)
-        assert_same(fused(FULL, profile, None, j), Dense().reduce(FULL, profile, None, j), 1e-11)
-    kernel = RadialKernel(Own(0.2), lengthscale=0.7)
-    q, a = normal(40, 3, seed=1), normal(40, 3, seed=2)
-    assert_same([kernel.using("fused").field(None, q, a)], [kernel.using("dense").field(None, q, a)], 1e-12)
-
-
-def test_a_changed_parameter_is_noticed() -> None:
-    backend, profile, j = Fused(), Own(0.4), points(30, 2)
-    for alpha in (0.4, 0.8):
-        profile.alpha = alpha
-        found = backend.reduce(FIELD, profile, None, j)
-        assert found is not None
-        assert_same(found, Dense().reduce(FIELD, profile, None, j), 1e-12)
 
 
 def test_a_number_from_elsewhere_is_noticed_when_it_changes() -> None:
@@ -238,19 +209,6 @@ def test_without_llvmlite_tiles_do_the_work(monkeypatch: pytest.MonkeyPatch) -> 
         sums._reason.cache_clear()
 
 
-def test_what_cannot_be_written_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nor would a full disk become fuller with every process."""
-
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(os, "replace", full)
-    monkeypatch.setattr(sums, "machine", cache(sums.Machine))
-    fused(FIELD, GaussianProfile(), None, points(30, 2))
-    assert list((tmp_path / "diffeo_calib" / "fused").iterdir()) == []
-
-
 def test_threads_that_start_together_share_one_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     """The functions of a second one would end with it, and the process with them."""
     monkeypatch.setattr(sums, "_machine", cache(lambda: time.sleep(0.05) or object()))
@@ -284,17 +242,6 @@ def test_a_process_forked_while_a_thread_compiles_can_compile() -> None:
     assert os.waitpid(child, 0)[1] == 0
 
 
-def test_many_rows_of_few_columns_make_few_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Small tiles would take longer to hand to a thread than to compute."""
-    parts: list[int] = []
-    in_parallel = sums.in_parallel
-    monkeypatch.setattr(sums, "in_parallel", lambda f, p: parts.append(len(p)) or in_parallel(f, p))
-    i, j = points(sums.LARGE_PAIRS // 100 + 1, 1), points(100, 2)
-    assert_same(fused(FIELD, GaussianProfile(), i, j), Dense().reduce(FIELD, GaussianProfile(), i, j), 1e-11)
-    assert len(parts) == 1
-    assert parts[0] <= sums.SHARED_PARTS
-
-
 def test_a_failure_of_llvm_is_not_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
     backend = Fused()
     monkeypatch.setattr(Program, "code", lambda self: ("nonsense", [1.0]))
@@ -303,11 +250,3 @@ def test_a_failure_of_llvm_is_not_repeated(monkeypatch: pytest.MonkeyPatch) -> N
         assert backend.reduce(FIELD, GaussianProfile(), None, points(30, 2)) is None
     assert not backend.available()
     assert backend.reduce(FIELD, GaussianProfile(), None, points(30, 2)) is None
-
-
-def test_code_is_short() -> None:
-    """A block of rows has one loop, and every instruction of it is written once per row."""
-    inputs = (("features", 3), ("momenta", 3))
-    text, factors = Program(Field(), GaussianProfile(), inputs, Vector(8)).code()
-    assert factors == [1.0]
-    assert text.count("shl <8 x i64>") == 2 * 8

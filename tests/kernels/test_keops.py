@@ -18,7 +18,7 @@ from math_bank import CASES, Case, case_named, normal
 from torch import Tensor
 
 from diffeo_calib.kernels.base import Kernel
-from diffeo_calib.kernels.profiles import MaternProfile, Profile
+from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kernels.reductions import backends
 from diffeo_calib.kernels.reductions.backends import Backend
@@ -127,37 +127,11 @@ def test_backends_agree(
     assert_close(method(case.kernel.using(backend), *inputs(case, *size)), expected)
 
 
-@every_compiled_sum
-def test_strided_inputs(case: Case, method: Method, only: Callable[[Backend], None]) -> None:
-    strided = tuple(torch.stack([t, t], -1)[..., 0] for t in inputs(case))
-    assert not any(t.is_contiguous() for t in strided)
-    expected = method(case.kernel.using("dense"), *inputs(case))
-    only("keops")
-    assert_close(method(case.kernel.using("keops"), *strided), expected)
-
-
-def test_several_fields_at_once(only: Callable[[Backend], None]) -> None:
-    """Two fields of one component: the formula of one field with two."""
-    kernel = RadialKernel(MaternProfile(1.5), lengthscale=0.7, output=1)
-    x, q, a = normal(6, 2, seed=1), normal(5, 2, seed=2), normal(5, 2, 2, seed=3)
-    expected = torch.stack([kernel.field(x, q, one) for one in a.unbind(1)], 1)
-    only("keops")
-    assert_close((kernel.using("keops").field(x, q, a),), (expected,))
-
-
 def test_single_precision(only: Callable[[Backend], None]) -> None:
     single = [t.float() for t in inputs(SINGLE)]
     expected = METHODS["field"](SINGLE.kernel.using("dense"), *single)
     only("keops")
     assert_close(METHODS["field"](SINGLE.kernel.using("keops"), *single), expected, 1e-6)
-
-
-@every_method
-@pytest.mark.parametrize("size", [(0, 5), (6, 0), (0, 0)])
-def test_no_rows_and_no_columns(method: Method, size: tuple[int, int]) -> None:
-    case = WITH_EVERY_FORMULA
-    expected, actual = (method(case.kernel.using(b), *inputs(case, *size)) for b in ("dense", "keops"))
-    torch.testing.assert_close(actual, expected, rtol=1e-12, atol=1e-12)
 
 
 @every_method

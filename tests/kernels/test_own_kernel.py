@@ -73,13 +73,6 @@ def test_defaults_agree_with_closed_forms(dim: int) -> None:
     same(PLAIN.field(x, q, normal(5, 4, dim, seed=3)), CLOSED.field(x, q, normal(5, 4, dim, seed=3)))
 
 
-def test_defaults_are_differentiable() -> None:
-    x, q, a = (normal(n, 2, seed=k).requires_grad_() for k, n in enumerate((3, 4, 4)))
-    assert torch.autograd.gradcheck(PLAIN.field, (x, q, a))
-    assert torch.autograd.gradcheck(PLAIN.field_and_jacobian, (x, q, a))
-    assert torch.autograd.gradcheck(PLAIN.hamiltonian_gradient, (q, a))
-
-
 def section_5_with(kernel: Kernel, k: int = 8) -> dc.Problem:
     """The paper's test bed with another task kernel."""
     problem = section_5(k=k)
@@ -107,22 +100,6 @@ def test_a_fit_is_that_of_the_closed_form() -> None:
 
 def skewed_fit(integrator: dc.RK4 | dc.RK8 | None = None) -> dc.Fit:
     return dc.fit(section_5_with(Skewed(0.7, 0.4) + dc.Gaussian(0.3, 0.1)), integrator=integrator or dc.RK4(2))
-
-
-def test_a_kernel_that_couples_components_reaches_an_optimum() -> None:
-    fit = skewed_fit(dc.RK8(1))
-    assert fit.converged, fit.status
-    assert fit.coupling_residual < 1e-6
-    assert fit.end_residual < 1e-3
-
-
-def test_products_of_the_tangent_model() -> None:
-    """Conjugate gradients need the product with gram()."""
-    fit = skewed_fit()
-    deformation = fit.problem.deform(fit.problem.zero(), dc.RK4(1))
-    lin = deformation.linearise()
-    product = lin.product(normal(64, 2, 1, seed=4))
-    same(product.flatten(), lin.gram() @ normal(64, 2, 1, seed=4).flatten(), 1e-9)
 
 
 def test_saved_by_name_and_numbers(tmp_path: Path) -> None:

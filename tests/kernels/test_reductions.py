@@ -24,7 +24,7 @@ from sum_bank import (
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.kernels.profiles import CauchyProfile, GaussianProfile, MaternProfile, Profile
+from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile, Profile
 from diffeo_calib.kernels.reductions import backends
 from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.kernels.reductions.formulas import FIELD, Formula
@@ -76,17 +76,6 @@ def test_no_rows_and_no_columns(formula: Formula, backend: Backend) -> None:
             backends.evaluate(formula, GaussianProfile(), rows, columns, backend), shapes, strict=True
         ):
             torch.testing.assert_close(result, torch.zeros(len(rows.features), *shape, dtype=torch.float64))
-
-
-@every_formula
-@torch_backends
-@pytest.mark.parametrize("same", [False, True])
-def test_strided_inputs(formula: Formula, backend: Backend, same: bool) -> None:
-    expected = backends.evaluate(formula, CauchyProfile(), *sides(same), backend)
-    i, j = (None if p is None else mapped(p, lambda t: torch.stack([t.T, t.T], -1)[..., 0].T) for p in sides(same))
-    assert j is not None
-    assert not j.features.is_contiguous()
-    assert_same(backends.evaluate(formula, CauchyProfile(), i, j, backend), expected)
 
 
 @every_profile

@@ -51,16 +51,6 @@ def test_derivatives_of_maps(features: FeatureMap) -> None:
     torch.testing.assert_close(bent, expected, rtol=1e-10, atol=1e-10)
 
 
-@every_map
-def test_maps_act_on_batches(features: FeatureMap) -> None:
-    x, dx = uniform(4, 3, seed=1), normal(4, 3, seed=2)
-    g = normal(4, 7, features.lift(x).shape[-1], seed=3)
-    rows = torch.stack([features.pull(x, g[:, k]) for k in range(7)], 1)
-    torch.testing.assert_close(features.pull(x[:, None], g), rows, rtol=0, atol=0)
-    bends = torch.stack([features.pull_derivative(x, dx, g[:, k]) for k in range(7)], 1)
-    torch.testing.assert_close(features.pull_derivative(x[:, None], dx[:, None], g), bends, rtol=0, atol=0)
-
-
 def test_unused_coordinates_are_zero() -> None:
     features = MAPS["some columns"]
     x, g = uniform(5, 3, seed=1), normal(5, 3, seed=3)

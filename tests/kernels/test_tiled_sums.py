@@ -26,8 +26,8 @@ from torch import Tensor
 from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile, Profile
 from diffeo_calib.kernels.reductions import backends, tiled
 from diffeo_calib.kernels.reductions.backends import Backend
-from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Dense, Field, Formula, Points
-from diffeo_calib.kernels.reductions.tiled import Tiled, pool_for
+from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Dense, Formula, Points
+from diffeo_calib.kernels.reductions.tiled import Tiled
 
 TILES = (1, 4, 6, COLUMNS, 9, ROWS * COLUMNS, 1000)
 """Pairs in a tile: sides that divide the points and sides that do not, one tile, and more than all pairs."""
@@ -54,27 +54,31 @@ def test_sums_that_visit_each_pair_once(formula: Formula, profile: Profile, elem
     assert_same(symmetric, Dense().reduce(formula, profile, None, i), atol)
 
 
-class Watched(Field):
-    """The field; records the size of every tile."""
+@pytest.fixture
+def tiles(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
+    """The size of every tile."""
+    sizes: list[tuple[int, int]] = []
+    recycled = tiled._recycled
 
-    def __init__(self) -> None:
-        self.tiles: list[tuple[int, int]] = []
+    def watched(weights: Any, elements: int, i: Points, j: Points) -> Any:
+        sizes.append((len(i.features), len(j.features)))
+        return recycled(weights, elements, i, j)
 
-    def weights(self, pairs: Any, profile: Profile, i: Points, j: Points) -> list[Any]:
-        self.tiles.append((len(i.features), len(j.features)))
-        return super().weights(pairs, profile, i, j)
+    monkeypatch.setattr(tiled, "_recycled", watched)
+    return sizes
 
 
-def test_memory_is_bounded_by_the_tiles() -> None:
+def test_memory_is_bounded_by_the_tiles(tiles: list[tuple[int, int]]) -> None:
     """20000 points on one thread: tiles fit the cache, each pair is visited once, and buffers are recycled."""
-    watched, count = Watched(), 20_000
+    count = 20_000
     many = Points(normal(count, FEATURES, seed=1), normal(count, 1, seed=2))
-    buffers = pool_for(tiled.CPU_ELEMENTS, many.features).free
+    buffers = tiled.BUFFERS.of(tiled.CPU_ELEMENTS, many.features)
     buffers.clear()
     with torch_threads(1):
-        (total,) = backends.evaluate(watched, GaussianProfile(), None, many, "tiled")
-    assert max(m * n for m, n in watched.tiles) <= tiled.CPU_ELEMENTS
-    assert sum(m * n for m, n in watched.tiles) < 0.52 * count**2
+        (total,) = backends.evaluate(FIELD, GaussianProfile(), None, many, "tiled")
+    assert max(m * n for m, n in tiles) <= tiled.CPU_ELEMENTS
+    assert sum(m * n for m, n in tiles) < 0.52 * count**2
+    tiled.BUFFERS.of(1, many.features)  # takes back what was lent
     assert 0 < len(buffers) <= 4
     few = many._replace(features=many.features[:3])
     assert_same(backends.evaluate(FIELD, GaussianProfile(), few, many, "dense"), [total[:3]], 1e-11)
@@ -96,17 +100,6 @@ def test_the_number_of_threads_changes_no_digit(formula: Formula) -> None:
     assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other, strict=True))
     expected = [*Dense().reduce(formula, GaussianProfile(), None, i), *Dense().reduce(formula, GaussianProfile(), i, j)]
     assert_same(found[0], expected, 1e-9)
-
-
-@pytest.mark.parametrize(("rows", "columns"), [(3, 5000), (5000, 3), (500, 700), (1, 1)])
-def test_rectangular_tiles_cover_everything_within_their_size(rows: int, columns: int) -> None:
-    watched, elements = Watched(), 1000
-    i, j = points(rows, 1), points(columns, 2)
-    assert_same(
-        Tiled(elements).reduce(watched, GaussianProfile(), i, j), Dense().reduce(FIELD, GaussianProfile(), i, j), 1e-12
-    )
-    assert max(m * n for m, n in watched.tiles) <= elements
-    assert sum(m * n for m, n in watched.tiles) == rows * columns
 
 
 # --- Differentiation --------------------------------------------------------------------------------------------
@@ -151,14 +144,3 @@ def test_dispatched_sums_are_differentiable(backend: Backend) -> None:
     live = [t.clone().requires_grad_() for t in (i, j, points(COLUMNS, 20).momenta)]
     assert torch.autograd.gradcheck(gradient, live)
     assert torch.autograd.gradgradcheck(gradient, live)
-
-
-@every_formula
-def test_without_gradients_nothing_is_recorded(formula: Formula) -> None:
-    i, j = apart()
-    expected = backends.evaluate(formula, GaussianProfile(), i, j)
-    live = mapped(i, lambda t: t.clone().requires_grad_())
-    with torch.no_grad():
-        results = backends.evaluate(formula, GaussianProfile(), live, j, "tiled")
-    assert_same(results, expected)
-    assert not any(t.requires_grad for t in results)

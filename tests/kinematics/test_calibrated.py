@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
 from math_bank import normal
-from product_bank import Case, noise_blocks, prior_covariance, simulated
+from product_bank import Case, noise_blocks, simulated
 from scipy.stats import f
+from tangent_bank import tangent_covariance
 from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, NumericalError
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.measurements.poses import angle_between, mark_jacobian, mark_points
+from diffeo_calib.runtime.chain import perpendicular
 
 CHI2_95 = 7.8147  # 95 % quantile, three degrees of freedom
 CASES = pytest.mark.parametrize(
@@ -28,7 +31,7 @@ def case(name: str, request: pytest.FixtureRequest) -> Case:
     return request.getfixturevalue(name)
 
 
-# --- derivatives --------------------------------------------------------------------------------------------------
+# --- derivatives ----------------------------------------------------------------------------------------------------
 
 
 @CASES
@@ -40,36 +43,12 @@ def test_jacobian_against_autograd(case: Case) -> None:
     assert_close(case.model.jacobian(q.detach()), expected, rtol=1e-9, atol=1e-12)
 
 
-@CASES
-def test_jacobian_against_central_differences(case: Case) -> None:
-    q, h = case.test.q[:6], 1e-3
-    steps = h * torch.eye(6, dtype=torch.float64)
-
-    def central(step: Tensor) -> Tensor:
-        return (case.model(q + step) - case.model(q - step)) / (2 * float(step.sum()))
-
-    # Richardson extrapolation twice cancels h^2 and h^4.
-    once = [[(4 * central(s / 2**k / 2) - central(s / 2**k)) / 3 for s in steps] for k in (0, 1)]
-    expected = torch.stack([(16 * fine - coarse) / 15 for coarse, fine in zip(*once, strict=True)], -1)
-    jacobian = case.model.jacobian(q)
-    assert float((jacobian - expected).abs().max() / jacobian.abs().max()) < 1e-9
+# --- prediction -----------------------------------------------------------------------------------------------------
 
 
 @CASES
-def test_jacobian_is_not_the_nominal_one(case: Case) -> None:
-    q = case.test.q[:6]
-    nominal = case.result.identification.geometry.jacobian(q)
-    difference = float((case.model.jacobian(q) - nominal).abs().max())
-    assert 1e-5 < difference < 1e-1
-
-
-# --- prediction ---------------------------------------------------------------------------------------------------
-
-
-@CASES
-@pytest.mark.parametrize("noise", [True, False])
-def test_covariance_is_symmetric_and_positive(case: Case, noise: bool) -> None:
-    mean, covariance = case.model.predict(case.test.q, noise=noise)
+def test_covariance_is_symmetric_and_positive(case: Case) -> None:
+    mean, covariance = case.model.predict(case.test.q, noise=False)
     torch.testing.assert_close(mean, case.model(case.test.q), rtol=0, atol=1e-12)
     assert covariance.shape == (*mean.shape, 3)
     largest = covariance.abs().amax()
@@ -77,33 +56,29 @@ def test_covariance_is_symmetric_and_positive(case: Case, noise: bool) -> None:
     assert float(torch.linalg.eigvalsh(covariance).min()) > 0
 
 
-@CASES
+@pytest.mark.parametrize("name", ["arm", pytest.param("pair", marks=pytest.mark.slow)])
 def test_covariance_is_that_of_the_tangent_model_written_out(case: Case) -> None:
     """Deformations of a millimetre change the covariance by about a permille; a missing term would change it more."""
     result, x, at = case.result, case.train.q, case.test.q[:20]
-    scales, tails, geometry = result.selection.scales, result.tails, result.identification.geometry
-    joint = [float(scales.translation_errors)] * 3 + [float(scales.rotation_errors)] * 3
-    deviations = torch.tensor([0.1] * 6 + joint * 6 + [0.1] * 3 * case.model.markers, dtype=torch.float64)
-
-    def prior(here: Tensor, there: Tensor) -> Tensor:
-        loads, others = (elastic_columns(case, q).flatten(0, 1) for q in (here, there))
-        return prior_covariance(scales, geometry, deviations, here, there) + loads @ others.T
-
-    noise = noise_blocks(scales, geometry, x)
+    scales, tails, P = result.selection.scales, result.tails, case.model.markers
+    nominal = GeometryMap(result.registration.geometry, elastic=True)
+    deflection = torch.zeros(nominal.parameters - nominal.geometry.size, dtype=torch.float64)
+    theta = torch.cat([result.identification.theta, deflection])
+    prior = tangent_covariance(scales, nominal, theta, torch.cat([x, at]))
+    noise = noise_blocks(scales, result.identification.geometry, x)
     inflated = tails.weights.rsqrt().repeat_interleave(3, 1)
-    data = prior(x, x) + torch.block_diag(*(inflated[:, :, None] * noise * inflated[:, None]))
-    cross, own = prior(at, x), prior(at, at)
-    total = own - cross @ torch.linalg.solve(data, cross.T)
-    m = 3 * case.model.markers
-    blocks = torch.stack([total[m * i : m * (i + 1), m * i : m * (i + 1)] for i in range(20)])
-    expected = torch.stack([blocks[:, 3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(case.model.markers)], 1)
+    fit = slice(0, 3 * P * len(x))
+    own, cross = prior[fit.stop :, fit.stop :], prior[fit.stop :, fit]
+    data = prior[fit, fit] + torch.block_diag(*(inflated[:, :, None] * noise * inflated[:, None]))
+    total = (own - cross @ torch.linalg.solve(data, cross.T)).unflatten(0, (-1, P, 3)).unflatten(3, (-1, P, 3))
+    expected = torch.einsum("npanpb->npab", total)
     _, without = case.model.predict(at, noise=False)
     _, with_noise = case.model.predict(at)
     scale = expected.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None]
     assert float(((without - expected) / scale).abs().max()) < 0.02
     wide = 3 * float(f.ppf(0.95, 3, tails.freedom)) / CHI2_95 if math.isfinite(tails.freedom) else 1.0
     wide *= simulated_quantile(noise) / CHI2_95
-    for k in range(case.model.markers):
+    for k in range(P):
         added = (with_noise - without)[:, k]
         own_noise = wide * noise.mean(0)[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
         assert_close(added, own_noise.expand_as(added), rtol=0, atol=0.01 * float(own_noise.abs().max()))
@@ -119,40 +94,6 @@ def simulated_quantile(noise: Tensor) -> float:
     return float(np.quantile(torch.cat(squares).numpy(), 0.95))
 
 
-def elastic_columns(case: Case, q: Tensor) -> Tensor:
-    """Displacement of the markers by each coefficient of the elasticity, in units of its prior: (N, 3 P, K).
-
-    Where the rows do not show a joint's sag (the slider's tilt) its prior deviation is at least that of any robot.
-    """
-    scales, elasticity = case.result.selection.scales, case.model.nominal.elasticity
-    assert elasticity is not None
-    geometry, features = case.result.identification.geometry, elasticity.features(q)
-    twists = geometry.sensitivities(q).flatten(1, 2)[..., geometry.slices["joints"]].unflatten(-1, (-1, 6))
-    widened = case.model.map.geodesic.spec.prior_variance[geometry.size :].sqrt()
-    columns = []
-    for family in elasticity.compliances:
-        size = scales.compliance if family.own else scales.lateral_compliance
-        effect = twists[:, :, family.joint] @ torch.from_numpy(family.direction) * size[family.joint]
-        for k in range(family.size):
-            usual = effect * scales.gravity[k % 3]
-            deviation = float(size[family.joint] * scales.gravity[k % 3])
-            wider = max(1.0, float(widened[len(columns)]) / deviation) if deviation > 0 else 1.0
-            columns.append(usual * wider * features[:, len(columns), None])
-    assert len(columns) == elasticity.size
-    return torch.stack(columns, 2)
-
-
-@pytest.mark.slow
-def test_mean_and_covariance_belong_to_their_marker(pair: Case) -> None:
-    """Markers in the wrong order would be 100 mm off, and their covariances would be swapped."""
-    mean, covariance = pair.model.predict(pair.test.q)
-    assert float((mean - pair.test.points).norm(dim=-1).max()) < 1e-3
-    whole = pair.model.map.predict(pair.test.q)[1]
-    assert torch.equal(covariance[:, 0], whole[:, :3, :3])
-    assert torch.equal(covariance[:, 1], whole[:, 3:, 3:])
-    assert not torch.allclose(covariance[:, 0], covariance[:, 1], rtol=1e-2, atol=0)
-
-
 @pytest.mark.slow
 def test_regions_of_95_percent_hold_about_as_many_points(arm: Case, pair: Case, slider: Case) -> None:
     inside = []
@@ -165,37 +106,7 @@ def test_regions_of_95_percent_hold_about_as_many_points(arm: Case, pair: Case, 
     assert 0.85 <= float(torch.cat(inside).double().mean()) <= 0.99
 
 
-def test_uncertainty_grows_away_from_the_data(arm: Case) -> None:
-    scales, near = arm.result.selection.scales, arm.train.q[:, 0].abs() < 0.8
-    rows = arm.train.rows(near)
-    model = dc.calibrate(arm.robot, rows, hyperparameters=scales).model
-
-    def spread(at: float) -> float:
-        q = rows.q.clone()
-        q[:, 0] = at
-        return float(model.predict(q, noise=False)[1].diagonal(dim1=-2, dim2=-1).sum(-1).mean().sqrt())
-
-    spreads = [spread(at) for at in (0.0, 1.2, 1.8, 2.6)]
-    assert all(later > 1.02 * earlier for earlier, later in pairwise(spreads)), spreads
-    at_data = model.predict(rows.q, noise=False)[1].diagonal(dim1=-2, dim2=-1).sum(-1).mean().sqrt()
-    assert float(at_data) < spreads[0]
-
-
-@pytest.mark.slow
-def test_regions_of_95_percent_with_200_poses(arm_200: Case) -> None:
-    mean, covariance = arm_200.model.predict(arm_200.test.q)
-    error = (arm_200.test.points - mean)[..., None]
-    distance = (error.mT @ torch.linalg.solve(covariance, error)).flatten()
-    assert 0.85 <= float((distance < CHI2_95).double().mean()) <= 0.99
-
-
-@pytest.mark.slow
-def test_more_data_reduce_the_uncertainty(arm: Case, arm_200: Case) -> None:
-    few, many = (c.model.predict(arm.test.q, noise=False)[1].diagonal(dim1=-2, dim2=-1).sum() for c in (arm, arm_200))
-    assert float(many) < 0.6 * float(few)
-
-
-# --- inverse ------------------------------------------------------------------------------------------------------
+# --- inverse --------------------------------------------------------------------------------------------------------
 
 
 @CASES
@@ -222,14 +133,6 @@ def test_inverse_compensates_what_the_nominal_model_misses(arm: Case) -> None:
 
 
 @pytest.mark.slow
-def test_inverse_with_as_many_equations_as_joints(pair: Case) -> None:
-    """Two markers give six coordinates, but their distance is fixed, so that only consistent targets can be reached."""
-    wanted = pair.test.q[:5]
-    q = pair.model.inverse(pair.model(wanted), wanted + 1e-3)
-    assert_close(pair.model(q), pair.model(wanted), rtol=0, atol=1e-9)
-
-
-@pytest.mark.slow
 def test_unreachable_target(arm: Case) -> None:
     start = arm.test.q[:3]
     targets = arm.model(start).clone()
@@ -238,61 +141,49 @@ def test_unreachable_target(arm: Case) -> None:
         arm.model.inverse(targets, start)
 
 
-def test_inverse_checks_its_shapes(arm: Case) -> None:
-    start = arm.test.q[:3]
-    for wrong in (arm.model(start)[:2], arm.model(start)[:, 0], torch.zeros(3, 2, 3)):
-        with pytest.raises(InputError, match=r"`points` has the wrong shape: expected \(3, 1, 3\)"):
-            arm.model.inverse(wrong, start)
-
-
-# --- input --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("method", ["__call__", "jacobian", "predict"])
-@pytest.mark.parametrize("shape", [(4, 5), (6,), (2, 3, 6), ()])
-def test_wrong_shape_names_the_robot_and_its_joints(arm: Case, method: str, shape: tuple[int, ...]) -> None:
-    with pytest.raises(InputError, match=r"`q` must have shape \(N, 6\) for robot 'simulated_arm'.*joint_names"):
-        getattr(arm.model, method)(torch.zeros(shape))
-
-
-@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_values_that_are_not_finite_are_refused(arm: Case, bad: float) -> None:
-    with pytest.raises(InputError, match="not finite"):
-        arm.model([[0.0, 0.0, bad, 0.0, 0.0, 0.0]])
-    with pytest.raises(InputError, match="not finite"):
-        arm.model(torch.full((1, 6), bad))
-
-
-def test_words_are_refused(arm: Case) -> None:
-    with pytest.raises(InputError, match="`q`"):
-        arm.model("home")
-
-
-def test_lists_arrays_and_other_dtypes(arm: Case) -> None:
-    q = arm.test.q[:3]
-    expected = arm.model(q)
-    for same in (q.tolist(), q.numpy(), tuple(map(tuple, q.tolist())), np.asfortranarray(q.numpy())):
-        assert torch.equal(arm.model(same), expected)
-        assert torch.equal(arm.model.jacobian(same), arm.model.jacobian(q))
-        assert torch.equal(arm.model.predict(same)[1], arm.model.predict(q)[1])
-    assert arm.model(q.float()).dtype == torch.float64
-    assert arm.model([[0, 0, 0, 0, 0, 0]]).dtype == torch.float64
-    assert_close(arm.model(q.float()), expected, rtol=0, atol=1e-5)
+# --- input ----------------------------------------------------------------------------------------------------------
 
 
 def test_no_rows(arm: Case) -> None:
     none = arm.test.q[:0]
     assert arm.model(none).shape == (0, 1, 3)
     assert arm.model.jacobian(none).shape == (0, 1, 3, 6)
+    assert [part.shape for part in arm.model.predict(none)] == [(0, 1, 3), (0, 1, 3, 3)]
+    assert arm.model.inverse(torch.zeros(0, 1, 3), none).shape == (0, 6)
+    assert arm.model.tool_poses(none).shape == (0, 4, 4)
+    assert arm.model.tool_jacobian(none).shape == (0, 6, 6)
+    assert [t.shape for t in arm.model.predict_tool_poses(none)] == [(0, 4, 4), (0, 6, 6)]
 
 
-def test_no_rows_to_predict(arm: Case) -> None:
-    mean, covariance = arm.model.predict(arm.test.q[:0])
-    assert (mean.shape, covariance.shape) == ((0, 1, 3), (0, 1, 3, 3))
+def test_wrong_input(arm: Case) -> None:
+    model, start = arm.model, arm.test.q[:3]
+    for ask in (model, model.jacobian, model.predict):
+        for shape in ((4, 5), (6,), ()):
+            with pytest.raises(InputError, match=r"`q` must have shape \(N, 6\) for robot 'simulated_arm'"):
+                ask(torch.zeros(shape))
+    for bad in (float("nan"), float("inf")):
+        with pytest.raises(InputError, match="not finite"):
+            model([[0.0, 0.0, bad, 0.0, 0.0, 0.0]])
+    for wrong in (model(start)[:2], model(start)[:, 0], torch.zeros(3, 2, 3)):
+        with pytest.raises(InputError, match=r"`points` has the wrong shape: expected \(3, 1, 3\)"):
+            model.inverse(wrong, start)
+    for device in ("foo", "cuda:99", torch.float32, "meta"):
+        with pytest.raises(InputError, match="the device"):
+            model.to(device)  # pyright: ignore[reportArgumentType]
 
 
-def test_no_rows_to_invert(arm: Case) -> None:
-    assert arm.model.inverse(torch.zeros(0, 1, 3), arm.test.q[:0]).shape == (0, 6)
+@pytest.mark.parametrize(
+    ("axis", "rows"),
+    [
+        ((0.0, 0.0, 1.0), ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0))),
+        ((0.0, 1.0, 0.0), ((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))),
+        ((1.0, 0.0, 0.0), ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0))),
+        ((0.0, 0.0, -1.0), ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0))),
+    ],
+)
+def test_lateral_directions_of_gravity_sag(axis: tuple[float, ...], rows: tuple[tuple[float, ...], ...]) -> None:
+    """Coefficients in model files refer to these directions: they must never change."""
+    np.testing.assert_allclose(perpendicular(np.array(axis)), np.array(rows), rtol=0, atol=1e-15)
 
 
 def test_large_batches_equal_small_ones(arm: Case) -> None:
@@ -311,3 +202,58 @@ def test_full_turns_change_nothing(arm: Case) -> None:
     turned = q + 2 * torch.pi * torch.tensor([1.0, -1, 0, 2, 0, -3], dtype=torch.float64)
     assert_close(arm.model(turned), arm.model(q), rtol=0, atol=1e-13)
     assert_close(arm.model.predict(turned)[1], arm.model.predict(q)[1], rtol=1e-6, atol=1e-16)
+
+
+# --- the poses of calibrated kinematics: their fit to three points, covariances and inverse -------------------------
+
+
+def test_poses_fit_the_points_of_the_model(posed: Case) -> None:
+    model, q = posed.model, posed.test.q
+    assert (model.lever, model.markers) == (0.1, 3)
+    assert "poses, fitted to 30 poses" in repr(model)
+    poses, points = model.poses(q), model(q)
+    assert_close(poses[:, :3, 3], points.mean(1), rtol=0, atol=1e-14)
+    eye = torch.eye(3, dtype=torch.float64).expand(len(q), 3, 3)
+    assert_close(poses[:, :3, :3].mT @ poses[:, :3, :3], eye, rtol=0, atol=1e-14)
+    change = (mark_points(poses, 0.1) - points).norm(dim=-1)
+    assert float(change.max()) < 1e-3  # the deformation changes the triangle of points only slightly
+    measured = posed.test.poses
+    assert measured is not None
+    assert float(angle_between(poses[:, :3, :3], measured[:, :3, :3]).max()) < 5e-3
+    assert_close(model.predict_poses(q)[0], poses, rtol=0, atol=1e-12)
+
+
+def test_covariance_of_poses_is_that_of_their_points(posed: Case) -> None:
+    """Position: the mean of the points. Rotation vectors: in the measuring frame."""
+    model, q = posed.model, posed.test.q[:40]
+    whole = model.map.predict(q)[1]
+    poses, covariance = model.predict_poses(q)
+    mean = torch.cat([torch.eye(3, dtype=torch.float64)] * 3, 1) / 3
+    assert_close(covariance[:, :3, :3], mean @ whole @ mean.T, rtol=1e-9, atol=1e-20)
+    back = torch.linalg.inv(mark_jacobian(poses, 0.1).mT @ mark_jacobian(poses, 0.1)) @ mark_jacobian(poses, 0.1).mT
+    assert_close(covariance, back @ whole @ back.mT, rtol=1e-6, atol=1e-16)
+    without = model.predict_poses(q, noise=False)[1]
+    assert bool((without.diagonal(dim1=1, dim2=2) < covariance.diagonal(dim1=1, dim2=2)).all())
+
+
+def test_predicted_deviations_of_poses_are_of_the_right_size(posed: Case) -> None:
+    poses, covariance = posed.model.predict_poses(posed.test.q)
+    measured = posed.test.poses
+    assert measured is not None
+    error = poses[:, :3, 3] - measured[:, :3, 3]
+    ratio = error.square().mean() / covariance.diagonal(dim1=1, dim2=2)[:, :3].mean()
+    assert 0.2 < float(ratio) < 5.0
+
+
+def test_points_have_no_poses(arm: Case) -> None:
+    for ask in (arm.model.poses, arm.model.predict_poses):
+        with pytest.raises(InputError, match=r"calibrated with points: it has no poses; .*from_poses"):
+            ask(arm.test.q)
+
+
+def test_a_lever_belongs_to_three_points(arm: Case, posed: Case) -> None:
+    with pytest.raises(InputError, match=r"a model of poses: expected three points for each, got 1"):
+        dc.CalibratedKinematics(arm.robot, arm.model.map, lever=0.1)
+    with pytest.raises(InputError, match=r"`lever`.*above 0, got -0.1"):
+        dc.CalibratedKinematics(posed.robot, posed.model.map, lever=-0.1)
+    assert dc.CalibratedKinematics(arm.robot, arm.model.map).lever is None

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from dataclasses import replace
 from math import radians
 
 import numpy as np
 import pytest
 import torch
-from product_bank import Case
+from product_bank import Case, with_usual_scales
 from robots_bank import tool_frame
 from scipy.optimize import least_squares
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.kinematics.compensation.compensate import Pace
 from diffeo_calib.measurements.poses import angle_between
+from diffeo_calib.robots.geometry import Geometry
 
 BOUND = radians(1.0)
 LEVER = 0.1
@@ -53,7 +56,7 @@ def inside(case: Case, found: dc.Compensation, bound: float = BOUND) -> bool:
     return bool(((found.q >= low) & (found.q <= high) & (found.correction.abs() <= bound)).all())
 
 
-# --- reached ------------------------------------------------------------------------------------------------------
+# --- reached --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("frame", ["base", "measuring"])
@@ -106,15 +109,6 @@ def test_positions_with_the_direction_of_an_axis(arm: Case) -> None:
         assert float(turned[found.reached].max()) > 1e-5  # the turn about the axis is free
 
 
-def test_weights_move_the_work_to_other_joints(arm: Case) -> None:
-    q = commands(arm, 30, seed=3)
-    targets = intended(arm, q)[:, :3, 3]
-    even = dc.compensate(arm.model, targets, q, tool=tool_frame())
-    heavy = dc.compensate(arm.model, targets, q, tool=tool_frame(), weights=[1e4, 1, 1, 1, 1, 1])
-    assert bool((even.reached & heavy.reached).all())
-    assert float(heavy.correction[:, 0].abs().max()) < 0.05 * float(even.correction[:, 0].abs().max())
-
-
 def test_a_slide_has_a_bound_in_metres(slider: Case) -> None:
     q = slider.test.q[:100]
     targets = intended(slider, q)
@@ -128,7 +122,7 @@ def test_a_slide_has_a_bound_in_metres(slider: Case) -> None:
     assert float(short.correction[:, 2].abs().max()) <= 1e-5
 
 
-# --- not reached --------------------------------------------------------------------------------------------------
+# --- not reached ----------------------------------------------------------------------------------------------------
 
 
 def near_wrist_singularity(case: Case, rows: int) -> Tensor:
@@ -199,34 +193,7 @@ def test_statuses_of_singular_and_distant_targets(arm: Case) -> None:
     assert dc.compensate(arm.model, aside, regular, tool=tool_frame()).counts.get("singular", 0) == 0
 
 
-def test_a_stretched_arm_ends_where_the_workspace_does(arm: Case) -> None:
-    """Targets beside a stretched elbow, by what searches without a bound find from both sides."""
-    q = commands(arm, 60, seed=7)
-    q[:, 2] = elbow_straight(arm)
-    targets = intended(arm, q)
-    found = dc.compensate(arm.model, targets, q, tool=tool_frame())
-    free = [[-20.0, 20.0]] * 6
-    possible = torch.zeros(60, dtype=torch.bool)
-    for side in (-0.3, -0.1, 0.1, 0.3):
-        bent = q + torch.tensor([0.0, -side / 2, side, -side / 2, 0.0, 0.0])
-        wide = dc.compensate(arm.model, targets, bent, tool=tool_frame(), bound=0.8, limits=free)
-        possible |= wide.reached
-    judged = torch.tensor([s in ("singular", "unreachable") for s in found.status])
-    singular = torch.tensor([s == "singular" for s in found.status])
-    assert int(judged.sum()) > 30
-    assert float((possible == singular)[judged].double().mean()) > 0.95
-
-
-def elbow_straight(case: Case) -> float:
-    """The angle of the third joint at which the arm is longest."""
-    angles = torch.linspace(-3.1, 3.1, 6201, dtype=torch.float64)
-    q = torch.zeros(len(angles), 6, dtype=torch.float64)
-    q[:, 2] = angles
-    frames = case.robot.joint_frames(q)
-    return float(angles[(frames[:, 4, :3, 3] - frames[:, 1, :3, 3]).norm(dim=1).argmax()])
-
-
-# --- limits -------------------------------------------------------------------------------------------------------
+# --- limits ---------------------------------------------------------------------------------------------------------
 
 
 def test_limits_stop_a_row_and_are_named(arm: Case) -> None:
@@ -249,34 +216,6 @@ def test_limits_stop_a_row_and_are_named(arm: Case) -> None:
     assert found.counts["limit"] > 5
 
 
-def test_a_limit_between_the_start_and_the_command(arm: Case) -> None:
-    """Six joints have no other way to a pose: the joint stops at its limit, and the limit is to blame."""
-    q = commands(arm, 20, seed=12)
-    targets = intended(arm, q)
-    free = dc.compensate(arm.model, targets, q, tool=tool_frame())
-    seen = 0
-    for row in free.reached.nonzero().flatten().tolist():
-        joint = int(free.correction[row].abs().argmax())
-        way = float(free.correction[row, joint])
-        narrow = arm.robot.limits.clone()
-        narrow[joint, int(way > 0)] = q[row, joint] + 0.5 * way
-        found = dc.compensate(arm.model, targets[[row]], q[[row]], tool=tool_frame(), limits=narrow)
-        assert found.status == ("limit",)
-        assert float(found.q[0, joint]) == float(narrow[joint, int(way > 0)])
-        assert float(found.miss[0]) > 1e-9
-        seen += 1
-    assert seen > 10
-
-
-def test_a_start_just_beyond_a_limit_is_brought_back(arm: Case) -> None:
-    q = commands(arm, 20, seed=9)
-    targets = intended(arm, q)
-    narrow = torch.stack([q.amin(0) - 1, q.amax(0) - 0.5 * BOUND], 1)
-    found = dc.compensate(arm.model, targets[:, :3, 3], q, tool=tool_frame(), limits=narrow)
-    assert bool((found.q <= narrow[:, 1]).all())
-    assert bool((found.correction.abs() <= BOUND).all())
-
-
 def test_one_bad_row_disturbs_no_other(arm: Case) -> None:
     q = commands(arm, 50, seed=10)
     targets = intended(arm, q)
@@ -289,7 +228,7 @@ def test_one_bad_row_disturbs_no_other(arm: Case) -> None:
     assert [together.status[row] for row in others] == [alone.status[row] for row in others]
 
 
-# --- input --------------------------------------------------------------------------------------------------------
+# --- input ----------------------------------------------------------------------------------------------------------
 
 
 def test_no_rows(arm: Case) -> None:
@@ -298,32 +237,180 @@ def test_no_rows(arm: Case) -> None:
     assert len(dc.compensate(arm.model, torch.zeros(0, 4, 4), none)) == 0
 
 
-Change = Callable[[dict[str, object]], object]
-
-
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"targets": torch.full((3, 3), float("nan"))}, r"`targets` has 9 value\(s\) that are not finite.*\[0, 0\]"),
-        ({"targets": torch.full((3, 4, 4), float("inf"))}, r"`targets` has 48 value\(s\) that are not finite"),
-        ({"start": torch.tensor([[0.0] * 6, [float("inf")] * 6, [0.0] * 6])}, r"`start` has 6 value.*\[1, 0\]"),
-        ({"start": torch.zeros(3, 7)}, r"`start` has the wrong shape: expected \(N, 6\)"),
-        ({"targets": torch.zeros(4, 3)}, r"`targets` has the wrong shape: expected \(3, 3\), got \(4, 3\)"),
-        ({"targets": torch.ones(3, 4, 4)}, r"`targets`, row 0: the last row of the transform"),
-        ({"axis": torch.zeros(3, 3)}, r"`axis`, row 0: expected a direction"),
-        ({"targets": torch.eye(4).repeat(3, 1, 1), "axis": torch.ones(3, 3)}, "`axis` beside target poses"),
-        ({"axis": torch.ones(3, 3), "tool_axis": "w"}, "`tool_axis`: expected 'x', 'y' or 'z'"),
-        ({"frame": "flange"}, "`frame`: expected 'base' or 'measuring'"),
-        ({"bound": -1.0}, "`bound`"),
-        ({"bound": [1.0, 2.0]}, "`bound` has the wrong shape"),
-        ({"weights": [1.0] * 5}, "`weights` has the wrong shape"),
-        ({"lever": 0.0}, "`lever`"),
-        ({"limits": [[1.0, -1.0]] * 6}, "`limits` of joint 'waist_joint': expected lower <= upper"),
-        ({"limits": [[0.0, 1.0]]}, r"`limits` has the wrong shape: expected \(6, 2\)"),
-        ({"model": 3}, "`model`: expected a calibrated model of a robot, got int"),
-    ],
+WRONG: tuple[tuple[dict[str, object], str], ...] = (
+    ({"targets": torch.full((3, 3), float("nan"))}, r"`targets` has 9 value\(s\) that are not finite.*\[0, 0\]"),
+    ({"start": torch.zeros(3, 7)}, r"`start` has the wrong shape: expected \(N, 6\)"),
+    ({"targets": torch.zeros(4, 3)}, r"`targets` has the wrong shape: expected \(3, 3\), got \(4, 3\)"),
+    ({"targets": torch.ones(3, 4, 4)}, r"`targets`, row 0: the last row of the transform"),
+    ({"axis": torch.zeros(3, 3)}, r"`axis`, row 0: expected a direction"),
+    ({"targets": torch.eye(4).repeat(3, 1, 1), "axis": torch.ones(3, 3)}, "`axis` beside target poses"),
+    ({"axis": torch.ones(3, 3), "tool_axis": "w"}, "`tool_axis`: expected 'x', 'y' or 'z'"),
+    ({"axis": torch.ones(3, 3), "tool_axis": [1]}, "`tool_axis`: expected 'x', 'y' or 'z'"),
+    ({"frame": "flange"}, "`frame`: expected 'base' or 'measuring'"),
+    ({"bound": [1.0, 2.0]}, "`bound` has the wrong shape"),
+    ({"weights": [1.0] * 5}, "`weights` has the wrong shape"),
+    ({"lever": 0.0}, "`lever`"),
+    ({"limits": [[1.0, -1.0]] * 6}, "`limits` of joint 'waist_joint': expected lower <= upper"),
+    ({"model": 3}, "`model`: expected a calibrated model of a robot, got int"),
+    ({"rate": 0.1}, "`rate` and `time` limit how fast the corrections of a path change"),
+    ({"path": True, "rate": -0.1}, "`rate`"),
+    ({"path": True, "time": [0.0, 1.0, 1.0]}, "`time`, row 2: expected increasing times, got 1 after 1"),
 )
-def test_wrong_input(arm: Case, changed: dict[str, object], message: str) -> None:
-    given = {"model": arm.model, "targets": torch.zeros(3, 3), "start": torch.zeros(3, 6)} | changed
-    with pytest.raises(InputError, match=message):
-        dc.compensate(**given)  # pyright: ignore[reportArgumentType]
+
+
+def test_wrong_input(arm: Case) -> None:
+    for changed, message in WRONG:
+        given = {"model": arm.model, "targets": torch.zeros(3, 3), "start": torch.zeros(3, 6)} | changed
+        with pytest.raises(InputError, match=message):
+            dc.compensate(**given)  # pyright: ignore[reportArgumentType]
+
+
+# --- thousands of targets at once, a redundant arm, and a bound of work ---------------------------------------------
+
+
+@pytest.mark.slow
+def test_thousands_of_targets(arm: Case) -> None:
+    """Random ones, through singularities, and out of reach: every row ends in the right status."""
+    q = torch.cat([commands(arm, 2000), near_wrist_singularity(arm, 400), commands(arm, 200, seed=1)])
+    targets = intended(arm, q)
+    targets[2400:, :3, 3] *= 2.5 / targets[2400:, :3, 3].norm(dim=1, keepdim=True)
+    found = dc.compensate(arm.model, targets, q, tool=tool_frame())
+    assert inside(arm, found)
+    distance, angle = misses(arm, found.q, targets)
+    assert float(torch.maximum(distance, angle)[found.reached].max()) <= 1e-9
+    assert float(torch.maximum(distance, angle)[~found.reached].min()) > 1e-10
+    assert set(found.status[2400:]) == {"unreachable"}
+    assert set(found.status[2000:2400]) <= {"reached", "singular", "limit"}
+    assert int(found.reached[:2000].sum()) > 1500
+    again = dc.compensate(arm.model, targets, q, tool=tool_frame(), limits=[[-20.0, 20.0]] * 6)
+    for row, status in enumerate(found.status):
+        if status == "limit":
+            assert again.status[row] == "reached"
+    J = arm.model.tool_jacobian(q, tool_frame())
+    J[:, 3:] *= 0.3  # m per rad
+    s = torch.linalg.svdvals(J)
+    weak = s[:, -1] / s[:, 0]
+    singular = torch.tensor([status == "singular" for status in found.status])
+    assert float(weak[singular].median()) < 0.2 * float(weak[found.reached].median())
+    assert float(weak[singular].max()) < 0.1
+
+
+def seven_joints() -> tuple[dc.Chain, dc.CalibratedKinematics]:
+    """An arm with an elbow that can swing, with geometric errors, calibrated with 60 positions of one marker."""
+    quarter = math.pi / 2
+    turns = (-quarter, quarter, quarter, -quarter, -quarter, quarter, 0.0)
+    lengths = (0.36, 0.0, 0.42, 0.0, 0.4, 0.0, 0.126)
+    robot = dc.from_dh([(0.0, turn, length) for turn, length in zip(turns, lengths, strict=True)], name="seven")
+    truth = replace(Geometry.nominal(robot), tool=torch.tensor([[0.05, 0.02, 0.1]], dtype=torch.float64))
+    theta = torch.from_numpy(5e-4 * np.random.default_rng(7).standard_normal(truth.size))
+    q = torch.from_numpy(np.random.default_rng(1).uniform(-1.5, 1.5, (60, 7)))
+    points = truth.absorb(theta).points(q + 3e-4 * torch.sin(q + 1))
+    noise = 1e-5 * torch.from_numpy(np.random.default_rng(2).standard_normal(tuple(points.shape)))
+    return robot, with_usual_scales(robot, dc.Measurements(q, points + noise)).model
+
+
+@pytest.mark.slow
+def test_a_redundant_arm_stays_near_its_start() -> None:
+    """The smallest weighted motion: weights times correction has no part along the self-motion."""
+    robot, model = seven_joints()
+    q = torch.from_numpy(np.random.default_rng(3).uniform(0.3, 1.4, (200, 7)))
+    targets = robot(q) @ tool_frame()
+    for weights in (torch.ones(7), torch.tensor([1.0, 10.0, 1.0, 0.1, 1.0, 5.0, 1.0])):
+        found = dc.compensate(model, targets, q, tool=tool_frame(), weights=weights)
+        free = found.reached & (found.correction.abs() < BOUND - 1e-9).all(1)
+        assert int(free.sum()) > 150
+        J = model.tool_jacobian(found.q, tool_frame())[free]
+        selfmotion = torch.linalg.svd(J, full_matrices=True).Vh[:, -1]
+        cost = weights.double() * found.correction[free]
+        share = (selfmotion * cost).sum(1).abs() / cost.norm(dim=1)
+        assert float(share.quantile(0.95)) < 0.02
+
+
+# --- paths: corrections that change slowly, jumps that are named, commands that start at the row before -------------
+
+
+def line(case: Case, rows: int, seed: int = 3) -> Tensor:
+    """A straight way between two configurations, away from singularities for seed 3."""
+    first, last = commands(case, 2, seed) * 0.4
+    first[4], last[4] = 0.6, 1.0
+    return first + torch.linspace(0, 1, rows, dtype=torch.float64)[:, None] * (last - first)
+
+
+def through_wrist(case: Case, rows: int) -> Tensor:
+    q = line(case, rows)
+    q[:, 4] = torch.linspace(-0.2, 0.2, rows, dtype=torch.float64)
+    return q
+
+
+def changes(found: dc.Compensation) -> Tensor:
+    return found.correction.diff(dim=0).abs()
+
+
+def test_a_path_without_jumps_is_that_of_its_rows(arm: Case) -> None:
+    q = line(arm, 60)
+    targets = intended(arm, q)
+    alone = dc.compensate(arm.model, targets, q, tool=tool_frame())
+    found = dc.compensate(arm.model, targets, q, tool=tool_frame(), path=True)
+    assert bool(alone.reached.all())
+    torch.testing.assert_close(found.q, alone.q, rtol=0, atol=0)
+    assert found.jumps == ()
+    assert float(changes(found).max()) < radians(0.1)
+
+
+def test_through_a_singularity_the_corrections_stay_slow(arm: Case) -> None:
+    q = through_wrist(arm, 81)
+    targets = intended(arm, q)
+    alone = dc.compensate(arm.model, targets, q, tool=tool_frame())
+    rate = radians(0.15)
+    assert float(changes(alone).max()) > rate  # there is something to slow down
+    with pytest.warns(dc.DiffeoCalibWarning, match=r"corrections of the path jump after [\d, ]+ rows"):
+        found = dc.compensate(arm.model, targets, q, tool=tool_frame(), path=True, rate=rate)
+    assert float(changes(found).max()) <= rate + 1e-12
+    assert float(found.correction.abs().max()) <= BOUND
+    assert {row for row in range(1, 81) if float(changes(alone)[row - 1].max()) > rate + 1e-9} == set(found.jumps)
+    distance, _ = misses(arm, found.q, targets)
+    torch.testing.assert_close(found.miss, distance, rtol=1e-6, atol=1e-12)
+    assert float(distance[found.reached].max()) <= 1e-9
+    for row, status in enumerate(found.status):
+        if status == "rate":
+            assert float((found.q - alone.q)[row].abs().max()) > 1e-9
+    assert float(distance.max()) < 2e-3
+    assert found.counts["reached"] > 40
+
+
+def test_seconds_instead_of_rows(arm: Case) -> None:
+    q = through_wrist(arm, 41)
+    targets = intended(arm, q)
+    time = torch.linspace(0, 1, 41, dtype=torch.float64) ** 2
+    rate = [0.2, 0.2, 0.2, 0.3, 0.2, 0.3]
+    with pytest.warns(dc.DiffeoCalibWarning):
+        found = dc.compensate(arm.model, targets, q, tool=tool_frame(), path=True, rate=rate, time=time)
+    allowed = time.diff()[:, None] * torch.tensor(rate, dtype=torch.float64)
+    assert bool((changes(found) <= allowed + 1e-12).all())
+
+
+def test_the_slowest_change_of_a_jump() -> None:
+    """A step is passed half before and half after; rows that miss their targets give way; NaN counts as nothing."""
+    pace = Pace(np.arange(9.0), np.array([1.0]))
+    step = np.array([0.0] * 4 + [4.0] * 5)[:, None]
+    found = pace.limited(step, np.ones(9, dtype=bool))[:, 0]
+    np.testing.assert_allclose(found, [0, 0.5, 1, 1.5, 2.5, 3, 3.5, 4, 4])
+    spike = np.zeros((9, 1))
+    spike[4] = 3.0
+    firm = np.arange(9) != 4
+    np.testing.assert_allclose(pace.limited(spike, firm)[:, 0], [0, 0, 0, 0, 1, 0, 0, 0, 0])
+    spike[4] = np.nan
+    kept = pace.limited(spike, firm)[:, 0]
+    assert np.isnan(kept[4])
+    assert not np.delete(kept, 4).any()
+
+
+def test_one_start_for_a_whole_path(arm: Case) -> None:
+    q = line(arm, 12)
+    targets = intended(arm, q)
+    found = dc.compensate(arm.model, targets, q[0], tool=tool_frame())
+    assert bool(found.reached.all())
+    torch.testing.assert_close(found.start[1:], found.q[:-1], rtol=0, atol=0)
+    torch.testing.assert_close(found.start[0], q[0], rtol=0, atol=0)
+    every = dc.compensate(arm.model, targets, q, tool=tool_frame())
+    torch.testing.assert_close(found.q, every.q, rtol=0, atol=1e-7)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import polars as pl
 import pytest
 import torch
 from math_bank import constant_kernel
 from product_bank import Case
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -59,35 +62,26 @@ def test_columns_are_taken_by_name(table: Table, arm: Case, posed: Case) -> None
 
 
 @pytest.mark.parametrize("table", LIBRARIES)
-def test_every_joint_needs_its_column(table: Table, arm: Case) -> None:
+def test_data_frames_that_cannot_be_taken(table: Table, arm: Case) -> None:
     q, names = arm.test.q[:4], arm.robot.joint_names
-    frame = table({name: q[:, k].numpy() for k, name in enumerate(names[:-1])} | {"last": q[:, -1].numpy()})
+    columns = {name: q[:, k].numpy() for k, name in enumerate(names)}
+    missing = table({name: columns[name] for name in names[:-1]} | {"last": columns[names[-1]]})
     with pytest.raises(InputError, match=rf"has no column \['{names[-1]}'\]: expected columns .* got .*'last'"):
-        arm.model(frame)
+        arm.model(missing)
     with pytest.raises(MeasurementError, match="has no column"):
-        dc.Measurements(frame, arm.test.points[:4], names)
-
-
-@pytest.mark.parametrize("table", LIBRARIES)
-def test_a_row_or_a_column_is_no_configuration(table: Table, arm: Case) -> None:
-    frame = shuffled(table, arm.robot, arm.test.q[:4])
+        dc.Measurements(missing, arm.test.points[:4], names)
     with pytest.raises(InputError, match=r"`q`: expected a data frame or an array, got Series"):
-        arm.model(frame[arm.robot.joint_names[0]])
-
-
-@pytest.mark.parametrize("table", LIBRARIES)
-def test_cells_must_be_numbers(table: Table, arm: Case) -> None:
-    first, *others = arm.robot.joint_names
-    with pytest.raises(InputError, match=f"column '{first}' of the data frame `q` cannot be read as numbers"):
-        arm.model(table({first: ["far"], **{name: [0.0] for name in others}}))
+        arm.model(table(columns)[names[0]])
+    with pytest.raises(InputError, match=f"column '{names[0]}' of the data frame `q` cannot be read as numbers"):
+        arm.model(table(columns | {names[0]: ["far"] * 4}))
     with pytest.raises(InputError, match=r"6 value\(s\) that are not finite, the first at index \[1, 0\]"):
-        arm.model(table({name: [0.0, None] for name in arm.robot.joint_names}))
-
-
-def test_two_columns_of_one_name(arm: Case) -> None:
-    frame = pd.DataFrame([[0.0] * 7], columns=pd.Index([*arm.robot.joint_names, arm.robot.joint_names[0]]))
-    with pytest.raises(InputError, match=f"has several columns named \\['{arm.robot.joint_names[0]}'\\]"):
-        arm.model(frame)
+        arm.model(table({name: [0.0, None] for name in names}))
+    kernel: Any = {"joint_kernel": constant_kernel(1.0), "task_kernel": constant_kernel(1.0)}
+    with pytest.raises(InputError, match="`x` is a data frame, but the inputs of this map have no names"):
+        dc.Problem(lambda x: x, table({"a": [0.0, 1.0]}), [[0.0], [1.0]], **kernel, noise=0.1)
+    twice = pd.DataFrame([[0.0] * 7], columns=pd.Index([*names, names[0]]))
+    with pytest.raises(InputError, match=f"has several columns named \\['{names[0]}'\\]"):
+        arm.model(twice)
 
 
 @pytest.mark.parametrize("table", LIBRARIES)
@@ -109,10 +103,65 @@ def test_measurements_of_a_data_frame_know_the_names(table: Table, arm: Case) ->
         dc.Measurements(shuffled(table, arm.robot, q), points)
 
 
-@pytest.mark.parametrize("table", LIBRARIES)
-def test_maps_without_names_refuse_data_frames(table: Table, arm: Case) -> None:
-    frame, kernel = table({"a": [0.0, 1.0]}), constant_kernel(1.0)
-    with pytest.raises(InputError, match="`x` is a data frame, but the inputs of this map have no names"):
-        dc.Problem(lambda x: x, frame, [[0.0], [1.0]], joint_kernel=kernel, task_kernel=kernel, noise=0.1)
-    with pytest.raises(InputError, match="`x` is a data frame"):
-        arm.model.map(shuffled(table, arm.robot, arm.test.q))
+# --- results as data frames of pandas -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["arm", "pair"])
+def test_errors_of_every_row(name: str, request: pytest.FixtureRequest) -> None:
+    case: Case = request.getfixturevalue(name)
+    data = case.test[5:25]
+    found = dc.evaluate(case.model, data)
+    frame = found.to_frame()
+    away = (data.points - case.model(data.q)).numpy()
+    assert list(frame.columns) == ["row", "marker", "x", "y", "z", "error"]
+    assert list(frame["row"]) == [row for row in range(5, 25) for _ in range(data.markers)]
+    assert frame.groupby("marker").size().tolist() == [20] * data.markers
+    np.testing.assert_allclose(frame[["x", "y", "z"]], away.reshape(-1, 3), atol=1e-15)
+    np.testing.assert_allclose(frame["error"], np.linalg.norm(frame[["x", "y", "z"]], axis=1), rtol=1e-12)
+    assert np.sqrt((frame["error"] ** 2).mean()) == pytest.approx(found.rms)
+    some = found.rows(torch.tensor([3, 1])).to_frame()
+    assert list(some["row"]) == [row for row in (8, 6) for _ in range(data.markers)]
+
+
+def test_poses_have_angles_and_rotation_vectors(posed: Case) -> None:
+    data = posed.test[:6]
+    frame = dc.evaluate(posed.model, data).to_frame()
+    assert list(frame.columns)[-2:] == ["error", "angle"]
+    turns = Rotation.from_matrix(posed.model.poses(data.q)[:, :3, :3].detach().numpy())
+    measured = Rotation.from_matrix(data.poses[:, :3, :3].numpy())  # pyright: ignore[reportOptionalSubscript]
+    np.testing.assert_allclose(frame["angle"], (turns.inv() * measured).magnitude(), atol=1e-9)
+    table, predicted = data.to_frame(), posed.model.to_frame(data.q)
+    for found, expected in ((table, measured), (predicted, turns)):
+        again = Rotation.from_rotvec(found[["rx", "ry", "rz"]].to_numpy(copy=True))
+        np.testing.assert_allclose(again.as_matrix(), expected.as_matrix(), rtol=0, atol=1e-9)
+    _, covariance = posed.model.predict_poses(data.q)
+    std = predicted[[f"std_{name}" for name in ("x", "y", "z", "rx", "ry", "rz")]]
+    np.testing.assert_allclose(std**2, covariance.diagonal(dim1=1, dim2=2), rtol=1e-9)
+
+
+def test_measurements_come_back(pair: Case) -> None:
+    data = pair.train[[4, 2, 9]].with_joint_names(pair.robot.joint_names)
+    frame = data.to_frame()
+    assert list(frame.index) == [4, 2, 9]
+    assert list(frame.columns)[6:] == [f"marker{k}_{axis}" for k in (1, 2) for axis in "xyz"]
+    again = dc.Measurements(frame, frame.iloc[:, 6:].to_numpy().reshape(3, 2, 3), pair.robot.joint_names)
+    assert torch.equal(again.q, data.q)
+    assert torch.equal(again.points, data.points)
+    known = dc.Measurements(data.q, data.points, std=1e-5).to_frame()
+    assert (known[[f"std_marker{k}_{axis}" for k in (1, 2) for axis in "xyz"]] == 1e-5).all(axis=None)
+
+
+def test_predictions_keep_the_index(arm: Case) -> None:
+    frame = pd.DataFrame(arm.test.q[:3].numpy(), columns=list(arm.robot.joint_names), index=["a", "b", "c"])
+    found = arm.model.to_frame(frame)
+    mean, covariance = arm.model.predict(arm.test.q[:3])
+    assert list(found.index) == ["a", "b", "c"]
+    np.testing.assert_allclose(found[["x", "y", "z"]], mean[:, 0])
+    np.testing.assert_allclose(found[["std_x", "std_y", "std_z"]] ** 2, covariance[:, 0].diagonal(dim1=1, dim2=2))
+
+
+def test_without_pandas_there_is_one_sentence(arm: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    for call in (arm.test.to_frame, dc.evaluate(arm.model, arm.test).to_frame, lambda: arm.model.to_frame(arm.test.q)):
+        with pytest.raises(ImportError, match=r"data frames need pandas: pip install .diffeo_calib\[notebooks\]"):
+            call()

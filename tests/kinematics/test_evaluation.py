@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from kind_bank import kind_named, marked
 from product_bank import Case
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -20,6 +23,8 @@ from diffeo_calib.kinematics.evaluation import (
 )
 from diffeo_calib.kinematics.joint_ranges import joints_outside_range, refuse_other_angles, warn_outside_range
 from diffeo_calib.measurements.poses import mark_points, rotation_matrices, transforms
+from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.measurements.sockets import Sockets
 
 
 @pytest.mark.parametrize(("rows", "markers"), [(1, 1), (2, 1), (7, 3), (200, 2)])
@@ -39,17 +44,6 @@ def test_numbers_are_numpy_s(rows: int, markers: int) -> None:
     assert isinstance(found.rms, float)
 
 
-def test_a_perfect_model_has_no_error() -> None:
-    data = dc.Measurements([[0.1], [0.2]], [[1.0, 2, 3], [4, 5, 6]])
-    found = dc.evaluate(lambda _: data.points, data)
-    assert (found.rms, found.mean, found.median, found.p95, found.max) == (0, 0, 0, 0, 0)
-
-
-def test_models_that_carry_a_gradient_can_be_evaluated(arm: Case) -> None:
-    data = arm.test.rows(slice(3))
-    assert dc.evaluate(lambda q: arm.model(q.requires_grad_(False).clone().requires_grad_()), data).rms > 0
-
-
 @pytest.mark.slow
 def test_another_number_of_markers(arm: Case, pair: Case) -> None:
     message = (
@@ -61,12 +55,7 @@ def test_another_number_of_markers(arm: Case, pair: Case) -> None:
         dc.evaluate(pair.model, arm.test)
 
 
-def test_another_number_of_joints(arm: Case) -> None:
-    with pytest.raises(InputError, match=r"`q` must have shape \(N, 6\)"):
-        dc.evaluate(arm.model, dc.Measurements(arm.test.q[:, :5], arm.test.points))
-
-
-# --- poses --------------------------------------------------------------------------------------------------------
+# --- poses ----------------------------------------------------------------------------------------------------------
 
 
 def moved(poses: Tensor, shifts: np.ndarray, vectors: np.ndarray) -> Tensor:
@@ -109,21 +98,6 @@ def test_tiny_errors_of_poses_are_not_lost() -> None:
     assert found.max == pytest.approx(math.sqrt(3) * 1e-9, rel=1e-4)
 
 
-def test_points_have_no_angles() -> None:
-    data = dc.Measurements([[0.1]], [[1.0, 2, 3]])
-    found = dc.evaluate(lambda _: data.points + 1.0, data)
-    assert found.angles is found.angle_rms is found.angle_median is found.angle_p95 is found.angle_max is None
-    assert repr(found) == "Evaluation(1 distances in m: rms=1.732, median=1.732, p95=1.732, max=1.732)"
-
-
-def test_angles_are_shown_in_degrees() -> None:
-    poses = random_poses(np.random.default_rng(0), 2)
-    data = dc.Measurements.from_poses([[0.0], [1.0]], poses)
-    turned = moved(poses, np.zeros((2, 3)), np.array([[0.0, 0.0, math.radians(3)]] * 2))
-    text = repr(dc.evaluate(lambda _: mark_points(turned, 0.1), data))
-    assert text.endswith("; 2 angles in deg: rms=3, median=3, p95=3, max=3)")
-
-
 @pytest.mark.slow
 def test_poses_and_points_are_not_confused(arm: Case, posed: Case) -> None:
     points = dc.Measurements(posed.test.q, posed.test.points)  # three markers, as far as shapes go
@@ -140,7 +114,7 @@ def test_predictions_on_a_line_have_no_orientation(posed: Case) -> None:
         dc.evaluate(lambda q: q.new_zeros(len(q), 3, 3), posed.test)
 
 
-# --- calibrated models --------------------------------------------------------------------------------------------
+# --- calibrated models ----------------------------------------------------------------------------------------------
 
 
 def test_rows_of_the_fit_are_recognised_up_to_rounding(arm: Case) -> None:
@@ -213,20 +187,53 @@ def test_implausible_errors_have_a_sentence(arm: Case) -> None:
         dc.evaluate(arm.model, far)
 
 
-def test_implausible_orientations_have_a_sentence(posed: Case) -> None:
-    """Positions fit, but the rotations were read in a wrong convention."""
-    assert implausible(posed.model, posed.test, dc.evaluate(posed.model, posed.test)) is None
-    poses = posed.test.poses
-    assert poses is not None
-    turned = dc.Measurements.from_poses(
-        posed.test.q, transforms(poses[:, :3, :3].mT, poses[:, :3, 3]), lever=posed.test.lever or 0.0
-    )
-    text = implausible(posed.model, turned, dc.evaluate(posed.model, turned)) or ""
-    assert "degrees by the model's own" in text
-    assert "`convention` and `rotation_angle`" in text
-
-
 @pytest.mark.parametrize("function", [dc.rows_used_in_fit, dc.joints_outside_range])
 def test_ranges_belong_to_a_model(function: object) -> None:
     with pytest.raises(InputError, match="`model`: expected a calibrated model of a robot, got int"):
         function(3, [[0.0]])  # pyright: ignore[reportCallIssue]
+
+
+# --- joint values in the other unit of angles are refused by every verb that compares rows with a model -------------
+
+
+def in_other_unit(rows: Any, factor: float) -> Any:
+    if isinstance(rows, dc.Observations):
+        return dc.Observations([in_other_unit(part, factor) for part in rows.parts], rows.index)
+    return with_attributes(rows, q=factor * rows.q)
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(math.pi / 180, "radians"), (180 / math.pi, "degrees")])
+@pytest.mark.parametrize("name", marked("ball in sockets", "positions", "heights", "several kinds"))
+def test_rows_in_another_unit_of_angles_are_named(name: str, factor: float, unit: str) -> None:
+    """Refused; small values of some joints lie in the ranges of the fit, too, and are warned of."""
+    kind = kind_named(name)
+    words = f"the joint values seem to be {unit}.*check the angle unit"
+    for verb in (dc.evaluate, dc.CalibratedKinematics.registered, dc.recalibrate, dc.compare):
+        with pytest.raises((MeasurementError, dc.DiffeoCalibWarning), match=words):
+            verb(kind.model, in_other_unit(kind.new, factor))
+
+
+def test_rows_of_another_region_are_not_taken_for_degrees() -> None:
+    """All of them are outside the joint ranges of the fit, and within these if divided by 57."""
+    kind = kind_named("positions")
+    q = kind.new.q.clone()
+    low, high = kind.model.configurations[:, 1].amin(), kind.model.configurations[:, 1].amax()
+    q[:, 1] = 0.5 * (low + high) + math.pi  # on the other side of the axis, whatever turns it has made
+    assert bool(joints_outside_range(kind.model, q).any(1).all())
+    refuse_other_angles(kind.model, q)
+
+
+MISTAKES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
+    "seem to be radians that were converted": lambda q: q * math.pi / 180,
+    "seem to be degrees": lambda q: q * 180 / math.pi,
+    "with joints=.waist_joint,elbow_joint,shoulder_joint,forearm_roll_joint,": lambda q: q[:, [0, 2, 1, 3, 4, 5]],
+}
+
+
+@pytest.mark.parametrize("words", MISTAKES)
+@pytest.mark.filterwarnings("ignore:no distance between sockets", "ignore:shoulder_joint. hardly moved")
+def test_rows_in_sockets_with_wrong_joint_values_are_refused(words: str) -> None:
+    kind = kind_named("ball in sockets")
+    data = with_attributes(kind.data, sockets=Sockets(kind.data.sockets.names))
+    with pytest.raises(MeasurementError, match=words):
+        dc.calibrate(kind.robot, with_attributes(data, q=MISTAKES[words](data.q)), hyperparameters=kind.scales)

@@ -1,14 +1,22 @@
 """The nominal map of a robot: geometry with gravity sag, and its derivatives by joints and parameters."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import pytest
 import torch
+from deformation_bank import deformation_of, model_of, waves_of
+from math_bank import central_difference
 from robots_bank import CHAINS, draw, every_chain
 from torch import Tensor
+from torch.testing import assert_close
 
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.robots import Chain, Geometry
+from diffeo_calib.robots.gear_waves import GearWaves
 from diffeo_calib.robots.se3 import twist_transform
 
 N = 4
@@ -72,29 +80,6 @@ def test_sensitivities_against_autograd(chain: Chain, size: float) -> None:
 
 
 @every_chain
-def test_jacobian_moves_with_the_coefficients(chain: Chain) -> None:
-    """The second derivative by joints and coefficients at zero, by finite differences."""
-    nominal, x, theta = setting(chain)
-    theta[: nominal.geometry.size] = 0.0
-    h = 1e-6
-    change = (nominal.jacobian(x, h * theta) - nominal.jacobian(x, -h * theta)) / (2 * h)
-    live = x.clone().requires_grad_()
-    expected = by_rows(torch.einsum("nmk,k->nm", nominal.sensitivities(live, 0 * theta), theta), live)
-    torch.testing.assert_close(change, expected, rtol=1e-6, atol=1e-7)
-
-
-@every_chain
-def test_without_parameters_it_is_the_geometry(chain: Chain) -> None:
-    nominal, x, _ = setting(chain)
-    theta = torch.zeros(nominal.parameters, dtype=torch.float64)
-    geometry = nominal.geometry
-    assert torch.equal(nominal(x, theta), geometry.points(x).flatten(1))
-    assert torch.equal(nominal.jacobian(x, theta), geometry.jacobian(x).flatten(1, 2))
-    sensitivities = nominal.sensitivities(x, theta)[..., : geometry.size]
-    assert torch.equal(sensitivities, geometry.sensitivities(x).flatten(1, 2))
-
-
-@every_chain
 def test_without_elasticity_it_is_the_geometry(chain: Chain) -> None:
     geometry = geometry_of(chain)
     rigid, x, theta = GeometryMap(geometry), draw(N, chain.n, seed=13), draw(geometry.size, seed=14, size=0.1)
@@ -108,29 +93,7 @@ def test_without_elasticity_it_is_the_geometry(chain: Chain) -> None:
     assert torch.equal(elastic.jacobian(x, longer), rigid.jacobian(x, theta))
 
 
-@every_chain
-def test_split(chain: Chain) -> None:
-    nominal, _, theta = setting(chain)
-    errors, coefficients = nominal.split(theta)
-    assert nominal.elasticity is not None
-    assert len(errors) == nominal.geometry.size
-    assert len(coefficients) == nominal.elasticity.size
-    assert torch.equal(torch.cat([errors, coefficients]), theta)
-    rigid = GeometryMap(nominal.geometry)
-    assert len(rigid.split(errors)[1]) == 0
-
-
-@every_chain
-def test_no_rows(chain: Chain) -> None:
-    nominal, x, theta = setting(chain)
-    none = x[:0]
-    for values in (theta, 0 * theta):
-        assert nominal(none, values).shape == (0, 6)
-        assert nominal.jacobian(none, values).shape == (0, 6, chain.n)
-        assert nominal.sensitivities(none, values).shape == (0, 6, nominal.parameters)
-
-
-# --- parameters that differ from row to row -----------------------------------------------------------------------
+# --- parameters that differ from row to row -------------------------------------------------------------------------
 
 
 @every_chain
@@ -149,3 +112,56 @@ def test_sensitivities_per_row_are_derivatives_of_that_row() -> None:
     expected = by_rows(geometry.points(x, theta).flatten(1), theta)
     actual = geometry.sensitivities(x, theta.detach()).flatten(1, 2)
     torch.testing.assert_close(actual, expected, rtol=1e-11, atol=1e-12)
+
+
+# --- waves of gears in the nominal map: derivatives, names, transmission errors -------------------------------------
+
+
+@every_chain
+@pytest.mark.parametrize("elastic", [True, False])
+def test_derivatives(chain: Chain, elastic: bool) -> None:
+    nominal = deformation_of(chain, elastic=elastic, waves=True).spec.nominal
+    x, theta = draw(4, chain.n, seed=1, size=2.0), draw(nominal.parameters, seed=2, size=0.03)
+    dx, dtheta = draw(4, chain.n, seed=3), draw(nominal.parameters, seed=4)
+    by_x = central_difference(lambda q: nominal(q, theta), x, dx)
+    assert_close((nominal.jacobian(x, theta) @ dx[:, :, None])[..., 0], by_x, rtol=0, atol=1e-7)
+    by_theta = central_difference(lambda t: nominal(x, t), theta, dtheta)
+    assert_close(nominal.sensitivities(x, theta) @ dtheta, by_theta, rtol=0, atol=1e-9)
+
+
+def test_a_wave_turns_its_joint_and_nothing_else() -> None:
+    chain = CHAINS["arm"]
+    plain, waves = deformation_of(chain).spec.nominal, waves_of(chain)
+    assert isinstance(plain, GeometryMap)
+    with_waves = GeometryMap(plain.geometry, elastic=True, waves=waves)
+    x, theta, c = draw(4, chain.n, seed=1, size=2.0), draw(plain.parameters, seed=2, size=0.03), draw(6, seed=3)
+    turned = x.clone()
+    for k, (joint, w) in enumerate(waves.to_config()):
+        turned[:, int(joint)] += c[2 * k] * (w * x[:, int(joint)]).cos() + c[2 * k + 1] * (w * x[:, int(joint)]).sin()
+    assert_close(with_waves(x, torch.cat([theta, c])), plain(turned, theta), rtol=0, atol=1e-14)
+
+
+def test_lines_have_names() -> None:
+    model = model_of(CHAINS["arm"], waves=True)
+    found = {line.frequency: line for line in gear_lines(model)}
+    C, S = model.nominal.wave_coefficients(model.map.deformation.momenta.theta)[2:4].tolist()
+    last, largest = model.robot.joint_names[-1], gear_lines(model)
+    assert [line.displacement for line in largest] == sorted((x.displacement for x in largest), reverse=True)
+    assert found[14.7].amplitude == pytest.approx((C * C + S * S) ** 0.5)
+    assert found[14.7].multiple == 2
+    assert found[14.7].sentence.startswith(f"{last}: gear line 14.7 per rad = 2 x 7.35, ")
+    assert found[7.3].multiple == found[5.1].multiple == 1
+    values = torch.linspace(-1.0, 1.0, 7, dtype=torch.float64)
+    wave = found[5.1].amplitude * (5.1 * values - found[5.1].phase).cos()
+    first, plain = model.robot.joint_names[0], model_of(CHAINS["arm"])
+    assert_close(model.transmission(first, values), plain.transmission(first, values) + wave, rtol=0, atol=1e-12)
+    assert gear_lines(plain) == ()
+
+
+def test_waves_that_cannot_be() -> None:
+    for waves in (((-1,), (5.0,)), ((0,), (0.0,)), ((0,), (float("nan"),))):
+        with pytest.raises(InputError, match="waves of gears"):
+            GearWaves(*waves)
+    chain = CHAINS["arm"]
+    with pytest.raises(InputError, match="joints of gear waves"):
+        GeometryMap(deformation_of(chain).spec.nominal.geometry, waves=GearWaves((chain.n,), (5.0,)))

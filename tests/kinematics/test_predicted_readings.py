@@ -118,19 +118,6 @@ def test_a_payload_of_all_rows_is_a_number(command: Command, tmp_path: Any) -> N
     np.testing.assert_allclose(np.stack([table[axis] for axis in "xyz"], 1), expected, atol=1e-3)
 
 
-@pytest.mark.parametrize(("name", "own"), [("heights", True), ("positions", False)])
-def test_positions_without_a_device_are_said_to_be_in_the_models_own_frame(
-    name: str, own: bool, command: Command, tmp_path: Any
-) -> None:
-    kind = kind_named(name)
-    assert kind.model.own_frame is own
-    path = tmp_path / "q.csv"
-    path.write_text("\n".join(",".join(map(str, r)) for r in [kind.robot.joint_names, *kind.q(2).rad2deg().tolist()]))
-    done = command("predict", kind.file, path, *UNITS, "-o", tmp_path / "p.csv")
-    assert done.code == 0, done.err
-    assert ("they are in the model's own frame" in " ".join(done.out.split())) is own
-
-
 def test_devices_of_a_kind_that_is_not_registered_are_warned_of(tmp_path: Any, monkeypatch: Any) -> None:
     kind = kind_named("heights")
     dc.save(kind.model, tmp_path / "m.safetensors")

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import re
+from dataclasses import replace
 from datetime import datetime, timedelta, timezone
+from math import inf, isnan, nan
 from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from product_bank import Case
+from safetensors import safe_open
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.kinematics.provenance import Provenance
+from diffeo_calib.kinematics.provenance import Provenance, Summary
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 
-ENTRIES: dict[str, str] = {
+ORIGIN: dict[str, str] = {
     "date": "2026-11-22T10:00:00+00:00",
     "version": "0.1.0",
     "table_sha256": "ab" * 32,
@@ -37,7 +41,7 @@ def test_a_calibration_says_when_and_from_what(arm: Case) -> None:
 
 
 def test_every_copy_keeps_it(arm: Case, tmp_path: Path) -> None:
-    provenance = Provenance(**ENTRIES)
+    provenance = Provenance(**ORIGIN)
     model = dc.CalibratedKinematics(
         arm.robot, arm.model.map, arm.model.summary, tool=[0, 0, 0.1], provenance=provenance
     )
@@ -71,26 +75,108 @@ def test_the_hash_is_that_of_the_file_or_of_the_arrays(arm: Case, tmp_path: Path
     assert len({arrays.sha256, of_the_file, *(other.sha256 for other in others)}) == 5
 
 
-def test_one_line_for_people() -> None:
-    line = Provenance(**ENTRIES).sentence("ur10", 442)
-    assert line == (
-        "fitted 2026-11-22 with diffeo_calib 0.1.0 to robot 'ur10', 442 rows, table sha256 abababababab...; "
-        "note: serial 17"
-    )
-
-
 def test_entries_that_cannot_be_read() -> None:
-    assert Provenance.from_dict(ENTRIES).to_dict() == {**ENTRIES, "command": "", "table": ""}
-    for entries in ({}, ENTRIES | {"mood": "good"}, 3):
+    assert Provenance.from_dict(ORIGIN).to_dict() == {**ORIGIN, "command": "", "table": ""}
+    for entries in ({}, ORIGIN | {"mood": "good"}, 3):
         with pytest.raises(InputError, match="the entry provenance"):
             Provenance.from_dict(entries)  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="the entry 'note' of the provenance: expected text, got 3"):
-        Provenance.from_dict(ENTRIES | {"note": 3})
+        Provenance.from_dict(ORIGIN | {"note": 3})
 
 
-def test_a_note_is_text(arm: Case) -> None:
-    with pytest.raises(InputError, match="`note`: expected text, got int"):
-        dc.calibrate(arm.robot, arm.train, note=3)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InputError, match="`note`: expected at most 10000 characters, got 20000"):
-        dc.calibrate(arm.robot, arm.train, note="ab" * 10_000)
-    assert torch.equal(arm.model.configurations, arm.train.q)
+# --- the summary of a calibration: as a dictionary, from dictionaries of every age, and in model files --------------
+
+SUMMARY = Summary(
+    registration_rms=8e-4,
+    geometry_rms=4e-4,
+    diffeomorphic_rms=6e-5,
+    leave_one_out_rms=1.1e-4,
+    outliers=2,
+    noise_degrees_of_freedom=7.5,
+    coupling_residual=1e-6,
+    end_residual=2e-6,
+    energy=640.0,
+    status="converged",
+    scales="given",
+    rows=60,
+    parts={"geometry": 3e-4, "task space": 1e-5},
+    effective_parameters=88.0,
+)
+ENTRIES = {
+    "registration rms [m]": 8e-4,
+    "geometry rms [m]": 4e-4,
+    "diffeomorphic rms [m]": 6e-5,
+    "leave-one-out rms [m]": 1.1e-4,
+    "outliers": 2,
+    "noise degrees of freedom": 7.5,
+    "coupling residual": 1e-6,
+    "end residual": 2e-6,
+    "energy": 640.0,
+    "status": "converged",
+    "scales": "given",
+    "rows": 60,
+    "geometry [m]": 3e-4,
+    "task space [m]": 1e-5,
+    "effective parameters": 88.0,
+}
+"""As model files of version 3 hold them."""
+
+
+def test_entries_are_named_with_their_units() -> None:
+    assert list(SUMMARY.to_dict().items()) == list(ENTRIES.items())
+    assert Summary.from_dict(ENTRIES) == SUMMARY
+
+
+def test_gaussian_noise_and_what_is_unknown() -> None:
+    gaussian = replace(SUMMARY, noise_degrees_of_freedom=inf, effective_parameters=None)
+    entries = gaussian.to_dict()
+    assert entries["noise degrees of freedom"] == "infinite"
+    assert "effective parameters" not in entries
+    assert Summary.from_dict(json.loads(json.dumps(entries))) == gaussian
+    coarse = Summary.from_dict(replace(SUMMARY, coupling_residual=nan).to_dict())
+    assert isnan(coarse.coupling_residual)
+
+
+def test_the_first_files_of_version_3_knew_less() -> None:
+    old = {k: v for k, v in ENTRIES.items() if k not in ("noise degrees of freedom", "effective parameters")}
+    found = Summary.from_dict(old)
+    assert found == replace(SUMMARY, noise_degrees_of_freedom=None, effective_parameters=None)
+    assert found.to_dict() == old
+
+
+def test_entries_of_a_summary_that_cannot_be_read() -> None:
+    for name in ("outliers", "energy", "status", "scales", "rows"):
+        with pytest.raises(InputError, match=f"the summary has no entry '{name}'"):
+            Summary.from_dict({k: v for k, v in ENTRIES.items() if k != name})
+    wrong: tuple[tuple[str, object, str], ...] = (
+        ("rows", 60.0, "a whole number, got 60.0"),
+        ("rows", True, "a whole number, got True"),
+        ("energy", None, "a number, got None"),
+        ("geometry [m]", "0.1", "a number, got '0.1'"),
+        ("status", 3, "text, got 3"),
+    )
+    for name, value, expected in wrong:
+        with pytest.raises(InputError, match=f"the entry '{re.escape(name)}' of the summary: expected {expected}"):
+            Summary.from_dict(ENTRIES | {name: value})
+    with pytest.raises(InputError, match=r"an entry of the summary: expected coupling residual, .* got 'note'"):
+        Summary.from_dict(ENTRIES | {"note": "mine"})
+
+
+def header(path: Path) -> dict[str, Any]:
+    with safe_open(path, framework="pt") as file:
+        return json.loads(file.metadata()["diffeo_calib"])
+
+
+@pytest.mark.parametrize(
+    "summary", [SUMMARY, replace(SUMMARY, noise_degrees_of_freedom=None, effective_parameters=None), None]
+)
+def test_a_model_file_holds_the_summary(summary: Summary | None, arm: Case, tmp_path: Path) -> None:
+    """Format version 3: readers of any age find the entries they know."""
+    path = tmp_path / "model.safetensors"
+    dc.save(dc.CalibratedKinematics(arm.robot, arm.model.map, summary), path)
+    assert header(path)["format"] == 3
+    assert header(path)["report"] == ({} if summary is None else summary.to_dict())
+    again = dc.load(path)
+    assert isinstance(again, dc.CalibratedKinematics)
+    assert again.summary == summary
+    assert again.report == ({} if summary is None else summary.to_dict())

@@ -144,26 +144,6 @@ def test_readings_that_are_noise() -> None:
         placed(replace(data, values=9.0 * normal(ROWS, 1, seed=6).abs()), points(data.q))
 
 
-def test_rows_keep_together_and_are_told_apart() -> None:
-    data = readings("distance")
-    twice = replace(data, q=torch.cat([data.q[:1], data.q[:1], data.q[2:]]))
-    train, test = twice.split(0.5, seed=1)
-    both = set(train.lines.tolist()) | set(test.lines.tolist())
-    assert both == set(range(ROWS))
-    assert ({0, 1} <= set(train.lines.tolist())) or ({0, 1} <= set(test.lines.tolist()))
-    assert data.sha256 == readings("distance").sha256
-    assert data.sha256 != replace(data, values=2 * data.values).sha256
-    assert twice.copies() == []
-    assert replace(data, q=data.q * 0, values=data.values * 0).copies()[0] == (0, 2)
-
-
-@pytest.mark.parametrize("kind", ["distance", "height", "image"])
-def test_places_are_said_with_their_frame(kind: str) -> None:
-    devices = KINDS[kind].at(readings(kind), points(Q)[:, 0])
-    said = devices.sentence(1, torch.ones_like(devices.deviations), "the measuring frame")
-    assert "in the measuring frame" in said
-
-
 def test_cameras_start_in_front_of_points_that_are_not_those() -> None:
     """Eight images each, points of a ball that is thought elsewhere: projection alone puts some behind the camera."""
     truth = Cameras(("left", "right"), constants("image"), torch.ones(6).double())

@@ -10,12 +10,17 @@ import torch
 from product_bank import Case, simulated
 from robots_bank import tool_frame
 from torch import Tensor
+from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints
-from diffeo_calib.kinematics.tool import tool_points
+from diffeo_calib.kinematics.tool import REFERENCE_ROWS, covariance_without_placement, tool_points, tool_transform
+from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import angle_between, mark_points, pose_directions, poses_from_marks
+from diffeo_calib.robots.se3 import twist_transform
+from diffeo_calib.runtime.program import TOOL_LEVER
 
 LEVER = 0.1
 FRAMES = ("base", "measuring")
@@ -40,21 +45,6 @@ def test_a_tool_that_was_never_measured(pair: Case) -> None:
     found = pair.model.tool_poses(pair.test.q, tool_frame(), "measuring")
     truth = true_poses(40, 2, pair.test.q, tool_frame())
     assert float(angle_between(found[:, :3, :3], truth[:, :3, :3]).square().mean().sqrt().rad2deg()) < 0.05
-
-
-def test_one_marker_leaves_the_roll_of_the_last_joint_to_the_prior(arm_200: Case) -> None:
-    """Known well along the last axis, not beside it; the predicted deviations say so."""
-    axis, along, beside = arm_200.robot.axes[-1], torch.eye(4, dtype=torch.float64), tool_frame()
-    along[:3, 3] = simulated(200)[0].truth.tool[0] + 0.1 * axis
-    truth = true_poses(200, 1, arm_200.test.q, along)
-    along[:3, 3] = arm_200.model.geometry.tool[0] + 0.1 * axis  # the same place beside the marker
-    found = arm_200.model.tool_poses(arm_200.test.q, along, "measuring")
-    assert float((found - truth)[:, :3, 3].norm(dim=1).square().mean().sqrt()) < 2.0 * arm_200.held_out()[-1]
-    covariance = arm_200.model.predict_tool_poses(arm_200.test.q[:50], beside, "measuring")[1]
-    deviation = float(covariance[:, :3, :3].diagonal(dim1=1, dim2=2).sum(1).mean().sqrt())
-    error = position_error(arm_200, 200, 1, beside)
-    assert error > 3.0 * arm_200.held_out()[-1]  # beside the axis
-    assert error < 3.0 * deviation
 
 
 def test_points_of_the_markers_are_those_of_the_model(pair: Case) -> None:
@@ -109,12 +99,6 @@ def test_deviations_are_of_the_size_of_the_errors(arm_200: Case) -> None:
     assert bool((torch.linalg.eigvalsh(covariance) > 0).all())
 
 
-def test_covariances_in_both_frames_are_positive(arm: Case) -> None:
-    for frame in FRAMES:
-        covariance = arm.model.predict_tool_poses(arm.test.q[:20], tool_frame(), frame)[1]
-        assert bool((torch.linalg.eigvalsh(covariance) > 0).all())
-
-
 def test_covariance_in_the_base_frame_is_turned_into_its_axes(arm: Case) -> None:
     """Written out: the base's columns dropped, then shifts and turns about the base's axes."""
     model, q, tool = arm.model, arm.test.q[:6], tool_frame()
@@ -140,22 +124,66 @@ def test_a_tool_travels_with_the_model(arm: Case, tmp_path: Path) -> None:
     torch.testing.assert_close(again(q), arm.model(q), rtol=0, atol=0)
 
 
-@pytest.mark.parametrize(
-    ("tool", "frame", "message"),
-    [
+def test_wrong_tools_and_frames(arm: Case) -> None:
+    for tool, frame, message in (
         ([0.0, 0.1], "base", r"`tool` has the wrong shape: expected \(4, 4\) or \(3,\)"),
         (torch.ones(4, 4), "base", "the last row of the transform"),
         ([0.0, 0.0, float("nan")], "base", "`tool` has 1 value"),
         (None, "flange", "`frame`: expected 'base' or 'measuring', got 'flange'"),
-    ],
-)
-def test_wrong_tools_and_frames(arm: Case, tool: object, frame: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        arm.model.tool_poses(arm.test.q, tool, frame)
+    ):
+        with pytest.raises(InputError, match=message):
+            arm.model.tool_poses(arm.test.q, tool, frame)
 
 
-def test_no_configurations(arm: Case) -> None:
-    none = arm.test.q[:0]
-    assert arm.model.tool_poses(none).shape == (0, 4, 4)
-    assert arm.model.tool_jacobian(none).shape == (0, 6, 6)
-    assert [t.shape for t in arm.model.predict_tool_poses(none)] == [(0, 4, 4), (0, 6, 6)]
+# --- apart from where the base stands and how the tool is mounted ---------------------------------------------------
+
+TOOL = tool_transform([0.15, -0.12, 0.16])
+STEP = 1e-5
+
+
+def reference(case: Case) -> Tensor:
+    known = case.model.configurations
+    count = min(len(known), REFERENCE_ROWS)
+    return known[torch.linspace(0, len(known) - 1, count, dtype=torch.float64).round().long()]
+
+
+def points(poses: Tensor) -> Tensor:
+    """Coordinates (9 N,) of three points of each pose."""
+    return mark_points(poses, TOOL_LEVER).flatten()
+
+
+def moved(case: Case, q: Tensor, twist: Tensor, *, of: str) -> Tensor:
+    """Coordinates of the tool after a motion of the base or of the tool on the flange."""
+    step = twist_transform(STEP * twist[None])[0]
+    if of == "base":
+        return points(step @ case.model.tool_poses(q, TOOL, "measuring"))
+    return points(case.model.tool_poses(q, step @ TOOL, "measuring"))
+
+
+def test_motions_of_base_and_tool_count_for_nothing(arm: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A decimetre and 0.1 rad of each, by finite differences, added to what the model does not know."""
+    q = arm.test.q[:4]
+    before = covariance_without_placement(arm.model, q, TOOL)
+    rows, twists = torch.cat([reference(arm), q]), torch.eye(6, dtype=torch.float64)
+    slopes = [
+        (moved(arm, rows, twist, of=of) - moved(arm, rows, -twist, of=of)) / (2 * STEP)
+        for of in ("base", "tool")
+        for twist in twists
+    ]
+    motion = 0.1 * torch.stack(slopes, 1)
+    known = FittedMap.covariance_between
+
+    def wider(self: FittedMap, at: Linearisation, other: Linearisation | None = None) -> Tensor:
+        return known(self, at, other) + motion @ motion.mT
+
+    monkeypatch.setattr(FittedMap, "covariance_between", wider)
+    after = covariance_without_placement(arm.model, q, TOOL)
+    assert_close(after, before, rtol=0, atol=1e-3 * float(before.diagonal(dim1=1, dim2=2).max()))
+
+
+def test_rows_alone_and_together_are_the_same(arm: Case) -> None:
+    """What is taught anew is found over the model's configurations, not over the commands."""
+    q = arm.test.q[:3]
+    together = covariance_without_placement(arm.model, q, TOOL)
+    alone = torch.cat([covariance_without_placement(arm.model, row[None], TOOL) for row in q])
+    assert_close(alone, together, rtol=1e-6, atol=1e-16)

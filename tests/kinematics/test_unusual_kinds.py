@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import reduce
+from functools import partial, reduce
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from product_bank import Case
+from product_bank import Case, usual_scales
+from section_5 import section_5
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -123,46 +124,35 @@ def test_every_kind_of_array(door: str, arm: Case) -> None:
         assert len(text) < 800, (door, name)
 
 
-def test_rows_are_chosen_by_integers_and_masks_only(arm: Case) -> None:
+def test_rows_and_seeds(arm: Case) -> None:
     for wrong in (1.5, "one", {"a": 1}, len, torch.zeros(2, device="meta"), None, [[0, 1], [2, 3]], [1 + 1j]):
         with pytest.raises(dc.DiffeoCalibError, match="the selection of rows"):
             arm.test.rows(wrong)
-
-
-@pytest.mark.parametrize("seed", [-1, 10**20, 1.5, "7", None, True])
-def test_seeds(seed: Any, arm: Case) -> None:
-    for call in (
-        lambda: arm.test.split(0.5, seed),
-        lambda: arm.test.folds(3, seed),
-        lambda: dc.calibrate(arm.robot, arm.train, seed=seed),
-    ):
-        with pytest.raises(InputError, match="`seed`: expected an integer from 0 to 9223372036854775807"):
-            call()
-
-
-@pytest.fixture(scope="module")
-def expected(arm: Case) -> Tensor:
-    """Points of a model of few rows, calibrated where derivatives are on."""
-    return dc.calibrate(arm.robot, arm.train[:14]).model(arm.test.q[:4])
+    for seed in (-1, 10**20, 1.5, "7", None, True):
+        calls: Any = (
+            partial(arm.test.split, 0.5),
+            partial(arm.test.folds, 3),
+            partial(dc.calibrate, arm.robot, arm.train),
+        )
+        for call in calls:
+            with pytest.raises(InputError, match="`seed`: expected an integer from 0 to 9223372036854775807"):
+                call(seed=seed)
 
 
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
-def test_modes_without_derivatives(mode: Callable[[], Any], arm: Case, expected: Tensor) -> None:
+def test_modes_without_derivatives(mode: Callable[[], Any], arm: Case) -> None:
     """Same results, and what was made there can be differentiated outside."""
-    q, x = arm.test.q[:4], elastic_rr.grid(4)
-    few = arm.train[:14]
+    q, few, scales = arm.test.q[:4], arm.train[:14], usual_scales(arm.robot)
+    expected = dc.calibrate(arm.robot, few, hyperparameters=scales).model(q)
     with mode():
         robot, data = dc.load_urdf(URDF_FILE, "base_link", "flange"), dc.Measurements(few.q * 1, few.points * 1)
-        model = dc.calibrate(robot, data).model
+        model = dc.calibrate(robot, data, hyperparameters=scales).model
         torch.testing.assert_close(model(q), expected, rtol=0, atol=0)
         assert model.predict(q)[1].isfinite().all()
         dc.compensate(model, model.tool_poses(q), q)
-        kernels = {"joint_kernel": dc.VonMises((1.0, 1.0)), "task_kernel": dc.Gaussian(0.5)}
-        problem = dc.Problem(elastic_rr.nominal, x, elastic_rr.real(x), noise=0.01, **kernels)  # pyright: ignore
-        fits = [dc.fit(problem, solver, dc.RK4(1)) for solver in (None, dc.LBFGS(max_iterations=5))]
+        fit = dc.fit(section_5(k=4), dc.LBFGS(max_iterations=5), dc.RK4(1))
         inside = q * 1
     slopes = torch.autograd.functional.jacobian(lambda row: model(row)[0, 0], q[:1])
     torch.testing.assert_close(slopes[:, 0], model.jacobian(q[:1])[0, 0])
-    assert model(inside.clone().requires_grad_()).requires_grad
-    for fit in fits:
-        assert fit.model(x.clone().requires_grad_()).requires_grad
+    for one, x in ((model, inside), (fit.model, elastic_rr.grid(4))):
+        assert one(x.clone().requires_grad_()).requires_grad

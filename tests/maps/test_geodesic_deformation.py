@@ -11,7 +11,6 @@ from math_bank import (
     case_named,
     central_difference,
     circle,
-    inverse_of,
     line,
     naive_rk4,
     normal,
@@ -165,21 +164,6 @@ def test_jacobian(arm: Arm) -> None:
 
 
 @every_arm
-def test_jacobian_at_the_controls(arm: Arm) -> None:
-    deformation, dx = arm.deform(), normal(N, arm.joints, seed=6)
-    difference = central_difference(deformation, deformation.x, dx)
-    actual = (deformation.jacobian(deformation.x) @ dx[:, :, None])[:, :, 0]
-    torch.testing.assert_close(actual, difference, rtol=1e-9, atol=1e-9)
-
-
-@every_arm
-def test_the_joint_flow_is_invertible(arm: Arm) -> None:
-    deformation = arm.deform()
-    found = inverse_of(deformation.joint_flow, deformation.xi)
-    torch.testing.assert_close(found, deformation.x, rtol=0, atol=1e-11)
-
-
-@every_arm
 def test_tangent_limit(arm: Arm) -> None:
     """k1(eps b, eps p, eps theta) - (k0 + eps (Dk0 K_V b + K_W p + S theta)) = O(eps^2)."""
     x, unit = arm.points(N, 2), arm.momenta(1.0)
@@ -220,13 +204,6 @@ def test_gram_of_the_tangent_model(arm: Arm) -> None:
     )
     actual = tangent.linearise(x).gram(tangent.linearise(y))
     torch.testing.assert_close(actual, expected, rtol=1e-12, atol=1e-12)
-
-
-@every_arm
-def test_gram_is_symmetric_and_positive_semi_definite(arm: Arm) -> None:
-    gram = arm.deform(0.3).linearise().gram()
-    torch.testing.assert_close(gram, gram.T, rtol=0, atol=1e-13)
-    assert float(torch.linalg.eigvalsh(gram).min()) >= -1e-10
 
 
 def perturbed(arm: Arm, x: Tensor, steps: int, eps: float, where: str) -> Tensor:
@@ -278,22 +255,6 @@ def test_linearisation_in_path_space(arm: Arm, where: str) -> None:
 
 
 @every_arm
-def test_response_is_that_of_its_own_fields(arm: Arm) -> None:
-    deformation = arm.deform(0.2)
-    lin = deformation.linearise()
-    expected = lin.sensitivity @ deformation.momenta.theta
-    for node, (q, a) in zip(lin.joint, deformation.joint_flow.nodes, strict=True):
-        v = arm.spec.joint_kernel.field(q, q, a)
-        torch.testing.assert_close(node.points, q, rtol=0, atol=1e-13)
-        expected = expected + node.weight * torch.einsum("imn,in->im", node.effect, v)
-    for node, (q, a) in zip(lin.task, deformation.task_flow.nodes, strict=True):
-        w = arm.spec.task_kernel.field(q, q, a)
-        torch.testing.assert_close(node.points, q, rtol=0, atol=1e-13)
-        expected = expected + node.weight * torch.einsum("ikl,il->ik", node.effect, w).reshape(expected.shape)
-    torch.testing.assert_close(deformation.linear_response(lin), expected, rtol=1e-12, atol=1e-13)
-
-
-@every_arm
 def test_momenta_are_the_end_momentum_transported_to_the_start(arm: Arm) -> None:
     """b = Theta_0^T mu, p = Phi_0^T mu, with Theta_0 = Dk1 of the whole path and Phi_0 = Dpsi."""
     deformation, mu = arm.deform(0.2), normal(N, arm.outputs, seed=9)
@@ -314,15 +275,6 @@ def test_a_flow_that_folds_space_is_named(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(deformation.joint_flow, "path", lambda _: (points, flat))
     with pytest.raises(NumericalError, match="folds space"):
         deformation.linearise(deformation.x)
-
-
-def test_momenta_as_one_vector() -> None:
-    one, two = ARMS["parameters"].momenta(1.0), ARMS["parameters"].momenta(3.0)
-    vector = one.flatten()
-    assert vector.numel() == sum(t.numel() for t in one.tensors)
-    for actual, expected in zip(one.unflatten(vector).tensors, one.tensors, strict=True):
-        torch.testing.assert_close(actual, expected, rtol=0, atol=0)
-    torch.testing.assert_close(one.towards(two, 0.25).flatten(), 1.5 * vector, rtol=1e-15, atol=0)
 
 
 @every_arm

@@ -13,7 +13,7 @@ from torch.testing import assert_close
 
 from diffeo_calib.measurements.csv.files import read_measurements
 from diffeo_calib.measurements.poses import angle_between
-from diffeo_calib.measurements.splits import REPEAT_TOLERANCE
+from diffeo_calib.measurements.rows import REPEAT_TOLERANCE
 from diffeo_calib.measurements.table import Measurements
 
 UR10_JOINTS = [

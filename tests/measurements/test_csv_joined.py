@@ -69,14 +69,6 @@ def test_a_name_in_both_files_says_of_which_it_is(tmp_path: Path) -> None:
     assert header == ["pose", "joints.x", "b", "places.x", "y", "z"]
 
 
-def test_times_more_than_half_a_step_apart_are_no_partners(tmp_path: Path) -> None:
-    joints, places = ("t,a", "0,1", "4,2", "8,3"), ("t,x", "0.5,1", "4.5,2", "11,3")
-    found = joined(tmp_path, joints, ("t,x", "0.5,1", "5.9,2", "8.4,9", "13,3"), by="t")
-    assert [cells[1:] for _, cells in read_cells(found, ",")[1]] == [["1", "1"], ["2", "2"], ["3", "9"]]
-    found = joined(tmp_path, joints, places, by="t")
-    assert [cells[1:] for _, cells in read_cells(found, ",")[1]] == [["1", "1"], ["2", "2"]]
-
-
 def test_several_partners_are_one_error(tmp_path: Path) -> None:
     with pytest.raises(MeasurementError, match=r"places\.csv', line 2, pose p3: expected one partner, got lines 4, 5"):
         joined(tmp_path, joints=(*JOINTS, "p3,7,8"))
@@ -123,10 +115,7 @@ def test_recordings_with_clocks_of_their_own(offset: float | None, tmp_path: Pat
     offset = offset or 0.0
     joints = ("t,n,a,c", *(f"{t:.4f},{k},{v:.4f},5" for k, (t, v) in enumerate(zip(one, at(one), strict=True))))
     seen = at(two)[:, None] * [1.0, 2.0, -3.0] + rng.normal(0.0, 0.01, (len(two), 3))
-    places = (
-        "t,x,y,z",
-        *(f"{t - offset:.4f},{x:.4f},{y:.4f},{z:.4f}" for t, (x, y, z) in zip(two, seen, strict=True)),
-    )
+    places = ("t,x,y,z", *(f"{t - offset:.4f},{x:.4f},{y:.4f},{z:.4f}" for t, (x, y, z) in zip(two, seen, strict=True)))
     found = joined(tmp_path, joints, places, "t")
     rows = np.array([[float(cell) for cell in cells] for _, cells in read_cells(found, ",")[1]])
     assert 8 <= len(rows) <= 13

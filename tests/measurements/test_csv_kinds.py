@@ -14,7 +14,6 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.csv.columns import Group
 from diffeo_calib.measurements.csv.files import read_measurements, read_observations, write_measurements
 from diffeo_calib.measurements.csv.images import ImageColumns
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns
@@ -133,13 +132,6 @@ def test_shuffled_rows_of_several_kinds_keep_their_order(tmp_path: Path) -> None
     assert found.kinds == data.kinds
 
 
-def test_a_round_trip_does_not_mix_frames(tmp_path: Path) -> None:
-    data = positions().with_sessions(["mon", "tue", "mon", "tue", "tue"])
-    write_measurements(tmp_path / "t.csv", data, SI, session="day")
-    again = dc.read_measurements(tmp_path / "t.csv", NAMES, list("xyz"), length="m", angle="rad", session="day")
-    assert again.device_names == data.device_names
-
-
 def test_set_ups_are_not_written_into_another_column(tmp_path: Path) -> None:
     data = KINDS["all"]()
     with pytest.raises(MeasurementError, match=says("distinct names", "socket")):
@@ -154,10 +146,6 @@ def test_a_corner_without_a_number_is_named(column: str, cells: str, tmp_path: P
     table = replace(SI, joints=NAMES, position=list("xyz"), readings=(ImageColumns((640, 480)),))
     with pytest.raises(MeasurementError, match=says("line 4", f"column '{column}'", "an empty cell")):
         read_observations(path, table)
-
-
-def test_whole_numbers_are_units() -> None:
-    assert float(Group(("a",), 1000).to_si(torch.tensor([[5.0]], dtype=torch.float64))) == 0.005
 
 
 LINES = """a,b,x,y,z,d,u,v,spot,who,sd
@@ -253,6 +241,8 @@ def test_read_readings_names_its_columns_and_units(tmp_path: Path) -> None:
     seen = dc.read_readings(path, NAMES, ["u", "v"], "image", std="d", intrinsics=(2.0, 4.0, 0.0, 0.0), **units)
     assert held(seen.reported_std).tolist() == [[400.0, 400.0], [500.0, 500.0]]
     assert dc.read_readings(path, NAMES, 0.0, "height", **units).values.tolist() == [[0.0], [0.0]]
+    with pytest.warns(dc.DiffeoCalibWarning, match=r"distances reach 500 m: they look like millimetres"):
+        dc.read_readings(path, NAMES, "d", length="m", angle="deg")
     wrong: tuple[tuple[Any, Any, dict[str, Any], str], ...] = (
         (("u",), "image", {}, "2 names of columns for 'image'"),
         ("d", "pose", {}, "`kind`"),

@@ -68,13 +68,6 @@ def test_deviations_of_rotations_are_read(names: Any, expected: Any, read: Reade
     assert held(data.covariance).isfinite().all()
 
 
-def test_one_column_of_deviations_is_three_alike(read: Reader) -> None:
-    text = "q1,q2,x,y,z,a,b,c,d,e,f\n0.1,0.2,1,2,3,10,20,30,0.5,0.5,0.5\n"
-    one, three = (read(text, **POSE, rotation_std=names) for names in (["d"], ["d", "e", "f"]))
-    assert torch.equal(held(one.rotation_std), held(three.rotation_std))
-    assert torch.equal(held(one.covariance), held(three.covariance))
-
-
 POSE_ROW = "0.1,0.2,1.0,2.0,3.0,10,20,30,1\n"
 QUATERNION = {"rotation": ["a", "b", "c", "d"], "convention": "quat_xyzw", "rotation_angle": None}
 MATRIX_HEADER = "q1,q2,x,y,z," + ",".join(f"r{i}" for i in range(9)) + "\n"
@@ -86,35 +79,24 @@ MATRIX = {"rotation": [f"r{i}" for i in range(9)], "convention": "matrix", "rota
     [
         ({"convention": None}, ("`rotation` is given", "`convention`", "'quat_xyzw'", "never guessed")),
         ({"rotation": None}, ("`convention` and `rotation_angle` without `rotation`", "leave")),
-        ({"rotation": None, "convention": None}, ("`rotation_angle` without `rotation`",)),
         (
             {"rotation": None, "convention": None, "rotation_angle": None, "rotation_std": ["d"] * 3},
             ("`rotation_std` without `rotation`",),
         ),
         ({"rotation_angle": None}, ("`rotation_angle` is missing", "'rad' or 'deg'", "unit of the joints")),
-        ({"convention": "rotvec", "rotation_angle": None}, ("`rotation_angle` is missing",)),
         ({"rotation_angle": "grad"}, ("`rotation_angle`", "'rad' or 'deg'", "got 'grad'")),
         ({"convention": "roll-pitch-yaw"}, ("`convention`", "got 'roll-pitch-yaw'")),
         ({"rotation": ["a", "b"]}, ("`rotation`", "3 names of columns for 'XYZ'", "got ['a', 'b']")),
-        ({"rotation": "abc"}, ("`rotation`", "got 'abc'")),
         ({"rotation": [1, 2, 3]}, ("`rotation`", "got [1, 2, 3]")),
         ({"convention": "quat_xyzw", "rotation_angle": None}, ("`rotation`", "4 names of columns for 'quat_xyzw'")),
         (QUATERNION | {"rotation_angle": "deg"}, ("`rotation_angle` beside convention 'quat_xyzw'", "leave it out")),
         (QUATERNION, ("table.csv', line 2, columns a, b, c, d", "length 1", "got 37.4299", "order of the columns")),
         ({"rotation": ["a", "b", "x"]}, ("distinct columns", "x")),
-        ({"rotation": ["a", "b", "e"]}, ("no column ['e']",)),
         ({"position": [["x", "y", "z"], ["a", "b", "c"]], "rotation": ["q1"] * 3}, ("one triple", "got 2 triples")),
-        ({"lever": 0}, ("`lever`", "above 0", "got 0")),
         ({"std": ["d", "q1"]}, ("`std`", "one per marker", "got ['d', 'q1']")),
-        ({"std": "d"}, ("`std`", "got 'd'")),
-        ({"std": []}, ("`std`", "got []")),
         ({"std": ["a"]}, ("distinct columns", "a")),
-        ({"std": [["d"], "d"]}, ("`std`",)),
         ({"rotation_std": ["d", "e"]}, ("`rotation_std`", "three, or one for all three axes", "got ['d', 'e']")),
-        (
-            {"rotation_std": ["d", "d", "d"]},
-            ("distinct columns", "d", "the deviations of all axes alone"),
-        ),
+        ({"rotation_std": ["d", "d", "d"]}, ("distinct columns", "d", "the deviations of all axes alone")),
         ({"rotation_std": [["d"], ["e", "f", "g"]]}, ("`rotation_std`", "as many names for every frame", "1 and 3")),
         (QUATERNION | {"rotation_std": ["u", "v", "w"]}, ("`rotation_angle` is missing", "`rotation_std`")),
     ],
@@ -129,7 +111,6 @@ def test_wrong_pose_option_is_one_clear_error(options: dict[str, Any], message: 
     ("text", "options", "message"),
     [
         (POSE_HEADER + POSE_ROW + "0,0,1,2,3,10,,30,1\n", {}, ("line 3, column 'b'", "an empty cell")),
-        (POSE_HEADER + POSE_ROW + "0,0,1,2,3,10,nan,30,1\n", {}, ("line 3, column 'b'", "'nan'")),
         (POSE_HEADER + POSE_ROW + "\n0,0,1,2,3,10,2,30,0\n", {"std": ["d"]}, ("line 4, column 'd'", "got '0'")),
         (
             POSE_HEADER + "0,0,1,2,3,10,2,30,-1\n" * 2,
@@ -142,7 +123,6 @@ def test_wrong_pose_option_is_one_clear_error(options: dict[str, Any], message: 
             ("line 3, columns r0, r1", "mirrored"),
         ),
         (MATRIX_HEADER + "0,0,1,2,3,2,0,0,0,2,0,0,0,2\n", MATRIX, ("line 2", "orthonormal", "without a scale")),
-        (POSE_HEADER + POSE_ROW * 2, {}, ("1 line(s)", "3 repeats 2")),
     ],
 )
 def test_wrong_pose_file_is_one_clear_error(

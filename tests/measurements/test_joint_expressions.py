@@ -87,15 +87,6 @@ def test_a_table_is_read_and_written_in_its_own_columns(tmp_path: Path) -> None:
     assert_close(read_joints(tmp_path / "new.csv", texts, table, kinds=kinds), expected + 0.01)
 
 
-def test_a_joint_twice_or_a_column_that_is_not_there(tmp_path: Path) -> None:
-    (tmp_path / "t.csv").write_text("a,b\n1,2\n")
-    table = TableFormat("m", "rad")
-    with pytest.raises(MeasurementError, match=r"no column \['c'\]"):
-        read_joints(tmp_path / "t.csv", ["a", "-{c}"], table)
-    with pytest.raises(MeasurementError, match="twice"):
-        read_joints(tmp_path / "t.csv", ["a", "a"], table)
-
-
 @pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("mm", 1e-3), ("cm", 1e-2), ("inch", 0.0254)])
 def test_units_of_length(unit: str, metres: float, tmp_path: Path) -> None:
     lengths = [f"{value / metres!r}" for value in (0.4, 1.0, 2.0, 3.0)]

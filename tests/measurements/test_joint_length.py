@@ -48,10 +48,7 @@ def test_what_is_written_is_read_back(units: tuple[str, str], tmp_path: Path) ->
 
 def test_programs_and_predictions_keep_the_unit(tmp_path: Path) -> None:
     robot, q = sliding_robot(), sliding_measurements(sliding_robot(), 3).q
-    path, table = (
-        tmp_path / "program.csv",
-        table_format(Units(length="mm", angle="deg", joint_length="m")),
-    )
+    path, table = (tmp_path / "program.csv", table_format(Units(length="mm", angle="deg", joint_length="m")))
     assert table == MIXED
     points = torch.ones(3, 1, 3, dtype=torch.float64)
     write_predictions(path, [(q, points, 1e-3 * points)], table, joints=robot.joint_names, kinds=robot.kinds)

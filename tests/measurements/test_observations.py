@@ -142,9 +142,11 @@ def test_payloads_names_lines_and_files(whole: Observations) -> None:
     assert laden.parts[4].joint_names == ("u", "v")
     assert laden.to("cpu").sha256 == laden.sha256
     assert len({laden.sha256, whole.sha256, whole.rows(range(28)).sha256, whole.rows([1, 0]).sha256}) == 4
-    assert laden.with_file_sha256("abc").sha256 == "abc"
-    assert laden.with_origin("table").origin == "table"
-    mixed = Observations.joined([whole.parts[0].with_file_sha256("a"), whole.parts[3].with_file_sha256("b")])
+    assert laden.with_columns(file_sha256="abc").sha256 == "abc"
+    assert laden.with_columns(origin="table").origin == "table"
+    mixed = Observations.joined(
+        [whole.parts[0].with_columns(file_sha256="a"), whole.parts[3].with_columns(file_sha256="b")]
+    )
     assert mixed.file_sha256 is None
 
 
@@ -212,7 +214,7 @@ def test_readings_iterate_split_fold_and_change() -> None:
     assert [row.device_names for row in data] == [["A"], ["A"], ["B"], ["B"], ["A"]]
     assert data[2:4].device.tolist() == [0, 0]
     assert sorted(line for _, test in data.folds(5) for line in test.lines.tolist()) == [0, 1, 2, 3, 4]
-    loaded = data.with_payload(2.0).with_file_sha256("x").with_tips(["left"]).with_line_numbers([9, 8, 7, 6, 5])
+    loaded = data.with_payload(2.0).with_columns(file_sha256="x").with_tips(["left"]).with_line_numbers([9, 8, 7, 6, 5])
     assert held(loaded[1:].payload).tolist() == [2.0] * 4
     assert (loaded.sha256, loaded.ball_tip, loaded[[0]].lines.tolist()) == ("x", "left", [9])
     assert len({data.sha256, data.with_payload(1.0).sha256, replace(data, std=None).sha256}) == 3

@@ -58,12 +58,6 @@ def test_frames_are_tables_of_one_frame_side_by_side() -> None:
     assert repr(data) == "Measurements(6 rows, 2 joints, poses on 3 tips, 3 of 18 sightings hidden)"
 
 
-def test_poses_follow_from_their_points() -> None:
-    frames = held(table().frames)
-    again = frames_of_points(points_of_frames(frames, 0.3), 0.3)
-    assert_close(again, frames, rtol=0, atol=1e-14, equal_nan=True)
-
-
 def test_directions_are_derivatives() -> None:
     """Of the poses by their points, against finite differences; no frame depends on the points of another."""
     frames = held(table(hidden=False).frames)[:, :2]

@@ -84,16 +84,15 @@ def test_what_was_decided_is_said(tmp_path: Path, kind: str, note: str) -> None:
 
 def test_lines_are_those_of_the_sheet(tmp_path: Path) -> None:
     _book(tmp_path / "t.xlsx")
-    with CsvLines(tmp_path / "t.xlsx", ",") as file:
-        (rows,) = file.blocks()
+    rows = CsvLines(tmp_path / "t.xlsx", ",").rows()
     assert [line for line, _ in rows] == list(range(4, 11))
 
 
 def test_poses_and_texts_have_columns(tmp_path: Path) -> None:
     poses = np.tile(np.eye(4), (3, 1, 1))
     np.savez(tmp_path / "t.npz", q=np.arange(6).reshape(3, 2), T=poses, day=np.array(["mon", "tue", "wed"]))
-    with CsvLines(tmp_path / "t.npz", ",") as file:
-        ((_, first), *_) = next(file.blocks())
+    file = CsvLines(tmp_path / "t.npz", ",")
+    (_, first), *_ = file.rows()
     assert file.header == ["q_1", "q_2", *(f"T_{row}{k}" for row in range(4) for k in range(4)), "day"]
     assert first == ["0", "1", *map(repr, poses[0].flatten().tolist()), "mon"]
 

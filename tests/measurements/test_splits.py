@@ -14,7 +14,7 @@ from table_bank import says, some
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.splits import FEWEST_PER_DEVICE, REPEAT_TOLERANCE
+from diffeo_calib.measurements.rows import FEWEST_PER_DEVICE, REPEAT_TOLERANCE
 from diffeo_calib.measurements.table import Measurements
 
 

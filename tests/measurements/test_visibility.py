@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from math import nan
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,9 +11,7 @@ from table_bank import Reader, says
 from torch.testing import assert_close
 
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
-from diffeo_calib.measurements.csv.files import read_measurements, write_measurements
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_format import TableFormat
 
 TWO = [("ax", "ay", "az"), ("bx", "by", "bz")]
 HEADER = "q1,q2,ax,ay,az,bx,by,bz\n"
@@ -72,16 +69,6 @@ def test_deviations_may_be_missing_where_a_marker_is_hidden() -> None:
         Measurements(q, places, std=std)
 
 
-def test_copies_are_found_with_hidden_markers() -> None:
-    q, places = points()
-    with pytest.warns(DiffeoCalibWarning, match="repeat an earlier row exactly"):
-        data = Measurements(np.concatenate([q, q[2:4]]), np.concatenate([places, places[2:4]]))
-    assert data.copies() == [(2, 12), (3, 13)]
-    places = np.concatenate([places, places[2:3]])
-    places[-1, ~np.isnan(places[2]).any(1)] += 1e-9
-    assert Measurements(np.concatenate([q, q[2:3]]), places).copies() == []
-
-
 def test_mistakes_in_arrays_are_named() -> None:
     q, places = points()
     half = places.copy()
@@ -133,8 +120,7 @@ def test_hidden_markers_with_decimal_commas_units_and_deviations(read: Reader) -
 
 
 @pytest.mark.parametrize(
-    ("row", "column"),
-    [("0.7,0.8,1,,3,4,5,6", "'ay'"), ("0.7,0.8,1,2,3,,,6", "'bx'"), ("0.7,,1,2,3,4,5,6", "'q2'")],
+    ("row", "column"), [("0.7,0.8,1,,3,4,5,6", "'ay'"), ("0.7,0.8,1,2,3,,,6", "'bx'"), ("0.7,,1,2,3,4,5,6", "'q2'")]
 )
 def test_half_a_marker_is_a_mistake(read: Reader, row: str, column: str) -> None:
     with pytest.raises(MeasurementError, match=says("line 5", column, "an empty cell", "marker or frame are empty")):
@@ -176,16 +162,3 @@ def test_wrong_cell_is_named_and_not_the_empty_one_beside_it(read: Reader, cells
     wrong = next(cell for cell in cells.split(",") if cell)
     with pytest.raises(MeasurementError, match=says("line 5", f"'{column}'", f"'{wrong}'")):
         read(text(*ROWS, f"0.7,0.8,1,2,3,{cells}"), position=TWO)
-
-
-def test_round_trip(tmp_path: Path) -> None:
-    q, places = points(5000)  # several blocks
-    std = np.where(np.isnan(places), nan, 0.001 + np.random.default_rng(1).random(places.shape))
-    data = Measurements(q, places, ["q1", "q2"], std=std)
-    path, triples = tmp_path / "table.csv", [[f"{axis}{k}" for axis in "xyz"] for k in range(3)]
-    write_measurements(path, data, TableFormat("m", "rad"), position=triples)
-    assert "nan" not in path.read_text().lower()
-    names = [f"std_{name}" for triple in triples for name in triple]
-    again = read_measurements(path, ["q1", "q2"], triples, length="m", angle="rad", std=names)
-    for name in ("q", "points", "std"):
-        assert_close(getattr(again, name), getattr(data, name), rtol=0, atol=0, equal_nan=True)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from eulerian_bank import CORRECTED, P0, SWITCHES, deformed, momenta, name, small_problem
-from math_bank import K_V, K_W, naive_rk4, normal, planar_two_markers, rr_problem, tensor, two_marker_problem, uniform
+from math_bank import K_V, K_W, naive_rk4, normal, tensor, uniform
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -101,13 +101,6 @@ def test_16_against_loops() -> None:
     assert float(parts.total) == pytest.approx(joint + task + data, rel=1e-12)
 
 
-def test_16_at_zero_is_the_data_term() -> None:
-    problem = EulerianProblem(small_problem())
-    parts = problem.energy(problem.deform(problem.zero(), dc.RK4(1)))
-    squares = (elastic_rr.nominal(problem.x) - problem.y).square().sum()
-    assert float(parts.total) == float(parts.data) == pytest.approx(float(squares) / 0.02, rel=1e-12)
-
-
 def test_18_holds_along_moving_points() -> None:
     """D(psi k0 phi^-1) at phi_t(q), by central differences, follows (18); at a fixed x it needs -D^2k[v] too."""
     q, a = uniform(5, 2, seed=1), 0.02 * normal(5, 2, seed=2)
@@ -186,27 +179,6 @@ def test_gradient_against_finite_differences(equations: Eulerian, integrator: In
     assert float((found[1] * direction).sum()) == pytest.approx(difference, rel=tolerance)
 
 
-def test_gradient_reaches_every_momentum_of_a_large_problem() -> None:
-    """Beyond the size that `auto` materialises: the tiled sums."""
-    problem = EulerianProblem(rr_problem(12))
-    p0 = 0.002 * normal(144, 2, seed=1)
-    at = p0.clone().requires_grad_()
-    found = slope(problem, dc.RK4(1), momenta(at), at)
-    assert found is not None
-    direction, h = normal(144, 2, seed=6), 1e-6
-    ends = [problem.energy(problem.deform(momenta(p0 + s * h * direction), dc.RK4(1))).total for s in (1, -1)]
-    assert float((found[1] * direction).sum()) == pytest.approx(float(ends[0] - ends[1]) / (2 * h), rel=1e-6)
-
-
-@pytest.mark.parametrize("equations", [Eulerian(), CORRECTED], ids=name)
-def test_order_of_the_time_steps(equations: Eulerian) -> None:
-    p0 = 3.0 * P0
-    exact = deformed(p0, equations, dc.RK8(16)).z1
-    errors = [float((deformed(p0, equations, dc.RK4(s)).z1 - exact).abs().max()) for s in (8, 16, 32)]
-    orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
-    np.testing.assert_allclose(orders, 4.0, atol=0.35)
-
-
 # --- Beside the exact model -------------------------------------------------------------------------------------------
 
 
@@ -223,28 +195,6 @@ def test_agrees_with_the_exact_model_to_first_order(equations: Eulerian) -> None
     ratios = np.array(gaps[:-1]) / np.array(gaps[1:])
     np.testing.assert_allclose(ratios, 4.0, atol=1.0)
     assert gaps[-1] < 0.01
-
-
-def test_tangent_solution_implies_b() -> None:
-    """b = Dk0^T P0: the exact model's tangent solution is the Eulerian one."""
-    problem = small_problem()
-    start = tangent(problem).momenta()
-    flow = EulerianProblem(problem).deform(momenta(start.task), dc.RK4(1)).flow
-    torch.testing.assert_close(-flow.joint_momenta(flow.nodes[0]), start.joint, rtol=0, atol=1e-12)
-
-
-def test_several_markers_move_in_one_field() -> None:
-    """Two markers of one configuration are two landmarks of w: against the field of all marker points."""
-    problem = two_marker_problem(uniform(5, 2, seed=2))
-    p0 = 0.05 * normal(10, 2, seed=3)
-    flow = EulerianProblem(problem).deform(momenta(p0), dc.RK4(1)).flow
-    z = planar_two_markers(problem.x)
-    jacobian = as_nominal(planar_two_markers).jacobian(problem.x, torch.zeros(0))
-    a = -torch.einsum("imn,im->in", jacobian, p0.reshape(5, 4))
-    v = problem.spec.joint_kernel.field(problem.x, problem.x, a)
-    w = problem.spec.task_kernel.field(z.reshape(10, 2), z.reshape(10, 2), p0).reshape(5, 4)
-    rate = flow.unpack(flow.rates(flow.nodes[0]))[0]
-    torch.testing.assert_close(rate, w - torch.einsum("imn,in->im", jacobian, v), rtol=0, atol=1e-13)
 
 
 def test_curvature_of_the_nominal_map() -> None:

@@ -57,13 +57,6 @@ every_way = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS.keys())
 
 
 @every_problem
-def test_product_is_the_matrix_times_vectors(problem: Problem) -> None:
-    lin = deformed(problem).linearise()
-    mu = normal(*problem.y.shape, 3, seed=4)
-    torch.testing.assert_close(lin.product(mu).flatten(0, 1), lin.gram() @ mu.flatten(0, 1), rtol=1e-11, atol=1e-11)
-
-
-@every_problem
 def test_product_with_parameters(problem: Problem) -> None:
     """For a nominal map with theta, the product includes the finite-rank part."""
     lin = deformed(problem).linearise()
@@ -73,13 +66,6 @@ def test_product_with_parameters(problem: Problem) -> None:
     lin = replace(lin, spec=model, sensitivity=sensitivity)
     mu = normal(*problem.y.shape, 2, seed=6)
     torch.testing.assert_close(lin.product(mu).flatten(0, 1), lin.gram() @ mu.flatten(0, 1), rtol=1e-11, atol=1e-11)
-
-
-@every_problem
-def test_linearisation_of_some_rows(problem: Problem) -> None:
-    lin, rows, m = deformed(problem).linearise(), torch.tensor([3, 1, 7]), problem.y.shape[1]
-    index = (rows[:, None] * m + torch.arange(m)).flatten()
-    torch.testing.assert_close(lin.rows(rows).gram(lin), lin.gram()[index], rtol=0, atol=1e-13)
 
 
 @pytest.mark.slow
@@ -93,16 +79,6 @@ def test_same_momenta_as_the_cholesky_factor(problem: Problem, way: Way) -> None
     reduced = ControlPointRegression(at, problem.x, problem.noise)
     wanted = reduced.response(expected.momenta())
     torch.testing.assert_close(reduced.response(actual), wanted, rtol=1e-5, atol=1e-6 * float(wanted.abs().max()))
-
-
-@every_way
-@every_problem
-def test_same_covariance_as_the_cholesky_factor(problem: Problem, way: Way) -> None:
-    at = deformed(problem)
-    queries = at.linearise(uniform(6, 2, seed=20))
-    expected = CholeskyRegression(at.linearise(), problem.noise).covariance(queries)
-    actual = way(problem, at).covariance(queries)
-    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-6 * float(expected.abs().max()) + 1e-9)
 
 
 @pytest.mark.parametrize("wide", [1.0, 100.0])
@@ -192,11 +168,6 @@ def test_auto_takes_conjugate_gradients_for_large_problems() -> None:
         dc.fit(PROBLEMS["rr"], dc.GaussNewton(linear="lu"), dc.RK4(1))  # pyright: ignore[reportArgumentType]
 
 
-def test_free_memory_is_a_plausible_number() -> None:
-    free = choose.free_memory()
-    assert free is None or 2**20 < free < 2**50
-
-
 @every_problem
 def test_features_give_every_covariance(problem: Problem) -> None:
     """F + sum of signed products is the posterior covariance, whichever way conditions on the data."""
@@ -209,14 +180,6 @@ def test_features_give_every_covariance(problem: Problem) -> None:
         values, signs = conditional.features(queries)
         found = queries.fields.gram(queries.fields) + (values.T * signs) @ values
         torch.testing.assert_close(found, conditional.covariance_between(queries), rtol=1e-8, atol=1e-12)
-
-
-def test_conditioning_by_iteration_has_no_features() -> None:
-    problem = PROBLEMS["rr"]
-    at = deformed(problem)
-    iterated = ConjugateGradientRegression(at.linearise(), problem.noise)
-    with pytest.raises(InputError, match=r"too many for covariances between .*`controls=200`"):
-        iterated.features(at.linearise())
 
 
 @pytest.mark.slow

@@ -7,17 +7,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from image_bank import png_size
+from matplotlib.axes import Axes
 from product_bank import Case, simulated, usual_scales, with_usual_scales
 from scipy.stats import chi2
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.common.files import write_figure
 from diffeo_calib.reports.analysis import predictions
 from diffeo_calib.reports.analysis.findings import find
 from diffeo_calib.reports.analysis.predictions import SHARES, FitRows, Predictions, forecast
 from diffeo_calib.reports.analysis.repeats import repeats_of
 from diffeo_calib.reports.analysis.stages import Deviations, stages_of
 from diffeo_calib.reports.html.sentences import advice
+from diffeo_calib.sensors.errors import Evaluation
 
 
 @pytest.mark.parametrize(
@@ -98,26 +102,6 @@ def test_a_forecast_follows_a_power_law_above_the_limit() -> None:
     assert forecast([(10, 1e-3), (20, 1.1e-3), (40, 1.2e-3)], limit) is None  # no improvement
     assert forecast(curve[:2], limit) is None  # too short
     assert forecast(curve, 1.0) is None  # below its limit
-
-
-@pytest.mark.slow
-def test_bands_of_transmission_errors_hold_the_truth() -> None:
-    """Over 2 arms, 6 joints and 40 values each; what one arm's bands claim errs together, so the limits are wide."""
-    inside = []
-    for seed in range(2):
-        case_arm = dc.robots.simulated_arm.SimulatedArm(seed=seed)
-        q, points = case_arm.measure(80, seed=seed)
-        model = with_usual_scales(case_arm.nominal, dc.Measurements(q, points)).model
-        rows = FitRows(model)
-        for joint, name in enumerate(model.robot.joint_names):
-            values = torch.linspace(float(q[:, joint].min()), float(q[:, joint].max()), 40, dtype=torch.float64)
-            at = torch.zeros(40, 6, dtype=torch.float64)
-            at[:, joint] = values
-            true = case_arm.components(at).transmission[:, joint]
-            error = (model.transmission(name, values) - true).numpy()
-            away = np.abs(error - error.mean()) / rows.transmission_deviation(joint, values).numpy()
-            inside.append(np.mean(away < 1.96))
-    assert 0.85 < np.mean(inside) <= 1.0
 
 
 def test_found_shares_of_a_perfect_model_are_the_claimed_ones(arm: Case) -> None:
@@ -241,12 +225,6 @@ def test_bad_arguments_are_input_errors(arm: Case) -> None:
         find(arm.model, arm.test[:20], against=["warmth"])
 
 
-def test_a_single_new_row_is_shown(arm: Case) -> None:
-    found = find(arm.model, dc.Measurements.joined([arm.train, arm.test[:1]]))
-    assert not found.shown.predictions.left_out
-    assert len(found.shown.predictions) == 1
-
-
 def test_errors_that_no_calibrated_robot_has_are_not_praised(arm: Case) -> None:
     test = arm.test[:60]
     with pytest.raises(MeasurementError, match="left-handed"):
@@ -276,22 +254,91 @@ def test_neighbours_and_copies_are_no_repeats(arm: Case) -> None:
 
 
 @pytest.mark.slow
-def test_joints_that_never_moved_are_named() -> None:
-    arm, train, _ = simulated(50)
-    q = train.q.clone()
-    q[:, 5] = 0.3
-    data = dc.Measurements(q, arm.true_points(q))
-    with pytest.warns(dc.DiffeoCalibWarning):
-        found = find(dc.calibrate(arm.nominal, data, hyperparameters=usual_scales(arm.nominal)).model)
-    assert any("wrist_roll_joint never moved" in text for text in advice(found))
+def test_bands_of_transmission_errors_hold_the_truth() -> None:
+    """Over 2 arms, 6 joints and 40 values each; what one arm's bands claim errs together, so the limits are wide."""
+    inside = []
+    for seed in range(2):
+        case_arm = dc.robots.simulated_arm.SimulatedArm(seed=seed)
+        q, points = case_arm.measure(80, seed=seed)
+        model = with_usual_scales(case_arm.nominal, dc.Measurements(q, points)).model
+        rows = FitRows(model)
+        for joint, name in enumerate(model.robot.joint_names):
+            values = torch.linspace(float(q[:, joint].min()), float(q[:, joint].max()), 40, dtype=torch.float64)
+            at = torch.zeros(40, 6, dtype=torch.float64)
+            at[:, joint] = values
+            true = case_arm.components(at).transmission[:, joint]
+            error = (model.transmission(name, values) - true).numpy()
+            away = np.abs(error - error.mean()) / rows.transmission_deviation(joint, values).numpy()
+            inside.append(np.mean(away < 1.96))
+    assert 0.85 < np.mean(inside) <= 1.0
 
 
-@pytest.mark.slow
-def test_the_marker_is_blamed_only_where_knowing_it_would_help(arm_200: Case) -> None:
-    """Its place along the last axis is never known, and matters nowhere."""
-    rows = FitRows(arm_200.model)
-    tool = torch.arange(arm_200.model.nominal.geometry.size)[arm_200.model.nominal.geometry.slices["tool"]]
-    assert float(rows.map.parameter_covariance(tool).diagonal().max()) > 1e-8
-    every = torch.arange(arm_200.model.nominal.parameters)
-    of_tool, of_all = (rows.map.explained_by(which, arm_200.test.q[:40]) for which in (tool, every))
-    assert of_tool < 0.5 * of_all < 0.5
+# --- the plot of errors by stage ------------------------------------------------------------------------------------
+
+
+def errors(rows: int, scale: float, seed: int, markers: int = 1) -> Evaluation:
+    return Evaluation(scale * torch.from_numpy(np.random.default_rng(seed).exponential(size=(rows, markers))))
+
+
+def panels(stages: dict[str, Evaluation]) -> tuple[Axes, Axes]:
+    left, right = dc.plots.stages(stages, "title").axes
+    return left, right
+
+
+def millimetres(evaluation: Evaluation) -> np.ndarray:
+    return 1e3 * evaluation.errors.flatten().numpy()
+
+
+def points(axes: Axes) -> np.ndarray:
+    """The points of a scatter plot: (N, 2)."""
+    (scatter,) = axes.collections
+    return np.asarray(scatter.get_offsets())
+
+
+FIVE = {f"stage {k}": errors(30, 10.0**-k, k, markers=2) for k in range(3, 8)}
+
+
+def test_every_stage_has_the_distribution_of_its_errors() -> None:
+    left, _ = panels(FIVE)
+    assert len(left.lines) == 5
+    assert len({line.get_color() for line in left.lines}) == 5
+    for line, (name, evaluation) in zip(left.lines, FIVE.items(), strict=True):
+        np.testing.assert_allclose(np.asarray(line.get_xdata()), np.sort(millimetres(evaluation)), rtol=1e-12)
+        np.testing.assert_allclose(np.asarray(line.get_ydata()), 100 * np.arange(1, 61) / 60, rtol=1e-12)
+        assert line.get_label() == f"{name}: {1e3 * evaluation.rms:.3g} mm RMS"
+    assert (left.get_xlabel(), left.get_ylabel()) == ("position error [mm]", "measurements [%]")
+    assert left.get_xscale() == "log"
+    assert left.get_ylim()[1] > 100.0
+    legend = left.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == [line.get_label() for line in left.lines]
+
+
+def test_the_last_stage_is_drawn_against_the_one_before() -> None:
+    _, right = panels(FIVE)
+    before, after = millimetres(FIVE["stage 6"]), millimetres(FIVE["stage 7"])
+    np.testing.assert_allclose(points(right), np.stack([before, after], 1), rtol=1e-12)
+    assert (right.get_xlabel(), right.get_ylabel()) == ("stage 6: error [mm]", "stage 7: error [mm]")
+    assert right.get_title() == f"better for {100 * (after < before).mean():.0f} % of the measurements"
+    (diagonal,) = right.lines
+    np.testing.assert_array_equal(diagonal.get_xdata(), diagonal.get_ydata())
+    for low, high in (right.get_xlim(), right.get_ylim()):
+        assert low < min(before.min(), after.min())
+        assert high > max(before.max(), after.max())
+
+
+def test_hardly_any_rows_and_errors_of_zero(tmp_path: Path) -> None:
+    """A logarithmic axis has no zero: they are drawn as tiny errors, without a warning."""
+    stages = {"before": errors(1, 1e-3, 0), "after": Evaluation(torch.zeros(1, 1, dtype=torch.float64))}
+    left, right = panels(stages)
+    drawn = np.asarray(left.lines[1].get_xdata())
+    assert 0.0 < drawn.min() <= drawn.max() < 1e-6
+    np.testing.assert_allclose(points(right)[:, 1], drawn, rtol=1e-12)
+    write_figure(dc.plots.stages(stages, "few rows"), tmp_path / "few.png")
+    assert png_size(tmp_path / "few.png") == (1408, 544)
+    for suffix, begin in (("svg", b"<?xml"), ("pdf", b"%PDF")):
+        write_figure(dc.plots.stages(FIVE, "a title longer than usual " * 4), str(tmp_path / f"five.{suffix}"))
+        assert (tmp_path / f"five.{suffix}").read_bytes().startswith(begin)
+    for name in ("stages.xyz", "none/stages.png"):
+        with pytest.raises(InputError, match="stages"):
+            write_figure(dc.plots.stages(FIVE), tmp_path / name)

@@ -5,21 +5,15 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import get_ur10_data
 import pytest
 import torch
 from robot_data import find, read
-from typer.testing import CliRunner
 
 import diffeo_calib as dc
-from diffeo_calib.cli import main as cli
 
-SCRIPT = Path(get_ur10_data.__file__)
 JOINTS = ";".join(f"{name}_joint" for name in get_ur10_data.JOINTS)
 ROWS = [f"{0.1 * k:.1f};0,2;0,3;0,4;0,5;{0.2 * k:.1f};10{k},5;2;3;10;20;30".replace(".", ",") for k in range(4)]
 POSITION = "measurement_x;measurement_y;measurement_z;measurement_rx;measurement_ry;measurement_rz"
@@ -75,84 +69,25 @@ def test_the_urdf_is_the_dh_table(small: Path, tmp_path: Path) -> None:
     torch.testing.assert_close(robot.limits[:, 1], torch.full((6,), 2 * math.pi, dtype=torch.float64))
 
 
-def test_prints_a_command_that_reads_the_table(
-    small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The command reaches the calibration with the robot and the table that were written."""
-    get_ur10_data.main([str(tmp_path / "a folder"), "--from", str(small)])
-    printed = capsys.readouterr().out
-    command = printed[printed.index("diffeo-calib fit ") : printed.index("\n\nor compare")].replace("\\\n", " ")
-    seen: list[tuple[dc.Chain, dc.Measurements]] = []
-
-    def look(robot: dc.Chain, data: dc.Measurements, **_: object) -> None:
-        seen.append((robot, data))
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", look)
-    monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(cli.app, [*shlex.split(command)[1:], "--holdout", "0"])
-    assert done.exit_code == 130
-    ((robot, data),) = seen
-    assert robot.tip == "tool0"
-    assert data.joint_names == robot.joint_names
-    assert data.points[1, 0].tolist() == pytest.approx([0.1015, 2e-3, 3e-3])
-
-
-def test_downloads(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(get_ur10_data, "URL", small.as_uri())
-    get_ur10_data.main([str(tmp_path)])
-    assert (tmp_path / "ipa_ur10" / get_ur10_data.FILE).read_bytes() == TABLE
-
-
-def test_no_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(get_ur10_data, "URL", "http://127.0.0.1:1/nothing.csv")  # refused at once
-    monkeypatch.setenv("no_proxy", "127.0.0.1")
-    said = failure(capsys, tmp_path / "data")
-    assert "cannot be downloaded" in said
-    assert "--from" in said
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_another_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    source = tmp_path / get_ur10_data.FILE
-    source.write_bytes(TABLE)
-    assert get_ur10_data.SHA256 in failure(capsys, tmp_path / "data", "--from", source)
-    assert not (tmp_path / "data").exists()
-
-
-def test_a_missing_copy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "neither a file nor a folder" in failure(capsys, tmp_path / "data", "--from", tmp_path)
-    assert not (tmp_path / "data").exists()
-
-
-def test_a_read_only_folder_stays_as_it_is(small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Even for an administrator, who could write to it."""
-    folder = tmp_path / "data"
-    folder.mkdir()
-    folder.chmod(0o555)
-    assert "read-only" in failure(capsys, folder, "--from", small)
-    assert "read-only" in failure(capsys, folder / "inner" / "most", "--from", small)
-    assert list(folder.iterdir()) == []
-
-
-def test_a_file_in_the_way(small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "data").write_text("a file")
-    assert "cannot be written" in failure(capsys, tmp_path / "data", "--from", small)
-    assert (tmp_path / "data").read_text() == "a file"
-
-
-def test_a_disk_that_fills_up(
+def test_failures_leave_nothing(
     small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def full(path: Path, data: bytes) -> int:
-        if path.name == "LICENSE.md":
-            raise OSError(28, "No space left on device")
-        with path.open("wb") as file:
-            return file.write(data)
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    assert "No space left" in failure(capsys, tmp_path / "new" / "data", "--from", small)
-    assert not (tmp_path / "new").exists()
+    """No network, a copy that is none or another file, a folder that cannot be written."""
+    folder, other = tmp_path / "data", tmp_path / "other" / get_ur10_data.FILE
+    other.parent.mkdir()
+    other.write_bytes(TABLE + b"1")
+    with monkeypatch.context() as patch:
+        patch.setattr(get_ur10_data, "URL", "http://127.0.0.1:1/nothing.csv")  # refused at once
+        patch.setenv("no_proxy", "127.0.0.1")
+        assert "cannot be downloaded" in failure(capsys, folder)
+    assert get_ur10_data.SHA256 in failure(capsys, folder, "--from", other)
+    assert "neither a file nor a folder" in failure(capsys, folder, "--from", tmp_path)
+    assert not folder.exists()
+    folder.mkdir()
+    folder.chmod(0o555)
+    for place in (folder, folder / "inner" / "most"):  # even for an administrator, who could write to it
+        assert "read-only" in failure(capsys, place, "--from", small)
+    assert list(folder.iterdir()) == []
 
 
 def test_existing_files_are_never_changed(small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -164,15 +99,6 @@ def test_existing_files_are_never_changed(small: Path, tmp_path: Path, capsys: p
     (tmp_path / "ipa_ur10" / "dataset.json").write_text("{}")
     assert "exists with other contents" in failure(capsys, tmp_path, "--from", small)
     assert (tmp_path / "ipa_ur10" / "dataset.json").read_text() == "{}"
-
-
-def test_as_a_program_without_the_package(tmp_path: Path) -> None:
-    """Standard library only, and exit code 1."""
-    command = [sys.executable, "-I", "-S", str(SCRIPT), str(tmp_path / "data"), "--from", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
-    assert done.returncode == 1
-    assert done.stderr.startswith("error: ")
-    assert done.stderr.count("\n") == 1
 
 
 def test_the_published_file(ur10_folder: Path, tmp_path: Path) -> None:

@@ -69,7 +69,10 @@ model have hardly any weight, since outliers look like a change."""
 OUTLIER_CHANCE = 0.01
 """Of any outlier among clean rows."""
 UNCHOSEN_FACTOR = 9.0
-"""On the squared distance of an outlier where the rows are too few to choose scales: defaults may be overconfident."""
+"""Least size of squared errors where the rows are too few to choose scales: defaults may be overconfident."""
+MEDIAN_EFFICIENCY = 0.5
+"""Of the median of squared errors, in place of their mean, as an estimate of their variance: .37, .53 and .58 of one,
+three and six numbers."""
 REMAINING_ERROR = 0.2
 """Largest part of a row's error that may remain with an explanation that is named."""
 REMAINING_UNDER_LABEL, LABEL_ROWS, MOST_MASSES = 0.3, 2, 10

@@ -14,8 +14,7 @@ from diffeo_calib.calibration.identification.identification import Identificatio
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
 from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.cameras.board import LENS
-from diffeo_calib.cameras.images import Camera
-from diffeo_calib.cameras.seeing import expected, sees
+from diffeo_calib.cameras.images import Camera, expected, sees
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
 from diffeo_calib.measurements.images import SharedErrors
 from diffeo_calib.measurements.pose_frames import inverse_poses

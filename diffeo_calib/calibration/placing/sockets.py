@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
-from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.plausibility import check_identification, registered
 from diffeo_calib.calibration.diagnostics.socket_plausibility import (
     check_registration,
@@ -28,7 +27,7 @@ from diffeo_calib.calibration.diagnostics.socket_plausibility import (
     warn_of_wrong_sockets,
 )
 from diffeo_calib.calibration.expected_errors import workspace_deviation
-from diffeo_calib.calibration.findings import Outlier, found_outliers
+from diffeo_calib.calibration.findings import Outlier, excluded_by_others, found_outliers
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters, identify
 from diffeo_calib.calibration.identification.registration import (
     register_sockets,
@@ -37,7 +36,6 @@ from diffeo_calib.calibration.identification.registration import (
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
-from diffeo_calib.common.quantiles import chi2_above, chi2_median
 from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.checks import numbers_of
@@ -409,10 +407,9 @@ def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> 
     judged = rests.sum(0)[socket] > FEWEST_BESIDE
     if not bool(judged.any()):
         return []
-    size = float(squares[judged].median()) / chi2_median(3)
-    limit = size * chi2_above(gates.OUTLIER_CHANCE / int(judged.sum()), 3)
     bad = torch.zeros(len(resting), model.markers, dtype=torch.bool, device=own.device)
-    bad[:, -1] = judged & (squares > limit)
+    squares = squares.masked_fill(~judged, torch.nan)
+    bad[:, -1] = excluded_by_others(squares, torch.full_like(squares, 3.0), least=0.0)
     distances = errors.norm(dim=1)[:, None].expand(-1, model.markers)
     placed = with_attributes(resting, points=middles[:, None])
     return found_outliers(model, placed.with_markers(model.markers), bad, distances)

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.planning.candidates import ranges_around
 from diffeo_calib.calibration.planning.sensors import Options, Scene, Sensor, Where
-from diffeo_calib.cameras.images import Camera
-from diffeo_calib.cameras.seeing import expected, sees
+from diffeo_calib.cameras.images import Camera, expected, sees
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.hand_eye import SetUp
 from diffeo_calib.measurements.pose_frames import camera_jacobian, inverse_poses

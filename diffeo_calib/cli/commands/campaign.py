@@ -1,38 +1,314 @@
-"""`diffeo-calib campaign`: rows judged while they are measured."""
+"""`diffeo-calib campaign`: rows judged while they are measured: the table, its journal, and what is answered."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
 from itertools import chain
+from pathlib import Path
 from queue import Empty
 from threading import Thread
+from typing import Any
 
 import typer
 
-from diffeo_calib.campaign.campaign import Campaign
-from diffeo_calib.campaign.feeds import Inbox, read_lines
-from diffeo_calib.campaign.journal import Journal
-from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, plain
-from diffeo_calib.cli.declarations import CampaignOptions
-from diffeo_calib.cli.live import Live, expected
+from diffeo_calib.campaign.campaign import Campaign, Next
+from diffeo_calib.campaign.feeds import DECISIONS, ID, Entry, Inbox, as_line, check_cells, read_lines
+from diffeo_calib.campaign.journal import BEGUN, KEPT, GrowingTable, Journal, digest
+from diffeo_calib.campaign.verdicts import Verdict
+from diffeo_calib.cli.console import err, interrupts, plain, say
 from diffeo_calib.cli.models import robot_of
+from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.printed import EXIT_ABOVE, parsed_length
-from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import joint_columns, measured_table
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.cli.record import EXIT_INTERRUPTED, record
+from diffeo_calib.cli.tables import MeasuredTable, joint_columns, measured_table
+from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.common.files import write_whole
+from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.files import read_joints
-from diffeo_calib.measurements.csv.joints import PoseColumns
+from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
 from diffeo_calib.reports.live import Page, served, state_of
 
 JOURNAL = ".journal"
 """Suffix of the journal beside a table."""
 LOOK_SECONDS = 0.1
+LONGEST = 200
+"""Characters of an option in a journal; of longer ones it holds a hash."""
 
 
-def run(given: CampaignOptions) -> None:
+@dataclass
+class Live:
+    """A campaign, the table that it follows and its journal.
+
+    Args:
+        tips: of the markers. table: the file. owner: the line of each row. lines: all that were judged.
+        waiting: those that were there at the start and were not. ids: number of the line of each id.
+        said: whether each row is accepted, and to be repeated. unreadable: lines that are no rows, and why.
+        revised: rows that the last line changed. late: rows that a new model changed, not told yet.
+        ignored: lines after the one with which the target was reached.
+    """
+
+    campaign: Campaign
+    source: MeasuredTable
+    tips: Sequence[str]
+    journal: Journal
+    given: Command
+    table: GrowingTable = field(init=False)
+    owner: list[int] = field(default_factory=list)
+    lines: list[bytes] = field(default_factory=list)
+    waiting: list[bytes] = field(default_factory=list)
+    said: list[tuple[bool, bool]] = field(default_factory=list)
+    ids: dict[str, int] = field(default_factory=dict)
+    unreadable: dict[int, str] = field(default_factory=dict)
+    revised: list[int] = field(default_factory=list)
+    late: list[int] = field(default_factory=list)
+    ignored: int = 0
+    _found: tuple[object, Next | None] | None = None
+
+    def __post_init__(self) -> None:
+        self.table = GrowingTable(self.source.csv, self.source.table.sep, self.source.table.decimal)
+
+    def say(self, text: str, entry: Entry) -> None:
+        """Print a text, or an entry as a line of JSON."""
+        if self.given.json_lines:
+            sys.stdout.write(as_line(entry).decode())
+            sys.stdout.flush()
+        elif text:
+            say(text)
+
+    def resume(self) -> None:
+        """Go on after the lines that the journal knows."""
+        known = [one for one in self.journal.entries if "line" in one]
+        lines = self.table.new_lines()
+        named = {cell.strip() for cell in self.table.cells(self.table.header)}
+        own = joint_columns(self.source.joints, self.campaign.robot)
+        joints = own.columns if isinstance(own, PoseColumns) else JointExpressions.of(own).columns
+        places = [name for name in joints if name.isdecimal() and name not in named]
+        if self.table.header and places:  # columns are named by their places, and the first line is a row
+            what = f"{self.source.csv} has no column {few(places)}: a table that grows needs a header line"
+            got = f"the first line {few(sorted(named))}"
+            raise InputError.of(what, got=got, fix="name the columns in its first line")
+        for number, entry in enumerate(known):
+            if number >= len(lines) or digest(lines[number]) != entry["sha"]:
+                fix = f"undo the change, or remove '{self.journal.path.name}' to judge all rows anew"
+                raise InputError.of(f"line {number + 2} of {self.source.csv} was changed after it was judged", fix=fix)
+        now = self._begun()
+        begun = next((one[BEGUN] for one in self.journal.entries if BEGUN in one), now)
+        if names := [name for name in begun | now if begun.get(name) != now.get(name)]:
+            then, got = (", ".join(f"{name} {each.get(name, 'none')}" for name in names) for each in (begun, now))
+            fix = f"go on as it was begun, or remove '{self.journal.path.name}' to judge all rows anew"
+            what = f"{self.source.csv} was judged with another {' and '.join(names)} than it is read with now"
+            raise InputError.of(what, expected=then, got=got, fix=fix)
+        for line in lines[: len(known)]:
+            self._keep(line)
+        self.unreadable = {n: entry["unreadable"] for n, entry in enumerate(known) if "unreadable" in entry}
+        verdicts = [one for entry in known for one in entry.get("rows", [])]
+        for entry in self.journal.entries:
+            if "row" in entry:
+                verdicts[entry["row"]] |= {name: entry[name] for name in KEPT if name in entry}
+        readable = [line for line, entry in zip(lines, known, strict=False) if "rows" in entry]
+        self.owner = [number for number, entry in enumerate(known) for _ in entry.get("rows", [])]
+        if verdicts:
+            self.campaign.resume(self._read(readable), [Verdict(row, **one) for row, one in enumerate(verdicts)])
+            self.say(f"going on after {len(known)} lines{expected(self.campaign)}", self.state())
+        self.said = [(one.accepted, one.again) for one in self.campaign.verdicts]
+        self.waiting = lines[len(known) :]
+
+    def _begun(self) -> dict[str, str]:
+        """What rows are read and judged with; of long texts their hashes."""
+        robot, source = self.campaign.robot, self.source
+        parts = robot.place_offsets, robot.axes, robot.coupling, robot.coupling_offset
+        numbers = [(part.round(decimals=9) + 0.0).tolist() for part in parts]  # without -0.0
+        found = {"robot": (robot.revolute.tolist(), robot.before, numbers), "tip": self.tips}
+        found |= vars(source.table) | {"header": self.table.header.decode("latin-1").strip()}
+        found["position"] = [",".join(triple) for triple in source.table.position or ()]
+        found["joints"] = joint_columns(source.joints, robot)
+        texts = {name: str(value) for name, value in found.items() if value}
+        return {name: text if len(text) < LONGEST else digest(text.encode()) for name, text in texts.items()}
+
+    def new_lines(self) -> list[bytes]:
+        """Lines that have not been judged."""
+        found, self.waiting = [*self.waiting, *self.table.new_lines()], []
+        return found
+
+    def judge(self, lines: Sequence[bytes]) -> None:
+        """Judge lines, and say what became of them; after the last what comes next."""
+        for left, line in zip(reversed(range(len(lines))), lines, strict=True):
+            number = self._add(line)
+            self._say(self.answer(number) | ({} if left or self.campaign.reached else self.state()))
+            if self.campaign.reached:
+                self.ignored = left
+                return
+
+    def poll(self) -> bool:
+        """Say what a model that was made in the background changes; whether there was one."""
+        if not self.campaign.poll():
+            return False
+        self.journal.add(self._revised())
+        self.late += self.revised
+        if not self.given.json_lines:  # those who send rows as JSON lines get one answer for each
+            changed = "\n".join(str(self.campaign.verdicts[row]) for row in self.revised)
+            self._say(({"text": changed} if changed else {}) | self.state())
+        return True
+
+    def take(self, entry: Entry | DiffeoCalibError) -> None:
+        """Do what was sent, and answer it: judge a row, decide about one, or say how the campaign is."""
+        told: Entry = {}
+        try:
+            if isinstance(entry, DiffeoCalibError):
+                raise entry
+            check_cells(entry)
+            told |= {ID: entry[ID]} if ID in entry else {}
+            if "do" in entry:
+                self.decide(entry.get("line"), entry["do"])
+            elif entry:
+                number = self.known(entry)
+                told = self.answer(self._append(entry) if number is None else number) | told
+            self.poll()
+            told |= self.state()
+        except InputError as error:
+            told["error"] = str(error)
+        self._say(told)
+
+    def known(self, row: Entry) -> int | None:
+        """Number of the line that a row repeats; InputError for other values under its id."""
+        if ID not in row:
+            return None
+        header, line = self.table.written(row)
+        number = self.ids.get(self.table.cells(line)[self.table.cells(header).index(ID)])
+        if number is not None and not self.table.same(line, self.lines[number]):
+            what = f"{ID} {row[ID]} is that of line {number + 2} of {self.source.csv}, whose values are others"
+            fix = "count on after those of the table when your program starts again, or leave ids out"
+            raise InputError.of(what, fix=fix)
+        return number
+
+    def decide(self, line: object, what: object) -> None:
+        """Do what a user decided about the rows of a line; InputError for no such line or decision."""
+        if what not in DECISIONS:
+            raise InputError.of("a decision about a row", expected=f"one of {few(DECISIONS)}", got=str(what))
+        rows = [row for row, owner in enumerate(self.owner) if owner + 2 == line]
+        if not rows:
+            numbers = f", 2 to {len(self.lines) + 1}" if self.lines else "; there is none yet"
+            expected = f"a line of {self.source.csv} with a row{numbers}"
+            raise InputError.of("`line`", expected=expected, got=str(line))
+        for row in rows:
+            getattr(self.campaign, str(what))(row)
+        self.journal.add(self._revised())
+
+    def _append(self, row: Entry) -> int:
+        """Append a row to the table and judge it; the number of its line."""
+        self.judge(self.new_lines())
+        header, line = self.table.written(row)
+        self._read([line], header, len(self.lines))
+        torn = self.table.append(header, line).decode(errors="replace")
+        if torn:
+            self.journal.add([{"removed": torn}])
+            self.say(f"half a line was removed from the end of {self.source.csv}: {torn}", {"removed": torn})
+        *others, own = self.new_lines()
+        self.judge(others)
+        return self._add(own)
+
+    def _add(self, line: bytes) -> int:
+        """Judge a line, and bring that to the disk; its number."""
+        number = len(self.lines)
+        begun: list[Entry] = [] if number else [{BEGUN: self._begun()}]
+        entry: Entry = {"line": number + 2, "sha": digest(line)}
+        try:
+            verdicts = self.campaign.add(self._read([line], first=number))
+            entry["rows"] = [{name: getattr(one, name) for name in KEPT} for one in verdicts]
+            self.owner += [number] * len(verdicts)
+        except DiffeoCalibError as error:
+            entry["unreadable"] = self.unreadable[number] = str(error)
+        self._keep(line)
+        self.journal.add([*begun, entry, *self._revised()])
+        return number
+
+    def _keep(self, line: bytes) -> None:
+        self.lines.append(line)
+        header, cells = self.table.cells(self.table.header), self.table.cells(line)
+        if ID in header and len(cells) == len(header) and cells[header.index(ID)]:
+            self.ids[cells[header.index(ID)]] = len(self.lines) - 1
+
+    def _revised(self) -> Iterator[Entry]:
+        """Entries of rows that are accepted now and were not, or the other way round; of those to be repeated, too."""
+        now = [(one.accepted, one.again) for one in self.campaign.verdicts]
+        self.revised = [row for row, (one, other) in enumerate(zip(self.said, now, strict=False)) if one != other]
+        self.said = now
+        for row in self.revised:
+            yield {"row": row} | {name: getattr(self.campaign.verdicts[row], name) for name in KEPT}
+
+    def answer(self, number: int) -> Entry:
+        """Outcome of a line."""
+        known, found = self.campaign.verdicts, dict[str, Any](line=number + 2)
+        if number in self.unreadable:
+            return found | {"error": f"line {number + 2} left out: {self.unreadable[number]}"}
+        rows = [row for row, owner in enumerate(self.owner) if owner == number]
+        found = known[rows[0]].entry() | found
+        found["text"] = "\n".join(str(known[row]) for row in rows)
+        revised, self.late = dict.fromkeys([*self.late, *self.revised]), []
+        return found | {"revised": [{"line": known[row].line, "accepted": known[row].accepted} for row in revised]}
+
+    def _say(self, told: Entry) -> None:
+        """Print an answer."""
+        words = ["left out: " + told["error"]] if "error" in told else [told["text"]] if "text" in told else []
+        if "next" in told:
+            words.append(f"  {'; '.join(filter(None, self.words))}")
+        self.say("\n".join(words), told)
+
+    def state(self) -> Entry:
+        """The campaign in numbers, with what to measure next: joint values in the unit of the table."""
+        known, found, robot = self.campaign.expected_error, self.found, self.campaign.robot
+        entry: Entry = {"rows": len(self.campaign), "accepted_rows": len(self.campaign.accepted)}
+        entry["expected_error_mm"] = None if known is None else 1e3 * known
+        if self.campaign.goal is not None:
+            limit, more = self.campaign.error_limit, None if found is None else found.needed
+            entry["error_limit_mm"] = None if limit is None else 1e3 * limit
+            entry |= {"more_rows": more, "target_reached": self.campaign.reached}
+        names = joint_columns(self.source.joints, robot)
+        columns = Columns.of(self.source.table.joints_only(names, robot.kinds))
+        poses = [] if found is None else columns.joints_from_si(found.q[: self.given.next]).tolist()
+        return entry | {"next": [dict(zip(columns.joints.columns, q, strict=True)) for q in poses]}
+
+    @property
+    def found(self) -> Next | None:
+        """The next poses, and the forecast."""
+        now = self.campaign.models, [(one.accepted, one.again) for one in self.campaign.verdicts]
+        if self._found is None or self._found[0] != now:
+            self._found = now, self.campaign.next(max(self.given.next, 1))
+        return self._found[1]
+
+    @property
+    def words(self) -> tuple[str, str]:
+        """The expected error with the rows to the goal, and the next poses."""
+        state, known = self.state(), expected(self.campaign)
+        more = "?" if state.get("more_rows", "") is None else state.get("more_rows", "")
+        needed = "" if more == "" else f", {more} more rows to the target"
+        poses = (", ".join(f"{value:.6g}" for value in pose.values()) for pose in state["next"])
+        return f"{known[2:]}{needed}" if known else "no model yet", "; ".join(f"next: {pose}" for pose in poses)
+
+    def _read(self, lines: Sequence[bytes], header: bytes = b"", first: int = 0) -> Any:
+        """Lines as a table, in their order; ``first`` is the number of the first one, for messages."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / self.source.csv.name
+            path.write_bytes((header or self.table.header) + b"\n" * first + b"".join(lines))
+            try:
+                data = replace(self.source, csv=path, growing=True).read(self.campaign.robot, self.tips)
+            except DiffeoCalibError as error:
+                raise type(error)(str(error).replace(str(path), str(self.source.csv))) from error
+        return data.rows(data.lines.argsort(stable=True))
+
+
+def expected(campaign: Campaign) -> str:
+    """The expected error in words, after a comma; empty without one."""
+    known, limit = campaign.expected_error, campaign.error_limit
+    below = "" if limit is None else f" (95 %: below {1e3 * limit:.4g} mm)"
+    return "" if known is None else f", {1e3 * known:.4g} mm expected{below}"
+
+
+def run(given: Command) -> None:
     """Follow a table until the target is reached or the rows end."""
     if given.rows.by is not None or given.rows.marker is not None:
         fix = "give every row in one line of one file, with columns for each marker"
@@ -63,7 +339,7 @@ def run(given: CampaignOptions) -> None:
         raise typer.Exit(code)
 
 
-def _followed(live: Live, given: CampaignOptions, inbox: Inbox, page: Page | None) -> int:
+def _followed(live: Live, given: Command, inbox: Inbox, page: Page | None) -> int:
     """Follow a campaign to its end; the exit code."""
     step = interrupts.watching(lambda *_: None, lambda text: err.print(plain(text)))
     try:
@@ -79,7 +355,7 @@ def _followed(live: Live, given: CampaignOptions, inbox: Inbox, page: Page | Non
     return 0 if live.campaign.goal is None or live.campaign.reached else EXIT_ABOVE
 
 
-def _happening(live: Live, given: CampaignOptions, inbox: Inbox) -> Iterator[bool]:
+def _happening(live: Live, given: Command, inbox: Inbox) -> Iterator[bool]:
     """Do what comes, until the rows end; yields whether anything was done."""
     if given.stdin:
         Thread(target=read_lines, args=(sys.stdin.buffer, inbox), daemon=True).start()
@@ -102,7 +378,6 @@ def _happening(live: Live, given: CampaignOptions, inbox: Inbox) -> Iterator[boo
 
 
 def _end(live: Live) -> None:
-    """Say how a campaign ended."""
     state = live.state() | {"ended": True}
     record.add(rows=len(live.campaign), accepted=state["accepted_rows"], expected_error_m=live.campaign.expected_error)
     accepted = f"{state['accepted_rows']} of {state['rows']} rows accepted"

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import degrees, isnan, radians
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.cli.console import out, plain, progress_bar, say, text_table
-from diffeo_calib.cli.declarations import CorrectOptions
 from diffeo_calib.cli.models import as_fitted, load_laden, tool_in_tip
+from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import ProgramTable, joint_columns, joints_of, table_format, written_columns
+from diffeo_calib.cli.tables import ProgramTable, joint_columns, joints_of, table_format
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -61,82 +62,103 @@ class ToolOnTip:
             apart.append(_deviations(covariance_without_placement(model, rows, self.tool, self.tip)))
         return torch.cat(whole), torch.cat(apart)
 
-    def own(self, values: Tensor) -> Tensor:
-        """Its own part of a result."""
-        return values if self.place is None else values[:, self.place]
+    def own(self, values: Any) -> Any:
+        """Its own part of a result; None of none."""
+        return values if self.place is None or values is None else values[:, self.place]
 
     def name(self, before: str, after: str) -> str:
         """Name of a column: with that of the tip where there are several."""
         return f"{before}_{after}" if self.place is None else f"{before}_{self.tip}_{after}"
 
-    @property
-    def label(self) -> str:
-        """Name of the tool in messages."""
-        return "tool" if self.place is None else f"tool on {self.tip}"
+    def pose_names(self, table: TableFormat) -> list[str]:
+        """Columns of the pose to command."""
+        return [self.name("command", name) for name in ("x", "y", "z", *flat_names(table.rotation))]
+
+    def added(
+        self, robot: Tree, found: Compensation, known: tuple[Tensor, Tensor] | None, table: TableFormat
+    ) -> dict[str, Column]:
+        """Its pose, misses and standard deviation, NaN where there is no command or no target."""
+        allowed, names = found.q.isfinite().all(1), self.pose_names(table)
+        numbers = found.q.new_full((len(found), len(names) + 1), torch.nan)
+        if known is not None:
+            poses, unit = self.nominal(robot, found.q[allowed]), table.rotation_angle or "rad"
+            turned = rotation_numbers(poses[:, :3, :3], table.convention or "rotvec", angle=unit)
+            parts = poses[:, :3, 3] * table.per_metre, turned, known[0][:, :1] * table.per_metre
+            numbers[allowed] = torch.cat(parts, dim=1)
+        *pose, deviation = numbers.mT.tolist()
+        added = dict[str, Column](zip(names, pose, strict=True))
+        added["status"] = list(map(str, found.status))
+        added[self.name("miss", table.length)] = (self.own(found.miss) * table.per_metre).tolist()
+        angle = self.own(found.angle_miss)
+        if angle is not None:
+            turned = angle.rad2deg() if table.angle == "deg" else angle
+            added[self.name("angle_miss", table.angle)] = turned.tolist()
+        return added | {self.name("std", table.length): deviation}
 
 
-def run(options: CorrectOptions) -> None:
+def run(options: Command) -> None:
     """Read a program, correct it, write it and print a summary; units that are not typed are those of the fit."""
     _check(options)
-    kinematics = load_laden(options.model, options.payload_mass)
-    stated = as_fitted(kinematics, None, options.units)[1]
-    program, output = options.program, options.output
-    source = ProgramTable(program, joints_of(stated), table_format(stated), options.targets)
-    table = source.written()
-    if len(options.tip or ()) == 1:
-        kinematics = kinematics.with_tool(kinematics.tool, *options.tip or ())
+    model = load_laden(options.model, options.payload_mass)
+    stated = as_fitted(model, None, options.units)[1]
+    source = ProgramTable(options.program, joints_of(stated), table_format(stated), options.targets)
+    table, tips = source.written(), options.tip or ()
+    if len(tips) == 1:
+        model = model.with_tool(model.tool, *tips)
     turned = {"convention": options.targets.convention, "rotation_angle": options.targets.rotation_angle}
-    robot, tools = kinematics.robot, _tools(kinematics, options, replace(source.table, **turned))
+    robot, tools = model.robot, _tools(model, options, replace(source.table, **turned))
     names = joint_columns(source.joints, robot)
     columns = Columns.of(table.joints_only(names, robot.kinds))
-    sheet = Program.read(program, table, columns.names)
+    sheet = Program.read(options.program, table, columns.names)
     if isinstance(names, PoseColumns) and names.is_program:
-        columns = Columns.of(table.joints_only(written_columns(names), robot.kinds))
+        columns = Columns.of(table.joints_only(names.written, robot.kinds))
         sheet = sheet.without(names.columns)  # they would be those of the program before
         sheet.check_free(columns.names)
     start, targets = source.commands(robot), source.targets(robot, len(tools))
-    oriented = targets is None or targets.ndim == 4
-    sheet.check_free([name for tool in tools for name in _pose_names(tool, table)])
-    sheet.check_free(["status", *(name for tool in tools for name in _miss_names(tool, table, oriented=oriented))])
-    sheet.check_free([tool.name("std", table.length) for tool in tools])
-    refuse_other_angles(kinematics, start)
-    warn_outside_range(kinematics, start)
+    for tool in tools:
+        misses = [tool.name("angle_miss", table.angle)] if targets is None or targets.ndim == 4 else []
+        misses += ["status", tool.name("miss", table.length), tool.name("std", table.length)]
+        sheet.check_free([*tool.pose_names(table), *misses])
+    refuse_other_angles(model, start)
+    warn_outside_range(model, start)
     if targets is None:
         targets = torch.stack([tool.nominal(robot, start) for tool in tools], dim=1)
         if is_cartesian(robot) and robot.n < AXES_OF_A_POSE:  # commanded places
             targets = targets[..., :3, 3]
-    bound = None if options.limit is None else radians(options.limit)
-    rate = None if options.rate is None else radians(options.rate)
+    bound, rate = (None if one is None else radians(one) for one in (options.limit, options.rate))
     how = {"frame": options.frame, "bound": bound, "path": rate is not None, "rate": rate}
     with progress_bar() as progress:
         progress("commands", 0, 1)
-        found = compensate(kinematics, _goals(robot, tools, targets), start, tool=_places(robot, tools), **how)
+        found = compensate(model, _goals(robot, tools, targets), start, tool=_places(robot, tools), **how)
     allowed = found.q.isfinite().all(1)
-    known = [tool.known(kinematics, found.q[allowed], options.frame) for tool in tools if bool(allowed.any())]
-    sheet.write(output, columns.from_si({"q": found.q}) | _added(kinematics, found, tools, known, table), table)
+    some = bool(allowed.any())
+    known = [tool.known(model, found.q[allowed], options.frame) if some else None for tool in tools]
+    added = dict[str, Column]()
+    for tool, own in zip(tools, known, strict=True):
+        added |= tool.added(robot, found, own, table)
+    place = {"command": 0, "status": 1, "miss": 2, "angle": 2, "std": 3}
+    added = {name: added[name] for name in sorted(added, key=lambda name: place[name.split("_")[0]])}
+    sheet.write(options.output, columns.from_si({"q": found.q}) | added, table)
     misses = {tool.tip: {"miss_m": tool.own(found.miss), "angle_miss_deg": _degrees(found, tool)} for tool in tools}
-    record.add(rows=len(found), statuses=found.counts, misses=misses, files={"program": output})
-    _summarise(kinematics, found, tools, sheet.lines)
+    record.add(rows=len(found), statuses=found.counts, misses=misses, files={"program": options.output})
+    _summarise(robot, found, tools, sheet.lines)
     where = "robot's base" if options.frame == "base" else "measuring frame"
-    for tool, each in zip(tools, known, strict=False):
-        say(_how_well_known(tool, *each, where))
+    say(*(_how_well_known(tool, *own, where) for tool, own in zip(tools, known, strict=True) if own is not None))
     frames = ", ".join(f"of the tool on {tool.tip}, in the frame of {robot.base}" for tool in tools)
-    corrected = f"{len(found)} rows written to {output}: corrected {', '.join(columns.names)}"
+    corrected = f"{len(found)} rows written to {options.output}: corrected {', '.join(columns.names)}"
     say(f"{corrected}, the pose to command ({frames}), status, miss and standard deviation")
 
 
-def _check(options: CorrectOptions) -> None:
-    """Refuse options without effect."""
-    if options.limit is not None:
-        check_number(options.limit, "--limit", above=0.0)
-    if options.rate is not None:
-        check_number(options.rate, "--rate", above=0.0)
+def _check(options: Command) -> None:
+    for name, value in (("--limit", options.limit), ("--rate", options.rate)):
+        if value is not None:
+            check_number(value, name, above=0.0)
     if options.frame == "measuring" and not options.targets.position:
         fix = "leave it out, or name the columns of the targets (--position)"
         raise InputError.of("--frame measuring: the nominal poses of commands are in the robot's base", fix=fix)
 
 
-def _tools(model: CalibratedKinematics, named: CorrectOptions, table: TableFormat) -> list[ToolOnTip]:
+def _tools(model: CalibratedKinematics, named: Command, table: TableFormat) -> list[ToolOnTip]:
     """The tools that have targets."""
     robot, tips = model.robot, named.tip or []
     if named.tool and len(named.tool) != max(len(tips), 1):
@@ -146,11 +168,10 @@ def _tools(model: CalibratedKinematics, named: CorrectOptions, table: TableForma
     if len(tips) < 2:
         tip = checked_tip(robot, model.tool_tip)
         return [ToolOnTip(tip, tool_in_tip(model, numbers[0], named.tool_from, table))]
-    again = [tip for k, tip in enumerate(tips) if tip in tips[:k]]
-    if again:
-        raise InputError.of(f"--tip {again[0]} is named twice", fix="name every tip once")
     found = []
-    for tip, text in zip(tips, numbers, strict=True):
+    for k, (tip, text) in enumerate(zip(tips, numbers, strict=True)):
+        if tip in tips[:k]:
+            raise InputError.of(f"--tip {tip} is named twice", fix="name every tip once")
         own = model.tool if checked_tip(robot, tip) == model.tool_tip else None
         tool = tool_in_tip(model.with_tool(own, tip), text, named.tool_from, table)
         found.append(ToolOnTip(tip, tool, robot.tips.index(tip)))
@@ -167,51 +188,10 @@ def _goals(robot: Tree, tools: list[ToolOnTip], targets: Tensor) -> Tensor:
 
 
 def _places(robot: Tree, tools: list[ToolOnTip]) -> Tensor:
-    """The tools (4, 4), or (T, 4, 4) of all tips."""
+    """The tool (4, 4), or those of all tips (T, 4, 4)."""
     by_tip = {tool.tip: tool.tool for tool in tools}
     only = tools[0].place is None
     return tools[0].tool if only else torch.stack([by_tip.get(tip, tool_transform(None)) for tip in robot.tips])
-
-
-def _pose_names(tool: ToolOnTip, table: TableFormat) -> list[str]:
-    return [tool.name("command", name) for name in ("x", "y", "z", *flat_names(table.rotation))]
-
-
-def _miss_names(tool: ToolOnTip, table: TableFormat, *, oriented: bool) -> list[str]:
-    return [tool.name("miss", table.length), *[tool.name("angle_miss", table.angle)] * oriented]
-
-
-def _added(
-    model: CalibratedKinematics,
-    found: Compensation,
-    tools: list[ToolOnTip],
-    known: list[tuple[Tensor, Tensor]],
-    table: TableFormat,
-) -> dict[str, Column]:
-    """The columns beside those of the program; poses and misses are NaN where there is no command or no target."""
-    added: dict[str, Column] = {}
-    allowed = found.q.isfinite().all(1)
-    for tool in tools:
-        names = _pose_names(tool, table)
-        numbers = torch.full((len(found), len(names)), torch.nan, dtype=torch.float64, device=found.q.device)
-        if bool(allowed.any()):
-            poses = tool.nominal(model.robot, found.q[allowed])
-            unit = table.rotation_angle or "rad"
-            turned = rotation_numbers(poses[:, :3, :3], table.convention or "rotvec", angle=unit)
-            numbers[allowed] = torch.cat([poses[:, :3, 3] * table.per_metre, turned], dim=1)
-        added |= dict(zip(names, numbers.mT.tolist(), strict=True))
-    added["status"] = [str(status) for status in found.status]
-    for tool in tools:
-        names = _miss_names(tool, table, oriented=found.angle_miss is not None)
-        added[names[0]] = (tool.own(found.miss) * table.per_metre).tolist()
-        if found.angle_miss is not None:
-            angle = tool.own(found.angle_miss)
-            added[names[1]] = (angle.rad2deg() if table.angle == "deg" else angle).tolist()
-    for tool, (whole, _) in zip(tools, known, strict=False):
-        deviations = torch.full((len(found),), torch.nan, dtype=torch.float64, device=found.q.device)
-        deviations[allowed] = whole[:, 0] * table.per_metre
-        added[tool.name("std", table.length)] = deviations.tolist()
-    return added
 
 
 def _degrees(found: Compensation, tool: ToolOnTip) -> Tensor | None:
@@ -219,26 +199,26 @@ def _degrees(found: Compensation, tool: ToolOnTip) -> Tensor | None:
     return None if found.angle_miss is None else tool.own(found.angle_miss).rad2deg()
 
 
-def _summarise(kinematics: CalibratedKinematics, found: Compensation, tools: list[ToolOnTip], lines: list[int]) -> None:
+def _summarise(robot: Tree, found: Compensation, tools: list[ToolOnTip], lines: list[int]) -> None:
     """Print sizes of corrections, counts of statuses, and the first rows that are not reached."""
-    robot, allowed = kinematics.robot, found.q.isfinite().all(1)
+    allowed = found.q.isfinite().all(1)
     if bool(allowed.any()):
         sizes, change = dict[str, Tensor](), found.correction[allowed].abs()
         for tool in tools:
             after, before = (tool.nominal(robot, q[allowed])[:, :3, 3] for q in (found.q, found.start))
-            sizes[f"{tool.label}, mm"] = 1e3 * (after - before).norm(dim=1)
-        for joint, name in enumerate(robot.joint_names):
-            unit, own = ("deg", change[:, joint].rad2deg()) if robot.periodic[joint] else ("mm", 1e3 * change[:, joint])
-            sizes[f"{name}, {unit}"] = own
+            label = "tool" if tool.place is None else f"tool on {tool.tip}"
+            sizes[f"{label}, mm"] = 1e3 * (after - before).norm(dim=1)
+        for name, turns, own in zip(robot.joint_names, robot.periodic, change.mT, strict=True):
+            sizes[f"{name}, {'deg' if turns else 'mm'}"] = own.rad2deg() if turns else 1e3 * own
         rows = [[plain(what), f"{float(own.median()):.4f}", f"{float(own.max()):.4f}"] for what, own in sizes.items()]
         out.print(text_table("Corrections", ["", "median", "max"], rows))
     say(f"{len(found)} rows: " + ", ".join(f"{count} {name}" for name, count in found.counts.items()))
     say(*_missed_lines(found, tools, lines))
     few_joints = robot.n < AXES_OF_A_POSE * len(tools) and found.angle_miss is not None
     if few_joints and 2 * int(found.reached.sum()) < len(found):
-        fix = "name target positions instead (--position)"
         of_tools = "" if len(tools) == 1 else f" of {len(tools)} tools"
-        warn_user(sentence(f"a robot with {robot.n} joints cannot hold every orientation{of_tools}", fix=fix))
+        what = f"a robot with {robot.n} joints cannot hold every orientation{of_tools}"
+        warn_user(sentence(what, fix="name target positions instead (--position)"))
     elif 2 * found.counts.get("unreachable", 0) > len(found):
         what = "most targets are farther from their commands than the largest correction allows"
         warn_user(sentence(what, fix="check the frame, the unit and the columns of the targets, and --tool"))
@@ -246,16 +226,13 @@ def _summarise(kinematics: CalibratedKinematics, found: Compensation, tools: lis
 
 def _how_well_known(tool: ToolOnTip, whole: Tensor, apart: Tensor, where: str) -> str:
     """How well the model knows a tool, by deviations (N, 2) as of :meth:`ToolOnTip.known`: misses are the model's."""
-    said = (
-        f"statuses and misses are those of the model, which knows the {tool.label} in the {where} to "
-        f"{_sizes(whole)[0]}, and its orientation to {_sizes(whole)[1]} (standard deviations)"
-    )
+    label, (shift, turn) = "tool" if tool.place is None else f"tool on {tool.tip}", _sizes(whole)
+    said = f"statuses and misses are those of the model, which knows the {label} in the {where} to {shift}, and its "
+    said += f"orientation to {turn} (standard deviations)"
     if float(apart.square().sum(0)[0]) >= float(whole.square().sum(0)[0]):  # as far from the rows of the fit
         return said
-    return (
-        f"{said}; apart from where the base stands and how the tool sits on its flange, which are the same for all "
-        f"commands and can be taught anew, to {_sizes(apart)[0]} and {_sizes(apart)[1]}"
-    )
+    said += "; apart from where the base stands and how the tool sits on its flange, which are the same for all "
+    return said + "commands and can be taught anew, to {} and {}".format(*_sizes(apart))
 
 
 def _deviations(covariance: Tensor) -> Tensor:
@@ -274,22 +251,15 @@ def _missed_lines(found: Compensation, tools: list[ToolOnTip], lines: list[int])
     """Sentences about the first rows that are not reached."""
     missed = (~found.reached).nonzero().flatten().tolist()
     for row in missed[:MOST_MISSED]:
+        status, misses = str(found.status[row]), list[str]()
+        for tool in tools:
+            distance, angle = float(tool.own(found.miss)[row]), _degrees(found, tool)
+            turned = "" if angle is None else f" and {float(angle[row]):.4f} deg"
+            who = "" if tool.place is None else f"{tool.tip} "
+            misses += [] if isnan(distance) else [f"{who}misses by {1e3 * distance:.4f} mm{turned}"]
+        words = f"{REASONS.get(status, status)}, {', '.join(misses)}"
         if not bool(found.q[row].isfinite().all()):
-            yield f"  line {lines[row]}: {found.status[row]}, no command is allowed: it starts beyond a joint's limit"
-            continue
-        misses = ", ".join(filter(None, (_miss(found, tool, row) for tool in tools)))
-        status = str(found.status[row])
-        yield f"  line {lines[row]}: {REASONS.get(status, status)}, {misses}"
+            words = f"{status}, no command is allowed: it starts beyond a joint's limit"
+        yield f"  line {lines[row]}: {words}"
     if len(missed) > MOST_MISSED:
         yield f"  and {len(missed) - MOST_MISSED} more; see the column `status`"
-
-
-def _miss(found: Compensation, tool: ToolOnTip, row: int) -> str:
-    """How far a tool is from its target; nothing if it has none."""
-    distance = float(tool.own(found.miss)[row])
-    if isnan(distance):
-        return ""
-    degrees_off = _degrees(found, tool)
-    angle = "" if degrees_off is None else f" and {float(degrees_off[row]):.4f} deg"
-    who = "misses" if tool.place is None else f"{tool.tip} misses"
-    return f"{who} by {1e3 * distance:.4f} mm{angle}"

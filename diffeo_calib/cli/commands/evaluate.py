@@ -1,17 +1,15 @@
-"""`diffeo-calib evaluate`: the errors of a model on a table of measurements of any kinds."""
+"""`diffeo-calib evaluate`: the errors of a model on a table of any kinds; `report`: a calibration on one HTML page."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge
-from diffeo_calib.cli.console import out, plain, say
-from diffeo_calib.cli.declarations import EvaluateOptions
+from diffeo_calib.cli.console import out, plain, progress_bar, say
 from diffeo_calib.cli.models import (
     another_date_lines,
     check_payload_column,
@@ -19,11 +17,13 @@ from diffeo_calib.cli.models import (
     provenance_lines,
     table_of,
 )
+from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.printed import (
     ErrorTable,
     accept,
     expectation_lines,
     outlier_lines,
+    parsed_length,
     parsed_limit,
     registration_lines,
     socket_lines,
@@ -31,7 +31,7 @@ from diffeo_calib.cli.printed import (
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError, warn_user
+from diffeo_calib.common.errors import InputError, MeasurementError, warn_user
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
@@ -47,6 +47,9 @@ from diffeo_calib.kinematics.evaluation import (
 from diffeo_calib.kinematics.joint_ranges import warn_outside_range
 from diffeo_calib.measurements.csv.writing import write_rows
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.reports.analysis.findings import unseen
+from diffeo_calib.reports.html.sentences import advice, verdict
+from diffeo_calib.reports.report import write_report
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, Evaluations
 from diffeo_calib.sensors.set_ups import MeasuringFrames
 
@@ -54,21 +57,21 @@ COLUMNS = ("line", "used_in_fit", "kind", "device", "marker", "dx", "dy", "dz", 
 """Of the table of residuals."""
 
 
-def run(options: EvaluateOptions) -> None:
+def run(options: Command) -> None:
     """Run the command."""
-    model, path = load_kinematics(options.model), options.model
+    model = load_kinematics(options.model)
     source = table_of(model, options.csv, options.rows, options.units)
     limit = parsed_limit(options.fail_above)
     check_payload_column(model, source.table.payload)
     say(*provenance_lines(model))
     data = source.read(model.robot)
     if options.register:
-        return _registered(model, path.name, data, options.free or "both", options.output)
+        return _registered(model, data, options)
     check_rows(model, data)
     places = place(model, data, every_session=source.table.session is not None)
     found, used = residuals(model, places, data), rows_used_in_fit(model, data.q)
     judged = judge(model, places, data, found)
-    _show(model, found, used, positions_of(model, places, data), path.name)
+    _show(model, found, used, positions_of(model, places, data), options.model.name)
     if options.residuals is not None:
         write_rows(options.residuals, COLUMNS, [list(_residuals(found, used, source))], source.table)
         record.add(files={"residuals": options.residuals})
@@ -98,13 +101,15 @@ def _show(model: CalibratedKinematics, found: Evaluations, used: Tensor, seen: M
     """Print and record errors of all rows, of the rows of the fit, of the others, and of set-ups and devices."""
     named = dict[str, dict[str, Any]]()
     for kind, errors in found.items():
-        of_rows, of_devices = _by_rows(errors, used[found.index[kind]]), _by_device(errors)
-        measured = seen is not None and errors is found.positions
-        expected = expected_rms(model, seen, errors.errors.shape[1]) if measured and seen is not None else None
-        table = ErrorTable(errors, f"of {plain(name)}", "rows", expected=measured)
+        own, positions = used[found.index[kind]], errors is found.positions
+        of_rows = {"in all": errors}
+        if own.any() and not own.all():
+            of_rows |= {"used in the fit": errors.rows(own), "not used in the fit": errors.rows(~own)}
+        of_devices, what = _by_device(errors), "session" if positions else "device"
+        expected = expected_rms(model, seen, errors.errors.shape[1]) if positions and seen is not None else None
+        table = ErrorTable(errors, f"of {plain(name)}", "rows", expected=positions and seen is not None)
         for label, some in of_rows.items():
             table.add(some, f"{some.count} {label}", expected=expected)
-        what = "session" if errors is found.positions else "device"
         for device, some in of_devices.items():
             table.add(some, f"{some.count} of {what} '{plain(device)}'", expected=expected)
         out.print(table)
@@ -113,41 +118,30 @@ def _show(model: CalibratedKinematics, found: Evaluations, used: Tensor, seen: M
     record.add(files={}, **entries_by_kind(named))
 
 
-def _by_rows(errors: Evaluation, used: Tensor) -> dict[str, Evaluation]:
-    """The errors of all rows, of the rows (N,) of the fit and of the others."""
-    found = {"in all": errors}
-    for label, mask in {"used in the fit": used, "not used in the fit": ~used}.items():
-        if used.any() and mask.any():
-            found[label] = errors.rows(mask)
-    return found
-
-
 def _by_device(errors: Evaluation) -> dict[str, Evaluation]:
     """The errors of each set-up, or of each of several devices; sockets have no errors of their own."""
     present = [name for name in dict.fromkeys(errors.devices) if name] if errors.what != SPREAD else []
     if errors.what == READINGS and len(present) < 2:
         return {}
-    masks = {
-        name: torch.tensor([own == name for own in errors.devices], dtype=torch.bool, device=HOST) for name in present
-    }
-    return {name: errors.rows(mask) for name, mask in masks.items()}
+    masks = {name: [own == name for own in errors.devices] for name in present}
+    return {name: errors.rows(torch.tensor(mask, dtype=torch.bool, device=HOST)) for name, mask in masks.items()}
 
 
 def _residuals(found: Evaluations, used: Tensor, source: MeasuredTable) -> Iterator[list[float | str]]:
     """Rows of the table of residuals: lengths in the unit of the table, pixels, degrees."""
-    per_mm = source.table.per_metre / 1e3
     for entry in found.lines():
         metres = entry["unit"] == "mm"
-        values = [entry[name] * (per_mm if metres else 1.0) for name in COLUMNS[5:9]]
+        values = [entry[name] * (source.table.per_metre / 1e3 if metres else 1.0) for name in COLUMNS[5:9]]
         cells = entry["line"], int(used[entry["row"]]), entry["kind"], entry["device"], entry["marker"]
         yield [*cells, *values, source.table.length if metres else entry["unit"]]
 
 
-def _registered(model: CalibratedKinematics, name: str, data: Any, free: str, output: Path | None) -> None:
+def _registered(model: CalibratedKinematics, data: Any, options: Command) -> None:
     """Find device and markers anew; print what was found and the errors before and after, and write the model."""
+    output = options.output
     warn_outside_range(model, data.q)
     say(*another_date_lines(model))
-    found = model.registered(data, free=free, learn=False)
+    found = model.registered(data, free=options.free or "both", learn=False)
     if output is not None:
         save(found, output)  # before anything is printed: output may be cut off
     errors = evaluate(found, data)
@@ -157,7 +151,7 @@ def _registered(model: CalibratedKinematics, name: str, data: Any, free: str, ou
     known = found.registration is not None and found.registration.rms_before is not None
     before = residuals(model, place(model, data), data) if known else None
     for kind, after in kinds.items():
-        table = ErrorTable(after, f"of {plain(name)}", "rows")
+        table = ErrorTable(after, f"of {plain(options.model.name)}", "rows")
         if before is not None:
             table.add(before[kind], f"{after.count} with the places of the fit")
         table.add(after, f"{after.count} with places found anew")
@@ -165,3 +159,27 @@ def _registered(model: CalibratedKinematics, name: str, data: Any, free: str, ou
     say(*map(plain, (*registration_lines(found), *placement_sentences(found))))
     if output is not None:
         say(f"registered model: {output}")
+
+
+def run_report(wanted: Command) -> None:
+    """Write the page, and say its first line."""
+    model, data = load_kinematics(wanted.model), None
+    if wanted.data is not None:
+        data = table_of(model, wanted.data, wanted.rows, wanted.units).read(model.robot)
+    tolerance = parsed_length(wanted.tolerance, "--tolerance")
+    if tolerance is not None and data is not None and not bool(unseen(model, data.q).any()):
+        expected, fix = "rows that took no part in fit and registration", "measure more rows, or leave --data out"
+        raise InputError.of("rows to hold against --tolerance", expected=expected, got=f"{len(data)} that did", fix=fix)
+    how = {"against": wanted.against or [], "tolerance": tolerance}
+    with progress_bar() as progress:
+        found = write_report(model, wanted.output, data, **how, progress=progress)
+    say(*provenance_lines(model))
+    words, stages = verdict(found, tolerance), dict(found.expected)
+    record.add(**entries_by_kind(found.kinds), expected_error_by_stage_m=stages, left_out=not found.shown.new)
+    record.add(verdict=words, advice=list(advice(found)), files={"report": wanted.output})
+    if found.shown.predictions is not None:
+        record.add(coverage_95=found.shown.predictions.coverage())
+    if data is not None and not found.shown.new:
+        each = "as fitted" if not found.errors else "each predicted by all others"
+        say(f"all rows of the table were used before: the rows of the fit are shown, {each}")
+    say(words, *expectation_lines(model, None, found.deviations.error), f"report: {wanted.output}")

@@ -7,12 +7,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from math import hypot
 from pathlib import Path
 
+import typer
 from torch import Tensor
 
 from diffeo_calib.calibration.expected_errors import ExpectedError, stands_free
 from diffeo_calib.cli.console import out, plain, say, text_table
-from diffeo_calib.cli.declarations import ExportOptions
 from diffeo_calib.cli.models import load_laden, tool_in_tip
+from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.printed import placement_lines
 from diffeo_calib.cli.record import make_folder, record
 from diffeo_calib.common.files import write_together
@@ -42,6 +43,15 @@ from diffeo_calib.sensors.known_drift import KnownDrift
 MEGABYTE = 1e6
 RIGID = ("--urdf", "--mjcf", "--dh", "--ur-kinematics")
 NOMINAL = "nominal robot, registered"
+OFFSETS = "joint offsets: reading + offset is the joint value for nominal kinematics; they hold no other error"
+FIELD = (
+    "field: a controller adds add_x, ... to the place that it is to reach; std_x, ... say how well",
+    "  each is known; between the points interpolate linearly",
+)
+UR_HASH = (
+    "the UR driver compares the entry hash with the controller's and will report another calibration: "
+    "pass the hash of the robot's own calibration file (--ur-hash)"
+)
 
 
 class _Export:
@@ -52,27 +62,25 @@ class _Export:
         geometry: the rigid kinematics that are written; None for none.
     """
 
-    def __init__(self, model: CalibratedKinematics, given: ExportOptions) -> None:
+    def __init__(self, model: CalibratedKinematics, given: Command) -> None:
         self.model, self.given = model, given
-        self.length, self.angle = given.length, given.angle
         self.files: dict[str, bytes] = {}
         self.rows: dict[str, RigidKinematics] = {NOMINAL: nominal_kinematics(model)}
         self.lines: list[str] = []
         self.geometry: Geometry | None = None
 
-    def rigid(self, options: list[str], *, with_tables: bool, tables: bool) -> None:
+    def rigid(self, options: list[str], *, tables: bool) -> None:
         """URDF, DH table and UR kinematics: three forms of the same rigid kinematics."""
-        urdf = urdf_of(self.model.robot, self.given.robot) if {"--urdf", "--ur-kinematics"} & {*options} else None
-        found = rigid_kinematics(self.model, transmission=with_tables)
-        self.geometry = found.geometry
-        together = " and --correction-tables"
-        if with_tables:
-            self.rows[", ".join(options) + together] = found
-            self.rows[f"{', '.join(options)} alone"] = applied_with_tables(self.model, found, applied=False)
+        urdf = urdf_of(self.model.robot, self.given.robot) if {"--urdf", "--ur-kinematics"} & {*options} else b""
+        found = rigid_kinematics(self.model, transmission=self.given.with_tables)
+        self.geometry, name = found.geometry, ", ".join(options)
+        together = f"{name} and --correction-tables"
+        if self.given.with_tables:
+            self.rows |= {together: found, f"{name} alone": applied_with_tables(self.model, found, applied=False)}
         else:
-            self.rows[", ".join(options)] = found
+            self.rows[name] = found
             if tables:
-                self.rows[", ".join(options) + together] = applied_with_tables(self.model, found, applied=True)
+                self.rows[together] = applied_with_tables(self.model, found, applied=True)
                 self.lines.append("to use them together with the tables, fit them for that: --with-tables")
         said = ", ".join(f"{name} {1e3 * rms:.4f} mm" for name, rms in found.validated.items())
         self.lines.append(f"rigid kinematics from the {found.how} (cross-validated: {said})")
@@ -84,32 +92,34 @@ class _Export:
         for option in options:
             self.files[option] = self._text(option, found.geometry, urdf).encode("utf-8", "surrogateescape")
 
-    def _text(self, option: str, geometry: Geometry, urdf: bytes | None) -> str:
+    def _text(self, option: str, geometry: Geometry, urdf: bytes) -> str:
         if option == "--dh":
             table = dh_table(geometry, self.given.dh_convention, self.given.tip or self.model.tool_tip)
             self.lines += _dh_lines(table, self.given)
-            return dh_text(table, self.length, self.angle)
-        content = urdf or b""
+            return dh_text(table, self.given.length, self.given.angle)
         if option == "--mjcf":
             return mjcf_text(geometry)
         if option == "--urdf":
-            return corrected_urdf(geometry, content).decode("utf-8", "surrogateescape")
-        if self.given.ur_hash is None:
-            self.lines.append(
-                "the UR driver compares the entry hash with the controller's and will report another calibration: "
-                "pass the hash of the robot's own calibration file (--ur-hash)"
-            )
-        return ur_text(ur_transforms(geometry, content), self.given.ur_hash)
+            return corrected_urdf(geometry, urdf).decode("utf-8", "surrogateescape")
+        self.lines += [UR_HASH] * (self.given.ur_hash is None)
+        return ur_text(ur_transforms(geometry, urdf), self.given.ur_hash)
 
-    def offsets(self) -> None:
-        """Joint offsets alone."""
-        found = best_joint_offsets(self.model)
-        self.rows["--joint-offsets"] = found.rigid
-        text = offsets_text(found, self.model.robot, self.length, self.angle)
-        self.files["--joint-offsets"] = text.encode()
-        self.lines.append(
-            "joint offsets: reading + offset is the joint value for nominal kinematics; they hold no other error"
-        )
+    def tables(self, wanted: Mapping[str, Path]) -> None:
+        """Joint offsets alone, correction tables for the nominal robot, corrections on a grid."""
+        length, angle = self.given.length, self.given.angle
+        if "--joint-offsets" in wanted:
+            found = best_joint_offsets(self.model)
+            self.rows["--joint-offsets"] = found.rigid
+            self.files["--joint-offsets"] = offsets_text(found, self.model.robot, length, angle).encode()
+            self.lines.append(OFFSETS)
+        if "--correction-tables" in wanted:
+            tables = correction_tables(self.model)
+            self.rows["--correction-tables, nominal robot"] = nominal_kinematics(self.model, transmission=True)
+            self.files["--correction-tables"] = tables_text(tables, length, angle).encode()
+            self.lines += _table_lines(tables)
+        if "--field" in wanted:
+            self.files["--field"] = field_text(self.model, self.given.grid, length).encode()
+            self.lines += FIELD
 
     def camera(self, folder: Path) -> dict[Path, bytes]:
         """The files of the camera; its place belongs to the rigid kinematics, if any are written."""
@@ -121,61 +131,38 @@ class _Export:
         self.lines.append(f"camera: {', '.join(files)} in {folder}; its place belongs to {belongs}")
         return {folder / name: text.encode() for name, text in files.items()}
 
-    def field(self) -> None:
-        """Corrections of commands on a grid, of a machine with commanded places."""
-        self.files["--field"] = field_text(self.model, self.given.grid, self.length).encode()
-        self.lines.append(
-            "field: a controller adds add_x, ... to the place that it is to reach; std_x, ... say how well"
-        )
-        self.lines.append("  each is known; between the points interpolate linearly")
 
-    def tables(self) -> None:
-        """Correction tables, with the nominal robot."""
-        tables = correction_tables(self.model)
-        self.rows["--correction-tables, nominal robot"] = nominal_kinematics(self.model, transmission=True)
-        text = tables_text(tables, self.length, self.angle)
-        self.files["--correction-tables"] = text.encode()
-        self.lines += _table_lines(tables)
-
-
-def run(given: ExportOptions) -> None:
+def run(given: Command) -> None:
     """Write the files, then say what each leaves of the model."""
-    wanted = {option: target for option, target in given.outputs.items() if target is not None}
+    files = {one.shown: getattr(given, one.field) for one in given.all() if one.kind in ("output", "source", "folder")}
+    wanted: dict[str, Path] = {option: path for option, path in files.items() if path is not None}
+    if not wanted:
+        raise typer.BadParameter(f"name at least one file to write: {', '.join(files)}")
     model = load_laden(given.model, given.payload_mass)
-    units = TableFormat(given.length, given.angle)
-    own = tool_in_tip(model, given.tool, given.tool_from, units)
+    own = tool_in_tip(model, given.tool, given.tool_from, TableFormat(given.length, given.angle))
     tool = None if given.tool is None else own
     source = None if given.c is None else c_files(model, given.c, tool, given.frame or "base", tip=given.tip)
-    export = _Export(model, given)
-    tables = "--correction-tables" in wanted
-    if rigid := [option for option in wanted if option in RIGID]:
-        export.rigid(rigid, with_tables=given.with_tables, tables=tables)
-    if "--joint-offsets" in wanted:
-        export.offsets()
-    if tables:
-        export.tables()
-    if "--field" in wanted:
-        export.field()
+    export, rigid = _Export(model, given), [option for option in wanted if option in RIGID]
+    if rigid:
+        export.rigid(rigid, tables="--correction-tables" in wanted)
+    export.tables(wanted)
     camera = export.camera(wanted["--camera"]) if "--camera" in wanted else {}
     texts = {} if source is None else source.contents
     write_together({wanted[option]: content for option, content in export.files.items()} | texts | camera)
     record.add(files={option[2:]: target for option, target in wanted.items()})
     if len(export.rows) > 1:
         _show(export.model, export.rows)
-    say(*export.lines, *_limits(model, rigid))
-    for option in export.files:
-        say(f"{option[2:]}: {wanted[option]}")
+    say(*export.lines, *_limits(model, rigid), *(f"{option[2:]}: {wanted[option]}" for option in export.files))
     for line in _write_programs(model, given, tool, source):
         say(line)
 
 
 def _write_programs(
-    model: CalibratedKinematics, given: ExportOptions, tool: Tensor | None, source: CFiles | None
+    model: CalibratedKinematics, given: Command, tool: Tensor | None, source: CFiles | None
 ) -> Iterator[str]:
-    """Write the programs that are no texts; yields a sentence about each program.
+    """Write the programs that are no texts, of the tool (4, 4), m, in the tip's frame; a sentence about each program.
 
-    Args:
-        tool: (4, 4) tool centre point in the tip's frame, m; None for the model's own. source: what was written in C.
+    ``source`` is what was written in C.
     """
     frame, named = given.frame or "base", not (tool is None and given.frame is None)
     if source is not None:
@@ -221,7 +208,7 @@ def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> N
         say(f"RMS distance from the measured positions of the fit, mm: {left}")
 
 
-def _dh_lines(table: DHTable, given: ExportOptions) -> Iterator[str]:
+def _dh_lines(table: DHTable, given: Command) -> Iterator[str]:
     """Base and tool of a Denavit-Hartenberg table, and the joints with Hayati's parameter."""
     for name, transform in (("base", table.base), ("tool", table.tool)):
         numbers = zip(origin_numbers(transform), (given.length, given.angle), strict=True)

@@ -1,11 +1,11 @@
-"""`diffeo-calib fit`: calibrate, show the errors of every stage, write the model."""
+"""`diffeo-calib fit`: calibrate, show the errors of every stage, write the model; `demo`: an arm to calibrate."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+import shlex
+from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import typer
@@ -15,9 +15,10 @@ from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.calibration.judgement import check_errors, contradicted
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, KindErrors, errors_by_kind
-from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, exit_on_interrupt, interrupts, out, progress_bar, say
-from diffeo_calib.cli.declarations import FitOptions
+from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, out, progress_bar, say
+from diffeo_calib.cli.main import app
 from diffeo_calib.cli.models import load_kinematics, made_by_command, robot_of
+from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.printed import (
     ErrorTable,
     expectation_lines,
@@ -27,17 +28,20 @@ from diffeo_calib.cli.printed import (
     socket_lines,
     stage_line,
 )
-from diffeo_calib.cli.record import entries_by_kind, kind_entry, record
+from diffeo_calib.cli.record import entries_by_kind, kind_entry, make_folder, record
 from diffeo_calib.cli.tables import measured_table
 from diffeo_calib.common.errors import PACKAGE, printable
 from diffeo_calib.common.files import write_figure
 from diffeo_calib.interop.model_file import save
-from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_entry, hand_eye_sentences
+from diffeo_calib.measurements.csv.files import write_measurements
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.reports.plots.errors import stages
 from diffeo_calib.reports.report import write_report
 from diffeo_calib.robots.cartesian import is_cartesian, turns_nowhere
-from diffeo_calib.sensors.errors import ERRORS, Evaluation
+from diffeo_calib.robots.simulated_arm import SimulatedArm
+from diffeo_calib.sensors.errors import ERRORS
 from diffeo_calib.sensors.tables import divided
 
 EXIT_UNCONVERGED = 3
@@ -48,48 +52,39 @@ Errors = dict[str, KindErrors]
 """Errors of every stage by the kind of rows."""
 
 
-def run(given: FitOptions) -> None:
+def run(given: Command) -> None:
     """Calibrate with the rows that are not held out, write the model, and end with the exit code of the fit."""
     source = measured_table(given.csv, given.rows, given.units, given.duplicates)
-    with exit_on_interrupt(), progress_bar() as progress:
-        chain, others = (
-            robot_of(given.robot, source),
-            [load_kinematics(path) for path in given.scales_of or ()],
-        )
+    with progress_bar() as progress:
+        chain = robot_of(given.robot, source)
+        others = [load_kinematics(path) for path in given.scales_of or ()]
         data = source.read(chain, given.robot.links.tip or chain.tips)
         train, test = data.split(1.0 - given.holdout, given.seed) if given.holdout else (data, None)
         how = {"controls": given.controls or "auto", "seed": given.seed, "note": given.note, "scales_of": others}
         result = calibrate(chain, train, **how, progress=interrupts.watching(progress, err.print))
         result = replace(result, model=made_by_command(result.model))
-    own = result.placed.coordinates
-    on_tool = (
-        None
-        if own is None
-        else own.table.sees_board_from_tool(commanded=is_cartesian(chain) and not turns_nowhere(chain))
-    )
+    own, commanded = result.placed.coordinates, is_cartesian(chain) and not turns_nowhere(chain)
+    on_tool = None if own is None else own.table.sees_board_from_tool(commanded=commanded)
     hand_eye = {} if on_tool is None else HandEye.of_each(result.model, camera_on_tool=on_tool)
     save(result.model, given.output)  # before anything is printed: output may be cut off
-    in_train, held_out = errors_by_kind(result, train), None if test is None else errors_by_kind(result, test)
+    in_train, held_out = errors_by_kind(result, train), {} if test is None else errors_by_kind(result, test)
     record.add(**hand_eye_entry(hand_eye))
-    _record(result, in_train, held_out, {"model": given.output, "figure": given.figure, "report": given.report})
-    say(*_verdict(result, held_out or {}))
-    _show_errors(result, in_train, held_out)
+    _record(result, in_train, held_out, given)
+    judged = [one.stages for one in held_out.values() if one.one.what == ERRORS]
+    say(*_verdict(result, judged))
+    _show_errors(result, in_train, None if test is None else held_out)
     _show_findings(result, len(train))
-    wrong = [] if held_out is None else _contradicted(result.model, held_out)
+    wrong = sorted(_contradicted(result, held_out), key=lambda outlier: -outlier.distance)
     say(*outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"))
     say(*_lines_about_places(result, data, held_out, hand_eye))
-    for one in (held_out or {}).values():
-        if one.one.what == ERRORS:
-            _show_verdict(one.stages[GEOMETRIC], one.stages[CALIBRATED], wrong=bool(wrong))
-    say(f"model: {given.output}")
-    shown = {"rows": "training", "data": train} if test is None else {"rows": "held-out", "data": test}
-    _write_pictures(result, given, source.csv.name, held_out or in_train, **shown)
+    say(*_advice(judged, wrong=bool(wrong)), f"model: {given.output}")
+    shown, rows = (train, "training") if test is None else (test, "held-out")
+    _write_pictures(result, given, held_out or in_train, f"{rows} rows", shown)
     _end(result, in_train, held_out or in_train)
 
 
-def _verdict(result: CalibrationResult, held_out: Errors) -> Iterator[str]:
+def _verdict(result: CalibrationResult, judged: list[Any]) -> Iterator[str]:
     """How accurate the robot is now, first of all: by measured positions, or by what the model expects."""
-    judged = [one.stages for one in held_out.values() if one.one.what == ERRORS]
     for stage in judged:
         geometry, model = stage[GEOMETRIC], stage[CALIBRATED]
         unit, per_unit = model.shown
@@ -110,30 +105,28 @@ def _end(result: CalibrationResult, in_train: Errors, judged: Errors) -> None:
         raise typer.Exit(EXIT_UNCONVERGED)
 
 
-def _contradicted(model: CalibratedKinematics, errors: Errors) -> list[Outlier]:
-    """Rows of any kind that took no part in the fit and that look wrong, the worst first."""
-    found: list[Outlier] = []
+def _contradicted(result: CalibrationResult, errors: Errors) -> Iterator[Outlier]:
+    """Rows of any kind that took no part in the fit and that look wrong."""
     for one in errors.values():
-        found += contradicted(model, one.rows) if one.one.what == ERRORS else []
-        found += contradicted_in_sockets(model, one.rows)
-    return sorted(found, key=lambda outlier: -outlier.distance)
+        yield from contradicted(result.model, one.rows) if one.one.what == ERRORS else ()
+        yield from contradicted_in_sockets(result.model, one.rows)
 
 
 def _lines_about_places(
-    result: CalibrationResult, data: Any, held_out: Errors | None, hand_eye: dict[str, HandEye]
+    result: CalibrationResult, data: Any, held_out: Errors, hand_eye: dict[str, HandEye]
 ) -> Iterator[str]:
     """Hidden markers, and where devices, base and markers, or camera and board, were found."""
     placed = result.placed
-    placement = list(placement_lines(result.model.geometry, poses=placed.lever is not None, ball=placed.ball))
-    placement = list(hand_eye_sentences(hand_eye)) or placement
-    for one in (held_out or {}).values():
+    placement = list(hand_eye_sentences(hand_eye)) or list(
+        placement_lines(result.model.geometry, poses=placed.lever is not None, ball=placed.ball)
+    )
+    for one in held_out.values():
         yield from socket_lines(one.one, "held out")
     own, _ = divided(data)
     if own is not None and not placed.free:
         yield from own.table.device_rows().hidden_lines()
-    yield from result.placement.sentences()
-    yield from map(str, result.lengths[:1])
-    if any(one.one.what == ERRORS for one in (held_out or {}).values()):  # else they are the verdict
+    yield from (*result.placement.sentences(), *map(str, result.lengths[:1]))
+    if any(one.one.what == ERRORS for one in held_out.values()):  # else they are the verdict
         yield stage_line(result.model, result.stages, result.expected)
     yield from expectation_lines(result.model, data, result.expected)
     advice = next(filter(None, (one.size_advice() for one in result.placement)), None)
@@ -143,19 +136,13 @@ def _lines_about_places(
     yield from placement[1:] if placed.free else placement  # without a device the robot's base is the measuring frame
 
 
-def _write_pictures(
-    result: CalibrationResult, given: FitOptions, name: str, errors: Errors, *, rows: str, data: Any
-) -> None:
-    """Draw the figure and write the report, if they are wanted.
-
-    Args:
-        name: of the table. errors: of each stage on the rows to show. rows: what these are. data: these rows.
-    """
+def _write_pictures(result: CalibrationResult, given: Command, errors: Errors, rows: str, data: Any) -> None:
+    """Draw the figure and write the report, if they are wanted; ``rows`` are what ``data`` to show are."""
     if given.figure is not None:
-        shown = f"{sum(len(one.rows) for one in errors.values())} {rows} rows"
-        shown += ", no row was held out" * (rows == "training")
-        panels = [one.stages for one in errors.values()]
-        write_figure(stages(panels, f"{printable(name)}: errors on {shown}"), given.figure)
+        shown = f"{sum(len(one.rows) for one in errors.values())} {rows}"
+        shown += ", no row was held out" * rows.startswith("training")
+        title = f"{printable(given.csv.name)}: errors on {shown}"
+        write_figure(stages([one.stages for one in errors.values()], title), given.figure)
         say(f"figure: {given.figure}")
     if given.report is not None:
         with progress_bar() as progress:
@@ -165,16 +152,14 @@ def _write_pictures(
         say(f"report: {given.report} (open it in a browser)")
 
 
-def _record(
-    result: CalibrationResult, in_train: Errors, held_out: Errors | None, files: Mapping[str, Path | None]
-) -> None:
+def _record(result: CalibrationResult, in_train: Errors, held_out: Errors, given: Command) -> None:
     """Add the results for programs."""
-    both = {"training": in_train} | ({} if held_out is None else {"held_out": held_out})
-    record.add(**result.placement.entry())
+    both = {"training": in_train, "held_out": held_out}
+    kinds = {kind: {rows: one[kind].stages for rows, one in both.items() if kind in one} for kind in in_train}
+    files = {"model": given.output, "figure": given.figure, "report": given.report}
     record.add(
-        **entries_by_kind(
-            {kind: {rows: one[kind].stages for rows, one in both.items() if kind in one} for kind in in_train}
-        ),
+        **result.placement.entry(),
+        **entries_by_kind(kinds),
         lengths={one.cause.name: [one.value, one.deviation] for one in result.lengths},
         leave_one_out={kind: kind_entry(one) for kind, one in result.left_out.items()},
         leave_one_out_rms_m=result.left_out.positions_rms,
@@ -209,14 +194,15 @@ def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors |
             say(f"no row was held out: {what} (leave-one-out RMS: {result.left_out.rms_text})")
 
 
-def _show_verdict(geometry: Evaluation, model: Evaluation, *, wrong: bool) -> None:
-    """Say what the errors on held-out rows mean where rows are wrong, or the model no better than geometry."""
-    if wrong:
-        median = f"the median is {1e3 * model.median:.4f} mm, with geometry alone {1e3 * geometry.median:.4f} mm"
-        say(f"the rows that look wrong dominate the held-out RMS: repair or remove them; {median}")
-    if model.rms < geometry.rms or (wrong and model.median < geometry.median):
-        return
-    say("the deformation does not improve on geometry for the held-out rows: measure more poses")
+def _advice(judged: list[Any], *, wrong: bool) -> Iterator[str]:
+    """What the errors on held-out rows mean where rows are wrong, or the model no better than geometry."""
+    for stage in judged:
+        geometry, model = stage[GEOMETRIC], stage[CALIBRATED]
+        if wrong:
+            median = f"the median is {1e3 * model.median:.4f} mm, with geometry alone {1e3 * geometry.median:.4f} mm"
+            yield f"the rows that look wrong dominate the held-out RMS: repair or remove them; {median}"
+        if model.rms >= geometry.rms and not (wrong and model.median < geometry.median):
+            yield "the deformation does not improve on geometry for the held-out rows: measure more poses"
 
 
 def _show_findings(result: CalibrationResult, rows: int) -> None:
@@ -224,10 +210,7 @@ def _show_findings(result: CalibrationResult, rows: int) -> None:
     detailed = logging.getLogger(PACKAGE).isEnabledFor(logging.INFO)
     if detailed:
         out.print(parts_table(result.parts))
-    for wave in result.gear_lines:
-        say(wave.sentence)
-    say(*outlier_lines(result.outliers, rows))
-    say(result.status)
+    say(*(wave.sentence for wave in result.gear_lines), *outlier_lines(result.outliers, rows), result.status)
     if detailed:
         left_out, fitted = result.leave_one_out, result.fit
         if left_out.effective is not None:
@@ -236,3 +219,26 @@ def _show_findings(result: CalibrationResult, rows: int) -> None:
             f"coupling residual {fitted.coupling_residual:.1e}, end residual {fitted.end_residual:.1e}, "
             f"time-stepping error {1e3 * fitted.step_error:.1e} mm with {fitted.integrator.intervals} step(s)"
         )
+
+
+POSITION = ("measurement_x", "measurement_y", "measurement_z")
+
+
+def run_demo(given: Command) -> None:
+    """Write an arm and its measurements, and calibrate it by a command that is printed."""
+    make_folder(folder := given.output)
+    arm = SimulatedArm(seed=given.seed)
+    urdf, csv = folder / "arm.urdf", folder / "measurements.csv"
+    arm.write_urdf(urdf)
+    data = Measurements(*arm.measure(given.rows, seed=given.seed), arm.nominal.joint_names)
+    write_measurements(csv, data, TableFormat("mm", "deg"), position=POSITION)
+    lines = [
+        ["fit", csv, "--robot", urdf, "--base", arm.nominal.base, "--tip", arm.nominal.tip],
+        ["--position", ",".join(POSITION), "--length", "mm", "--angle", "deg"],
+        ["-o", folder / "model.safetensors", "--figure", folder / "calibration.png"],
+        ["--report", folder / "report.html"],
+    ]
+    command = [list(map(str, line)) for line in lines]
+    say(f"{given.rows} simulated measurements written to {csv}. Now running:\n")
+    say("  diffeo-calib " + " \\\n      ".join(map(shlex.join, command)) + "\n")
+    app([word for line in command for word in line])

@@ -10,17 +10,27 @@ from math import inf
 from os.path import relpath
 from pathlib import Path
 from statistics import median
-from typing import Any, NamedTuple, get_args
+from typing import NamedTuple
 
 from diffeo_calib.calibration.diagnostics.likely_mistakes import UNMOVED_JOINT_RANGE
 from diffeo_calib.cli import commanded_poses, proposals
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.declarations import InitOptions
-from diffeo_calib.cli.guesses import NAMED, JointColumns, Sheet, guess_joints, guess_sheet, joints_without_column
+from diffeo_calib.cli.guesses import (
+    NAMED,
+    Choice,
+    JointColumns,
+    Sheet,
+    entries,
+    guess_joints,
+    guess_sheet,
+    joints_without_column,
+    rows_in,
+    tips_of,
+    with_places,
+)
 from diffeo_calib.cli.models import is_urdf, load_robot
-from diffeo_calib.cli.options import CORNERS, Convention, Links
+from diffeo_calib.cli.options import CORNERS, Command, Links
 from diffeo_calib.cli.proposals import Source
-from diffeo_calib.cli.row_columns import Choice, entries, rows_in, tips_of, with_places
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.checks import quiet
@@ -67,7 +77,7 @@ class Arm(NamedTuple):
         return Arm(links, self.joints[:count], self.ends[:count], self.columns[:count], self.how, self.lacking)
 
 
-def run(given: InitOptions) -> None:
+def run(given: Command) -> None:
     """Propose a campaign, write it, and print it; a file that was edited is replaced with --force alone."""
     output = given.output
     if given.csv.is_dir():
@@ -83,14 +93,14 @@ def run(given: InitOptions) -> None:
         Choice("csv", relpath(given.csv, output.parent), "; ".join(["the table", *sheet.notes])),
         *joined,
         *names,
+        *source.rows.entries(output.parent),
+        *filter(None, [source.marker]),
+        Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it"),
+        Choice("decimal", sheet.decimal, "the same"),
+        *units,
+        Choice("output", csv.with_suffix(".safetensors").name, "the model"),
+        Choice("report", csv.with_suffix(".html").name, "the report"),
     ]
-    choices += (one._replace(value=_from_folder(one.value, output.parent)) for one in source.rows.entries())
-    choices += [] if source.marker is None else [source.marker]
-    sep = "tab" if sheet.sep == "\t" else sheet.sep
-    choices.append(Choice("sep", sep, f"{len(sheet.numbers)} columns are numbers with it"))
-    choices += [Choice("decimal", sheet.decimal, "the same"), *units]
-    choices.append(Choice("output", csv.with_suffix(".safetensors").name, "the model"))
-    choices.append(Choice("report", csv.with_suffix(".html").name, "the report"))
     unused = [name for name in sheet.header if name not in _used(choices)]
     lines = [
         "# Options of `diffeo-calib fit`, proposed by `diffeo-calib init`: check every line.",
@@ -113,14 +123,12 @@ Proposal = tuple[Source, list[Choice], list[Choice]]
 
 def _of_robot(csv: Path, robot: Path, folder: Path, sheet: Sheet) -> Proposal:
     """The proposal for a table with joint values of a robot."""
-    urdf = is_urdf(robot)
-    about = [Choice("robot", relpath(robot, folder), "a URDF" if urdf else f"a DH table, {DHFile.read(robot).units}")]
+    about = "a URDF" if is_urdf(robot) else f"a DH table, {DHFile.read(robot).units}"
+    about = [Choice("robot", relpath(robot, folder), about)]
     arm, why, seen, names, units = _explained(csv, robot, sheet)
-    if urdf:
+    if is_urdf(robot):
         about.append(Choice("base", arm.links.base or "", "root of the URDF"))
-    if arm.links.dh_convention is not None:
-        convention = "the convention with which it explains the rows"
-        about.append(Choice("dh-convention", arm.links.dh_convention, convention))
+    about += entries([arm.links], dh_convention="the convention with which it explains the rows")
     if seen.tips:
         about.append(Choice("tip", list(seen.tips), "leaves after which the columns are named"))
     elif arm.links.tip is not None:
@@ -148,14 +156,6 @@ def _commanded(csv: Path, robot: Path | None, sheet: Sheet) -> Proposal | None:
     return None
 
 
-def _from_folder(value: Any, folder: Path) -> Any:
-    """Files of cameras in texts of --reading relative to the folder of the campaign."""
-    if isinstance(value, list):
-        return [_from_folder(text, folder) for text in value]
-    named = isinstance(value, str) and value.startswith(CORNERS) and value.endswith(".yaml")
-    return CORNERS + relpath(value.removeprefix(CORNERS), folder) if named else value
-
-
 def _format(units: list[Choice], seen: Source) -> TableFormat:
     """The format of positions and joints in these units."""
     found = {choice.name: choice.value for choice in units}
@@ -172,32 +172,33 @@ class Explained(NamedTuple):
     names: list[Choice]
     units: list[Choice]
 
+    @classmethod
+    def of(cls, csv: Path, robot: Path, sheet: Sheet, arm: Arm) -> Explained:
+        """Those of some joints of a robot; InputError if it does not explain the rows."""
+        leaves = [path[-1].child for path in chains_in(robot)] if is_urdf(robot) else []
+        rows = rows_in(csv, sheet, arm.columns)
+        tips = tips_of(rows.markers, leaves)
+        chain = load_robot(robot, replace(arm.links, tip=tips or arm.links.tip))
+        table = TableFormat("mm", "deg", sheet.sep, sheet.decimal)
+        seen = Source(csv, chain, arm.columns, rows, table, sheet.numbers, tips)
+        guessed = guess_joints(sheet.numbers, chain.joint_names) or [JointColumns(arm.columns, arm.how, ())]
+        seen, names = proposals.joint_columns(seen, guessed)
+        seen = proposals.measured(seen)
+        units = list(_units(seen))
+        if meant := [choice for choice in units if choice.name == "joints"]:
+            names, units = meant, [choice for choice in units if choice.name != "joints"]
+        seen = replace(seen, joints=str(names[0].value).split(",")) if names[0].sure else seen
+        seen = proposals.measured(seen) if meant else seen  # the robot explains the rows only now
+        return _with_tip(robot, cls(arm, "", seen, names, units))
+
 
 def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
     """The joints, or the convention, that explain the rows; InputError if none do, or several."""
     found, refused = dict[tuple[str | None, ...], Explained](), list[InputError]()
-    leaves = [path[-1].child for path in chains_in(robot)] if is_urdf(robot) else []
     for arm in (arms := _arms(robot, sheet)):
         try:
             with quiet():  # `fit` warns of the right reading
-                rows = rows_in(csv, sheet, arm.columns)
-                tips = tips_of(rows.markers, leaves)
-                chain = load_robot(robot, replace(arm.links, tip=tips or arm.links.tip))
-                table = TableFormat("mm", "deg", sheet.sep, sheet.decimal)
-                seen = Source(csv, chain, arm.columns, rows, table, sheet.numbers, tips)
-                guessed = guess_joints(sheet.numbers, chain.joint_names) or [JointColumns(arm.columns, arm.how, ())]
-                seen, names = proposals.joint_columns(seen, guessed)
-                seen = proposals.measured(seen)
-                seen = replace(seen, marker=proposals.marker(seen))
-                units = list(_units(seen))
-                meant = [choice for choice in units if choice.name == "joints"]
-                names = meant or names
-                seen = replace(seen, joints=str(names[0].value).split(",")) if names[0].sure else seen
-                units = [choice for choice in units if choice.name != "joints"]
-                if meant:  # the robot explains the rows only now
-                    seen = proposals.measured(seen)
-                    seen = replace(seen, marker=seen.marker or proposals.marker(seen))
-                one = _with_tip(robot, Explained(arm, "", seen, names, units))
+                one = Explained.of(csv, robot, sheet, arm)
                 found.setdefault((arm.links.dh_convention, *one.seen.robot.joint_names), one)
         except InputError as error:
             refused.append(error)
@@ -212,10 +213,8 @@ def _explained(csv: Path, robot: Path, sheet: Sheet) -> Explained:
     if not proposals.is_clear(sorted((size, "") for size in alike.values()), CLEAR_RATIO):
         got = "; ".join(f"{key[0] or few(key[1:], 9)}: {100 * size:.3g} %" for key, size in alike.items())
         fix = "say the convention in the file, by a line such as `# craig`" if best.arm.links.dh_convention else ""
-        fix = fix or "name the columns after the joints of the arm"
-        raise InputError.of(
-            f"the joints of '{robot}'", expected="some that explain the rows far better", got=got, fix=fix
-        )
+        fix, expected = fix or "name the columns after the joints of the arm", "some that explain the rows far better"
+        raise InputError.of(f"the joints of '{robot}'", expected=expected, got=got, fix=fix)
     return best
 
 
@@ -229,7 +228,7 @@ def _arms(robot: Path, sheet: Sheet) -> list[Arm]:
             whole.append((Links(base=path[0].parent), [joint.name for joint in moving], ends))
     else:
         table = DHFile.read(robot)
-        ways = [None] if table.convention else get_args(Convention)
+        ways = [None] if table.convention else ("standard", "craig")
         whole += [(Links(dh_convention=way), table.names, table.names) for way in ways]
     arms = list[Arm]()
     for options, joints, ends in whole:
@@ -301,10 +300,8 @@ def _units(source: Source) -> Iterator[Choice]:
     if not all(source.robot.periodic) and doubtful:
         others = sorted([*found, *_left(source, lengths, lengths, boards=boards)], key=lambda entry: entry[0])
         found = others if proposals.is_clear(others, CLEAR_RATIO) else found
-    if by_limits := not any(source.robot.periodic) and [
-        (left, table) for left, table in found if left < inf and _within(source, table)
-    ]:
-        found = by_limits  # all lengths in another unit are another size, which the rows do not show
+    by_limits = [] if any(source.robot.periodic) else [one for one in found if one[0] < inf and _within(source, one[1])]
+    found = by_limits or found  # all lengths in another unit are another size, which the rows do not show
     (best, table), *others = found
     excluded = found[-1][0] == inf
     named = [(left, table) for left, table in found if not proposals.other_units(source, table)]
@@ -316,28 +313,29 @@ def _units(source: Source) -> Iterator[Choice]:
     if best == inf and not poses:
         source.read_residual(table)  # says why
     meant = [] if poses or best < DOUBTFUL or not any(source.robot.periodic) else list(source.conventions(best))
-    if not clear and not poses and not meant:
-        camera = "camera on the tool"
-        read = [
-            (left, (t.length, t.angle, t.joint_length, camera * t.camera_on_tool)) for left, t in found if left < inf
-        ]
-        got = "; ".join(f"{' and '.join(filter(None, units))}: {100 * left:.3g} %" for left, units in read)
-        got += "; the units that the file states exclude others" * excluded
-        sought = source.rows.markers and not (source.rows.sockets or source.rows.readings)
-        fix = "no signs, zeros, coupling or units of the joints do either: " if sought else ""
-        fix += "check the table's joints against the robot's, or write the file yourself; of a robot with several tips "
-        fix += "the columns of each are to be named after it, such as left_x"
-        what = "units with which the robot explains what the rows vary"
-        raise InputError.of(what, expected="one clear reading", got=f"left unexplained {got}", fix=fix)
     if poses or meant:
         yield from poses or meant
         return
+    if not clear:
+        raise _unclear(source, found, excluded=excluded)
     why = source.words(best, others[0][0] if others else inf)
     why += ", by the names of the columns: the numbers leave it open" * by_names
     why += ", by the limits of the joints: the numbers leave it open" * bool(by_limits)
     length, angle = ("of lengths that you add: the table holds none", why) if no_length else (why, "the same")
     camera, slides = "the same; else the board is on the tool", "the same: the slides are in another unit"
     yield from entries([table], length=length, angle=angle, joint_length=slides, camera_on_tool=camera)
+
+
+def _unclear(source: Source, found: list[tuple[float, TableFormat]], *, excluded: bool) -> InputError:
+    parts = [(left, (t.length, t.angle, t.joint_length, "camera on the tool" * t.camera_on_tool)) for left, t in found]
+    got = "; ".join(f"{' and '.join(filter(None, words))}: {100 * left:.3g} %" for left, words in parts if left < inf)
+    got += "; the units that the file states exclude others" * excluded
+    sought = source.rows.markers and not (source.rows.sockets or source.rows.readings)
+    fix = "no signs, zeros, coupling or units of the joints do either: " if sought else ""
+    fix += "check the table's joints against the robot's, or write the file yourself; of a robot with several tips "
+    fix += "the columns of each are to be named after it, such as left_x"
+    what = "units with which the robot explains what the rows vary"
+    return InputError.of(what, expected="one clear reading", got=f"left unexplained {got}", fix=fix)
 
 
 def _within(source: Source, table: TableFormat) -> bool:
@@ -359,7 +357,7 @@ def _left(
         for length, angle, slide, camera in ways
         if slide != length
     )
-    return proposals.residuals(source, formats)
+    return source.residuals(formats)
 
 
 def _used(choices: list[Choice]) -> set[str]:

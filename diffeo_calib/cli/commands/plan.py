@@ -14,13 +14,12 @@ from diffeo_calib.calibration.planning.candidates import Tracker, collision_free
 from diffeo_calib.calibration.planning.knowledge import MARKER
 from diffeo_calib.calibration.planning.plan import Plan, drawn, plan, sensors_for
 from diffeo_calib.calibration.planning.sensors import Sensor
-from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say, text_table
-from diffeo_calib.cli.declarations import PlanOptions
+from diffeo_calib.cli.console import out, progress_bar, say, text_table
 from diffeo_calib.cli.models import as_fitted, load_kinematics, load_robot, planned
-from diffeo_calib.cli.options import DRAWN, Candidates
+from diffeo_calib.cli.options import DRAWN, Candidates, Command
 from diffeo_calib.cli.printed import expectation_lines
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import joint_columns, joints_of, stated_numbers, table_format, written_columns
+from diffeo_calib.cli.tables import joint_columns, joints_of, stated_numbers, table_format
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -50,23 +49,29 @@ def sensors_of(words: list[str] | None, table: TableFormat) -> list[Sensor]:
         if text in TRACKERS:
             found.append(TRACKERS[text]())
         elif kind in SENSORS and values:
-            numbers.setdefault(kind, []).append(
-                [x / table.per_metre for x in stated_numbers("--sensor", values, (3, 4, 6))]
-            )
+            each = stated_numbers("--sensor", values, (3, 4, 6))
+            numbers.setdefault(kind, []).append([x / table.per_metre for x in each])
         else:
             expected = f"{', '.join(TRACKERS)}, or {', '.join(f'{kind}=NUMBERS' for kind in SENSORS)}"
             raise InputError.of(f"--sensor {text}", expected=expected)
     return [*found, *(SENSORS[kind](places) for kind, places in numbers.items())]
 
 
-def run(given: PlanOptions) -> None:
+def run(given: Command) -> None:
     """Plan, write the poses, and print what to expect of them."""
     cell, count, output = given.cell, given.count, given.output
-    with exit_on_interrupt(), progress_bar() as progress:
+    if given.model is None and given.robot is None:
+        raise InputError.of("what to plan for", expected="a MODEL, or --robot", got="neither")
+    with progress_bar() as progress:
         model = None if given.model is None else load_kinematics(given.model)
         stated = given.units if model is None else as_fitted(model, None, given.units)[1]
         table = table_format(stated)
-        source, markers = _robot(given, table) if model is None else planned(model, given.payload_mass)
+        numbers = [stated_numbers("--marker", text, (3,)) for text in given.marker or ()]
+        markers = torch.tensor(numbers or [MARKER], dtype=torch.float64, device=HOST)
+        markers = markers / table.per_metre if numbers else markers
+        source = model or load_robot(given.robot, given.links)
+        if model is not None:
+            source, markers = planned(model, given.payload_mass)
         robot = source.robot if isinstance(source, CalibratedKinematics) else source
         names = joint_columns(joints_of(stated), robot)
 
@@ -81,17 +86,10 @@ def run(given: PlanOptions) -> None:
         progress("candidates", 1, 1)
         progress("plan", 0, 1)
         framed = model is not None or any(one.of_frames for one in sensors)
-        found = plan(
-            source,
-            q,
-            count,
-            target=configurations(given.target_poses),
-            marker=None if framed else markers,
-            measured=configurations(given.measured),
-            free=given.free,
-            sensor=sensors,
-        )
-    found.write(output, table, written_columns(names))
+        target, measured = configurations(given.target_poses), configurations(given.measured)
+        how: dict[str, Any] = {"marker": None if framed else markers, "free": given.free, "sensor": sensors}
+        found = plan(source, q, count, target=target, measured=measured, **how)
+    found.write(output, table, names.written if isinstance(names, PoseColumns) else names)
     entries = {"expected_rms_m": found.expected_rms, "noise_rms_m": found.noise_rms, "assumed": found.assumed}
     record.add(rows=count, **entries, files={"poses": output})
     _show(found, of_positions=all(one.of_positions for one in sensors), free=MOVED.get(given.free or ""))
@@ -105,14 +103,6 @@ def run(given: PlanOptions) -> None:
     if found.devices:
         say("its column `device`: what measures the pose")
         say(*(line for one in sensors for line in one.sentences()))
-
-
-def _robot(given: PlanOptions, table: TableFormat) -> tuple[Tree, Tensor]:
-    """The robot, and the markers (P, 3) on its tip, m."""
-    robot = load_robot(given.robot or Path(), given.links)
-    numbers = [stated_numbers("--marker", text, (3,)) for text in given.marker or ()]
-    places = torch.tensor(numbers or [MARKER], dtype=torch.float64, device=HOST)
-    return robot, places / table.per_metre if numbers else places
 
 
 def _cell(cell: Candidates, robot: Tree, table: TableFormat) -> dict[str, Any]:
@@ -137,7 +127,7 @@ def _ranges(cell: Candidates, robot: Tree, table: TableFormat) -> dict[str, list
     """Name of a joint -> its range, rad or m."""
     turns = dict(zip(robot.joint_names, robot.periodic, strict=True))
     found = {}
-    for text in cell.limits or ():
+    for text in cell.range or ():
         name, _, ends = text.rpartition("=")
         if not name or ends.count(":") != 1:
             raise InputError.of(f"--range {text}", expected="JOINT=A:B, such as joint_1=-90:90")
@@ -154,11 +144,9 @@ OPEN_M = 0.01
 
 
 def _show(found: Plan, *, of_positions: bool, free: str | None) -> None:
-    """Print the expected errors by number of poses.
+    """Print the expected errors by number of poses, also as held-out errors of positions.
 
-    Args:
-        found: the plan. of_positions: whether held-out errors of the planned poses are errors of positions.
-        free: what has moved since the fit; without poses only its place would be expected to be wrong.
+    ``free`` has moved since the fit: without poses only its place would be expected to be wrong.
     """
     more = "" if found.assumed else " more"
     title = f"Expected RMS error in mm by number of{more} poses"

@@ -11,11 +11,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.cli.console import progress_bar, say
-from diffeo_calib.cli.declarations import PredictOptions
 from diffeo_calib.cli.models import as_fitted, check_payload_column, load_kinematics, provenance_lines
-from diffeo_calib.cli.options import Rows
+from diffeo_calib.cli.options import Command, Rows
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import joint_columns, joints_of, table_format, with_rows, written_columns
+from diffeo_calib.cli.tables import joint_columns, joints_of, table_format, with_rows
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -25,17 +24,18 @@ from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.files import read_configurations
 from diffeo_calib.measurements.csv.joints import PoseColumns
-from diffeo_calib.measurements.csv.tables import ROWS_AT_ONCE
 from diffeo_calib.measurements.csv.writing import Predictions, write_predictions
 from diffeo_calib.measurements.table_format import BESIDE, TableFormat, options_of
 
+ROWS_AT_ONCE = 2048
+"""A multiple of the rows that predictions linearise together: blocks do not change their last digits."""
 OWN_FRAME = (
     "no device measured positions: they are in the model's own frame, and 95 % regions hold true points only after one "
     "rigid motion of all of them; `evaluate --register` with measured positions finds it"
 )
 
 
-def run(given: PredictOptions) -> None:
+def run(given: Command) -> None:
     """Read joint values, and write them with predictions and their standard deviations, block by block.
 
     A payload that is a number is the mass of all rows.
@@ -53,11 +53,10 @@ def run(given: PredictOptions) -> None:
         kinematics, table = kinematics.with_payload(mass), replace(table, payload=None)
     else:
         check_payload_column(kinematics, table.payload)
-    written = written_columns(names)
+    written = names.written if isinstance(names, PoseColumns) else names
     prefixes, columns = kinematics.bodies.prefixes(kinematics), table.joints_only(written, robot.kinds)
-    if {f"{prefix}{axis}" for prefix in prefixes for axis in "xyz"} & {
-        *Columns.of(columns).names
-    }:  # commanded places have these names
+    added = {f"{prefix}{axis}" for prefix in prefixes for axis in "xyz"}
+    if added & {*Columns.of(columns).names}:  # commanded places have these names
         prefixes = tuple(f"predicted_{prefix}" for prefix in prefixes)
     readings = _Readings(table, kinematics.predict_readings(kinematics.configurations[:1]))
     values = read_configurations(given.csv, names, table, kinds=robot.kinds)
@@ -66,11 +65,13 @@ def run(given: PredictOptions) -> None:
     warn_outside_range(kinematics, q)
 
     def blocks() -> Iterator[Predictions]:
-        """Predictions of some rows at a time."""
         for first in range(0, len(q), ROWS_AT_ONCE):
             progress("rows", first, len(q))
             own = slice(first, first + ROWS_AT_ONCE)
-            yield _predicted(readings, kinematics, q[own], None if masses is None else masses[own])
+            model = kinematics if masses is None else kinematics.at_payloads(masses[own])
+            mean, covariance = model.bodies.written(model, q[own])
+            deviations = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+            yield q[own], mean, deviations, readings.cells(model, q[own])
 
     with progress_bar() as progress:
         how = {"kinds": robot.kinds, "prefixes": prefixes, "more": readings.names, "poses": with_poses}
@@ -85,9 +86,7 @@ def run(given: PredictOptions) -> None:
         say(f"`evaluate` and `fit` read these poses with {reading_options(table, prefixes)}")
 
 
-def _written_as_read(
-    model: CalibratedKinematics, given: PredictOptions
-) -> tuple[TableFormat, str | PoseColumns | None]:
+def _written_as_read(model: CalibratedKinematics, given: Command) -> tuple[TableFormat, str | PoseColumns | None]:
     """The format of the predictions, and the names of the joint columns, by default those of the fit."""
     units = given.units
     rows = Rows(convention=given.convention, rotation_angle=given.rotation_angle, payload=given.payload)
@@ -106,24 +105,9 @@ def reading_options(table: TableFormat, prefixes: Sequence[str] = ("",)) -> str:
     return shlex.join(options_of(replace(units, position=position, **turned, **dict.fromkeys(BESIDE))))
 
 
-def _predicted(readings: _Readings, model: CalibratedKinematics, q: Tensor, masses: Tensor | None) -> Predictions:
-    """Joint values, means and standard deviations of markers or poses, and cells of the devices' readings.
-
-    Args:
-        q: (B, n) rad or m. masses: (B,) payloads, if they are known.
-    """
-    model = model if masses is None else model.at_payloads(masses)
-    mean, covariance = model.bodies.written(model, q)
-    return q, mean, covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt(), readings.cells(model, q)
-
-
 @dataclass(frozen=True)
 class _Readings:
-    """Columns of what devices will read, and of standard deviations; lengths in the unit of the table.
-
-    Args:
-        table: its format. devices: the readings of one configuration.
-    """
+    """Columns of what ``devices`` will read, and of standard deviations; lengths in the unit of the table."""
 
     table: TableFormat
     devices: Sequence[PredictedReadings]
@@ -136,12 +120,9 @@ class _Readings:
     @property
     def names(self) -> list[str]:
         """KIND_DEVICE and std_KIND_DEVICE, of several numbers with _1, _2."""
-        found = []
-        for own in self.devices:
-            count = own.mean.shape[1]
-            ends = [""] if count == 1 else [f"_{k + 1}" for k in range(count)]
-            found += [f"{std}{own.kind}_{own.device}{end}" for std in ("", "std_") for end in ends]
-        return found
+        counts = [(own, range(1, 1 + own.mean.shape[1])) for own in self.devices]
+        ends = [(f"{own.kind}_{own.device}", [f"_{k}" if len(ks) > 1 else "" for k in ks]) for own, ks in counts]
+        return [f"{std}{name}{end}" for name, each in ends for std in ("", "std_") for end in each]
 
     def cells(self, model: CalibratedKinematics, q: Tensor) -> Tensor:
         """(B, k) means and standard deviations of every device."""

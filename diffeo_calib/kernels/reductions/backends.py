@@ -15,7 +15,7 @@ To add a backend, write a class with the methods of :class:`SumBackend` and ente
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal, Protocol, get_args
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -25,40 +25,11 @@ from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions import fourier, keops
 from diffeo_calib.kernels.reductions.distributed import Distributed
-from diffeo_calib.kernels.reductions.formulas import Dense, Formula, MatrixPairs, Points
-from diffeo_calib.kernels.reductions.fused.sums import FUSED
+from diffeo_calib.kernels.reductions.formulas import Dense, Formula, Points, SumBackend, matrices
+from diffeo_calib.kernels.reductions.fused import FUSED
 from diffeo_calib.kernels.reductions.tiled import Tiled
 
 Backend = Literal["auto", "dense", "fused", "tiled", "keops", "distributed"]
-
-
-class SumBackend(Protocol):
-    """How kernel sums are evaluated.
-
-    Attributes:
-        differentiable: whether autograd can differentiate the sums. Tiled sums replace a backend that cannot where
-            gradients are needed.
-    """
-
-    differentiable: ClassVar[bool]
-
-    def usable(self) -> bool:
-        """Whether the backend is expected to work on this machine; warns once if not."""
-        ...
-
-    def reduce(
-        self, formula: Formula, profile: Profile, rows: Points | None, columns: Points
-    ) -> tuple[Tensor, ...] | None:
-        """The results of a formula, M rows each; None where the backend cannot evaluate it: tiled sums replace it.
-
-        Args:
-            formula: one of formulas.py.
-            profile: the radial profile kappa.
-            rows: the M points at which sums are evaluated; None for the columns themselves, where the weights are
-                symmetric.
-            columns: the N points of the sum.
-        """
-        ...
 
 
 BACKENDS: dict[str, SumBackend] = {
@@ -68,14 +39,10 @@ BACKENDS: dict[str, SumBackend] = {
     "keops": keops.Keops(),
     "distributed": Distributed(),
 }
-FINEST_ACCURACY = 1e-12
-"""Below it rounding counts."""
-FALLBACK = "tiled"
-"""The backend that works everywhere, for any number of points."""
-FUSED_PAIRS = 1 << 8
-"""Smallest number of pairs for which `auto` uses compiled loops."""
-DENSE_PAIRS = {"cpu": 1 << 14, "cuda": 1 << 22}
-"""Largest number of pairs for which `auto` materialises the matrix."""
+FINEST_ACCURACY = 1e-12  # below it rounding counts
+FALLBACK = "tiled"  # the backend that works everywhere, for any number of points
+FUSED_PAIRS = 1 << 8  # smallest number of pairs for which `auto` uses compiled loops
+DENSE_PAIRS = {"cpu": 1 << 14, "cuda": 1 << 22}  # largest number of pairs for which `auto` materialises the matrix
 KEOPS_PAIRS = 1 << 22
 """Smallest number of pairs for which `auto` uses KeOps on a GPU. On a CPU tiled sums, which visit each pair once, take
 less time at every size."""
@@ -123,19 +90,12 @@ def evaluate(
     *,
     accuracy: float | None = None,
 ) -> tuple[Tensor, ...]:
-    """Evaluate a formula for all rows.
+    """The results of a formula, M rows each: arguments as of :meth:`SumBackend.reduce`.
 
     Args:
-        formula: one of formulas.py.
-        profile: the radial profile kappa.
-        rows: the M points at which sums are evaluated; None for the columns themselves.
-        columns: the N points of the sum.
         backend: where to evaluate it. Tiled sums replace one that autograd cannot differentiate if an input requires
             gradients.
         accuracy: error that sums may have where this saves time; None for sums over all pairs.
-
-    Returns:
-        the formula's results, each with M rows.
     """
     at = columns if rows is None else rows
     tensors = at.tensors + columns.tensors
@@ -146,26 +106,25 @@ def evaluate(
     followed = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     if followed and not BACKENDS[name].differentiable:
         name = FALLBACK
+    # Loops compute differences of points, which need no centre.
+    i, j = (rows, columns) if name == "fused" and accuracy is None else _centred(rows, columns)
     if accuracy is not None and name != "dense" and not followed:
         finite = (at.features.sum() + columns.features.sum()).isfinite()  # a flow that diverges has no extent
-        found = fourier.sums(formula, profile, *_centred(rows, columns), accuracy) if bool(finite) else None
+        found = fourier.sums(formula, profile, i, j, accuracy) if bool(finite) else None
         if found is not None:
             return found
     try:
-        found = BACKENDS[name].reduce(
-            formula, profile, *(rows, columns) if name == "fused" else _centred(rows, columns)
-        )
+        found = BACKENDS[name].reduce(formula, profile, i, j)
     except keops.KeopsUnavailableError as error:
         keops.warn(str(error))
         found = None
-    return found or Tiled().reduce(formula, profile, *_centred(rows, columns))
+    return found or Tiled().reduce(formula, profile, *_centred(i, j))
 
 
 def profile_matrix(profile: Profile, rows: Tensor, columns: Tensor) -> Tensor:
     """The matrix kappa_ij of features (M, D) and (N, D): (M, N), differentiable by autograd."""
     i, j = _centred(Points(rows), Points(columns))
-    e = (j if i is None else i).features
-    return profile.derivatives(MatrixPairs().squared_distance(e, j.features), 0)[0]
+    return profile.derivatives(matrices(j if i is None else i, j)("r2"), 0)[0]
 
 
 def _centred(rows: Points | None, columns: Points) -> tuple[Points | None, Points]:

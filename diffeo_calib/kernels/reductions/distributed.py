@@ -15,10 +15,10 @@ from __future__ import annotations
 
 import atexit
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
-from typing import ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import torch
 import torch.distributed as messages
@@ -26,8 +26,8 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import DiffeoCalibError, InputError
 from diffeo_calib.kernels.profiles import Profile
-from diffeo_calib.kernels.reductions.formulas import Formula, Points
-from diffeo_calib.kernels.reductions.fused.sums import FUSED
+from diffeo_calib.kernels.reductions.formulas import Formula, Points, SumBackend
+from diffeo_calib.kernels.reductions.fused import FUSED
 from diffeo_calib.kernels.reductions.tiled import Tiled
 
 T = TypeVar("T")
@@ -37,8 +37,7 @@ SMALLEST_SHARED_PAIRS = 1 << 26
 Compiled loops take 15 ms for so many on one thread."""
 PATIENCE_SECONDS = 300.0
 """How long a rank waits for others that are alive but late. A rank that has ended is noticed at once."""
-AGREEMENT = 1e-9
-"""Relative difference between summaries of the ranks' data that counts as rounding."""
+AGREEMENT = 1e-9  # relative difference between summaries of the ranks' data that counts as rounding
 
 
 class LostRankError(DiffeoCalibError):
@@ -74,10 +73,7 @@ class Ranks:
         if self.count == 1:
             return parts
         flat = torch.cat([part.flatten() for part in parts])
-        try:
-            messages.all_reduce(flat)
-        except RuntimeError as error:
-            raise self._lost(error) from error
+        self._exchange(messages.all_reduce, flat)
         pieces = flat.split([part.numel() for part in parts])
         return [piece.view(part.shape) for piece, part in zip(pieces, parts, strict=True)]
 
@@ -90,10 +86,7 @@ class Ranks:
         if self.count == 1:
             return
         found = [torch.empty_like(numbers) for _ in range(self.count)]
-        try:
-            messages.all_gather(found, numbers)
-        except RuntimeError as error:
-            raise self._lost(error) from error
+        self._exchange(messages.all_gather, found, numbers)
         every = torch.stack(found)
         apart = (every - every[0]).abs() > AGREEMENT * every.abs().amax(0)
         if bool(apart.any()):
@@ -101,10 +94,19 @@ class Ranks:
             fix = "read the same files and use the same seeds in every process"
             raise LostRankError.of(f"{what} of rank {others} differ from those of rank 0", fix=fix)
 
-    def _lost(self, error: RuntimeError) -> LostRankError:
-        reason = str(error).strip().splitlines()[0]
-        what = f"rank {self.own} of {self.count} waited for another process that has ended, hangs or does other work"
-        return LostRankError.of(f"{what} ({reason})", fix="look at the first error of the others, and start all again")
+    def _exchange(self, message: Callable[..., Any], *tensors: Any) -> None:
+        try:
+            message(*tensors)
+        except RuntimeError as error:
+            what = (
+                f"rank {self.own} of {self.count} waited for another process that has ended, hangs or does other work"
+            )
+            fix = "look at the first error of the others, and start all again"
+            raise LostRankError.of(f"{what} ({_first_line(error)})", fix=fix) from error
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0]
 
 
 def ranks() -> Ranks:
@@ -137,50 +139,32 @@ def _connect() -> None:
     try:
         messages.init_process_group(kind, timeout=timedelta(seconds=PATIENCE_SECONDS))
     except (RuntimeError, ValueError) as error:
-        reason = str(error).strip().splitlines()[0]
-        raise LostRankError.of(f"the processes of this program do not find each other ({reason})") from error
-    atexit.register(_disconnect)
+        what = f"the processes of this program do not find each other ({_first_line(error)})"
+        raise LostRankError.of(what) from error
+    atexit.register(lambda: messages.destroy_process_group() if messages.is_initialized() else None)
 
 
-def _disconnect() -> None:
-    if messages.is_initialized():
-        messages.destroy_process_group()
+class Distributed(SumBackend):
+    """Evaluates the parts of this rank in compiled loops, or by tiles, and adds those of all ranks.
 
-
-class Distributed:
-    """Evaluates the parts of this rank in compiled loops, or by tiles, and adds those of all ranks."""
-
-    differentiable: ClassVar[bool] = False
+    It is always usable: a program that runs in one process only gets an error, no fallback.
+    """
 
     def __init__(self, smallest: int = SMALLEST_SHARED_PAIRS) -> None:
         self.smallest = smallest
         self.tiles = Tiled()
 
-    def usable(self) -> bool:
-        """Always: a program that runs in one process only gets an error, no fallback."""
-        return True
-
     def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> tuple[Tensor, ...]:
-        """The results of a formula, M rows each; rows None for the columns themselves. Not differentiable by autograd.
-
-        Raises:
-            InputError: the program does not run in several processes.
-            LostRankError: ranks are lost, or have other data.
-        """
+        """As :meth:`SumBackend.reduce`; InputError in a single process, LostRankError if ranks are lost or differ."""
         together, at = ranks(), columns if rows is None else rows
         if together.count == 1 or len(at.features) * len(columns.features) < self.smallest:
             return FUSED.reduce(formula, profile, rows, columns) or self.tiles.reduce(formula, profile, rows, columns)
-        together.check_agreement(f"the points of a kernel sum ({type(formula).__name__})", _summary(at, columns))
+        norms = torch.stack([torch.linalg.vector_norm(t.detach()) for t in (*at.tensors, *columns.tensors)])
+        sizes = norms.new_tensor([len(at.features), len(columns.features)])
+        together.check_agreement(f"the points of a kernel sum ({formula.name})", torch.cat([norms, sizes]))
         with torch.no_grad():
             compiled = FUSED.program(formula, profile, rows, columns)
             if compiled is not None:
                 (totals,) = together.total([compiled.totals(rows, columns, together.mine)])
                 return compiled.results(totals, len(at.features))
             return formula.finish(together.total(self.tiles.share(formula, profile, rows, columns, together.mine)), at)
-
-
-def _summary(rows: Points, columns: Points) -> Tensor:
-    """A few numbers that differ where sizes or points do."""
-    numbers = [torch.linalg.vector_norm(t.detach()) for t in (*rows.tensors, *columns.tensors)]
-    sizes = torch.tensor([len(rows.features), len(columns.features)], dtype=numbers[0].dtype, device=numbers[0].device)
-    return torch.cat([torch.stack(numbers), sizes])

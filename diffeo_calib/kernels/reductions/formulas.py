@@ -1,9 +1,9 @@
-"""The kernel sums that the package needs, each written once on pairwise symbols.
+"""The kernel sums that the package needs, each written once on the scalars of a pair of points.
 
 Every result of a formula is a sum of terms  sum_j w_ij b_j  or  sum_j w_ij b_j (e_i - e_j)^T:
 
     weights   pairwise scalars w_ij, computed from squared distances and dot products by exp, sqrt and
-              arithmetic, so that the same lines run on matrices and on symbols of any kind
+              arithmetic, so that the same lines run on matrices and on symbols
     terms     which vectors b and differences of which vectors e they multiply
 
 All weights are symmetric in the points: where rows and columns are the same points, w_ij = w_ji, and a backend may
@@ -16,8 +16,9 @@ column points (and of the row points, where a formula needs them).
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from functools import reduce
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, reduce
 from itertools import chain
 from typing import Any, ClassVar, NamedTuple
 
@@ -26,6 +27,7 @@ from torch import Tensor
 
 from diffeo_calib.kernels.profiles import Profile
 
+Leaf = Callable[[str], Any]  # one of the :data:`LEAVES` by its name, as a matrix or a symbol
 Summand = tuple[str | None, str | None]
 """A field b of :class:`Points`, or None for 1, and one that it is multiplied by, e."""
 
@@ -64,31 +66,33 @@ class Term(NamedTuple):
     factor: float = 1.0
 
 
-class Formula(ABC):
+@dataclass(frozen=True, eq=False)
+class Formula:
     """Kernel sums; see the module's docstring.
 
-    Attributes:
+    Args:
+        name: for messages.
+        weigh: the pairwise scalars w_ij from those of :data:`LEAVES` and a profile.
         results: the terms that every result is the sum of.
         reads: the fields of :class:`Points` that it needs of the columns.
     """
 
-    results: ClassVar[tuple[tuple[Term, ...], ...]]
-    reads: ClassVar[tuple[str, ...]] = ("features", "momenta")
-
-    @abstractmethod
-    def weights(self, pairs: Any, profile: Profile, i: Points, j: Points) -> list[Any]:
-        """The pairwise scalars w_ij, computed by ``pairs`` as matrices or as lazy symbols."""
+    name: str
+    weigh: Callable[[Leaf, Profile], list[Any]]
+    results: tuple[tuple[Term, ...], ...]
+    reads: tuple[str, ...] = ("features", "momenta")
 
     def summands(self, j: Points) -> list[Tensor]:
         """Factors of every weight: (N, k) each, the vectors b_j and products b_j e_j^T of all its terms."""
-        return [torch.cat([_summand(j, *key) for key in keys], -1) for keys in self._expanded()]
+        return [torch.cat([_summand(j, *key) for key in keys], -1) for keys in self._expanded]
 
     def finish(self, sums: list[Tensor], i: Points) -> tuple[Tensor, ...]:
         """The results, from the sums (M, k) over all columns."""
         dim = i.features.shape[-1]
-        parts = [_split(s, keys, dim) for s, keys in zip(sums, self._expanded(), strict=True)]
+        parts = [_split(s, keys, dim) for s, keys in zip(sums, self._expanded, strict=True)]
         return tuple(reduce(torch.add, [_finished(t, parts[t.weight], i) for t in terms]) for terms in self.results)
 
+    @cached_property
     def _expanded(self) -> list[list[Summand]]:
         """The summands of every weight, without repetitions."""
         found: dict[int, dict[Summand, None]] = {}
@@ -124,110 +128,84 @@ def _finished(term: Term, parts: dict[Summand, Tensor], i: Points) -> Tensor:
     return total if term.factor == 1.0 else term.factor * total
 
 
-class Field(Formula):
-    """V_i = sum_j kappa_ij u_j: (M, r)."""
-
-    results = ((Term(0, "momenta"),),)
-
-    def weights(self, pairs: Any, profile: Profile, i: Points, j: Points) -> list[Any]:
-        """kappa."""
-        return profile.derivatives(pairs.squared_distance(i.features, j.features), 0)
+def _gradient(leaf: Leaf, profile: Profile) -> list[Any]:
+    kappa, kappa1 = profile.derivatives(leaf("r2"), 1)
+    return [kappa, kappa1 * leaf("s")]
 
 
-class FieldAndJacobian(Formula):
-    """V (M, r) and its feature Jacobian sum_j 2 kappa'_ij u_j (E_i - F_j)^T (M, r, D)."""
-
-    results = ((Term(0, "momenta"),), (Term(1, "momenta", "features", 2.0),))
-
-    def weights(self, pairs: Any, profile: Profile, i: Points, j: Points) -> list[Any]:
-        """kappa, kappa'."""
-        return profile.derivatives(pairs.squared_distance(i.features, j.features), 1)
+def _hessian_product(leaf: Leaf, profile: Profile) -> list[Any]:
+    kappa, kappa1, kappa2 = profile.derivatives(leaf("r2"), 2)
+    rho, s, ds = leaf("rho"), leaf("s"), leaf("ds")
+    return [kappa, kappa1 * rho, kappa1 * s, kappa2 * rho * s + kappa1 * ds]
 
 
-class Gradient(Formula):
-    """Gradient of H = sum_ij kappa_ij u_i . u_j in the row points' (u, E): V (M, r) and (M, D).
+FIELD = Formula("field", lambda leaf, profile: profile.derivatives(leaf("r2"), 0), ((Term(0, "momenta"),),))
+"""V_i = sum_j kappa_ij u_j: (M, r)."""
+FIELD_AND_JACOBIAN = Formula(
+    "field and Jacobian",
+    lambda leaf, profile: profile.derivatives(leaf("r2"), 1),
+    ((Term(0, "momenta"),), (Term(1, "momenta", "features", 2.0),)),
+)
+"""V (M, r) and its feature Jacobian sum_j 2 kappa'_ij u_j (E_i - F_j)^T (M, r, D)."""
+GRADIENT = Formula("gradient", _gradient, ((Term(0, "momenta"),), (Term(1, None, "features", 2.0),)))
+"""Gradient of H = sum_ij kappa_ij u_i . u_j in the row points' (u, E): V (M, r) and (M, D).
 
-    The second result is sum_j 2 kappa'_ij (u_i . u_j) (E_i - F_j). Where rows and columns are the same points,
-    both are gradients of H / 2.
-    """
-
-    results = ((Term(0, "momenta"),), (Term(1, None, "features", 2.0),))
-
-    def weights(self, pairs: Any, profile: Profile, i: Points, j: Points) -> list[Any]:
-        """kappa, kappa' s with s = u_i . u_j."""
-        kappa, kappa1 = profile.derivatives(pairs.squared_distance(i.features, j.features), 1)
-        return [kappa, kappa1 * pairs.dot(i.momenta, j.momenta)]
-
-
-class HessianProduct(Formula):
-    """Derivative of :class:`Gradient` along (d_momenta, d_features), and the gradient in the features.
-
-    Results: dV (M, r), dG (M, D), G (M, D). With rho = d r2 = 2 (F_i - F_j) . (dF_i - dF_j), s = u_i . u_j and
-    ds = du_i . u_j + u_i . du_j:
-
-        dV_i = sum_j kappa' rho u_j + kappa du_j
-        dG_i = sum_j 2 (kappa'' rho s + kappa' ds) (F_i - F_j) + 2 kappa' s (dF_i - dF_j)
-    """
-
-    results = (
+The second result is sum_j 2 kappa'_ij (u_i . u_j) (E_i - F_j). Where rows and columns are the same points, both are
+gradients of H / 2."""
+HESSIAN_PRODUCT = Formula(
+    "Hessian product",
+    _hessian_product,
+    (
         (Term(0, "d_momenta"), Term(1, "momenta")),
         (Term(3, None, "features", 2.0), Term(2, None, "d_features", 2.0)),
         (Term(2, None, "features", 2.0),),
-    )
-    reads = Points._fields
+    ),
+    Points._fields,
+)
+"""Derivative of :data:`GRADIENT` along (d_momenta, d_features), and the gradient in the features.
 
-    def weights(self, pairs: Any, profile: Profile, i: Points, j: Points) -> list[Any]:
-        """kappa, kappa' rho, kappa' s, kappa'' rho s + kappa' ds."""
-        kappa, kappa1, kappa2 = profile.derivatives(pairs.squared_distance(i.features, j.features), 2)
-        rho = pairs.squared_distance_change(i.features, i.d_features, j.features, j.d_features)
-        s = pairs.dot(i.momenta, j.momenta)
-        ds = pairs.dot(pairs.joined(i.d_momenta, i.momenta), pairs.joined(j.momenta, j.d_momenta))
-        return [kappa, kappa1 * rho, kappa1 * s, kappa2 * rho * s + kappa1 * ds]
+Results: dV (M, r), dG (M, D), G (M, D). With rho = d r2 = 2 (F_i - F_j) . (dF_i - dF_j), s = u_i . u_j and
+ds = du_i . u_j + u_i . du_j:
 
-
-FIELD, FIELD_AND_JACOBIAN, GRADIENT, HESSIAN_PRODUCT = Field(), FieldAndJacobian(), Gradient(), HessianProduct()
-
-
-class Unknown:
-    """A symbol has no value yet: comparing it raises TypeError, where Python's defaults would answer with a guess."""
-
-    __slots__ = ()
-
-    def _refuse(self, *_: object) -> Any:
-        raise TypeError("a pairwise symbol has no value to compare")
-
-    __eq__ = __ne__ = __bool__ = _refuse
+    dV_i = sum_j kappa' rho u_j + kappa du_j
+    dG_i = sum_j 2 (kappa'' rho s + kappa' ds) (F_i - F_j) + 2 kappa' s (dF_i - dF_j)
+    G_i  = sum_j 2 kappa' s (F_i - F_j)
+"""
+LEAVES = ("r2", "rho", "s", "ds")
+"""Scalars of a pair of points that weights are made of: |E_i - F_j|^2, 2 (E_i - F_j) . (dE_i - dF_j), u_i . u_j and
+du_i . u_j + u_i . du_j."""
 
 
-class MatrixPairs:
-    """Pairwise symbols as materialised (M, N) tensors, differentiable by autograd; all of them are dot products."""
-
-    def dot(self, a: Tensor, b: Tensor) -> Any:
-        """a_i . b_j: (M, k), (N, k) -> (M, N)."""
-        return a @ b.T
-
-    def joined(self, a: Tensor, b: Tensor) -> Tensor:
-        """Vectors one after the other: (M, k), (M, l) -> (M, k + l)."""
-        return torch.cat([a, b], -1)
-
-    def squared_distance(self, e: Tensor, f: Tensor) -> Any:
-        """|e_i - f_j|^2 up to rounding, possibly -1e-16: (M, D), (N, D) -> (M, N)."""
-        e2, f2 = _dots(e, e), _dots(f, f)
-        left = torch.cat([-2.0 * e, e2, torch.ones_like(e2)], -1)  # (M, D + 2)
-        return self.dot(left, torch.cat([f, torch.ones_like(f2), f2], -1))
-
-    def squared_distance_change(self, e: Tensor, de: Tensor, f: Tensor, df: Tensor) -> Any:
-        """2 (e_i - f_j) . (de_i - df_j), the derivative of the squared distance: (M, N)."""
-        ee, ff = 2.0 * _dots(e, de), 2.0 * _dots(f, df)
-        left = torch.cat([-2.0 * e, -2.0 * de, ee, torch.ones_like(ee)], -1)  # (M, 2 D + 2)
-        return self.dot(left, torch.cat([df, f, torch.ones_like(ff), ff], -1))
+def factors(leaf: str, i: Points, j: Points) -> tuple[Tensor, Tensor]:
+    """Vectors (M, k) and (N, k) whose dot products are one of the :data:`LEAVES`, differences up to rounding."""
+    if leaf == "s":
+        return i.momenta, j.momenta
+    if leaf == "ds":
+        return torch.cat([i.d_momenta, i.momenta], -1), torch.cat([j.momenta, j.d_momenta], -1)
+    (e, de), (f, df) = (i.features, i.d_features), (j.features, j.d_features)
+    if leaf == "r2":
+        left, right, e2, f2 = [-2.0 * e], [f], _dots(e, e), _dots(f, f)
+    else:
+        left, right, e2, f2 = [-2.0 * e, -2.0 * de], [df, f], 2.0 * _dots(e, de), 2.0 * _dots(f, df)
+    one_i, one_j = torch.ones_like(e2), torch.ones_like(f2)
+    return torch.cat([*left, e2, one_i], -1), torch.cat([*right, one_j, f2], -1)
 
 
 def _dots(a: Tensor, b: Tensor) -> Tensor:
     return (a * b).sum(-1, keepdim=True)
 
 
-def weighted_sums(weights: list[Tensor], summands: list[Tensor]) -> list[Tensor]:
+def matrices(i: Points, j: Points) -> Callable[[str], Tensor]:
+    """The leaves as materialised (M, N) tensors, differentiable by autograd."""
+
+    def leaf(name: str) -> Tensor:
+        left, right = factors(name, i, j)
+        return left @ right.T
+
+    return leaf
+
+
+def weighted_sums(weights: Sequence[Tensor], summands: list[Tensor]) -> list[Tensor]:
     """[sum_j w_ij b_j], transposed: weights (M, N) and summands (k, N) -> (k, M) each.
 
     On a CPU the product of a large matrix with a few columns is 2 to 3 times faster in this orientation.
@@ -235,18 +213,41 @@ def weighted_sums(weights: list[Tensor], summands: list[Tensor]) -> list[Tensor]
     return [b @ w.T for w, b in zip(weights, summands, strict=True)]
 
 
-class Dense:
-    """Evaluates all pairs at once."""
+class SumBackend:
+    """How kernel sums are evaluated.
 
-    differentiable: ClassVar[bool] = True
+    Attributes:
+        differentiable: whether autograd can differentiate the sums. Tiled sums replace a backend that cannot where
+            gradients are needed.
+    """
+
+    differentiable: ClassVar[bool] = False
 
     def usable(self) -> bool:
-        """Always."""
+        """Whether the backend is expected to work on this machine; warns once if not."""
         return True
 
+    def reduce(
+        self, formula: Formula, profile: Profile, rows: Points | None, columns: Points
+    ) -> tuple[Tensor, ...] | None:
+        """The results of a formula, M rows each; None where the backend cannot evaluate it: tiled sums replace it.
+
+        Args:
+            profile: the radial profile kappa.
+            rows: the M points at which sums are evaluated; None for the columns themselves, where the weights are
+                symmetric.
+            columns: the N points of the sum.
+        """
+        raise NotImplementedError
+
+
+class Dense(SumBackend):
+    """Evaluates all pairs at once."""
+
+    differentiable = True
+
     def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> tuple[Tensor, ...]:
-        """The results of a formula, M rows each; rows None for the columns themselves."""
         at = columns if rows is None else rows
-        weights = formula.weights(MatrixPairs(), profile, at, columns)
+        weights = formula.weigh(matrices(at, columns), profile)
         summands = [b.T.contiguous() for b in formula.summands(columns)]
         return formula.finish([s.T for s in weighted_sums(weights, summands)], at)

@@ -27,22 +27,22 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.threads import in_parallel
 from diffeo_calib.kernels.profiles import Profile
-from diffeo_calib.kernels.reductions.formulas import Field, FieldAndJacobian, Formula, Gradient, HessianProduct, Points
+from diffeo_calib.kernels.reductions.formulas import (
+    FIELD,
+    FIELD_AND_JACOBIAN,
+    GRADIENT,
+    HESSIAN_PRODUCT,
+    Formula,
+    Points,
+)
 
-MOST_WAVES = 1 << 16
-"""Largest lattice. Beyond it a sum needs more memory and time than it saves at most sizes."""
-WAVE_COST = 0.5
-"""Time of a wave at a point relative to that of a pair of points (measured: 0.2 to 0.5)."""
-POINT_COST = 150.0
-"""Time of a point beside its waves, relative to that of a pair."""
-WAVES_TIMES_POINTS_AT_ONCE = 1 << 20
-"""Waves times points in memory at once."""
-CHECKED_ROWS = 24
-"""Rows and columns at which every lattice is checked."""
-DERIVATIVES = 2
-"""The highest derivative of the kernel in a formula."""
-STEPS, FARTHEST = 4096, 60.0
-"""Distances and frequencies that are looked at."""
+MOST_WAVES = 1 << 16  # largest lattice. Beyond it a sum needs more memory and time than it saves at most sizes
+WAVE_COST = 0.5  # time of a wave at a point relative to that of a pair of points (measured: 0.2 to 0.5)
+POINT_COST = 150.0  # time of a point beside its waves, relative to that of a pair
+WAVES_TIMES_POINTS_AT_ONCE = 1 << 20  # waves times points in memory at once
+CHECKED_ROWS = 24  # rows and columns at which every lattice is checked
+DERIVATIVES = 2  # the highest derivative of the kernel in a formula
+STEPS, FARTHEST = 4096, 60.0  # distances and frequencies that are looked at
 
 
 @lru_cache(maxsize=256)
@@ -86,12 +86,7 @@ def sums(
     """The results of a formula within an accuracy; None where pairs take less time, or waves do not reach it.
 
     The error of a field is at most ``accuracy`` times the sum of the momenta's absolute values; those of its
-    derivatives likewise, in features. Not differentiable by autograd.
-
-    Args:
-        formula: one of formulas.py. profile: the radial profile.
-        rows: the M points at which sums are evaluated; None for the columns themselves. columns: the N points.
-        accuracy: relative, between 0 and 1.
+    derivatives likewise, in features. Arguments as of :meth:`SumBackend.reduce`. Not differentiable by autograd.
     """
     at = columns if rows is None else rows
     m, n = len(at.features), len(columns.features)
@@ -106,7 +101,7 @@ def sums(
             return None
         if waves.error(profile, _displacements(at.features, columns.features, extent)) > accuracy:
             return None
-        return RESULTS[type(formula)](waves, at, columns)
+        return RESULTS[formula](waves, at, columns)
 
 
 def _displacements(rows: Tensor, columns: Tensor, extent: Tensor) -> Tensor:
@@ -202,25 +197,16 @@ class Lattice:
         return [slice(k, min(k + size, count)) for k in range(0, count, size)] or [slice(0, 0)]
 
 
-def field(waves: Lattice, i: Points, j: Points) -> tuple[Tensor, ...]:
-    """V (M, r)."""
-    return (waves.values(i.features, waves.coefficients(j.features, j.momenta)),)
+def _field_and_jacobian(waves: Lattice, i: Points, j: Points) -> tuple[Tensor, ...]:
+    return _with_slopes(waves, i.features, waves.coefficients(j.features, j.momenta))
 
 
-def field_and_jacobian(waves: Lattice, i: Points, j: Points) -> tuple[Tensor, ...]:
-    """V (M, r) and its Jacobian (M, r, D)."""
-    grid = waves.coefficients(j.features, j.momenta)
-    return _with_slopes(waves, i.features, grid)
-
-
-def gradient(waves: Lattice, i: Points, j: Points) -> tuple[Tensor, ...]:
-    """V (M, r) and the gradient of u_i . V in the row points (M, D)."""
-    v, slopes = field_and_jacobian(waves, i, j)
+def _gradient(waves: Lattice, i: Points, j: Points) -> tuple[Tensor, ...]:
+    v, slopes = _field_and_jacobian(waves, i, j)
     return v, torch.einsum("mr,mrd->md", i.momenta, slopes)
 
 
-def hessian_product(waves: Lattice, i: Points, j: Points) -> tuple[Tensor, ...]:
-    """dV (M, r), dG (M, D), G (M, D): derivatives of :func:`gradient` along the points' directions, and G."""
+def _hessian_product(waves: Lattice, i: Points, j: Points) -> tuple[Tensor, ...]:
     r, d = j.momenta.shape[1], j.features.shape[1]
     moved = (j.momenta[:, :, None] * j.d_features[:, None]).flatten(1)  # (N, r D)
     grids = waves.coefficients(j.features, torch.cat([j.momenta, j.d_momenta, moved], 1))
@@ -245,10 +231,10 @@ def _with_slopes(waves: Lattice, at: Tensor, grid: Tensor) -> tuple[Tensor, Tens
     return found[:, :r], found[:, r:].unflatten(1, (r, at.shape[1]))
 
 
-RESULTS: dict[type[Formula], Callable[[Lattice, Points, Points], tuple[Tensor, ...]]] = {
-    Field: field,
-    FieldAndJacobian: field_and_jacobian,
-    Gradient: gradient,
-    HessianProduct: hessian_product,
+RESULTS: dict[Formula, Callable[[Lattice, Points, Points], tuple[Tensor, ...]]] = {
+    FIELD: lambda waves, i, j: (waves.values(i.features, waves.coefficients(j.features, j.momenta)),),
+    FIELD_AND_JACOBIAN: _field_and_jacobian,
+    GRADIENT: _gradient,
+    HESSIAN_PRODUCT: _hessian_product,
 }
 """The results of every formula, from waves."""

@@ -16,18 +16,19 @@ import shutil
 import stat
 import tempfile
 import warnings
+from collections.abc import Callable, Sequence
 from functools import cache, reduce
-from itertools import compress
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import DiffeoCalibWarning, NumericalError, sentence
 from diffeo_calib.kernels.profiles import Profile
-from diffeo_calib.kernels.reductions.formulas import Formula, Points
+from diffeo_calib.kernels.reductions.formulas import LEAVES, Formula, Points, SumBackend, factors
+from diffeo_calib.kernels.reductions.symbols import Weights, recorded
 
 CXXFLAGS = (
     "-march=native -fno-math-errno -fno-trapping-math -fno-signed-zeros -fassociative-math -D__FAST_MATH__"
@@ -42,81 +43,82 @@ class KeopsUnavailableError(NumericalError):
     """pykeops is missing, finds no compiler, or could not compile a formula."""
 
 
-class LazyPairs:
-    """Pairwise symbols as LazyTensors, which are never materialised."""
-
-    def __init__(self, keops: ModuleType) -> None:
-        self.rows, self.columns = keops.Vi, keops.Vj
-
-    def dot(self, a: Tensor, b: Tensor) -> Any:
-        """a_i . b_j."""
-        return self.rows(a.contiguous()) | self.columns(b.contiguous())
-
-    def joined(self, a: Tensor, b: Tensor) -> Tensor:
-        """Vectors one after the other."""
-        return torch.cat([a, b], -1)
-
-    def squared_distance(self, e: Tensor, f: Tensor) -> Any:
-        """|e_i - f_j|^2."""
-        return ((self.rows(e.contiguous()) - self.columns(f.contiguous())) ** 2).sum(-1)
-
-    def squared_distance_change(self, e: Tensor, de: Tensor, f: Tensor, df: Tensor) -> Any:
-        """2 (e_i - f_j) . (de_i - df_j)."""
-        difference = self.rows(e.contiguous()) - self.columns(f.contiguous())
-        change = self.rows((2.0 * de).contiguous()) - self.columns((2.0 * df).contiguous())
-        return difference | change
+OPERATIONS: dict[str, Callable[..., Any]] = {
+    "product": lambda a, b, _: a * b,
+    "ratio": lambda a, b, _: a / b,
+    "sum": lambda a, b, c: a + b * c,
+    "shift": lambda a, c: a + c,
+    "scale": lambda a, c: a * c,
+    "inverse": lambda a, _: 1.0 / a,
+    "exp": lambda a, c: (a * c).exp(),
+    "sqrt": lambda a, _: a.sqrt(),
+    "relu": lambda a, _: a.relu(),
+}
+"""Operations of :class:`Node` on LazyTensors."""
 
 
-class Keops:
+def _lazy(weights: Weights, keops: ModuleType, i: Points, j: Points) -> list[Any]:
+    """The weights without their scales as LazyTensors, which are never materialised; None for the number one."""
+
+    def apart(e: Tensor, f: Tensor) -> Any:
+        return keops.Vi(e.contiguous()) - keops.Vj(f.contiguous())
+
+    def leaf(name: str) -> Any:
+        if name == "r2":
+            return (apart(i.features, j.features) ** 2).sum(-1)
+        if name == "rho":
+            return apart(i.features, j.features) | apart(2.0 * i.d_features, 2.0 * j.d_features)
+        left, right = factors(name, i, j)
+        return keops.Vi(left.contiguous()) | keops.Vj(right.contiguous())
+
+    found: dict[int | None, Any] = {None: None}
+    for k, (name, operands, number) in weights.steps():
+        found[k] = leaf(name) if name in LEAVES else OPERATIONS[name](*(found[o] for o in operands), number)
+    return [found[node] for node, _ in weights.results]
+
+
+class Keops(SumBackend):
     """Fused lazy sums.
 
     Attributes:
         failed: whether a compilation or a run has failed; KeOps is not tried again then.
     """
 
-    differentiable: ClassVar[bool] = False
-
     def __init__(self) -> None:
         self.failed = False
 
     def usable(self) -> bool:
-        """Whether KeOps is expected to work; warns once if not."""
         return not self.failed and available()
 
     def reduce(
         self, formula: Formula, profile: Profile, rows: Points | None, columns: Points
     ) -> tuple[Tensor, ...] | None:
-        """The results of a formula, M rows each, as :meth:`SumBackend.reduce`; not differentiable by autograd.
-
-        Raises:
-            KeopsUnavailableError: compiling or running the formula failed.
-        """
-        rows = columns if rows is None else rows
-        keops = load()
-        summands = formula.summands(columns)
+        """As :meth:`SumBackend.reduce`; KeopsUnavailableError if compiling or running the formula failed."""
+        rows, weights = columns if rows is None else rows, recorded(formula, profile)
+        if weights is None:
+            return None
+        keops, summands = load(), formula.summands(columns)
         with torch.no_grad():
-            try:
-                weights = formula.weights(LazyPairs(keops), profile, rows, columns)
-            except Exception:  # a profile of the user may need operations that LazyTensors lack, and raise anything
-                return None
-            terms = [w * keops.Vj(b.contiguous()) for w, b in zip(weights, summands, strict=True)]
-            lazy = [not isinstance(term, int) for term in terms]  # KeOps simplifies a zero weight to the number 0
-            if not any(lazy):
-                return formula.finish([b.new_zeros(len(rows.features), b.shape[1]) for b in summands], rows)
-            fused = reduce(lambda a, b: a.concat(b), compress(terms, lazy))
-            # KeOps' default sums in blocks of 200: the branch this needs prevents vectorisation of the loop.
-            try:
-                total = fused.sum(dim=1, sum_scheme="direct_sum")
-            except Exception as error:  # the compiler chain may raise anything
-                self.failed = True
-                raise KeopsUnavailableError.of(f"KeOps could not compile or run a kernel sum ({error})") from error
-        total = total.expand(len(rows.features), -1)  # KeOps drops the row index of a constant weight
-        parts = iter(torch.split(total, [b.shape[1] for b in compress(summands, lazy)], dim=1))
-        sums = [
-            next(parts) if summed else total.new_zeros(len(total), b.shape[1])
-            for summed, b in zip(lazy, summands, strict=True)
-        ]
-        return formula.finish(sums, rows)
+            lazy = _lazy(weights, keops, rows, columns)
+            terms = [w * keops.Vj(b.contiguous()) for w, b in zip(lazy, summands, strict=True) if w is not None]
+            sums = iter(self._summed(terms, [b.shape[1] for w, b in zip(lazy, summands, strict=True) if w is not None]))
+            found = [
+                scale * (b.sum(0).expand(len(rows.features), -1) if w is None else next(sums))
+                for w, b, (_, scale) in zip(lazy, summands, weights.results, strict=True)
+            ]
+        return formula.finish(found, rows)
+
+    def _summed(self, terms: list[Any], widths: list[int]) -> Sequence[Tensor]:
+        """The sums over all columns in one loop."""
+        if not terms:
+            return []
+        fused = reduce(lambda a, b: a.concat(b), terms)
+        # KeOps' default sums in blocks of 200: the branch this needs prevents vectorisation of the loop.
+        try:
+            return torch.split(fused.sum(dim=1, sum_scheme="direct_sum"), widths, dim=1)
+        except Exception as error:  # the compiler chain may raise anything
+            self.failed = True
+            raise KeopsUnavailableError.of(f"KeOps could not compile or run a kernel sum ({error})") from error
 
 
 @cache

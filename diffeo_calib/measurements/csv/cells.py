@@ -13,9 +13,6 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
-
-from torch import Tensor
 
 from diffeo_calib.common.errors import LONGEST_NAME, MOST_NAMES, MeasurementError, few, listed, shown
 
@@ -28,22 +25,6 @@ _MISSING = re.compile(
 _INFINITE = re.compile(r"[+-]?inf(inity)?", re.IGNORECASE)
 _TYPOGRAPHY = str.maketrans("\u2212\u2013\u2019\u00a0\u202f\u2009", "--'   ")
 """Minus signs, apostrophes and spaces of word processors."""
-
-
-class Hideable(NamedTuple):
-    """Columns that lines may leave empty together: places of values and of deviations among all; what they show."""
-
-    values: Sequence[int]
-    deviations: Sequence[int]
-    word: str
-
-
-class Block(NamedTuple):
-    """Lines of a file: numbers (B, c), NaN where hidden, texts by the name of their column, and the lines' numbers."""
-
-    numbers: Tensor
-    texts: dict[str, list[str]]
-    lines: list[int]
 
 
 LARGEST_NUMBER = 1e12

@@ -12,16 +12,9 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written, listed
 from diffeo_calib.measurements.checks import unlikely_units
-from diffeo_calib.measurements.csv.cells import Hideable, repeated
+from diffeo_calib.measurements.csv.cells import repeated
 from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
-from diffeo_calib.measurements.table_format import (
-    UNITS_PER_METRE,
-    Names,
-    TableFormat,
-    check_choice,
-    column_names,
-    flat_names,
-)
+from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat, check_choice, column_names, flat_names
 from diffeo_calib.robots.joint import KINDS
 
 
@@ -84,37 +77,47 @@ class Group(NamedTuple):
         return self.unit if isinstance(self.unit, (int, float)) else UNITS_PER_METRE.get(self.unit or "", 1.0)
 
 
-class Reported(NamedTuple):
-    """Columns of what devices reported: the numbers, their known deviations, and what a line with them holds."""
+class Hideable(NamedTuple):
+    """Columns of values and of deviations that lines may leave empty together: their places; what they show."""
 
-    values: Group
-    std: Group
+    values: list[int]
+    deviations: list[int]
     word: str
+
+    @classmethod
+    def of(cls, groups: Sequence[Group], word: str, names: Sequence[str]) -> Hideable:
+        """The columns of these groups among all names; deviations are values where there are no others."""
+        known = [names.index(name) for group in groups if group.check is DEVIATION for name in group.names]
+        values = [names.index(name) for group in groups if group.check is not DEVIATION for name in group.names]
+        return cls(values or known, known if values else [], word)
 
 
 @dataclass(frozen=True)
 class Columns:
-    """The wanted columns of numbers: joints, positions, rotation, covariates, payload, deviations, readings.
+    """The wanted columns of numbers.
 
     Args:
         table: what it holds, and the units.
         joints: names or expressions of n joints, or the columns of a pose. prismatic: (n,) which of them are prismatic.
-        std: names of standard deviations of positions: one, one per marker, or three per marker.
         kinds_known: whether the kinds of the joints were given; otherwise all are taken as revolute.
-        readings: what devices reported.
+        groups: all columns by what they hold: "q", "points", "rotations", covariates, "payload", "std",
+            "rotation_std"; those of readings by themselves.
+        readings: columns of each kind of what devices reported, and its name, such as "a distance".
         all_hidden: whether rows may show no marker, because they hold something else.
     """
 
     table: TableFormat
     joints: JointExpressions | PoseColumns
     prismatic: Tensor
-    std: tuple[str, ...] = ()
-    kinds_known: bool = True
-    readings: tuple[Reported, ...] = ()
+    kinds_known: bool
+    groups: dict[Any, Group]
+    readings: Sequence[tuple[Sequence[Group], str]] = ()
     all_hidden: bool = False
 
     @classmethod
-    def of(cls, table: TableFormat, readings: Sequence[Reported] = (), *, all_hidden: bool = False) -> Columns:
+    def of(
+        cls, table: TableFormat, readings: Sequence[tuple[Sequence[Group], str]] = (), *, all_hidden: bool = False
+    ) -> Columns:
         """Check names and kinds of columns.
 
         Raises:
@@ -125,20 +128,18 @@ class Columns:
         if table.joint_length is not None and not kinds_known:
             what, fix = "`joint_length` without the kinds of the joints", "pass the robot, or `kinds`"
             raise MeasurementError.of(what, got="joints that are all taken as revolute", fix=fix)
-        markers = len(table.triples)
-        _check_frames(table, markers)
-        for name, column in table.beside.items():
-            column_names(name, [column], "the name of a column", (1,))
-        std = _std_names(table.std, markers)
         given = table.joints
         read = replace(given, angle=table.angle) if isinstance(given, PoseColumns) else JointExpressions.of(names)
-        columns = cls(table, read, prismatic, std, kinds_known, tuple(readings), all_hidden)
+        every = {"q": Group(read.columns)} | _measured(table) | {own: own for groups, _ in readings for own in groups}
+        named = {key: group for key, group in every.items() if group.names}
+        columns = cls(table, read, prismatic, kinds_known, named, readings, all_hidden)
         twice = repeated(columns.names) or repeated(names)
         if twice:
+            markers = len(table.triples)
             plain = len(columns.names) == len(names) + 3 * markers
             what = "`joints`" + " and `position`" * bool(markers) if plain else "the named columns"
             fix = "name every column once"
-            deviations = {*twice} & {*std, *columns.rotation_std}
+            deviations = {*twice} & {*every["std"].names, *every["rotation_std"].names}
             fix += ", and one that holds the deviations of all axes alone" * bool(deviations)
             raise MeasurementError.of(what, expected="distinct columns", got=f"{listed(twice)} twice", fix=fix)
         return columns
@@ -154,27 +155,6 @@ class Columns:
         return flat_names(self.table.rotation)
 
     @property
-    def rotation_std(self) -> tuple[str, ...]:
-        """Names of standard deviations of rotations: one, one per frame, or three per frame."""
-        return flat_names(self.table.rotation_std)
-
-    @property
-    def groups(self) -> dict[Any, Group]:
-        """All columns by what they hold, joints first; those of readings by themselves."""
-        table = self.table
-        found = {
-            "q": Group(self.joints.columns),
-            "points": Group(flat_names(self.triples), table.length),
-            "rotations": Group(self.rotation),
-        }
-        checks = {"payload": MASS}
-        found |= {name: Group((column.strip(),), None, checks.get(name)) for name, column in table.beside.items()}
-        found["std"] = Group(self.std, table.length, DEVIATION)
-        found["rotation_std"] = Group(self.rotation_std, self.rotation_unit, DEVIATION)
-        own = [group for one in self.readings for group in (one.values, one.std)]
-        return {key: group for key, group in (*found.items(), *zip(own, own, strict=True)) if group.names}
-
-    @property
     def names(self) -> list[str]:
         """All columns, joints first."""
         return [name for group in self.groups.values() for name in group.names]
@@ -182,25 +162,16 @@ class Columns:
     @property
     def hideable(self) -> list[Hideable]:
         """The columns of every marker, frame and reading that lines may leave empty."""
-        count, place = len(self.triples), {name: number for number, name in enumerate(self.names)}
-
-        def places(*names: str) -> list[int]:
-            return [place[name] for name in names]
-
-        def own(names: Sequence[str], k: int) -> list[int]:
-            each = len(names) // count  # of deviations 0, 1 or 3; one for all markers belongs to none
-            return places(*names[k * each : (k + 1) * each])
-
-        said = f"shows this {'frame' if self.rotation else 'marker'}"
-        markers = [
-            Hideable(places(*triple) + own(self.rotation, k), own(self.std, k) + own(self.rotation_std, k), said)
-            for k, triple in enumerate(self.triples)
+        count, found, names = len(self.triples), list[Hideable](), self.names
+        measured = [self.groups[key] for key in ("points", "rotations", "std", "rotation_std") if key in self.groups]
+        for k in range(count):
+            each = [len(group.names) // count for group in measured]  # one for all markers belongs to none
+            own = [one._replace(names=one.names[k * n : (k + 1) * n]) for n, one in zip(each, measured, strict=True)]
+            found.append(Hideable.of(own, f"shows this {'frame' if self.rotation else 'marker'}", names))
+        others = self.readings if self.all_hidden else ()
+        return found + [
+            Hideable.of(own, f"holds {word}", names) for own, word in others if own[0].names + own[-1].names
         ]
-        if not self.all_hidden:
-            return markers
-        pairs = [(one.values.names or one.std.names, one.values.names and one.std.names, one) for one in self.readings]
-        shown = [Hideable(places(*names), places(*std), f"holds {one.word}") for names, std, one in pairs if names]
-        return markers + shown
 
     @property
     def rotation_unit(self) -> str:
@@ -213,7 +184,7 @@ class Columns:
         Returns:
             q (N, n), points (N, P, 3), std (N, P, 3), rotation_std (N, T, 3), those beside them (N,), others (N, c).
         """
-        found, count = self._parts(raw), len(self.triples)
+        found, count = self.parts(raw), len(self.triples)
         values = {name: group.to_si(found[name]) for name, group in self.groups.items()}
         q, table = self.joints.values(found["q"]), self.table
         turns = q.deg2rad() if table.angle == "deg" else q
@@ -225,10 +196,10 @@ class Columns:
 
     def from_si(self, values: Mapping[Any, Tensor | None]) -> dict[str, list[float]]:
         """The cells of columns by name, of values in SI by what they are."""
-        groups, rows = self.groups, {name: own for name, own in values.items() if own is not None}
-        found = {"q": self.joints_from_si(rows["q"])}
-        found |= {name: groups[name].from_si(own) for name, own in rows.items() if name != "q"}
-        pairs = [zip(groups[name].names, own.T.tolist(), strict=True) for name, own in found.items()]
+        rows = {name: own for name, own in values.items() if own is not None}
+        found = {"q": self.joints_from_si(rows.pop("q"))}
+        found |= {name: self.groups[name].from_si(own) for name, own in rows.items()}
+        pairs = [zip(self.groups[name].names, own.T.tolist(), strict=True) for name, own in found.items()]
         return {column: cells for pair in pairs for column, cells in pair}
 
     def joints_from_si(self, q: Tensor) -> Tensor:
@@ -239,35 +210,50 @@ class Columns:
 
     def unlikely_units(self, raw: Tensor) -> list[str]:
         """Sentences about values (N, c), in the file's units, that look as if they were in another unit."""
-        found, table = self._parts(raw), self.table
-        plain = self.joints.plain
+        found, table, plain = self.parts(raw), self.table, self.joints.plain
         q = self.joints.values(found["q"])[:, plain] if bool(plain.any()) else found["q"][:, :0]
-        slide = self.prismatic[plain]
-        angle, known = _largest(q[:, ~slide]), self.kinds_known
-        sentences = unlikely_units("angles", angle, table.angle, "angle", kinds_known=known)
-        sentences += unlikely_units("prismatic joints", _largest(q[:, slide]), table.joint_unit, "joint_length")
-        if self.triples:
-            sentences += unlikely_units("positions", _largest(found["points"]), table.length, "length")
-        if self.rotation and len(self.rotation) == 3 * len(self.triples):
-            sentences += unlikely_units("rotations", _largest(found["rotations"]), self.rotation_unit, "rotation_angle")
+        slide, known = self.prismatic[plain], self.kinds_known
+        sentences = unlikely_units("angles", q[:, ~slide], table.angle, "angle", kinds_known=known)
+        sentences += unlikely_units("prismatic joints", q[:, slide], table.joint_unit, "joint_length")
+        if "points" in found:
+            sentences += unlikely_units("positions", found["points"], table.length, "length")
+        if len(self.rotation) == 3 * len(self.triples) > 0:
+            sentences += unlikely_units("rotations", found["rotations"], self.rotation_unit, "rotation_angle")
         return sentences
 
-    def _parts(self, raw: Tensor) -> Values:
+    def parts(self, raw: Tensor) -> Values:
         """The columns of each group of rows (N, c)."""
-        groups = self.groups
-        return dict(zip(groups, raw.split([len(group.names) for group in groups.values()], dim=1), strict=True))
+        return dict(zip(self.groups, raw.split([len(own.names) for own in self.groups.values()], dim=1), strict=True))
 
 
-def _check_frames(table: TableFormat, positions: int) -> None:
-    """Raise MeasurementError unless every rotation has its position, and every deviation its rotation."""
-    deviations = None if len(flat_names(table.rotation_std)) == 1 else table.rotation_std  # one for all frames
-    for name, names in (("rotation", table.rotation), ("rotation_std", deviations)):
-        count = len(names or ())
-        if count not in (0, positions):
-            got = f"{positions} triples and {count} {'list' if count == 1 else 'lists'} of columns in `{name}`"
+def _measured(table: TableFormat) -> dict[str, Group]:
+    """The columns of positions, rotations, what stands beside them, and deviations; MeasurementError for bad names."""
+    count, deviations = len(table.triples), flat_names(table.rotation_std)
+    for name, names in (("rotation", table.rotation), ("rotation_std", table.rotation_std)):
+        one_for_all = name == "rotation_std" and len(deviations) == 1
+        if not one_for_all and len(names or ()) not in (0, count):
+            lists = f"{len(names or ())} list{'s' * (len(names or ()) != 1)}"
+            got = f"{count} triples and {lists} of columns in `{name}`"
             fix = "name the position of every frame whose rotation is measured, or leave the rotations out"
             what, expected = f"`position` beside `{name}`", "one triple of columns for each"
             raise MeasurementError.of(what, expected=expected, got=got, fix=fix)
+    for name, column in table.beside.items():
+        column_names(name, [column], "the name of a column", (1,))
+    std: Any = table.std if isinstance(table.std, str) else flat_names(table.std) or table.std
+    if std is not None:
+        expected = "names of columns: one, one per marker or three per marker"
+        std = column_names("std", std, expected, (1, count, 3 * count))
+    beside = {
+        name: Group((column.strip(),), None, MASS if name == "payload" else None)
+        for name, column in table.beside.items()
+    }
+    return {
+        "points": Group(flat_names(table.triples), table.length),
+        "rotations": Group(flat_names(table.rotation)),
+        **beside,
+        "std": Group(std or (), table.length, DEVIATION),
+        "rotation_std": Group(deviations, table.rotation_angle or "rad", DEVIATION),
+    }
 
 
 def check_count(what: str, items: Sequence[object], count: int, each: str) -> None:
@@ -296,16 +282,3 @@ def _joint_columns(joints: Joints, kinds: Sequence[str] | None) -> tuple[tuple[s
         check_choice("kinds", kind, [known for known in KINDS if known != "fixed"])
     prismatic = torch.tensor([kind == "prismatic" for kind in kinds], dtype=torch.bool, device=HOST)
     return tuple(name.strip() for name in joints), prismatic, known
-
-
-def _std_names(std: Names | None, markers: int) -> tuple[str, ...]:
-    """One, ``markers`` or 3 x ``markers`` names, given flat or as one triple per marker."""
-    if std is None:
-        return ()
-    names = std if isinstance(std, str) else flat_names(std) or std
-    expected = "names of columns: one, one per marker or three per marker"
-    return column_names("std", names, expected, (1, markers, 3 * markers))
-
-
-def _largest(values: Tensor) -> float:
-    return float(values.abs().max()) if values.numel() else 0.0

@@ -18,12 +18,11 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import outside_inference_mode
-from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
+from diffeo_calib.common.errors import MeasurementError, as_written, few, shown, warn_user
 from diffeo_calib.measurements.checks import file_sha256, quiet
-from diffeo_calib.measurements.csv.columns import ChainLike, Columns, Joints, Values
+from diffeo_calib.measurements.csv.columns import ChainLike, Columns, Joints, Values, check_count
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.sensors import (
-    FileRows,
     ReadingColumns,
     SensorColumns,
     SocketColumns,
@@ -31,13 +30,13 @@ from diffeo_calib.measurements.csv.sensors import (
     sensors_of,
     text_columns,
 )
-from diffeo_calib.measurements.csv.tables import TableFile, TableOrigin
+from diffeo_calib.measurements.csv.tables import FileRows, TableOrigin, read_table
 from diffeo_calib.measurements.csv.writing import write_measurements  # noqa: F401  # read and written by one module
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice
+from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice, column_names
 from diffeo_calib.robots.se3 import transforms
 
 LOG = logging.getLogger(__name__)
@@ -64,29 +63,25 @@ def read_observations(
     check_choice("duplicates", duplicates, ("error", "keep", "drop"))
     file = path if isinstance(path, Path) else Path(path)
     sensors, numbers = sensors_of(table), numeric_columns(table)
-    with TableFile(file, numbers, text_columns(table)) as whole:
-        rows = FileRows(file, numbers, *whole.read(zeros=not growing), alone=len(sensors) == 1)
+    rows, alone = read_table(file, numbers, text_columns(table), zeros=not growing), len(sensors) == 1
     tables = []
     for sensor, here in _divided(rows, sensors):
         own = sensor.own_lines(here)
-        found = sensor.table(here).with_line_numbers(own.lines)
-        time, temperature = own.values.get("time"), own.values.get("temperature")
-        tables.append(found.with_payload(own.values.get("payload")).with_covariates(time=time, temperature=temperature))
-    data = tables[0] if rows.alone else joined_tables(tables)
-    data = data if rows.alone else data.rows(data.lines.argsort(stable=True))
-    sha256 = file_sha256(file)
-    data = data.with_file_sha256(sha256)
-    if rows.alone and table.position is not None:
+        found = sensor.table(here).with_line_numbers(own.lines).with_payload(own.values.get("payload"))
+        tables.append(found.with_covariates(**{name: own.values.get(name) for name in ("time", "temperature")}))
+    data, sha256 = tables[0] if alone else joined_tables(tables), file_sha256(file)
+    data = (data if alone else data.rows(data.lines.argsort(stable=True))).with_columns(file_sha256=sha256)
+    if alone and table.position is not None:
         marker = table.marker and f"{table.marker.partition('=')[0]}={','.join(data.marker_names)}"
         numbers = replace(numbers, table=replace(numbers.table, marker=marker))
-        data = data.with_origin(TableOrigin(file, numbers, sha256))
+        data = data.with_columns(origin=TableOrigin(file, numbers, sha256))
     LOG.info("read %d rows of %s", len(data), shown(path))
-    return data if duplicates == "keep" else without_copies(file, data, data.lines, drop=duplicates == "drop")
+    return data if duplicates == "keep" else _without_copies(file, data, drop=duplicates == "drop")
 
 
 def _divided(rows: FileRows, sensors: Sequence[SensorColumns]) -> list[tuple[SensorColumns, FileRows]]:
     """Each kind and the lines that hold it; MeasurementError for lines without any."""
-    if rows.alone:
+    if len(sensors) == 1:
         return [(sensors[0], rows)]
     filled = [sensor.filled(rows) for sensor in sensors]
     for sensor in (sensor for sensor, here in zip(sensors, filled, strict=True) if not bool(here.any())):
@@ -101,10 +96,9 @@ def _divided(rows: FileRows, sensors: Sequence[SensorColumns]) -> list[tuple[Sen
     return [(sensor, rows.of(here)) for sensor, here in zip(sensors, filled, strict=True)]
 
 
-def without_copies(path: Path, data: Rows, lines: Sequence[int] | Tensor, drop: bool) -> Rows:
+def _without_copies(path: Path, data: Rows, drop: bool) -> Rows:
     """Drop or refuse the rows that repeat an earlier one exactly."""
-    copies, count = data.copies(), len(data.q)
-    at = [int(line) for line in lines]
+    copies, at = data.copies(), data.lines.tolist()
     if copies and not drop:
         pairs = few([f"{at[row]} repeats {at[earlier]}" for earlier, row in copies])
         what = f"file '{path}': {len(copies)} line(s) repeat an earlier line exactly: line {pairs}"
@@ -114,7 +108,7 @@ def without_copies(path: Path, data: Rows, lines: Sequence[int] | Tensor, drop: 
     if dropped:
         text = f"file '{path}': dropped {len(dropped)} line(s) that repeat an earlier line exactly"
         warn_user(f"{text} (line {few([at[row] for row in dropped])}); pass duplicates='keep' to keep them.")
-    return data.rows(np.setdiff1d(np.arange(count), dropped))
+    return data.rows(np.setdiff1d(np.arange(len(data)), dropped))
 
 
 @outside_inference_mode
@@ -180,9 +174,7 @@ def _read(path: str | PathLike[str], table: TableFormat, duplicates: str, joints
     if joints is None:
         return read_observations(path, table, duplicates=duplicates)
     names, kinds = (robot.joint_names, robot.kinds) if isinstance(robot, ChainLike) else (robot, None)
-    if len(names) != len(joints):
-        got, fix = f"{len(joints)} columns", "name a column for every joint of the robot, in its order"
-        raise MeasurementError.of("`joints`", expected=len(names), got=got, fix=fix)
+    check_count("`joints`", joints, len(names), "joint of the robot, in its order")
     table = replace(table, joints=joints, kinds=table.kinds or kinds)
     return read_observations(path, table, duplicates=duplicates).with_joint_names(names)
 
@@ -211,38 +203,35 @@ def read_readings(
     """
     check_choice("kind", kind, ("distance", "height", "image"))
     given = {name: columns.pop(name) for name in ("std", "offset_std", "intrinsics", "on") if name in columns}
-    own = ReadingColumns.checked(kind, values, device=columns.pop("session", None), **given)
+    count, std, lens = 2 if kind == "image" else 1, given.pop("std", None), given.get("intrinsics")
+    if count > 1 or isinstance(values, (bool, str)) or not isinstance(values, (int, float)):
+        names = [values] if isinstance(values, str) else values
+        values = column_names("values", names, f"{count} names of columns for {kind!r}", (count,))
+    if (lens is None) != (kind != "image"):
+        fix = "pass fx, fy, cx, cy in pixels" if kind == "image" else "leave it out"
+        raise MeasurementError.of(f"`intrinsics` of {kind!r}", got=as_written(lens), fix=fix)
+    if std is not None:
+        given["std"] = column_names("std", [std] if isinstance(std, str) else std, "names of columns", (1, count))
+    own = ReadingColumns(kind, values, columns.pop("session", None), **given)
     return _read(path, TableFormat(**columns, joints=robot, readings=(own,)), duplicates, joints)
 
 
 def read_joints(
-    path: str | PathLike[str],
-    joints: Joints,
-    table: TableFormat,
-    *,
-    kinds: Sequence[str] | None = None,
+    path: str | PathLike[str], joints: Joints, table: TableFormat, *, kinds: Sequence[str] | None = None
 ) -> Tensor:
-    """Read joint configurations alone from a CSV file, for instance to predict positions.
+    """Joint configurations (N, n), rad (revolute) and m (prismatic), from a CSV file, rows in the order of the file.
 
-    Args, errors and warnings are those of :func:`read_measurements`. Of the format only units, separator and decimal
-    mark matter.
-
-    Returns:
-        (N, n) in rad (revolute) and m (prismatic), rows in the order of the file.
+    Arguments, errors and warnings are those of :func:`read_measurements`. Of the format only units, separator and
+    decimal mark matter.
     """
     return read_configurations(path, joints, table, kinds=kinds)["q"]
 
 
 def read_configurations(
-    path: str | PathLike[str],
-    joints: Joints,
-    table: TableFormat,
-    *,
-    kinds: Sequence[str] | None = None,
+    path: str | PathLike[str], joints: Joints, table: TableFormat, *, kinds: Sequence[str] | None = None
 ) -> Values:
     """Joint values "q" as of :func:`read_joints`, with the "payload" (N,), "time" and "temperature" that are named."""
-    with TableFile(Path(path), Columns.of(table.joints_only(joints, kinds))) as file:
-        return file.read()[0]
+    return read_table(Path(path), Columns.of(table.joints_only(joints, kinds))).values
 
 
 def read_poses(path: Path, columns: PoseColumns, table: TableFormat) -> Tensor:

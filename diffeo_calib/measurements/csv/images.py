@@ -12,8 +12,9 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.measurements.csv.cells import bad_cells
-from diffeo_calib.measurements.csv.columns import Group, Reported
-from diffeo_calib.measurements.csv.sensors import FileRows, SensorColumns, Written
+from diffeo_calib.measurements.csv.columns import Group
+from diffeo_calib.measurements.csv.sensors import SensorColumns, Written
+from diffeo_calib.measurements.csv.tables import FileRows
 from diffeo_calib.measurements.images import Known
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -43,8 +44,8 @@ class ImageColumns(SensorColumns):
     def texts(self) -> Mapping[str, bool]:
         return {CAMERA: False, IMAGE: True} | ({} if self.device is None else {self.device: True})
 
-    def reported(self, table: TableFormat) -> tuple[Reported, ...]:
-        return tuple(Reported(group, Group(()), self.word) for group in (Group(POINT, table.length), Group(PIXEL)))
+    def groups(self, table: TableFormat) -> tuple[Group, ...]:
+        return Group(POINT, table.length), Group(PIXEL)
 
     def filled(self, rows: FileRows) -> Tensor:
         return rows.filled(IMAGE)
@@ -56,7 +57,7 @@ class ImageColumns(SensorColumns):
     def table(self, rows: FileRows) -> Measurements:
         images = self._images(rows)
         _check_joints(rows, images)
-        points, pixels = (rows.values[one.values] for one in self.reported(rows.columns.table))
+        points, pixels = (rows.values[one] for one in self.groups(rows.columns.table))
         flat = torch.cat([points, torch.zeros_like(points[:, :1]), pixels], 1)
         empty = flat[:, [0, 1, 3, 4]].isnan().nonzero().tolist()
         if empty:
@@ -81,7 +82,7 @@ class ImageColumns(SensorColumns):
         named = {CAMERA: part.camera_names} if len(part.cameras) > 1 else {}
         named |= {} if self.device is None else {self.device: part.device_names}
         texts |= {name: [column[k] for k in whose] for name, column in named.items()}
-        points, pixels = (one.values for one in self.reported(table))
+        points, pixels = self.groups(table)
         return {points: seen[:, :2], pixels: seen[:, 3:]}, texts, number
 
     def _images(self, rows: FileRows) -> dict[str, list[int]]:

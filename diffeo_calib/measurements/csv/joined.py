@@ -80,15 +80,12 @@ class _Table(NamedTuple):
 def joined_file(
     joints: Path, places: Path, by: str, sep: str = ",", decimal: str = ".", *, several: bool = False
 ) -> JoinedFile:
-    """A file with the columns of both tables.
+    """A file with the columns of the tables of joints and of places, joined by a common column.
 
-    Args:
-        joints, places: the files. by: the common column, or "A=B" where the places have it under another name B.
-        sep, decimal: as of a table; another usual separator of one of the files is found by the common column.
-        several: whether lines of places may share their joint values, as those of markers do.
-
-    Raises:
-        MeasurementError: a file that cannot be read or lacks the column, several partners of a line, or no pair.
+    ``by`` is the common column, or "A=B" where the places have it under another name B. Another usual separator of one
+    of the files is found by it. ``several``: whether lines of places may
+    share their joint values, as those of markers do. MeasurementError for a file that cannot be read or lacks the
+    column, several partners of a line, or no pair.
     """
     own, _, other = by.partition("=")
     tables = table, measured = _Table.read(joints, own, sep), _Table.read(places, other or own, sep)
@@ -173,9 +170,9 @@ def _write(file: TextIO, tables: Sequence[_Table], pairs: Pairs, sep: str) -> No
     """Write the joined lines under the numbers of those of the places; a name in both files says of which it is."""
     table, measured = tables
     kept = [place for place in range(len(measured.header)) if place != measured.by]
-    twice = {*table.header} & {measured.header[place] for place in kept}
-    names = [f"joints.{name}" if name in twice else name for name in table.header]
-    names += [f"places.{name}" if name in twice else name for name in (measured.header[place] for place in kept)]
+    both = ("joints", table.header), ("places", [measured.header[place] for place in kept])
+    twice = {*both[0][1]} & {*both[1][1]}
+    names = [f"{of}.{name}" if name in twice else name for of, own in both for name in own]
     writer, at = csv.writer(file, delimiter=sep, lineterminator="\n"), 2
     writer.writerow(names)
     for row, place in pairs:

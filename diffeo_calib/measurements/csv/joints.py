@@ -61,11 +61,7 @@ class JointExpressions:
 
     @classmethod
     def of(cls, texts: Sequence[str]) -> JointExpressions:
-        """Parse names and expressions.
-
-        Raises:
-            MeasurementError: a product of columns, a column below a fraction line, or a constant.
-        """
+        """Parse names and expressions; MeasurementError for a product, or a column below a fraction line."""
         parsed = [_parsed(text) for text in texts]
         columns = tuple(dict.fromkeys(name for factors, _ in parsed for name in factors))
         rows = [[factors.get(name, 0.0) for name in columns] for factors, _ in parsed]
@@ -136,11 +132,7 @@ class PoseColumns:
 
     @classmethod
     def of(cls, text: str) -> PoseColumns:
-        """Parse ``X,Y,Z``, ``X,Y,Z,A,B,C=CONVENTION``, or ``A,B,C=FILE.py:NAME``.
-
-        Raises:
-            MeasurementError: another number of columns than the convention says, or a column twice.
-        """
+        """Parse ``X,Y,Z``, ``X,Y,Z,A,B,C=CONVENTION``, or ``A,B,C=FILE.py:NAME``; MeasurementError for others."""
         names, equal, convention = text.rpartition("=") if "=" in text else (text, "", "")
         columns = tuple(name.strip() for name in names.split(","))
         if len(columns) > 3 and not equal:
@@ -188,16 +180,14 @@ class PoseColumns:
         if self.is_program:
             return _made(self.convention, cells)
         with of_measurements():
-            turns = rotation_matrices(
-                cells[:, 3:], self.convention, angle=self.angle, place="row {} of the commanded poses".format
-            )
+            place = "row {} of the commanded poses".format
+            turns = rotation_matrices(cells[:, 3:], self.convention, angle=self.angle, place=place)
         return transforms(turns, cells[:, :3])
 
     def reread(self, table: Mapping[str, Tensor], per_metre: float) -> Iterator[tuple[Chain, Tensor, str]]:
         """Machine and joint values (N, n) of these columns in every other convention and unit, and its options.
 
-        Args:
-            table: the columns of a file. per_metre: units of length in the file.
+        ``table``: the columns of a file with so many units of length per metre.
         """
         if not self.convention or self.is_program:
             return
@@ -225,19 +215,14 @@ class PoseColumns:
         if self.robot is None or not self.convention:
             return values
         q = torch.cat([values[:, :3], values[:, 3:].deg2rad() if self.angle == "deg" else values[:, 3:]], 1)
-        found, known = q.new_full((len(q), len(self.columns)), torch.nan), q.isfinite().all(1)
-        poses = self.robot(q[known])
+        known = q.isfinite().all(1, keepdim=True)
+        poses = self.robot(q.where(known, 0.0)).masked_fill(~known[..., None], torch.nan)
         turns = rotation_numbers(poses[:, :3, :3], self.convention, angle=self.angle)
-        found[known] = torch.cat([poses[:, :3, 3], turns], 1)
-        return found
+        return torch.cat([poses[:, :3, 3], turns], 1)
 
 
 def _made(program: str, cells: Tensor) -> Tensor:
-    """Poses (N, 4, 4) or places (N, k) that a function makes of cells (N, c).
-
-    Raises:
-        MeasurementError: a file that does not run, no such function, or one that fails or returns something else.
-    """
+    """Poses (N, 4, 4) or places (N, k) that a function makes of cells (N, c); MeasurementError if it does not."""
     path, _, name = program.rpartition(":")
     function: Callable[[Tensor], Any] | None = getattr(_module(path), name, None)
     if function is None:

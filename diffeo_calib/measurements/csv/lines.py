@@ -1,4 +1,4 @@
-"""Lines of a table in a text file, in blocks: its encoding, its header, and what is no row.
+"""Lines of a table in a text file: its encoding, its header, and what is no row.
 
 What is unmistakable is read and noted: lines before the header, comments, a row of units, no header at all. Neither
 units nor robots are known here.
@@ -8,32 +8,25 @@ from __future__ import annotations
 
 import codecs
 import csv
+import io
 import re
-import shutil
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from io import TextIOWrapper
 from itertools import combinations, islice
 from math import isnan
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, BinaryIO
 
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.measurements.csv.cells import number, repeated
-from diffeo_calib.measurements.csv.sheets import as_text
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
+from diffeo_calib.measurements.csv.sheets import MARKS, as_text
 
 Lines = list[tuple[int, list[str]]]
 """Line number in the file and cells of every line that is not blank."""
 
-AT_ONCE = 1 << 13
-"""Bytes that are decoded together."""
 HEAD = 200
 """Lines among which the header is."""
+AT_ONCE = 1 << 13
+"""Bytes by which a file is judged."""
+WIDE = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 COMMENTS = "#", "%", "//"
 """Marks that begin a comment."""
 DAMAGED = re.compile(r"#[A-Z/0]+[!?]")
@@ -46,141 +39,79 @@ OTHERS = re.compile(r"[mu]?s|sec|min|h|k?g|nm?|°?c|k|v|px|pixels?|%|-|none")
 
 
 class CsvLines:
-    """A table in a text file, used as a context; blank lines are skipped.
+    """A table in a text file; blank lines are skipped.
 
     Args:
-        path: the file. What can be read only once, such as a pipe, is copied first.
-        sep: one character between cells.
+        path: the file, which is read once. sep: one character between cells.
         wanted: names of columns, by which the header is known.
 
     Attributes:
         header: the names of the columns; by position, "1", "2", ..., where no line names them.
         units: by name of column, of a row of units below the header.
+        notes: what was decided, in words; after :meth:`rows` also which lines between them were skipped.
 
     Raises:
-        MeasurementError: a file that cannot be opened or read, is no text or no valid CSV, has no row, or lines of
-            different lengths; on entering or while it is read.
+        MeasurementError: a file that cannot be read, is empty, no text or no valid CSV.
     """
 
     def __init__(self, path: Path, sep: str, wanted: Sequence[str] = ()) -> None:
-        self.path, self.sep, self._wanted = path, sep, wanted
-        self.header, self.units = list[str](), dict[str, str]()
+        self.path, self.sep = path, sep
+        self.header, self.units, self.notes = list[str](), dict[str, str](), list[str]()
         self._aligned, self._commented = False, True
         self._last, self._extra = 0, 0  # line before the rows, and empty cells at the end of rows
-        self._notes, self._skipped = list[str](), list[int]()
-        self._stack = ExitStack()
-        self._file: TextIOWrapper
-
-    def __enter__(self) -> Self:
-        with self._stack as stack, self._read():  # closed if the header cannot be read
-            file = stack.enter_context(self.path.open("rb"))
-            if not file.seekable():
-                copy = stack.enter_context(tempfile.TemporaryFile())
-                shutil.copyfileobj(file, copy)
-                file = copy
-            sheet = as_text(self.path, file, self.sep)
-            file = file if sheet is None else sheet.text
-            encoding = self._encoding(file)
-            file.seek(0)
-            self._file = stack.enter_context(TextIOWrapper(file, encoding, "replace", newline=""))
+        self._text, notes = _text(path, sep)
+        lines = list(islice(self._cells(), HEAD))
+        if sep == " " and len({len(cells) for _, cells in lines}) > 1:  # columns that spaces align
+            self._aligned = True
             lines = list(islice(self._cells(), HEAD))
-            if self.sep == " " and len({len(cells) for _, cells in lines}) > 1:  # columns that spaces align
-                self._aligned = True
-                lines = list(islice(self._cells(), HEAD))
-            if not any(any(cells) for _, cells in lines):
-                what, fix = f"file '{self.path}' is empty", "check that it was exported completely"
-                raise MeasurementError.of(what, expected="a header and rows of numbers", fix=fix)
-            self._notes = [f"text in {encoding}, not UTF-8"] * (encoding != "utf-8-sig")
-            self._notes += [] if sheet is None else sheet.notes
-            self._find_header(lines)
-            self._stack = stack.pop_all()
-        return self
+        if not any(any(cells) for _, cells in lines):
+            what, fix = f"file '{path}' is empty", "check that it was exported completely"
+            raise MeasurementError.of(what, expected="a header and rows of numbers", fix=fix)
+        self.notes += notes
+        self._find_header(lines, {*wanted})
 
-    def __exit__(self, kind: type[BaseException] | None, _value: object, _trace: TracebackType | None) -> None:
-        self._stack.close()
+    def rows(self, most: int | None = None) -> Lines:
+        """The lines below the header, of the first ``most`` if given.
 
-    @property
-    def notes(self) -> list[str]:
-        """What was decided, in words; after a pass through the rows also which lines between them were skipped."""
-        skipped = f"{len(self._skipped)} line(s) with comments, names or nothing skipped (line {few(self._skipped)})"
-        return self._notes + [skipped] * bool(self._skipped)
-
-    def blocks(self, rows: int | None = None) -> Iterator[Lines]:
-        """The lines below the header, up to ``rows`` at once, or all, from the first one at every call."""
-        self._skipped, count, expected = [], 0, len(self.header)
-        lines = (line for line in self._cells() if line[0] > self._last)
-        while block := list(islice(lines, rows)):
-            kept = [(line, cells) for line, cells in block if not self._no_row(cells)]
-            self._skipped += sorted({line for line, _ in block} - {line for line, _ in kept})
-            sizes = expected, expected + self._extra
-            bad = [(line, len(cells)) for line, cells in kept if len(cells) not in sizes or any(cells[expected:])]
-            if bad:
-                what = f"file '{self.path}', line {few([line for line, _ in bad])}"
-                fix = "repair these lines (a cell that holds the separator must be quoted)"
-                raise MeasurementError.of(what, expected=f"{expected} cells as in the header", got=bad[0][1], fix=fix)
-            count += len(kept)
-            if kept:
-                yield [(line, cells[:expected]) for line, cells in kept]
-        if not count:
+        Raises:
+            MeasurementError: no row, or lines of different lengths.
+        """
+        below = list(islice((line for line in self._cells() if line[0] > self._last), most))
+        kept, expected = [(line, cells) for line, cells in below if not self._no_row(cells)], len(self.header)
+        sizes = expected, expected + self._extra
+        bad = [(line, len(cells)) for line, cells in kept if len(cells) not in sizes or any(cells[expected:])]
+        if bad:
+            what = f"file '{self.path}', line {few([line for line, _ in bad])}"
+            fix = "repair these lines (a cell that holds the separator must be quoted)"
+            raise MeasurementError.of(what, expected=f"{expected} cells as in the header", got=bad[0][1], fix=fix)
+        if not kept:
             what, fix = f"file '{self.path}' has a header but no rows", "check that it was exported completely"
             raise MeasurementError.of(what, expected="at least one row of numbers", fix=fix)
-
-    def _encoding(self, file: BinaryIO) -> str:
-        """Of the text; MeasurementError if the file is none."""
-        file.seek(0)
-        part, decoder = file.read(AT_ONCE), codecs.getincrementaldecoder("utf-8")()
-        if part.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-            return "utf-16"
-        encoding = "utf-8-sig"
-        while part:
-            if b"\0" in part:
-                what, fix = f"file '{self.path}' is no text but binary", "export the table as CSV"
-                raise MeasurementError.of(what, expected="a CSV file", fix=fix)
-            try:
-                decoder.decode(part, final=len(part) < AT_ONCE)
-            except UnicodeDecodeError:
-                encoding = "cp1252"
-            part = file.read(AT_ONCE)
-        return encoding
+        if skipped := sorted({line for line, _ in below} - {line for line, _ in kept}):
+            self.notes.append(f"{len(skipped)} line(s) with comments, names or nothing skipped (line {few(skipped)})")
+        return [(line, cells[:expected]) for line, cells in kept]
 
     def _cells(self) -> Iterator[tuple[int, list[str]]]:
         """Line number and stripped cells of every line that is not blank."""
-        line = 0
-        self._file.seek(0)
-        texts = (re.sub(" +", " ", text.strip(" ")) for text in self._file) if self._aligned else self._file
+        line, text = 0, io.StringIO(self._text, newline="")
+        texts = (re.sub(" +", " ", own.strip(" ")) for own in text) if self._aligned else text
         reader = csv.reader(texts, delimiter=self.sep, strict=True, skipinitialspace=self.sep != " ")
         try:
-            with self._read():
-                for cells in reader:
-                    first, line = line + 1, reader.line_num  # a quoted cell may span lines
-                    stripped = [cell.strip() for cell in cells]
-                    if len(stripped) > 1 or any(stripped):
-                        yield first, stripped
+            for cells in reader:
+                first, line = line + 1, reader.line_num  # a quoted cell may span lines
+                stripped = [cell.strip() for cell in cells]
+                if len(stripped) > 1 or any(stripped):
+                    yield first, stripped
         except csv.Error as error:
             what = f"file '{self.path}', line {line + 1}: not valid CSV ({error})"
             raise MeasurementError.of(what, fix="repair the quotes of this line") from error
-
-    @contextmanager
-    def _read(self) -> Iterator[None]:
-        try:
-            yield
-        except IsADirectoryError as error:
-            fix = f"of images of a board run `diffeo-calib images '{self.path}' JOINTS.csv ...`, and pass its table"
-            raise MeasurementError.of(f"'{self.path}' is a folder", expected="a table", fix=fix) from error
-        except FileNotFoundError as error:
-            fix = f"check the name and the folder (searched from '{Path.cwd()}')"
-            path = self.path
-            raise MeasurementError.of(f"file '{path}' does not exist", fix=fix) from error
-        except OSError as error:
-            what = f"file '{self.path}' cannot be read ({error.strerror})"
-            raise MeasurementError.of(what, fix="pass the name of a readable file") from error
 
     def _no_row(self, cells: Sequence[str]) -> bool:
         """Whether a line below the header is a comment, empty, or the header again."""
         again = self._last > 0 and cells[: len(self.header)] == self.header  # not where columns are counted
         return not any(cells) or again or (self._commented and _is_comment(cells))
 
-    def _find_header(self, lines: Lines) -> None:
+    def _find_header(self, lines: Lines, wanted: set[str]) -> None:
         """Find the header as most rows of numbers, and the wanted names, among the first lines have it.
 
         It is the first line with a name for every cell of the rows, or two lines together; if it lacks a wanted name,
@@ -199,7 +130,7 @@ class CsvLines:
         start = next((k for k in rows if 2 * counts[k] > usual), len(lines))
         filled = max((place + 1 for k in rows for place, cell in enumerate(lines[k][1]) if cell), default=0)
         place, header = _named(lines, comments, start, range(filled, width + 1))
-        wanted, counted = {*self._wanted}, [str(k + 1) for k in range(filled)]
+        counted = [str(k + 1) for k in range(filled)]
         for k, (_, cells) in enumerate(lines[: max(start, 1)] if not wanted <= {*header} else []):
             for names in (cells, _uncommented(cells, width)):
                 if wanted <= {*names}:
@@ -210,28 +141,53 @@ class CsvLines:
             start -= 1  # few numbers, but no line names the columns
         skipped = [line for line, _ in lines[: start if place < 0 else place]]
         if skipped:
-            self._notes.append(f"line {few(skipped)} before the {'rows' if place < 0 else 'header'} skipped")
+            self.notes.append(f"line {few(skipped)} before the {'rows' if place < 0 else 'header'} skipped")
         if place < 0:
             header, place = counted, start - 1
-            self._notes.append(f"no header line: columns are named by their places, 1 to {filled}")
+            self.notes.append(f"no header line: columns are named by their places, 1 to {filled}")
         while header and not header[-1]:
             header = header[:-1]
         below = next((lines[k] for k in range(place + 1, len(lines)) if not comments[k]), (0, [""]))
         self._last = lines[place][0] if place >= 0 else 0
         if _is_units(below[1]):
-            self._notes.append(f"line {below[0]} holds units")
+            self.notes.append(f"line {below[0]} holds units")
             self._last, self.units = below[0], dict(zip(header, map(unit_of, below[1]), strict=False))
         self.header, self._extra = header, max(width - len(header), 0)
 
 
-def read_cells(path: Path, sep: str, wanted: Sequence[str] = ()) -> tuple[list[str], Lines]:
-    """Read a table as text: the header, and number and cells of every row.
+def _text(path: Path, sep: str) -> tuple[str, list[str]]:
+    """The text of a file, and what was decided about it; MeasurementError if it cannot be read or is no table."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(AT_ONCE)  # tells a device without an end
+            whole = b"\0" not in data or data.startswith((*WIDE, *MARKS)) or path.suffix.lower() == ".mat"
+            data += file.read() if whole else b""
+    except IsADirectoryError as error:
+        fix = f"of images of a board run `diffeo-calib images '{path}' JOINTS.csv ...`, and pass its table"
+        raise MeasurementError.of(f"'{path}' is a folder", expected="a table", fix=fix) from error
+    except FileNotFoundError as error:
+        fix = f"check the name and the folder (searched from '{Path.cwd()}')"
+        raise MeasurementError.of(f"file '{path}' does not exist", fix=fix) from error
+    except OSError as error:
+        what = f"file '{path}' cannot be read ({error.strerror})"
+        raise MeasurementError.of(what, fix="pass the name of a readable file") from error
+    if data.startswith(WIDE):
+        return data.decode("utf-16", "replace"), ["text in utf-16, not UTF-8"]
+    if (sheet := as_text(path, data, sep)) is not None:
+        return sheet
+    if b"\0" in data:
+        what, fix = f"file '{path}' is no text but binary", "export the table as CSV"
+        raise MeasurementError.of(what, expected="a CSV file", fix=fix)
+    try:
+        return data.decode("utf-8-sig"), []
+    except UnicodeDecodeError:
+        return data.decode("cp1252", "replace"), ["text in cp1252, not UTF-8"]
 
-    Raises:
-        MeasurementError: as :class:`CsvLines`.
-    """
-    with CsvLines(path, sep, wanted) as file:
-        return file.header, [line for block in file.blocks() for line in block]
+
+def read_cells(path: Path, sep: str, wanted: Sequence[str] = ()) -> tuple[list[str], Lines]:
+    """Read a table as text: the header, and number and cells of every row; MeasurementError as :class:`CsvLines`."""
+    file = CsvLines(path, sep, wanted)
+    return file.header, file.rows()
 
 
 def _named(lines: Lines, comments: Sequence[bool], start: int, sizes: Sequence[int]) -> tuple[int, list[str]]:

@@ -77,10 +77,7 @@ def with_coordinate(data: Measurements, marker: int, axis: int, values: Tensor) 
 
 
 def numeric_table(data: Measurements) -> tuple[Columns | None, Mapping[str, Tensor]]:
-    """How the measurements were read, and all numeric columns of their file; None if there is none any more.
-
-    None too where a row is made of several lines.
-    """
+    """How measurements were read, and all numeric columns of their file; None without it, or of rows of many lines."""
     if not isinstance(data.origin, TableOrigin) or data.origin.columns.table.marker is not None:
         return None, {}
     table = data.origin.numeric_columns(data.line_numbers)

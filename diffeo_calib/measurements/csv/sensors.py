@@ -4,81 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError, as_written, few, shown, warn_user
+from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
 from diffeo_calib.measurements.checks import of_measurements, unlikely_units
-from diffeo_calib.measurements.csv.cells import bad_cells
-from diffeo_calib.measurements.csv.columns import (
-    DEVIATION,
-    Check,
-    Columns,
-    Group,
-    Reported,
-    Values,
-)
-from diffeo_calib.measurements.pose_frames import (
-    inverse_poses,
-    of_frames,
-    transforms_of_frames,
-    visible_rotation_numbers,
-)
-from diffeo_calib.measurements.poses import rotation_matrices
+from diffeo_calib.measurements.csv.columns import DEVIATION, Check, Columns, Group
+from diffeo_calib.measurements.csv.tables import FileRows
+from diffeo_calib.measurements.pose_frames import inverse_poses, of_frames, transforms_of_frames
+from diffeo_calib.measurements.poses import rotation_matrices, rotation_numbers
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 from diffeo_calib.measurements.sockets import SEPARATOR, Distances
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_format import TableFormat, column_names
+from diffeo_calib.measurements.table_format import TableFormat
 
 ONE_READING = "every line is one reading of one device: fill the cell in, or remove the line"
 LENGTH = Check(
     "a distance above 0", fix="repair or remove these lines; distances with an unknown zero are displacements"
 )
-
-
-class FileRows(NamedTuple):
-    """Some lines of a file.
-
-    Args:
-        path: the file. columns: its columns of numbers. values: these in SI. texts: its columns of texts.
-        lines: their numbers in the file.
-        alone: whether all lines of the file hold rows of one kind, so that no cell may be empty.
-    """
-
-    path: Path
-    columns: Columns
-    values: Values
-    texts: Mapping[str, Sequence[str]]
-    lines: Sequence[int]
-    alone: bool
-
-    def of(self, rows: Tensor) -> FileRows:
-        """The lines with these numbers (M,), or those that a mask (N,) chooses."""
-        chosen = torch.arange(len(self.lines), device=HOST)[rows].tolist()
-        values = {name: own[rows] for name, own in self.values.items()}
-        texts = {name: [own[row] for row in chosen] for name, own in self.texts.items()}
-        return self._replace(values=values, texts=texts, lines=[self.lines[row] for row in chosen])
-
-    def filled(self, column: str) -> Tensor:
-        """(N,) boolean, which lines have a text in a column."""
-        return torch.tensor([bool(text) for text in self.texts[column]], dtype=torch.bool, device=HOST)
-
-    def named(self, column: str, expected: str, fix: str = "fill it in") -> Sequence[str]:
-        """The texts of a column; MeasurementError for empty ones, which says what is expected and what to do."""
-        empty = [line for line, text in zip(self.lines, self.texts[column], strict=True) if not text]
-        if empty:
-            raise bad_cells(self.path, [(line, column, "") for line in empty], expected, fix)
-        return self.texts[column]
-
-    def devices(self, column: str | None, expected: str, fix: str = "fill it in") -> Sequence[str] | None:
-        """Names of devices or set-ups; None without a column, or where other kinds alone fill it."""
-        if column is None or not (self.alone or any(self.texts[column])):
-            return None
-        return self.named(column, expected, fix)
 
 
 Written = tuple[Mapping[Any, Tensor | None], Mapping[str, Sequence[str]], Tensor]
@@ -92,25 +38,20 @@ class SensorColumns:
     texts: Mapping[str, bool]
     """Columns of texts, and whether a table must have them."""
 
-    def reported(self, table: TableFormat) -> tuple[Reported, ...]:
+    def groups(self, table: TableFormat) -> tuple[Group, ...]:
         """The columns of numbers beside joints, positions, payloads and covariates."""
         return ()
 
-    def filled(self, rows: FileRows) -> Tensor:
-        """(N,) boolean, which lines hold such a row."""
-        raise NotImplementedError
+    filled: Any
+    """Lines -> (N,) boolean, which of them hold such a row."""
+    table: Any
+    """Lines, all of which hold one -> their rows."""
+    written: Any
+    """The inverse of ``table``; joints, payloads and covariates are those of the rows."""
 
     def own_lines(self, rows: FileRows) -> FileRows:
         """The line of every row."""
         return rows
-
-    def table(self, rows: FileRows) -> Any:
-        """The rows of these lines, all of which hold one."""
-        raise NotImplementedError
-
-    def written(self, part: Any, table: TableFormat) -> Written:
-        """The inverse of :meth:`table`; joints, payloads and covariates are those of the rows."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -136,21 +77,15 @@ class PositionColumns(SensorColumns):
         """MeasurementError for numbers that do not form a rotation."""
         rows, names = self._with_markers(rows)
         values, columns, table = rows.values, rows.columns, rows.columns.table
-        std, turns = values.get("std"), values.get("rotation_std")
+        q, joints, known = values["q"], columns.joints.texts, [values.get("std"), values.get("rotation_std")]
         if table.convention is None:
-            data = Measurements(values["q"], values["points"], columns.joints.texts, names, std=std, doubt=False)
+            data = Measurements(q, values["points"], joints, names, std=known[0], doubt=False)
         else:
-            single = len(columns.triples) == 1
-            data = Measurements.from_poses(
-                values["q"],
-                of_frames(transforms_of_frames(_rotations(rows, table.convention), values["points"])),
-                columns.joints.texts,
-                lever=table.lever,
-                position_std=std[:, 0] if single and std is not None else std,
-                rotation_std=turns[:, 0] if single and turns is not None else turns,
-                camera_on_tool=table.camera_on_tool,
-                doubt=False,
-            )
+            if len(columns.triples) == 1:
+                known = [None if own is None else own[:, 0] for own in known]
+            poses = of_frames(transforms_of_frames(_rotations(rows, table.convention), values["points"]))
+            how = {"lever": table.lever, "position_std": known[0], "rotation_std": known[1]}
+            data = Measurements.from_poses(q, poses, joints, **how, camera_on_tool=table.camera_on_tool, doubt=False)
         set_ups = rows.devices(self.form.session, "a name")
         return data.with_tips(self.form.on).with_sessions(set_ups, remounted=table.remounted)
 
@@ -187,10 +122,14 @@ class PositionColumns(SensorColumns):
         frames = part.frames if part.frames is None or part.board is None else inverse_poses(part.frames)
         values = {"points": part.points if frames is None else frames[..., :3, 3], "std": part.std}
         if frames is not None:
-            numbers = visible_rotation_numbers(frames, table.convention or "rotvec", table.rotation_angle or "rad")
-            values |= {"rotations": numbers, "rotation_std": part.rotation_std}
-        texts = {} if self.form.session is None else {self.form.session: part.device_names}
-        return values, texts, *part.index
+            values |= {"rotations": written_rotations(frames, table), "rotation_std": part.rotation_std}
+        return values, {} if self.form.session is None else {self.form.session: part.device_names}, *part.index
+
+
+def written_rotations(frames: Tensor, table: TableFormat) -> Tensor:
+    """Rotations (N, T, k) of frames (N, T, 4, 4) as a table writes them."""
+    convention, angle = table.convention or "rotvec", table.rotation_angle or "rad"
+    return rotation_numbers(frames[..., :3, :3], convention, angle=angle)
 
 
 def _rotations(rows: FileRows, convention: str) -> Tensor:
@@ -272,28 +211,6 @@ class ReadingColumns(SensorColumns):
     on: str | None = None
     unit: tuple[str, float] = MILLIMETRES
 
-    @classmethod
-    def checked(
-        cls,
-        kind: str,
-        values: Any,
-        *,
-        std: Sequence[str] | str | None = None,
-        intrinsics: tuple[float, float, float, float] | None = None,
-        **others: Any,
-    ) -> ReadingColumns:
-        """The columns by names in any form; MeasurementError for a number of them that does not match the kind."""
-        count = 2 if kind == "image" else 1
-        if count > 1 or isinstance(values, (bool, str)) or not isinstance(values, (int, float)):
-            given = [values] if isinstance(values, str) else values
-            values = column_names("values", given, f"{count} names of columns for {kind!r}", (count,))
-        if (intrinsics is None) != (kind != "image"):
-            fix = "pass fx, fy, cx, cy in pixels" if kind == "image" else "leave it out"
-            raise MeasurementError.of(f"`intrinsics` of {kind!r}", got=as_written(intrinsics), fix=fix)
-        given = [std] if isinstance(std, str) else std
-        known = () if given is None else column_names("std", given, "names of columns", (1, count))
-        return cls(kind, values, intrinsics=intrinsics or (1.0, 1.0, 0.0, 0.0), std=known, **others)
-
     @property
     def word(self) -> str:
         return "an image" if self.kind == "image" else f"a {self.kind}"
@@ -302,15 +219,15 @@ class ReadingColumns(SensorColumns):
     def texts(self) -> Mapping[str, bool]:
         return {} if self.device is None else {self.device: True}
 
-    def reported(self, table: TableFormat) -> tuple[Reported, ...]:
+    def groups(self, table: TableFormat) -> tuple[Group, Group]:
         unit = None if self.kind == "image" else table.length if self.unit == MILLIMETRES else self.unit[1]
         check = LENGTH if self.kind == "distance" and not self.offset_std else None
         names = self.values if isinstance(self.values, tuple) else ()
-        return (Reported(Group(names, unit, check), Group(self.std, unit, DEVIATION), self.word),)
+        return Group(names, unit, check), Group(self.std, unit, DEVIATION)
 
     def filled(self, rows: FileRows) -> Tensor:
         if isinstance(self.values, tuple):
-            return ~rows.values[self.reported(rows.columns.table)[0].values].isnan().any(1)
+            return ~rows.values[self.groups(rows.columns.table)[0]].isnan().any(1)
         if self.device is None:
             fix = "name the column of its devices: the rows that name one hold this reading"
             raise MeasurementError.of(f"one {self.kind} for all rows beside rows of other kinds", fix=fix)
@@ -318,19 +235,18 @@ class ReadingColumns(SensorColumns):
 
     def table(self, rows: FileRows) -> Readings:
         q, joints, table = rows.values["q"], rows.columns.joints.texts, rows.columns.table
-        (own,) = self.reported(table)
+        own, own_std = self.groups(table)
         if isinstance(self.values, tuple):
-            seen = rows.values[own.values]
+            seen = rows.values[own]
         else:
-            seen = own.values.to_si(torch.full((len(q), 1), self.values, dtype=torch.float64, device=HOST))
+            seen = own.to_si(torch.full((len(q), 1), self.values, dtype=torch.float64, device=HOST))
         devices = rows.devices(self.device, "the name of the device of this reading", ONE_READING)
-        std = rows.values[own.std].expand_as(seen) if self.std else None
+        std = rows.values[own_std].expand_as(seen) if self.std else None
         given, known = (q, seen, devices, joints), {"std": std, "doubt": False}
         if self.kind == "image":
             data = Readings.images(*given, focal=self.intrinsics[:2], centre=self.intrinsics[2:], **known)
         elif self.kind == "distance":
-            largest = float(own.values.from_si(seen).abs().max())
-            for text in unlikely_units("positions", largest, table.length, "length"):
+            for text in unlikely_units("positions", own.from_si(seen), table.length, "length"):
                 warn_user(f"file '{rows.path}': {text}".replace("positions", "distances"))
             data = Readings.distances(*given, offset_std=self.offset_std, **known)
         else:
@@ -338,8 +254,8 @@ class ReadingColumns(SensorColumns):
         return data.with_tips(None if self.on is None else [self.on])
 
     def written(self, part: Any, table: TableFormat) -> Written:
-        (own,) = self.reported(table)
-        values = {own.values: part.reported} | ({own.std: part.reported_std} if self.std else {})
+        own, std = self.groups(table)
+        values = {own: part.reported} | ({std: part.reported_std} if self.std else {})
         return values, {} if self.device is None else {self.device: part.device_names}, *part.index
 
 
@@ -364,8 +280,8 @@ def numeric_columns(table: TableFormat) -> Columns:
     sensors = sensors_of(table)
     _check_options(table, several=len(sensors) != 1)
     table = table if table.position is None else table.for_reading()
-    reported = [one for sensor in sensors for one in sensor.reported(table)]
-    return Columns.of(table, reported, all_hidden=len(sensors) > 1)
+    readings = [(own, sensor.word) for sensor in sensors if (own := sensor.groups(table))]
+    return Columns.of(table, readings, all_hidden=len(sensors) > 1)
 
 
 def _check_options(table: TableFormat, *, several: bool) -> None:

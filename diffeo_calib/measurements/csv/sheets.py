@@ -14,52 +14,43 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from io import BytesIO, StringIO
 from itertools import product
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from diffeo_calib.common.errors import MeasurementError, few
 
-ZIP, OLD_SHEET, NUMPY, MATLAB = b"PK\3\4", b"\xd0\xcf\x11\xe0", b"\x93NUMPY", b"MATLAB "
+MARKS = ZIP, OLD_SHEET, NUMPY, MATLAB = b"PK\3\4", b"\xd0\xcf\x11\xe0", b"\x93NUMPY", b"MATLAB "
 """First bytes of files that are no text."""
 HDF5 = b"MATLAB 7.3"
 PLACES = {"p", "pos", "position", "positions", "point", "points", "xyz", "marker", "markers", "measured", "tcp"}
 """Names of arrays (N, 3) of places."""
 
 
-class Sheet(NamedTuple):
-    """The text of a table in UTF-8, and what was decided, in words."""
-
-    text: BinaryIO
-    notes: list[str]
-
-
-def as_text(path: Path, file: BinaryIO, sep: str) -> Sheet | None:
-    """A table that is no text, with ``sep`` between its cells; None for text.
+def as_text(path: Path, data: bytes, sep: str) -> tuple[str, list[str]] | None:
+    """A table that is no text, with ``sep`` between its cells, and what was decided; None for text.
 
     Raises:
         MeasurementError: a spreadsheet of an old format, arrays that are no table, or a package that is not installed.
     """
-    file.seek(0)
-    first = file.read(len(HDF5))
-    file.seek(0)
-    if first.startswith(OLD_SHEET):
+    if data.startswith(OLD_SHEET):
         raise _no_table(path, "a spreadsheet of an old format", "save it as .xlsx or CSV")
-    if first.startswith(HDF5):
+    if data.startswith(HDF5):
         raise _no_table(path, "a MATLAB file of version 7.3", "save it with `save(..., '-v7')`, or as CSV")
-    if first.startswith(ZIP):
+    file = BytesIO(data)
+    if data.startswith(ZIP):
         names = _zipped(file)
         reader = _arrays_of_zip if names and all(name.endswith(".npy") for name in names) else _spreadsheet
-    elif first.startswith(NUMPY):
+    elif data.startswith(NUMPY):
         reader = _array
-    elif first.startswith(MATLAB) or (b"\0" in first and path.suffix.lower() == ".mat"):  # version 4 has no mark
+    elif data.startswith(MATLAB) or (b"\0" in data and path.suffix.lower() == ".mat"):  # version 4 has no mark
         reader = _variables
     else:
         return None
     rows, notes = reader(path, file)
     text = StringIO()
     csv.writer(text, delimiter=sep, lineterminator="\n").writerows(rows)
-    return Sheet(BytesIO(text.getvalue().encode()), notes)
+    return text.getvalue(), notes
 
 
 Rows = Sequence[Sequence[object]]

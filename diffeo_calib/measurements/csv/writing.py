@@ -22,15 +22,15 @@ from diffeo_calib.measurements.csv.columns import check_count
 from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, ImageColumns, written_columns
 from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.sensors import (
+    PositionColumns,
     ReadingColumns,
-    SensorColumns,
     SocketColumns,
     numeric_columns,
-    sensors_of,
     text_columns,
+    written_rotations,
 )
 from diffeo_calib.measurements.observations import Observations
-from diffeo_calib.measurements.pose_frames import by_frame, visible_rotation_numbers
+from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.readings import ONE_DEVICE
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
 
@@ -63,25 +63,20 @@ def write_predictions(
         table: the format, of poses with defaults as in :func:`write_measurements`.
         prefixes: what the names of the columns of each marker or frame begin with. more: k names of further columns.
         poses: whether the blocks hold poses. columns: further fields of the format, such as ``joints`` and ``kinds``.
-
-    Raises:
-        MeasurementError: unknown unit or convention.
-        InputError: a file that cannot be written.
     """
     table = replace(table, **columns, position=[[f"{prefix}{axis}" for axis in "xyz"] for prefix in prefixes])
     table = replace(table, std=[f"{prefix}std_{axis}" for prefix in prefixes for axis in "xyz"])
     numeric = numeric_columns(table.for_writing(rotation_std=True, prefixes=prefixes) if poses else table)
-    table, names = numeric.table, [*numeric.joints.columns]
+    table, names, std = numeric.table, [*numeric.joints.columns], numeric.groups["std"].names
     turned = zip(table.rotation or (), table.rotation_std or (), strict=True) if poses else [((), ())] * len(prefixes)
     for k, (triple, (turns, deviations)) in enumerate(zip(numeric.triples, turned, strict=True)):
-        names += [*triple, *numeric.std[3 * k : 3 * k + 3], *turns, *deviations]
+        names += [*triple, *std[3 * k : 3 * k + 3], *turns, *deviations]
 
     def rows(q: Tensor, mean: Tensor, deviations: Tensor, *others: Tensor) -> Cells:
         frames, spreads = by_frame(mean) if poses else None, deviations.reshape(len(q), len(prefixes), -1)
         values = {"q": q, "points": mean if frames is None else frames[..., :3, 3], "std": spreads[..., :3]}
         if frames is not None:
-            numbers = visible_rotation_numbers(frames, table.convention or "rotvec", table.rotation_angle or "rad")
-            values |= {"rotations": numbers, "rotation_std": spreads[..., 3:]}
+            values |= {"rotations": written_rotations(frames, table), "rotation_std": spreads[..., 3:]}
         cells = numeric.from_si(values)
         beside = torch.cat(others, 1).tolist() if others else [[]] * len(q)
         lines = zip(*(cells[name] for name in names), strict=True)
@@ -95,10 +90,16 @@ def write_rows(path: str | PathLike[str], names: Sequence[str], blocks: Iterable
 
     Texts are written as they are, NaN becomes an empty cell.
     """
+
+    def cell(value: str | float) -> str:
+        if isinstance(value, str):
+            return value
+        return repr(value).replace(".", table.decimal) if isfinite(value) else ""
+
     with WholeFile(path) as file:
         file.write(csv_text([names], table.sep))
         for block in blocks:
-            file.write(csv_text(([_cell(value, table) for value in row] for row in block), table.sep))
+            file.write(csv_text((map(cell, row) for row in block), table.sep))
 
 
 def csv_text(rows: Iterable[Iterable[object]], sep: str, end: str = "\r\n") -> bytes:
@@ -126,11 +127,7 @@ class Program:
 
     @classmethod
     def read(cls, path: Path, table: TableFormat, wanted: Sequence[str] = ()) -> Program:
-        """Read all cells as text; ``wanted`` are names of columns, by which the header is known.
-
-        Raises:
-            MeasurementError: a file that cannot be read, or lines of different lengths.
-        """
+        """Read all cells as text; ``wanted`` are names of columns, by which the header is known."""
         header, lines = read_cells(path, table.sep, wanted)
         return cls(header, [cells for _, cells in lines], [line for line, _ in lines])
 
@@ -149,22 +146,11 @@ class Program:
     def write(self, path: Path, cells: Mapping[str, Column], table: TableFormat) -> None:
         """Write the program with other and more columns; overwrites.
 
-        Args:
-            path: the file. cells: name -> texts, or numbers in the units of the file, of which NaN is an empty cell.
-            table: separator and decimal mark.
-
-        Raises:
-            InputError: a file that cannot be written.
+        ``cells``: name -> texts, or numbers in the units of the file, of which NaN is an empty cell.
         """
         added = {name: own for name, own in cells.items() if name not in self.header}
         kept = [cells.get(name, [row[k] for row in self.rows]) for k, name in enumerate(self.header)]
         write_rows(path, [*self.header, *added], [list(zip(*kept, *added.values(), strict=True))], table)
-
-
-def _cell(value: str | float, table: TableFormat) -> str:
-    if isinstance(value, str):
-        return value
-    return repr(value).replace(".", table.decimal) if isfinite(value) else ""
 
 
 SOCKET, SESSION = "socket", "session"
@@ -203,7 +189,7 @@ def write_measurements(path: str | PathLike[str], data: Any, table: TableFormat,
     """
     whole, table = Observations.joined([data]), replace(table, **columns)
     names = table.joints or whole.joint_names or [f"q{i + 1}" for i in range(whole.n)]
-    table = replace(_sheet(whole, table), joints=names)
+    table, kinds = _sheet(whole, replace(table, joints=names))
     numeric = numeric_columns(table)
     check_count("joint columns", numeric.joints.texts, whole.n, "joint")
     sockets = () if table.sockets is None else table.sockets.names
@@ -214,7 +200,7 @@ def write_measurements(path: str | PathLike[str], data: Any, table: TableFormat,
         what, fix, got = "the names of the columns", "rename the joints or positions", f"{listed(twice)} twice"
         raise MeasurementError.of(what, expected="distinct names", got=got, fix=fix)
     found: list[tuple[int, dict[str, float | str]]] = []
-    for part, rows, sensor in zip(whole.parts, whole.index, _sensors(whole, table), strict=True):
+    for part, rows, sensor in zip(whole.parts, whole.index, kinds, strict=True):
         values, texts, lines = sensor.written(part, table)
         known = {"q": part.q, "payload": part.payload, **part.drifting}
         of_lines = {name: own if own is None else own[lines.to(own.device)] for name, own in known.items()}
@@ -231,8 +217,8 @@ def write_measurements(path: str | PathLike[str], data: Any, table: TableFormat,
     return table
 
 
-def _sheet(whole: Observations, table: TableFormat) -> TableFormat:
-    """The columns, by default those of :func:`write_measurements`; joints are not named yet."""
+def _sheet(whole: Observations, table: TableFormat) -> tuple[TableFormat, list[Any]]:
+    """The format, by default that of :func:`write_measurements`, and the columns of each part."""
     measured = [part for part in whole.parts if part.kind in ("position", "pose")]
     if len(measured) > 1:
         fix = "write them to two files"
@@ -257,16 +243,11 @@ def _sheet(whole: Observations, table: TableFormat) -> TableFormat:
     known = [*whole.covariate_names, *["payload"] * (whole.payload is not None)]
     beside = {name: getattr(table, name) or name for name in known}
     own = session if device is not None and device.session is not None else None
-    readings = _reading_columns(whole, session)
-    return replace(table, **beside, sockets=_socket_columns(whole), readings=readings, session=own)
-
-
-def _sensors(whole: Observations, table: TableFormat) -> list[SensorColumns]:
-    """The columns of each part."""
-    readings, (first, *_) = iter(table.readings), sensors_of(table)
-    positions = [part.kind in ("position", "pose") and part.corners is None for part in whole.parts]
-    kinds = zip(whole.parts, positions, strict=True)
-    return [first if own else table.sockets if part.kind == "socket" else next(readings) for part, own in kinds]
+    others = _others(whole, session)
+    sockets = next((one for one in others if isinstance(one, SocketColumns)), None)
+    readings = tuple(one for one in others if one not in (None, sockets))
+    table = replace(table, **beside, sockets=sockets, readings=readings, session=own)
+    return table, [one or PositionColumns(table) for one in others]
 
 
 def _with_names(data: Any, table: TableFormat) -> TableFormat:
@@ -282,27 +263,23 @@ def _with_names(data: Any, table: TableFormat) -> TableFormat:
     return replace(table, std=std)
 
 
-def _socket_columns(whole: Observations) -> SocketColumns | None:
-    part = next((part for part in whole.parts if part.kind == "socket"), None)
-    if part is None:
-        return None
-    part = part.with_sockets_of_rows()  # a reader finds these alone
-    names, known = part.sockets.names, part.sockets.distances
-    distances = {(names[first], names[second]): length for first, second, length in known}
-    return SocketColumns((SOCKET,), distances or None, part.sockets.distance_std, part.ball_tip)
-
-
-def _reading_columns(whole: Observations, session: str | None) -> tuple[Any, ...]:
-    """Columns of the parts with images or readings; those of a second part of a kind with a number."""
-    found, taken = [], list[str]()
+def _others(whole: Observations, session: str | None) -> list[Any]:
+    """The columns of each part, None for positions and poses; those of a second part of a kind with a number."""
+    found, taken = list[Any](), list[str]()
     for part in whole.parts:
         if "corners" in part.columns:
             found.append(written_columns(part, session))
-        elif part.kind not in ("position", "pose", "socket"):
+        elif part.kind == "socket":
+            sockets = part.with_sockets_of_rows().sockets  # a reader finds these alone
+            distances = {(sockets.names[a], sockets.names[b]): length for a, b, length in sockets.distances}
+            found.append(SocketColumns((SOCKET,), distances or None, sockets.distance_std, part.ball_tip))
+        elif part.kind in ("position", "pose"):
+            found.append(None)
+        else:
             taken.append(part.value_names[0])
             number = "" if (count := taken.count(taken[-1])) == 1 else str(count)
             names = tuple(f"{name}{number}" for name in part.value_names)
             std = () if part.std is None else tuple(f"std_{name}" for name in names)
             given = part.kind, names, session, part.offset_std, part.intrinsics
             found.append(ReadingColumns(*given, std=std, on=part.on, unit=part.unit))
-    return tuple(found)
+    return found

@@ -110,7 +110,7 @@ class FitRows:
         made = Measurements.of_points(self.q, self.points, self.on, self.lever)
         rows: Any = self.map.geodesic.spec.nominal_of_controls
         made = made.with_load(rows.load)
-        return made if given is None else made.with_line_numbers(given.line_numbers.tolist()).with_origin(given.origin)
+        return made if given is None else made.with_columns(line_numbers=given.line_numbers, origin=given.origin)
 
     @cached_property
     def blocks(self) -> list[tuple[Tensor, CholeskyRegression]]:

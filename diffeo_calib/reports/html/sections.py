@@ -12,6 +12,7 @@ from diffeo_calib.common.errors import PACKAGE, printable
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics, measured_words
 from diffeo_calib.kinematics.evaluation import at_payloads
+from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_sentences
 from diffeo_calib.kinematics.provenance import Provenance
 from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.measurements.bodies import matrix_lines
@@ -342,6 +343,7 @@ def record(model: CalibratedKinematics, data_sha256: str | None) -> Section:
     """Everything needed to make the model again."""
     lines = [*_origin(model.provenance, data_sha256), *_fit(model), "robot base in the measuring frame, 4 x 4 [m]:"]
     lines += [*matrix_lines(model.geometry.base), *model.bodies.place_lines(model)]
+    lines += hand_eye_sentences(HandEye.of_fit(model))
     return Section("record", "Record", "Everything needed to make this model again.", text=lines)
 
 

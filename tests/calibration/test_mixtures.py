@@ -1,0 +1,376 @@
+"""Tables of several kinds, and positions beside rows in sockets: accuracy, frames, devices, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from mixture_bank import DISTANCES, TRACKED
+from reading_bank import POINTS, readings
+from reading_bank import scales as usual
+from simulated_sockets import SocketRows, rest_in_sockets
+from table_bank import refused
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.identification.identification import Prior
+from diffeo_calib.calibration.placing.place import place
+from diffeo_calib.calibration.placing.sockets import stages_by_sockets
+from diffeo_calib.calibration.result import errors_by_kind
+from diffeo_calib.calibration.scales.cross_validation import inflation_by_places
+from diffeo_calib.calibration.scales.selection import defaults, log_posterior
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.fitting.result import silent
+from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.measurements.sockets import Sockets
+from diffeo_calib.regression.regions import region_factor
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.placement import rigid_fit
+from diffeo_calib.robots.se3 import twist_transform
+
+
+@pytest.fixture(scope="module")
+def arm() -> SimulatedArm:
+    """Marker 0 is the ball; the tracker sees marker 1."""
+    return SimulatedArm(seed=3, markers=2)
+
+
+@pytest.fixture(scope="module")
+def rows(arm: SimulatedArm) -> SocketRows:
+    return rest_in_sockets(arm, seed=3, places=4, rows=8)
+
+
+@pytest.fixture(scope="module")
+def resting(rows: SocketRows, arm: SimulatedArm) -> dc.Measurements:
+    names = arm.nominal.joint_names
+    return dc.Measurements.from_sockets(rows.q, rows.names, names, distances=DISTANCES, distance_std=1e-5)
+
+
+@pytest.fixture(scope="module")
+def tracked(arm: SimulatedArm) -> dc.Measurements:
+    q, points = arm.measure(TRACKED + 20, seed=5)
+    return dc.Measurements(q, points[:, 1:], arm.nominal.joint_names)
+
+
+@pytest.fixture(scope="module")
+def mixture(tracked: dc.Measurements, resting: dc.Measurements) -> dc.Measurements:
+    return dc.Measurements.joined([tracked.rows(slice(TRACKED)), resting])
+
+
+CHI2_3 = 7.815
+
+
+@pytest.fixture(scope="module")
+def scales(arm: SimulatedArm, tracked: dc.Measurements) -> dc.Hyperparameters:
+    noise = torch.tensor(2e-5, dtype=torch.float64)
+    return replace(dc.calibrate(arm.nominal, tracked).selection.scales, other_noise=noise)
+
+
+@pytest.fixture(scope="module")
+def result(arm: SimulatedArm, mixture: dc.Measurements, scales: dc.Hyperparameters) -> Any:
+    return dc.calibrate(arm.nominal, mixture, hyperparameters=scales)
+
+
+@pytest.fixture(scope="module")
+def tangent(arm: SimulatedArm, mixture: dc.Measurements) -> TangentData:
+    """The mixture around its geometric calibration."""
+    return place(arm.nominal, mixture, silent).tangent_data()
+
+
+def rms(errors: Tensor) -> float:
+    return float(errors.square().sum(-1).mean().sqrt())
+
+
+def test_better_than_either_half(
+    arm: SimulatedArm, result: Any, scales: dc.Hyperparameters, tracked: dc.Measurements, resting: dc.Measurements
+) -> None:
+    """In the tracker's frame, where the sockets alone know no frame at all; as accurate as predicted."""
+    q = arm.sample(400, seed=9)
+    truth = arm.true_points(q)
+    mean, covariance = result.model.predict(q, noise=False)
+    errors = mean - truth.flip(1)  # the ball is last
+    squares = (errors * torch.linalg.solve(covariance, errors[..., None])[..., 0]).sum(-1)
+    assert float((squares < CHI2_3).double().mean()) > 0.85
+    alone = replace(scales, other_noise=None)
+    by_tracker = dc.calibrate(arm.nominal, tracked.rows(slice(TRACKED)), hyperparameters=alone)
+    by_sockets = dc.calibrate(arm.nominal, resting, hyperparameters=alone)
+    away = by_sockets.model(q)[:, 0].detach() @ arm.truth.base[:3, :3].mT + arm.truth.base[:3, 3] - truth[:, 0]
+    assert rms(errors[:, 0]) < 0.8 * rms(by_tracker.model(q)[:, 0] - truth[:, 1])
+    assert rms(errors[:, 1]) < 0.8 * rms(away)
+    assert result.fit.converged
+
+
+def test_the_sockets_are_in_the_frame_of_the_device(arm: SimulatedArm, result: Any, rows: SocketRows) -> None:
+    found, base = result.sockets, arm.truth.base
+    assert found.by_device
+    truth = torch.stack([rows.positions[name] for name in found.names]) @ base[:3, :3].mT + base[:3, 3]
+    errors = (found.positions - truth).flatten()
+    assert float(errors.square().mean().sqrt()) < 4e-4
+    squares = float(errors @ torch.linalg.solve(found.covariance, errors))
+    assert squares < 2.5 * len(errors), "as far away as the covariance says"
+    assert "mm in the measuring frame, deviations 0." in found.sentences()[0]
+    assert not any("smaller than the true error" in line for line in found.sentences())
+
+
+def test_equivariance_under_motions_of_the_device(
+    arm: SimulatedArm, mixture: dc.Measurements, scales: dc.Hyperparameters, result: Any
+) -> None:
+    """Another frame of the tracker is another frame of everything that was found."""
+    T = twist_transform(torch.tensor([0.4, -0.2, 0.9, 0.3, 1.1, -0.5], dtype=torch.float64))
+    moved = with_attributes(mixture, points=mixture.points @ T[:3, :3].mT + T[:3, 3])
+    first, second = result, dc.calibrate(arm.nominal, moved, hyperparameters=scales)
+    q = arm.sample(20, seed=1)
+    torch.testing.assert_close(second.model(q), first.model(q) @ T[:3, :3].mT + T[:3, 3], rtol=0, atol=2e-6)
+    places = first.sockets.positions @ T[:3, :3].mT + T[:3, 3]
+    torch.testing.assert_close(second.sockets.positions, places, rtol=0, atol=2e-6)
+
+
+def test_the_posterior_of_independent_equations(tangent: TangentData) -> None:
+    """The regression with hidden coordinates and shared shifts, against one of the measured coordinates alone."""
+    data, scales = tangent, defaults(tangent, 3e-4, Prior())
+    kinds, shared = data.noise_model.row_kinds, data.shared
+    resting = kinds == 1
+    assert not bool(shared[~resting].any()), "no position that was measured shares a shift"
+    assert not bool(shared[:, :3].any())
+    assert bool(shared[resting][:, 3:].any(2).all())
+    scales = replace(scales, other_noise=3.0 * scales.sensor_noise)
+    data = data.with_tails(replace(data.tails, weights=torch.ones_like(data.tails.weights)))
+    seen = data.visible.flatten()
+    levels = torch.where(resting, 3.0, 1.0).double() * scales.sensor_noise
+    J = data.jacobian.flatten(0, 1)[seen]
+    own = torch.arange(len(resting)).repeat_interleave(6)[seen]
+    same = (own[:, None] == own).double()
+    R = same * (J @ torch.diag(scales.joint_noise.square()) @ J.mT)
+    R = R + torch.diag(levels[own].square() + 1e-14)
+    G, Z = data.linearisation(scales).gram()[seen][:, seen], shared.flatten(0, 1)[seen]
+    mu = torch.linalg.solve(G + R + Z @ Z.mT, data.target.flatten()[seen])
+    found = data.numbers.in_table(data.process(scales).mu).flatten()[seen]
+    assert float((found - mu).norm() / mu.norm()) < 1e-6
+
+
+def test_the_noise_of_sockets_is_searched(tangent: TangentData) -> None:
+    """One more scale, whose slope is that of the log posterior."""
+    centre = defaults(tangent, 3e-4, Prior())
+    point, step = centre.logarithms() + 0.1, 1e-4
+    assert len(point) == len(replace(centre, other_noise=None).logarithms()) + 1
+    found = log_posterior(point, centre, tangent)
+    values = []
+    for sign in (-1.0, 1.0):
+        moved = point.clone()
+        moved[-1] += sign * step
+        there = log_posterior(moved, centre, tangent)
+        values.append(there.likelihood + there.prior)
+    assert abs(float(found.gradient[-1])) > 1.0
+    assert float(found.gradient[-1]) == pytest.approx((values[1] - values[0]) / (2 * step), rel=1e-5)
+    wider = centre.inflated(2.0).other_noise
+    assert float(wider) == 2.0 * float(centre.other_noise)
+
+
+def test_each_tracked_configuration_is_a_degree_of_freedom_beside_the_places(
+    tangent: TangentData, mixture: dc.Measurements
+) -> None:
+    """Places that contradict each other widen the deviations as by themselves, but no more for being few."""
+    places, socket, groups = mixture.places, mixture.socket, mixture.groups()
+    assert len(places.unique()) == 4 + 1, "one number for all tracked rows"
+    wide = defaults(tangent, 1e-2, Prior())
+    assert inflation_by_places(tangent, wide, places, socket, groups) == region_factor(4 + TRACKED, 3)
+    repeated = torch.where(places < 0, groups // 5, groups)
+    assert inflation_by_places(tangent, wide, places, socket, repeated) == region_factor(4 + TRACKED // 5, 3)
+    narrow = defaults(tangent, 1e-5, Prior())
+    found = inflation_by_places(tangent, narrow, places, socket, groups)
+    assert found > 2.0 * region_factor(4 + TRACKED, 3), "contradictions are not diluted by tracked rows"
+    alone = inflation_by_places(tangent, narrow, places, socket, torch.zeros_like(groups))
+    assert found / region_factor(4 + TRACKED, 3) == pytest.approx(alone / region_factor(4 + 1, 3), rel=1e-9)
+
+
+def test_evaluation_of_each_kind(result: Any, tracked: Any, resting: Any, mixture: Any) -> None:
+    new, model, summary = tracked.rows(slice(TRACKED, None)), result.model, result.model.summary
+    positions, spread, both = (dc.evaluate(model, rows) for rows in (new, resting, mixture))
+    assert positions.rms == pytest.approx(rms(model(new.q)[:, 0] - new.points[:, 0]), rel=1e-9)
+    assert positions.rms < 3e-4
+    assert both["position"].count == TRACKED
+    assert both.rms == pytest.approx(dc.evaluate(model, mixture.device_rows()).rms, rel=1e-12)
+    assert both.rms == pytest.approx(summary.diffeomorphic_rms, rel=1e-12)
+    assert both["socket"].rms == pytest.approx(spread.rms, rel=1e-12)
+    assert len(both["socket"].distances) == len(spread.distances) == 4
+    left_out = result.leave_one_out.errors
+    assert result.left_out_rms == pytest.approx(rms(left_out[:TRACKED, :3]), rel=1e-9)
+    assert result.left_out["socket"].rms == pytest.approx(rms(left_out[TRACKED:, 3:]), rel=1e-9)
+
+
+def test_several_set_ups_of_the_device(
+    arm: SimulatedArm, mixture: dc.Measurements, scales: dc.Hyperparameters, result: Any
+) -> None:
+    """Rows in sockets belong to no set-up, and the places of the robot to all."""
+    T = twist_transform(torch.tensor([0.1, -0.05, 0.02, 0.0, 0.2, 0.1], dtype=torch.float64))
+    device, resting = mixture.device_rows(), mixture.socket_rows()
+    second = torch.arange(TRACKED) % 3 == 1
+    points = torch.where(second[:, None, None], device.points @ T[:3, :3].mT + T[:3, 3], device.points)
+    moved = with_attributes(device, points=points).with_sessions(["ab"[int(flag)] for flag in second])
+    both = dc.Measurements.joined([moved, resting])
+    found = dc.calibrate(arm.nominal, both, hyperparameters=scales)
+    torch.testing.assert_close(found.sessions.transforms[1], T, rtol=0, atol=5e-4)
+    q = arm.sample(100, seed=2)
+    assert rms(found.model(q) - arm.true_points(q).flip(1)) < 1.5 * rms(result.model(q) - arm.true_points(q).flip(1))
+
+
+# --- tables of both ---------------------------------------------------------------------------------------------------
+
+
+def test_splits_hold_out_measured_positions(mixture: dc.Measurements) -> None:
+    train, test = mixture.split(0.6, seed=1)
+    assert bool((test.places < 0).all())
+    assert (len(test), int((train.places >= 0).sum())) == (10, 64)
+    held = torch.cat([part.line_numbers for _, part in mixture.folds(5)])
+    assert torch.equal(held.sort().values, torch.arange(TRACKED))
+
+
+def test_joined_and_taken_apart(mixture: Any, tracked: Any, resting: Any) -> None:
+    assert mixture.device_rows().sha256 == tracked.rows(slice(TRACKED)).sha256
+    assert mixture.socket_rows().sha256 == resting.sha256
+    assert "2 markers, the last one in 8 sockets in 64 of the rows" in repr(mixture)
+    frame = mixture.to_frame()
+    assert list(frame.columns[6:]) == ["socket", "x", "y", "z"]
+    assert frame["x"].isna().sum() == (frame["socket"] != "").sum() == len(resting)
+
+
+def test_rows_in_sockets_join_a_mixture(mixture: dc.Measurements, resting: dc.Measurements) -> None:
+    """The same as if they had been joined at once, in any order; rows in other sockets are named."""
+    some = resting.rows(slice(10))
+    for parts, places in (([mixture, some], slice(-10, None)), ([some, mixture], slice(10))):
+        both = dc.Measurements.joined(parts)
+        assert both.visible[places].tolist() == [[False, True]] * 10
+        assert torch.equal(both.socket[places], some.socket)  # pyright: ignore[reportArgumentType]
+        assert len(both.device_rows()) == TRACKED
+    marked = dc.Measurements.joined([mixture.device_rows().with_sessions(["day"] * TRACKED), resting])
+    whole = dc.Measurements.joined([marked, some])
+    assert whole.session[-10:].tolist() == [-1] * 10
+    other = dc.Measurements.from_sockets(some.q, ["x/0"] * 10, some.joint_names)
+    with pytest.raises(MeasurementError, match="the tables differ in sockets;"):
+        dc.Measurements.joined([mixture, other])
+
+
+def test_rows_of_another_robot(arm: SimulatedArm, tracked: dc.Measurements, resting: dc.Measurements) -> None:
+    bend = torch.zeros(6, dtype=torch.float64)
+    bend[4] = 0.05
+    other = with_attributes(resting, q=resting.q + bend, sockets=Sockets(resting.sockets.names))
+    with pytest.warns(dc.DiffeoCalibWarning, match="do not fit the robot whose positions were measured"):
+        stages_by_sockets(arm.nominal, dc.Measurements.joined([tracked, other]))
+
+
+def test_refused(arm: SimulatedArm, tracked: Any, resting: Any) -> None:
+    def staged(*tables: Any) -> Callable[[], object]:
+        return lambda: stages_by_sockets(arm.nominal, dc.Measurements.joined(tables))
+
+    large, renamed = with_attributes(tracked, points=1e3 * tracked.points), [f"q{k}" for k in range(6)]
+    loaded = tracked.with_payload(1.0)
+    refused(
+        ("9 unknowns .* expected at least 3 poses", staged(tracked.rows([0, 1]), resting)),
+        (r"at least 2 rows in every socket.*, got '0/1' in 1 row", staged(tracked, resting.rows(slice(0, 9)))),
+        ("positions seem to be 1000 times too large", staged(large, resting)),
+        ("rows with sockets: expected no payloads", staged(loaded, resting.with_payload(0.0))),
+        ("the tables differ in payload", staged(loaded, resting)),
+        ("the tables differ in joint_names", staged(tracked, resting.with_joint_names(renamed))),
+    )
+
+
+# --- tables of several kinds ------------------------------------------------------------------------------------------
+
+PLAIN = SimulatedArm(3)
+NAMES = PLAIN.nominal.joint_names
+NOISE = 2e-5
+
+
+def positions(count: int) -> dc.Measurements:
+    return dc.Measurements(*PLAIN.measure(count, seed=4), NAMES)
+
+
+def sockets() -> dc.Measurements:
+    rows = rest_in_sockets(PLAIN, seed=3, places=4, rows=5)
+    return dc.Measurements.from_sockets(rows.q, rows.names, NAMES, distances={("0", "1"): 0.05}, distance_std=1e-5)
+
+
+def read(kind: str, count: int, zero: float = 0.0) -> dc.Readings:
+    return readings(PLAIN, kind, count, zero, noise=NOISE)
+
+
+def fit_of(parts: list[object], **options: object) -> Any:
+    """Of the joined tables, with the noise of each kind given."""
+    data = dc.Observations.joined(parts)
+    other = torch.full((len({part.kind for part in data.parts}) - 1,), NOISE, dtype=torch.float64)
+    given = replace(usual(), other_noise=other if len(other) else None)
+    return dc.calibrate(PLAIN.nominal, data, hyperparameters=given, **options)  # type: ignore[arg-type]
+
+
+def ball_errors(result: Any, *, free: bool, q: Tensor | None = None) -> Tensor:
+    """Errors (N, 3) of the ball, m; after a rigid fit if no device says where the robot stands."""
+    q = PLAIN.sample(200, 9) if q is None else q
+    truth, found = PLAIN.true_points(q)[:, 0], result.model(q).detach()[:, -1]
+    T = rigid_fit(found, truth) if free else torch.eye(4, dtype=torch.float64)
+    return found @ T[:3, :3].mT + T[:3, 3] - truth
+
+
+CASES = {
+    "sockets, distances": lambda: [sockets(), read("distance", 36)],
+    "positions, distances from another zero": lambda: [positions(25), read("distance", 36, 0.03)],
+    "positions, sockets, images": lambda: [positions(20), sockets(), read("image", 24)],
+}
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * ("images" in name)) for name in CASES])
+def test_as_accurate_as_expected(name: str) -> None:
+    """Better than geometry, and as good as the model says; errors of every kind are judged by themselves."""
+    parts = CASES[name]()
+    result = fit_of(parts)
+    free = not any(part.kind == "position" for part in parts)
+    error = rms(ball_errors(result, free=free))
+    assert 0.5 * result.expected.workspace < error < 1.8 * result.expected.workspace
+    assert result.fit.converged
+    kinds = errors_by_kind(result, dc.Observations.joined(parts))
+    assert len(kinds) == len(parts)
+    for one in kinds.values():
+        assert one.stages["calibrated"].rms < one.stages["geometric"].rms
+
+
+@pytest.fixture(scope="module")
+def joint() -> Any:
+    return fit_of([positions(25), read("distance", 36)])
+
+
+@pytest.mark.slow
+def test_devices_are_where_they_are_within_their_deviations(joint: Any) -> None:
+    """Three fixed points in the tracker's frame, and the ball as a marker of its own."""
+    base = PLAIN.truth.base
+    ranges = joint.readings[0]
+    errors = ranges.devices.constants[:, :3] - (POINTS @ base[:3, :3].mT + base[:3, 3])
+    away = errors / ranges.known[:, :3]
+    assert float(away.square().mean()) < 4.0
+    assert 1e-6 < float(ranges.known[:, :3].max()) < 1e-3
+    assert float((joint.model.geometry.tool[1] - PLAIN.truth.tool[0]).norm()) < 1e-3
+    assert joint.model.markers == 2
+    assert "mm in the measuring frame" in joint.placement.sentences()[0]
+
+
+@pytest.mark.slow
+def test_the_order_of_the_rows_does_not_matter() -> None:
+    data = dc.Observations.joined([positions(20), read("distance", 24), read("height", 24)])
+    order = torch.randperm(len(data), generator=torch.Generator().manual_seed(2))
+    order[order.argmin()], order[0] = order[0].clone(), 0  # positions stay the first kind
+    mixed = data.rows(order.tolist())
+    assert [part.kind for part in data.parts] != [part.kind for part in mixed.parts]
+    q, given = PLAIN.sample(20, 9), replace(usual(), other_noise=torch.full((2,), NOISE, dtype=torch.float64))
+    one, other = (dc.calibrate(PLAIN.nominal, rows, hyperparameters=given).model(q) for rows in (data, mixed))
+    torch.testing.assert_close(other, one, rtol=0, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_controls(joint: Any) -> None:
+    """Fewer momenta than rows: the deviations of devices are found as well."""
+    coarse = fit_of([positions(25), read("distance", 36)], controls=40)
+    for one, other in zip(joint.readings, coarse.readings, strict=True):
+        torch.testing.assert_close(other.known, one.known, rtol=0.1, atol=1e-6)
+    assert rms(joint.model(PLAIN.sample(50, 2)).detach() - coarse.model(PLAIN.sample(50, 2)).detach()) < 1e-4

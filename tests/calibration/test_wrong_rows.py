@@ -1,0 +1,267 @@
+"""Rows that are wrong: contradicted by a model, in blocks, out of step, with wrong labels, in wrong sockets."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from kind_bank import kind_named
+from product_bank import Case, simulated
+from reading_bank import scales
+from simulated_sockets import rest_in_sockets
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.diagnostics.misplaced_rows import check_row_order
+from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_flat_places
+from diffeo_calib.calibration.identification.registration import register
+from diffeo_calib.calibration.judgement import block_text, contradicted, find_block, steps_of
+from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
+from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.robots import SimulatedArm
+
+# --- rows that a model contradicts ------------------------------------------------------------------------------------
+
+ASIDE = torch.tensor([0.2, 0.0, 0.0], dtype=torch.float64)
+
+
+def changed(case: Case, rows: slice, change: Tensor, count: int = 60) -> dc.Measurements:
+    """Some of the held-out rows, a part of them displaced."""
+    points = case.test.points[:count].clone()
+    points[rows] += change
+    return dc.Measurements(case.test.q[:count], points).with_line_numbers(range(2, count + 2))
+
+
+def test_new_rows_that_are_right_are_not_named(arm: Case, pair: Case) -> None:
+    for case in (arm, pair):
+        assert contradicted(case.model, case.test) == []
+        assert steps_of(case.model, case.test) == []
+
+
+def test_a_new_row_that_is_wrong_is_named(arm: Case) -> None:
+    (found,) = contradicted(arm.model, changed(arm, slice(7, 8), 0.01 * ASIDE))
+    assert (found.row, found.number, found.weight) == (7, 9, None)
+    assert found.distance == pytest.approx(0.002, rel=0.1)
+
+
+def test_a_wrong_pose_is_named(posed: Case) -> None:
+    assert contradicted(posed.model, posed.test) == []
+    poses = posed.test.poses.clone()
+    poses[4, :3, 3] += 0.1 * ASIDE
+    poses[9, :3, :3] = poses[9, :3, [1, 2, 0]]
+    found = contradicted(posed.model, dc.Measurements.from_poses(posed.test.q, poses))
+    assert {one.row for one in found} == {4, 9}
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [(slice(50, 60), "lines 52 to 61 to the end of the table: got"), (slice(20, 30), "lines 22 to 31: got")],
+)
+def test_a_block_of_rows_that_moved_together(rows: slice, words: str, arm: Case) -> None:
+    data = changed(arm, rows, ASIDE)
+    text = block_text(arm.model, data, contradicted(arm.model, data))
+    assert text.startswith(f"10 rows look wrong that follow one another: {words} a median error of 200 mm")
+    assert "moving the measuring device by 200 mm" in text
+
+
+@pytest.mark.parametrize("share", [0.02, 0.1, 0.3])
+def test_random_rows_are_rarely_a_block(share: float) -> None:
+    generator = torch.Generator().manual_seed(1)
+    found = [find_block(torch.rand(80, generator=generator) < share) for _ in range(300)]
+    assert sum(place is not None for place in found) <= 2
+
+
+def test_the_block_is_where_the_wrong_rows_are() -> None:
+    wrong = torch.zeros(100, dtype=torch.bool)
+    wrong[40:50] = True
+    wrong[[3, 77]] = True
+    assert find_block(wrong) == (40, 50)
+    wrong[45] = False
+    assert find_block(wrong) == (40, 50)
+    assert find_block(~wrong) is None  # nearly all rows
+
+
+# --- wrong labels -----------------------------------------------------------------------------------------------------
+
+ARM, ROWS = SimulatedArm(seed=0), 60
+
+
+def said(data: dc.Measurements) -> list[str]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        dc.calibrate(ARM.nominal, data, hyperparameters=scales())
+    return [str(one.message) for one in caught if "look wrong and fit" in str(one.message)]
+
+
+def measured(payload: Tensor | None = None) -> dc.Measurements:
+    return dc.Measurements(*ARM.measure(ROWS, seed=1, payload=payload))
+
+
+@pytest.mark.slow
+def test_a_session_that_begins_earlier_than_said() -> None:
+    """Of right sessions nothing is said: tests/calibration/test_sessions.py, where a warning is an error."""
+    whole, late = measured(), 3
+    points = whole.points.clone()
+    points[30:] += torch.tensor([2e-3, -1e-3, 5e-4], dtype=torch.float64)
+    names = ["before"] * (30 + late) + ["after"] * (30 - late)
+    (text,) = said(dc.Measurements(whole.q, points).with_sessions(names))
+    assert "3 rows look wrong and fit session 'after': lines 30, 31, 32" in text
+
+
+@pytest.mark.parametrize("wrong", [0, 3])
+def test_rows_that_carried_another_payload_than_said(wrong: int) -> None:
+    masses = torch.tensor([0.0, 5.0, 10.0], dtype=torch.float64)[torch.arange(ROWS) % 3]
+    labels = masses.clone()
+    labels[2 : 3 * wrong : 3] = 0.0
+    texts = said(measured(masses).with_payload(labels))
+    assert len(texts) == bool(wrong)
+    assert all("fit a payload of 10: lines 2," in text for text in texts)
+
+
+# --- names that few rows carry ----------------------------------------------------------------------------------------
+
+
+RENAMED: dict[str, Callable[[Any, list[str]], Any]] = {
+    "ball in sockets": lambda data, names: dc.Measurements.from_sockets(data.q, names, data.joint_names),
+    "sessions": lambda data, names: data.with_sessions(names),
+    "heights": lambda data, names: dc.Readings.heights(data.q, data.values[:, 0], names, data.joint_names),
+}
+
+
+def with_a_lone_name(kind: str, data: Any) -> tuple[Any, str]:
+    """Rows of which one carries a name of its own, and what must be said of it."""
+    names = list(data.row_sockets if kind == "ball in sockets" else data.device_names)
+    usual, names[5] = names[5], f"{names[5]}x"
+    return RENAMED[kind](data, names), rf"'{usual}x' in 1 row \(5\), perhaps meant as '{usual}'"
+
+
+@pytest.mark.parametrize("name", RENAMED)
+def test_a_lone_name_is_told_by_its_row(name: str) -> None:
+    kind = kind_named(name)
+    data, words = with_a_lone_name(name, kind.data)
+    with pytest.raises(MeasurementError, match=words):
+        dc.calibrate(kind.robot, data, hyperparameters=kind.scales)
+
+
+def test_a_lone_socket_of_new_rows_is_told_by_its_row() -> None:
+    model = kind_named("ball in sockets").model
+    new, words = with_a_lone_name("ball in sockets", kind_named("ball in sockets").new)
+    found = " ".join(dc.evaluate(model, new).placed)
+    assert "1 of 12 rows show no error" in found
+    assert re.search(words, found)
+    for verb in (dc.recalibrate, dc.compare):
+        with pytest.warns(DiffeoCalibWarning, match=words):
+            verb(model, new)
+
+
+# --- single rows in sockets -------------------------------------------------------------------------------------------
+
+WRONG = [10, 45]
+SHIFT_M = 8e-4
+RESTING = SimulatedArm(seed=2)
+
+
+def in_their_sockets(seed: int, places: int) -> dc.Measurements:
+    """The sockets of three places lie near a plane as those of any three do."""
+    rows, names = rest_in_sockets(RESTING, seed=seed, places=places, rows=10), RESTING.nominal.joint_names
+    return dc.Measurements.from_sockets(rows.q, rows.names, names, distances={("0", "1"): 0.05}, distance_std=1e-5)
+
+
+@pytest.fixture(scope="module")
+def result() -> Any:
+    """Of rows two of which are wrong; nobody says that a plane is too little for the workspace."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*lie near.*")
+        return dc.calibrate(RESTING.nominal, moved(in_their_sockets(2, 3), WRONG))
+
+
+def moved(data: dc.Measurements, rows: list[int]) -> dc.Measurements:
+    """Some rows with joint values at which the ball is 0.8 mm beside its socket."""
+    q = data.q.clone()
+    slopes = RESTING.truth.jacobian(q[rows])[:, 0]
+    away = torch.tensor([0.0, SHIFT_M, 0.0], dtype=q.dtype)
+    q[rows] += torch.linalg.pinv(slopes) @ away
+    return with_attributes(data, q=q)
+
+
+def test_rows_of_the_fit_are_named(result: Any) -> None:
+    assert sorted(one.row for one in result.outliers) == WRONG
+    for one in result.outliers:
+        assert one.distance == pytest.approx(SHIFT_M, rel=0.4)
+        assert one.weight < 0.3
+
+
+def test_rows_that_took_no_part_are_named(result: Any) -> None:
+    new = in_their_sockets(7, 1)
+    assert contradicted_in_sockets(result.model, new) == []
+    wrong = contradicted_in_sockets(result.model, moved(new, [7]))
+    assert [one.row for one in wrong] == [7]
+    assert wrong[0].weight is None
+    assert wrong[0].distance == pytest.approx(SHIFT_M, rel=0.4)
+    two = moved(new, [7]).rows([0, 7])
+    assert contradicted_in_sockets(result.model, two) == [], "two rows cannot tell which of them is wrong"
+
+
+def test_a_plane_is_named_where_it_matters(result: Any) -> None:
+    found = result.sockets
+    flat = found.positions.clone()
+    flat[:, 2] = 0.2
+
+    def warned(positions: torch.Tensor, expected_error: float) -> list[str]:
+        with warnings.catch_warnings(record=True) as texts:
+            warnings.simplefilter("always")
+            warn_of_flat_places(result.model.map, positions, found.socket, found.sockets.place, expected_error)
+        return [str(text.message) for text in texts]
+
+    assert warned(flat, found.workspace_deviation) == []
+    large = warned(flat, 10 * found.workspace_deviation)
+    assert len(large) == 1
+    assert "the sockets lie near a plane" in large[0]
+    assert "raise or tilt the block at one place" in large[0]
+    tall = flat.clone()
+    tall[[0, 3], 2] = 0.9
+    assert warned(tall, 10 * found.workspace_deviation) == []
+
+
+# --- rows out of step with their joints -------------------------------------------------------------------------------
+
+
+def shifted(data: dc.Measurements, first: int, lag: int) -> dc.Measurements:
+    """The measured values from row ``first`` on belong to the joints ``lag`` rows below; row 0 is line 2."""
+    wanted = torch.arange(len(data))
+    wanted[first:] += lag
+    kept = wanted < len(data)
+    lines = torch.arange(2, len(data) + 2)[kept].tolist()
+    return dc.Measurements(data.q[kept], data.points[wanted[kept]]).with_line_numbers(lines)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("first", "lag", "words"),
+    [
+        (20, -1, "from line 22 on the measured values belong to the joints 1 line above"),
+        (10, 2, "from line 12 on the measured values belong to the joints 2 lines below"),
+        (34, -1, "from line 36 on the measured values belong to the joints 1 line above"),
+    ],
+)
+def test_from_a_line_on(first: int, lag: int, words: str) -> None:
+    """Whether these are most of the rows, or the last few."""
+    arm, train, _ = simulated(40)
+    with pytest.raises(MeasurementError, match=f"do not fit this robot: {words}: got .* rows that fit there.*; pair"):
+        dc.calibrate(arm.nominal, shifted(train, first, lag))
+
+
+@pytest.mark.slow
+def test_tables_that_are_right_pass() -> None:
+    """With a few wrong rows, and with a pair of exchanged ones."""
+    arm, train, _ = simulated(40)
+    points = train.points.clone()
+    points[[3, 4]] = points[[4, 3]]
+    points[[8, 15, 30]] += 0.2
+    data = dc.Measurements(train.q, points)
+    check_row_order(arm.nominal, data, register(arm.nominal, data.q, data.points))
