@@ -157,8 +157,7 @@ class SimulatedArm:
             joint: its number. factor: of the amplitudes of all its harmonics.
         """
         other, (joints, frequencies, amplitudes, phases) = copy(self), self._waves
-        own = range(self.nominal.n)[joint]
-        grown = (joints == own) & (torch.arange(len(joints), device=joints.device) < HARMONICS * self.nominal.n)
+        grown = torch.arange(len(joints), device=joints.device) // HARMONICS == range(self.nominal.n)[joint]
         other._waves = joints, frequencies, torch.where(grown, factor * amplitudes, amplitudes), phases
         return other
 
