@@ -82,7 +82,6 @@ def test_the_frames_are_known_as_well_where_the_rows_are_many(result: Any) -> No
     fitted, many = result.model.map, copy(result.model.map)
     vars(many)["conditional"] = ConjugateGradientRegression(fitted.geodesic.linearise(None), fitted.noise)
     expected = fitted.shift_covariance()
-    assert len(expected) > 6
     assert_close(many.shift_covariance(), expected, rtol=1e-3, atol=1e-3 * float(expected.diagonal().min()))
 
 

@@ -257,8 +257,7 @@ def test_commands_of_both_hands(tmp_path: Path, command: Command) -> None:
     arms, program, output = both_arms(tmp_path)
     names, q = arms.robot.joint_names, np.random.default_rng(3).uniform(-1, 1, (6, 5))
     program.write_text("\n".join([",".join(names), *(",".join(map(repr, row)) for row in q.tolist())]))
-    written = ["-o", output, "--json", tmp_path / "out.json"]
-    done = command("correct", tmp_path / "arms.safetensors", program, *UNITS_OF_HANDS, *TOOLS, *written)
+    done = command("correct", tmp_path / "arms.safetensors", program, *UNITS_OF_HANDS, *TOOLS, "-o", output)
     assert done.code == 0
     assert "a robot with 5 joints cannot hold every orientation of 2 tools" in done.err
     goals = arms.robot(torch.from_numpy(q)) @ torch.stack([tool_transform(place) for place in PLACES])
@@ -268,9 +267,6 @@ def test_commands_of_both_hands(tmp_path: Path, command: Command) -> None:
         misses = table(read(output), [f"miss_{hand}_mm", f"angle_miss_{hand}_rad"])
         own = torch.stack([1e3 * expected.miss[:, k], held(expected.angle_miss)[:, k]], 1)
         np.testing.assert_allclose(misses, own.numpy(), rtol=1e-9, atol=1e-9)
-        recorded = recorded_misses(tmp_path / "out.json")[hand]
-        np.testing.assert_allclose(1e3 * np.array(recorded["miss_m"]), misses[:, 0], rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(np.radians(recorded["angle_miss_deg"]), misses[:, 1], rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,6 @@ def test_fit_equals_calibrate(site: Site, model: dc.CalibratedKinematics) -> Non
     expected = dc.calibrate(site.arm.nominal, train).model
     # The CSV's last digit is not the same, and the search for scales ends a little elsewhere.
     torch.testing.assert_close(model(test.q), expected(test.q), rtol=0, atol=1e-5)
-    assert expected.report["rows"] == model.report["rows"]
     assert expected.report.keys() == model.report.keys()
 
 

@@ -65,12 +65,6 @@ def test_invalid_control_points_are_refused(controls: object, message: str) -> N
         dc.fit(rr_problem(5), controls=controls)
 
 
-def test_a_start_of_another_size_is_refused() -> None:
-    problem = rr_problem(5)
-    with pytest.raises(InputError, match=r"the momenta of `start`: expected shapes .*\(20, 2\).*got .*\(25, 2\)"):
-        dc.fit(problem, controls=20, start=problem.zero())
-
-
 def test_choice_of_control_points_covers_the_workspace() -> None:
     problem = rr_problem(10)
     rows = choose_controls(problem, 30)

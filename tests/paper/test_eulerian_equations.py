@@ -210,13 +210,6 @@ def test_several_markers_move_in_one_field() -> None:
     torch.testing.assert_close(rate, expected, rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("equations", [Eulerian(), CORRECTED], ids=name)
-def test_order_of_the_time_steps(equations: Eulerian) -> None:
-    exact = deformed(3.0 * P0, equations, dc.RK8(16)).z1
-    errors = [float((deformed(3.0 * P0, equations, dc.RK4(s)).z1 - exact).abs().max()) for s in (8, 16, 32)]
-    np.testing.assert_allclose(-np.diff(np.log2(errors)), 4.0, atol=0.35)
-
-
 def test_curvature_of_the_nominal_map() -> None:
     x = uniform(4, 2, seed=1)
     expected = np.stack([rr_derivatives(row)[2] for row in x.numpy()])
