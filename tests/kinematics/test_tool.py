@@ -188,8 +188,8 @@ def test_it_is_what_the_truth_leaves_after_both_are_taught(arm_200: Case) -> Non
     q, count = torch.cat([reference(arm_200), test]), 9 * len(reference(arm_200))
     found = points(model.tool_poses(q, TOOL, "measuring"))
     errors = found - points(true_poses(200, 1, q, TOOL))
-    twists = torch.eye(6, dtype=torch.float64)
-    S = torch.stack([(moved(arm_200, q, t, of=of) - found) / STEP for of in ("base", "tool") for t in twists], 1)
+    motions = [moved(arm_200, q, t, of=of) for of in ("base", "tool") for t in torch.eye(6, dtype=torch.float64)]
+    S = torch.stack([(one - found) / STEP for one in motions], 1)
     taught = errors[:, None] - S @ torch.linalg.lstsq(S[:count], errors[:count, None]).solution
     left, whole = (float(e[count:].view(-1, 3, 3).mean(1).square().sum(1).mean().sqrt()) for e in (taught, errors))
     known = [model.predict_tool_poses(test, TOOL, frame)[1] for frame in ("measuring", "base")]
