@@ -192,8 +192,8 @@ def test_it_is_what_the_truth_leaves_after_both_are_taught(arm_200: Case) -> Non
     S = torch.stack([(one - found) / STEP for one in motions], 1)
     taught = errors[:, None] - S @ torch.linalg.lstsq(S[:count], errors[:count, None]).solution
     left, whole = (float(e[count:].view(-1, 3, 3).mean(1).square().sum(1).mean().sqrt()) for e in (taught, errors))
-    known = [model.predict_tool_poses(test, TOOL, frame)[1] for frame in ("measuring", "base")]
-    each = [covariance_without_placement(model, test, TOOL), *known]
+    each = [model.predict_tool_poses(test, TOOL, frame)[1] for frame in ("measuring", "base")]
+    each.insert(0, covariance_without_placement(model, test, TOOL))
     predicted, measuring, in_base = (float(C.diagonal(dim1=1, dim2=2)[:, :3].sum(1).mean().sqrt()) for C in each)
     assert left < 0.5 * whole
     assert 0.5 * left < predicted < 2.0 * left
