@@ -27,21 +27,22 @@ CORNERS = "corners="
 """Begin of --reading for images of a board."""
 
 
-def option(text: str, metavar: str | None = None, default: Any = None, kind: Kind = "read", **how: Any) -> Any:
-    """A field that is an option of its name.
+def option(
+    text: str, metavar: str | None = None, default: Any = None, kind: Kind = "read", *, named: bool = True, **how: Any
+) -> Any:
+    """A field that is an option of its name, or, if it is not ``named``, an argument.
 
     Args:
         text: its help. metavar: what its value is called. default: MISSING for one that is required.
         kind: what happens to its file. how: limits of its value, as of :func:`typer.Option`.
     """
     how = {"help": text, "metavar": metavar, **how}
-    return field(default=default, metadata={"argument": False, "kind": kind, "how": how})
+    return field(default=default, metadata={"named": named, "kind": kind, "how": how})
 
 
 def argument(text: str, metavar: str, default: Any = MISSING, kind: Kind = "read") -> Any:
     """A field that is an argument, as :func:`option`."""
-    how = {"help": text, "metavar": metavar}
-    return field(default=default, metadata={"argument": True, "kind": kind, "how": how})
+    return option(text, metavar, default, kind, named=False)
 
 
 def written(text: str, metavar: str, default: Any = None) -> Any:
@@ -70,7 +71,7 @@ class Option(NamedTuple):
         """That of a field."""
         kind, how = own.metadata["kind"], own.metadata["how"]
         long = f"--{own.name.replace('_', '-')}"
-        names = () if own.metadata["argument"] else tuple(filter(None, (SHORT.get(own.name), long)))
+        names = tuple(filter(None, (SHORT.get(own.name), long))) if own.metadata["named"] else ()
         return cls(own.name, hint, own.default, names, (*names, how["metavar"])[0], kind, how)
 
 
