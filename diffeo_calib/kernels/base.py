@@ -222,8 +222,8 @@ def check_points(x: Tensor | None, q: Tensor, a: Tensor) -> None:
 def _added(name: str) -> Any:
     """A method that adds up the results of the terms: tensors, or tuples of tensors."""
 
-    def method(self: SumKernel, *arguments: Any) -> Any:
-        return reduce(_plus, (getattr(term, name)(*arguments) for term in self.terms))
+    def method(self: SumKernel, *arguments: Any, **named: Any) -> Any:
+        return reduce(_plus, (getattr(term, name)(*arguments, **named) for term in self.terms))
 
     return method
 
