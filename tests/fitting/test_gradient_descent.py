@@ -46,6 +46,8 @@ def test_limit_and_interruption_keep_the_best_state() -> None:
     assert fit.solution.exhausted
     assert fit.iterations == 3
     assert fit.energy == pytest.approx(fit.history[-1], rel=1e-12)
+    again = dc.fit(fit.problem, dc.GradientDescent(step=STEP, max_iterations=1), dc.RK4(1), start=fit.momenta)
+    assert again.history[0] == pytest.approx(fit.energy, rel=1e-12)
 
     fit = dc.fit(few_points(), dc.GradientDescent(step=STEP), dc.RK4(1), progress=stop_at(2))
     assert fit.solution.interrupted
