@@ -149,15 +149,11 @@ class Flow:
         self.kernel, self.integrator = kernel, integrator
         self._jacobians: list[Tensor] | None = None
         if variational:
-            n = q.shape[1]
-
-            def kept(packed: Tensor) -> Tensor:
-                return torch.stack([packed[:, :n], packed[:, n : 2 * n]])
-
-            start = torch.cat([q, a, _eye(q).flatten(1)], -1)
-            self._run = Run(integrator, self._variational_controls, start, kept)
-            self._jacobians = [s[:, 2 * n :].unflatten(1, (n, n)) for s in self._run.nodes]
-            self._run.nodes = list(map(kept, self._run.nodes))
+            n, start = q.shape[1], torch.cat([q, a, _eye(q).flatten(1)], -1)
+            run = Run(integrator, self._variational_controls, start, lambda s: torch.stack(s[:, : 2 * n].split(n, 1)))
+            self._jacobians = [s[:, 2 * n :].unflatten(1, (n, n)) for s in run.nodes]
+            run.nodes = [torch.stack(s[:, : 2 * n].split(n, 1)) for s in run.nodes]
+            self._run = run
         else:
             self._run = Run(integrator, self._rate, torch.stack([q, a]))
         self.nodes, self.stages = self._run.nodes, self._run.stages

@@ -86,11 +86,10 @@ class Run:
 
     Args:
         integrator: time stepping. field: right-hand side of the controls. start: their initial state, any shape.
-        kept: what is kept of a state at a stage.
 
     Attributes:
         nodes: the controls' states at the nodes of the time grid.
-        stages: at every stage; empty if the method is not replayable.
+        stages: what is ``kept`` of them at every stage; empty if the method is not replayable.
     """
 
     def __init__(self, integrator: Integrator, field: Rate, start: Tensor, kept: Rate = lambda state: state) -> None:
@@ -106,8 +105,7 @@ class Run:
     def alongside(self, field: Callable[[Tensor, Tensor], Tensor], start: Tensor, rate: Rate) -> list[Tensor]:
         """The states at the nodes of ``state' = field(state, controls)``, from any state.
 
-        The controls' stages are replayed; if the method is not replayable, the controls are integrated again by their
-        own rate.
+        The controls' stages are replayed; if the method is not replayable, the controls follow their ``rate`` again.
         """
         if self.integrator.replayable:
             return self.integrator.nodes(lambda stage, state: field(state, self.stages[stage]), start)

@@ -83,8 +83,7 @@ class FeatureMap:
 
     def _parts(self, *points: Sequence[Tensor]) -> list[list[Tensor] | None]:
         """The lines of some points and the circles of others, with their inverse scales; None where there are none."""
-        scales = self._scales() if self.lengthscale.requires_grad else self._fixed_scales
-        scales = scales.to(points[1][0])
+        scales = (self._scales() if self.lengthscale.requires_grad else self._fixed_scales).to(points[1][0])
         return [
             [*(t[..., own] for t in some), scales[scaled]] if places else None
             for some, places, (own, scaled) in zip(points, self._places, self._selections, strict=True)
