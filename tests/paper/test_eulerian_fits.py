@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+from weakref import ref
+
 import numpy as np
 import pytest
 import torch
@@ -49,6 +52,17 @@ def test_lbfgs_by_torchdiffeq_and_its_adjoint() -> None:
         )
     ]
     np.testing.assert_allclose(energies, energies[0], rtol=1e-3)
+
+
+def test_a_flow_ends_with_its_last_reference() -> None:
+    """And with it the tensors that autograd keeps: a fit has many flows."""
+    gc.collect()
+    gc.disable()
+    try:
+        flow = ref(deformed(P0).flow)
+        assert flow() is None
+    finally:
+        gc.enable()
 
 
 def test_no_configurations_give_no_points() -> None:
