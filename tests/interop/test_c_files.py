@@ -146,6 +146,7 @@ def test_names_cannot_end_a_comment(tmp_path: Path) -> None:
     ("path", "options", "message"),
     [
         ("model.cpp", {}, "`path`: expected the name of a C file"),
+        ("/", {}, "`path`: expected the name of a C file"),
         ("model.c", {"frame": "world"}, "`frame`: expected 'base' or 'measuring', got 'world'"),
         ("model.c", {"prefix": "a-b"}, "prefix of names in C"),
         ("7axes.c", {}, "pass `prefix`"),
