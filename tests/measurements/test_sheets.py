@@ -75,7 +75,10 @@ def test_the_rows_are_those_of_a_csv_file(tmp_path: Path, kind: str, sep: str) -
 
 @pytest.mark.parametrize(
     ("kind", "note"),
-    [("the sheet with rows", "sheet 'Sheet' read, not notes"), ("arrays", "arrays gain left out: they have no 7 rows")],
+    [
+        ("the sheet with rows", "sheet 'Sheet' read, not notes"),
+        ("arrays", "arrays gain left out: no numbers or texts of 7 rows"),
+    ],
 )
 def test_what_was_decided_is_said(tmp_path: Path, kind: str, note: str) -> None:
     name, write, joints, places = WRITERS[kind]
@@ -108,6 +111,16 @@ def test_poses_and_texts_have_columns(tmp_path: Path) -> None:
     (_, first), *_ = file.rows()
     assert file.header == ["q_1", "q_2", *(f"T_{row}{k}" for row in range(4) for k in range(4)), "day"]
     assert first == ["0", "1", *map(repr, poses[0].flatten().tolist()), "mon"]
+
+
+def test_cells_of_texts_are_a_column(tmp_path: Path) -> None:
+    """And not those that hold something else."""
+    own = {"day": np.array(["mon", "tuesday"], dtype=object), "all": np.array([{"a": 1.0}, "b"], dtype=object)}
+    savemat(tmp_path / "t.mat", {"q": JOINTS[:2], **own})
+    file = CsvLines(tmp_path / "t.mat", ",")
+    assert file.header == ["q_1", "q_2", "day"]
+    assert [cells[2] for _, cells in file.rows()] == ["mon", "tuesday"]
+    assert file.notes == ["arrays all left out: no numbers or texts of 2 rows"]
 
 
 BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {

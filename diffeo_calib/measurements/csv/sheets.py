@@ -32,8 +32,7 @@ PLACES = {"p", "pos", "position", "positions", "point", "points", "xyz", "marker
 def as_text(path: Path, data: bytes, sep: str) -> tuple[str, list[str]] | None:
     """A table that is no text, with ``sep`` between its cells, and what was decided; None for text.
 
-    Raises:
-        MeasurementError: a spreadsheet of an old format, arrays that are no table, or a package that is not installed.
+    MeasurementError for a spreadsheet of an old format, arrays that are no table, or a package that is not installed.
     """
     variables = b"\0" in data and (data.startswith(MATLAB) or path.suffix.lower() == ".mat")  # version 4 has no mark
     if not variables and not data.startswith((ZIP, OLD_SHEET, NUMPY)):
@@ -146,6 +145,8 @@ def _loaded(path: Path, load: Callable[[], Any]) -> Any:
 def _joined(path: Path, arrays: Mapping[str, Any]) -> tuple[Rows, list[str]]:
     """Arrays (N, ...) of numbers or texts side by side below their names; those of other lengths are left out."""
     known = {name: np.asarray(array) for name, array in arrays.items()}
+    cells = {name: array for name, array in known.items() if array.dtype.kind == "O"}  # of MATLAB
+    known |= {name: array.astype(str) for name, array in cells.items() if all(isinstance(v, str) for v in array.flat)}
     usable = {name: array for name, array in known.items() if array.dtype.kind in "fiubUS" and 0 < array.ndim < 4}
     counts = Counter[int]()
     for array in usable.values():
@@ -157,7 +158,7 @@ def _joined(path: Path, arrays: Mapping[str, Any]) -> tuple[Rows, list[str]]:
     header = [column for name, array in own.items() for column in _names(name, array.shape[1:])]
     values = zip(*(_texts(array.reshape(rows, math.prod(array.shape[1:]))) for array in own.values()), strict=True)
     left = [name for name in known if name not in own]
-    notes = [f"arrays {few(left)} left out: they have no {rows} rows"] * bool(left)
+    notes = [f"arrays {few(left)} left out: no numbers or texts of {rows} rows"] * bool(left)
     return [header, *([cell for part in row for cell in part] for row in values)], notes
 
 
