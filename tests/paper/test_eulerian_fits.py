@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from eulerian_bank import P0, deformed
-from math_bank import few_points
+from math_bank import few_points, uniform
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, NumericalError
@@ -22,6 +22,9 @@ def test_converges_where_the_problem_is_easy() -> None:
     again = dc.fit(fit.problem, formulation="eulerian", start=fit.momenta)
     assert again.energy == pytest.approx(fit.energy, rel=1e-8)
     assert fit.energy == pytest.approx(dc.fit(few_points()).energy, rel=0.1)
+    x = uniform(6, 2, seed=3)
+    found = fit.model.inverse(fit.model(x), x + 0.01)
+    torch.testing.assert_close(fit.model(found), fit.model(x), rtol=0, atol=1e-10)
 
 
 def test_shooting_starts_at_the_tangent_solution_and_ends_at_12() -> None:
