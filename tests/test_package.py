@@ -50,6 +50,12 @@ def test_a_bare_import_loads_nothing_slow() -> None:
     assert run(code) == ""
 
 
+def test_models_are_used_without_scipy() -> None:
+    file = PACKAGE.parent / "tests/interop/data/robot_format_3.safetensors"
+    code = f"import sys, diffeo_calib as dc; m = dc.load({str(file)!r}); m([[0.1] * m.robot.n]); dc.calibrate; "
+    assert run(code + "print('scipy' in sys.modules)") == "False"
+
+
 def test_every_public_name_is_loaded_and_listed() -> None:
     assert set(dc.__all__) <= set(dir(dc))
     assert not {"TYPE_CHECKING", "annotations", "import_module", "logging"} & set(dir(dc))

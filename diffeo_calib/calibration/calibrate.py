@@ -171,12 +171,12 @@ def calibrate(
         stages = placed.registration, placed.identification
         choose = partial(choose_scales, given=hyperparameters, models=scales_of, seed=seed, progress=progress)
         chosen = choose(data, measurements, *stages)
-        drifting = placed.drifting()
-        if drifting is not None:
+        if not chosen.selection.interrupted and (drifting := placed.drifting()) is not None:
             again = choose(drifting.tangent_data(), measurements, *stages)
             if worth_it(chosen.left_out.errors, again.left_out.errors):
                 placed, chosen = drifting, again
-        if (widened := placed.widened(chosen.data, chosen.selection.scales)) is not None:
+        how = chosen.selection
+        if not how.interrupted and (widened := placed.widened(chosen.data, how.scales)):
             placed, found = widened
             chosen = choose(placed.tangent_data(), measurements, *stages)
             warn_user(found.sentence)

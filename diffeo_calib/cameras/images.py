@@ -110,8 +110,8 @@ class Camera:
 
     @property
     def longer(self) -> Tensor:
-        """(c,) errors of unit variance, of which ``root`` has the effects, that are a focal length longer by itself."""
-        return torch.linalg.pinv(self.root)[:, :2] @ self.unknowns[:2]
+        """(c,) errors of unit variance, of which ``root`` has the effects, that double the focal length; 0 if exact."""
+        return self.root[:2].any() * torch.linalg.pinv(self.root)[:, :2] @ self.unknowns[:2]
 
     def pixels(self, poses: Tensor, points: Tensor) -> Tensor:
         """Where corners (N, K, 3) of a board at poses (N, 4, 4) are seen: (N, K, 2)."""

@@ -39,7 +39,8 @@ import typer
 from typer.core import TyperGroup
 
 from diffeo_calib.cli.console import INTERRUPTED, interrupts, log_lines, show
-from diffeo_calib.cli.options import COMMANDS, CORNERS, Command, description, has
+from diffeo_calib.cli.declarations import COMMANDS, Command
+from diffeo_calib.cli.options import CORNERS, has
 from diffeo_calib.cli.record import EXIT_ERROR, EXIT_INTERRUPTED, check_outputs, record, remove_earlier
 from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning, InputError, as_written, printable
 from diffeo_calib.common.files import PROGRAM
@@ -143,11 +144,11 @@ def _declare(name: str, options: type[Command]) -> None:
 
     def run(_json: Any, **given: Any) -> None:
         written, read, appended = dict[str, Path](), dict[str, Path](), dict[str, Path]()
-        files = {"output": written, "source": written, "file": read, "files": read, "table": appended}
+        files = {"write": written, "source": written, "read": read, "later": appended}
         for one in own:
             value = given[one.field]
             for path in value if isinstance(value, list) else [value]:
-                if one.kind in files and path is not None:
+                if one.kind in files and isinstance(path, Path):
                     files[one.kind][one.shown + f" {path}" * isinstance(value, list)] = path
                     if one.kind == "source":
                         written[f"{one.shown} (its header)"] = path.with_suffix(".h")
@@ -162,7 +163,7 @@ def _declare(name: str, options: type[Command]) -> None:
         kind, annotation = inspect.Parameter.KEYWORD_ONLY, Annotated[one.hint, typed]
         parameters.append(inspect.Parameter(one.field, kind, default=default, annotation=annotation))
     parameters.append(inspect.Parameter("_json", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Json))
-    run.__name__, run.__doc__ = f"{name}_command", description()[name].text
+    run.__name__, run.__doc__ = f"{name}_command", options.__doc__
     run.__annotations__ = {one.name: one.annotation for one in parameters}
     vars(run)["__signature__"] = inspect.Signature(parameters)
     app.command(name)(run)

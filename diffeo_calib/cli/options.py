@@ -1,34 +1,53 @@
-"""The options of all commands, as options.md describes them: classes of options made from it. Imports nothing slow."""
+"""What an option is, and the groups of options that several commands share. Imports nothing slow: help appears at once.
+
+A group is a frozen dataclass whose fields are options, or groups of more of them.
+"""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping
-from dataclasses import MISSING, dataclass, field
+from dataclasses import MISSING, Field, dataclass, field, fields
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args, get_origin
+from typing import Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 from diffeo_calib.common.errors import InputError
 
-DESCRIPTION = Path(__file__).with_name("options.md")
-TYPES: dict[str, tuple[Any, Any]] = {
-    "text": (str, str),
-    "texts": (list[str], str),
-    "number": (float, float),
-    "count": (int, int),
-    "seed": (int, int),
-    "flag": (bool, bool),
-    "files": (list[Path], Path),
-    **dict.fromkeys(("file", "table", "output", "source", "folder"), (Path, Path)),
-}
-"""Word for a type -> the type of a value, and what makes one of a text."""
+Kind = Literal["read", "write", "source", "later", "folder"]
+"""A file must exist, is written, is written with a header beside it, may come later; or is a folder that is made."""
+Length = Literal["m", "mm", "cm", "inch"]
+"""As in measurements/table_format.py, which loads torch."""
+Angle = Literal["rad", "deg"]
+Convention = Literal["standard", "craig"]
 SHORT = {"output": "-o", "count": "-n"}
-SEEDS = {"min": 0, "max": 2**63 - 1}
+SEED: dict[str, Any] = {"default": 0, "min": 0, "max": 2**63 - 1}
 """The largest as in common/checks.py, which loads torch."""
 DRAWN = 3000
 CORNERS = "corners="
 """Begin of --reading for images of a board."""
+
+
+def option(
+    text: str, metavar: str | None = None, default: Any = None, kind: Kind = "read", *, named: bool = True, **how: Any
+) -> Any:
+    """A field that is an option of its name, or, if it is not ``named``, an argument.
+
+    Args:
+        text: its help. metavar: what its value is called. default: MISSING for one that is required.
+        kind: what happens to its file. how: limits of its value, as of :func:`typer.Option`.
+    """
+    how = {"help": text, "metavar": metavar, **how}
+    return field(default=default, metadata={"named": named, "kind": kind, "how": how})
+
+
+def argument(text: str, metavar: str, default: Any = MISSING, kind: Kind = "read") -> Any:
+    """A field that is an argument, as :func:`option`."""
+    return option(text, metavar, default, kind, named=False)
+
+
+def written(text: str, metavar: str, default: Any = None) -> Any:
+    """A field that is an option for a file to write, as :func:`option`."""
+    return option(text, metavar, default, "write")
 
 
 class Option(NamedTuple):
@@ -36,7 +55,7 @@ class Option(NamedTuple):
 
     Args:
         field: its name in Python. hint: type of its value. default: MISSING where one is required. names: as typed,
-            none of an argument. shown: in messages. kind: word for its type. how: its help and limits.
+            none of an argument. shown: in messages. kind: what happens to its file. how: its help and limits.
     """
 
     field: str
@@ -44,103 +63,62 @@ class Option(NamedTuple):
     default: Any
     names: tuple[str, ...]
     shown: str
-    kind: str
+    kind: Kind
     how: dict[str, Any]
 
     @classmethod
-    def of(cls, entry: str) -> Option:
-        """One of a line of options.md."""
-        head, _, text = entry.partition(": ")
-        mark, name, spec, *more = head.split(" ")
-        kind, equal, default = spec.rstrip("!").partition("=")
-        hint: Any
-        hint, made = TYPES.get(kind) or (Literal[tuple(kind.split("|"))], str)
-        how: dict[str, Any] = dict(SEEDS) if kind == "seed" else {}
-        if more and re.match(r"[\d.e-]+\.\.", more[0]):
-            ends = more.pop(0).partition("..")
-            how = {end: made(number) for end, number in zip(("min", "max"), ends[::2], strict=True) if number}
-        how |= {"help": text, "metavar": more[0] if more else None}
-        value = made(default) if equal else {"seed": 0, "flag": False}.get(kind)
-        long = f"--{name.replace('_', '-')}"
-        names = () if mark == "*" else tuple(filter(None, (SHORT.get(name), long)))
-        hint = hint if spec.endswith("!") or value is not None else hint | None
-        return cls(name, hint, MISSING if spec.endswith("!") else value, names, (*names, *more)[0], kind, how)
-
-
-class Section(NamedTuple):
-    """One of options.md: its text, field -> its entry, and which options need or exclude which."""
-
-    text: str
-    entries: dict[str, str]
-    rules: list[tuple[list[str], bool, list[str]]]
-
-
-@cache
-def description() -> dict[str, Section]:
-    """The sections of options.md."""
-    found = dict[str, Section]()
-    for section in DESCRIPTION.read_text(encoding="utf-8").split("\n# ")[1:]:
-        name, _, body = section.partition("\n")
-        text, *lines = re.split("^(?=[-*+!] )", body, flags=re.MULTILINE)
-        heads = [(" ".join(line.split())).partition(":") for line in lines]
-        rules = [(head[2:].split(), rest.split()) for head, _, rest in heads if head.startswith("!")]
-        entries = {head.split(" ")[1]: f"{head}{colon}{rest}" for head, colon, rest in heads if head[0] != "!"}
-        found[name] = Section(text.strip(), entries, [(own, rest[0] == "need", rest[1:]) for own, rest in rules])
-    return found
+    def of(cls, own: Field[Any], hint: Any) -> Option:
+        """That of a field."""
+        kind, how = own.metadata["kind"], own.metadata["how"]
+        long = f"--{own.name.replace('_', '-')}"
+        names = tuple(filter(None, (SHORT.get(own.name), long))) if own.metadata["named"] else ()
+        return cls(own.name, hint, own.default, names, (*names, how["metavar"])[0], kind, how)
 
 
 class Options:
-    """A group of options: a dataclass with the fields of its section."""
+    """A group of options.
 
-    groups: ClassVar[dict[str, type[Options]]] = {}
-    parts: ClassVar[dict[str, type[Options] | Option]] = {}
-    """Field -> what it is."""
+    Attributes:
+        needs: options, and others of which each of them needs one. excludes: and others that it cannot stand beside.
+    """
 
-    if TYPE_CHECKING:
-        __dataclass_fields__: ClassVar[dict[str, Any]]
+    needs: ClassVar[tuple[tuple[str, str], ...]] = ()
+    excludes: ClassVar[tuple[tuple[str, str], ...]] = ()
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
-        def __init__(self, **given: Any) -> None: ...
-
-        def __getattr__(self, name: str) -> Any: ...
-
-    def __init_subclass__(cls) -> None:
-        section = cls.__name__.lower()
-        if section in description():
-            cls.groups[section], cls.parts, cls.__annotations__ = cls, {}, {}
-            for name, entry in description()[section].entries.items():
-                if entry.startswith("+"):
-                    cls.parts[entry.split(" ")[2]] = cls.groups.get(name) or type(name, (Options,), {})
-                else:
-                    cls.parts[name] = Option.of(entry if ": " in entry else description()["shared"].entries[name])
-            for name, part in cls.parts.items():
-                cls.__annotations__[name] = "Any"
-                if isinstance(part, Option) and part.default is not MISSING:
-                    setattr(cls, name, field(default=part.default))
-            dataclass(frozen=True, kw_only=True)(cls)
+    @classmethod
+    @cache
+    def parts(cls) -> dict[str, Option | type[Options]]:
+        """Field -> the option, or the group of options, that it is."""
+        hints = get_type_hints(cls)
+        return {own.name: Option.of(own, hints[own.name]) if own.metadata else hints[own.name] for own in fields(cls)}
 
     @classmethod
     def all(cls) -> Iterator[Option]:
         """Its options, and those of the groups in it."""
-        for part in cls.parts.values():
+        for part in cls.parts().values():
             yield from [part] if isinstance(part, Option) else part.all()
 
     @classmethod
     def made(cls, given: Mapping[str, Any]) -> Any:
         """The group, and the groups in it, from the values of all options."""
-        found = cls.parts.items()
-        return cls(**{name: given[name] if isinstance(part, Option) else part.made(given) for name, part in found})
+        made: Any = cls
+        found = cls.parts().items()
+        return made(**{name: given[name] if isinstance(part, Option) else part.made(given) for name, part in found})
 
     @classmethod
     def check_together(cls, given: Mapping[str, Any]) -> None:
         """Refuse options without those of which they need one, or beside those that they exclude."""
         typed = {one.shown for one in cls.all() if given[one.field] not in (None, [], one.default)}
-        for options, need, others in description()[cls.__name__.lower()].rules:
-            for option in (one for one in options if one in typed):
-                if need and not typed & {*others}:
-                    what = f"{option} without {' or '.join(others)}"
+        for options, others in cls.needs:
+            for one in options.split():
+                if one in typed and typed.isdisjoint(others.split()):
+                    what = f"{one} without {' or '.join(others.split())}"
                     raise InputError.of(what, fix="name this too, or leave the option out")
-                if not need and typed & {*others}:
-                    raise InputError.of(f"{option} beside {min(typed & {*others})}", fix="leave one of them out")
+        for options, others in cls.excludes:
+            for one in options.split():
+                if one in typed and (found := typed.intersection(others.split())):
+                    raise InputError.of(f"{one} beside {min(found)}", fix="leave one of them out")
 
 
 def has(hint: Any, part: Any) -> bool:
@@ -148,16 +126,121 @@ def has(hint: Any, part: Any) -> bool:
     return part in {hint, get_origin(hint)} or any(has(one, part) for one in get_args(hint))
 
 
+# --- groups of several commands -----------------------------------------------------------------------------------
+
+CONVENTION = (
+    "How rotations are written: rotvec, quat_xyzw, quat_wxyz, matrix, or an order of Euler angles, extrinsic (such as "
+    "xyz) or intrinsic (such as XYZ)."
+)
+ROTATION_ANGLE = "Unit of Euler angles and rotation vectors."
+PAYLOAD = "Column with the known mass that the robot carried, in any unit."
+ROBOT = "The robot's description: a URDF, or a table of its Denavit-Hartenberg parameters, one line per joint."
+
+
+@dataclass(frozen=True, kw_only=True)
 class Units(Options):
     """How tables are written; a model knows that of the table of its fit."""
 
+    length: Length | None = option(
+        "Unit of positions in the table, and of prismatic joints; needed where no model knows it."
+    )
+    angle: Angle | None = option("Unit of revolute joints in the table; needed where no model knows it.")
+    joint_length: Length | None = option("Unit of prismatic joints, if not that of --length.")
+    joints: str | None = option(
+        "Joint columns in the robot's order, if not named after its joints, or expressions of columns in the units of "
+        "the table, such as -{J2}+90 or {J3}+{J2}.",
+        "A,B,...",
+    )
+    robot_pose: str | None = option(
+        "Columns of the commanded place or pose, as the controller writes it, in place of joint values and a robot's "
+        "description: X,Y,Z, or X,Y,Z,A,B,C=CONVENTION as of --convention, angles in the unit of --angle; or "
+        "A,B,...=FILE.py:NAME, a function of yours that makes places or poses of these columns.",
+        "X,Y,Z[,...]",
+    )
+    sep: str | None = option("Column separator ('\\t' for a tab), by default that of the model, or a comma.")
+    decimal: str | None = option("Decimal mark, by default that of the model, or a point.")
 
+
+@dataclass(frozen=True, kw_only=True)
 class Places(Options):
     """Measured places in a file of their own."""
 
+    places: Path | None = option(
+        "File with the measured places where CSV has the joint values alone; --by joins both.", "FILE"
+    )
+    by: str | None = option(
+        "Column of both files: texts that are the same in both, such as names of poses; or times, of which the nearest "
+        "within half a step belong together. Of two recordings the clocks may differ, and every stop becomes a row. "
+        "COLUMN=OTHER where it has another name in the file of the places.",
+        "COLUMN",
+    )
 
-class Rows(Options):
+
+@dataclass(frozen=True, kw_only=True)
+class Rows(Places):
     """Columns of the measurements in a table, of any kinds."""
+
+    position: list[str] | None = option(
+        "The three position columns of a marker; repeat for more markers. Empty cells: hidden in that row.", "X,Y,Z"
+    )
+    socket: str | None = option(
+        "Columns that name the socket in which a ball on the tool rested, in rows without a position.", "PLACE,SOCKET"
+    )
+    distance: list[str] | None = option(
+        "Known distance between two sockets, in the unit of --length; repeat for more.", "A,B=LENGTH"
+    )
+    distance_std: float | None = option("Standard deviation of these distances, in the unit of --length.")
+    reading: list[str] | None = option(
+        "What a device reported of a ball on the tool; repeat for more kinds: distance=COLUMN (ball bar), "
+        "displacement=COLUMN (distance with an unknown zero: wire, interferometer), height=COLUMN (dial gauge, touched "
+        "plane; a number in place of the column holds for all rows), image=U,V,FX,FY,CX,CY (pixels, focal lengths and "
+        "principal point of a camera), or corners=CAMERA.yaml (=WIDTH,HEIGHT of an unknown camera) for corners of a "
+        "printed board. --session names the fixed point, plane or camera of each row.",
+        "KIND=COLUMN",
+    )
+    marker: str | None = option(
+        "Column that names which marker a line holds, where each has the position of one (not with --rotation or "
+        "several --position, nor for readings and images). Lines with the same joint values that follow each other are "
+        "one row. With names in order where a model has them: COLUMN=A,B,...",
+        "COLUMN",
+    )
+    session: str | None = option("Column that names the set-up of the device for every row.", "COLUMN")
+    remounted: bool = option("For each --session the markers were mounted anew; the device stayed.", default=False)
+    payload: str | None = option(PAYLOAD, "COLUMN")
+    time: str | None = option("Column of times, in any unit: device or arm may drift with it.", "COLUMN")
+    temperature: str | None = option("Column of temperatures, in any unit; likewise.", "COLUMN")
+    rotation: list[str] | None = option(
+        "Columns of the rotation, if poses were measured: 3, 4 or 9, depending on --convention; for frames on several "
+        "tips once per --position.",
+        "A,B,...",
+    )
+    convention: str | None = option(CONVENTION)
+    rotation_angle: Angle | None = option(ROTATION_ANGLE)
+    lever: float | None = option(
+        "Distance from a pose's origin to the three points that represent the pose, in the unit of --length: it weighs "
+        "orientation against position. 0.1 m by default."
+    )
+    camera_on_tool: bool = option(
+        "The poses, or corners, are those of a fixed board in the frame of a camera on the tool, as detectors of "
+        "boards give them; standard deviations are along the camera's axes.",
+        default=False,
+    )
+    std: str | None = option(
+        "Columns with standard deviations of the positions: one for all, one per marker or three per marker.", "A,B,..."
+    )
+    rotation_std: list[str] | None = option(
+        "Columns with standard deviations of the rotation about the measuring frame's axes, or one for all three, in "
+        "the unit of --rotation-angle; once per --rotation.",
+        "A,B,C",
+    )
+    needs = (
+        ("--lever", "--rotation"),
+        ("--camera-on-tool", "--rotation --reading"),
+        ("--places", "--by"),
+        ("--by", "--places"),
+        ("--distance-std", "--socket"),
+        ("--distance", "--distance-std"),
+    )
 
     @property
     def named(self) -> bool:
@@ -170,25 +253,76 @@ class Rows(Options):
         return any(text.startswith(CORNERS) for text in self.reading or ())
 
 
+@dataclass(frozen=True, kw_only=True)
 class Links(Options):
     """Which part of the robot in a file."""
 
+    base: str | None = option("First link of the chain; by default that of the file.", "LINK")
+    tip: list[str] | None = option(
+        "Last link of the chain, to which the markers are fixed, by default that of the file; for several tips once "
+        "per --position. Of a DH table the last joint.",
+        "LINK",
+    )
+    load: list[str] | None = option("End of a branch without markers whose weight bends the robot; repeatable.", "LINK")
+    dh_convention: Convention | None = option(
+        "Convention of a DH table that does not say its own; craig is also called modified."
+    )
 
+
+@dataclass(frozen=True, kw_only=True)
 class Robot(Options):
     """Which robot was measured; none where --robot-pose names commanded poses."""
 
+    links: Links
+    robot: Path | None = option(ROBOT, "FILE")
 
+
+@dataclass(frozen=True, kw_only=True)
 class Targets(Options):
     """Columns of the poses that a tool shall have."""
 
+    position: list[str] | None = option(
+        "Columns of the target positions of the tool, if the commands' own nominal poses are not the targets.", "X,Y,Z"
+    )
+    rotation: list[str] | None = option("Columns of the target orientations: 3, 4 or 9, see --convention.", "A,B,...")
+    convention: str | None = option(CONVENTION)
+    rotation_angle: Angle | None = option(ROTATION_ANGLE)
 
+
+@dataclass(frozen=True, kw_only=True)
 class Candidates(Options):
     """Configurations to choose from: a table, or random ones within what the cell allows."""
 
+    candidates: Path | None = option("Choose from these configurations instead of random ones.", "CSV")
+    draw: int | None = option(f"Number of random candidates to choose from, {DRAWN} by default.", min=1)
+    range: list[str] | None = option(
+        "Range of a joint within its limits; by default these, but one turn at most. Repeat for more joints.",
+        "JOINT=A:B",
+    )
+    tracker: str | None = option(
+        "Place of the measuring device in the robot's base frame: plan only poses in which it sees the marker. Behind "
+        "it the direction in which the marker looks, in the frame of the tip (0,0,1), and the largest angle in degrees "
+        "between that and the line to the device (45).",
+        "X,Y,Z[,DX,DY,DZ[,DEG]]",
+    )
+    floor: float | None = option("Height in the base frame below which no link and no marker may be.", "Z")
+    column: str | None = option(
+        "Upright cylinder in the base frame that no link may enter: place, radius, and top if it ends.", "X,Y,R[,TOP]"
+    )
+    collisions: bool = option(
+        "Leave out poses in which the robot collides with itself, by its URDF; needs the extra `collisions`.",
+        default=False,
+    )
+    seed: int = option("Seed of the random candidates.", **SEED)
 
-class Command(Options):
-    """The options of a command; its work is ``run`` of the module of its name in ``commands``, which takes them."""
 
+@dataclass(frozen=True, kw_only=True)
+class ChangeTests(Options):
+    """How changes since an old fit are tested."""
 
-COMMANDS = {name: type(name, (Command,), {}) for name, section in description().items() if section.text}
-"""By name, in the order of the help."""
+    marker_freedom: Literal["evidence", "same", "moved", "other"] = option(
+        "Whether the markers are the same (0.05 mm: nobody touched them), have moved a little (1 mm: remounted) or are "
+        "other ones (anywhere); by default the rows decide.",
+        default="evidence",
+    )
+    seed: int = option("Seed of the tests for changes.", **SEED)

@@ -67,7 +67,7 @@ _KEPT: ContextVar[list[str] | None] = ContextVar("kept", default=None)  # where 
 
 @contextmanager
 def kept_warnings() -> Iterator[list[str]]:
-    """A list to which the text of every warning of :func:`warn_user` inside is added, however warnings are filtered."""
+    """A list to which every text of :func:`warn_user` inside is added once, however warnings are filtered."""
     texts = list[str]()
     before = _KEPT.set(texts)
     try:
@@ -79,7 +79,7 @@ def kept_warnings() -> Iterator[list[str]]:
 def warn_user(text: str) -> None:
     """Issue a :class:`DiffeoCalibWarning` that points at the line outside this package which led here."""
     kept = _KEPT.get()
-    if kept is not None:
+    if kept is not None and printable(text) not in kept:
         kept.append(printable(text))
     level, frame = 1, sys._getframe()
     skipped = PACKAGE, "contextlib"  # which the decorators of threads.py come from

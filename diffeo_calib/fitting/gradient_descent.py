@@ -65,7 +65,6 @@ class GradientDescent:
                     return run.solution(Stop.GRADIENT, measure=size)
                 with torch.no_grad():
                     run.variables -= self.step * run.gradient
-                run.iterations += 1
             self._evaluate(run)
         except KeyboardInterrupt:
             return run.solution(Stop.INTERRUPTED)
@@ -77,4 +76,5 @@ class GradientDescent:
         if run.overflowed:
             return False
         run.history.append(energy)
+        run.iterations = len(run.history) - 1
         return energy <= DIVERGED_ENERGY_RATIO * run.best_energy

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from copy import copy
-from functools import partial
 from math import isqrt
 from typing import Any
 
@@ -150,24 +149,23 @@ class Flow:
         self.kernel, self.integrator = kernel, integrator
         self._jacobians: list[Tensor] | None = None
         if variational:
-            n = q.shape[1]
-            packed = Run(integrator, self._variational_controls, torch.cat([q, a, _eye(q).flatten(1)], -1))
-            self._jacobians = [s[:, 2 * n :].unflatten(1, (n, n)) for s in packed.nodes]
-            self._run = copy(packed)
-            self._run.field = partial(geodesic_field, kernel)
-            self._run.nodes, self._run.stages = (
-                [torch.stack([s[:, :n], s[:, n : 2 * n]]) for s in states] for states in (packed.nodes, packed.stages)
-            )
+            n, start = q.shape[1], torch.cat([q, a, _eye(q).flatten(1)], -1)
+            run = Run(integrator, self._variational_controls, start, lambda s: torch.stack(s[:, : 2 * n].split(n, 1)))
+            self._jacobians = [s[:, 2 * n :].unflatten(1, (n, n)) for s in run.nodes]
+            run.nodes = [torch.stack(s[:, : 2 * n].split(n, 1)) for s in run.nodes]
+            self._run = run
         else:
-            self._run = Run(integrator, partial(geodesic_field, kernel), torch.stack([q, a]))
+            self._run = Run(integrator, self._rate, torch.stack([q, a]))
         self.nodes, self.stages = self._run.nodes, self._run.stages
 
     def using(self, backend: Backend) -> Flow:
         """The same flow, whose passive points move by kernel sums of this backend."""
         other = copy(self)
-        other.kernel, other._run = self.kernel.using(backend), copy(self._run)
-        other._run.field = partial(geodesic_field, other.kernel)
+        other.kernel = self.kernel.using(backend)
         return other
+
+    def _rate(self, state: Tensor) -> Tensor:
+        return geodesic_field(self.kernel, state)
 
     def _variational_controls(self, packed: Tensor) -> Tensor:
         """q' = v, a' = -Dv^T a, M' = Dv M: one kernel sum gives all three."""
@@ -192,7 +190,7 @@ class Flow:
         def field(points: Tensor, controls: Tensor) -> Tensor:
             return velocity(self.kernel, points, *controls)
 
-        return torch.cat([self._run.alongside(field, x[rows])[-1] for rows in row_blocks(x)])
+        return torch.cat([self._run.alongside(field, x[rows], self._rate)[-1] for rows in row_blocks(x)])
 
     def with_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The flow (M, n) and its Jacobian (M, n, n) at passive points x (M, n)."""
@@ -207,7 +205,7 @@ class Flow:
             v, dv = self.kernel.field_and_jacobian(state[:, :n], *controls)
             return torch.cat([v, (dv @ state[:, n:].unflatten(1, (n, n))).flatten(1)], -1)
 
-        states = self._run.alongside(field, torch.cat([x, _eye(x).flatten(1)], -1))
+        states = self._run.alongside(field, torch.cat([x, _eye(x).flatten(1)], -1), self._rate)
         return [s[:, :n] for s in states], [s[:, n:].unflatten(1, (n, n)) for s in states]
 
     def control_path(self) -> tuple[list[Tensor], list[Tensor]]:

@@ -21,6 +21,7 @@ from diffeo_calib.runtime.arrays import MOST_STEPS, TABLEAUS
 
 RightHandSide = Callable[[int, Tensor], Tensor]
 """``field(stage, state)``: time derivative of the state at the numbered stage of the run."""
+Rate = Callable[[Tensor], Tensor]
 
 
 class Integrator(ABC):
@@ -88,22 +89,23 @@ class Run:
 
     Attributes:
         nodes: the controls' states at the nodes of the time grid.
-        stages: at every stage; empty if the method is not replayable.
+        stages: what is ``kept`` of them at every stage; empty if the method is not replayable.
     """
 
-    def __init__(self, integrator: Integrator, field: Callable[[Tensor], Tensor], start: Tensor) -> None:
-        self.integrator, self.field, self.stages = integrator, field, list[Tensor]()
-        self.nodes = integrator.nodes(self._recorded, start)
+    def __init__(self, integrator: Integrator, field: Rate, start: Tensor, kept: Rate = lambda state: state) -> None:
+        self.integrator, self.stages = integrator, (stages := list[Tensor]())
 
-    def _recorded(self, _: int, state: Tensor) -> Tensor:
-        if self.integrator.replayable:
-            self.stages.append(state)
-        return self.field(state)
+        def recorded(_: int, state: Tensor) -> Tensor:
+            if integrator.replayable:
+                stages.append(kept(state))
+            return field(state)
 
-    def alongside(self, field: Callable[[Tensor, Tensor], Tensor], start: Tensor) -> list[Tensor]:
+        self.nodes = integrator.nodes(recorded, start)
+
+    def alongside(self, field: Callable[[Tensor, Tensor], Tensor], start: Tensor, rate: Rate) -> list[Tensor]:
         """The states at the nodes of ``state' = field(state, controls)``, from any state.
 
-        The controls' stages are replayed; if the method is not replayable, the controls are integrated again.
+        The controls' stages are replayed; if the method is not replayable, the controls follow their ``rate`` again.
         """
         if self.integrator.replayable:
             return self.integrator.nodes(lambda stage, state: field(state, self.stages[stage]), start)
@@ -112,7 +114,7 @@ class Run:
 
         def packed_field(_: int, packed: Tensor) -> Tensor:
             live, state = packed[:size].view_as(controls), packed[size:].view_as(start)
-            return torch.cat([self.field(live).flatten(), field(state, live).flatten()])
+            return torch.cat([rate(live).flatten(), field(state, live).flatten()])
 
         nodes = self.integrator.nodes(packed_field, torch.cat([controls.flatten(), start.flatten()]))
         return [node[size:].view_as(start) for node in nodes]

@@ -111,10 +111,10 @@ def c_files(
 ) -> CFiles:
     """The files that :func:`write_c` writes."""
     robot, source = model.robot, Path(path)
-    carrier, header = checked_tip(robot, model.tool_tip if tip is None else tip), source.with_suffix(".h")
+    carrier = checked_tip(robot, model.tool_tip if tip is None else tip)
     if source.suffix != ".c":
         raise InputError.of("`path`", expected="the name of a C file, such as model.c", got=as_written(str(source)))
-    for file in (source, header):
+    for file in (source, header := source.with_suffix(".h")):
         if file.exists() and GENERATED not in file.read_bytes()[:1000].decode("ascii", "replace"):
             raise InputError.of(f"'{file}' exists and was not generated", fix="name another file, or remove it")
     name = re.sub(r"[^0-9A-Za-z_]", "_", source.stem) if prefix is None else prefix

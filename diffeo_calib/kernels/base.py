@@ -110,7 +110,7 @@ class Kernel(ABC):
         half = left @ self.matrix(x, y).view(M, n, N * width)  # (M, k, N Q n)
         return torch.einsum("ikjb,jlb->ikjl", half.view(M, k, N, width), right).reshape(M * k, N * r)
 
-    def diagonal(self, x: Tensor, y: Tensor) -> Iterator[tuple[int, Tensor]] | None:
+    def diagonal_components(self, x: Tensor, y: Tensor) -> Iterator[tuple[int, Tensor]] | None:
         """For every component k that is not always zero, k and K(x_i, y_j)_kk (N, M), differentiable.
 
         None for a kernel whose values are not diagonal matrices. Sums of kernels add theirs before :meth:`gram`.
@@ -222,8 +222,8 @@ def check_points(x: Tensor | None, q: Tensor, a: Tensor) -> None:
 def _added(name: str) -> Any:
     """A method that adds up the results of the terms: tensors, or tuples of tensors."""
 
-    def method(self: SumKernel, *arguments: Any) -> Any:
-        return reduce(_plus, (getattr(term, name)(*arguments) for term in self.terms))
+    def method(self: SumKernel, *arguments: Any, **named: Any) -> Any:
+        return reduce(_plus, (getattr(term, name)(*arguments, **named) for term in self.terms))
 
     return method
 
@@ -271,7 +271,7 @@ class SumKernel(Kernel):
         return set().union(*(term.backends(count, device) for term in self.terms))
 
     def gram(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor) -> Tensor:
-        diagonals = [term.diagonal(x, y) for term in self.terms]
+        diagonals = [term.diagonal_components(x, y) for term in self.terms]
         parts = [t.gram(x, left, y, right) for t, own in zip(self.terms, diagonals, strict=True) if own is None]
         present = [own for own in diagonals if own is not None]
         if present:

@@ -271,7 +271,7 @@ class RadialKernel(Kernel):
         half = torch.einsum("npq,nkqr->nkpr", kappa, reduced)
         return reduced.flatten(2) @ half.flatten(2).mT
 
-    def diagonal(self, x: Tensor, y: Tensor) -> Iterator[tuple[int, Tensor]]:
+    def diagonal_components(self, x: Tensor, y: Tensor) -> Iterator[tuple[int, Tensor]]:
         if self.vanishes:
             return
         n = x.shape[-1]

@@ -81,13 +81,12 @@ class FeatureMap:
         """Indices of lines and of circles in the coordinates of x, and in the length scales."""
         return [(_as_slice([self.columns[k] for k in places]), _as_slice(places)) for places in self._places]
 
-    def _parts(self, x: Tensor, *others: Tensor) -> list[list[Tensor] | None]:
-        """The lines and the circles of points and of others, with their inverse scales; None where there are none."""
-        scales = self._scales() if self.lengthscale.requires_grad else self._fixed_scales
-        scales = scales.to(x)
+    def _parts(self, *points: Sequence[Tensor]) -> list[list[Tensor] | None]:
+        """The lines of some points and the circles of others, with their inverse scales; None where there are none."""
+        scales = (self._scales() if self.lengthscale.requires_grad else self._fixed_scales).to(points[1][0])
         return [
-            [*(t[..., own] for t in (x, *others)), scales[scaled]] if places else None
-            for places, (own, scaled) in zip(self._places, self._selections, strict=True)
+            [*(t[..., own] for t in some), scales[scaled]] if places else None
+            for some, places, (own, scaled) in zip(points, self._places, self._selections, strict=True)
         ]
 
     def _scales(self) -> Tensor:
@@ -100,7 +99,7 @@ class FeatureMap:
 
     def lift(self, x: Tensor) -> Tensor:
         """F(x): (..., n) -> (..., D)."""
-        lines, circles, found = *self._parts(x), []
+        lines, circles, found = *self._parts([x], [x]), []
         if lines is not None:
             found.append(lines[0] * lines[1])
         if circles is not None:
@@ -110,9 +109,9 @@ class FeatureMap:
 
     def push(self, x: Tensor, dx: Tensor) -> Tensor:
         """DF(x) dx: (..., n), (..., n) -> (..., D)."""
-        lines, circles, found = *self._parts(x, dx), []
+        lines, circles, found = *self._parts([dx], [x, dx]), []
         if lines is not None:
-            found.append(lines[1] * lines[2])
+            found.append(lines[0] * lines[1])
         if circles is not None:
             angle, turn, scale = circles
             found += [-angle.sin() * turn * scale, angle.cos() * turn * scale]
@@ -120,10 +119,10 @@ class FeatureMap:
 
     def pull(self, x: Tensor, g: Tensor) -> Tensor:
         """DF(x)^T g: (..., n), (..., D) -> (..., n)."""
-        lines, circles, found = *self._parts(x), []
+        lines, circles, found = *self._parts([], [x]), []
         g_line, g_cos, g_sin = self._split(g)
         if lines is not None:
-            found.append(g_line * lines[1])
+            found.append(g_line * lines[0])
         if circles is not None:
             angle, scale = circles
             found.append((angle.cos() * g_sin - angle.sin() * g_cos) * scale)
@@ -133,7 +132,7 @@ class FeatureMap:
         """(D^2F(x)[dx])^T g: the derivative of ``pull(x, g)`` along dx at fixed g; (..., n)."""
         g_line, g_cos, g_sin = self._split(g)
         found = [torch.zeros_like(g_line)]
-        _, circles = self._parts(x, dx)
+        _, circles = self._parts([], [x, dx])
         if circles is not None:
             angle, turn, scale = circles
             found.append(-(angle.cos() * g_cos + angle.sin() * g_sin) * scale * turn)

@@ -191,8 +191,7 @@ class GeodesicDeformation(Deformation):
         self, points: list[Tensor], jacobians: list[Tensor], to_end: Tensor | None = None
     ) -> list[NodeSensitivity]:
         """The nodes of one flow, with effects M_s^-1, or to_end M_s^-1."""
-        inverses = [_inverse(m) for m in jacobians]
-        effects = inverses if to_end is None else [to_end @ inverse for inverse in inverses]
+        effects = [_inverse(m) if to_end is None else to_end @ _inverse(m) for m in jacobians]
         return [NodeSensitivity(*n) for n in zip(self.integrator.weights(), points, effects, strict=True)]
 
     def _points(self, z: Tensor) -> Tensor:

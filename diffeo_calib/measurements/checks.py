@@ -35,7 +35,6 @@ USUAL_SIZES = {
 """Larger values in rad or m, and smaller ones in deg or mm, are probably in the other unit."""
 OTHER_UNITS = {"rad": ("deg", "degrees"), "deg": ("rad", "radians"), "m": ("mm", "millimetres"), "mm": ("m", "metres")}
 
-
 ANGLE_MISTAKES = ((math.pi / 180, "degrees: convert them to radians"), (180 / math.pi, "radians that were converted"))
 """Factor that undoes a wrong unit of joint values, and what they then are."""
 

@@ -27,7 +27,6 @@ another camera. A focal length that is wrong by 1 % makes 1.06 of 60 images with
 FEWEST_IMAGES = 8
 """From which a free lens is well enough known to be compared."""
 
-
 Known = tuple[int, int] | Camera
 """Prior knowledge of a camera: width and height of its images, pixels, or lens and board too."""
 ONLY_CAMERA = "camera"

@@ -159,11 +159,8 @@ class TableFormat:
         with of_measurements():
             count = numbers_of(self.convention)
         expected = f"{count} names of columns for {self.convention!r}"
-        rotation, std, unit = (
-            by_frame("rotation", self.rotation, expected, count),
-            self.rotation_std,
-            self.rotation_angle,
-        )
+        rotation = by_frame("rotation", self.rotation, expected, count)
+        std, unit = self.rotation_std, self.rotation_angle
         if std is not None:
             std = by_frame("rotation_std", std, "names of columns: three, or one for all three axes", 1, 3)
         if unit is None and (count == 3 or std is not None):

@@ -140,7 +140,7 @@ class EulerianFlow:
             return torch.cat(self._transport(Kinematics(k, jacobian, start.curvature), x, controls)[:2], 1)
 
         packed = torch.cat([start.value, start.jacobian.flatten(1)], 1)
-        end = self._run.alongside(field, packed)[-1]
+        end = self._run.alongside(field, packed, self.rates)[-1]
         return end[:, :m], end[:, m:].unflatten(1, start.jacobian.shape[1:])
 
     def unpack(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -56,6 +56,7 @@ class GravitySag:
         self.chain, self.payload = chain, payload
         self.compliances = (*chain.arrays.compliances, *(_under_payload(chain, payload.link) if payload else ()))
         self._masses = Masses(*map(torch.from_numpy, Masses.of(self.compliances, chain.arrays)))
+        self._numbers = self._masses.own.mT.nonzero()[:, 1]  # of the compliance of each mass
 
     @property
     def size(self) -> int:
@@ -97,10 +98,10 @@ class GravitySag:
     def features(self, q: Tensor) -> Tensor:
         """Feature values [m; 1 for forces on prismatic joints]: q (N, n) -> (N, K)."""
         masses, frames = self._on(q), self._frames(q)
-        e = (frames[:, masses.joints, :3, :3] @ masses.axes[..., None])[..., 0]  # (N, compliances, 3)
-        e = masses.own.mT @ e  # (N, masses, 3)
+        numbers = self._numbers.to(q.device)
+        e = (frames[:, masses.joints, :3, :3] @ masses.axes[..., None])[:, numbers, :, 0]  # (N, masses, 3)
         pulls = torch.linalg.cross(e, masses.arms @ frames[..., :3, 3]) + e * masses.slides
-        return (pulls * (self._loads(q) @ masses.own)[..., None]).flatten(1)
+        return (pulls * self._loads(q)[:, numbers, None]).flatten(1)
 
     def twists(self, q: Tensor, w: Tensor) -> Tensor:
         """Error twists of the moving joints' frames: q (N, n), w (K,) -> (N, n_all, 6) [m, rad]."""
@@ -119,9 +120,8 @@ class GravitySag:
 
     def sensitivities(self, q: Tensor, by_twist: Tensor) -> Tensor:
         """Derivatives by the coefficients (N, m, K) from the derivatives by the twists (N, m, joints, 6)."""
-        masses = self._on(q)
-        by_mass = by_twist.flatten(2) @ masses.directions.mT @ masses.own
-        return by_mass.repeat_interleave(3, -1) * self.features(q)[:, None]
+        by_compliance = by_twist.flatten(2) @ self._on(q).directions.mT
+        return by_compliance[..., self._numbers.to(q.device).repeat_interleave(3)] * self.features(q)[:, None]
 
     def folded(self, w: Tensor) -> Tensor:
         """The coefficients (K,) of a robot that carries its payload everywhere as those of one without payload.

@@ -65,7 +65,8 @@ class Joint:
             raise RobotError.of(f"the kind of {what}", expected=f"one of {', '.join(KINDS)}", got=as_written(self.kind))
         object.__setattr__(self, "origin", rigid(self.origin, f"the origin of {what}"))
         if (largest := float(self.origin[:3, 3].abs().max())) > LARGEST_OFFSET:
-            fix, expected = "check the unit of the lengths, which are in m", f"a place within {LARGEST_OFFSET:g} m"
+            expected = f"a place within {LARGEST_OFFSET:g} m of the joint before it"
+            fix = "check the unit of the lengths, which are in m"
             raise RobotError.of(f"the origin of {what}", expected=expected, got=f"{largest:g} m", fix=fix)
         axis = as_tensor(self.axis, f"axis of {what}", (3,))
         if not float(axis.abs().max()) > 0:

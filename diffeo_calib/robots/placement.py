@@ -23,7 +23,6 @@ from math import sqrt
 from typing import NamedTuple
 
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from diffeo_calib.robots.se3 import nearest_rotations, rotation, skew, transforms
@@ -142,6 +141,8 @@ def _best_rotation(factor: Tensor) -> tuple[Tensor, int]:
 
     Gauss-Newton alone needs a hundred steps where the residuals are large: rows that do not belong to the robot.
     """
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  # slow to import, not needed to use a model
+
     F, f = factor[:, :9], factor[:, 9]
     linear = torch.linalg.lstsq(F, f[:, None], driver="gelsd").solution.reshape(3, 3)
     B = torch.cat([nearest_rotations(linear)[None], factor.new_tensor(Rotation.create_group("O").as_matrix())])

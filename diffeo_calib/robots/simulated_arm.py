@@ -157,7 +157,7 @@ class SimulatedArm:
             joint: its number. factor: of the amplitudes of all its harmonics.
         """
         other, (joints, frequencies, amplitudes, phases) = copy(self), self._waves
-        grown = (joints == joint) & (torch.arange(len(joints), device=joints.device) < HARMONICS * self.nominal.n)
+        grown = torch.arange(len(joints), device=joints.device) // HARMONICS == range(self.nominal.n)[joint]
         other._waves = joints, frequencies, torch.where(grown, factor * amplitudes, amplitudes), phases
         return other
 

@@ -238,10 +238,8 @@ def _warn_of_branches(urdf: URDF, paths: _Paths) -> None:
     left_out = [joint for joint in hanging if joint.kind in MOVING and joint.driver not in passed]
     if left_out:
         names = few([f"'{joint.name}'" for joint in left_out], MOST_NAMES)
-        what = (
-            f"'{urdf.path}': joints that hang on links between '{paths.base}' and '{', '.join(paths.tips)}' are left "
-        )
-        what += f"out: {names}; where they move, their weight bends the robot in ways that its model does not know"
+        what = f"'{urdf.path}': joints that hang on links between '{paths.base}' and '{', '.join(paths.tips)}' are "
+        what += f"left out: {names}; where they move, their weight bends the robot in ways that its model does not know"
         loads = [*paths.loads, *(_farthest(urdf, joint) for joint in left_out)]
         fix = f"pass load={loads} (on the command line --load) if the measurements have their values"
         warn_user(sentence(what, fix=fix))

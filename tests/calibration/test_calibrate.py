@@ -208,6 +208,19 @@ def test_ctrl_c_keeps_a_usable_model(task: str, at: int, arm: Case) -> None:
     assert bool(torch.isfinite(result.model.predict(arm.test.q[:3])[1]).all())
 
 
+@pytest.mark.filterwarnings("ignore:leave-one-out errors contradict the selected scales")
+def test_ctrl_c_ends_the_search_beside_what_may_drift(arm: Case) -> None:
+    tasks, interrupted = list[str](), interrupting("hyper-parameters", 1)
+
+    def progress(name: str, done: int, total: int) -> None:
+        tasks.append(name)
+        interrupted(name, done, total)
+
+    data = arm.train.with_covariates(time=torch.arange(len(arm.train)))
+    assert dc.calibrate(arm.robot, data, progress=progress).interrupted
+    assert tasks.count("hyper-parameters") <= 2, "no second search"
+
+
 def test_ctrl_c_before_the_first_step_leaves_geometry(arm: Case) -> None:
     given = arm.result.selection.scales
     result = dc.calibrate(arm.robot, arm.train, hyperparameters=given, progress=interrupting("Gauss-Newton", 0))

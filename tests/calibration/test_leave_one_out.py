@@ -137,6 +137,15 @@ def test_leave_one_out_is_refitting_without_the_row(name: str, request: pytest.F
     assert found.effective == pytest.approx(trace, rel=1e-6)
 
 
+@pytest.mark.parametrize("name", ["clean", "pair", "framed"])
+def test_effective_number_of_parameters(name: str, request: pytest.FixtureRequest) -> None:
+    """The trace of the matrix that makes fitted values from measured ones."""
+    case: Chosen = request.getfixturevalue(name)
+    data = case.conditioned().told
+    expected = torch.linalg.solve(covariance(data, case.scales), data.linearisation(case.scales).gram()).trace()
+    assert leave_one_out(data, case.scales).effective == pytest.approx(float(expected), rel=1e-6)
+
+
 @pytest.mark.parametrize(("coordinates", "count"), [(180, 1), (179, 2), (26, 7), (3, 60)])
 def test_blocks_cover_every_row_once(coordinates: int, count: int, clean: Chosen) -> None:
     blocks = random_blocks(clean.data, 0, coordinates)

@@ -322,3 +322,9 @@ def test_the_chance_of_a_jump_is_that_of_white_noise() -> None:
         gains = (draws[..., :unknowns].square() / count).sum(2)[:, 4:95].amax(1)
         level = float(gains.quantile(0.98))
         assert 0.01 < chance_of_jump(level, unknowns, 0.05) < 0.04
+
+
+@pytest.mark.parametrize(("gain", "unknowns", "level"), [(8.68, 1, 0.05), (12.16, 1, 0.01), (18.3, 5, 0.05)])
+def test_the_chance_of_a_jump_is_a_little_more_than_the_tabulated_one(gain: float, unknowns: int, level: float) -> None:
+    """By table I of Andrews, Econometrica 71 (2003), without 15 % of the rows at both ends."""
+    assert 1.05 < chance_of_jump(gain, unknowns, 0.15) / level < 1.15

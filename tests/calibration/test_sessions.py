@@ -2,6 +2,7 @@
 
 import json
 import re
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegression
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 
@@ -73,6 +75,14 @@ def test_the_frames_are_found(result: Any) -> None:
     assert_close(sessions.transforms[:, :3, :3], expected[:, :3, :3], rtol=0, atol=1e-4)
     assert_close(sessions.transforms @ centre, expected @ centre, rtol=0, atol=3e-4)
     assert len(sessions.sentences()) == len(NAMES) - 1
+
+
+def test_the_frames_are_known_as_well_where_the_rows_are_many(result: Any) -> None:
+    """Where conjugate gradients take the place of a factor of all rows."""
+    fitted, many = result.model.map, copy(result.model.map)
+    vars(many)["conditional"] = ConjugateGradientRegression(fitted.geodesic.linearise(None), fitted.noise)
+    expected = fitted.shift_covariance()
+    assert_close(many.shift_covariance(), expected, rtol=1e-3, atol=1e-3 * float(expected.diagonal().min()))
 
 
 def test_new_rows_of_a_session_are_brought_into_the_model_frame(arm: SimulatedArm, result: Any) -> None:

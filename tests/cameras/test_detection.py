@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -215,6 +216,16 @@ def test_a_folder_becomes_a_table(folder: Path, command: Command) -> None:
     done = command(*words, "--sep", ";", "--decimal", ",")
     assert done.code == 0, done.err
     assert [line.replace(",", ".").replace(";", ",") for line in out.read_text().splitlines()] == lines
+
+
+def test_ctrl_c_among_images_leaves_the_files(folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("diffeo_calib.cameras.folder._seen", Mock(side_effect=KeyboardInterrupt))
+    for name in ("corners.csv", "corners.yaml"):
+        (folder / name).write_text("old")
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    words = ["images", folder, folder / "joints.csv", "--board", BOARD, "--length", "mm", "-o", folder / "corners.csv"]
+    assert command(*words, "--overview", folder / "page.html").code == 130
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from torch.testing import assert_close
 from diffeo_calib.cameras.board import LENS, BoardPrior, board_slopes, project, project_slopes, real_board
 from diffeo_calib.cameras.files import camera_text, read_camera
 from diffeo_calib.cameras.images import UNKNOWNS, Images, first_guess, sighted, sighted_by_several
+from diffeo_calib.common.device import seeded
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError
 from diffeo_calib.robots.se3 import rotation, transforms
 
@@ -145,6 +146,14 @@ def test_a_known_lens_stays() -> None:
     assert float(held.camera.deviations[: len(LENS)].max()) == 0.0
     assert float(held.camera.deviations[len(LENS) :].min()) > 0.0
     assert float(held.shared.norm()) < float(FOUND.shared.norm())
+
+
+def test_a_longer_focal_length_is_an_error_of_the_lens_alone() -> None:
+    whole = FOUND.camera.root
+    assert_close(whole @ FOUND.camera.longer, FOUND.camera.unknowns * (torch.arange(len(whole)) < 2))
+    board = torch.randn(5, 5, dtype=whole.dtype, generator=seeded(0))
+    exact = replace(FOUND.camera, root=torch.cat([torch.zeros_like(whole[: len(LENS), :5]), board]))
+    assert not bool(exact.longer.any())  # and not what rounding makes of it
 
 
 # --- files ----------------------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ import pytest
 import torch
 from command_bank import Command, Site
 from recorded_bank import made_with
+from table_bank import held
 from torch import Tensor
 from two_arms_bank import HANDS
 from two_arms_bank import robot as two_arms
@@ -22,6 +23,7 @@ from diffeo_calib.cli import record
 from diffeo_calib.cli.options import Targets
 from diffeo_calib.cli.tables import ProgramTable
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.kinematics.tool import tool_transform
 from diffeo_calib.measurements.poses import angle_between, rotation_matrices, transforms
 from diffeo_calib.measurements.table_format import TableFormat
 
@@ -248,6 +250,23 @@ def test_targets_of_both_hands(tmp_path: Path, command: Command) -> None:
     assert recorded_misses(tmp_path / "out.json")["left"]["angle_miss_deg"] is None
     assert "6 rows: 6 reached" in done.out
     assert [row["miss_right_mm"] == "" for row in read(output)] == [k == 2 for k in range(6)]
+
+
+def test_commands_of_both_hands(tmp_path: Path, command: Command) -> None:
+    """Nominal poses of both as targets."""
+    arms, program, output = both_arms(tmp_path)
+    names, q = arms.robot.joint_names, np.random.default_rng(3).uniform(-1, 1, (6, 5))
+    program.write_text("\n".join([",".join(names), *(",".join(map(repr, row)) for row in q.tolist())]))
+    done = command("correct", tmp_path / "arms.safetensors", program, *UNITS_OF_HANDS, *TOOLS, "-o", output)
+    assert done.code == 0
+    assert "a robot with 5 joints cannot hold every orientation of 2 tools" in done.err
+    goals = arms.robot(torch.from_numpy(q)) @ torch.stack([tool_transform(place) for place in PLACES])
+    expected = dc.compensate(arms, goals, q, tool=PLACES, bound=np.radians(20.0))
+    np.testing.assert_allclose(table(read(output), list(names)), expected.q.numpy(), rtol=0, atol=1e-12)
+    for k, hand in enumerate(HANDS):
+        misses = table(read(output), [f"miss_{hand}_mm", f"angle_miss_{hand}_rad"])
+        own = torch.stack([1e3 * expected.miss[:, k], held(expected.angle_miss)[:, k]], 1)
+        np.testing.assert_allclose(misses, own.numpy(), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize(

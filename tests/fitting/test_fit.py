@@ -91,6 +91,7 @@ WRONG: dict[str, tuple[Callable[[Problem], object], str]] = {
         lambda p: dc.fit(p, start=p.zero().unflatten(p.zero().flatten() * nan)),
         "`start` has 50 value",
     ),
+    "start's size": (lambda p: dc.fit(p, controls=20, start=p.zero()), r"`start`: expected shapes .*\(20, 2\).*25"),
     "iterations": (lambda p: dc.GaussNewton(max_iterations=-1), "`max_iterations`: expected an integer of at least 1"),
     "broken iterations": (lambda p: dc.LBFGS(max_iterations=1.5), "`max_iterations`: expected an integer"),  # pyright: ignore[reportArgumentType]
     "tolerance": (lambda p: dc.GaussNewton(tolerance=nan), "`tolerance`: expected a number above"),

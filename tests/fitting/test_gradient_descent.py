@@ -28,13 +28,15 @@ def test_finds_the_optimum_of_an_easy_problem(formulation: str, step: float, tol
     assert fit.history[0] == pytest.approx(float(problem.energy(problem.deform(problem.zero(), dc.RK4(1))).total))
 
 
+@pytest.mark.parametrize("step", [100.0, 1e30])
 @pytest.mark.parametrize("formulation", ["exact", "eulerian"])
-def test_too_long_a_step_diverges_and_says_so(formulation: str) -> None:
-    solver = dc.GradientDescent(step=100.0)
+def test_too_long_a_step_diverges_and_says_so(formulation: str, step: float) -> None:
+    solver = dc.GradientDescent(step=step)
     fit = dc.fit(few_points(), solver, dc.RK4(1), formulation=formulation)  # pyright: ignore[reportArgumentType]
     assert not fit.converged
     assert "diverged" in fit.status
     assert "lower `step`" in fit.status
+    assert fit.iterations == len(fit.history) - 1
     assert fit.energy == pytest.approx(min(fit.history), rel=1e-12)
 
 
@@ -44,6 +46,8 @@ def test_limit_and_interruption_keep_the_best_state() -> None:
     assert fit.solution.exhausted
     assert fit.iterations == 3
     assert fit.energy == pytest.approx(fit.history[-1], rel=1e-12)
+    again = dc.fit(fit.problem, dc.GradientDescent(step=STEP, max_iterations=1), dc.RK4(1), start=fit.momenta)
+    assert again.history[0] == pytest.approx(fit.energy, rel=1e-12)
 
     fit = dc.fit(few_points(), dc.GradientDescent(step=STEP), dc.RK4(1), progress=stop_at(2))
     assert fit.solution.interrupted

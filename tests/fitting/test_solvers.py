@@ -63,6 +63,8 @@ def test_certificates_improve_with_the_time_steps(small: Fit, fine: Fit) -> None
     assert fine.end_residual <= small.end_residual / 50
     assert fine.energy_drift <= small.energy_drift / 50
     assert fine.step_error <= small.step_error / 50
+    exact = small.problem.deform(small.momenta, dc.RK4(32)).z1
+    assert small.step_error == pytest.approx(float((small.model.deformation.z1 - exact).abs().max()), rel=5e-3)
 
 
 def test_optimum_does_not_depend_on_the_start(small: Fit) -> None:

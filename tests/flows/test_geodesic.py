@@ -16,6 +16,7 @@ from math_bank import (
 )
 from torch import Tensor
 
+from diffeo_calib.flows import geodesic
 from diffeo_calib.flows.geodesic import Flow
 from diffeo_calib.flows.integrators import RK4, RK8, Integrator
 from diffeo_calib.flows.torchdiffeq import TorchDiffEq
@@ -55,6 +56,13 @@ def test_jacobian_is_the_derivative_of_the_flow(case: Case) -> None:
     torch.testing.assert_close(jacobian, rows_jacobian(flow, x), rtol=1e-12, atol=1e-12)
     difference = central_difference(flow, x, dx)
     torch.testing.assert_close((jacobian @ dx[:, :, None])[:, :, 0], difference, rtol=1e-9, atol=1e-9)
+
+
+def test_blocks_of_passive_points_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    flow, x = flow_of(case_named("sum")), case_named("sum").points(M, seed=1)
+    whole = flow(x), *flow.with_jacobian(x)
+    monkeypatch.setattr(geodesic, "BLOCK_ROWS", M - 1)
+    torch.testing.assert_close((flow(x), *flow.with_jacobian(x)), whole, rtol=0, atol=1e-13)
 
 
 @every_case

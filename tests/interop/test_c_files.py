@@ -5,12 +5,13 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from c_bank import C99, COMPILER, CPLUSPLUS, STRICT, compiled, needs_compiler
+from c_bank import C99, COMPILER, CPLUSPLUS, STRICT, CModel, compiled, needs_compiler
 from deformation_bank import model_of
 from robots_bank import CHAINS
 
@@ -52,6 +53,16 @@ def undefined_and_defined(library: Path) -> tuple[set[str], dict[str, str]]:
     words = [line.split() for line in listing.splitlines()]
     needed = {word[1].partition("@")[0] for word in words if len(word) == 2 and word[0] == "U"}
     return needed, {word[2]: word[1] for word in words if len(word) == 3}
+
+
+@needs_compiler
+def test_calls_from_several_threads(files: CFiles) -> None:
+    made = CModel(files.source, 3, 2)
+    each = np.random.default_rng(5).uniform(-1, 1, (2, 400, 3))
+    expected = [made.poses_and_jacobian(rows) for rows in each]
+    with ThreadPoolExecutor(2) as threads:
+        for number, found in enumerate(threads.map(made.poses_and_jacobian, [*each] * 9)):
+            np.testing.assert_equal(found, expected[number % 2])
 
 
 @needs_compiler
@@ -146,6 +157,7 @@ def test_names_cannot_end_a_comment(tmp_path: Path) -> None:
     ("path", "options", "message"),
     [
         ("model.cpp", {}, "`path`: expected the name of a C file"),
+        ("/", {}, "`path`: expected the name of a C file"),
         ("model.c", {"frame": "world"}, "`frame`: expected 'base' or 'measuring', got 'world'"),
         ("model.c", {"prefix": "a-b"}, "prefix of names in C"),
         ("7axes.c", {}, "pass `prefix`"),

@@ -50,6 +50,13 @@ def test_the_geometric_calibration_is_taken_where_it_is_better(arm: Case) -> Non
         assert rms(found.geometry.points(arm.test.q), model(arm.test.q)) < 2e-8
 
 
+@pytest.mark.slow
+def test_cross_validation_predicts_the_error_elsewhere(arm_200: Case) -> None:
+    found = rigid_kinematics(arm_200.model)
+    elsewhere = rms(found.geometry.points(arm_200.test.q), arm_200.model(arm_200.test.q))
+    assert found.validated[found.how] == pytest.approx(elsewhere, rel=0.15)
+
+
 def test_numbers_are_those_of_the_geometry(arm: Case) -> None:
     model = arm.model
     found = rigid_kinematics(model)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import threading
@@ -11,11 +12,12 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
 from math_bank import normal, torch_threads
-from sum_bank import Formulated, assert_same, every_formula, every_profile, points
+from sum_bank import Formulated, assert_same, every_formula, every_profile, mapped, points
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -78,6 +80,12 @@ def test_shares_of_processes_add_up() -> None:
     for rows in (None, i):
         shares = [program.totals(rows, j, lambda tiles, k=k: list(tiles)[k::2]) for k in range(2)]
         torch.testing.assert_close(shares[0] + shares[1], program.totals(rows, j), rtol=1e-13, atol=1e-10)
+
+
+def test_points_of_other_types_go_elsewhere() -> None:
+    j = points(40, 2)
+    for other in (j._replace(momenta=j.momenta.float()), mapped(j, Tensor.float)):
+        assert Fused().reduce(FIELD, GaussianProfile(), None, other) is None
 
 
 # --- The exponential ---------------------------------------------------------------------------------------------
@@ -207,6 +215,15 @@ def test_without_llvmlite_tiles_do_the_work(monkeypatch: pytest.MonkeyPatch) -> 
             assert torch.equal(dc.Gaussian(0.5).using("fused").field(None, q, a), expected)
     finally:
         sums._reason.cache_clear()
+
+
+def test_what_cannot_be_written_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor would a full disk become fuller with every process."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(os, "replace", Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))))
+    monkeypatch.setattr(sums, "machine", cache(sums.Machine))
+    fused(FIELD, GaussianProfile(), None, points(30, 2))
+    assert list((tmp_path / "diffeo_calib" / "fused").iterdir()) == []
 
 
 def test_threads_that_start_together_share_one_machine(monkeypatch: pytest.MonkeyPatch) -> None:

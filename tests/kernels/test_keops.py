@@ -127,6 +127,15 @@ def test_backends_agree(
     assert_close(method(case.kernel.using(backend), *inputs(case, *size)), expected)
 
 
+@every_method
+@pytest.mark.parametrize("size", [(6, 5), (0, 5), (6, 0), (0, 0)])
+def test_strided_and_empty_inputs(method: Method, size: tuple[int, int]) -> None:
+    case = WITH_EVERY_FORMULA
+    strided = [torch.stack([t, t], -1)[..., 0] for t in inputs(case, *size)]
+    expected = method(case.kernel.using("dense"), *inputs(case, *size))
+    torch.testing.assert_close(method(case.kernel.using("keops"), *strided), expected, rtol=1e-12, atol=1e-12)
+
+
 def test_single_precision(only: Callable[[Backend], None]) -> None:
     single = [t.float() for t in inputs(SINGLE)]
     expected = METHODS["field"](SINGLE.kernel.using("dense"), *single)

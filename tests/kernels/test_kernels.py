@@ -188,6 +188,7 @@ def test_sums_are_flat_and_add() -> None:
     x = normal(4, 2, seed=1)
     expected = one.matrix(x, x) + two.matrix(x, x) + three.matrix(x, x)
     torch.testing.assert_close(total.matrix(x, x), expected, rtol=0, atol=1e-15)
+    assert torch.equal(total.field(x=None, q=x, a=x), total.field(None, x, x))
 
 
 def test_an_empty_sum_is_refused() -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.kernels.base import Kernel
+from diffeo_calib.kernels.base import Kernel, SumKernel
 
 
 class Skewed(Kernel):
@@ -71,6 +71,15 @@ def test_defaults_agree_with_closed_forms(dim: int) -> None:
         same(getattr(PLAIN, method)(*arguments), getattr(CLOSED, method)(*arguments))
     same(PLAIN.field(None, q, a), CLOSED.field(None, q, a))
     same(PLAIN.field(x, q, normal(5, 4, dim, seed=3)), CLOSED.field(x, q, normal(5, 4, dim, seed=3)))
+
+
+def test_sums_with_kernels_of_the_package() -> None:
+    """Constructor arguments may have any name."""
+    own = Plain(0.8, 1.3)
+    own.diagonal = True  # pyright: ignore[reportAttributeAccessIssue]
+    x, left = normal(4, 2, seed=1), normal(4, 3, 2, seed=2)
+    terms = own, dc.Gaussian(0.5), dc.Matern(0.7)
+    same(SumKernel(terms).gram(x, left, x, left), sum(t.gram(x, left, x, left) for t in terms))
 
 
 def section_5_with(kernel: Kernel, k: int = 8) -> dc.Problem:

@@ -48,6 +48,17 @@ def test_profile_matrix_is_made_pair_by_pair(profile: Profile) -> None:
         assert_same([backends.profile_matrix(profile, i + shift, j + shift)], [expected])
 
 
+@every_formula
+@torch_backends
+@pytest.mark.parametrize("same", [False, True])
+def test_strided_inputs(formula: Formula, backend: Backend, same: bool) -> None:
+    expected = backends.evaluate(formula, GaussianProfile(), *sides(same), backend)
+    i, j = (None if p is None else mapped(p, lambda t: torch.stack([t.T, t.T], -1)[..., 0].T) for p in sides(same))
+    assert j is not None
+    assert not j.features.is_contiguous()
+    assert_same(backends.evaluate(formula, GaussianProfile(), i, j, backend), expected)
+
+
 @every_profile
 @every_formula
 @torch_backends

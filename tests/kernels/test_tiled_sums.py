@@ -102,6 +102,14 @@ def test_the_number_of_threads_changes_no_digit(formula: Formula) -> None:
     assert_same(found[0], expected, 1e-9)
 
 
+def test_buffers_of_inference_mode_serve_outside_of_it() -> None:
+    i, formula = points(COLUMNS, 1), GRADIENT
+    tiled.BUFFERS.of(7, i.features).clear()
+    with torch.inference_mode():
+        inside = Tiled(7).reduce(formula, GaussianProfile(), None, i)
+    assert_same(Tiled(7).reduce(formula, GaussianProfile(), None, i), list(inside), 0.0)
+
+
 # --- Differentiation --------------------------------------------------------------------------------------------
 
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from product_bank import Case
 from recorded_bank import made_with
-from robots_bank import parallelogram
+from robots_bank import CHAINS, parallelogram
 from table_bank import held
 from torch import Tensor
 from torch.testing import assert_close
@@ -19,9 +19,13 @@ from two_arms_bank import HANDS, robot
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.kinematics.compensation.box_search import box_minimum, joint_limits
+from diffeo_calib.kinematics.compensation.box_search import _Search, box_minimum, joint_limits
+from diffeo_calib.kinematics.compensation.chord import Box
+from diffeo_calib.kinematics.compensation.kinematics import ToolFunctions, tool_functions
+from diffeo_calib.kinematics.compensation.targets import Targets
 from diffeo_calib.measurements.poses import angle_between
 from diffeo_calib.robots.joint import Joint
+from diffeo_calib.robots.se3 import twist_transform
 
 ROWS = 12
 TOOLS = torch.tensor([[0.0, 0.0, 0.1], [0.02, 0.05, 0.0]], dtype=torch.float64)
@@ -162,6 +166,45 @@ def test_the_minimum_in_a_box() -> None:
         values = [0.5 * s @ H[row] @ s + g[row] @ s for s in (found[row], expected)]
         assert values[0] == pytest.approx(values[1], rel=1e-9, abs=1e-12)
         assert bool(((found[row] >= low[row]) & (found[row] <= high[row])).all())
+
+
+def rigid(model: dc.CalibratedKinematics, axes: int) -> tuple[ToolFunctions, Targets, Array]:
+    """Kinematics of all tips; targets for six rows, far away, with one free tip of several in two; joint values."""
+    rng, tips = np.random.default_rng(1), model.robot.tips
+    poses, free = twist_transform(torch.from_numpy(rng.standard_normal((6, len(tips), 6)))).numpy(), np.zeros((6, 2))
+    free[1, 0] = free[4, 1] = len(tips) - 1
+    parts = poses[..., :3, 3], poses[..., :3, :axes], np.eye(3)[:, 3 - axes :]
+    tool = tool_functions(model, {tip: torch.eye(4, dtype=torch.float64) for tip in tips}, "base")[1]
+    return tool, Targets(*parts, 0.3, free[:, : len(tips)] > 0), rng.uniform(-2, 2, (6, model.robot.n))
+
+
+@pytest.mark.parametrize("axes", [3, 1, 0])
+@pytest.mark.parametrize("slides", [False, True])
+def test_gradient_and_hessian_of_the_cost(model: dc.CalibratedKinematics, axes: int, slides: bool) -> None:
+    """By central differences."""
+    tool, goal, q = rigid(made_with(CHAINS["slides"], dc.RK4(1)) if slides else model, axes)
+
+    def slope(at: Array) -> Array:
+        return -np.einsum("nkj,nk->nj", goal.slopes(tool.jacobian(at)), goal.errors(tool.poses(at)))
+
+    S = goal.slopes(tool.jacobian(q))
+    hessian, h = S.swapaxes(1, 2) @ S + goal.curvature(tool.jacobian(q), tool.poses(q)), 1e-5
+    for joint, step in enumerate(h * np.eye(q.shape[1])):
+        rise = goal.cost(tool.poses(q + step)) - goal.cost(tool.poses(q - step))
+        np.testing.assert_allclose(slope(q)[:, joint], rise / (2 * h), rtol=0, atol=1e-8)
+        change = (slope(q + step) - slope(q - step)) / (2 * h)
+        np.testing.assert_allclose(hessian[:, :, joint], change, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_joints_that_push_against_their_limits_are_apart(side: float) -> None:
+    tool, goal, q = rigid(made_with(CHAINS["arm"], dc.RK4(1)), 3)
+    box = Box(q, np.minimum(q, q - side), np.maximum(q, q - side), np.ones_like(q))
+    found = _Search(tool, goal, q, box, tool.poses(q))
+    free = side * found.gradient > 0
+    assert 5 < free.sum() < free.size - 5
+    together = (free[:, :, None] & free[:, None, :]) | np.eye(q.shape[1], dtype=bool)
+    np.testing.assert_array_equal(np.abs(found.hessian) > 1e-12, together)
 
 
 # --- limits ---------------------------------------------------------------------------------------------------------

@@ -72,6 +72,26 @@ def test_known_points_place_their_devices(kind: str) -> None:
     assert_close(robust.constants[:, :size], known[:, :size], rtol=0, atol=1e-3)
 
 
+@pytest.mark.parametrize(("kind", "zero"), [("distance", 0.0), ("distance", 0.3), ("height", 0.0)])
+def test_the_rows_of_a_device_alone_find_it_and_the_ball(kind: str, zero: float) -> None:
+    """From poses of the tip, of an unknown zero too."""
+    R, t, ball = rotation(2 * normal(ROWS, 3, seed=6)), normal(ROWS, 3, seed=7), normal(3, seed=8)
+    known = constants(kind)[:1] + torch.tensor([0.0, 0.0, 0.0, zero], dtype=torch.float64)
+    data = replace(readings(kind), device=torch.zeros(ROWS, dtype=torch.int64), offset_std=float(zero > 0))
+    there = replace(KINDS[kind].at(readings(kind), points(Q)[:, 0]), constants=known)
+    data = replace(data, values=there.observation(data.device).value(R @ ball + t))
+    assert_close(torch.cat(KINDS[kind].alone(data, R, t) or ()), torch.cat([ball, known[0]]), rtol=0, atol=1e-9)
+
+
+def test_a_stated_camera_is_right_handed_and_looks_at_its_point() -> None:
+    numbers = normal(9, 6, seed=5)
+    R, t = Cameras.stated(numbers)[:, :12].view(9, 3, 4).split([3, 1], 2)
+    assert_close(torch.linalg.det(R), torch.ones(9, dtype=torch.float64))
+    assert_close(R.mT @ t, -numbers[:, :3, None])
+    line = numbers[:, 3:] - numbers[:, :3]
+    assert_close(R[:, 2], line / line.norm(dim=1, keepdim=True))
+
+
 @pytest.mark.parametrize("size", [0.0, 1e-6, 0.3, 20.0])
 def test_a_unit_vector_of_least_squares(size: float) -> None:
     """As good as the best of many, whatever the target's size; no target leaves the direction of least variance."""

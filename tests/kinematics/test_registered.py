@@ -19,7 +19,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.interop.model_header import describe, rebuild_registration
 from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.kinematics.re_registration.linear_rows import LinearRows
-from diffeo_calib.kinematics.re_registration.registered_map import Registration, moved
+from diffeo_calib.kinematics.re_registration.registered_map import Registration, check_isotropic, moved
 from diffeo_calib.measurements.poses import mark_points, poses_from_marks
 from diffeo_calib.robots.se3 import twist_transform
 
@@ -98,6 +98,23 @@ def test_registration_follows_the_frame(arm: Case, *, learn: bool) -> None:
     again = there.registered(seen(arm, rows, S @ T), free="base", learn=False)
     torch.testing.assert_close(again(q), by(S @ T, here(q)), rtol=0, atol=1e-8)
     torch.testing.assert_close(again.predict(q)[1], S[:3, :3] @ there.predict(q)[1] @ S[:3, :3].mT, rtol=0.05, atol=0)
+
+
+def test_two_formulas_of_what_a_registration_adds(arm: Case) -> None:
+    """Covariances of single configurations, and of several together; of a changed robot, whose frame is found."""
+    q = arm.test.q[20:24]
+    fitted = arm.model.registered(seen(arm, slice(0, 8), transform(3)), learn=False).map
+    single, together = fitted.predict(q, noise=False)[1], fitted.joint_covariance(q).unflatten(0, (4, 3))
+    blocks = torch.stack([together[k, :, 3 * k : 3 * k + 3] for k in range(4)])
+    torch.testing.assert_close(blocks, single, rtol=1e-9, atol=1e-16)
+    known, wider = (one.predict(q, noise=False)[1] for one in (arm.model.map, arm.model.map.inflated(50.0)))
+    torch.testing.assert_close(wider, 50 * known, rtol=1e-6, atol=0.0)
+
+
+def test_a_task_kernel_with_directions_cannot_be_moved() -> None:
+    for kernel in (dc.Gaussian([0.3, 0.3, 0.4], 1.0), dc.Gaussian(0.3, [1.0, 1.0, 2.0])):
+        with pytest.raises(InputError, match="is not the same in all directions"):
+            check_isotropic(kernel)
 
 
 def test_rows_of_the_model_itself_change_nothing(arm: Case) -> None:

@@ -181,6 +181,25 @@ def test_motions_of_base_and_tool_count_for_nothing(arm: Case, monkeypatch: pyte
     assert_close(after, before, rtol=0, atol=1e-3 * float(before.diagonal(dim1=1, dim2=2).max()))
 
 
+@pytest.mark.slow
+def test_it_is_what_the_truth_leaves_after_both_are_taught(arm_200: Case) -> None:
+    """One marker: most of the tool's error is its place on the flange, and a robot's base is known even worse."""
+    model, test = arm_200.model, arm_200.test.q
+    q, count = torch.cat([reference(arm_200), test]), 9 * len(reference(arm_200))
+    found = points(model.tool_poses(q, TOOL, "measuring"))
+    errors = found - points(true_poses(200, 1, q, TOOL))
+    motions = [moved(arm_200, q, t, of=of) for of in ("base", "tool") for t in torch.eye(6, dtype=torch.float64)]
+    S = torch.stack([(one - found) / STEP for one in motions], 1)
+    taught = errors[:, None] - S @ torch.linalg.lstsq(S[:count], errors[:count, None]).solution
+    left, whole = (float(e[count:].view(-1, 3, 3).mean(1).square().sum(1).mean().sqrt()) for e in (taught, errors))
+    each = [model.predict_tool_poses(test, TOOL, frame)[1] for frame in ("measuring", "base")]
+    each.insert(0, covariance_without_placement(model, test, TOOL))
+    predicted, measuring, in_base = (float(C.diagonal(dim1=1, dim2=2)[:, :3].sum(1).mean().sqrt()) for C in each)
+    assert left < 0.5 * whole
+    assert 0.5 * left < predicted < 2.0 * left
+    assert predicted < 0.5 * measuring < 0.5 * in_base
+
+
 def test_rows_alone_and_together_are_the_same(arm: Case) -> None:
     """What is taught anew is found over the model's configurations, not over the commands."""
     q = arm.test.q[:3]

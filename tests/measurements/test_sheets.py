@@ -1,8 +1,10 @@
 """Spreadsheets, arrays of NumPy and variables of MATLAB hold the same rows as a CSV file."""
 
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 import openpyxl
@@ -73,7 +75,10 @@ def test_the_rows_are_those_of_a_csv_file(tmp_path: Path, kind: str, sep: str) -
 
 @pytest.mark.parametrize(
     ("kind", "note"),
-    [("the sheet with rows", "sheet 'Sheet' read, not notes"), ("arrays", "arrays gain left out: they have no 7 rows")],
+    [
+        ("the sheet with rows", "sheet 'Sheet' read, not notes"),
+        ("arrays", "arrays gain left out: no numbers or texts of 7 rows"),
+    ],
 )
 def test_what_was_decided_is_said(tmp_path: Path, kind: str, note: str) -> None:
     name, write, joints, places = WRITERS[kind]
@@ -83,9 +88,20 @@ def test_what_was_decided_is_said(tmp_path: Path, kind: str, note: str) -> None:
 
 
 def test_lines_are_those_of_the_sheet(tmp_path: Path) -> None:
+    """Whatever size the file says that the sheet has: some programs write that of one cell."""
     _book(tmp_path / "t.xlsx")
-    rows = CsvLines(tmp_path / "t.xlsx", ",").rows()
-    assert [line for line, _ in rows] == list(range(4, 11))
+    with ZipFile(tmp_path / "t.xlsx") as book, ZipFile(tmp_path / "one.xlsx", "w") as other:
+        for name in book.namelist():
+            other.writestr(name, re.sub(b'<dimension ref="[^"]*"', b'<dimension ref="A1"', book.read(name)))
+    for name in ("t.xlsx", "one.xlsx"):
+        rows = CsvLines(tmp_path / name, ",").rows()
+        assert [line for line, _ in rows] == list(range(4, 11))
+
+
+def test_a_text_may_begin_with_the_name_of_a_program(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("MATLAB export of Monday\nq1,q2\n1.5,2.5\n", encoding="utf-8")
+    file = CsvLines(tmp_path / "t.csv", ",")
+    assert (file.header, file.rows()) == (["q1", "q2"], [(3, ["1.5", "2.5"])])
 
 
 def test_poses_and_texts_have_columns(tmp_path: Path) -> None:
@@ -97,10 +113,21 @@ def test_poses_and_texts_have_columns(tmp_path: Path) -> None:
     assert first == ["0", "1", *map(repr, poses[0].flatten().tolist()), "mon"]
 
 
+def test_cells_of_texts_are_a_column(tmp_path: Path) -> None:
+    """And not those that hold something else."""
+    own = {"day": np.array(["mon", "tuesday"], dtype=object), "all": np.array([{"a": 1.0}, "b"], dtype=object)}
+    savemat(tmp_path / "t.mat", {"q": JOINTS[:2], **own})
+    file = CsvLines(tmp_path / "t.mat", ",")
+    assert file.header == ["q_1", "q_2", "day"]
+    assert [cells[2] for _, cells in file.rows()] == ["mon", "tuesday"]
+    assert file.notes == ["arrays all left out: no numbers or texts of 2 rows"]
+
+
 BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "one array of one axis": ("t.npy", lambda path: np.save(path, ROWS[0]), "of shape .5,."),
     "objects": ("t.npy", lambda path: np.save(path, np.array([{}, []], dtype=object)), "cannot be read"),
     "no rows": ("t.npz", lambda path: np.savez(path, gain=1.0), "the arrays gain"),
+    "arrays without rows": ("t.npz", lambda path: np.savez(path, q=JOINTS[:0], p=PLACES[:0]), "no column"),
     "damaged archive": ("t.xlsx", lambda path: path.write_bytes(b"PK\x03\x04 and no more"), "cannot be read"),
     "no cells": ("t.xlsx", lambda path: openpyxl.Workbook().save(path), "without cells"),
     "old spreadsheet": ("t.xls", lambda path: path.write_bytes(b"\xd0\xcf\x11\xe0" + bytes(60)), "save it as .xlsx"),

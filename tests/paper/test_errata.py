@@ -8,7 +8,7 @@ from math import factorial
 import numpy as np
 import pytest
 import torch
-from eulerian_bank import deformed, momenta, small_problem
+from eulerian_bank import CORRECTED, P0, deformed, momenta, small_problem
 from math_bank import K_V, K_W, normal, rr_problem, uniform
 from numpy.polynomial import hermite_e
 from torch import Tensor
@@ -100,12 +100,29 @@ def test_erratum_2_the_transported_jacobian_is_some_per_cent_off(bed: dc.Problem
     assert mean_error(better.model, x) < 1e-2 * mean_error(elastic_rr.nominal, x)
 
 
+def test_erratum_2_order_of_the_missing_term() -> None:
+    """Dk1 compared with differences of k1: a first-order error as printed, a second-order one with -D^2k0[v]."""
+    x = uniform(10, 2, seed=0)
+    for equations, ratio in ((Eulerian(), 2.0), (CORRECTED, 4.0)):
+        errors = [jacobian_error(FittedMap(deformed(s * P0, equations), small_problem().noise), x) for s in (0.1, 0.05)]
+        assert errors[0] / errors[1] == pytest.approx(ratio, rel=0.15)
+
+
 def test_erratum_3_the_energy_drifts_with_p_div_v_and_not_without(bed: dc.Problem, corrected: dc.Fit) -> None:
     """On the optimum's path 1/2 |v|^2 + 1/2 |w|^2 should be constant."""
     printed = fitted(bed, printed_divergence=True)
     assert corrected.energy_drift < 0.01
     assert printed.energy_drift > 10 * corrected.energy_drift
     assert printed.energy > corrected.energy
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("sigma", "share"), [(100.0, (0.9, 1.1)), (200.0**-0.5, (0.0, 0.05)), (0.01, (0.0, 0.05))])
+def test_erratum_4_sigma_100_is_no_sigma(sigma: float, share: tuple[float, float]) -> None:
+    """As the sigma of (5), 100 leaves the model undeformed; as a weight 1 / (2 sigma^2) or 1 / sigma it calibrates."""
+    x, solver = uniform(300, 2, seed=2), dc.LBFGS(max_iterations=15)
+    model = dc.fit(rr_problem(6, noise=sigma), solver, dc.RK4(2), formulation="eulerian").model
+    assert share[0] < mean_error(model, x) / mean_error(elastic_rr.nominal, x) < share[1]
 
 
 def gaussian_derivative(order: int, x: np.ndarray, variance: float) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from eulerian_bank import CORRECTED, P0, SWITCHES, deformed, momenta, name, small_problem
-from math_bank import K_V, K_W, naive_rk4, normal, tensor, uniform
+from math_bank import K_V, K_W, naive_rk4, normal, planar_two_markers, tensor, two_marker_problem, uniform
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -195,6 +195,19 @@ def test_agrees_with_the_exact_model_to_first_order(equations: Eulerian) -> None
     ratios = np.array(gaps[:-1]) / np.array(gaps[1:])
     np.testing.assert_allclose(ratios, 4.0, atol=1.0)
     assert gaps[-1] < 0.01
+
+
+def test_several_markers_move_in_one_field() -> None:
+    """Two markers of one configuration are two landmarks of w: against the field of all marker points."""
+    problem, p0 = two_marker_problem(uniform(5, 2, seed=2)), 0.05 * normal(10, 2, seed=3)
+    flow = EulerianProblem(problem).deform(momenta(p0), dc.RK4(1)).flow
+    z = planar_two_markers(problem.x).reshape(10, 2)
+    jacobian = as_nominal(planar_two_markers).jacobian(problem.x, torch.zeros(0))
+    a = -torch.einsum("imn,im->in", jacobian, p0.reshape(5, 4))
+    v, w = problem.spec.joint_kernel.field(problem.x, problem.x, a), problem.spec.task_kernel.field(z, z, p0)
+    rate = flow.unpack(flow.rates(flow.nodes[0]))[0]
+    expected = w.reshape(5, 4) - torch.einsum("imn,in->im", jacobian, v)
+    torch.testing.assert_close(rate, expected, rtol=0, atol=1e-13)
 
 
 def test_curvature_of_the_nominal_map() -> None:

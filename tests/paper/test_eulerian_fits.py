@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gc
+from weakref import ref
+
 import numpy as np
 import pytest
 import torch
 from eulerian_bank import P0, deformed
-from math_bank import few_points
+from math_bank import few_points, uniform
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, NumericalError
@@ -22,6 +25,9 @@ def test_converges_where_the_problem_is_easy() -> None:
     again = dc.fit(fit.problem, formulation="eulerian", start=fit.momenta)
     assert again.energy == pytest.approx(fit.energy, rel=1e-8)
     assert fit.energy == pytest.approx(dc.fit(few_points()).energy, rel=0.1)
+    x = uniform(6, 2, seed=3)
+    found = fit.model.inverse(fit.model(x), x + 0.01)
+    torch.testing.assert_close(fit.model(found), fit.model(x), rtol=0, atol=1e-10)
 
 
 def test_shooting_starts_at_the_tangent_solution_and_ends_at_12() -> None:
@@ -46,6 +52,17 @@ def test_lbfgs_by_torchdiffeq_and_its_adjoint() -> None:
         )
     ]
     np.testing.assert_allclose(energies, energies[0], rtol=1e-3)
+
+
+def test_a_flow_ends_with_its_last_reference() -> None:
+    """And with it the tensors that autograd keeps: a fit has many flows."""
+    gc.collect()
+    gc.disable()
+    try:
+        flow = ref(deformed(P0).flow)
+        assert flow() is None
+    finally:
+        gc.enable()
 
 
 def test_no_configurations_give_no_points() -> None:

@@ -6,6 +6,7 @@ from math import pi
 import pytest
 import torch
 
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots import elastic_rr
 
 # torch compiles its forward-mode rules on first use with torch.jit.script, which it has deprecated.
@@ -75,3 +76,8 @@ def test_smooth_and_periodic(k0: Callable[[torch.Tensor], torch.Tensor]) -> None
     each = torch.func.vmap(torch.func.jacrev(lambda z: k0(z[None])[0]))(x.detach())
     both = torch.func.vmap(torch.func.jacfwd(lambda z: k0(z[None])[0]))(x.detach())
     torch.testing.assert_close(each, both)
+
+
+def test_wrong_shapes_are_explained() -> None:
+    with pytest.raises(InputError, match=r"`x` has the wrong shape: expected \(N, 2\), got \(4, 3\)"):
+        elastic_rr.real(torch.zeros(4, 3))

@@ -118,6 +118,13 @@ def test_chains_check_their_mimic_joints(mimic: Mapping[str, Mapping[str, float]
         build(crooked_joints(KINDS), {name: (drivers, 0.0) for name, drivers in mimic.items()})
 
 
+def test_the_mimic_of_a_joint_is_a_copy() -> None:
+    drivers = {"k": 1.0}
+    joint = Joint("j", "revolute", torch.eye(4), mimic=drivers)
+    drivers["k"] = 2.0
+    assert joint.mimic == {"k": 1.0}
+
+
 @pytest.mark.parametrize("convention", ["standard", "craig"])
 def test_rows_of_a_table_with_mimic(convention: str) -> None:
     free = [(0.1, 0.4, 0.3, 0.2), (-0.2, -1.1, 0.5, 0.7, "prismatic"), (0.3, 0.9, -0.1), (0.1, 0.2, 0.4)]

@@ -88,6 +88,17 @@ def test_measurements_have_the_stated_noise() -> None:
     torch.testing.assert_close(points, SimulatedArm().true_points(q), rtol=0, atol=0)
 
 
+def test_one_joint_wears() -> None:
+    arm, q = SimulatedArm(seed=5, lines=[(5, 100.0, 1e-4)]), SimulatedArm().sample(10)
+    grown = arm.worn(5, 3.0).components(q).transmission - arm.components(q).transmission
+    smooth = SimulatedArm(seed=5).components(q).transmission  # without lines, which do not grow
+    torch.testing.assert_close(grown[:, 5], 2.0 * smooth[:, 5], rtol=0, atol=1e-15)
+    assert float(grown[:, :5].abs().max()) == 0.0
+    torch.testing.assert_close(arm.worn(-1, 3.0).true_points(q), arm.worn(5, 3.0).true_points(q), rtol=0, atol=0)
+    with pytest.raises(IndexError):
+        arm.worn(6, 3.0)
+
+
 def test_wrong_options_are_explained() -> None:
     wrong: list[dict[str, Any]] = [{"noise": -1.0}, {"gravity": -0.5}, {"markers": 0}, {"payload": float("nan")}]
     for options in wrong:

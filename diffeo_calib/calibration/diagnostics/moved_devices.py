@@ -14,6 +14,7 @@ has one set of effects for all rows, and gains chi-squared.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from math import exp, lgamma, log
 from types import MappingProxyType
 from typing import NamedTuple
@@ -30,6 +31,7 @@ from diffeo_calib.common.quantiles import chi2_median, chi2_probability
 from diffeo_calib.kinematics.nominal import rigid_motions
 from diffeo_calib.process.process import Process
 from diffeo_calib.process.scales import Hyperparameters
+from diffeo_calib.process.tails import FACTORS
 from diffeo_calib.sensors.devices import Hypothesis
 from diffeo_calib.sensors.set_ups import frame_slopes
 
@@ -42,7 +44,6 @@ SLOW = (
     "measure in random order; or name a column of times or temperatures (`time`, `temperature`), with which the model "
     "then drifts"
 )
-
 
 VARIATION_M = torch.logspace(-6, -2, 41, dtype=torch.float64, device="cpu")
 """RMS motions by a number that differs from row to row."""
@@ -160,41 +161,44 @@ def change_during(
 
 
 class Variation(NamedTuple):
-    """A number that differs from row to row.
-
-    Args:
-        hypothesis: which. size: its standard deviation. motion: RMS motion of a coordinate by it, m. odds: logarithm.
-    """
+    """A number that differs from row to row: which, with effects on coordinates, its deviation, and log odds."""
 
     hypothesis: Hypothesis
     size: float
-    motion: float
     odds: float
 
     @property
     def sentence(self) -> str:
         """What differs by how much, and what to do."""
-        unit, per_unit = self.hypothesis.unit or ("mm", 1e-3)
-        got = f"about {self.size / per_unit:.2g} {unit}, which moves the tool by {1e3 * 3**0.5 * self.motion:.2g} mm"
+        (unit, per_unit), e = self.hypothesis.unit or ("mm", 1e-3), self.hypothesis.effects
+        moved = 1e3 * self.size * float((3 * e[e != 0].square().mean()).sqrt())
+        got = f"about {self.size / per_unit:.2g} {unit}, which moves the tool by {moved:.2g} mm"
         what = f"{self.hypothesis.name} seems to differ"
         return sentence(what, expected="the same for all rows", got=got, fix=self.hypothesis.fix)
 
 
 def variation(data: TangentData, scales: Hyperparameters, hypotheses: Iterable[Hypothesis]) -> Variation | None:
-    """The likeliest number that differs from row to row, if it is clear: an unknown u_i ~ N(0, s^2) of every row i."""
+    """The likeliest number that differs from row to row, if it is clear: an unknown u_i ~ N(0, s^2) of every row i.
+
+    It is clear beside the tails of the noise, but seems small beside those that it makes: s counts all but gross rows.
+    """
     rows, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed=0)
-    process, found = some.process(scales), list[Variation]()
-    numbers = torch.arange(len(process.numbers.cells), device=rows.device)
-    for one in hypotheses:
-        e = process.numbers.of_table(some.motions_in_numbers(one.effects[rows]))[:, 0]
-        E = e.new_zeros(len(e), len(rows)).index_put((numbers, process.numbers.owner), e)
-        motion = float(e[e != 0].square().mean().sqrt())
-        sizes = VARIATION_M.to(e) / motion
-        odds = Evidence.of(E[:, (E != 0).any(0)], process).log_odds(sizes.square())
-        best = int(odds.argmax())
-        found.append(Variation(one, float(sizes[best]), float(VARIATION_M[best]), float(odds[best])))
-    clear = max(found, key=lambda one: one.odds, default=None)
-    return None if clear is None or clear.odds < gates.ROW_ODDS else clear
+    found = (_varying(one, rows, some, scales) for one in hypotheses)
+    clear, weights = max(found, key=lambda one: one.odds, default=None), some.tails.weights
+    if clear is None or clear.odds < gates.ROW_ODDS:
+        return None
+    tails = replace(some.tails, weights=weights.where(weights < 1.0 / FACTORS[0], 1.0))
+    return _varying(clear.hypothesis, rows, some.with_tails(tails), scales)
+
+
+def _varying(one: Hypothesis, rows: Tensor, some: TangentData, scales: Hyperparameters) -> Variation:
+    process = some.process(scales)
+    e = process.numbers.of_table(some.motions_in_numbers(one.effects[rows]))[:, 0]
+    numbers = torch.arange(len(e), device=rows.device)
+    E = e.new_zeros(len(e), len(rows)).index_put((numbers, process.numbers.owner), e)
+    sizes = VARIATION_M.to(e) / float(e[e != 0].square().mean().sqrt())
+    odds = Evidence.of(E[:, (E != 0).any(0)], process).log_odds(sizes.square())
+    return Variation(one, float(sizes[odds.argmax()]), float(odds.max()))
 
 
 def findings(
@@ -203,9 +207,7 @@ def findings(
     """Every hypothesis from its most likely row on, and drifting.
 
     Gains are divided by ``excess``, or by the mean square of what is left unexplained where that is larger.
-
-    Args:
-        order: (N,) row numbers in the order of measurement.
+    ``order``: (N,) row numbers in the order of measurement.
     """
     found = []
     for one in hypotheses:

@@ -158,9 +158,8 @@ class LensAndBoard(CameraErrors):
 
     def widened(self, table: Measurements) -> LensAndBoard:
         """The same with the noise of the images as a table of them has it now."""
-        (shared,), each = table.shared_errors(), range(len(self.explained))
-        corners = [_corners(shared, number) for number in each]
-        explained = tuple(replace(self.explained[number], corners=corners[number]) for number in each)
+        (shared,) = table.shared_errors()
+        explained = tuple(replace(own, corners=_corners(shared, k)) for k, own in enumerate(self.explained))
         return replace(self, shared=shared, explained=explained)
 
     def sees(self, row: int, points: Tensor, views: Mapping[str, View]) -> Tensor:

@@ -39,7 +39,6 @@ from diffeo_calib.robots.tree import Tree
 
 SMALLEST_STROKE = 1e-9
 
-
 JOINT_DIGITS = 6
 """Decimal places of joint values in a plan: no controller takes more."""
 

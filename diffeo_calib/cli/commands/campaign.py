@@ -20,8 +20,8 @@ from diffeo_calib.campaign.feeds import DECISIONS, ID, Entry, Inbox, as_line, ch
 from diffeo_calib.campaign.journal import BEGUN, KEPT, GrowingTable, Journal, digest
 from diffeo_calib.campaign.verdicts import Verdict
 from diffeo_calib.cli.console import err, interrupts, plain, say
+from diffeo_calib.cli.declarations import CampaignOptions
 from diffeo_calib.cli.models import robot_of
-from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.printed import EXIT_ABOVE, parsed_length
 from diffeo_calib.cli.record import EXIT_INTERRUPTED, record
 from diffeo_calib.cli.tables import MeasuredTable, joint_columns, measured_table
@@ -55,7 +55,7 @@ class Live:
     source: MeasuredTable
     tips: Sequence[str]
     journal: Journal
-    given: Command
+    given: CampaignOptions
     table: GrowingTable = field(init=False)
     owner: list[int] = field(default_factory=list)
     lines: list[bytes] = field(default_factory=list)
@@ -308,7 +308,7 @@ def expected(campaign: Campaign) -> str:
     return "" if known is None else f", {1e3 * known:.4g} mm expected{below}"
 
 
-def run(given: Command) -> None:
+def run(given: CampaignOptions) -> None:
     """Follow a table until the target is reached or the rows end."""
     if given.rows.by is not None or given.rows.marker is not None:
         fix = "give every row in one line of one file, with columns for each marker"
@@ -339,7 +339,7 @@ def run(given: Command) -> None:
         raise typer.Exit(code)
 
 
-def _followed(live: Live, given: Command, inbox: Inbox, page: Page | None) -> int:
+def _followed(live: Live, given: CampaignOptions, inbox: Inbox, page: Page | None) -> int:
     """Follow a campaign to its end; the exit code."""
     step = interrupts.watching(lambda *_: None, lambda text: err.print(plain(text)))
     try:
@@ -355,7 +355,7 @@ def _followed(live: Live, given: Command, inbox: Inbox, page: Page | None) -> in
     return 0 if live.campaign.goal is None or live.campaign.reached else EXIT_ABOVE
 
 
-def _happening(live: Live, given: Command, inbox: Inbox) -> Iterator[bool]:
+def _happening(live: Live, given: CampaignOptions, inbox: Inbox) -> Iterator[bool]:
     """Do what comes, until the rows end; yields whether anything was done."""
     if given.stdin:
         Thread(target=read_lines, args=(sys.stdin.buffer, inbox), daemon=True).start()

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.cli.console import out, plain, progress_bar, say, text_table
+from diffeo_calib.cli.declarations import CorrectOptions
 from diffeo_calib.cli.models import as_fitted, load_laden, tool_in_tip
-from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import ProgramTable, joint_columns, joints_of, table_format
 from diffeo_calib.common.checks import check_number
@@ -96,7 +96,7 @@ class ToolOnTip:
         return added | {self.name("std", table.length): deviation}
 
 
-def run(options: Command) -> None:
+def run(options: CorrectOptions) -> None:
     """Read a program, correct it, write it and print a summary; units that are not typed are those of the fit."""
     _check(options)
     model = load_laden(options.model, options.payload_mass)
@@ -149,7 +149,7 @@ def run(options: Command) -> None:
     say(f"{corrected}, the pose to command ({frames}), status, miss and standard deviation")
 
 
-def _check(options: Command) -> None:
+def _check(options: CorrectOptions) -> None:
     for name, value in (("--limit", options.limit), ("--rate", options.rate)):
         if value is not None:
             check_number(value, name, above=0.0)
@@ -158,7 +158,7 @@ def _check(options: Command) -> None:
         raise InputError.of("--frame measuring: the nominal poses of commands are in the robot's base", fix=fix)
 
 
-def _tools(model: CalibratedKinematics, named: Command, table: TableFormat) -> list[ToolOnTip]:
+def _tools(model: CalibratedKinematics, named: CorrectOptions, table: TableFormat) -> list[ToolOnTip]:
     """The tools that have targets."""
     robot, tips = model.robot, named.tip or []
     if named.tool and len(named.tool) != max(len(tips), 1):

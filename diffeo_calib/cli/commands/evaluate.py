@@ -10,6 +10,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge
 from diffeo_calib.cli.console import out, plain, say
+from diffeo_calib.cli.declarations import EvaluateOptions
 from diffeo_calib.cli.models import (
     another_date_lines,
     check_payload_column,
@@ -17,7 +18,6 @@ from diffeo_calib.cli.models import (
     provenance_lines,
     table_of,
 )
-from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.printed import (
     ErrorTable,
     accept,
@@ -53,7 +53,7 @@ COLUMNS = ("line", "used_in_fit", "kind", "device", "marker", "dx", "dy", "dz", 
 """Of the table of residuals."""
 
 
-def run(options: Command) -> None:
+def run(options: EvaluateOptions) -> None:
     """Run the command."""
     model = load_kinematics(options.model)
     source = table_of(model, options.csv, options.rows, options.units)
@@ -132,7 +132,7 @@ def _residuals(found: Evaluations, used: Tensor, source: MeasuredTable) -> Itera
         yield [*cells, *values, source.table.length if metres else entry["unit"]]
 
 
-def _registered(model: CalibratedKinematics, data: Any, options: Command) -> None:
+def _registered(model: CalibratedKinematics, data: Any, options: EvaluateOptions) -> None:
     """Find device and markers anew; print what was found and the errors before and after, and write the model."""
     output = options.output
     warn_outside_range(model, data.q)

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from diffeo_calib.calibration.expected_errors import ExpectedError, stands_free
 from diffeo_calib.cli.console import out, plain, say, text_table
+from diffeo_calib.cli.declarations import ExportOptions
 from diffeo_calib.cli.models import load_laden, tool_in_tip
-from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.printed import placement_lines
 from diffeo_calib.cli.record import make_folder, record
 from diffeo_calib.common.files import write_together
@@ -62,7 +62,7 @@ class _Export:
         geometry: the rigid kinematics that are written; None for none.
     """
 
-    def __init__(self, model: CalibratedKinematics, given: Command) -> None:
+    def __init__(self, model: CalibratedKinematics, given: ExportOptions) -> None:
         self.model, self.given = model, given
         self.files: dict[str, bytes] = {}
         self.rows: dict[str, RigidKinematics] = {NOMINAL: nominal_kinematics(model)}
@@ -132,9 +132,9 @@ class _Export:
         return {folder / name: text.encode() for name, text in files.items()}
 
 
-def run(given: Command) -> None:
+def run(given: ExportOptions) -> None:
     """Write the files, then say what each leaves of the model."""
-    files = {one.shown: getattr(given, one.field) for one in given.all() if one.kind in ("output", "source", "folder")}
+    files = {one.shown: getattr(given, one.field) for one in given.all() if one.kind in ("write", "source", "folder")}
     wanted: dict[str, Path] = {option: path for option, path in files.items() if path is not None}
     if not wanted:
         raise typer.BadParameter(f"name at least one file to write: {', '.join(files)}")
@@ -158,7 +158,7 @@ def run(given: Command) -> None:
 
 
 def _write_programs(
-    model: CalibratedKinematics, given: Command, tool: Tensor | None, source: CFiles | None
+    model: CalibratedKinematics, given: ExportOptions, tool: Tensor | None, source: CFiles | None
 ) -> Iterator[str]:
     """Write the programs that are no texts, of the tool (4, 4), m, in the tip's frame; a sentence about each program.
 
@@ -208,7 +208,7 @@ def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> N
         say(f"RMS distance from the measured positions of the fit, mm: {left}")
 
 
-def _dh_lines(table: DHTable, given: Command) -> Iterator[str]:
+def _dh_lines(table: DHTable, given: ExportOptions) -> Iterator[str]:
     """Base and tool of a Denavit-Hartenberg table, and the joints with Hayati's parameter."""
     for name, transform in (("base", table.base), ("tool", table.tool)):
         numbers = zip(origin_numbers(transform), (given.length, given.angle), strict=True)

@@ -16,9 +16,9 @@ from diffeo_calib.calibration.judgement import check_errors, contradicted
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, KindErrors, errors_by_kind
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, out, progress_bar, say
+from diffeo_calib.cli.declarations import DemoOptions, FitOptions, ReportOptions
 from diffeo_calib.cli.main import app
 from diffeo_calib.cli.models import load_kinematics, made_by_command, provenance_lines, robot_of, table_of
-from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.printed import (
     ErrorTable,
     expectation_lines,
@@ -55,7 +55,7 @@ Errors = dict[str, KindErrors]
 """Errors of every stage by the kind of rows."""
 
 
-def run(given: Command) -> None:
+def run(given: FitOptions) -> None:
     """Calibrate with the rows that are not held out, write the model, and end with the exit code of the fit."""
     source = measured_table(given.csv, given.rows, given.units, given.duplicates)
     with progress_bar() as progress:
@@ -139,7 +139,7 @@ def _lines_about_places(
     yield from placement[1:] if placed.free else placement  # without a device the robot's base is the measuring frame
 
 
-def _write_pictures(result: CalibrationResult, given: Command, errors: Errors, rows: str, data: Any) -> None:
+def _write_pictures(result: CalibrationResult, given: FitOptions, errors: Errors, rows: str, data: Any) -> None:
     """Draw the figure and write the report, if they are wanted; ``rows`` are what ``data`` to show are."""
     if given.figure is not None:
         shown = f"{sum(len(one.rows) for one in errors.values())} {rows}"
@@ -155,7 +155,7 @@ def _write_pictures(result: CalibrationResult, given: Command, errors: Errors, r
         say(f"report: {given.report} (open it in a browser)")
 
 
-def _record(result: CalibrationResult, in_train: Errors, held_out: Errors, given: Command) -> None:
+def _record(result: CalibrationResult, in_train: Errors, held_out: Errors, given: FitOptions) -> None:
     """Add the results for programs."""
     both = {"training": in_train, "held_out": held_out}
     kinds = {kind: {rows: one[kind].stages for rows, one in both.items() if kind in one} for kind in in_train}
@@ -224,7 +224,7 @@ def _show_findings(result: CalibrationResult, rows: int) -> None:
         )
 
 
-def run_report(wanted: Command) -> None:
+def run_report(wanted: ReportOptions) -> None:
     """Write the page, and say its first line."""
     model, data = load_kinematics(wanted.model), None
     if wanted.data is not None:
@@ -251,7 +251,7 @@ def run_report(wanted: Command) -> None:
 POSITION = ("measurement_x", "measurement_y", "measurement_z")
 
 
-def run_demo(given: Command) -> None:
+def run_demo(given: DemoOptions) -> None:
     """Write an arm and its measurements, and calibrate it by a command that is printed."""
     make_folder(folder := given.output)
     arm = SimulatedArm(seed=given.seed)

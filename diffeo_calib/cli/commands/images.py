@@ -10,7 +10,7 @@ from diffeo_calib.cameras.detection import Board
 from diffeo_calib.cameras.files import camera_text
 from diffeo_calib.cameras.folder import page, read_folders
 from diffeo_calib.cli.console import progress_bar, say
-from diffeo_calib.cli.options import Command
+from diffeo_calib.cli.declarations import ImagesOptions, RecordOptions
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import shown
 from diffeo_calib.common.files import write_together, write_whole
@@ -21,7 +21,7 @@ from diffeo_calib.measurements.stops import PLACE, TURN, StopLimits, pictured, r
 from diffeo_calib.measurements.table_format import TableFormat, options_of
 
 
-def run(given: Command) -> None:
+def run(given: ImagesOptions) -> None:
     """Find the board, and write corners, cameras and overview."""
     output, table = given.output, TableFormat(given.length, "rad", given.sep, given.decimal)
     with progress_bar() as progress:
@@ -54,7 +54,7 @@ def run(given: Command) -> None:
     record.add(rows=rows, refused=refused, files={"table": output, **files})
 
 
-def run_record(given: Command) -> None:
+def run_record(given: RecordOptions) -> None:
     """Find the stops, write them, and say how to go on."""
     output, offset, limits = given.output, given.offset, StopLimits(joints=given.still, shortest=given.shortest)
     joints, names, seen = read_bag(given.bag, given.joints, given.seen)

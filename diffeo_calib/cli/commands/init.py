@@ -15,6 +15,7 @@ from typing import NamedTuple
 from diffeo_calib.calibration.diagnostics.likely_mistakes import UNMOVED_JOINT_RANGE
 from diffeo_calib.cli import commanded_poses, proposals
 from diffeo_calib.cli.console import say
+from diffeo_calib.cli.declarations import InitOptions
 from diffeo_calib.cli.guesses import (
     NAMED,
     Choice,
@@ -29,7 +30,7 @@ from diffeo_calib.cli.guesses import (
     with_places,
 )
 from diffeo_calib.cli.models import is_urdf, load_robot
-from diffeo_calib.cli.options import CORNERS, Command, Links
+from diffeo_calib.cli.options import CORNERS, Links
 from diffeo_calib.cli.proposals import Source
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.common.files import write_whole
@@ -77,7 +78,7 @@ class Arm(NamedTuple):
         return Arm(links, self.joints[:count], self.ends[:count], self.columns[:count], self.how, self.lacking)
 
 
-def run(given: Command) -> None:
+def run(given: InitOptions) -> None:
     """Propose a campaign, write it, and print it; a file that was edited is replaced with --force alone."""
     output = given.output
     if given.csv.is_dir():

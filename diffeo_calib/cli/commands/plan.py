@@ -15,8 +15,9 @@ from diffeo_calib.calibration.planning.knowledge import MARKER
 from diffeo_calib.calibration.planning.plan import Plan, drawn, plan, sensors_for
 from diffeo_calib.calibration.planning.sensors import Sensor
 from diffeo_calib.cli.console import out, progress_bar, say, text_table
+from diffeo_calib.cli.declarations import PlanOptions
 from diffeo_calib.cli.models import as_fitted, load_kinematics, load_robot, planned
-from diffeo_calib.cli.options import DRAWN, Candidates, Command
+from diffeo_calib.cli.options import DRAWN, Candidates
 from diffeo_calib.cli.printed import expectation_lines
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import joint_columns, joints_of, stated_numbers, table_format
@@ -57,10 +58,10 @@ def sensors_of(words: list[str] | None, table: TableFormat) -> list[Sensor]:
     return [*found, *(SENSORS[kind](places) for kind, places in numbers.items())]
 
 
-def run(given: Command) -> None:
+def run(given: PlanOptions) -> None:
     """Plan, write the poses, and print what to expect of them."""
-    cell, count, output = given.cell, given.count, given.output
-    if given.model is None and given.robot is None:
+    cell, count, output, begin = given.cell, given.count, given.output, given.model or given.robot
+    if begin is None:
         raise InputError.of("what to plan for", expected="a MODEL, or --robot", got="neither")
     with progress_bar() as progress:
         model = None if given.model is None else load_kinematics(given.model)
@@ -69,7 +70,7 @@ def run(given: Command) -> None:
         numbers = [stated_numbers("--marker", text, (3,)) for text in given.marker or ()]
         markers = torch.tensor(numbers or [MARKER], dtype=torch.float64, device=HOST)
         markers = markers / table.per_metre if numbers else markers
-        source = model or load_robot(given.robot, given.links)
+        source = model or load_robot(begin, given.links)
         if model is not None:
             source, markers = planned(model, given.payload_mass)
         robot = source.robot if isinstance(source, CalibratedKinematics) else source

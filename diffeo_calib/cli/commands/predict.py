@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.cli.console import progress_bar, say
+from diffeo_calib.cli.declarations import PredictOptions
 from diffeo_calib.cli.models import as_fitted, check_payload_column, load_kinematics, provenance_lines
-from diffeo_calib.cli.options import Command, Rows
+from diffeo_calib.cli.options import Rows
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import joint_columns, joints_of, table_format, with_rows
 from diffeo_calib.common.errors import InputError
@@ -35,7 +36,7 @@ OWN_FRAME = (
 )
 
 
-def run(given: Command) -> None:
+def run(given: PredictOptions) -> None:
     """Read joint values, and write them with predictions and their standard deviations, block by block.
 
     A payload that is a number is the mass of all rows.
@@ -86,7 +87,9 @@ def run(given: Command) -> None:
         say(f"`evaluate` and `fit` read these poses with {reading_options(table, prefixes)}")
 
 
-def _written_as_read(model: CalibratedKinematics, given: Command) -> tuple[TableFormat, str | PoseColumns | None]:
+def _written_as_read(
+    model: CalibratedKinematics, given: PredictOptions
+) -> tuple[TableFormat, str | PoseColumns | None]:
     """The format of the predictions, and the names of the joint columns, by default those of the fit."""
     units = given.units
     rows = Rows(convention=given.convention, rotation_angle=given.rotation_angle, payload=given.payload)

@@ -15,8 +15,8 @@ from diffeo_calib.calibration.recalibration.offsets import HiddenOffset
 from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
 from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
 from diffeo_calib.cli.console import progress_bar, say
+from diffeo_calib.cli.declarations import CompareOptions, RecalibrateOptions
 from diffeo_calib.cli.models import another_date_lines, load_kinematics, made_by_command, provenance_lines, table_of
-from diffeo_calib.cli.options import Command
 from diffeo_calib.cli.printed import frame_lines, motion_lines, placement_lines
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.common.errors import InputError, few
@@ -24,7 +24,7 @@ from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.joint_ranges import warn_outside_range
 
 
-def run(given: Command) -> None:
+def run(given: RecalibrateOptions) -> None:
     """Recalibrate, write the model, say what has changed, and end with the exit code of the fit."""
     model, tests = load_kinematics(given.old), given.tests
     source = table_of(model, given.csv, given.rows, given.units)
@@ -94,7 +94,7 @@ def change_lines(changes: Changes, none: object = None) -> list[str]:
     return [f"  {change}" for change in changes.found] or [str(none or changes), *smallest[: len(changes.smallest)]]
 
 
-def run_compare(given: Command) -> None:
+def run_compare(given: CompareOptions) -> None:
     """Compare a model with new measurements, or with another model."""
     model, other = load_kinematics(given.old), given.other
     if _is_model(other):

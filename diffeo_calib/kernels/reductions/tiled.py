@@ -20,6 +20,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.threads import in_parallel, small_work
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions.formulas import (
@@ -210,7 +211,7 @@ def _recycled(weights: Weights, elements: int, i: Points, j: Points) -> tuple[li
         return buffer[: shape[0] * shape[1]].view(shape)
 
     def taken() -> Tensor:
-        return free.pop() if free else torch.empty(elements, dtype=i.features.dtype, device=i.features.device)
+        return free.pop() if free else outside_inference_mode(i.features.new_empty)(elements)
 
     def dots(k: int, scale: float = 1.0) -> Tensor:
         """A leaf times a number, in a new buffer."""

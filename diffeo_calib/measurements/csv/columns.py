@@ -87,8 +87,8 @@ class Hideable(NamedTuple):
     @classmethod
     def of(cls, groups: Sequence[Group], word: str, names: Sequence[str]) -> Hideable:
         """The columns of these groups among all names; deviations are values where there are no others."""
-        known = [names.index(name) for group in groups if group.check is DEVIATION for name in group.names]
-        values = [names.index(name) for group in groups if group.check is not DEVIATION for name in group.names]
+        known = [names.index(name) for group in groups if group.check == DEVIATION for name in group.names]
+        values = [names.index(name) for group in groups if group.check != DEVIATION for name in group.names]
         return cls(values or known, known if values else [], word)
 
 

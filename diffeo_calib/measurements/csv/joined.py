@@ -83,9 +83,8 @@ def joined_file(
     """A file with the columns of the tables of joints and of places, joined by a common column.
 
     ``by`` is the common column, or "A=B" where the places have it under another name B. Another usual separator of one
-    of the files is found by it. ``several``: whether lines of places may
-    share their joint values, as those of markers do. MeasurementError for a file that cannot be read or lacks the
-    column, several partners of a line, or no pair.
+    of the files is found by it. ``several``: whether lines of places may share their joint values, as those of markers
+    do. MeasurementError for a file that cannot be read or lacks the column, several partners of a line, or no pair.
     """
     own, _, other = by.partition("=")
     tables = table, measured = _Table.read(joints, own, sep), _Table.read(places, other or own, sep)

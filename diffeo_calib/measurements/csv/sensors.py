@@ -26,7 +26,6 @@ LENGTH = Check(
     "a distance above 0", fix="repair or remove these lines; distances with an unknown zero are displacements"
 )
 
-
 Written = tuple[Mapping[Any, Tensor | None], Mapping[str, Sequence[str]], Tensor]
 """Rows as lines of a file: numbers in SI by what they are, texts by their column, and the row (M,) of each line."""
 

@@ -8,9 +8,11 @@ several arrays those with the most common number of rows are the table.
 from __future__ import annotations
 
 import csv
+import math
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from io import BytesIO, StringIO
 from itertools import product
 from pathlib import Path
@@ -30,30 +32,32 @@ PLACES = {"p", "pos", "position", "positions", "point", "points", "xyz", "marker
 def as_text(path: Path, data: bytes, sep: str) -> tuple[str, list[str]] | None:
     """A table that is no text, with ``sep`` between its cells, and what was decided; None for text.
 
-    Raises:
-        MeasurementError: a spreadsheet of an old format, arrays that are no table, or a package that is not installed.
+    MeasurementError for a spreadsheet of an old format, arrays that are no table, or a package that is not installed.
     """
-    if data.startswith(OLD_SHEET):
-        raise _no_table(path, "a spreadsheet of an old format", "save it as .xlsx or CSV")
-    if data.startswith(HDF5):
-        raise _no_table(path, "a MATLAB file of version 7.3", "save it with `save(..., '-v7')`, or as CSV")
-    file = BytesIO(data)
-    if data.startswith(ZIP):
-        names = _zipped(file)
-        reader = _arrays_of_zip if names and all(name.endswith(".npy") for name in names) else _spreadsheet
-    elif data.startswith(NUMPY):
-        reader = _array
-    elif data.startswith(MATLAB) or (b"\0" in data and path.suffix.lower() == ".mat"):  # version 4 has no mark
-        reader = _variables
-    else:
+    variables = b"\0" in data and (data.startswith(MATLAB) or path.suffix.lower() == ".mat")  # version 4 has no mark
+    if not variables and not data.startswith((ZIP, OLD_SHEET, NUMPY)):
         return None
-    rows, notes = reader(path, file)
+    rows, notes = _table(path, data)
     text = StringIO()
     csv.writer(text, delimiter=sep, lineterminator="\n").writerows(rows)
     return text.getvalue(), notes
 
 
 Rows = Sequence[Sequence[object]]
+
+
+@lru_cache(maxsize=2)  # a spreadsheet of 5000 rows takes a second, and `init` reads its tables many times
+def _table(path: Path, data: bytes) -> tuple[Rows, list[str]]:
+    """The cells of a file that is no text, and what was decided."""
+    if data.startswith(OLD_SHEET):
+        raise _no_table(path, "a spreadsheet of an old format", "save it as .xlsx or CSV")
+    if data.startswith(HDF5):
+        raise _no_table(path, "a MATLAB file of version 7.3", "save it with `save(..., '-v7')`, or as CSV")
+    file = BytesIO(data)
+    if not data.startswith(ZIP):
+        return (_array if data.startswith(NUMPY) else _variables)(path, file)
+    names = _zipped(file)
+    return (_arrays_of_zip if names and all(name.endswith(".npy") for name in names) else _spreadsheet)(path, file)
 
 
 def _no_table(path: Path, got: str, fix: str) -> MeasurementError:
@@ -80,6 +84,8 @@ def _spreadsheet(path: Path, file: BinaryIO) -> tuple[Rows, list[str]]:
         raise _no_table(path, "a spreadsheet, and openpyxl, which reads it, is not installed", fix) from None
     try:
         book = load_workbook(file, read_only=True, data_only=True)
+        for sheet in book.worksheets:
+            sheet.reset_dimensions()  # which some programs write as one cell
         sheets = {sheet.title: list(sheet.iter_rows(values_only=True)) for sheet in book.worksheets}
     except Exception as error:  # openpyxl raises errors of many kinds for damaged files
         raise _no_table(path, f"a spreadsheet that cannot be read ({error})", "save it as .xlsx or CSV") from error
@@ -139,6 +145,8 @@ def _loaded(path: Path, load: Callable[[], Any]) -> Any:
 def _joined(path: Path, arrays: Mapping[str, Any]) -> tuple[Rows, list[str]]:
     """Arrays (N, ...) of numbers or texts side by side below their names; those of other lengths are left out."""
     known = {name: np.asarray(array) for name, array in arrays.items()}
+    cells = {name: array for name, array in known.items() if array.dtype.kind == "O"}  # of MATLAB
+    known |= {name: array.astype(str) for name, array in cells.items() if all(isinstance(v, str) for v in array.flat)}
     usable = {name: array for name, array in known.items() if array.dtype.kind in "fiubUS" and 0 < array.ndim < 4}
     counts = Counter[int]()
     for array in usable.values():
@@ -148,9 +156,9 @@ def _joined(path: Path, arrays: Mapping[str, Any]) -> tuple[Rows, list[str]]:
     rows = counts.most_common(1)[0][0]
     own = {name: array for name, array in usable.items() if len(array) == rows}
     header = [column for name, array in own.items() for column in _names(name, array.shape[1:])]
-    values = zip(*(_texts(array.reshape(rows, -1)) for array in own.values()), strict=True)
+    values = zip(*(_texts(array.reshape(rows, math.prod(array.shape[1:]))) for array in own.values()), strict=True)
     left = [name for name in known if name not in own]
-    notes = [f"arrays {few(left)} left out: they have no {rows} rows"] * bool(left)
+    notes = [f"arrays {few(left)} left out: no numbers or texts of {rows} rows"] * bool(left)
     return [header, *([cell for part in row for cell in part] for row in values)], notes
 
 
