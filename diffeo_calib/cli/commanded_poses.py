@@ -38,7 +38,7 @@ MOST_ROWS, STEPS = 40, (1, 3)
 """Rows whose motions are compared, and how many rows each of these spans."""
 JOINTS = "q0", "q1"
 """First names of four numbers before a place that are joint values rather than a quaternion."""
-MOST_WAYS = 60
+MOST_WAYS, FEW_WAYS = 60, 6
 """Ways to read the rows that are tried with a registration; where there are more, nothing about rotations is sure."""
 TURNED = "robot-pose", "angle", "convention", "rotation-angle", "camera-on-tool"
 ALIKE, EXACT = 6.0, 1e-6
@@ -197,7 +197,7 @@ def _read(
         ways = _alike((metres[0], own), (metres[1], seen))
     else:
         ways = list(product(own or [Reading()], seen or [Reading()], (False, True) if rows.of_boards else (False,)))
-    for commanded, measured, camera in ways:
+    for commanded, measured, camera in ways[:FEW_WAYS] if any(lengths) else ways:
         pose = PoseColumns((*machine.place, *machine.turn), commanded.convention)
         table = TableFormat(other, commanded.angle, sheet.sep, sheet.decimal)
         table = replace(table, joint_length=None if length == other else length, camera_on_tool=camera)
