@@ -18,7 +18,7 @@ from diffeo_calib.calibration.diagnostics.likely_mistakes import (
     refuse_or_warn,
     residual_of,
 )
-from diffeo_calib.calibration.diagnostics.misplaced_rows import check_row_order
+from diffeo_calib.calibration.diagnostics.row_order import check_row_order
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.identification.registration import (
     can_register,
