@@ -13,8 +13,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.fitting.objective import tangent
-from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.fitting.problem import Problem, tangent
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.observation import LinearFunctionals, Observation, ReadPoints
 from diffeo_calib.robots import elastic_rr
