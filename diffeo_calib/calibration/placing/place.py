@@ -27,9 +27,9 @@ from diffeo_calib.calibration.placing.lens import LensAndBoard
 from diffeo_calib.calibration.placing.placement import OtherLabel, OtherRows, Placement, label_text
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
-    ball_of,
     identify_readings,
     reading_sets,
+    stages_beside,
     with_freed_devices,
 )
 from diffeo_calib.calibration.placing.sessions import Sessions
@@ -51,8 +51,8 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import errors_of_kinds
 from diffeo_calib.sensors.devices import ROW, Devices
 from diffeo_calib.sensors.errors import Evaluations, shown_unit
-from diffeo_calib.sensors.places import Places, fitting_devices
-from diffeo_calib.sensors.tables import Coordinates, OtherReadings, ball_tip, check_poses, divided, with_markers
+from diffeo_calib.sensors.places import Places
+from diffeo_calib.sensors.tables import Coordinates, OtherReadings, check_poses, divided, with_markers
 
 
 class Told(NamedTuple):
@@ -348,14 +348,7 @@ def _by_coordinates(
     LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", *(1e3 * stage.rms for stage in stages))
     warn_of_joints_below_tip(robot, table)
     warn_of_open_directions(robot, table, stages[0])
-    tables, tips = [one.table for one in readings], stages[0].geometry.on
-    if table.sockets is None:  # else a socket shows the ball
-        ball = ball_of(tables, stages[1].geometry, ball_tip(None, readings, tips[-1]))
-        stages = stages if ball is None else [stage.with_ball(ball) for stage in stages]
-    stages = [
-        replace(one, devices=tuple(fitting_devices(own, one.geometry.points(own.q)) for own in tables))
-        for one in stages
-    ]
+    stages = stages_beside(stages, readings, table)
     sets = reading_sets(readings, stages[1].devices, table)
     cameras = LensAndBoard.of_table(table, own.rows, stages[0], sessions)
     placement = Placement((*sessions, *sockets, *cameras, *sets))

@@ -36,8 +36,8 @@ from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.devices import Devices, Hypothesis, check_devices
 from diffeo_calib.sensors.kinds import kind_of
-from diffeo_calib.sensors.places import PlacedDevices
-from diffeo_calib.sensors.tables import OtherReadings
+from diffeo_calib.sensors.places import PlacedDevices, fitting_devices
+from diffeo_calib.sensors.tables import OtherReadings, ball_tip
 
 ROUGH_M = 2e-3
 """Errors of a robot before its calibration, to compare starts."""
@@ -215,6 +215,22 @@ def reading_sets(
         ReadingDevices(table, own, rows, torch.arange(table.values.shape[1], device=rows.device), frame)
         for (table, rows), own in zip(readings, devices, strict=True)
     )
+
+
+def stages_beside(stages: Stages, readings: Sequence[OtherReadings], table: Measurements) -> Stages:
+    """Stages of rows that tell coordinates, with the devices of readings around them, and their ball.
+
+    A ball that rested in sockets is known from these.
+    """
+    tables, geometry = [one.table for one in readings], stages[1].geometry
+    ball = None
+    if table.sockets is None:
+        ball = ball_of(tables, geometry, ball_tip(None, readings, geometry.on[-1]))
+    whole = [stage if ball is None else stage.with_ball(ball) for stage in stages]
+    before, after = (
+        replace(own, devices=tuple(fitting_devices(one, own.geometry.points(one.q)) for one in tables)) for own in whole
+    )
+    return before, after
 
 
 def with_freed_devices(tables: Sequence[Readings], found: Identification) -> Identification | None:
