@@ -26,11 +26,10 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.files import PROGRAM
 from diffeo_calib.measurements.csv.files import read_joints, read_observations
-from diffeo_calib.measurements.csv.images import ImageColumns
 from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
-from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, numeric_columns
+from diffeo_calib.measurements.csv.sensors import ImageColumns, ReadingColumns, SocketColumns, numeric_columns
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table_format import TableFormat

@@ -24,11 +24,12 @@ from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.maps.observation import Distances
+from diffeo_calib.maps.observation import ReadPoints
 from diffeo_calib.process.scales import SCALES
 from diffeo_calib.robots import Geometry, SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.range import FixedPoints
 
 
 def identified(robot: Tree, data: dc.Readings) -> FoundReadings:
@@ -60,7 +61,8 @@ def test_likelihood_and_its_slope_of_distances() -> None:
     one = geometry.with_tool(geometry.tool[:1])
     nominal = type(setting.nominal)(one, elastic=True)
     theta = 1e-4 * normal(nominal.parameters, seed=4)
-    observe = Distances(torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64).repeat(len(x), 1))
+    fixed = torch.tensor([3.0, 2.0, 1.0, 0.0], dtype=torch.float64).repeat(len(x), 1)
+    observe = ReadPoints(FixedPoints.read, fixed, 3)
     y = observe.value(nominal(x, theta)) + 1e-4 * normal(len(x), 1, seed=5)
     tails = type(whole.tails).none(len(x), 1)
     data = TangentData(nominal, theta, x, y, NoiseModel(1, size=1), tails, observe=observe)

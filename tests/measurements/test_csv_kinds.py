@@ -15,8 +15,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.csv.files import read_measurements, read_observations, write_measurements
-from diffeo_calib.measurements.csv.images import ImageColumns
-from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns
+from diffeo_calib.measurements.csv.sensors import ImageColumns, ReadingColumns, SocketColumns
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table_format import TableFormat
