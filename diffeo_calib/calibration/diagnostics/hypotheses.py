@@ -107,7 +107,7 @@ def left_out_rms(process: Process) -> float:
     return (total / len(numbers.q)) ** 0.5
 
 
-# --- lengths against what they are said to be --------------------------------------------------------------------------
+# --- lengths against what they are said to be -------------------------------------------------------------------------
 
 PERCENT = "%", 1e-2
 OF_ROBOT = "check the scale and the unit of the device, known distances, and the robot's variant"
