@@ -22,7 +22,7 @@ from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.re_registration.linear_rows import LinearRows, NewDate
 from diffeo_calib.kinematics.re_registration.session import Session
 from diffeo_calib.maps.noise import measured_coordinates
-from diffeo_calib.measurements.pose_frames import own_blocks
+from diffeo_calib.measurements.poses import own_blocks
 from diffeo_calib.regression.regions import OTHER_DATE, region_scale
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import rotation, transforms
