@@ -92,7 +92,7 @@ def other_columns(robot: Tree, data: Measurements) -> Iterator[Reading]:
             q[:, k] = _joint_values(columns, spare[name], slides=not robot.periodic[k]).to(q.device)
             words = f"column '{shown(name)}' fits as {joint} in place of '{shown(own)}': check the joint columns"
             yield replace(as_read, q=q, words=words)
-    for marker, triple in enumerate(columns.triples):
+    for marker, triple in enumerate(columns.table.triples):
         for axis, own in enumerate(triple):
             for name in _similar([own], spare):
                 points = rotations.with_coordinate(data, marker, axis, spare[name] / columns.table.per_metre)

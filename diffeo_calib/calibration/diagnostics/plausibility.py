@@ -18,7 +18,7 @@ from diffeo_calib.calibration.diagnostics.likely_mistakes import (
     refuse_or_warn,
     residual_of,
 )
-from diffeo_calib.calibration.diagnostics.misplaced_rows import check_row_order
+from diffeo_calib.calibration.diagnostics.row_order import check_row_order
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.identification.registration import (
     can_register,
@@ -260,7 +260,7 @@ def _residual(robot: Tree, data: Measurements, marker: int, tip: str) -> float:
 def check_markers(robot: Tree, data: Measurements) -> None:
     """Refuse markers that are no measurements, with the proof; warn of doubtful ones."""
     for marker, words, proved in unmeasured_markers(robot, data):
-        triples = data.origin.columns.triples if isinstance(data.origin, TableOrigin) else []
+        triples = data.origin.columns.table.triples if isinstance(data.origin, TableOrigin) else []
         numbers = data.marker_names or range(data.markers)
         names = triples[marker] if len(triples) == data.markers else [f"marker {numbers[marker]}"]
         fix = f"leave {few(names)} out: wished or computed places, or the same marker twice, are no measurements"
