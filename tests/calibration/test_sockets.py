@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 import torch
-from diffeo_calib.regression.conditional import WithoutRigidMotions
 from product_bank import with_usual_scales
 from reading_bank import scales
 from simulated_sockets import SocketRows, rest_in_sockets
@@ -27,6 +26,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.regression.conditional import WithoutRigidMotions
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
 
