@@ -96,7 +96,7 @@ class FitRows:
             return measured.masked_fill(~self.map.noise.visible, nan).unflatten(1, (-1, 3))
         if self._measured is None:
             what = "the model has fewer control points than rows, and keeps no trace of the errors of its rows"
-            raise InputError.of(what, fix="pass measurements (--data)")
+            raise InputError.of(what, fix="pass measurements")
         return self._measured.points.to(HOST)
 
     @cached_property

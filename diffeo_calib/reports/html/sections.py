@@ -111,7 +111,7 @@ def how_good(found: Findings) -> Section:
         pictures += stage_pictures(stages, f"-{number}", own)
     see = f"Errors on {sentences.rows_of(found)}: each stage should lie well to the left of the one before it."
     see += " Each kind has its own unit; units are never mixed." * (len(found.kinds) > 1)
-    see = see if found.kinds else "No rows were passed: pass some (--data) to see errors of each kind in its own unit."
+    see = see if found.kinds else "No rows were passed: pass some to see errors of each kind in its own unit."
     notes = [
         "Nominal: the robot's description, placed where it fits best. Geometric: joint axes and links corrected, the "
         "classical calibration. Calibrated: gravity sag, transmission errors and remaining errors as well."
@@ -121,7 +121,7 @@ def how_good(found: Findings) -> Section:
     if found.kinds and not found.shown.new:
         notes.append(
             "Nominal and geometric kinematics were fitted to these poses too, with so few parameters that it hardly "
-            "matters. Measurements of new poses (--data) are the stronger proof."
+            "matters. Measurements of new poses are the stronger proof."
         )
     return Section("errors", "How good", see, [stage_table(own) for own in found.kinds.values()], None, pictures, notes)
 
@@ -301,7 +301,7 @@ def repeatability(found: Findings) -> Section:
     repeats = found.repeats
     if repeats is None:
         see = "No pose was measured twice: pose accuracy and repeatability (ISO 9283) cannot be told from these rows."
-        note = "Repeat five poses, 30 times each, and pass the table with --data."
+        note = "Repeat five poses, 30 times each, and pass the table."
         return Section("repeatability", "Repeatability", see, notes=[note])
     header = ["pose", "measured", "RP [mm]", *(f"AP {name} [mm]" for name in repeats.accuracy)]
     values = torch.stack([repeats.repeatability, *repeats.accuracy.values()], 1)  # (G, 1 + stages) m

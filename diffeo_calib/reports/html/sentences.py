@@ -111,7 +111,7 @@ def advice(found: Findings) -> Iterator[str]:
             of = f"{own.title}: the" if len(found.kinds) > 1 else "The"
             yield f"{of} model is no better than the {before} one on these rows: measure more poses."
     if found.kinds and not shown.new and not found.errors:
-        yield "These are rows of the fit: pass rows that the model has not seen (--data)."
+        yield "These are rows of the fit: pass rows that the model has not seen."
     if not found.learning_curve or found.learning_curve[-1][0] < len(found.rows):
         return
     if found.forecast is None:
