@@ -298,7 +298,7 @@ class Live:
                 data = replace(self.source, csv=path, growing=True).read(self.campaign.robot, self.tips)
             except DiffeoCalibError as error:
                 raise type(error)(str(error).replace(str(path), str(self.source.csv))) from error
-        return data.rows(data.lines.argsort(stable=True))
+        return data.rows(data.line_numbers.argsort(stable=True))
 
 
 def expected(campaign: Campaign) -> str:

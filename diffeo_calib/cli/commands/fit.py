@@ -11,8 +11,8 @@ from typing import Any
 import typer
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
-from diffeo_calib.calibration.findings import Outlier
-from diffeo_calib.calibration.judgement import check_errors, contradicted
+from diffeo_calib.calibration.diagnostics.outliers import Outlier, contradicted
+from diffeo_calib.calibration.judgement import check_errors
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, KindErrors, errors_by_kind
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, out, progress_bar, say

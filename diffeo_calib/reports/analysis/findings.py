@@ -12,10 +12,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.outliers import Outlier
+from diffeo_calib.calibration.diagnostics.row_order import common_cause
 from diffeo_calib.calibration.expected_errors import expected_errors
-from diffeo_calib.calibration.findings import Outlier, Part, parts
-from diffeo_calib.calibration.judgement import Accuracy, accuracy, block_text, judge, steps_of
+from diffeo_calib.calibration.findings import Part, parts
+from diffeo_calib.calibration.judgement import Accuracy, accuracy, judge
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.result import Progress, silent
@@ -359,8 +360,7 @@ def _left_out(model: CalibratedKinematics, rows: FitRows, stages: Mapping[str, K
     errors[own] = Evaluations.of([(found.errors, torch.arange(len(found), device=HOST))], len(found))
     outliers, moved = found.outliers(model), list[str]()
     if model.registration is None:  # else the rows of its fit are in another place
-        steps = steps_of(model, found.data) if len(outliers) >= gates.LAG_ROWS else []
-        moved = [step.sentence() for step in steps[:1]] or [block_text(model, found.data, outliers) or ""]
+        moved = [common_cause(model, found.data, outliers) or ""]
     return Shown(errors, found.data.q, found.data.lines, False, found, outliers, list(filter(None, moved)))
 
 

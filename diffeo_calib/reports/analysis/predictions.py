@@ -20,7 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.findings import Outlier, excluded, found_outliers
+from diffeo_calib.calibration.diagnostics.outliers import Outlier, excluded, found_outliers
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.quantiles import chi2_above, known
@@ -306,7 +306,9 @@ class Predictions:
 
     def outliers(self, model: CalibratedKinematics) -> list[Outlier]:
         """Rows further from their prediction than the claims allow by chance in all rows, the worst first."""
-        return found_outliers(model, self.data, excluded(self.squares, 3), self.errors.errors)
+        freedom = torch.full_like(self.squares, 3.0)
+        bad = excluded(self.squares, freedom, by_others=False)
+        return found_outliers(model, self.data, bad, self.errors.errors)
 
 
 def _errors(points: Tensor, data: Measurements) -> Evaluation:

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.findings import Outlier
+from diffeo_calib.calibration.diagnostics.outliers import Outlier
 from diffeo_calib.common.errors import PACKAGE, printable
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics, measured_words
