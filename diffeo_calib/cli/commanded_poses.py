@@ -87,6 +87,9 @@ def bodies_in(csv: Path, sheet: Sheet) -> list[Body]:
     while matrix := matrix_in(csv, sheet, [name for name in sheet.numbers if name not in used]):
         found.append(Body(*(list(names) for names in matrix)))
         used |= {*found[-1].place, *found[-1].turn}
+    for group in whole([name for name in sheet.numbers if name not in used], "xy"):
+        if group.wished and not group.says("rate", "deviation", "turn"):
+            found.append(Body(list(group.names.values()), []))
     for labels in NUMBERED:
         for group in whole([name for name in sheet.numbers if name not in used], labels):
             names = list(group.names.values())

@@ -338,6 +338,23 @@ def test_a_slide_that_stood_still_is_corrected(tmp_path: Path, command: Command)
     assert float(added.max() - added.min()) > 0.1
 
 
+def test_a_table_with_two_slides_is_corrected_where_it_can_move(tmp_path: Path, command: Command, init: Any) -> None:
+    places = torch.rand(40, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    places[:, 2] = 0.0
+    measured = bent(places) + 2e-5 * drawn(40, 3, seed=2)
+    measured[:, 2] += 3e-4 * (4.0 * places[:, 0]).sin()
+    table = write_columns(tmp_path / "t.csv", cmdx_cmdy=1e3 * places[:, :2], x_y_z=1e3 * measured)
+    assert init(table)[0]["robot-pose"] == "cmdx,cmdy"
+    done = command("fit", tmp_path / "c.toml", "--holdout", "0")
+    assert done.code in (0, 3), done.error
+    done = command("correct", tmp_path / "t.safetensors", table, "-o", tmp_path / "p.csv")
+    assert done.code == 0, done.error
+    header, *rows = cells(tmp_path / "p.csv")
+    assert {row[header.index("status")] for row in rows} == {"reached"}
+    sent = torch.tensor([[*map(float, row[:2]), 0.0] for row in rows], dtype=torch.float64) / 1e3
+    assert without_frames(bent(sent), places) < 0.15 * without_frames(bent(places), places)
+
+
 def test_nothing_is_sure_where_the_machine_never_turns(tmp_path: Path, init: Any) -> None:
     """Every convention explains the rows."""
     commanded = flange()

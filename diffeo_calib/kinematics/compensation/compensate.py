@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -49,6 +49,8 @@ from diffeo_calib.robots.tree import Tree
 
 BOUND_FACTOR_BETWEEN_ROWS = 10.0
 """Default bounds where rows start at the row before, in units of the usual ones."""
+LEAST_DIRECTION = 1e-3
+"""Motion of a tool in a direction, as a share of its largest one, below which slides do not move it there."""
 ROWS_PER_BOUND = 0.1
 """Default rate of a path without times, in bounds per row."""
 
@@ -133,6 +135,9 @@ def compensate(
     The base frame is the robot's base **as it was found**: it absorbs what cannot be told apart from it, such as a
     constant offset of the first joint. Intended poses of a nominal program, ``robot(q) @ tool``, are targets in it.
 
+    Of a robot of slides alone, miss and status are those in the directions in which the slides move the tool: a table
+    with two of them does not lift it.
+
     Args:
         model: a calibrated model of a robot.
         targets: (N, 4, 4) poses or (N, 3) positions of the tool centre point, m. For a robot with several tips those of
@@ -178,6 +183,9 @@ def compensate(
     goals = checked_targets(wanted, robot, len(begin), axis=axis, tool_axis=tool_axis, lever=lever)
     tools = _tools(model, tool, goals)
     exact, rough = tool_functions(model, tools, frame)
+    if not any(robot.periodic):
+        v = rough.jacobian(np.zeros((1, robot.n)))[0, :, :3]
+        goals = replace(goals, along=v @ np.linalg.pinv(v, rcond=LEAST_DIRECTION))
     motion = largest_motion(robot, bound, BOUND_FACTOR_BETWEEN_ROWS if following and bound is None else 1.0)
     aimed = np.ones((len(begin), 1), dtype=bool) if goals.free is None else ~goals.free
     mobility = mobilities(robot, weights, tuple(tools), aimed)

@@ -48,6 +48,7 @@ class Targets:
         tool_axes: (3, A) the axes in the frame of the tool.
         lever: L in m.
         free: (N, T) True where a tool may be anywhere; None for targets of the single tool of a model.
+        along: (T, 3, 3) projectors on the directions in which shifts count; None for all.
     """
 
     position: Array
@@ -55,6 +56,7 @@ class Targets:
     tool_axes: Array
     lever: float = 0.1
     free: Array | None = None
+    along: Array | None = None
 
     def __len__(self) -> int:
         return len(self.position)
@@ -95,27 +97,28 @@ class Targets:
         -slopes^T errors = grad f; zero where a tool is free.
         """
         turn = self.weight * cross(self._pointing(poses), self.axes).sum(3, keepdims=True)  # sin(angle) times its axis
-        return self._joined((self.position - poses[..., :3, 3])[..., None], turn)[..., 0]
+        return self._joined(self._shift(poses)[..., None], turn)[..., 0]
 
     def slopes(self, jacobian: Array) -> Array:
         """Of Jacobians (N, T, 6, n), (N, T k, n): the decrease of the errors, to first order near the target."""
-        return self._joined(jacobian[:, :, :3], jacobian[:, :, 3:])
+        v = jacobian[:, :, :3]
+        return self._joined(v if self.along is None else self.along @ v, jacobian[:, :, 3:])
 
     def cost(self, poses: Array) -> Array:
         """(N,) f in m^2, without cancellation near zero."""
-        shift = self.position - poses[..., :3, 3]
+        shift = self._shift(poses)
         return self._counted(0.5 * np.einsum("nti,nti->nt", shift, shift) + self.lever**2 * self._versine(poses)).sum(1)
 
     def misses(self, poses: Array) -> tuple[Array, Array | None]:
         """(N, T) distances in m, and angles in rad, None where only the position counts; zero where a tool is free."""
-        distance = self._counted(np.linalg.norm(self.position - poses[..., :3, 3], axis=2))
+        distance = self._counted(np.linalg.norm(self._shift(poses), axis=2))
         angle = self._counted(2.0 * np.arcsin(np.sqrt(np.minimum(0.5 * self._versine(poses), 1.0))))
         return distance, angle if self.axes.shape[3] else None
 
     def curvature(self, jacobian: Array, poses: Array) -> Array:
         """(N, n, n) what the Hessian of f has beyond slopes^T slopes, for joints in a row from base to tip."""
         v, w = jacobian[:, :, :3], jacobian[:, :, 3:]  # (N, T, 3, n)
-        shift, pointing, counted = self.position - poses[..., :3, 3], self._pointing(poses), self.across @ w
+        shift, pointing, counted = self._shift(poses), self._pointing(poses), self.across @ w
         upper = -cross(shift[..., None], w).swapaxes(2, 3) @ v  # -(shift x w_i) . v_j
         cosine = (pointing * self.axes).sum((2, 3))[..., None, None]
         turns = w.swapaxes(2, 3)
@@ -123,6 +126,11 @@ class Targets:
         upper += self.lever**2 * (self.weight * bent - counted.swapaxes(2, 3) @ counted)
         upper = self._counted(upper).sum(1)
         return np.triu(upper) + np.triu(upper, 1).swapaxes(1, 2)
+
+    def _shift(self, poses: Array) -> Array:
+        """(N, T, 3) p* - p as far as it counts, m."""
+        shift = self.position - poses[..., :3, 3]
+        return shift if self.along is None else (self.along @ shift[..., None])[..., 0]
 
     def _pointing(self, poses: Array) -> Array:
         """(N, T, 3, A) where the axes of each tool point."""
