@@ -44,6 +44,9 @@ from diffeo_calib.robots.urdf import moving_joints_below, read_urdf
 
 UNMOVED_JOINT_RANGE = 1e-3
 """Range of a joint, rad or m, below which it never moved."""
+GROSS_MEDIANS, KEPT_ROWS, TRIMMINGS = 3.0, 0.75, 2
+"""Distance, in medians, beyond which the rows that are the farthest off may spoil a registration: it is repeated with
+the share of rows that are closest, at most so often."""
 MOST_COLUMNS = 4
 """Most columns that are tried in the place of another one: every try is a registration."""
 
@@ -241,16 +244,28 @@ def _advice(good: list[tuple[float, Reading]], typical: float) -> str:
 
 
 def _residual(reading: Reading) -> float:
-    """Median distance after registration of a random subset of the rows, m; infinite if that cannot be done."""
+    """Median distance after registration of a random subset of the rows, m; infinite if that cannot be done.
+
+    Gross rows are left out of the registration, a few rounds long those that are the farthest off (P. Rousseeuw,
+    K. Van Driessen, "Computing LTS regression for large data sets", 2006).
+    """
     q, points = reading.q, reading.points
     rows = torch.randperm(len(q), generator=seeded(0), device=HOST)[: gates.REGISTERED_ROWS]
     if len(known(points)) < 2 * (6 + 3 * points.shape[1]) or not can_register(points[rows]):
         return torch.inf
-    try:
-        geometry = register(reading.robot, q[rows], points[rows], reading.on).geometry
-    except DiffeoCalibError:
-        return torch.inf
-    return float((geometry.points(q[rows]) - points[rows]).norm(dim=-1).nanmedian())
+    q, points = q[rows], points[rows]
+    typical, kept = torch.inf, torch.ones(len(q), dtype=torch.bool, device=q.device)
+    for _ in range(1 + TRIMMINGS):
+        try:
+            geometry = register(reading.robot, q[kept], points[kept], reading.on).geometry
+        except DiffeoCalibError:
+            break
+        off = (geometry.points(q) - points).norm(dim=-1)
+        typical, worst = min(typical, float(off.nanmedian())), off.nan_to_num(0.0).amax(1)
+        if float(worst.max()) <= GROSS_MEDIANS * typical:
+            break
+        kept = worst <= worst.quantile(KEPT_ROWS)
+    return typical
 
 
 def _other_points(robot: Tree, data: Measurements) -> Iterator[Reading]:
