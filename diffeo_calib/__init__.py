@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
     from diffeo_calib.fitting.fit import fit
     from diffeo_calib.fitting.gauss_newton import GaussNewton
-    from diffeo_calib.fitting.gradient_descent import GradientDescent
     from diffeo_calib.fitting.lbfgs import LBFGS
     from diffeo_calib.fitting.problem import Problem
     from diffeo_calib.fitting.result import Fit
@@ -47,6 +46,7 @@ if TYPE_CHECKING:
     from diffeo_calib.measurements.observations import Observations
     from diffeo_calib.measurements.readings import Readings
     from diffeo_calib.measurements.table import Measurements
+    from diffeo_calib.paper.gradient_descent import GradientDescent
     from diffeo_calib.process.scales import Hyperparameters
     from diffeo_calib.reports import plots as plots
     from diffeo_calib.reports.report import write_report
@@ -129,7 +129,6 @@ if not TYPE_CHECKING:  # type checkers see the imports above, and report unknown
             "common.errors": "DiffeoCalibError DiffeoCalibWarning",
             "fitting.fit": "fit",
             "fitting.gauss_newton": "GaussNewton",
-            "fitting.gradient_descent": "GradientDescent",
             "fitting.lbfgs": "LBFGS",
             "fitting.problem": "Problem",
             "fitting.result": "Fit",
@@ -147,6 +146,7 @@ if not TYPE_CHECKING:  # type checkers see the imports above, and report unknown
             "measurements.observations": "Observations",
             "measurements.readings": "Readings",
             "measurements.table": "Measurements",
+            "paper.gradient_descent": "GradientDescent",
             "reports": "plots",
             "reports.report": "write_report",
             "robots.cartesian": "cartesian pose_inputs",

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_count, check_finite, check_number
 from diffeo_calib.common.errors import NumericalError
-from diffeo_calib.fitting.objective import slope
-from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.fitting.problem import Problem, slope
 from diffeo_calib.flows.integrators import RK4, Integrator
 from diffeo_calib.kernels.base import Kernel, check_kernel
 from diffeo_calib.maps.deformation import ModelSpec, Momenta

@@ -59,7 +59,7 @@ import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibError, NumericalError
 from diffeo_calib.fitting.fit import Formulation, Solver, formulate
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.fitting.objective import Objective, slope
+from diffeo_calib.fitting.problem import Problem, slope
 from diffeo_calib.flows.integrators import Integrator, RungeKutta
 
 GRID = 16
@@ -186,7 +186,7 @@ def at_the_border(model: FittedMap, x: Tensor) -> Record:
     }
 
 
-def gradient_descent(objective: Objective, iterations: int) -> dc.GradientDescent:
+def gradient_descent(objective: Problem, iterations: int) -> dc.GradientDescent:
     """Return Algorithm 1 with the step 2 / (largest eigenvalue of the Hessian at zero), by power iteration."""
     zero, push, curvature = objective.zero().flatten(), 1e-6, 0.0
 

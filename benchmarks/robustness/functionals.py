@@ -34,10 +34,11 @@ from held_out import covered, rms_mm
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.maps.observation import CameraPoints, Distances, LinearFunctionals, Observation
+from diffeo_calib.maps.observation import Observation
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.se3 import transforms
+from diffeo_calib.sensors.kinds import KINDS
 
 COLUMNS = (
     *("case", "noise_mm", "seed", "method", "rows", "rms_mm", "coverage", "expected_mm", "held_out_mm"),
@@ -60,11 +61,12 @@ STEPS, HELD_OUT = 60, 100
 
 
 def cameras() -> Tensor:
-    """Transforms from the robot's base to the cameras: (C, 4, 4)."""
+    """Constants of the cameras: rows of the transforms from the robot's base to these, and depths, m: (C, 13)."""
     z = torch.nn.functional.normalize(LOOKED_AT - EYES, dim=1)
     x = torch.nn.functional.normalize(torch.linalg.cross(z, torch.tensor([[0.0, 0.0, 1.0]]).to(z).expand_as(z)), dim=1)
     R = torch.stack([x, torch.linalg.cross(z, x), z], 1)
-    return transforms(R, -(R @ EYES[:, :, None])[..., 0])
+    rows = transforms(R, -(R @ EYES[:, :, None])[..., 0])[:, :3].flatten(1)
+    return torch.cat([rows, (EYES - LOOKED_AT).norm(dim=1, keepdim=True)], 1)
 
 
 @dataclass(frozen=True)
@@ -84,12 +86,11 @@ class Case:
 
     def observation(self, which: Tensor) -> Observation:
         """What the devices (N,) see, in the robot's base; image points in m at the mean distance."""
-        if self.kind == "height":
-            return LinearFunctionals(NORMALS[which][:, None], HEIGHTS[which])
-        if self.kind == "image":
-            depth = (EYES - LOOKED_AT).norm(dim=1)[which]
-            return CameraPoints(cameras()[which], depth[:, None])
-        return Distances((BAR_FIXED if self.at else FIXED)[which])
+        constants = {"height": torch.cat([NORMALS, HEIGHTS], 1), "image": cameras()}
+        fixed = BAR_FIXED if self.at else FIXED
+        own = constants.get(self.kind, torch.cat([fixed, torch.zeros_like(fixed[:, :1])], 1))
+        kind = KINDS[self.kind]
+        return kind(tuple(map(str, range(len(own)))), own, own.new_tensor(kind.prior())).observation(which)
 
     def targets(self, which: Tensor) -> Tensor:
         """Readings (N, 1) to which the ball is brought, each of them at every device."""

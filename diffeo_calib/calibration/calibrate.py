@@ -16,25 +16,28 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
+from diffeo_calib.calibration.choose_scales import LIMITS as SCALE_LIMITS
 from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE, ChosenScales, choose_scales, robot_problem
+from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.campaign import warn_of_rounding
-from diffeo_calib.calibration.diagnostics.hypotheses import worth_it
-from diffeo_calib.calibration.diagnostics.lengths import lengths, warn_of_lengths
+from diffeo_calib.calibration.diagnostics.hypotheses import lengths, warn_of_lengths, worth_it
 from diffeo_calib.calibration.diagnostics.moved_devices import change_during
+from diffeo_calib.calibration.diagnostics.outliers import (
+    Outlier,
+    outliers,
+    stuck_columns,
+    warn_of_outliers,
+    warn_of_stuck,
+)
 from diffeo_calib.calibration.diagnostics.plausibility import (
     check_joints,
     check_limits,
     warn_of_no_errors,
 )
+from diffeo_calib.calibration.diagnostics.row_order import warn_of_contradictions
 from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_what_is_open
-from diffeo_calib.calibration.diagnostics.stuck_columns import (
-    stuck_columns,
-    warn_of_outliers,
-    warn_of_stuck,
-)
 from diffeo_calib.calibration.expected_errors import with_open_directions
-from diffeo_calib.calibration.findings import Outlier, Part, outliers, parts
-from diffeo_calib.calibration.judgement import warn_of_contradictions
+from diffeo_calib.calibration.findings import Part, parts
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.result import CalibrationResult
 from diffeo_calib.calibration.scales.of_models import check_models
@@ -221,10 +224,10 @@ def _result(
     model = CalibratedKinematics(robot, fitted_map, lever=placed.lever, ball=placed.ball)
     for devices in placed.placement:
         devices.warn_of_weakness(model)
-    explained, found = parts(model), outliers(model, placed, data, chosen.judged)
+    least = gates.UNCHOSEN_FACTOR if len(data.x) < SCALE_LIMITS.fewest_poses else 1.0
+    explained, found = parts(model), outliers(model, placed, data, chosen.judged, least)
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
-    wrong = list({one.row for one in found})
-    warn_of_outliers(wrong, placed.data, found[0].reason if found else "", stuck_columns(placed.data))
+    warn_of_outliers(found, placed.data)
     changed = placed.mislabelled(model, found)
     if changed is None:
         devices, lines = placed.placement.hypotheses(data, CHANGE), placed.data.line_numbers

@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from math import log
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import torch
-from torch import Tensor
-
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.misplaced_rows import Step, out_of_step
+from diffeo_calib.calibration.diagnostics.outliers import Outlier, contradicted
 from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
+from diffeo_calib.calibration.diagnostics.row_order import block_text, steps_of
 from diffeo_calib.calibration.expected_errors import ExpectedError
-from diffeo_calib.calibration.findings import Outlier, excluded, found_outliers
-from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
+from diffeo_calib.common.errors import InputError, MeasurementError, sentence
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
     LARGEST_ERROR_PER_REACH,
     causes_of,
     expected,
-    expected_error,
     impossible,
     impossible_errors,
     positions_of,
@@ -30,95 +25,8 @@ from diffeo_calib.kinematics.evaluation import (
 )
 from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.sensors.coordinates import sensor_of
 from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
 from diffeo_calib.sensors.places import Places
-from diffeo_calib.sensors.tables import Coordinates
-
-
-def contradicted(model: CalibratedKinematics, data: Measurements) -> list[Outlier]:
-    """Measurements that took no part in a fit and that its model excludes, the worst first.
-
-    Their distances are judged by the model's own deviations, or by the median distance if the model is overconfident.
-    """
-    data = sensor_of(data).with_points(data, model)
-    found = data.bodies.predicted(model.at_payloads(data.payload), data.q)
-    errors = data.bodies.errors(data, found.points)  # (N, bodies, 3 or 6) m and rad, NaN for hidden markers
-    squares = (errors * torch.linalg.solve(found.covariance, errors[..., None])[..., 0]).sum(-1)
-    bad = excluded(squares, errors.shape[-1], gates.OVERCONFIDENT)
-    return found_outliers(model, data, bad, errors[..., :3].norm(dim=-1))
-
-
-def steps_of(model: CalibratedKinematics, data: Measurements) -> list[Step]:
-    """Rows whose measured values belong to the joints of other lines, judged by a model."""
-    return out_of_step(
-        model.at_payloads(data.payload)(data.q).detach(), data.points, data.line_numbers, expected_error(model, data)
-    )
-
-
-def block_text(model: CalibratedKinematics, data: Measurements, wrong: list[Outlier]) -> str | None:
-    """One sentence about wrong rows that follow one another, with their common cause if there is one; else None."""
-    order = data.line_numbers.argsort()
-    flags = torch.zeros(len(data), dtype=torch.bool, device=order.device)
-    flags[[one.row for one in wrong]] = True
-    place = find_block(flags[order])
-    if place is None:
-        return None
-    start, end = place
-    block = data.rows(order[start:end])
-    lines, last = block.line_numbers.tolist(), " to the end of the table" * (end == len(data))
-    size = float((model.at_payloads(block.payload)(block.q) - block.points).norm(dim=-1).nanmedian())
-    causes = motions(model, block)
-    why = "; " + ", ".join(cause.sentence for cause in causes) if causes else ", for no common reason"
-    count = int(flags[order[start:end]].sum())
-    return sentence(
-        f"{count} rows look wrong that follow one another: lines {lines[0]} to {lines[-1]}{last}",
-        got=f"a median error of {1e3 * size:.3g} mm{why}",
-        fix="check what happened there; calibrate without these lines, or measure them again",
-    )
-
-
-def warn_of_contradictions(
-    model: CalibratedKinematics, own: Coordinates | None, wrong: list[Outlier], moved: str | None
-) -> None:
-    """Warn of the best explanation of wrong rows of a fit.
-
-    Args:
-        model: the fitted model. own: its rows that tell coordinates. wrong: the outliers among all rows.
-        moved: a sentence about something that moved, which explains wrong rows after it.
-
-    Warns:
-        DiffeoCalibWarning: rows are out of step, follow one another, or something moved.
-    """
-    text = moved
-    if own is not None:
-        place = {row: number for number, row in enumerate(own.rows.tolist())}
-        wrong = [replace(one, row=place[one.row]) for one in wrong if one.row in place]
-        steps = steps_of(model, own.table) if len(wrong) >= gates.LAG_ROWS else []
-        text = steps[0].sentence() if steps else moved or block_text(model, own.table, wrong)
-    if text is not None:
-        warn_user(text)
-
-
-def find_block(wrong: Tensor) -> tuple[int, int] | None:
-    """First and last + 1 of the rows (N,), in order, where wrong ones follow one another beyond chance; or None.
-
-    The segment with the largest likelihood ratio of ``gates.BLOCK_SHARE`` against the overall share (S. Karlin,
-    S. Altschul, "Methods for assessing the statistical significance of molecular sequence features", 1990).
-    """
-    count, n = int(wrong.sum()), len(wrong)
-    share = count / n
-    if count < gates.BLOCK_ROWS or share >= gates.BLOCK_SHARE:
-        return None
-    gain, loss = log(gates.BLOCK_SHARE / share), log((1 - gates.BLOCK_SHARE) / (1 - share))
-    best, score, start, place = log(n / gates.BLOCK_CHANCE), 0.0, 0, None
-    for row, bad in enumerate(wrong.tolist()):
-        if score <= 0:
-            score, start = 0.0, row
-        score += gain if bad else loss
-        if score > best:
-            best, place = score, (start, row + 1)
-    return place
 
 
 def check_errors(model: CalibratedKinematics, found: Evaluation, usual: float) -> None:

@@ -9,9 +9,10 @@ from typing import Any
 
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.lengths import Length
+from diffeo_calib.calibration.diagnostics.hypotheses import Length
+from diffeo_calib.calibration.diagnostics.outliers import Outlier
 from diffeo_calib.calibration.expected_errors import ExpectedError
-from diffeo_calib.calibration.findings import Outlier, Part
+from diffeo_calib.calibration.findings import Part
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.placing.place import Placed
 from diffeo_calib.calibration.placing.placement import Placement

@@ -16,9 +16,9 @@ from diffeo_calib.cli.column_names import LENGTHS, WORDS, Column, Group, column,
 from diffeo_calib.cli.options import CORNERS, Places
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, bad_cells, number, number_hint, numbers_in
-from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.csv.joined import joined_file
 from diffeo_calib.measurements.csv.lines import HEAD, CsvLines, read_cells
+from diffeo_calib.measurements.csv.sensors import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.readings import MILLIMETRES
 from diffeo_calib.sensors.kinds import known_kinds
 

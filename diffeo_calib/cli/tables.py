@@ -26,11 +26,10 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.files import PROGRAM
 from diffeo_calib.measurements.csv.files import read_joints, read_observations
-from diffeo_calib.measurements.csv.images import ImageColumns
 from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
-from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, numeric_columns
+from diffeo_calib.measurements.csv.sensors import ImageColumns, ReadingColumns, SocketColumns, numeric_columns
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table_format import TableFormat
@@ -259,7 +258,7 @@ class ProgramTable:
         data = read_observations(self.csv, table, duplicates="keep", growing=True)  # 0, 0, 0 is a target
         lines = [line for line, _ in read_cells(self.csv, table.sep, numeric_columns(table).names)[1]]
         if len(data) < len(lines):
-            what = f"file '{self.csv}', line {few(sorted({*lines} - {*data.lines.tolist()}))}"
+            what = f"file '{self.csv}', line {few(sorted({*lines} - {*data.line_numbers.tolist()}))}"
             raise InputError.of(what, expected="a target", got="empty cells", fix="fill them in, or remove the lines")
         return data.points if data.poses is None else by_frame(data.poses)
 

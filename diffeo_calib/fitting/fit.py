@@ -18,7 +18,6 @@ from diffeo_calib.common.errors import InputError, NumericalError, as_written
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.lbfgs import LBFGS
-from diffeo_calib.fitting.objective import Objective
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import MAX_END_RESIDUAL, Fit, Progress, Solution, Stepped, certify, silent, stepped
 from diffeo_calib.flows.integrators import RK4, RK8, Integrator
@@ -47,7 +46,7 @@ class Solver(Protocol):
         ...
 
     def solve(
-        self, problem: Objective, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
+        self, problem: Problem, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
     ) -> Solution:
         """Minimise the energy from ``start``."""
         ...
@@ -129,7 +128,7 @@ def fit(
     return found
 
 
-def formulate(problem: Problem, formulation: str, errata: Mapping[str, object]) -> Objective:
+def formulate(problem: Problem, formulation: str, errata: Mapping[str, object]) -> Problem:
     """The problem in the named formulation.
 
     Raises:
@@ -188,7 +187,7 @@ def _check_arguments(problem: object, solver: object, integrator: object, start:
         raise InputError.of("`start`", expected="momenta", got=type(start).__name__, fix=fix)
 
 
-def _check_start(start: Momenta, problem: Objective) -> None:
+def _check_start(start: Momenta, problem: Problem) -> None:
     for tensor in start.tensors:
         if not isinstance(tensor, Tensor) or tensor.dtype != torch.float64:
             raise InputError.of("the momenta of `start`", expected="float64 tensors", got=as_written(tensor)[:60])
@@ -201,7 +200,7 @@ def _check_start(start: Momenta, problem: Objective) -> None:
 
 
 def _with_chosen_steps(
-    problem: Objective, solver: Solver, start: Momenta | None, progress: Progress
+    problem: Problem, solver: Solver, start: Momenta | None, progress: Progress
 ) -> tuple[Solution, Integrator, Stepped | None]:
     """The solution with time steps that are fine enough, and its run with them, if the flows do not overflow."""
     integrator: Integrator = RK4(2) if problem.reduced else RK4(1)
@@ -229,7 +228,7 @@ def _with_chosen_steps(
 
 
 def _enough_steps(
-    problem: Objective, momenta: Momenta, integrator: Integrator, *, at_optimum: bool
+    problem: Problem, momenta: Momenta, integrator: Integrator, *, at_optimum: bool
 ) -> tuple[Integrator, Stepped | None]:
     """The given integrator if its errors at these momenta are small enough, else a finer one; and its own run."""
     try:

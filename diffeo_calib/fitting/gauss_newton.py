@@ -25,8 +25,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import check_count, check_number
 from diffeo_calib.common.errors import InputError, NumericalError
-from diffeo_calib.fitting.objective import Objective, linear_optimum
-from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.fitting.problem import Problem, linear_optimum
 from diffeo_calib.fitting.result import MAX_END_RESIDUAL, NEGLIGIBLE_ENERGY, Progress, Solution, Stop, silent
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Momenta
@@ -71,7 +70,7 @@ class GaussNewton:
         choose(self.linear, 1)
 
     def solve(
-        self, problem: Objective, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
+        self, problem: Problem, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
     ) -> Solution:
         """Minimise the energy from ``start`` (zero by default).
 
@@ -81,7 +80,7 @@ class GaussNewton:
             InputError: a problem in the Eulerian formulation, which has no linearisation.
             NumericalError: the first factorisation fails.
         """
-        if not isinstance(problem, Problem):
+        if not problem.certified:
             what = "Gauss-Newton needs a linearisation, which the Eulerian formulation does not have"
             raise InputError.of(what, fix="use dc.LBFGS() or dc.GradientDescent(step=...)")
         run = _Run(problem, integrator, start if start is not None else problem.zero(), self.linear)

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import check_count, check_number
 from diffeo_calib.common.errors import InputError, as_written
-from diffeo_calib.fitting.objective import Objective, slope
+from diffeo_calib.fitting.problem import Problem, slope
 from diffeo_calib.fitting.result import Progress, Solution, Stop, silent
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Momenta
@@ -61,9 +61,9 @@ class LBFGS:
             raise InputError.of("`preconditioned`", expected="True or False", got=as_written(self.preconditioned))
 
     def solve(
-        self, problem: Objective, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
+        self, problem: Problem, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
     ) -> Solution:
-        """Minimise the energy from ``start``; by default from :meth:`Objective.start`.
+        """Minimise the energy from ``start``; by default from :meth:`Problem.start`.
 
         Steps whose flows overflow are shortened. Ctrl-C stops early and keeps the best state.
 
@@ -99,7 +99,7 @@ class LBFGS:
 class Descent:
     """State of one solve: the optimiser's variables and the best momenta."""
 
-    problem: Objective
+    problem: Problem
     integrator: Integrator
     best: Momenta
     history_size: int = 0

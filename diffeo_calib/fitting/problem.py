@@ -1,9 +1,13 @@
-"""The fitting problem: measured pairs, kernels, noise, and the energy (16) of the exact model.
+"""The fitting problem: measured pairs, kernels, noise, and the energy (16) of Orozco & Ratajczak (2025).
 
-    E(b, p, theta) = 1/2 b^T K_V b + 1/2 p^T K_W p + 1/2 theta^T Lambda theta + 1/2 sum_i r_i^T R_i^-1 r_i
+    E = 1/2 b^T K_V b + 1/2 p^T K_W p + 1/2 theta^T Lambda theta + 1/2 sum_i r_i^T R_i^-1 r_i,   r_i = k1(x_i) - y_i
 
-with r_i = k1(x_i) - y_i. This is (16) of Orozco & Ratajczak (2025) with the initial momenta as unknowns;
-R_i = sigma^2 I gives the weight 1 / (2 sigma^2).
+with the initial momenta as unknowns; R_i = sigma^2 I gives the weight 1 / (2 sigma^2).
+
+Linearised around a deformation it is one Gaussian regression, a Gauss-Newton step. At zero deformation that is the
+tangent model k1 = k0 + Dk0 K_V b + K_W p + S theta, a Gaussian process with the prior covariance
+
+    G(x, x') = Dk0(x) K_V(x, x') Dk0(x')^T + K_W(k0(x), k0(x')) + S(x) Lambda^-1 S(x')^T
 """
 
 from __future__ import annotations
@@ -11,6 +15,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
+from math import nan
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,24 +24,41 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor, check_count, check_covariance, check_finite, positive, real_tensor
 from diffeo_calib.common.data_frames import refuse_data_frame
 from diffeo_calib.common.device import methods_outside_inference_mode, usable
-from diffeo_calib.common.errors import InputError
-from diffeo_calib.fitting.objective import Objective, linear_optimum
+from diffeo_calib.common.errors import InputError, NumericalError
+from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows.integrators import RK4, Integrator
 from diffeo_calib.kernels.base import Kernel, check_kernel
 from diffeo_calib.kernels.reductions.backends import Backend
-from diffeo_calib.maps.deformation import ModelSpec, Momenta
+from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, relative
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap, as_nominal
 from diffeo_calib.maps.observation import Observation, coordinate_noise, observed_dim
 from diffeo_calib.regression.cholesky import CholeskyRegression
+from diffeo_calib.regression.choose import LinearSolver, condition, condition_controls
+from diffeo_calib.regression.conditional import DataConditional
+from diffeo_calib.regression.conjugate_gradients import CG_TOLERANCE
 
 SMALLEST_NOISE = 1e-100  # smallest standard deviation in m: its square must not underflow
 NEGLIGIBLE_VARIANCE = 1e-18  # noise in m^2 of new coordinates where none were measured: a nanometre
 
 
+class EnergyParts(NamedTuple):
+    """The terms of the energy, dimensionless; fits minimise ``total``."""
+
+    field_x: Tensor
+    field_y: Tensor
+    prior: Tensor
+    data: Tensor
+
+    @property
+    def total(self) -> Tensor:
+        """E."""
+        return self.field_x + self.field_y + self.prior + self.data
+
+
 @methods_outside_inference_mode
-class Problem(Objective[GeodesicDeformation]):
+class Problem:
     """Measured pairs (x_i, y_i) with the nominal map, kernels and noise of their fit.
 
     Args:
@@ -53,12 +76,18 @@ class Problem(Objective[GeodesicDeformation]):
 
     Attributes:
         controls: (M, n) configurations that carry momenta; the data's own x unless :meth:`with_controls`.
+        reduced: whether they differ from the data's. spec: k0, kernels, prior.
+        whole: the problem whose maps the fit leads to, by default its own; see :meth:`standing_for`.
+        certified: whether a minimum of the energy satisfies the end condition (12), up to the time steps: not in the
+            paper's Eulerian formulation, which replaces some methods.
 
     Raises:
         InputError: wrong shapes or kernels, values that are not finite, or a nominal map that is not
             defined at the data.
     """
 
+    certified = True
+    reduced = False
     whole: Problem | None = None
 
     def __init__(
@@ -75,7 +104,6 @@ class Problem(Objective[GeodesicDeformation]):
         new_noise: object = None,
         observe: Observation | None = None,
     ) -> None:
-        self.certified, self.reduced = True, False
         refuse_data_frame(x, "x")
         self.x = self.controls = as_tensor(x, "x", ("N", "n")).detach()
         self.y = as_tensor(y, "y", (len(self.x), "m"), fix="pass one measured point per configuration").detach()
@@ -173,6 +201,7 @@ class Problem(Objective[GeodesicDeformation]):
         return self._with(controls=x, reduced=False, whole=whole, **measured)
 
     def zero(self) -> Momenta:
+        """The unknowns of no deformation, k1 = k0."""
         m = self.y.shape[1] if self.observe is None else self.observe.dim
         points = len(self.controls) * (m // self.spec.task_dim)
         task = self.y.new_zeros(points, self.spec.task_dim)
@@ -183,10 +212,15 @@ class Problem(Objective[GeodesicDeformation]):
         return GeodesicDeformation(self.spec, self.controls, momenta, integrator, variational=variational)
 
     def start(self, integrator: Integrator) -> tuple[Momenta, int]:
-        """The tangent solution."""
+        """The default start of L-BFGS, which makes no progress from zero: the tangent solution.
+
+        Returns:
+            its momenta; runs of the flows that were needed to find them.
+        """
         return linear_optimum(self, self.deform(self.zero(), RK4(1)))[0], 0
 
     def unknowns(self, momenta: Momenta) -> Momenta:
+        """The free ones of all momenta (b, p, theta); the rest is implied by them, and empty."""
         return momenta
 
     def preconditioner(self, momenta: Momenta, integrator: Integrator) -> CholeskyRegression:
@@ -198,3 +232,136 @@ class Problem(Objective[GeodesicDeformation]):
             mean = self.noise.mean if slopes is None else coordinate_noise(self.noise, slopes)
             return CholeskyRegression(at, Noise((count / len(self.x) * mean).repeat(count, 1, 1)))
         return CholeskyRegression(at if slopes is None else at.projected(slopes), self.noise)
+
+    def calibrated(self, deformation: Deformation) -> FittedMap:
+        """A deformation of this problem as the map that users work with."""
+        if self.whole is not None:
+            return self.whole.calibrated(self.whole.deform(deformation.momenta, deformation.integrator))
+        slopes = self.slopes(deformation)
+        data = self.x if self.reduced else None
+        return FittedMap(deformation, self.noise, data, self.new_noise, slopes=slopes, y=self.y)
+
+    def coordinates(self, deformation: Deformation) -> Tensor:
+        """k1 at the data: (N, m)."""
+        return deformation(self.x) if self.reduced else deformation.z1
+
+    def values(self, deformation: Deformation) -> Tensor:
+        """Predicted measurements: k1 (N, m), or h(k1) (N, r)."""
+        points = self.coordinates(deformation)
+        return points if self.observe is None else self.observe.value(points)
+
+    def residual(self, rows: Tensor, points: Tensor) -> Tensor:
+        """Measured minus predicted, (M, m) or (M, r), at the rows with these numbers, from k1 there, (M, m)."""
+        predicted = points if self.observe is None else self.observe.rows(rows).value(points)
+        return self.y[rows] - predicted
+
+    def slopes(self, deformation: Deformation) -> Tensor | None:
+        """A = Dh at k1 of the data: (N, r, m); None if all coordinates were measured."""
+        return None if self.observe is None else self.observe.slope(self.coordinates(deformation)).detach()
+
+    def energy(self, deformation: Deformation, values: Tensor | None = None) -> EnergyParts:
+        """The energy of a deformation of this problem; differentiable once in its momenta.
+
+        Args:
+            deformation: of this problem. values: :meth:`values` of it, if they are known.
+        """
+        residual = (self.values(deformation) if values is None else values) - self.y
+        return EnergyParts(
+            *deformation.field_energies(),
+            0.5 * (deformation.momenta.theta**2 / self.spec.prior_variance).sum(),
+            0.5 * (residual * self.noise.solve(residual)).sum(),
+        )
+
+    def coupling_residual(self, deformation: Deformation) -> float:
+        """|b_end - Dk0(xi)^T p| / |b_end|, zero at the optimum.
+
+        NaN with fewer control points than data, since the paper's momentum lives at the data, and in the Eulerian
+        formulation, in which the coupling holds by construction.
+        """
+        return float("nan") if self.reduced else deformation.coupling_residual()
+
+    def end_residual(self, deformation: Deformation) -> float:
+        """|p_end - A^T R^-1 (y - h(z1))| / |p_end|: the end condition (12); NaN with fewer control points than data.
+
+        Without ``observe`` h is the identity.
+        """
+        if self.reduced:
+            return float("nan")
+        p_end = deformation.end_momenta.reshape(deformation.z1.shape)
+        pull, slopes = self.noise.solve(self.y - self.values(deformation)), self.slopes(deformation)
+        pull = pull if slopes is None else (slopes.mT @ pull[:, :, None])[:, :, 0]
+        return relative(p_end - pull, p_end)
+
+
+def slope(
+    problem: Problem, integrator: Integrator, momenta: Momenta, variables: Tensor
+) -> tuple[Tensor, Tensor] | None:
+    """Energy and its gradient by ``variables``, of which the momenta are made; None where they are not finite."""
+    with torch.enable_grad():
+        try:
+            total = problem.energy(problem.deform(momenta, integrator)).total
+            (gradient,) = torch.autograd.grad(total, variables)
+        except (NumericalError, AssertionError):  # the latter if steps of torchdiffeq's adjoint underflow
+            return None
+    total = total.detach()
+    return (total, gradient) if bool(torch.isfinite(total)) and bool(torch.isfinite(gradient).all()) else None
+
+
+class Regression(NamedTuple):
+    """A linearisation conditioned on its data; ``target`` (N, m) is measured minus linearised at zero fields, m."""
+
+    conditional: DataConditional
+    target: Tensor
+
+    def momenta(self) -> Momenta:
+        """Posterior mode of b, p, theta."""
+        return self.conditional.momenta(self.target)
+
+
+def regress(
+    problem: Problem,
+    deformation: GeodesicDeformation,
+    linear: LinearSolver = "auto",
+    tolerance: float = CG_TOLERANCE,
+) -> Regression:
+    """Linearise a problem around a deformation of it and condition it on its data, which are its control points.
+
+    Args:
+        linear: "cholesky" of G + R, conjugate gradients "cg", or "auto" by size.
+        tolerance: of conjugate gradients, relative residual.
+
+    Raises:
+        InputError: the method needs more memory than is free.
+        NumericalError: G + R is not positive definite in float64.
+    """
+    slopes = problem.slopes(deformation)
+    lin = deformation.linearise()
+    response = deformation.linear_response(lin)
+    if slopes is not None:
+        lin, response = lin.projected(slopes), (slopes @ response[:, :, None])[:, :, 0]
+    target = problem.y - problem.values(deformation) + response
+    return Regression(condition(lin, problem.noise, linear, tolerance), target)
+
+
+def linear_optimum(
+    problem: Problem,
+    deformation: GeodesicDeformation,
+    linear: LinearSolver = "auto",
+    tolerance: float = CG_TOLERANCE,
+) -> tuple[Momenta, float]:
+    """The momenta that minimise the energy of a problem linearised around a deformation; arguments as of `regress`.
+
+    Problems with fewer control points than data are solved by their normal equations.
+
+    Returns:
+        the momenta; how far the energy of the linearised problem falls to them, NaN if the data are the controls.
+    """
+    if not problem.reduced:
+        return regress(problem, deformation, linear, tolerance).momenta(), nan
+    slopes = problem.slopes(deformation)
+    return condition_controls(deformation, problem.x, problem.noise, slopes, problem.residual).mode()
+
+
+def tangent(problem: Problem, linear: LinearSolver = "auto") -> Regression:
+    """The tangent model at zero deformation."""
+    return regress(problem, problem.deform(problem.zero(), RK4(1)), linear)

@@ -6,17 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from math import inf, isnan, nan
-from typing import Generic
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.fitting.objective import D, Objective
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.flows.integrators import Integrator
-from diffeo_calib.maps.deformation import Momenta
+from diffeo_calib.maps.deformation import Deformation, Momenta
 
 
 class Stop(Enum):
@@ -215,15 +213,15 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Stepped(Generic[D]):
+class Stepped:
     """A run of the flows, what it predicts, and its estimated time-stepping error, m: what certificates need."""
 
-    deformation: D
+    deformation: Deformation
     values: Tensor
     error: float
 
 
-def stepped(objective: Objective[D], momenta: Momenta, integrator: Integrator) -> Stepped[D]:
+def stepped(objective: Problem, momenta: Momenta, integrator: Integrator) -> Stepped:
     """Run the flows with these time steps, and with refined ones."""
     deformation = objective.deform(momenta, integrator)
     values = objective.values(deformation)
@@ -232,7 +230,7 @@ def stepped(objective: Objective[D], momenta: Momenta, integrator: Integrator) -
 
 def certify(
     problem: Problem,
-    objective: Objective,
+    objective: Problem,
     solution: Solution,
     integrator: Integrator,
     seconds: float,
@@ -257,7 +255,7 @@ def certify(
     )
 
 
-def step_error(objective: Objective[D], deformation: D, values: Tensor | None = None) -> float:
+def step_error(objective: Problem, deformation: Deformation, values: Tensor | None = None) -> float:
     """Estimated time-stepping error of k1(x_i) in m: the largest change with a finer integrator, extrapolated.
 
     Args:

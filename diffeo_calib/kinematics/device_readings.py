@@ -21,7 +21,6 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
 from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.maps.observation import Observation
 from diffeo_calib.measurements.pose_frames import block_diagonal
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.places import PlacedDevices
@@ -89,24 +88,21 @@ class FittedDevice(NamedTuple):
         columns = (shared != 0).any(1).any(0)
         if fitted.registration is not None or fitted.slopes is None or int(columns.sum()) != len(deviations):
             return placed
-        slopes = placed.observation(len(rows)).by_constants(fitted.fitted_points[rows, -3 * devices.seen_points :])
+        slopes = placed.by_increments(fitted.fitted_points[rows, -3 * devices.seen_points :])
         effects = shared[:, numbers][..., columns]
         root = torch.linalg.lstsq(slopes.flatten(0, 1), effects.flatten(0, 1), driver="gelsd").solution
         return placed._replace(columns=columns, root=root)
 
-    def observation(self, rows: int) -> Observation:
-        """Its observation for a number of rows, m."""
-        return self.devices.observation(torch.zeros(rows, dtype=torch.int64, device=HOST))
-
-    def shared(self, points: Tensor) -> Tensor:
-        """(N, r, k) effects of its unknowns of unit variance on readings of points (N, 3 P'), which it sees, m."""
-        return self.observation(len(points)).by_constants(points) @ self.root
+    def by_increments(self, points: Tensor) -> Tensor:
+        """(N, r, k) derivatives of readings of points (N, 3 P'), which it sees, by its unknowns, m."""
+        return self.devices.by_increments(points, torch.zeros(len(points), dtype=torch.int64, device=HOST))
 
     def readings(self, fitted: FittedMap, seen: _Seen, *, noise: bool) -> tuple[Tensor, Tensor]:
         """Mean (N, r) and covariance (N, r, r) of its readings, m."""
-        points, observation = seen.points[:, -3 * self.devices.seen_points :], self.observation(len(seen.points))
+        points = seen.points[:, -3 * self.devices.seen_points :]
+        observation = self.devices.observation(torch.zeros(len(points), dtype=torch.int64, device=HOST))
         A = torch.nn.functional.pad(observation.slope(points), (seen.points.shape[1] - points.shape[1], 0))
-        B = self.shared(points)
+        B = self.by_increments(points) @ self.root
         if self.columns is None:
             covariance = fitted.covariance_at(seen.at, A) + B @ B.mT
         else:

@@ -5,27 +5,28 @@ measurement of the linear functional A_i k1(x_i): with it the covariance G of k1
 (12) becomes P_i(1) = A_i^T R_i^-1 (y_i - h_i(k1(x_i))). Slopes are renewed in every iteration of a solver.
 
 Constants of a device that are not known exactly, such as the fixed end of a ball bar, are errors that all its rows
-share: with :meth:`Observation.by_constants` = D and their prior covariance P, R = blockdiag(R_i) + (D P D^T).
+share: with the derivatives D by them and their prior covariance P, R = blockdiag(R_i) + (D P D^T).
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import torch
 from torch import Tensor
+from torch.func import jacrev, vmap
 
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.noise import Noise
 
 O = TypeVar("O", bound="Observation")  # noqa: E741
-SMALLEST_DISTANCE_M = 1e-6
-"""Nearer to its fixed end the direction of a distance, and nearer to its lens the image of a camera, is undefined."""
+Read = Callable[[Tensor, Tensor], Tensor]
+Check = Callable[[Tensor, Tensor], None]
 UNSEEN_SHARE = 1e-6  # information about coordinates that no row sees, relative to the mean of all coordinates
 
 
@@ -47,10 +48,6 @@ class Observation(ABC):
     @abstractmethod
     def slope(self, points: Tensor) -> Tensor:
         """A = Dh: points (N, m) -> (N, r, m)."""
-
-    @abstractmethod
-    def by_constants(self, points: Tensor) -> Tensor:
-        """Derivatives of h by the device's constants: points (N, m) -> (N, r, c)."""
 
     @property
     def dim(self) -> int:
@@ -74,51 +71,37 @@ class Observation(ABC):
         return other
 
 
-class Distances(Observation):
-    """h(z) = |z - c| + o: a ball bar, a wire or an interferometer from a fixed point c, with the offset o of its zero.
+class ReadPoints(Observation):
+    """What a function reads of the point of every row, with derivatives by torch.
 
     Args:
-        fixed: (N, m) the fixed point of every row, m.
-        offsets: (N, 1) o, m; zero by default.
-
-    Constants of :meth:`by_constants`: the m coordinates of c, then o.
+        read: constants (c,) of a row and its point (m,) -> (r,), differentiable by torch.func.
+        own: (N, c) the constants of every row. dim: m. size: r.
+        check: of the constants (N, c) and points (N, m), raises InputError where readings are not defined.
     """
 
-    constants = ("fixed", "offsets")
-    size = 1
+    constants = ("own",)
+    dim, size = 0, 0
 
-    def __init__(self, fixed: object, offsets: object = None) -> None:
-        self.fixed = as_tensor(fixed, "fixed", ("N", "m"), fix="pass the fixed point of every row, in m").detach()
-        none = self.fixed.new_zeros(len(self.fixed), 1)
-        given = none if offsets is None else as_tensor(offsets, "offsets", (len(self.fixed), 1))
-        self.offsets = given.detach()
+    def __init__(
+        self, read: Read, own: Tensor, dim: int, size: int = 1, check: Check = lambda own, points: None
+    ) -> None:
+        self.read, self.own, self.dim, self.size, self.check = read, own, dim, size, check
 
     def value(self, points: Tensor) -> Tensor:
-        return (points - self.fixed).norm(dim=1, keepdim=True) + self.offsets
+        self.check(self.own, points)
+        return vmap(self.read)(self.own, points)
 
     def slope(self, points: Tensor) -> Tensor:
-        """Unit vectors from the fixed point: (N, 1, m)."""
-        away = points - self.fixed
-        length = away.norm(dim=1, keepdim=True)
-        near = (length[:, 0] < SMALLEST_DISTANCE_M).nonzero()[:, 0]
-        if len(near):
-            fix = "move the fixed point, or leave the row out"
-            raise InputError.of(f"row {int(near[0])} is at its fixed point, where a distance has no direction", fix=fix)
-        return (away / length)[:, None]
-
-    def by_constants(self, points: Tensor) -> Tensor:
-        """(N, 1, m + 1)."""
-        slope = self.slope(points)
-        return torch.cat([-slope, torch.ones_like(slope[..., :1])], 2)
+        self.check(self.own, points)
+        return vmap(jacrev(self.read, argnums=1))(self.own, points)
 
 
 class LinearFunctionals(Observation):
-    """h(z) = A z - b: heights above planes, readings of dial gauges, single coordinates.
+    """h(z) = A z - b, such as single coordinates.
 
     Args:
         axes: (N, r, m) rows A_i, such as unit normals. offsets: (N, r) b_i, m; 0 by default.
-
-    Constants of :meth:`by_constants`: for r = 1 the m - 1 turns of the axis by radians, then b; else only the r of b.
     """
 
     constants = ("axes", "offsets")
@@ -138,69 +121,6 @@ class LinearFunctionals(Observation):
 
     def slope(self, points: Tensor) -> Tensor:
         return self.axes
-
-    def by_constants(self, points: Tensor) -> Tensor:
-        """(N, 1, m), or (N, r, r)."""
-        N, r, _ = self.axes.shape
-        own = -torch.eye(r, dtype=points.dtype, device=points.device).expand(N, r, r)
-        if r > 1:
-            return own
-        across = torch.linalg.svd(self.axes, full_matrices=True).Vh[:, 1:]  # (N, m - 1, m), orthogonal to the axis
-        return torch.cat([(across @ points[:, :, None]).mT, own], 2)
-
-
-class CameraPoints(Observation):
-    """h(z) = f (X / Z, Y / Z) with (X, Y, Z) = R z + t: a point in the image of a calibrated camera.
-
-    Args:
-        poses: (N, 4, 4) transforms from the measuring frame to the camera's, which looks along its z axis, m.
-        focal: (N, 1) f, in the unit of the image; 1 by default, for tangents of two angles.
-
-    Constants of :meth:`by_constants`: a shift (3, m) and a turn (3, rad) of the camera, in its own frame.
-    """
-
-    constants = ("poses", "focal")
-    dim, size = 3, 2
-
-    def __init__(self, poses: object, focal: object = None) -> None:
-        self.poses = as_tensor(poses, "poses", ("N", 4, 4), fix="pass one rigid transform per row").detach()
-        one = self.poses.new_ones(len(self.poses), 1)
-        self.focal = one if focal is None else as_tensor(focal, "focal", (len(one), 1)).detach()
-
-    def _seen(self, points: Tensor) -> Tensor:
-        """Points in the camera's frame (N, 3), m."""
-        return (self.poses[:, :3, :3] @ points[:, :, None])[:, :, 0] + self.poses[:, :3, 3]
-
-    def _in_front(self, points: Tensor) -> Tensor:
-        """Points in the camera's frame (N, 3), m; InputError if one of them is behind its camera."""
-        seen = self._seen(points)
-        behind = (seen[:, 2] < SMALLEST_DISTANCE_M).nonzero()[:, 0]
-        if len(behind):
-            fix = "check the camera's pose: it is the transform from the measuring frame to the camera"
-            raise InputError.of(f"row {int(behind[0])} is behind its camera", fix=fix)
-        return seen
-
-    def value(self, points: Tensor) -> Tensor:
-        seen = self._in_front(points)
-        return self.focal * seen[:, :2] / seen[:, 2:]
-
-    def slope(self, points: Tensor) -> Tensor:
-        """(N, 2, 3), in the unit of the image per m."""
-        return self._projection(points) @ self.poses[:, :3, :3]
-
-    def by_constants(self, points: Tensor) -> Tensor:
-        """(N, 2, 6)."""
-        seen = self._seen(points)
-        eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(len(points), 3, 3)
-        turned = torch.linalg.cross(eye, seen[:, None].expand(-1, 3, 3)).mT  # columns e_k x seen
-        return self._projection(points) @ torch.cat([eye, turned], 2)
-
-    def _projection(self, points: Tensor) -> Tensor:
-        """Derivatives (N, 2, 3) of the image by the point in the camera's frame."""
-        X, Y, Z = self._in_front(points).unbind(1)
-        zero = torch.zeros_like(X)
-        rows = [torch.stack([1 / Z, zero, -X / Z**2], 1), torch.stack([zero, 1 / Z, -Y / Z**2], 1)]
-        return self.focal[:, None] * torch.stack(rows, 1)
 
 
 @dataclass(frozen=True)
@@ -289,20 +209,11 @@ class Stacked(Observation):
             found[rows, part.numbers[:, None], part.points] = part.observe.slope(part.seen(points))
         return found
 
-    def by_constants(self, points: Tensor) -> Tensor:
-        columns = []
-        for part in self.parts:
-            own = part.observe.by_constants(part.seen(points))
-            column = points.new_zeros(len(points), self.size, own.shape[2])
-            column[part.rows[:, None], part.numbers] = own
-            columns.append(column)
-        return torch.cat(columns, 2)
-
 
 def observed_dim(observe: object, y: Tensor, markers: int) -> int:
     """Coordinates m of the points of an observation; InputError unless y are its numbers (N, r)."""
     if not isinstance(observe, Observation):
-        expected, fix = "an Observation", "pass Distances(...), LinearFunctionals(...) or CameraPoints(...)"
+        expected, fix = "an Observation", "pass LinearFunctionals(...), or ReadPoints(...) with a function"
         raise InputError.of("`observe`", expected=expected, got=type(observe).__name__, fix=fix)
     if observe.dim % markers:
         raise InputError.of("`markers` with `observe`", expected=f"a divisor of {observe.dim}", got=markers)

@@ -34,8 +34,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, NumericalError, as_written
-from diffeo_calib.fitting.objective import Objective, tangent
-from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.fitting.problem import Problem, tangent
 from diffeo_calib.flows.geodesic import energy
 from diffeo_calib.flows.integrators import RK4, Integrator, Run
 from diffeo_calib.kernels.base import Kernel
@@ -286,7 +285,7 @@ MAX_SHOTS = 20  # largest number of shooting steps; few suffice where shooting c
 SHORTEST_SHOT = 0.5  # smallest fraction of a shooting step that is tried
 
 
-class EulerianProblem(Objective[EulerianDeformation]):
+class EulerianProblem(Problem):
     """A problem's data, kernels and noise under the paper's equations; the unknown is P0 alone.
 
     Args:
@@ -297,6 +296,8 @@ class EulerianProblem(Objective[EulerianDeformation]):
         InputError: fewer control points than data, or a problem with ``observe``.
     """
 
+    certified = False
+
     def __init__(self, exact: Problem, equations: Eulerian | None = None) -> None:
         if exact.reduced:
             what = "the Eulerian formulation has a momentum at every measurement: fewer `controls` are not possible"
@@ -304,10 +305,8 @@ class EulerianProblem(Objective[EulerianDeformation]):
         if exact.observe is not None:
             fix = 'leave `observe` out, or pass formulation="exact"'
             raise InputError.of("`observe` in the Eulerian formulation", expected="measured coordinates", fix=fix)
+        vars(self).update(vars(exact))
         self.exact, self.equations = exact, equations or Eulerian()
-        self.spec, self.x, self.y, self.noise = exact.spec, exact.x, exact.y, exact.noise
-        self.controls, self.reduced, self.new_noise = exact.controls, False, exact.new_noise
-        self.certified = False
 
     @classmethod
     def with_errata(cls, exact: Problem, switches: Mapping[str, object]) -> EulerianProblem:
@@ -333,7 +332,7 @@ class EulerianProblem(Objective[EulerianDeformation]):
     def unknowns(self, momenta: Momenta) -> Momenta:
         return Momenta(momenta.joint[:0], momenta.task, momenta.theta)
 
-    def deform(self, momenta: Momenta, integrator: Integrator) -> EulerianDeformation:
+    def deform(self, momenta: Momenta, integrator: Integrator) -> EulerianDeformation:  # pyright: ignore[reportIncompatibleMethodOverride]
         return EulerianDeformation(self.spec, self.x, momenta, integrator, self.equations)
 
     def preconditioner(self, momenta: Momenta, integrator: Integrator) -> CholeskyRegression:

@@ -16,8 +16,9 @@ import torch
 from torch import Tensor
 from torch.func import jacrev, vmap
 
+from diffeo_calib.common.checks import wrapped
 from diffeo_calib.common.errors import InputError, MeasurementError, few
-from diffeo_calib.maps.observation import Observation
+from diffeo_calib.maps.observation import Observation, ReadPoints
 from diffeo_calib.measurements.checks import numbers_of, rare_names
 from diffeo_calib.measurements.pose_frames import POINTS, of_frames
 from diffeo_calib.measurements.poses import poses_of_triangles
@@ -33,9 +34,13 @@ ROUNDS = 20
 OUTLIER_MEDIANS = 3.0
 """Errors, in medians, from which rows lose their weight in a refinement."""
 SMALLEST_MEDIAN_M = 1e-7
+SMALLEST_DISTANCE_M = 1e-6
+"""Nearer to its fixed end the direction of a distance, and nearer to its lens the image of a camera, is undefined."""
 BISECTIONS = 100
 
 
+MILLIMETRE = "mm", 1e-3
+"""A unit and its size, m."""
 CHANGE, VALUE, ROW = "change", "value", "row"
 """What a hypothesis opens: what changes at a row or drifts, one number that a device is said to hold, such as a focal
 length, or a number that differs from row to row."""
@@ -56,13 +61,18 @@ class Hypothesis(NamedTuple):
     fix: str = "name the rows before and after as two devices, or use those before or after it"
     about: str = CHANGE
 
+    def amount(self, size: float, sign: str = "") -> str:
+        """A size of its unknown, m, rad or relative, with its unit."""
+        unit, one = self.unit or MILLIMETRE
+        return f"{size / one:{sign}.2g} {unit}"
+
 
 @dataclass(frozen=True, eq=False)
 class Devices(ABC):
     """The devices of some readings, all of one kind.
 
     A kind says how a reading follows from constants (:meth:`read`) and how these change (:meth:`changed`); derivatives
-    are then found by torch. Or it has :meth:`observation` and :meth:`moved` with derivatives of its own.
+    are found by torch.
 
     Args:
         names: D names. constants: (D, c). deviations: (k,) of the prior of the increments, m or rad.
@@ -110,18 +120,38 @@ class Devices(ABC):
         raise InputError.of(f"a plan for devices of the kind {cls.kind!r}", fix="write its method `stated`")
 
     @staticmethod
+    @abstractmethod
     def read(constants: Tensor, body: Tensor) -> Tensor:
         """The reading (r,) of one device with constants (c,) of one body (3,) or (4, 4), see :meth:`bodies`."""
-        raise NotImplementedError
 
     @staticmethod
     def changed(constants: Tensor, increments: Tensor) -> Tensor:
         """Constants (c,) of one device after increments (k,)."""
-        raise NotImplementedError
+        return constants + increments
+
+    @classmethod  # noqa: B027
+    def check_seen(cls, constants: Tensor, points: Tensor) -> None:
+        """Raise InputError for points (N, 3 k) of which devices with constants (N, c) have no reading."""
+
+    @classmethod
+    def _read_metres(cls, constants: Tensor, points: Tensor) -> Tensor:
+        """(r,) of one device, of the coordinates (3 k,) that it sees, m."""
+        return cls.metres_each * cls.read(constants, cls.bodies(points[None])[0])
 
     def observation(self, device: Tensor) -> Observation:
         """What rows of these devices (N,) observe, m."""
-        return ReadPoints(type(self), self.constants[device], len(self.deviations))
+        own, dim = self.constants[device], 3 * self.seen_points
+        return ReadPoints(self._read_metres, own, dim, self.numbers_each, self.check_seen)
+
+    def by_increments(self, points: Tensor, device: Tensor) -> Tensor:
+        """Derivatives (N, r, k) of what rows of these devices (N,) observe at points (N, 3 k), m, by increments."""
+
+        def read(own: Tensor, at: Tensor, step: Tensor) -> Tensor:
+            return self._read_metres(self.changed(own, step), at)
+
+        own = self.constants[device]
+        self.check_seen(own, points)
+        return vmap(jacrev(read, argnums=2))(own, points, own.new_zeros(len(own), len(self.deviations)))
 
     def moved(self, increments: Tensor) -> Devices:
         """The devices after increments (D, k)."""
@@ -177,7 +207,7 @@ class Devices(ABC):
 
     def hypotheses(self, points: Tensor, device: Tensor) -> Iterator[Hypothesis]:
         """What may be wrong, or change between rows of these devices (N,) at points (N, 3), m: where each stands."""
-        for name, own in self._of_each(self.observation(device).by_constants(points), device):
+        for name, own in self._of_each(self.by_increments(points, device), device):
             yield Hypothesis(f"{self.kind} device '{name}'", own)
 
     def _of_each(self, effects: Tensor, device: Tensor) -> Iterator[tuple[str, Tensor]]:
@@ -245,7 +275,7 @@ class Devices(ABC):
 
     def shared(self, points: Tensor, device: Tensor) -> Tensor:
         """Uncertainty of the devices, as effects of unit variance that rows share: (N, r, D k)."""
-        own = self.observation(device).by_constants(points) * self.deviations  # (N, r, k)
+        own = self.by_increments(points, device) * self.deviations  # (N, r, k)
         whose = torch.nn.functional.one_hot(device, len(self.constants)).to(own)
         return (whose[:, None, :, None] * own[:, :, None]).flatten(2)
 
@@ -273,56 +303,19 @@ class Devices(ABC):
         return covariance.diagonal().clamp(min=0).sqrt().view(len(self.names), -1) * self.deviations
 
 
-class ReadPoints(Observation):
-    """What devices of a kind read of the tool: :meth:`Devices.read` of every row, with its derivatives, m.
-
-    Args:
-        kind: of the devices. own: (N, c) their constants. increments: k.
-    """
-
-    constants = ("own",)
-
-    def __init__(self, kind: type[Devices], own: Tensor, increments: int) -> None:
-        self.kind, self.own, self.increments = kind, own, increments
-
-    @property
-    def dim(self) -> int:
-        """3, or 9 of the points of a frame."""
-        return 3 * self.kind.seen_points
-
-    @property
-    def size(self) -> int:
-        """r."""
-        return self.kind.numbers_each
-
-    def _read(self, own: Tensor, points: Tensor) -> Tensor:
-        return self.kind.metres_each * self.kind.read(own, self.kind.bodies(points[None])[0])
-
-    def value(self, points: Tensor) -> Tensor:
-        """(N, r)."""
-        return vmap(self._read)(self.own, points)
-
-    def slope(self, points: Tensor) -> Tensor:
-        """(N, r, 3 k)."""
-        return vmap(jacrev(self._read, argnums=1))(self.own, points)
-
-    def by_constants(self, points: Tensor) -> Tensor:
-        """(N, r, increments)."""
-
-        def read(own: Tensor, at: Tensor, step: Tensor) -> Tensor:
-            return self._read(self.kind.changed(own, step), at)
-
-        zero = self.own.new_zeros(len(self.own), self.increments)
-        return vmap(jacrev(read, argnums=2))(self.own, points, zero)
-
-
 def check_devices(data: Readings) -> None:
     """Refuse devices with too few rows to be placed: a plane, a fixed point or a camera takes three to six numbers."""
-    short = rare_names(data.device_names, data.lines.tolist(), FEWEST_PER_DEVICE)
+    short = rare_names(data.device_names, data.line_numbers.tolist(), FEWEST_PER_DEVICE)
     if short:
         fix = "check the names in these rows, measure more rows of them, or leave them out"
         expected = f"at least {FEWEST_PER_DEVICE} rows of each device"
         raise MeasurementError.of("`readings`", expected=expected, got=few(short), fix=fix)
+
+
+def refuse_first(rows: Tensor, what: str, fix: str) -> None:
+    """Raise InputError for the first of some rows, (N,) boolean; none of it under torch.func."""
+    if not wrapped(rows) and bool(rows.any()):
+        raise InputError.of(f"row {int(rows.nonzero()[0])} {what}", fix=fix)
 
 
 def least_squares(matrix: Tensor, target: Tensor) -> Tensor:

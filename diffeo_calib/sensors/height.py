@@ -10,13 +10,12 @@ linear in (n, n c^T, d).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import few
-from diffeo_calib.maps.observation import LinearFunctionals
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.sensors.devices import (
     Devices,
@@ -62,15 +61,15 @@ class Planes(Devices):
         normal = unit_least_squares(points - points.mean(0), values - values.mean())
         return torch.cat([normal, (points @ normal - values).mean()[None]])
 
-    def observation(self, device: Tensor) -> LinearFunctionals:
-        own = self.constants[device]
-        return LinearFunctionals(own[:, None, :3], own[:, 3:])
+    @staticmethod
+    def read(constants: Tensor, body: Tensor) -> Tensor:
+        return (body @ constants[:3] - constants[3])[None]
 
-    def moved(self, increments: Tensor) -> Devices:
-        """Turned about two directions across the normal, those of :meth:`LinearFunctionals.by_constants`."""
-        normals = self.constants[:, :3] + (across(self.constants[:, :3]) * increments[:, :2, None]).sum(1)
-        normals = normals / normals.norm(dim=1, keepdim=True)
-        return replace(self, constants=torch.cat([normals, self.constants[:, 3:] + increments[:, 2:]], 1))
+    @staticmethod
+    def changed(constants: Tensor, increments: Tensor) -> Tensor:
+        """Turned about two directions across the normal, and shifted along it."""
+        normal = constants[:3] + increments[:2] @ across(constants[:3])
+        return torch.cat([normal / normal.norm(), constants[3:] + increments[2:]])
 
     def where(self, number: int) -> str:
         return f"above the plane of normal {numbers_text(self.constants[number, :3].tolist())}"

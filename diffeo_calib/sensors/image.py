@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import cos
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.maps.observation import CameraPoints
 from diffeo_calib.robots.se3 import nearest_rotations, transforms
 from diffeo_calib.sensors.devices import (
+    SMALLEST_DISTANCE_M,
     SMALLEST_M,
     VALUE,
     Devices,
     Hypothesis,
     moved_pose,
     numbers_text,
+    refuse_first,
 )
 
 VIEW_HALF_ANGLE_RAD = 0.5
@@ -51,8 +52,7 @@ class Cameras(Devices):
         return torch.cat([torch.cat([R, t], 2).flatten(1), depth], 1)
 
     def sees(self, points: Tensor, device: Tensor) -> Tensor:
-        own = self.poses[device]
-        seen = (own[:, :3, :3] @ points[:, :, None])[..., 0] + own[:, :3, 3]
+        seen = self._seen(self.constants[device], points)
         return seen[:, 2] > cos(VIEW_HALF_ANGLE_RAD) * seen.norm(dim=1)
 
     @classmethod
@@ -77,14 +77,27 @@ class Cameras(Devices):
         rows = self.constants[:, :12].view(-1, 3, 4)
         return transforms(rows[..., :3], rows[..., 3])
 
-    def observation(self, device: Tensor) -> CameraPoints:
-        """Image points times the mean depth."""
-        return CameraPoints(self.poses[device], self.metres[device][:, None])
+    @staticmethod
+    def _seen(constants: Tensor, points: Tensor) -> Tensor:
+        """Points (..., 3) in the frame of cameras with constants (..., 13), m."""
+        rows = constants[..., :12].unflatten(-1, (3, 4))
+        return (rows[..., :3] @ points[..., None])[..., 0] + rows[..., 3]
 
-    def moved(self, increments: Tensor) -> Devices:
-        """Shifted and turned in the cameras' own frames."""
-        moved = moved_pose(self.constants[:, :12], increments)
-        return replace(self, constants=torch.cat([moved, self.constants[:, 12:]], 1))
+    @classmethod
+    def read(cls, constants: Tensor, body: Tensor) -> Tensor:
+        """Image points times the mean depth, m."""
+        seen = cls._seen(constants, body)
+        return constants[12] * seen[:2] / seen[2]
+
+    @staticmethod
+    def changed(constants: Tensor, increments: Tensor) -> Tensor:
+        """Shifted and turned in the camera's own frame."""
+        return torch.cat([moved_pose(constants[:12], increments), constants[12:]])
+
+    @classmethod
+    def check_seen(cls, constants: Tensor, points: Tensor) -> None:
+        behind = cls._seen(constants, points)[:, 2] < SMALLEST_DISTANCE_M
+        refuse_first(behind, "is behind its camera", "check the camera's pose, and which camera each row names")
 
     def hypotheses(self, points: Tensor, device: Tensor) -> Iterator[Hypothesis]:
         """Also focal lengths, which stretch the image, and principal points, which shift it, both in focal lengths."""

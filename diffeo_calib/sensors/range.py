@@ -16,9 +16,15 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
-from diffeo_calib.maps.observation import Distances
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.sensors.devices import Devices, Hypothesis, least_squares, numbers_text
+from diffeo_calib.sensors.devices import (
+    SMALLEST_DISTANCE_M,
+    Devices,
+    Hypothesis,
+    least_squares,
+    numbers_text,
+    refuse_first,
+)
 
 FIXED_DEVIATION_M = 1e-9
 """Prior standard deviation of an offset that is known to be zero."""
@@ -59,12 +65,15 @@ class FixedPoints(Devices):
         found = least_squares(torch.cat([-2 * points, one], 1), (values**2)[:, 0] - points.square().sum(1))
         return torch.cat([found[:3], found.new_zeros(1)])
 
-    def observation(self, device: Tensor) -> Distances:
-        own = self.constants[device]
-        return Distances(own[:, :3], own[:, 3:])
+    @staticmethod
+    def read(constants: Tensor, body: Tensor) -> Tensor:
+        return (body - constants[:3]).norm()[None] + constants[3:]
 
-    def moved(self, increments: Tensor) -> Devices:
-        return replace(self, constants=self.constants + increments)
+    @classmethod
+    def check_seen(cls, constants: Tensor, points: Tensor) -> None:
+        near = (points - constants[:, :3]).norm(dim=1) < SMALLEST_DISTANCE_M
+        fix = "move the fixed point, or leave the row out"
+        refuse_first(near, "is at its fixed point, where a distance has no direction", fix)
 
     def where(self, number: int) -> str:
         return f"from {numbers_text((1e3 * self.constants[number, :3]).tolist())} mm"
@@ -92,7 +101,7 @@ class FixedPoints(Devices):
         return replace(self, deviations=free)
 
     def hypotheses(self, points: Tensor, device: Tensor) -> Iterator[Hypothesis]:
-        effects = self.observation(device).by_constants(points)
+        effects = self.by_increments(points, device)
         yield Hypothesis("the zero of all devices", effects[..., 3:], ("mm", 1e-3))
         for name, own in self._of_each(effects, device):
             yield Hypothesis(f"the zero of '{name}'", own[..., 3:], ("mm", 1e-3))

@@ -31,7 +31,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.calibration.recalibration.new_set_up import Before, place_again
 from diffeo_calib.measurements.csv.files import write_measurements
-from diffeo_calib.measurements.csv.images import ImageColumns
+from diffeo_calib.measurements.csv.sensors import ImageColumns
 from diffeo_calib.measurements.poses import LEVER, mark_points
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table_format import TableFormat

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from diffeo_calib.calibration.findings import excluded_by_others
+from diffeo_calib.calibration.diagnostics.outliers import excluded
 
 TABLES = 1500
 
@@ -20,12 +20,12 @@ def test_one_of_a_hundred_clean_tables_is_suspected_however_few_its_rows(
     drawn = torch.Generator().manual_seed(rows)
     squares = expected * torch.randn(TABLES, rows, freedom, generator=drawn, dtype=torch.float64).square().sum(2)
     each = torch.full((rows, 1), float(freedom), dtype=torch.float64)
-    suspected = sum(bool(excluded_by_others(one[:, None], each, least=0.0).any()) for one in squares)
+    suspected = sum(bool(excluded(one[:, None], each, least=0.0).any()) for one in squares)
     assert suspected < 0.02 * TABLES
 
 
 def test_a_gross_error_is_named_and_hidden_markers_are_not() -> None:
     squares = torch.randn(30, 2, 3, generator=torch.Generator().manual_seed(0)).double().square().sum(2)
     squares[4, 1], squares[7, 0] = 100.0, torch.nan
-    found = excluded_by_others(squares, torch.full_like(squares, 3.0))
+    found = excluded(squares, torch.full_like(squares, 3.0))
     assert found.nonzero().tolist() == [[4, 1]]

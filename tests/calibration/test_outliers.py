@@ -11,7 +11,7 @@ from product_bank import Case, simulated
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.findings import Outlier
+from diffeo_calib.calibration.diagnostics.outliers import Outlier
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 

@@ -11,8 +11,7 @@ from math_bank import few_points, normal, rr_problem
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import NumericalError
-from diffeo_calib.fitting.objective import tangent
-from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.fitting.problem import Problem, tangent
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation

@@ -12,8 +12,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.fitting.objective import tangent
-from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.fitting.problem import Problem, tangent
 from diffeo_calib.flows.integrators import RK4
 from diffeo_calib.robots import elastic_rr
 

@@ -8,8 +8,7 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.gauss_newton import GaussNewton
-from diffeo_calib.fitting.objective import Regression, tangent
-from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.fitting.problem import Problem, Regression, tangent
 from diffeo_calib.flows.integrators import RK4
 from diffeo_calib.regression import choose
 from diffeo_calib.regression.cholesky import CholeskyRegression

@@ -146,6 +146,8 @@ def test_what_is_refused() -> None:
         dc.Readings.images(Q, torch.zeros(ROWS, 2), focal=(0.0, 1.0), centre=(0.0, 0.0))
     with pytest.raises(MeasurementError, match="pixels"):
         dc.Readings.images(Q, torch.zeros(ROWS, 3), focal=(1.0, 1.0), centre=(0.0, 0.0))
+    with pytest.raises(InputError, match="row 3 is at its fixed point"):
+        devices.errors(data, devices.constants[data.device, :3] + torch.arange(3.0, -57.0, -1.0).double()[:, None])
     assert dc.evaluate(points, data).rms < 1e-9
 
 

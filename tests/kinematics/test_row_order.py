@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.misplaced_rows import out_of_step
+from diffeo_calib.calibration.diagnostics.row_order import out_of_step
 
 NOISE = 1e-3
 TYPICAL = 1.5 * NOISE
@@ -38,7 +38,7 @@ def test_from_a_line_on(first: int, lag: int) -> None:
 def test_a_block_in_the_middle() -> None:
     (step,) = out_of_step(*table(40, 10, 22, -1), typical=TYPICAL)
     assert (step.first, step.last, step.lag, step.to_the_end) == (12, 23, -1, False)
-    assert step.words.startswith("in lines 12 to 23 the measured values belong to the joints 1 line above")
+    assert step.sentence().startswith("in lines 12 to 23 the measured values belong to the joints 1 line above")
 
 
 def test_rows_in_any_order_and_with_gaps() -> None:

@@ -7,7 +7,8 @@ import torch
 from math_bank import normal
 from torch.testing import assert_close
 
-from diffeo_calib.maps.observation import Distances, LinearFunctionals, Part, Stacked
+from diffeo_calib.maps.observation import LinearFunctionals, Part, ReadPoints, Stacked
+from diffeo_calib.sensors.range import FixedPoints
 
 N, M, R = 7, 6, 3
 Z = normal(N, M, seed=1)
@@ -18,7 +19,7 @@ LENGTHS, HEIGHTS = torch.tensor([4, 0, 2]), torch.tensor([1, 6])
 @pytest.fixture
 def table() -> Stacked:
     """Three distances and two pairs of heights of different points; rows 3 and 5 report nothing."""
-    distances = Distances(3.0 + normal(3, 3, seed=2), normal(3, 1, seed=3))
+    distances = ReadPoints(FixedPoints.read, torch.cat([3.0 + normal(3, 3, seed=2), normal(3, 1, seed=3)], 1), 3)
     heights = LinearFunctionals(normal(2, 2, 3, seed=4), normal(2, 2, seed=5))
     parts = [
         Part(LENGTHS, BALL, torch.tensor([1]), distances),
@@ -48,10 +49,3 @@ def test_rows_are_those_of_the_whole(table: Stacked, index: list[int]) -> None:
     assert len(some) == len(index)
     assert_close(some.value(Z[rows]), table.value(Z)[rows])
     assert_close(some.slope(Z[rows]), table.slope(Z)[rows])
-
-
-def test_constants_stand_side_by_side(table: Stacked) -> None:
-    found = table.by_constants(Z)
-    assert found.shape == (N, R, 4 + 2)
-    assert_close(found[LENGTHS, 1, :4], table.parts[0].observe.by_constants(Z[LENGTHS, 3:])[:, 0])
-    assert not bool(found[HEIGHTS][..., :4].any())

@@ -15,7 +15,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.fitting.objective import tangent
+from diffeo_calib.fitting.problem import tangent
 from diffeo_calib.paper.eulerian import Eulerian, EulerianProblem
 from diffeo_calib.robots import elastic_rr
 

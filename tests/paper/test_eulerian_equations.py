@@ -13,7 +13,7 @@ from math_bank import K_V, K_W, naive_rk4, normal, planar_two_markers, tensor, t
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.fitting.objective import slope, tangent
+from diffeo_calib.fitting.problem import slope, tangent
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.nominal import as_nominal
 from diffeo_calib.paper.eulerian import Eulerian, EulerianDeformation, EulerianProblem, curvature

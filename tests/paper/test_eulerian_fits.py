@@ -13,7 +13,7 @@ from math_bank import few_points, uniform
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, NumericalError
-from diffeo_calib.fitting.objective import tangent
+from diffeo_calib.fitting.problem import tangent
 from diffeo_calib.paper.eulerian import EulerianProblem
 
 

@@ -12,8 +12,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, NumericalError
-from diffeo_calib.fitting.objective import regress
-from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.fitting.problem import Problem, regress
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.regression import choose, control_points

@@ -19,8 +19,8 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.campaign import warn_of_open_directions
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
 from diffeo_calib.calibration.diagnostics.moved_devices import Variation, variation
+from diffeo_calib.calibration.diagnostics.outliers import Outlier
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_readings
-from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters
 from diffeo_calib.calibration.placing.drift import Drift
 from diffeo_calib.calibration.placing.lens import LensAndBoard
@@ -29,7 +29,7 @@ from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
     identify_readings,
     reading_sets,
-    with_ball_of,
+    stages_beside,
     with_freed_devices,
 )
 from diffeo_calib.calibration.placing.sessions import Sessions
@@ -51,7 +51,7 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import errors_of_kinds
 from diffeo_calib.sensors.devices import ROW, Devices
 from diffeo_calib.sensors.errors import Evaluations, shown_unit
-from diffeo_calib.sensors.places import Places, fitting_devices
+from diffeo_calib.sensors.places import Places
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings, check_poses, divided, with_markers
 
 
@@ -129,9 +129,8 @@ class Placed:
     Args:
         data: the table. coordinates: its rows that tell coordinates, in that frame, sockets at their places.
         placement: the devices.
-        registration: base and markers, or ball and devices. identification: the geometric calibration.
-        registered, identified: the devices of readings at the registration and after the geometric calibration, in the
-            order of their sets.
+        registration: base and markers, or ball and devices. identification: the geometric calibration. Both have the
+            devices of readings as they were then, in the order of their sets.
     """
 
     data: Any
@@ -139,8 +138,6 @@ class Placed:
     placement: Placement
     registration: Identification
     identification: Identification
-    registered: tuple[Devices, ...] = ()
-    identified: tuple[Devices, ...] = ()
 
     @property
     def readings(self) -> list[ReadingDevices]:
@@ -223,7 +220,8 @@ class Placed:
     @property
     def devices_by_stage(self) -> list[tuple[Devices, ...]]:
         """The devices of readings at the registration, after the geometric calibration, and now."""
-        return [self.registered, self.identified, tuple(own.devices for own in self.readings)]
+        stages = self.registration.devices, self.identification.devices
+        return [*stages, tuple(own.devices for own in self.readings)]
 
     def tangent_data(self) -> TangentData:
         """The rows around the geometric calibration, weighted by its residuals."""
@@ -350,13 +348,11 @@ def _by_coordinates(
     LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", *(1e3 * stage.rms for stage in stages))
     warn_of_joints_below_tip(robot, table)
     warn_of_open_directions(robot, table, stages[0])
-    tables = [one.table for one in readings]
-    stages = with_ball_of(tables, table, stages)
-    at = [tuple(fitting_devices(own, stage.geometry.points(own.q)) for own in tables) for stage in stages]
-    sets = reading_sets(readings, at[1], table)
+    stages = stages_beside(stages, readings, table)
+    sets = reading_sets(readings, stages[1].devices, table)
     cameras = LensAndBoard.of_table(table, own.rows, stages[0], sessions)
     placement = Placement((*sessions, *sockets, *cameras, *sets))
-    return Placed(data, own._replace(table=table), placement, *stages, *at)
+    return Placed(data, own._replace(table=table), placement, *stages)
 
 
 def _by_readings(robot: Tree, data: Any, readings: list[OtherReadings], progress: Progress) -> Placed:
@@ -365,13 +361,10 @@ def _by_readings(robot: Tree, data: Any, readings: list[OtherReadings], progress
     LOG.info("calibrating %s with %r", robot.name, data)
     tables = [one.table for one in readings]
     bare = Geometry.nominal(robot, 1, () if tables[0].on is None else (tables[0].on,))
-    found = identify_readings(bare, tables)
-    LOG.info("registration RMS %.4f mm, geometry %.4f mm", 1e3 * found.registration.rms, 1e3 * found.identification.rms)
-    freed = with_freed_devices(tables, found)
+    stages = identify_readings(bare, tables)
+    LOG.info("registration RMS %.4f mm, geometry %.4f mm", *(1e3 * stage.rms for stage in stages))
+    freed = with_freed_devices(tables, stages[0])
     if freed is not None:
         for devices in freed.devices:
-            devices.check_freed(found.identification.noise, freed.identification.noise)
-    sets = reading_sets(readings, found.devices)
-    return Placed(
-        data, None, Placement(sets), found.registration, found.identification, found.registered, found.devices
-    )
+            devices.check_freed(stages[1].noise, freed.noise)
+    return Placed(data, None, Placement(reading_sets(readings, stages[1].devices)), *stages)

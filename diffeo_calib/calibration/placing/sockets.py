@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
+from diffeo_calib.calibration.diagnostics.outliers import Outlier, excluded, found_outliers
 from diffeo_calib.calibration.diagnostics.plausibility import check_identification, registered
 from diffeo_calib.calibration.diagnostics.socket_plausibility import (
     check_registration,
@@ -27,7 +28,6 @@ from diffeo_calib.calibration.diagnostics.socket_plausibility import (
     warn_of_wrong_sockets,
 )
 from diffeo_calib.calibration.expected_errors import workspace_deviation
-from diffeo_calib.calibration.findings import Outlier, excluded_by_others, found_outliers
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters, identify
 from diffeo_calib.calibration.identification.registration import (
     register_sockets,
@@ -409,7 +409,7 @@ def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> 
         return []
     bad = torch.zeros(len(resting), model.markers, dtype=torch.bool, device=own.device)
     squares = squares.masked_fill(~judged, torch.nan)
-    bad[:, -1] = excluded_by_others(squares, torch.full_like(squares, 3.0), least=0.0)
+    bad[:, -1] = excluded(squares, torch.full_like(squares, 3.0), least=0.0)
     distances = errors.norm(dim=1)[:, None].expand(-1, model.markers)
     placed = with_attributes(resting, points=middles[:, None])
     return found_outliers(model, placed.with_markers(model.markers), bad, distances)

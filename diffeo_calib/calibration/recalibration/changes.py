@@ -24,7 +24,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
-from diffeo_calib.calibration.judgement import find_block
+from diffeo_calib.calibration.diagnostics.row_order import find_block
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import sentence, warn_user, with_deviation

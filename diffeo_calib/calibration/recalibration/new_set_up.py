@@ -127,7 +127,9 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
     nominal = robot_map(old)
     geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])  # without deformation
     ball, tip = None if own is None else ball_in_sockets(own.table, geometry), nominal.geometry.on[-1]
-    ball = ball_of([one.table for one in readings], geometry, ball_tip(own, readings, tip)) if ball is None else ball
+    if ball is None:
+        found = ball_of([one.table for one in readings], geometry, ball_tip(own, readings, tip))
+        ball = None if found is None else found.geometry.tool[0]
     new_ball = ball is not None and not knows_ball(model)
     if ball is not None and new_ball:
         old = with_ball(old, nominal, ball, ball_tip(own, readings, tip), PLACES.found_m_rad)

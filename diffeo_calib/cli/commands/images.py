@@ -15,7 +15,7 @@ from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import shown
 from diffeo_calib.common.files import write_together, write_whole
 from diffeo_calib.measurements.bags import read_bag, read_images
-from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, PIXEL, POINT
+from diffeo_calib.measurements.csv.sensors import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.csv.writing import csv_text
 from diffeo_calib.measurements.stops import PLACE, TURN, StopLimits, pictured, rows_of, stops
 from diffeo_calib.measurements.table_format import TableFormat, options_of
@@ -36,8 +36,8 @@ def run(given: ImagesOptions) -> None:
         own = {f"{one.name}/{image.name}" if several else image.name: image.refused for image in one.images}
         refused |= {name: reason for name, reason in own.items() if reason}
     contents[output] = csv_text(lines, table.sep)
-    if given.overview is not None:
-        contents[given.overview] = page(found).encode()
+    if given.report is not None:
+        contents[given.report] = page(found).encode()
     write_together(contents)
     for name, reason in refused.items():
         say(f"{name}: {reason}: left out")

@@ -36,7 +36,7 @@ class ChainLike(Protocol):
 Joints = Sequence[str] | ChainLike | PoseColumns
 """Columns of joint values: their names, a robot whose joints they are named after, or those of a pose."""
 Values = dict[Any, Tensor]
-"""Numbers of the rows of a table in SI by the keys of :attr:`Columns.groups`; rotations are as in the file."""
+"""Numbers of the rows of a table in SI by the keys of :attr:`Columns.groups`."""
 
 
 class Check(NamedTuple):
@@ -56,12 +56,13 @@ class Group(NamedTuple):
 
     Args:
         names: of the columns. unit: in the file: m, mm, rad, deg, or how many of it are one in SI; None without.
-        check: what the numbers are expected to be.
+        check: what the numbers are expected to be. what: name of numbers whose unit is judged by their size.
     """
 
     names: tuple[str, ...]
     unit: str | float | None = None
     check: Check | None = None
+    what: str = ""
 
     def to_si(self, values: Tensor) -> Tensor:
         """Numbers in the unit of the file -> rad, m, or as they are."""
@@ -92,6 +93,10 @@ class Hideable(NamedTuple):
         return cls(values or known, known if values else [], word)
 
 
+Body = tuple[Sequence[Group], str]
+"""The columns of a marker, frame or reading, and what lines do that fill them, such as "holds a distance"."""
+
+
 @dataclass(frozen=True)
 class Columns:
     """The wanted columns of numbers.
@@ -100,9 +105,8 @@ class Columns:
         table: what it holds, and the units.
         joints: names or expressions of n joints, or the columns of a pose. prismatic: (n,) which of them are prismatic.
         kinds_known: whether the kinds of the joints were given; otherwise all are taken as revolute.
-        groups: all columns by what they hold: "q", "points", "rotations", covariates, "payload", "std",
-            "rotation_std"; those of readings by themselves.
-        readings: columns of each kind of what devices reported, and its name, such as "a distance".
+        groups: all columns: "q", those beside joints by what they hold, and what was measured by themselves.
+        bodies: that lines may leave empty, markers and frames first.
         all_hidden: whether rows may show no marker, because they hold something else.
     """
 
@@ -111,48 +115,41 @@ class Columns:
     prismatic: Tensor
     kinds_known: bool
     groups: dict[Any, Group]
-    readings: Sequence[tuple[Sequence[Group], str]] = ()
+    bodies: Sequence[Body] = ()
     all_hidden: bool = False
 
     @classmethod
     def of(
-        cls, table: TableFormat, readings: Sequence[tuple[Sequence[Group], str]] = (), *, all_hidden: bool = False
+        cls, table: TableFormat, groups: Sequence[Group] = (), bodies: Sequence[Body] = (), *, all_hidden: bool = False
     ) -> Columns:
-        """Check names and kinds of columns.
+        """Check names and kinds of columns; ``groups`` are those of what was measured.
 
         Raises:
             MeasurementError: not names, another number of kinds than names or unknown ones, a unit of prismatic joints
-                without kinds, other numbers of positions and rotations, or a column named twice.
+                without kinds, or a column named twice.
         """
         names, prismatic, kinds_known = _joint_columns(table.joints, table.kinds)
         if table.joint_length is not None and not kinds_known:
             what, fix = "`joint_length` without the kinds of the joints", "pass the robot, or `kinds`"
             raise MeasurementError.of(what, got="joints that are all taken as revolute", fix=fix)
+        for name, column in table.beside.items():
+            column_names(name, [column], "the name of a column", (1,))
         given = table.joints
         read = replace(given, angle=table.angle) if isinstance(given, PoseColumns) else JointExpressions.of(names)
-        every = {"q": Group(read.columns)} | _measured(table) | {own: own for groups, _ in readings for own in groups}
-        named = {key: group for key, group in every.items() if group.names}
-        columns = cls(table, read, prismatic, kinds_known, named, readings, all_hidden)
+        every = {"q": Group(read.columns)} | {group: group for group in groups if group.names}
+        for name, column in table.beside.items():
+            every[name] = Group((column.strip(),), check=MASS if name == "payload" else None)
+        columns = cls(table, read, prismatic, kinds_known, every, bodies, all_hidden)
         twice = repeated(columns.names) or repeated(names)
         if twice:
             markers = len(table.triples)
             plain = len(columns.names) == len(names) + 3 * markers
             what = "`joints`" + " and `position`" * bool(markers) if plain else "the named columns"
             fix = "name every column once"
-            deviations = {*twice} & {*every["std"].names, *every["rotation_std"].names}
+            deviations = {*twice} & {*flat_names(table.std), *flat_names(table.rotation_std)}
             fix += ", and one that holds the deviations of all axes alone" * bool(deviations)
             raise MeasurementError.of(what, expected="distinct columns", got=f"{listed(twice)} twice", fix=fix)
         return columns
-
-    @property
-    def triples(self) -> list[tuple[str, ...]]:
-        """Names of x, y and z of every marker."""
-        return self.table.triples
-
-    @property
-    def rotation(self) -> tuple[str, ...]:
-        """Names of the columns of the rotations, as many for each of the triples."""
-        return flat_names(self.table.rotation)
 
     @property
     def names(self) -> list[str]:
@@ -161,37 +158,16 @@ class Columns:
 
     @property
     def hideable(self) -> list[Hideable]:
-        """The columns of every marker, frame and reading that lines may leave empty."""
-        count, found, names = len(self.triples), list[Hideable](), self.names
-        measured = [self.groups[key] for key in ("points", "rotations", "std", "rotation_std") if key in self.groups]
-        for k in range(count):
-            each = [len(group.names) // count for group in measured]  # one for all markers belongs to none
-            own = [one._replace(names=one.names[k * n : (k + 1) * n]) for n, one in zip(each, measured, strict=True)]
-            found.append(Hideable.of(own, f"shows this {'frame' if self.rotation else 'marker'}", names))
-        others = self.readings if self.all_hidden else ()
-        return found + [
-            Hideable.of(own, f"holds {word}", names) for own, word in others if own[0].names + own[-1].names
-        ]
-
-    @property
-    def rotation_unit(self) -> str:
-        """Unit of the rotation's angles; "rad" where there are none."""
-        return self.table.rotation_angle or "rad"
+        """The columns of every body that lines may leave empty."""
+        return [Hideable.of(groups, word, self.names) for groups, word in self.bodies if any(g.names for g in groups)]
 
     def to_si(self, raw: Tensor) -> Values:
-        """Convert rows (N, c) in the file's units, columns in the order of ``names``.
-
-        Returns:
-            q (N, n), points (N, P, 3), std (N, P, 3), rotation_std (N, T, 3), those beside them (N,), others (N, c).
-        """
-        found, count = self.parts(raw), len(self.triples)
-        values = {name: group.to_si(found[name]) for name, group in self.groups.items()}
-        q, table = self.joints.values(found["q"]), self.table
+        """Rows (N, c) in the units of the file as those of each group (N, columns), or (N,) beside joints."""
+        found, table = self.parts(raw), self.table
+        q = self.joints.values(found["q"])
         turns = q.deg2rad() if table.angle == "deg" else q
+        values = {name: group.to_si(found[name]) for name, group in self.groups.items()}
         values["q"] = torch.where(self.prismatic, q / table.joints_per_metre, turns)
-        for name in {"points", "std", "rotation_std"} & {*values}:
-            each = 3 if values[name].shape[1] == 3 * count else 1  # or one per marker, or for all
-            values[name] = values[name].reshape(len(raw), -1, each).expand(len(raw), count, 3)
         return values | {name: values[name][:, 0] for name in table.beside}
 
     def from_si(self, values: Mapping[Any, Tensor | None]) -> dict[str, list[float]]:
@@ -215,45 +191,15 @@ class Columns:
         slide, known = self.prismatic[plain], self.kinds_known
         sentences = unlikely_units("angles", q[:, ~slide], table.angle, "angle", kinds_known=known)
         sentences += unlikely_units("prismatic joints", q[:, slide], table.joint_unit, "joint_length")
-        if "points" in found:
-            sentences += unlikely_units("positions", found["points"], table.length, "length")
-        if len(self.rotation) == 3 * len(self.triples) > 0:
-            sentences += unlikely_units("rotations", found["rotations"], self.rotation_unit, "rotation_angle")
+        for what, option in (("positions", "length"), ("rotations", "rotation_angle")):
+            own = {key: group.unit for key, group in self.groups.items() if group.what == what}
+            cells = torch.cat([found[key] for key in own] or [raw[:, :0]], 1)
+            sentences += unlikely_units(what, cells, str(next(iter(own.values()), None)), option)
         return sentences
 
     def parts(self, raw: Tensor) -> Values:
         """The columns of each group of rows (N, c)."""
         return dict(zip(self.groups, raw.split([len(own.names) for own in self.groups.values()], dim=1), strict=True))
-
-
-def _measured(table: TableFormat) -> dict[str, Group]:
-    """The columns of positions, rotations, what stands beside them, and deviations; MeasurementError for bad names."""
-    count, deviations = len(table.triples), flat_names(table.rotation_std)
-    for name, names in (("rotation", table.rotation), ("rotation_std", table.rotation_std)):
-        one_for_all = name == "rotation_std" and len(deviations) == 1
-        if not one_for_all and len(names or ()) not in (0, count):
-            lists = f"{len(names or ())} list{'s' * (len(names or ()) != 1)}"
-            got = f"{count} triples and {lists} of columns in `{name}`"
-            fix = "name the position of every frame whose rotation is measured, or leave the rotations out"
-            what, expected = f"`position` beside `{name}`", "one triple of columns for each"
-            raise MeasurementError.of(what, expected=expected, got=got, fix=fix)
-    for name, column in table.beside.items():
-        column_names(name, [column], "the name of a column", (1,))
-    std: Any = table.std if isinstance(table.std, str) else flat_names(table.std) or table.std
-    if std is not None:
-        expected = "names of columns: one, one per marker or three per marker"
-        std = column_names("std", std, expected, (1, count, 3 * count))
-    beside = {
-        name: Group((column.strip(),), None, MASS if name == "payload" else None)
-        for name, column in table.beside.items()
-    }
-    return {
-        "points": Group(flat_names(table.triples), table.length),
-        "rotations": Group(flat_names(table.rotation)),
-        **beside,
-        "std": Group(std or (), table.length, DEVIATION),
-        "rotation_std": Group(deviations, table.rotation_angle or "rad", DEVIATION),
-    }
 
 
 def check_count(what: str, items: Sequence[object], count: int, each: str) -> None:

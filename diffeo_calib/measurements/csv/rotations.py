@@ -15,6 +15,7 @@ from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.pose_frames import POINTS, inverse_poses, points_of_frames, transforms_of_frames
 from diffeo_calib.measurements.poses import EULER, rotation_matrices
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.table_format import flat_names
 
 INVERTED = (
     "the poses seem to be those of the measuring frame, seen from the tool: if a camera on the tool sees a board, "
@@ -87,10 +88,12 @@ def numeric_table(data: Measurements) -> tuple[Columns | None, Mapping[str, Tens
 def _rewritten(data: Measurements) -> Iterator[tuple[Tensor, str, str]]:
     """Rotations (N, T, 3, 3) read in other ways, with words, and the option that reads them so."""
     columns, table = numeric_table(data)
-    if columns is None or columns.table.convention is None or not all(name in table for name in columns.rotation):
+    names = () if columns is None else flat_names(columns.table.rotation)
+    if columns is None or columns.table.convention is None or not all(name in table for name in names):
         return
-    convention, unit, frames = columns.table.convention, columns.rotation_unit, len(columns.triples)
-    numbers = torch.stack([table[name] for name in columns.rotation], dim=1).unflatten(1, (frames, -1))
+    convention, unit = columns.table.convention, columns.table.rotation_angle or "rad"
+    frames = len(columns.table.triples)
+    numbers = torch.stack([table[name] for name in names], dim=1).unflatten(1, (frames, -1))
     count, flat = numbers.shape[2], numbers.flatten(0, 1)
 
     def read(values: Tensor, convention: str, angle: str) -> Tensor:
@@ -104,6 +107,5 @@ def _rewritten(data: Measurements) -> Iterator[tuple[Tensor, str, str]]:
         other = "deg" if unit == "rad" else "rad"
         yield read(flat, convention, other), "", f"rotation_angle='{other}'"
         for order in list(permutations(range(3)))[1:-1]:  # the last, reversed Euler angles, is a convention by itself
-            names = ",".join(columns.rotation[k] for k in order)
-            words = f"the rotation columns seem to be in the order {shown(names)}"
+            words = f"the rotation columns seem to be in the order {shown(','.join(names[k] for k in order))}"
             yield read(flat[:, list(order)], convention, unit), words, ""

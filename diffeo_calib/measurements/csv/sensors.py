@@ -1,10 +1,11 @@
-"""The columns of a CSV file by the kind of their rows: positions or poses, a ball in sockets, readings of devices."""
+"""The columns of a CSV file by the kind of their rows: positions or poses, sockets, readings of devices, images."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,19 +13,24 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
 from diffeo_calib.measurements.checks import of_measurements, unlikely_units
-from diffeo_calib.measurements.csv.columns import DEVIATION, Check, Columns, Group
+from diffeo_calib.measurements.csv.cells import bad_cells
+from diffeo_calib.measurements.csv.columns import DEVIATION, Body, Check, Columns, Group
 from diffeo_calib.measurements.csv.tables import FileRows
+from diffeo_calib.measurements.images import Known
 from diffeo_calib.measurements.pose_frames import inverse_poses, of_frames, transforms_of_frames
 from diffeo_calib.measurements.poses import rotation_matrices, rotation_numbers
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 from diffeo_calib.measurements.sockets import SEPARATOR, Distances
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.measurements.table_format import TableFormat, column_names, flat_names
 
 ONE_READING = "every line is one reading of one device: fill the cell in, or remove the line"
 LENGTH = Check(
     "a distance above 0", fix="repair or remove these lines; distances with an unknown zero are displacements"
 )
+IMAGE, POINT, PIXEL, CAMERA = "image", ("board_x", "board_y"), ("u", "v"), "camera"
+"""Columns of images: name of the image, place of the corner on the board in the unit of length, pixels; name of the
+camera, if there are several."""
 
 Written = tuple[Mapping[Any, Tensor | None], Mapping[str, Sequence[str]], Tensor]
 """Rows as lines of a file: numbers in SI by what they are, texts by their column, and the row (M,) of each line."""
@@ -34,12 +40,18 @@ class SensorColumns:
     """The columns of rows of one kind; ``word``: name of the contents of a row, such as "a position"."""
 
     word: ClassVar[str]
+    hidden: ClassVar[bool] = False
+    """Whether rows may show some of it alone, and leave the other cells empty."""
     texts: Mapping[str, bool]
     """Columns of texts, and whether a table must have them."""
 
     def groups(self, table: TableFormat) -> tuple[Group, ...]:
-        """The columns of numbers beside joints, positions, payloads and covariates."""
+        """The columns of numbers beside joints, payloads and covariates."""
         return ()
+
+    def bodies(self, table: TableFormat) -> list[Body]:
+        """Those that lines without such a row leave empty."""
+        return [(self.groups(table), f"holds {self.word}")]
 
     filled: Any
     """Lines -> (N,) boolean, which of them hold such a row."""
@@ -53,49 +65,105 @@ class SensorColumns:
         return rows
 
 
+class OfBody(NamedTuple):
+    """The columns of a marker or frame: place, rotation, and deviations of both, which may be those of all bodies."""
+
+    place: Group
+    turn: Group
+    std: Group
+    turn_std: Group
+
+
 @dataclass(frozen=True)
 class PositionColumns(SensorColumns):
     """Measured positions or poses, whose columns a table's :class:`TableFormat` names."""
 
     form: TableFormat
-    word = "a position"
+    word, hidden = "a position", True
 
     @property
     def texts(self) -> Mapping[str, bool]:
         own = self.form.session, self.form.marker and self.form.marker.partition("=")[0]
         return {name: True for name in own if name is not None}
 
+    @cached_property
+    def each(self) -> list[OfBody]:
+        """The columns of every marker or frame; MeasurementError for numbers of names that do not match."""
+        form, count = self.form, len(self.form.triples)
+        turn, turn_std = flat_names(form.rotation), flat_names(form.rotation_std)
+        for name, lists in (("rotation", form.rotation or ()), ("rotation_std", form.rotation_std or ())):
+            one_for_all = name == "rotation_std" and len(turn_std) == 1
+            if not one_for_all and len(lists) not in (0, count):
+                got = f"{count} triples and {len(lists)} list{'s' * (len(lists) != 1)} of columns in `{name}`"
+                fix = "name the position of every frame whose rotation is measured, or leave the rotations out"
+                what, expected = f"`position` beside `{name}`", "one triple of columns for each"
+                raise MeasurementError.of(what, expected=expected, got=got, fix=fix)
+        std: Any = form.std if isinstance(form.std, str) else flat_names(form.std) or form.std
+        if std is not None:
+            expected = "names of columns: one, one per marker or three per marker"
+            std = column_names("std", std, expected, (1, count, 3 * count))
+        unit, angles = form.rotation_angle or "rad", len(turn) == 3 * count  # no quaternions or matrices
+        kinds = (
+            (flat_names(form.triples), Group((), form.length, what="positions")),
+            (turn, Group((), unit, what="rotations") if angles else Group(())),
+            (std or (), Group((), form.length, DEVIATION)),
+            (turn_std, Group((), unit, DEVIATION)),
+        )
+
+        def own(names: Sequence[str], k: int) -> tuple[str, ...]:
+            each = len(names) // count
+            return tuple(names[k * each : (k + 1) * each] if each else names)
+
+        return [OfBody(*(group._replace(names=own(names, k)) for names, group in kinds)) for k in range(count)]
+
+    def groups(self, table: TableFormat) -> tuple[Group, ...]:
+        place, turn, *deviations = zip(*self.each, strict=True)
+        return *place, *turn, *(group for groups in deviations for group in dict.fromkeys(groups))
+
+    def bodies(self, table: TableFormat) -> list[Body]:
+        """Deviations of all belong to none of several."""
+        word = f"shows this {'frame' if self.form.rotation else 'marker'}"
+        return [
+            ([group for group in own if sum(group in other for other in self.each) == 1], word) for own in self.each
+        ]
+
     def filled(self, rows: FileRows) -> Tensor:
-        return ~rows.values["points"].isnan().flatten(1).all(1)
+        return torch.stack([~rows.values[own.place].isnan().all(1) for own in self.each]).any(0)
 
     def own_lines(self, rows: FileRows) -> FileRows:
         """The first line of every row."""
-        return self._with_markers(rows)[0]
+        return rows if self.form.marker is None else rows.of(self._markers(rows, self.form.marker)[0])
 
     def table(self, rows: FileRows) -> Measurements:
         """MeasurementError for numbers that do not form a rotation."""
-        rows, names = self._with_markers(rows)
-        values, columns, table = rows.values, rows.columns, rows.columns.table
-        q, joints, known = values["q"], columns.joints.texts, [values.get("std"), values.get("rotation_std")]
-        if table.convention is None:
-            data = Measurements(q, values["points"], joints, names, std=known[0], doubt=False)
+        form, names, joints = self.form, None, rows.columns.joints.texts
+        points = torch.stack([rows.values[own.place] for own in self.each], 1)
+        std, turn_std = (
+            torch.stack([rows.values[own[k]].expand(-1, 3) for own in self.each], 1) if self.each[0][k].names else None
+            for k in (2, 3)
+        )
+        if form.marker is not None:
+            first, at, names = self._markers(rows, form.marker)
+            nowhere = points.new_full((len(first), len(names), 3), torch.nan)
+            points, std = nowhere.index_put(at, points[:, 0]), std if std is None else nowhere.index_put(at, std[:, 0])
+            rows = rows.of(first)
+        q = rows.values["q"]
+        if form.convention is None:
+            data = Measurements(q, points, joints, names, std=std, doubt=False)
         else:
-            if len(columns.triples) == 1:
-                known = [None if own is None else own[:, 0] for own in known]
-            poses = of_frames(transforms_of_frames(_rotations(rows, table.convention), values["points"]))
-            how = {"lever": table.lever, "position_std": known[0], "rotation_std": known[1]}
-            data = Measurements.from_poses(q, poses, joints, **how, camera_on_tool=table.camera_on_tool, doubt=False)
-        set_ups = rows.devices(self.form.session, "a name")
-        return data.with_tips(self.form.on).with_sessions(set_ups, remounted=table.remounted)
+            poses = of_frames(transforms_of_frames(self._rotations(rows, form.convention), points))
+            known = [own if own is None or len(self.each) > 1 else own[:, 0] for own in (std, turn_std)]
+            how = {"lever": form.lever, "position_std": known[0], "rotation_std": known[1]}
+            data = Measurements.from_poses(q, poses, joints, **how, camera_on_tool=form.camera_on_tool, doubt=False)
+        set_ups = rows.devices(form.session, "a name")
+        return data.with_tips(form.on).with_sessions(set_ups, remounted=form.remounted)
 
-    def _with_markers(self, rows: FileRows) -> tuple[FileRows, Sequence[str] | None]:
-        """The rows, with (N, P, 3) of all markers, NaN where hidden, if a column names that of every line; these names.
+    def _markers(self, rows: FileRows, marker: str) -> tuple[Tensor, tuple[Tensor, Tensor], Sequence[str]]:
+        """The first line (N,) of every row; row and marker of each line; names of the markers, which a column holds.
 
         A row holds lines that follow each other with the same joint values, payload and session, of different markers.
         """
-        if self.form.marker is None:
-            return rows, None
-        column, _, given = self.form.marker.partition("=")
+        column, _, given = marker.partition("=")
         texts, values = rows.named(column, "the name of a marker"), rows.values
         names = given.split(",") if given else list(dict.fromkeys(texts))
         if unknown := [name for name in dict.fromkeys(texts) if name not in names]:
@@ -109,44 +177,39 @@ class PositionColumns(SensorColumns):
             if not first or pose != poses[first[-1]] or texts[line] in texts[first[-1] : line]:
                 first.append(line)
             numbers.append(len(first) - 1)
-        places = [names.index(text) for text in texts]
-        of_rows = rows.of(torch.tensor(first, dtype=torch.int64, device=HOST))
-        for key in {"points", "std"} & {*values}:
-            own = torch.full((len(first), len(names), 3), torch.nan, dtype=torch.float64, device=HOST)
-            own[numbers, places] = values[key][:, 0]
-            of_rows = of_rows._replace(values={**of_rows.values, key: own})
-        return of_rows, names
+        at = [names.index(text) for text in texts]
+        begin, row, marker_number = (torch.tensor(own, dtype=torch.int64, device=HOST) for own in (first, numbers, at))
+        return begin, (row, marker_number), names
+
+    def _rotations(self, rows: FileRows, convention: str) -> Tensor:
+        """Rotations (N, T, 3, 3) of frames, NaN where hidden."""
+        numbers = torch.stack([rows.values[own.turn] for own in self.each], 1)
+        seen = ~numbers.isnan().any(2)
+        shown = seen.nonzero().tolist()
+
+        def place(number: int) -> str:
+            row, frame = shown[number]
+            return f"file '{rows.path}', line {rows.lines[row]}, columns {', '.join(self.each[frame].turn.names)}"
+
+        found = numbers.new_full((*seen.shape, 3, 3), torch.nan)
+        with of_measurements():
+            found[seen] = rotation_matrices(numbers[seen], convention, place=place)
+        return found
+
+    def numbers(
+        self, places: Tensor, frames: Tensor | None, std: Tensor | None, turn_std: Tensor | None
+    ) -> dict[Group, Tensor]:
+        """Places (N, B, 3), rotations of frames (N, B, 4, 4), and deviations (N, B, 3), in SI, by their columns."""
+        turns = None if frames is None else rotation_numbers(frames[..., :3, :3], self.form.convention or "rotvec")
+        parts = [(k, own) for k, own in enumerate((places, turns, std, turn_std)) if own is not None]
+        return {each[k]: own[:, body] for body, each in enumerate(self.each) for k, own in parts}
 
     def written(self, part: Any, table: TableFormat) -> Written:
         frames = part.frames if part.frames is None or part.board is None else inverse_poses(part.frames)
-        values = {"points": part.points if frames is None else frames[..., :3, 3], "std": part.std}
-        if frames is not None:
-            values |= {"rotations": written_rotations(frames, table), "rotation_std": part.rotation_std}
-        return values, {} if self.form.session is None else {self.form.session: part.device_names}, *part.index
-
-
-def written_rotations(frames: Tensor, table: TableFormat) -> Tensor:
-    """Rotations (N, T, k) of frames (N, T, 4, 4) as a table writes them."""
-    convention, angle = table.convention or "rotvec", table.rotation_angle or "rad"
-    return rotation_numbers(frames[..., :3, :3], convention, angle=angle)
-
-
-def _rotations(rows: FileRows, convention: str) -> Tensor:
-    """Rotations (N, T, 3, 3) of frames, NaN where hidden."""
-    columns, lines = rows.columns, rows.lines
-    numbers = rows.values["rotations"].unflatten(1, (len(columns.triples), -1))
-    seen, count = ~numbers.isnan().any(2), numbers.shape[2]
-    shown = seen.nonzero().tolist()
-
-    def place(number: int) -> str:
-        row, frame = shown[number]
-        own = columns.rotation[frame * count : (frame + 1) * count]
-        return f"file '{rows.path}', line {lines[row]}, columns {', '.join(own)}"
-
-    found = numbers.new_full((*seen.shape, 3, 3), torch.nan)
-    with of_measurements():
-        found[seen] = rotation_matrices(numbers[seen], convention, angle=columns.rotation_unit, place=place)
-    return found
+        places, turn_std = (part.points if frames is None else frames[..., :3, 3]), part.rotation_std
+        turn_std = None if turn_std is None else turn_std.view_as(places)
+        texts = {} if self.form.session is None else {self.form.session: part.device_names}
+        return self.numbers(places, frames, part.std, turn_std), texts, *part.index
 
 
 @dataclass(frozen=True)
@@ -258,9 +321,100 @@ class ReadingColumns(SensorColumns):
         return values, {} if self.device is None else {self.device: part.device_names}, *part.index
 
 
+@dataclass(frozen=True)
+class ImageColumns(SensorColumns):
+    """How a table holds images.
+
+    Args:
+        camera: width and height of the images, pixels, or what is known of lens and board; of several cameras by the
+            names in the column `camera`.
+        camera_on_tool: whether the camera is on the tool; else the board is.
+        device: column that names the set-up of every image; None for one.
+    """
+
+    camera: Known | Mapping[str, Known]
+    camera_on_tool: bool = False
+    device: str | None = None
+    word = "an image"
+
+    @classmethod
+    def of(cls, data: Any, session: str | None) -> ImageColumns:
+        """How to read images that are written, with this column of set-ups."""
+        several = len(data.cameras) > 1
+        session = None if not data.session_names or (several and data.device_names == data.camera_names) else session
+        sizes = {name: (camera.width, camera.height) for name, camera in data.cameras.items()}
+        return cls(sizes if several else sizes.popitem()[1], data.board is not None, session)
+
+    @property
+    def texts(self) -> Mapping[str, bool]:
+        return {CAMERA: False, IMAGE: True} | ({} if self.device is None else {self.device: True})
+
+    def groups(self, table: TableFormat) -> tuple[Group, ...]:
+        return Group(POINT, table.length), Group(PIXEL)
+
+    def filled(self, rows: FileRows) -> Tensor:
+        return rows.filled(IMAGE)
+
+    def own_lines(self, rows: FileRows) -> FileRows:
+        """The first line of every image."""
+        return rows.of(torch.tensor([own[0] for own in self._images(rows).values()], dtype=torch.int64, device=HOST))
+
+    def table(self, rows: FileRows) -> Measurements:
+        images = self._images(rows)
+        _check_joints(rows, images)
+        points, pixels = (rows.values[one] for one in self.groups(rows.columns.table))
+        flat = torch.cat([points, torch.zeros_like(points[:, :1]), pixels], 1)
+        empty = flat[:, [0, 1, 3, 4]].isnan().nonzero().tolist()
+        if empty:
+            bad = [(rows.lines[row], (*POINT, *PIXEL)[k], "") for row, k in empty]
+            raise bad_cells(rows.path, bad, "a number", "fill it in, or delete the line")
+        corners = flat.new_full((len(images), max(map(len, images.values())), 5), torch.nan)
+        for number, own in enumerate(images.values()):
+            corners[number, : len(own)] = flat[own]
+        first = self.own_lines(rows)
+        known: dict[str, Any] = {"camera_on_tool": self.camera_on_tool, "doubt": False}
+        if CAMERA in rows.texts:
+            known["seen_by"] = first.named(CAMERA, "the name of the camera")
+        data = Measurements.from_images(first.values["q"], corners, self.camera, rows.columns.joints.texts, **known)
+        set_ups = first.devices(self.device, "a name")
+        return data if set_ups is None else data.with_sessions(set_ups)
+
+    def written(self, part: Any, table: TableFormat) -> Written:
+        """A line for each corner."""
+        number, corner = (~part.corners[..., 0].isnan()).nonzero().unbind(1)
+        seen, whose = part.corners[number, corner], number.tolist()
+        texts = {IMAGE: [str(k) for k in whose]}
+        named = {CAMERA: part.camera_names} if len(part.cameras) > 1 else {}
+        named |= {} if self.device is None else {self.device: part.device_names}
+        texts |= {name: [column[k] for k in whose] for name, column in named.items()}
+        points, pixels = self.groups(table)
+        return {points: seen[:, :2], pixels: seen[:, 3:]}, texts, number
+
+    def _images(self, rows: FileRows) -> dict[str, list[int]]:
+        """The lines of each image, by its name with that of its camera."""
+        images = rows.named(IMAGE, "the name of the image")
+        if CAMERA in rows.texts:
+            images = [f"{camera}/{image}" for camera, image in zip(rows.texts[CAMERA], images, strict=True)]
+        found: dict[str, list[int]] = {}
+        for row, name in enumerate(images):
+            found.setdefault(name, []).append(row)
+        return found
+
+
+def _check_joints(rows: FileRows, groups: dict[str, list[int]]) -> None:
+    """Raise MeasurementError for an image whose lines differ in their joint values."""
+    for name, own in groups.items():
+        other = (rows.values["q"][own] != rows.values["q"][own[0]]).any(1).nonzero()[:, 0].tolist()
+        if other:
+            what = f"file '{rows.path}', image '{name}'"
+            got = f"other ones in line {few([rows.lines[own[row]] for row in other])}"
+            fix = "give every image a name of its own, and its joint values in all of its lines"
+            raise MeasurementError.of(what, expected="the joint values of its first line", got=got, fix=fix)
+
+
 def sensors_of(table: TableFormat) -> list[SensorColumns]:
-    """The columns of each kind of rows of a table."""
-    positions = [] if table.position is None else [PositionColumns(table)]
+    """The columns of each kind of rows of a table; MeasurementError for options of rotations that do not match."""
+    positions = [] if table.position is None else [PositionColumns(table.for_reading())]
     return [*positions, *([] if table.sockets is None else [table.sockets]), *table.readings]
 
 
@@ -276,20 +430,22 @@ def numeric_columns(table: TableFormat) -> Columns:
     Raises:
         MeasurementError: no kind of rows, or options for something that is not measured.
     """
-    sensors = sensors_of(table)
-    _check_options(table, several=len(sensors) != 1)
-    table = table if table.position is None else table.for_reading()
-    readings = [(own, sensor.word) for sensor in sensors if (own := sensor.groups(table))]
-    return Columns.of(table, readings, all_hidden=len(sensors) > 1)
+    sensors, groups = sensors_of(table), list[Group]()
+    several = len(sensors) > 1
+    _check_options(table, alone=len(sensors) == 1)
+    for sensor in sensors:
+        groups += [group for group in sensor.groups(table) if group not in groups]  # kinds may share deviations
+    bodies = [body for sensor in sensors if several or sensor.hidden for body in sensor.bodies(table)]
+    return Columns.of(table, groups, bodies, all_hidden=several)
 
 
-def _check_options(table: TableFormat, *, several: bool) -> None:
+def _check_options(table: TableFormat, *, alone: bool) -> None:
     if not sensors_of(table):
         fix = "name the columns of the marker, or those of `socket`"
         raise MeasurementError.of("`position` is missing", fix=fix)
     if table.remounted and table.session is None:
         raise MeasurementError.of("`remounted` without `session`", fix="name the column of the set-ups too")
-    if table.marker is not None and (several or len(table.triples) != 1 or table.rotation is not None):
+    if table.marker is not None and (not alone or len(table.triples) != 1 or table.rotation is not None):
         expected = "one position (x, y, z) in every line, and neither rotations, sockets nor readings"
         raise MeasurementError.of(f"`marker` ({shown(table.marker)})", expected=expected, fix="leave it out")
     options = "rotation", "rotation_std", "std", "camera_on_tool", "remounted", "session"

@@ -59,12 +59,12 @@ class TableOrigin:
         try:
             if self.sha256 is None or file_sha256(self.path) != self.sha256:
                 return {}
-            header, rows = read_cells(self.path, self.columns.table.sep, self.columns.names)
-        except (OSError, MeasurementError):
+            sheet = read_cells(self.path, self.columns.table.sep, self.columns.names)
+            known = dict(sheet.rows)
+            wanted = [known[line] for line in line_numbers.tolist()]
+        except (OSError, MeasurementError, KeyError):
             return {}
-        cells = dict(rows)
-        wanted = [cells.get(line, []) for line in line_numbers.tolist()]
-        return {name: [row[place] for row in wanted] for place, name in enumerate(header)} if all(wanted) else {}
+        return dict(zip(sheet.header, map(list, zip(*wanted, strict=True)), strict=True))
 
 
 FEW_ROWS = 2000
@@ -142,7 +142,7 @@ def read_table(
     for text in ["; ".join(file.notes + notes)] * bool(file.notes + notes) + columns.unlikely_units(numbers):
         warn_user(f"file '{path}': {text}")
     _check_filled(path, columns, numbers)
-    markers = columns.hideable[: len(columns.triples)]
+    markers = columns.hideable[: len(columns.table.triples)]
     for own in markers if zeros else ():
         _hide_zeros(path, columns, numbers, lines, own)
     whole = FileRows(path, columns, columns.to_si(numbers), dict(zip(named, words, strict=True)), lines)
@@ -243,8 +243,6 @@ def _check_units(file: CsvLines, columns: Columns) -> None:
     units = [(name, table.joint_unit if slide else table.angle) for name, slide, plain in joints if plain]
     read: dict[str, Any] = dict(units)
     read |= {name: group.unit for group in columns.groups.values() for name in group.names if group.unit}
-    angles = len(columns.rotation) == 3 * len(columns.triples)  # not a quaternion or a matrix
-    read |= dict.fromkeys(columns.rotation if angles else (), columns.rotation_unit)
     stated = {name: stated_unit(name, file.units) for name in read}
     if not columns.kinds_known:  # the joints may be prismatic
         stated |= {name: None for name, _ in units if stated[name] not in ANGLES}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import isfinite
 from os import PathLike
 from pathlib import Path
@@ -19,15 +19,16 @@ from diffeo_calib.common.errors import MeasurementError, listed
 from diffeo_calib.common.files import WholeFile
 from diffeo_calib.measurements.csv.cells import repeated
 from diffeo_calib.measurements.csv.columns import check_count
-from diffeo_calib.measurements.csv.images import CAMERA, IMAGE, ImageColumns, written_columns
-from diffeo_calib.measurements.csv.lines import read_cells
+from diffeo_calib.measurements.csv.lines import TextTable
 from diffeo_calib.measurements.csv.sensors import (
+    CAMERA,
+    IMAGE,
+    ImageColumns,
     PositionColumns,
     ReadingColumns,
     SocketColumns,
     numeric_columns,
     text_columns,
-    written_rotations,
 )
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.pose_frames import by_frame
@@ -66,18 +67,15 @@ def write_predictions(
     """
     table = replace(table, **columns, position=[[f"{prefix}{axis}" for axis in "xyz"] for prefix in prefixes])
     table = replace(table, std=[f"{prefix}std_{axis}" for prefix in prefixes for axis in "xyz"])
-    numeric = numeric_columns(table.for_writing(rotation_std=True, prefixes=prefixes) if poses else table)
-    table, names, std = numeric.table, [*numeric.joints.columns], numeric.groups["std"].names
-    turned = zip(table.rotation or (), table.rotation_std or (), strict=True) if poses else [((), ())] * len(prefixes)
-    for k, (triple, (turns, deviations)) in enumerate(zip(numeric.triples, turned, strict=True)):
-        names += [*triple, *std[3 * k : 3 * k + 3], *turns, *deviations]
+    table = table.for_writing(rotation_std=True, prefixes=prefixes) if poses else table
+    numeric, own = numeric_columns(table), PositionColumns(table.for_reading())
+    of_bodies = [name for body in own.each for k in (0, 2, 1, 3) for name in body[k].names]
+    names = [*numeric.joints.columns, *of_bodies]
 
     def rows(q: Tensor, mean: Tensor, deviations: Tensor, *others: Tensor) -> Cells:
         frames, spreads = by_frame(mean) if poses else None, deviations.reshape(len(q), len(prefixes), -1)
-        values = {"q": q, "points": mean if frames is None else frames[..., :3, 3], "std": spreads[..., :3]}
-        if frames is not None:
-            values |= {"rotations": written_rotations(frames, table), "rotation_std": spreads[..., 3:]}
-        cells = numeric.from_si(values)
+        places, turns = (mean, None) if frames is None else (frames[..., :3, 3], spreads[..., 3:])
+        cells = numeric.from_si({"q": q, **own.numbers(places, frames, spreads[..., :3], turns)})
         beside = torch.cat(others, 1).tolist() if others else [[]] * len(q)
         lines = zip(*(cells[name] for name in names), strict=True)
         return [[*line, *own] for line, own in zip(lines, beside, strict=True)]
@@ -112,45 +110,14 @@ def csv_text(rows: Iterable[Iterable[object]], sep: str, end: str = "\r\n") -> b
 Column = Sequence[str] | Sequence[float]
 
 
-@dataclass(frozen=True)
-class Program:
-    """The cells of a table.
+def write_columns(path: Path, sheet: TextTable, cells: Mapping[str, Column], table: TableFormat) -> None:
+    """Write a table with other and more columns; overwrites.
 
-    Args:
-        header: names of the columns. rows: cells of every line below that is not blank.
-        lines: line number of every row in the file.
+    ``cells``: name -> texts, or numbers in the units of the file, of which NaN is an empty cell.
     """
-
-    header: list[str]
-    rows: list[list[str]]
-    lines: list[int]
-
-    @classmethod
-    def read(cls, path: Path, table: TableFormat, wanted: Sequence[str] = ()) -> Program:
-        """Read all cells as text; ``wanted`` are names of columns, by which the header is known."""
-        header, lines = read_cells(path, table.sep, wanted)
-        return cls(header, [cells for _, cells in lines], [line for line, _ in lines])
-
-    def without(self, names: Sequence[str]) -> Program:
-        """The same without some columns."""
-        kept = [k for k, name in enumerate(self.header) if name not in names]
-        return Program([self.header[k] for k in kept], [[row[k] for k in kept] for row in self.rows], self.lines)
-
-    def check_free(self, names: Sequence[str]) -> None:
-        """Raise MeasurementError if a column that is to be added is there already."""
-        taken = [name for name in names if name in self.header]
-        if taken:
-            what = f"the program already has the column(s) {listed(taken)}, which the output adds"
-            raise MeasurementError.of(what, fix="rename or remove them, unless the program has been corrected already")
-
-    def write(self, path: Path, cells: Mapping[str, Column], table: TableFormat) -> None:
-        """Write the program with other and more columns; overwrites.
-
-        ``cells``: name -> texts, or numbers in the units of the file, of which NaN is an empty cell.
-        """
-        added = {name: own for name, own in cells.items() if name not in self.header}
-        kept = [cells.get(name, [row[k] for row in self.rows]) for k, name in enumerate(self.header)]
-        write_rows(path, [*self.header, *added], [list(zip(*kept, *added.values(), strict=True))], table)
+    added = {name: own for name, own in cells.items() if name not in sheet.header}
+    kept = [cells.get(name, [row[k] for _, row in sheet.rows]) for k, name in enumerate(sheet.header)]
+    write_rows(path, [*sheet.header, *added], [list(zip(*kept, *added.values(), strict=True))], table)
 
 
 SOCKET, SESSION = "socket", "session"
@@ -247,7 +214,7 @@ def _sheet(whole: Observations, table: TableFormat) -> tuple[TableFormat, list[A
     sockets = next((one for one in others if isinstance(one, SocketColumns)), None)
     readings = tuple(one for one in others if one not in (None, sockets))
     table = replace(table, **beside, sockets=sockets, readings=readings, session=own)
-    return table, [one or PositionColumns(table) for one in others]
+    return table, [one or PositionColumns(table.for_reading()) for one in others]
 
 
 def _with_names(data: Any, table: TableFormat) -> TableFormat:
@@ -268,7 +235,7 @@ def _others(whole: Observations, session: str | None) -> list[Any]:
     found, taken = list[Any](), list[str]()
     for part in whole.parts:
         if "corners" in part.columns:
-            found.append(written_columns(part, session))
+            found.append(ImageColumns.of(part, session))
         elif part.kind == "socket":
             sockets = part.with_sockets_of_rows().sockets  # a reader finds these alone
             distances = {(sockets.names[a], sockets.names[b]): length for a, b, length in sockets.distances}

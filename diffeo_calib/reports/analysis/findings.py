@@ -12,10 +12,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.outliers import Outlier
+from diffeo_calib.calibration.diagnostics.row_order import common_cause
 from diffeo_calib.calibration.expected_errors import expected_errors
-from diffeo_calib.calibration.findings import Outlier, Part, parts
-from diffeo_calib.calibration.judgement import Accuracy, accuracy, block_text, judge, steps_of
+from diffeo_calib.calibration.findings import Part, parts
+from diffeo_calib.calibration.judgement import Accuracy, accuracy, judge
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.result import Progress, silent
@@ -46,6 +47,8 @@ STEPS = 4
 """Of the analysis, as they are told."""
 PROBE_CONFIGURATIONS = 60
 """Configurations at which the share of the markers in the expected variance is judged."""
+FAR_RATIO = 3.0
+"""Ratio of expected errors anywhere to those like the measured ones from which the reason is told."""
 COLUMN_WORDS = ("temp", "time", "stamp", "date", "hour")
 """Parts of the names of columns against which errors are shown without being asked."""
 
@@ -127,6 +130,21 @@ class Findings:
         return next((stages for stages in kinds if next(iter(stages.values())).what == ERRORS), {})
 
     @property
+    def calibrated(self) -> Evaluation | None:
+        """The last of these: errors of the model."""
+        return list(self.errors.values())[-1] if self.errors else None
+
+    @property
+    def rms(self) -> Mapping[str, float]:
+        """RMS error of positions by stage, m: measured, or the expected one where none were."""
+        return {name: one.rms for name, one in self.errors.items()} or self.expected
+
+    @property
+    def unlike(self) -> bool:
+        """Whether poses unlike the measured ones are much less certain than these."""
+        return self.deviations.error.whole >= FAR_RATIO * self.deviations.error.measured
+
+    @property
     def count(self) -> int:
         """Number of rows shown."""
         return sum(len(one.lines) for one in self.own)
@@ -143,12 +161,16 @@ class Findings:
         """Twice the rows of the fit and the error there, m; None if it cannot be told."""
         return forecast(self.learning_curve, self.limit)
 
+    @property
+    def tool(self) -> Tensor:
+        """Numbers of the parameters that place the markers of the fit."""
+        geometry = self.model.nominal.geometry
+        return torch.arange(geometry.size, device=self.rows.q.device)[geometry.slices["tool"]]
+
     @cached_property
     def share_of_tool(self) -> float:
         """Share of the expected variance that knowing the markers would remove."""
-        geometry = self.model.nominal.geometry
-        tool = torch.arange(geometry.size, device=self.rows.q.device)[geometry.slices["tool"]]
-        return self.rows.map.explained_by(tool, self.deviations.q[:PROBE_CONFIGURATIONS])
+        return self.rows.map.explained_by(self.tool, self.deviations.q[:PROBE_CONFIGURATIONS])
 
     @property
     def telling(self) -> Repeats | None:
@@ -338,8 +360,7 @@ def _left_out(model: CalibratedKinematics, rows: FitRows, stages: Mapping[str, K
     errors[own] = Evaluations.of([(found.errors, torch.arange(len(found), device=HOST))], len(found))
     outliers, moved = found.outliers(model), list[str]()
     if model.registration is None:  # else the rows of its fit are in another place
-        steps = steps_of(model, found.data) if len(outliers) >= gates.LAG_ROWS else []
-        moved = [step.sentence() for step in steps[:1]] or [block_text(model, found.data, outliers) or ""]
+        moved = [common_cause(model, found.data, outliers) or ""]
     return Shown(errors, found.data.q, found.data.lines, False, found, outliers, list(filter(None, moved)))
 
 

@@ -13,13 +13,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import ceil, nan
+from math import ceil, hypot, log, nan
+from statistics import linear_regression
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.findings import Outlier, excluded, found_outliers
+from diffeo_calib.calibration.diagnostics.outliers import Outlier, excluded, found_outliers
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.quantiles import chi2_above, known
@@ -95,7 +96,7 @@ class FitRows:
             return measured.masked_fill(~self.map.noise.visible, nan).unflatten(1, (-1, 3))
         if self._measured is None:
             what = "the model has fewer control points than rows, and keeps no trace of the errors of its rows"
-            raise InputError.of(what, fix="pass measurements (--data)")
+            raise InputError.of(what, fix="pass measurements")
         return self._measured.points.to(HOST)
 
     @cached_property
@@ -221,18 +222,11 @@ def forecast(curve: Sequence[tuple[int, float]], limit: float) -> tuple[int, flo
 
     Above the repeatability ``limit`` [m] errors fall like a power of the number of rows; None if they do not fall.
     """
-    if len(curve) < 3:
+    counts, above = [log(count) for count, _ in curve[-4:]], [max(e**2 - limit**2, 0.0) ** 0.5 for _, e in curve[-4:]]
+    if len(curve) < 3 or min(above) <= 0:
         return None
-    counts = torch.tensor([count for count, _ in curve[-4:]], dtype=torch.float64, device="cpu").log()
-    above = torch.tensor([max(e**2 - limit**2, 0.0) ** 0.5 for _, e in curve[-4:]], dtype=torch.float64, device="cpu")
-    if float(above.min()) <= 0:
-        return None
-    x, y = counts - counts.mean(), above.log()
-    slope = float((x * y).sum() / x.square().sum())
-    if slope >= 0:
-        return None
-    rows, _ = curve[-1]
-    return 2 * rows, float((above[-1] * 2.0**slope).square() + limit**2) ** 0.5
+    slope = linear_regression(counts, list(map(log, above))).slope
+    return None if slope >= 0 else (2 * curve[-1][0], hypot(above[-1] * 2.0**slope, limit))
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,7 +306,9 @@ class Predictions:
 
     def outliers(self, model: CalibratedKinematics) -> list[Outlier]:
         """Rows further from their prediction than the claims allow by chance in all rows, the worst first."""
-        return found_outliers(model, self.data, excluded(self.squares, 3), self.errors.errors)
+        freedom = torch.full_like(self.squares, 3.0)
+        bad = excluded(self.squares, freedom, by_others=False)
+        return found_outliers(model, self.data, bad, self.errors.errors)
 
 
 def _errors(points: Tensor, data: Measurements) -> Evaluation:

@@ -3,7 +3,7 @@
     P0 <- 0;   repeat   P0 <- P0 - mu grad E(P0)   until |grad E| < epsilon
 
 (R. Orozco, A. Ratajczak, "Calibration by diffeomorphisms of robot manipulator kinematics: a novel approach", 2025,
-Listing 1.) The Hessian at zero is G + G R^-1 G (tangent.py): steps beyond 2 / (g + g^2 / sigma^2), with g the largest
+Listing 1.) The Hessian at zero is G + G R^-1 G: steps beyond 2 / (g + g^2 / sigma^2), with g the largest
 eigenvalue of G, diverge, and momenta along small eigenvalues hardly change. The other solvers need thousands of times
 fewer evaluations.
 """
@@ -16,7 +16,7 @@ import torch
 
 from diffeo_calib.common.checks import check_count, check_number
 from diffeo_calib.fitting.lbfgs import Descent
-from diffeo_calib.fitting.objective import Objective
+from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import Progress, Solution, Stop, silent
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Momenta
@@ -47,7 +47,7 @@ class GradientDescent:
         check_count(self.max_iterations, "`max_iterations`")
 
     def solve(
-        self, problem: Objective, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
+        self, problem: Problem, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
     ) -> Solution:
         """Descend from ``start`` (zero by default).
 

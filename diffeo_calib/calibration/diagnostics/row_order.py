@@ -1,0 +1,234 @@
+"""Rows that are wrong together: out of step with their joints, or one after the other.
+
+Row i measured at lag k belongs to the joints k lines below its own, for instance because one of two logs lost a line. A
+lag fits where the prediction of those joints is near the measured points. The most likely lags along the table are a
+shortest path: every row costs up to one, less the better its lag fits, and every change of the lag costs as much as a
+few rows that fit nowhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import product
+from math import log
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.outliers import Outlier, flagged
+from diffeo_calib.calibration.identification.identification import Identification
+from diffeo_calib.calibration.identification.registration import (
+    ROBUST,
+    can_register,
+    largest_distances,
+    register,
+    spread,
+)
+from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
+from diffeo_calib.common.quantiles import largest_known
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.evaluation import expected_error
+from diffeo_calib.kinematics.re_registration.motions import motions
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.coordinates import marker_tips
+from diffeo_calib.sensors.tables import Coordinates
+
+
+class Step(NamedTuple):
+    """Consecutive rows whose measured values belong to the joints of other lines.
+
+    Args:
+        first: line of the first row. last: line of the last row. lag: number of lines to their joints, downwards.
+        to_the_end: whether the table ends with these rows. rows: how many rows are known to fit there.
+    """
+
+    first: int
+    last: int
+    lag: int
+    to_the_end: bool
+    rows: int
+
+    def sentence(self, before: str = "", after: str = "") -> str:
+        """What is wrong, between some words, and what to do: ``from line 32 on the measured values belong to ...``."""
+        where = f"from line {self.first} on" if self.to_the_end else f"in lines {self.first} to {self.last}"
+        count = f"{abs(self.lag)} line{'s' * (abs(self.lag) > 1)} {'above' if self.lag < 0 else 'below'}"
+        return sentence(
+            f"{before}{where} the measured values belong to the joints {count}{after}",
+            got=f"{self.rows} rows that fit there, and not at their own joints",
+            fix="pair every configuration with its own measured values: was a line lost or doubled there?",
+        )
+
+
+def out_of_step(predicted: Tensor, measured: Tensor, line_numbers: Tensor, typical: float) -> list[Step]:
+    """Runs of rows whose measured values belong to the joints of other lines, in the order of their lines.
+
+    Args:
+        predicted: (N, P, 3) markers at the joints of every row, m. measured: (N, P, 3) m, NaN where hidden.
+        line_numbers: (N,) distinct numbers; rows may be missing.
+        typical: typical distance of rows that are right, m.
+    """
+    order = line_numbers.argsort()
+    lines, predicted, measured = line_numbers[order], predicted[order], measured[order]
+    distances = measured.new_full((2 * gates.LARGEST_LAG + 1, len(lines)), torch.nan)  # to the joints at every lag
+    for number, each in enumerate(distances):
+        rows, others = _paired(lines, number - gates.LARGEST_LAG)
+        each[rows] = largest_known((predicted[others] - measured[rows]).norm(dim=-1))
+    costs = (distances / (gates.LAG_NEAR * typical)).square().clamp(max=1.0).nan_to_num(1.0)
+    path = _cheapest_path(costs, gates.LAG_CHANGE_COST)
+    own, steps = distances[gates.LARGEST_LAG], []
+    starts = [row for row in range(len(path)) if row == 0 or path[row] != path[row - 1]]
+    for start, end in zip(starts, [*starts[1:], len(path)], strict=True):
+        there, lag = distances[path[start], start:end], path[start] - gates.LARGEST_LAG
+        fits = there <= gates.LAG_NEAR * typical
+        moved = int((fits & (own[start:end] > gates.LAG_GROSS * typical)).sum())
+        if lag and moved >= gates.LAG_ROWS and int(fits.sum()) >= gates.LAG_SHARE * int((~there.isnan()).sum()):
+            steps.append(Step(int(lines[start]), int(lines[end - 1]), lag, end == len(lines), moved))
+    return steps
+
+
+def _paired(line_numbers: Tensor, lag: int) -> tuple[Tensor, Tensor]:
+    """Rows of which the row ``lag`` lines below is in the table too, and the numbers of these, by ascending lines."""
+    wanted = line_numbers + lag
+    at = torch.searchsorted(line_numbers, wanted).clamp(max=len(line_numbers) - 1)
+    rows = (line_numbers[at] == wanted).nonzero()[:, 0]
+    return rows, at[rows]
+
+
+def _cheapest_path(costs: Tensor, change_cost: float) -> list[int]:
+    """The state of every row that minimises the sum of its costs (states, N) and of the changes: N states."""
+    total, before = costs[:, 0], []
+    for column in costs.unbind(1)[1:]:
+        best = int(total.argmin())
+        changed = total > total[best] + change_cost
+        before.append(torch.where(changed, best, torch.arange(len(total), device=total.device)))
+        total = torch.where(changed, total[best] + change_cost, total) + column
+    path = [int(total.argmin())]
+    for previous in reversed(before):
+        path.append(int(previous[path[-1]]))
+    return path[::-1]
+
+
+def check_row_order(robot: Tree, data: Measurements, registration: Identification) -> None:
+    """Refuse measured values that are out of step with the joints from some line on.
+
+    A table that is out of step from its first line to its last is left to ``likely_mistake``. Where the whole table
+    fits nowhere, consecutive rows that are consistent by themselves say where the joints of the others are.
+
+    Args:
+        robot: n joints. data: N rows. registration: of the whole table.
+
+    Raises:
+        MeasurementError: with the line, and where the right joints are.
+    """
+    own, geometry = largest_distances(registration.geometry, data), registration.geometry
+    typical = float(own.median())
+    if typical > ROBUST.consistent_residual * spread(data.points):
+        found = next(_consistent(robot, data), None)
+        if found is None:
+            return
+        geometry, typical = found
+    elif int((own > gates.LAG_GROSS * typical).sum()) < gates.LAG_ROWS:
+        return
+    steps = out_of_step(geometry.points(data.q), data.points, data.line_numbers, typical)
+    near = largest_distances(geometry, data) <= gates.LAG_GROSS * typical
+    if steps and int(near.sum()) >= gates.WINDOW_ROWS and can_register(data.points[near]):  # all that fit say more
+        geometry = register(robot, data.q[near], data.points[near], marker_tips(robot, data)).geometry
+        typical = float(largest_distances(geometry, data)[near].median())
+        steps = out_of_step(geometry.points(data.q), data.points, data.line_numbers, typical)
+    if not steps or (steps[0].to_the_end and steps[0].first == int(data.line_numbers.min())):
+        return
+    more = f" (and {len(steps) - 1} more such block{'s' * (len(steps) > 2)})" * (len(steps) > 1)
+    raise MeasurementError(steps[0].sentence("the measurements do not fit this robot: ", more))
+
+
+def _consistent(robot: Tree, data: Measurements) -> Iterator[tuple[Geometry, float]]:
+    """Registrations of consecutive rows at some lag that are consistent, and their median distances, m."""
+    limit, order = ROBUST.consistent_residual * spread(data.points), data.line_numbers.argsort().to(data.q.device)
+    windows = [rows for parts in gates.WINDOW_PARTS for rows in order.tensor_split(parts)]
+    for lag, rows in product(gates.WINDOW_LAGS, windows):
+        own, other = _paired(data.line_numbers[rows], lag)
+        q, points = data.q[rows][other], data.points[rows][own]
+        if len(own) >= gates.WINDOW_ROWS and can_register(points):
+            geometry = register(robot, q, points, marker_tips(robot, data)).geometry
+            typical = float(largest_known((geometry.points(q) - points).norm(dim=-1)).median())
+            if typical <= limit:
+                yield geometry, typical
+
+
+def steps_of(model: CalibratedKinematics, data: Measurements) -> list[Step]:
+    """Rows whose measured values belong to the joints of other lines, judged by a model."""
+    predicted = model.at_payloads(data.payload)(data.q).detach()
+    return out_of_step(predicted, data.points, data.line_numbers, expected_error(model, data))
+
+
+def find_block(wrong: Tensor) -> tuple[int, int] | None:
+    """First and last + 1 of the rows (N,), in order, where wrong ones follow one another beyond chance; or None.
+
+    The segment with the largest likelihood ratio of ``gates.BLOCK_SHARE`` against the overall share (S. Karlin,
+    S. Altschul, "Methods for assessing the statistical significance of molecular sequence features", 1990).
+    """
+    count, n = int(wrong.sum()), len(wrong)
+    share = count / n
+    if count < gates.BLOCK_ROWS or share >= gates.BLOCK_SHARE:
+        return None
+    gain, loss = log(gates.BLOCK_SHARE / share), log((1 - gates.BLOCK_SHARE) / (1 - share))
+    best, score, start, place = log(n / gates.BLOCK_CHANCE), 0.0, 0, None
+    for row, bad in enumerate(wrong.tolist()):
+        if score <= 0:
+            score, start = 0.0, row
+        score += gain if bad else loss
+        if score > best:
+            best, place = score, (start, row + 1)
+    return place
+
+
+def block_text(model: CalibratedKinematics, data: Measurements, wrong: Sequence[Outlier]) -> str | None:
+    """One sentence about wrong rows that follow one another, with their common cause if there is one; else None."""
+    order = data.line_numbers.argsort()
+    flags = flagged(len(data), [one.row for one in wrong])[order]
+    place = find_block(flags)
+    if place is None:
+        return None
+    start, end = place
+    block = data.rows(order[start:end])
+    lines, last = block.line_numbers.tolist(), " to the end of the table" * (end == len(data))
+    size = float((model.at_payloads(block.payload)(block.q) - block.points).norm(dim=-1).nanmedian())
+    why = ", ".join(cause.sentence for cause in motions(model, block))
+    return sentence(
+        f"{int(flags[start:end].sum())} rows look wrong that follow one another: lines {lines[0]} to {lines[-1]}{last}",
+        got=f"a median error of {1e3 * size:.3g} mm{f'; {why}' if why else ', for no common reason'}",
+        fix="check what happened there; calibrate without these lines, or measure them again",
+    )
+
+
+def common_cause(
+    model: CalibratedKinematics, data: Measurements, wrong: Sequence[Outlier], moved: str | None = None
+) -> str | None:
+    """The best explanation of several wrong rows: they are out of step, something moved, they follow one another.
+
+    Args:
+        moved: a sentence about something that moved, which explains wrong rows after it.
+    """
+    steps = steps_of(model, data) if len(wrong) >= gates.LAG_ROWS else []
+    return steps[0].sentence() if steps else moved or block_text(model, data, wrong)
+
+
+def warn_of_contradictions(
+    model: CalibratedKinematics, own: Coordinates | None, wrong: Sequence[Outlier], moved: str | None
+) -> None:
+    """Warn of the best explanation of wrong rows of a fit, see :func:`common_cause`.
+
+    Args:
+        model: the fitted model. own: its rows that tell coordinates. wrong: the outliers among all rows.
+    """
+    if own is not None:
+        place = {row: number for number, row in enumerate(own.rows.tolist())}
+        wrong = [replace(one, row=place[one.row]) for one in wrong if one.row in place]
+        moved = common_cause(model, own.table, wrong, moved)
+    if moved is not None:
+        warn_user(moved)
