@@ -305,7 +305,7 @@ class Devices(ABC):
 
 def check_devices(data: Readings) -> None:
     """Refuse devices with too few rows to be placed: a plane, a fixed point or a camera takes three to six numbers."""
-    short = rare_names(data.device_names, data.lines.tolist(), FEWEST_PER_DEVICE)
+    short = rare_names(data.device_names, data.line_numbers.tolist(), FEWEST_PER_DEVICE)
     if short:
         fix = "check the names in these rows, measure more rows of them, or leave them out"
         expected = f"at least {FEWEST_PER_DEVICE} rows of each device"
