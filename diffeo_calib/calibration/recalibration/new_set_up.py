@@ -13,7 +13,6 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.placing.placement import DeviceSet
 from diffeo_calib.calibration.placing.readings import ball_of
 from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.placing.sockets import ball_in_sockets
@@ -70,7 +69,7 @@ class Before:
     coordinates: Coordinates | None
     readings: list[OtherReadings]
     place: FoundPlace | None
-    sessions: list[DeviceSet]
+    sessions: list[Sessions]
     ball: Tensor | None
     new_ball: bool
 
@@ -134,7 +133,7 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
     if ball is not None and new_ball:
         old = with_ball(old, nominal, ball, ball_tip(own, readings, tip), PLACES.found_m_rad)
         nominal = robot_map(old)
-    place, sessions = None, list[DeviceSet]()
+    place, sessions = None, list[Sessions]()
     if own is not None:
         table = with_markers(own.table, nominal.geometry.markers, model.lever)
         own = own._replace(table=mounted_of(model).in_any_frame(table))
