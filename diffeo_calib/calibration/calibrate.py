@@ -20,8 +20,7 @@ from diffeo_calib.calibration.choose_scales import LIMITS as SCALE_LIMITS
 from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE, ChosenScales, choose_scales, robot_problem
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.campaign import warn_of_rounding
-from diffeo_calib.calibration.diagnostics.hypotheses import worth_it
-from diffeo_calib.calibration.diagnostics.lengths import lengths, warn_of_lengths
+from diffeo_calib.calibration.diagnostics.hypotheses import lengths, warn_of_lengths, worth_it
 from diffeo_calib.calibration.diagnostics.moved_devices import change_during
 from diffeo_calib.calibration.diagnostics.outliers import (
     Outlier,

@@ -147,7 +147,7 @@ class Source:
         if not lengths:
             return max(_in_images(self.robot, one) for one in tables)
         size = float(torch.cat([one.reported.flatten() for one in lengths]).square().mean().sqrt())
-        rms = identify_readings(Geometry.nominal(self.robot), lengths, rigid=True).registration.rms
+        rms = identify_readings(Geometry.nominal(self.robot), lengths, rigid=True)[0].rms
         return rms / max(size, SMALLEST_SPREAD_M)
 
     def conventions(self, best: float) -> Iterator[Choice]:

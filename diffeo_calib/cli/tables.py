@@ -258,7 +258,7 @@ class ProgramTable:
         data = read_observations(self.csv, table, duplicates="keep", growing=True)  # 0, 0, 0 is a target
         lines = [line for line, _ in read_cells(self.csv, table.sep, numeric_columns(table).names)[1]]
         if len(data) < len(lines):
-            what = f"file '{self.csv}', line {few(sorted({*lines} - {*data.lines.tolist()}))}"
+            what = f"file '{self.csv}', line {few(sorted({*lines} - {*data.line_numbers.tolist()}))}"
             raise InputError.of(what, expected="a target", got="empty cells", fix="fill them in, or remove the lines")
         return data.points if data.poses is None else by_frame(data.poses)
 

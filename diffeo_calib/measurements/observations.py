@@ -112,13 +112,7 @@ class Observations(RowGroups):
         return f"Observations({', '.join(words)}: {', '.join(map(repr, self.parts))})"
 
     def to_frame(self) -> Any:
-        """A pandas.DataFrame of the rows, in SI units and pixels, whose index are the line numbers.
-
-        Its columns are kind, and those of all parts; cells are empty (NaN) where rows of a kind have no such value.
-
-        Raises:
-            ImportError: pandas is not installed.
-        """
+        """See :meth:`RowTable.to_frame`; the first column is kind, and cells of other kinds are NaN."""
         frames = [part.to_frame() for part in self.parts]
         import pandas  # noqa: PLC0415  # optional; the line before has found it
 
@@ -191,7 +185,6 @@ def _pieces(tables: Sequence[Any]) -> list[Rows]:
 
 def _observations(pieces: Sequence[Rows]) -> Observations:
     """The pieces as observations, those of the same kind as one part."""
-    _check_joinable([piece.table for piece in pieces])
     groups: dict[object, list[Rows]] = {}
     whole = [Rows(*pure) for piece in pieces for pure in unmixed(*piece)]
     if any("corners" in piece.table.columns for piece in whole):

@@ -48,8 +48,6 @@ FEWEST_PER_DEVICE = 8
 """Rows of a device that reports readings, with which it can be placed."""
 CONFIGURATIONS, PLACES = "distinct configurations", "places with sockets"
 """Words for what a split keeps together."""
-RANGES = ("column", "from [rad or m]", "to", "degrees")
-"""Header of the ranges that notebooks show."""
 
 
 @methods_outside_inference_mode
@@ -80,11 +78,6 @@ class RowGroups:
     def n(self) -> int:
         """Number of joints."""
         return self.q.shape[1]
-
-    @property
-    def lines(self) -> Tensor:
-        """(N,) lines of the rows in their file, or their numbers."""
-        return self.line_numbers
 
     def __len__(self) -> int:
         return len(self.q)
@@ -164,9 +157,15 @@ class RowGroups:
 
     def copies(self) -> list[tuple[int, int]]:
         """(earlier row, row) for every row that repeats an earlier one of its kind exactly; real repeats differ."""
-        pairs = zip(self.parts, self.index, strict=True)
-        found = [sorted(rows[list(pair)].tolist()) for part, rows in pairs for pair in exact_copies(part.compared)]
-        return sorted(((first, second) for first, second in found), key=lambda pair: pair[1])
+        found = list[tuple[int, int]]()
+        for part, rows in zip(self.parts, self.index, strict=True):
+            values = part.compared.cpu().numpy()
+            values = np.where(np.isnan(values), np.nan, values) + 0.0  # one kind of NaN; -0.0 becomes 0.0
+            first: dict[bytes, int] = {}
+            for own, row in zip(values, rows.tolist(), strict=True):
+                earlier = first.setdefault(own.tobytes(), row)
+                found += [(min(earlier, row), max(earlier, row))] * (earlier != row)
+        return sorted(found, key=lambda pair: pair[1])
 
     def _repr_html_(self) -> str:
         ranges = []
@@ -174,7 +173,8 @@ class RowGroups:
             turns = f"{math.degrees(float(values.min())):.1f} to {math.degrees(float(values.max())):.1f} if it turns"
             name = printable(self.joint_names[joint]) if self.joint_names else f"joint {joint}"
             ranges.append(value_range(name, values, turns))
-        return table_html(repr(self), RANGES, ranges + [one for part in self.parts for one in part.ranges])
+        header = "column", "from [rad or m]", "to", "degrees"
+        return table_html(repr(self), header, ranges + [one for part in self.parts for one in part.ranges])
 
     @property
     def masses(self) -> Tensor:
@@ -208,7 +208,17 @@ class RowGroups:
         ``tolerance`` [rad or m] of the leader in every joint: rows along a slow trajectory do not chain into a single
         group. Angles are compared without wrapping.
         """
-        return repeat_groups(self.q, tolerance)
+        from scipy.spatial import KDTree  # noqa: PLC0415  # slow to import, not needed to use a model
+
+        check_number(tolerance, "`tolerance`", above=-1e-300)
+        tree = KDTree(self.q.cpu().numpy())
+        labels, count = np.full(len(self.q), -1), 0
+        for row in range(len(labels)):
+            if labels[row] < 0:
+                near = np.asarray(tree.query_ball_point(tree.data[row], tolerance, p=math.inf))
+                labels[near[labels[near] < 0]] = count
+                count += 1
+        return torch.as_tensor(labels, dtype=torch.int64, device=HOST)
 
     def split(self, fraction: float = 0.7, seed: int = 0) -> tuple[Self, Self]:
         """Split at random into (train, test), keeping repeated configurations together, and the sockets of a place.
@@ -250,18 +260,11 @@ class RowGroups:
 
     @property
     def _divided(self) -> tuple[np.ndarray, Tensor]:
-        """The rows (M,) that splits divide, and labels (M,) of those that stay together: repeats, or a place's rows."""
-        places = self.places
-        others = places == NO_SOCKET
-        if bool(others.all()):
-            return np.arange(len(self.q)), self.groups()
-        if not self.without_device:
-            rows = others.nonzero()[:, 0]
-            return rows.numpy(), repeat_groups(self.q[rows.to(self.q.device)], REPEAT_TOLERANCE)
-        if not bool(others.any()):
-            return np.arange(len(self.q)), places.unique(return_inverse=True)[1]
-        alone = places.max() + 1 + torch.arange(len(places), device=HOST)
-        return np.arange(len(self.q)), connected(torch.where(others, alone, places), self.groups())
+        """The rows (M,) that splits divide, and labels (M,) of those that stay together: repeats, rows of a place."""
+        resting = self.places != NO_SOCKET
+        rows = (resting | True if self.without_device else ~resting).nonzero()[:, 0]
+        alone = int(self.places.max()) + 1 + torch.arange(len(self), device=HOST)
+        return rows.numpy(), connected(torch.where(resting, self.places, alone)[rows], self.rows(rows).groups())
 
     @property
     def _kind(self) -> str:
@@ -285,6 +288,8 @@ class RowTable(RowGroups):
     kind: Any
     compared: Any
     """(N, c) numbers in which a row that repeats another one equals it."""
+    measured: Any
+    """() -> name -> values (N,) of every column but joints, payloads and covariates, in SI units and pixels."""
     ranges: Any
     """Column, smallest and largest value and their unit, of what was measured."""
 
@@ -337,10 +342,6 @@ class RowTable(RowGroups):
         payload = {} if self.payload is None else {"payload": self.payload}
         columns = dict(zip(names, self.q.T, strict=True)) | self.measured() | payload | self.drifting
         return data_frame(columns, self.line_numbers.numpy())
-
-    def measured(self) -> dict[str, Any]:
-        """Name -> values (N,) of every column but joints and payloads: what was measured, in SI units and pixels."""
-        raise NotImplementedError
 
     def doubted(self, doubt: bool = True) -> Self:
         """The same table, after warnings about exact copies of rows and joint values that look like degrees."""
@@ -398,30 +399,6 @@ def check_alike(parts: Sequence[RowGroups], by_row: Sequence[str], alike: Sequen
             raise MeasurementError.of(f"the tables differ in {', '.join(other)}", fix=fix)
 
 
-def repeat_groups(q: Tensor, tolerance: float) -> Tensor:
-    """Labels (N,) of repeated configurations (N, n), see :meth:`RowGroups.groups`."""
-    from scipy.spatial import KDTree  # noqa: PLC0415  # slow to import, not needed to use a model
-
-    check_number(tolerance, "`tolerance`", above=-1e-300)
-    tree = KDTree(q.cpu().numpy())
-    labels = np.full(len(q), -1)
-    count = 0
-    for row in range(len(q)):
-        if labels[row] < 0:
-            near = np.asarray(tree.query_ball_point(tree.data[row], tolerance, p=math.inf))
-            labels[near[labels[near] < 0]] = count
-            count += 1
-    return torch.as_tensor(labels, dtype=torch.int64, device=HOST)
-
-
-def exact_copies(table: Tensor) -> list[tuple[int, int]]:
-    """(earlier row, row) for every row of a table (N, c) that repeats an earlier one exactly, NaN for NaN."""
-    values = np.where(np.isnan(rows := table.cpu().numpy()), np.nan, rows) + 0.0  # one kind of NaN; -0.0 becomes 0.0
-    first: dict[bytes, int] = {}
-    pairs = ((first.setdefault(row.tobytes(), number), number) for number, row in enumerate(values))
-    return [(earlier, number) for earlier, number in pairs if earlier != number]
-
-
 def connected(first: Tensor, second: Tensor) -> Tensor:
     """(N,) labels of rows that share a label in one of two groupings (N,), or are linked by such rows."""
     from scipy.sparse import coo_matrix  # noqa: PLC0415  # slow to import, not needed to use a model
@@ -435,14 +412,8 @@ def connected(first: Tensor, second: Tensor) -> Tensor:
     return torch.as_tensor(labels, dtype=torch.int64, device=HOST).unique(return_inverse=True)[1]
 
 
-def in_train(labels: Tensor, fraction: float, seed: int, kind: str = CONFIGURATIONS) -> np.ndarray:
-    """Choose whole groups at random for training: labels (N,) -> boolean (N,).
-
-    Each group, in random order, goes to training if that brings the number of rows nearer to ``round(fraction * N)``.
-
-    Raises:
-        MeasurementError: fraction outside (0, 1), or a single group, so that one part would be empty.
-    """
+def in_train(labels: Tensor, fraction: float, seed: int, kind: str) -> np.ndarray:
+    """(N,) boolean: whole groups of labels (N,), at random, see :meth:`RowGroups.split`."""
     if not isinstance(fraction, (int, float)) or not 0.0 < fraction < 1.0:
         fix = "pass the share of rows to train on, such as 0.7"
         raise MeasurementError.of("`fraction`", expected="a number between 0 and 1", got=as_written(fraction), fix=fix)
@@ -456,18 +427,13 @@ def in_train(labels: Tensor, fraction: float, seed: int, kind: str = CONFIGURATI
     return np.isin(labels.numpy(), chosen)
 
 
-def fold_numbers(labels: Tensor, k: int, seed: int, kind: str = CONFIGURATIONS) -> np.ndarray:
-    """Distribute whole groups over ``k`` folds of about equal size: labels (N,) -> fold of every row (N,).
-
-    Raises:
-        MeasurementError: k below 2, or fewer groups than folds.
-    """
+def fold_numbers(labels: Tensor, k: int, seed: int, kind: str) -> np.ndarray:
+    """(N,) whole groups of labels (N,) over ``k`` folds of about equal size, see :meth:`RowGroups.folds`."""
     if not isinstance(k, (int, np.integer)) or isinstance(k, bool) or k < 2:
         raise MeasurementError.of("`k`", expected="at least 2 folds", got=as_written(k), fix="pass 5 or 10")
     sizes, order = _shuffled(labels, seed, kind, fewest=k, what=f"cannot make {k} folds")
-    largest_first = order[np.argsort(-sizes[order], kind="stable")]
     load, fold_of = np.zeros(k, dtype=np.int64), np.zeros(len(sizes), dtype=np.int64)
-    for group in largest_first:
+    for group in order[np.argsort(-sizes[order], kind="stable")]:  # the largest first
         fold_of[group] = load.argmin()
         load[fold_of[group]] += sizes[group]
     return fold_of[labels.numpy()]

@@ -39,6 +39,8 @@ SMALLEST_DISTANCE_M = 1e-6
 BISECTIONS = 100
 
 
+MILLIMETRE = "mm", 1e-3
+"""A unit and its size, m."""
 CHANGE, VALUE, ROW = "change", "value", "row"
 """What a hypothesis opens: what changes at a row or drifts, one number that a device is said to hold, such as a focal
 length, or a number that differs from row to row."""
@@ -58,6 +60,11 @@ class Hypothesis(NamedTuple):
     unit: tuple[str, float] | None = None
     fix: str = "name the rows before and after as two devices, or use those before or after it"
     about: str = CHANGE
+
+    def amount(self, size: float, sign: str = "") -> str:
+        """A size of its unknown, m, rad or relative, with its unit."""
+        unit, one = self.unit or MILLIMETRE
+        return f"{size / one:{sign}.2g} {unit}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,7 +305,7 @@ class Devices(ABC):
 
 def check_devices(data: Readings) -> None:
     """Refuse devices with too few rows to be placed: a plane, a fixed point or a camera takes three to six numbers."""
-    short = rare_names(data.device_names, data.lines.tolist(), FEWEST_PER_DEVICE)
+    short = rare_names(data.device_names, data.line_numbers.tolist(), FEWEST_PER_DEVICE)
     if short:
         fix = "check the names in these rows, measure more rows of them, or leave them out"
         expected = f"at least {FEWEST_PER_DEVICE} rows of each device"

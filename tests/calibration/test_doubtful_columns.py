@@ -15,9 +15,13 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.campaign import quantum, warn_of_rounding
-from diffeo_calib.calibration.diagnostics.likely_mistakes import marker_column
 from diffeo_calib.calibration.diagnostics.outliers import stuck_columns
-from diffeo_calib.calibration.diagnostics.plausibility import check_identification, check_markers, unmeasured_markers
+from diffeo_calib.calibration.diagnostics.plausibility import (
+    check_identification,
+    check_markers,
+    marker_column,
+    unmeasured_markers,
+)
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from math import inf
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.identification.identification import Prior, identify, least_squares_of
+from diffeo_calib.calibration.identification.identification import Prior, identify, solve
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots import Geometry, SimulatedArm
@@ -129,19 +130,29 @@ def test_scales_of_the_joint_errors_are_found() -> None:
         assert (prior.translation > prior.rotation) == (translation > rotation_size)
 
 
-def test_a_step_to_where_nothing_can_be_measured_is_shortened() -> None:
-    """The first step of Gauss-Newton leads to u = 1, from where on there are no errors, such as behind a camera."""
+class Ahead:
+    """One row with one unknown c, from c = 0.9 on nothing can be measured, such as behind a camera."""
 
-    def errors(u: Tensor) -> Tensor:
-        if float(u[0]) > 0.9:
+    freedom = (1,)
+
+    def errors(self, theta: Tensor, c: Tensor) -> list[Tensor]:
+        if float(c[0]) > 0.9:
             raise InputError("behind the camera")
-        return 100 * (1 / (1 - u) - 2)
+        return [100 * (1 / (1 - c) - 2).view(1, 1, 1)]
 
-    found = least_squares_of(errors, lambda u: torch.diag(100 / (1 - u) ** 2), torch.zeros(1, dtype=torch.float64))
+    def slopes(self, theta: Tensor, c: Tensor, root: Tensor) -> list[Tensor]:
+        return [100 / (1 - c).square().view(1, 1, 1, 1)]
+
+
+def test_a_step_to_where_nothing_can_be_measured_is_shortened() -> None:
+    """The first step of Gauss-Newton leads to c = 1."""
+    rows: Any = Ahead()
+    one, none = torch.ones(1, 1, dtype=torch.float64), torch.zeros(1, 0, dtype=torch.float64)
+    found = solve(rows, one, none)
     assert found.converged
-    assert float(found.u[0]) == pytest.approx(0.5, abs=1e-4)
+    assert float(found.shifts[0]) == pytest.approx(0.5, abs=1e-4)
     with pytest.raises(InputError, match="behind"):
-        least_squares_of(errors, lambda u: u[None], torch.ones(1, dtype=torch.float64))
+        solve(rows, one, none, start=(one[0], one[0]))
 
 
 def test_what_is_given_stays() -> None:

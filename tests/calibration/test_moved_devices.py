@@ -75,7 +75,7 @@ def test_the_result_tells_which_scales_pass_without_a_warning(share: float, noti
     wrong, texts = warned(dc.Measurements(q, y * (1 + share * found.unnoticed - found.value)))
     assert bool(texts) == noticed
     moved = (y - y.mean((0, 1))).square().sum(-1).mean().sqrt() * found.unnoticed
-    assert found.unnoticed * found.motion * 3**0.5 == pytest.approx(float(moved), rel=0.15)
+    assert found.unnoticed * found.motion == pytest.approx(float(moved), rel=0.15)
     assert "may be wrong without a warning" in str(wrong.lengths[0])
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.placing.readings import FoundReadings, identify_readings
+from diffeo_calib.calibration.placing.readings import Stages, identify_readings
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -32,7 +32,7 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.range import FixedPoints
 
 
-def identified(robot: Tree, data: dc.Readings) -> FoundReadings:
+def identified(robot: Tree, data: dc.Readings) -> Stages:
     return identify_readings(Geometry.nominal(robot, 1), [data])
 
 
@@ -41,9 +41,9 @@ def identified(robot: Tree, data: dc.Readings) -> FoundReadings:
 )
 def test_a_perfect_robot_finds_ball_and_devices(kind: str, zero: float) -> None:
     arm = SimulatedArm(2, geometry=0.0, transmission=0.0, gravity=0.0)
-    found = identified(arm.nominal, readings(arm, kind, 45, zero))
-    assert found.identification.rms < 2e-6
-    assert_close(found.identification.geometry.tool, arm.truth.tool, rtol=0, atol=1e-4)
+    _, found = identified(arm.nominal, readings(arm, kind, 45, zero))
+    assert found.rms < 2e-6
+    assert_close(found.geometry.tool, arm.truth.tool, rtol=0, atol=1e-4)
     expected = {
         "distance": torch.cat([POINTS, torch.full((3, 1), zero)], 1),
         "height": torch.cat([AXES, torch.full((3, 1), 0.3)], 1),
@@ -185,8 +185,8 @@ def test_devices_of_a_real_robot_are_found(kind: str, ur10_folder: Path) -> None
     """60 readings made of measured positions, heights as large as the robot moves."""
     robot, data = ur10_measurements(ur10_folder)
     some = data.split(0.1, seed=0)[0]
-    found = identified(robot, as_readings.readings(kind, as_readings.Devices(some.points[:, 0]), some))
-    assert found.identification.rms < 0.3e-3 < found.registration.rms < 1e-3
+    registration, found = identified(robot, as_readings.readings(kind, as_readings.Devices(some.points[:, 0]), some))
+    assert found.rms < 0.3e-3 < registration.rms < 1e-3
 
 
 @pytest.mark.slow

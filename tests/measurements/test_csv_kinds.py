@@ -115,7 +115,7 @@ def test_written_tables_are_read_back(kind: str, table: TableFormat, tmp_path: P
     form = write_measurements(tmp_path / "t.csv", data, table)
     again = read_observations(tmp_path / "t.csv", form)
     assert_same(again, data)
-    assert again.lines.tolist() == list(range(2, 2 + len(data)))
+    assert again.line_numbers.tolist() == list(range(2, 2 + len(data)))
     assert len(again.sha256) == 64
     shuffled = data.rows([3, 1, 0, 2])
     form = write_measurements(tmp_path / "s.csv", shuffled, table)
@@ -167,7 +167,7 @@ def read(tmp_path: Path, text: str, table: TableFormat = COLUMNS, **options: Any
 def test_a_line_with_two_kinds_is_two_rows(tmp_path: Path) -> None:
     data = read(tmp_path, LINES)
     assert data.kinds == ("position", "distance", "position", "distance", "image", "socket")
-    assert data.lines.tolist() == [2, 3, 4, 4, 5, 6]
+    assert data.line_numbers.tolist() == [2, 3, 4, 4, 5, 6]
     assert data.device_names == ["", "A", "", "B", "C", ""]
     assert held(data.parts[1].std).tolist() == [[0.1], [0.1]]
     both = LINES.replace("1,2,3,,,,,", "1,2,3,,,,s1,")

@@ -200,7 +200,7 @@ def test_a_marker_at_the_origin_far_from_all_rows_was_not_seen(rows: tuple[int, 
         f"x, y, z are 0, 0, 0 in line {at}, far from other rows: taken as not seen",
         f"no marker was seen in line {at}: {len(rows)} row(s) left out",
     ]
-    assert data.lines.tolist() == [k + 2 for k in range(8) if k not in rows]
+    assert data.line_numbers.tolist() == [k + 2 for k in range(8) if k not in rows]
 
 
 def test_a_marker_near_the_origin_stays(read: Reader) -> None:

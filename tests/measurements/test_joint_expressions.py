@@ -14,8 +14,9 @@ from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.files import read_joints, write_measurements
 from diffeo_calib.measurements.csv.joints import JointExpressions
+from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.tables import TableOrigin
-from diffeo_calib.measurements.csv.writing import Program
+from diffeo_calib.measurements.csv.writing import write_columns
 from diffeo_calib.measurements.table_format import TableFormat
 
 
@@ -82,8 +83,8 @@ def test_a_table_is_read_and_written_in_its_own_columns(tmp_path: Path) -> None:
     assert (tmp_path / "again.csv").read_text().startswith("A,B,s,x,y,z")
     assert_close(read_joints(tmp_path / "again.csv", texts, table, kinds=kinds), expected)
     columns = Columns.of(table.joints_only(texts, kinds))
-    program = Program.read(tmp_path / "t.csv", table)
-    program.write(tmp_path / "new.csv", columns.from_si({"q": expected + 0.01}), table)
+    cells = columns.from_si({"q": expected + 0.01})
+    write_columns(tmp_path / "new.csv", read_cells(tmp_path / "t.csv", table.sep), cells, table)
     assert_close(read_joints(tmp_path / "new.csv", texts, table, kinds=kinds), expected + 0.01)
 
 

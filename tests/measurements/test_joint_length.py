@@ -18,7 +18,7 @@ from diffeo_calib.cli.options import Targets, Units
 from diffeo_calib.cli.tables import MeasuredTable, ProgramTable, table_format
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.csv.files import write_measurements
-from diffeo_calib.measurements.csv.writing import Program, write_predictions
+from diffeo_calib.measurements.csv.writing import write_predictions
 from diffeo_calib.measurements.table_format import TableFormat
 
 ROBOT = SimpleNamespace(joint_names=("q1", "q2"), kinds=("prismatic", "revolute"))
@@ -58,7 +58,6 @@ def test_programs_and_predictions_keep_the_unit(tmp_path: Path) -> None:
     cells = dict(zip(header, first, strict=True))
     assert float(cells["slide"]) == pytest.approx(float(q[0, 2]))
     assert float(cells["x"]) == 1000.0
-    assert Program.read(path, table).header == header
     measured = MeasuredTable(path, None, replace(table, position=[["x", "y", "z"]])).read(robot)
     assert_close(measured.q, q, rtol=1e-14, atol=1e-15)
 

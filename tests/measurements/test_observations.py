@@ -66,7 +66,7 @@ def test_any_selection_keeps_the_order_asked_for(whole: Observations) -> None:
     some_rows = whole.rows(chosen)
     assert_close(some_rows.q, whole.q[chosen])
     assert some_rows.kinds == tuple(whole.kinds[row] for row in chosen)
-    assert some_rows.lines.tolist() == whole.lines[chosen].tolist()
+    assert some_rows.line_numbers.tolist() == whole.line_numbers[chosen].tolist()
     assert some_rows[1:3].kinds == ("position", "distance")
     assert [len(row) for row in some_rows] == [1] * 7
     again = Observations.joined([some_rows[:3], some_rows[3:]])
@@ -138,7 +138,7 @@ def test_payloads_names_lines_and_files(whole: Observations) -> None:
     laden = whole.with_payload(torch.arange(29.0)).with_line_numbers(range(100, 129)).with_joint_names(["u", "v"])
     assert held(laden.payload).tolist() == list(range(29))
     assert held(laden.parts[1].payload).tolist() == [5, 6, 7, 8, 9]
-    assert laden.rows([28, 3]).lines.tolist() == [128, 103]
+    assert laden.rows([28, 3]).line_numbers.tolist() == [128, 103]
     assert laden.parts[4].joint_names == ("u", "v")
     assert laden.to("cpu").sha256 == laden.sha256
     assert len({laden.sha256, whole.sha256, whole.rows(range(28)).sha256, whole.rows([1, 0]).sha256}) == 4
@@ -213,10 +213,10 @@ def test_readings_iterate_split_fold_and_change() -> None:
     data = tables()["distance"]
     assert [row.device_names for row in data] == [["A"], ["A"], ["B"], ["B"], ["A"]]
     assert data[2:4].device.tolist() == [0, 0]
-    assert sorted(line for _, test in data.folds(5) for line in test.lines.tolist()) == [0, 1, 2, 3, 4]
+    assert sorted(line for _, test in data.folds(5) for line in test.line_numbers.tolist()) == [0, 1, 2, 3, 4]
     loaded = data.with_payload(2.0).with_columns(file_sha256="x").with_tips(["left"]).with_line_numbers([9, 8, 7, 6, 5])
     assert held(loaded[1:].payload).tolist() == [2.0] * 4
-    assert (loaded.sha256, loaded.ball_tip, loaded[[0]].lines.tolist()) == ("x", "left", [9])
+    assert (loaded.sha256, loaded.ball_tip, loaded[[0]].line_numbers.tolist()) == ("x", "left", [9])
     assert len({data.sha256, data.with_payload(1.0).sha256, replace(data, std=None).sha256}) == 3
     assert data.to("cpu").values.device.type == "cpu"
     assert list(data.to_frame().columns) == ["a", "b", "distance", "std_distance", "session"]

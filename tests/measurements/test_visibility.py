@@ -132,7 +132,7 @@ def test_line_without_any_marker_is_left_out_and_named(read: Reader) -> None:
         assert read(text(*ROWS, "0.7,0.8,,,,,,"), position=TWO).visible.tolist() == SEEN
     with pytest.warns(DiffeoCalibWarning, match="no marker was seen in line 3"):
         data = read(text("0.1,0.2,1,2,3,4,5,6", "0.3,0.4,,,,4,5,6"), position=TWO[0])  # of a single marker
-    assert data.lines.tolist() == [2]
+    assert data.line_numbers.tolist() == [2]
     with pytest.raises(MeasurementError, match=says("line 5", "'q2'", "a finite number")):
         read(text(*ROWS, "0.7,,,,,,,"), position=TWO)
 

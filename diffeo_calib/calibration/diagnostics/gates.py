@@ -45,10 +45,8 @@ it is the last number: a model of few rows is overconfident."""
 
 # --- lengths, and usual errors of a robot ---
 
-USUAL_TRANSLATION_M, USUAL_ROTATION_RAD = 5e-4, 5e-4
-"""Of the errors of links."""
-USUAL_COUPLED_RAD, USUAL_TASK_M = 3e-4, 1e-4
-"""Amplitudes of the fields; what these explain beyond is not the robot's."""
+USUAL_SCALES = {"translation_errors": 5e-4, "rotation_errors": 5e-4, "coupled_amplitude": 3e-4, "task_amplitude": 1e-4}
+"""Of the errors of links and the amplitudes of the fields, m and rad; what these explain beyond is not the robot's."""
 LINK_M = 0.05
 """Length of a link from which it is judged by itself."""
 LENGTH_CHANCE = 1e-3

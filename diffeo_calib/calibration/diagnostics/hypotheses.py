@@ -8,10 +8,15 @@ They explain the gain g^T u of r^T K^-1 r: by chance chi-squared, one degree of 
 N(0, s^2) of the unknowns the log evidence grows by
 
     1/2 g^T (H + s^-2)^-1 g - 1/2 log |1 + s^2 H|.
+
+Errors of links and a wrong scale of the device look alike: the fit takes up either without a trace in its residuals.
+What tells them apart is how improbable links are that are wrong by so much: a length of the robot, its links or the
+device is a hypothesis beside the errors of a robot with usual errors of its links.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -19,8 +24,13 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.common.errors import sentence, warn_user, with_deviation
+from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.process.process import Process
+from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.regression.factor import Factor
+from diffeo_calib.sensors.devices import MILLIMETRE, Hypothesis
 
 RELATIVE_RIDGE = 1e-9
 """Relative size of the diagonal that keeps H invertible where rows do not determine all unknowns."""
@@ -95,3 +105,95 @@ def left_out_rms(process: Process) -> float:
         mu = process.mu[part.numbers].view(*part.cells.shape, 1)
         total += float(torch.linalg.solve(block, mu).square().sum())
     return (total / len(numbers.q)) ** 0.5
+
+
+# --- lengths against what they are said to be -------------------------------------------------------------------------
+
+PERCENT = "%", 1e-2
+OF_ROBOT = "check the scale and the unit of the device, known distances, and the robot's variant"
+OF_AXIS = "check the scale of the device along this axis and the columns of the positions"
+OF_LINK = "check the robot's variant and this link in its description"
+
+
+class Length(NamedTuple):
+    """A length against what it is said to be.
+
+    Args:
+        cause: what. value, deviation: how much it differs, in m or relative. motion: RMS motion of a point by a unit of
+            it, m. unnoticed: largest value that a usual robot shows by chance, and that passes without a warning.
+    """
+
+    cause: Hypothesis
+    value: float
+    deviation: float
+    motion: float
+    unnoticed: float
+
+    def __str__(self) -> str:
+        unit, size = self.cause.unit or MILLIMETRE
+        found = with_deviation(self.value / size, self.deviation / size)
+        return (
+            f"{self.cause.name} against its description: {found} {unit}, which moves points by "
+            f"{1e3 * abs(self.value) * self.motion:.2g} mm; up to {self.cause.amount(self.unnoticed)} "
+            f"({1e3 * self.unnoticed * self.motion:.2g} mm) may be wrong without a warning"
+        )
+
+
+def lengths(data: TangentData, scales: Hyperparameters, devices: Iterable[Hypothesis] = ()) -> list[Length]:
+    """Lengths against what they are said to be, that of the whole robot first, beside errors of usual size.
+
+    Args:
+        data: the measurements. scales: those of the model. devices: what devices are said to hold, such as a focal
+            length.
+    """
+    rows, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed=0)
+    usual = {name: getattr(scales, name).clamp(max=most) for name, most in gates.USUAL_SCALES.items()}
+    process, found = some.process(replace(scales, **usual)), list[Length]()
+    for one in (*_lengths_of(some), *(each._replace(effects=each.effects[rows]) for each in devices)):
+        evidence = Evidence.of(process.numbers.of_table(some.motions_in_numbers(one.effects)), process)
+        if (h := float(evidence.H)) > 0.0:
+            motion = float((3 * (one.effects - one.effects.mean(0))[some.visible].square().mean()).sqrt())
+            found.append(Length(one, float(evidence.size), (evidence.excess / h) ** 0.5, motion, 0.0))
+    allowed = chi2_above(gates.LENGTH_CHANCE / max(len(found), 1), 1) ** 0.5
+    return [one._replace(unnoticed=allowed * one.deviation) for one in found]
+
+
+def warn_of_lengths(found: list[Length]) -> float | None:
+    """Warn of the least probable length, if it is too improbable; by how much any such length moves points, m."""
+    wrong = [one for one in found if abs(one.value) > one.unnoticed]
+    if not wrong:
+        return None
+    worst = max(wrong, key=lambda one: abs(one.value) / one.deviation)
+    moved = max(abs(one.value) * one.motion for one in wrong)
+    text = sentence(
+        f"{worst.cause.name} seems to differ by {worst.cause.amount(worst.value, '+')} from what it is said to be",
+        expected=f"at most about {worst.cause.amount(3 * worst.deviation)}: links and devices are seldom that wrong",
+        got=f"absolute positions that may be wrong by {1e3 * moved:.2g} mm RMS",
+        fix=f"{worst.cause.fix}; the expected error does not hold before that is settled",
+    )
+    warn_user(text)
+    return moved
+
+
+def _lengths_of(data: TangentData) -> Iterator[Hypothesis]:
+    """The whole robot, the axes of its measuring device, and single links."""
+    geometry = data.nominal.geometry
+    away = data.places.unflatten(1, (-1, 3)) - geometry.base[:3, 3].to(data.x.device)
+
+    def seen(motion: Tensor) -> Tensor:
+        motion = motion.flatten(1)[..., None]
+        return motion if data.slopes is None else data.slopes @ motion
+
+    yield Hypothesis("the size of the robot", seen(away), PERCENT, OF_ROBOT)
+    if not data.adrift:  # a device has axes
+        eye = torch.eye(3, dtype=away.dtype, device=away.device)
+        for axis, own in zip("xyz", eye, strict=True):
+            yield Hypothesis(f"the scale of the measuring frame along {axis}", seen(away * own), PERCENT, OF_AXIS)
+    chain = geometry.chain
+    for joint, name in enumerate(chain.moving_names):
+        offset = chain.offsets[joint].to(data.x.device)
+        length = float(offset[:3, 3].norm())
+        if chain.before[joint] >= 0 and length > gates.LINK_M:  # the first joint's is where the base stands
+            along, start = offset[:3, :3].mT @ offset[:3, 3] / length, 6 + 6 * joint
+            own = data.sensitivities[..., start : start + 3] @ along[:, None]
+            yield Hypothesis(f"the link before {name} ({1e3 * length:.4g} mm)", own, fix=OF_LINK)

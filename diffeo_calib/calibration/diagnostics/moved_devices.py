@@ -53,26 +53,21 @@ class Finding(NamedTuple):
     """A hypothesis that explains errors: from a row on, or drifting over all rows.
 
     Args:
-        hypothesis: what, with effects (N, R, U). shares: (N,) of it in every row.
+        hypothesis: what, with effects (N, R, U). columns: (N, R, U) its effects in the rows.
         size: (U,) of a drift between the first row and the last. gain: what it explains.
         row: the first one after a change, in the order of measurement; None for a drift.
     """
 
     hypothesis: Hypothesis
-    shares: Tensor
+    columns: Tensor
     size: Tensor
     gain: float
     row: int | None
 
     @property
-    def columns(self) -> Tensor:
-        """(N, R, U) effects in the rows."""
-        return self.shares[:, None, None] * self.hypothesis.effects
-
-    @property
     def evidence(self) -> float:
         """Gain less the price of the unknowns by the Bayesian information criterion; the row is one more."""
-        return self.gain - (len(self.size) + (self.row is not None)) * log(len(self.shares))
+        return self.gain - (len(self.size) + (self.row is not None)) * log(len(self.columns))
 
     @property
     def displacement(self) -> float:
@@ -85,15 +80,14 @@ class Finding(NamedTuple):
         """Probability that chance alone gains as much."""
         if self.row is None:
             return chi2_probability(self.gain, len(self.size))
-        return chance_of_jump(self.gain, len(self.size), gates.CHANGE_ROWS / len(self.shares))
+        return chance_of_jump(self.gain, len(self.size), gates.CHANGE_ROWS / len(self.columns))
 
     def words(self, data: TangentData) -> str:
         """Phrase for the change and its size."""
         name, verb = self.hypothesis.name, "to drift" if self.row is None else "to have moved"
         if self.hypothesis.unit is not None:
-            unit, size = self.hypothesis.unit
             verb = verb if self.row is None else "to have changed"
-            return f"{name} seems {verb} by about {float(self.size.abs().max()) / size:.2g} {unit}"
+            return f"{name} seems {verb} by about {self.hypothesis.amount(float(self.size.abs().max()))}"
         motion = data.in_coordinates(self.hypothesis.effects @ self.size)
         size = 3 if motion.shape[1] % 3 == 0 else motion.shape[1]
         distances = motion.unflatten(1, (-1, size)).norm(dim=-1)  # of every marker
@@ -103,12 +97,7 @@ class Finding(NamedTuple):
             distance = float(typical.max())
             single = float(typical.min()) < gates.OTHER_MARKERS * distance
             name = f"marker {int(typical.argmax())}" if single else name
-        return f"{name} seems {verb} by about {1e3 * distance:.2g} mm"
-
-    def as_good_as(self, best: Finding) -> bool:
-        """Whether the rows do not tell it apart from the best one: it explains as much, or is as probable."""
-        apart = min(best.gain - self.gain, best.evidence - self.evidence)
-        return (self.row is None) == (best.row is None) and apart < gates.CHANGES_TOLD_APART
+        return f"{name} seems {verb} by about {self.hypothesis.amount(distance)}"
 
 
 def change_during(
@@ -141,64 +130,28 @@ def change_during(
     if not likely or len(found) * min(one.chance for one in likely) > gates.CHANGE_CHANCE:
         return None
     best = max(likely, key=lambda one: one.evidence)
-    others = [one for one in likely if one.hypothesis.name != best.hypothesis.name and one.as_good_as(best)]
-    words = dict.fromkeys(one.words(some) for one in (best, *others))
+    what, fix = best.hypothesis.name, best.hypothesis.fix
+
+    def as_good(one: Finding) -> bool:
+        apart = min(best.gain - one.gain, best.evidence - one.evidence)
+        same = (one.row is None) == (best.row is None)
+        return same and one.hypothesis.name != what and apart < gates.CHANGES_TOLD_APART
+
+    words = dict.fromkeys(one.words(some) for one in (best, *filter(as_good, likely)))
     before, after = left_out_rms(process), left_out_rms(opened(process, process.numbers.of_table(best.columns)))
-    if best.row is None and (moved := moved_twice(best, process, order, after)):
+    if best.row is None and (moved := moved_twice(best.hypothesis.effects, process, order, after)):
         lines = " and ".join(str(int(numbers[order[row]])) for row in moved)
-        what = f"{best.hypothesis.name} seems to have moved more than once, near rows {lines}"
-        fix = f"check what happened then; {best.hypothesis.fix}"
-        return sentence(what, expected="one set-up for all rows", fix=fix)
+        text = f"{what} seems to have moved more than once, near rows {lines}"
+        return sentence(text, expected="one set-up for all rows", fix=f"check what happened then; {fix}")
     if after > gates.WORTH * before:
         return None
     where = "over the rows" if best.row is None else f"near row {int(numbers[order[best.row]])}"
     return sentence(
-        f"{', or '.join(words)}{' (these rows do not tell which)' * bool(others)} {where}",
+        f"{', or '.join(words)}{' (these rows do not tell which)' * any(map(as_good, likely))} {where}",
         expected="one set-up for all rows, in the order of their numbers",
         got=f"leave-one-out errors that fall to {100 * after / before:.0f} % with this change in the model",
-        fix=SLOW if best.row is None else f"check what happened then; {best.hypothesis.fix}",
+        fix=SLOW if best.row is None else f"check what happened then; {fix}",
     )
-
-
-class Variation(NamedTuple):
-    """A number that differs from row to row: which, with effects on coordinates, its deviation, and log odds."""
-
-    hypothesis: Hypothesis
-    size: float
-    odds: float
-
-    @property
-    def sentence(self) -> str:
-        """What differs by how much, and what to do."""
-        (unit, per_unit), e = self.hypothesis.unit or ("mm", 1e-3), self.hypothesis.effects
-        moved = 1e3 * self.size * float((3 * e[e != 0].square().mean()).sqrt())
-        got = f"about {self.size / per_unit:.2g} {unit}, which moves the tool by {moved:.2g} mm"
-        what = f"{self.hypothesis.name} seems to differ"
-        return sentence(what, expected="the same for all rows", got=got, fix=self.hypothesis.fix)
-
-
-def variation(data: TangentData, scales: Hyperparameters, hypotheses: Iterable[Hypothesis]) -> Variation | None:
-    """The likeliest number that differs from row to row, if it is clear: an unknown u_i ~ N(0, s^2) of every row i.
-
-    It is clear beside the tails of the noise, but seems small beside those that it makes: s counts all but gross rows.
-    """
-    rows, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed=0)
-    found = (_varying(one, rows, some, scales) for one in hypotheses)
-    clear, weights = max(found, key=lambda one: one.odds, default=None), some.tails.weights
-    if clear is None or clear.odds < gates.ROW_ODDS:
-        return None
-    tails = replace(some.tails, weights=weights.where(weights < 1.0 / FACTORS[0], 1.0))
-    return _varying(clear.hypothesis, rows, some.with_tails(tails), scales)
-
-
-def _varying(one: Hypothesis, rows: Tensor, some: TangentData, scales: Hyperparameters) -> Variation:
-    process = some.process(scales)
-    e = process.numbers.of_table(some.motions_in_numbers(one.effects[rows]))[:, 0]
-    numbers = torch.arange(len(e), device=rows.device)
-    E = e.new_zeros(len(e), len(rows)).index_put((numbers, process.numbers.owner), e)
-    sizes = VARIATION_M.to(e) / float(e[e != 0].square().mean().sqrt())
-    odds = Evidence.of(E[:, (E != 0).any(0)], process).log_odds(sizes.square())
-    return Variation(one, float(sizes[odds.argmax()]), float(odds.max()))
 
 
 def findings(
@@ -211,12 +164,11 @@ def findings(
     """
     found = []
     for one in hypotheses:
-        row = change_row(one.effects, process, order)
-        for shares, first in ((_since(order, row), row), (_growing(order), None)):
-            columns = shares.to(one.effects)[:, None, None] * one.effects
+        for first in (change_row(one.effects, process, order), None):
+            columns = _shown(one.effects, order, first)
             evidence = Evidence.of(process.numbers.of_table(columns), process)
             gain = float(evidence.gain) / max(excess, evidence.excess)
-            found.append(Finding(one, shares.to(one.effects), evidence.size, gain, first))
+            found.append(Finding(one, columns, evidence.size, gain, first))
     return found
 
 
@@ -238,35 +190,67 @@ def change_row(effects: Tensor, process: Process, order: Tensor) -> int:
     return n - fewest - int(Evidence(g, H).gain[fewest - 1 : n - fewest].argmax())
 
 
-def _since(order: Tensor, row: int) -> Tensor:
-    """(N,) zero before a row of the order, and one from it on."""
-    return (order.argsort() >= row).double()
+def _shown(effects: Tensor, order: Tensor, row: int | None) -> Tensor:
+    """Effects (N, R, U) from a row of the order on; of a drift from -1/2 in the first row to 1/2 in the last."""
+    place = order.argsort()
+    shares = place.double() / (len(order) - 1) - 0.5 if row is None else (place >= row).double()
+    return shares.to(effects)[:, None, None] * effects
 
 
-def _growing(order: Tensor) -> Tensor:
-    """(N,) from -1/2 in the first row of the order to 1/2 in the last."""
-    return order.argsort().double() / (len(order) - 1) - 0.5
-
-
-def moved_twice(drift: Finding, process: Process, order: Tensor, left: float) -> tuple[int, int] | None:
+def moved_twice(effects: Tensor, process: Process, order: Tensor, left: float) -> tuple[int, int] | None:
     """First rows after two sudden changes that leave less than the RMS left-out error, m, of a drift; else None.
 
     Three set-ups look like a drift. The first change is sought once more beside the second one.
     """
-    effects, known, found = drift.hypothesis.effects, process, list[int]()
-    for _ in range(3):
-        found.append(change_row(effects, known, order))
-        known = opened(process, _from_rows(effects, process, order, found[-1:]))
-    low, high = sorted(found[1:])
-    both = opened(process, _from_rows(effects, process, order, [low, high]))
+
+    def with_changes(*rows: int) -> Process:
+        columns = torch.cat([_shown(effects, order, row) for row in rows], 2)
+        return opened(process, process.numbers.of_table(columns))
+
+    row = change_row(effects, process, order)
+    low, high = sorted([row := change_row(effects, with_changes(row), order) for _ in range(2)])
     apart = high - low >= gates.CHANGE_ROWS
-    return (low, high) if apart and left_out_rms(both) < gates.WORTH * left else None
+    return (low, high) if apart and left_out_rms(with_changes(low, high)) < gates.WORTH * left else None
 
 
-def _from_rows(effects: Tensor, process: Process, order: Tensor, rows: Sequence[int]) -> Tensor:
-    """Effects (N, R, U) of changes at rows of the order on all numbers, side by side."""
-    each = [_since(order, row).to(effects)[:, None, None] * effects for row in rows]
-    return process.numbers.of_table(torch.cat(each, 2))
+class Variation(NamedTuple):
+    """A number that differs from row to row: which, with effects on coordinates, its deviation, and log odds."""
+
+    hypothesis: Hypothesis
+    size: float
+    odds: float
+
+    @property
+    def sentence(self) -> str:
+        """What differs by how much, and what to do."""
+        e = self.hypothesis.effects
+        moved = 1e3 * self.size * float((3 * e[e != 0].square().mean()).sqrt())
+        got = f"about {self.hypothesis.amount(self.size)}, which moves the tool by {moved:.2g} mm"
+        what = f"{self.hypothesis.name} seems to differ"
+        return sentence(what, expected="the same for all rows", got=got, fix=self.hypothesis.fix)
+
+
+def variation(data: TangentData, scales: Hyperparameters, hypotheses: Iterable[Hypothesis]) -> Variation | None:
+    """The likeliest number that differs from row to row, if it is clear: an unknown u_i ~ N(0, s^2) of every row i.
+
+    It is clear beside the tails of the noise, but seems small beside those that it makes: s counts all but gross rows.
+    """
+    rows, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed=0)
+
+    def varying(one: Hypothesis, process: Process) -> Variation:
+        e = process.numbers.of_table(some.motions_in_numbers(one.effects[rows]))[:, 0]
+        numbers = torch.arange(len(e), device=rows.device)
+        E = e.new_zeros(len(e), len(rows)).index_put((numbers, process.numbers.owner), e)
+        sizes = VARIATION_M.to(e) / float(e[e != 0].square().mean().sqrt())
+        odds = Evidence.of(E[:, (E != 0).any(0)], process).log_odds(sizes.square())
+        return Variation(one, float(sizes[odds.argmax()]), float(odds.max()))
+
+    found = (varying(one, some.process(scales)) for one in hypotheses)
+    clear, weights = max(found, key=lambda one: one.odds, default=None), some.tails.weights
+    if clear is None or clear.odds < gates.ROW_ODDS:
+        return None
+    tails = replace(some.tails, weights=weights.where(weights < 1.0 / FACTORS[0], 1.0))
+    return varying(clear.hypothesis, some.with_tails(tails).process(scales))
 
 
 def chance_of_jump(gain: float, unknowns: int, edge: float) -> float:
@@ -284,7 +268,9 @@ def changes_of(data: TangentData, devices: Iterable[Hypothesis] = (), index: Ten
         devices: with effects on more rows, of which these have the numbers ``index`` (N,).
     """
     points, geometry = data.points.unflatten(1, (-1, 3)), data.nominal.geometry
-    base, markers = frame_slopes(points, points.mean((0, 1))), _shifts(geometry.marker_poses(data.x)[..., :3, :3])
+    base, R = frame_slopes(points, points.mean((0, 1))), geometry.marker_poses(data.x)[..., :3, :3]
+    own = torch.eye(R.shape[1], dtype=R.dtype, device=R.device)
+    markers = torch.einsum("npab,pk->npakb", R, own).flatten(3).flatten(1, 2)  # (N, 3 P, 3 P), in the tips' frames
     if data.basis is not None:  # nothing bends a frame
         markers = markers @ torch.block_diag(*rigid_motions(geometry.tool.flatten()).to(markers.device))
     places = data.places.unflatten(1, (-1, 3))
@@ -304,9 +290,3 @@ def changes_of(data: TangentData, devices: Iterable[Hypothesis] = (), index: Ten
     found += [one._replace(effects=one.effects[index]) for one in devices]
     every = (one for one in found if bool((one.effects != 0).any()))
     return [one._replace(effects=data.motions_in_numbers(one.effects)) for one in every]
-
-
-def _shifts(rotations: Tensor) -> Tensor:
-    """Shifts of every marker in its tip's frame: (N, P, 3, 3) -> (N, 3 P, 3 P)."""
-    own = torch.eye(rotations.shape[1], dtype=rotations.dtype, device=rotations.device)
-    return torch.einsum("npab,pk->npakb", rotations, own).flatten(3).flatten(1, 2)

@@ -14,7 +14,6 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.likely_mistakes import (
     NO_MISTAKE_FOUND,
     likely_mistake,
-    marker_column,
     refuse_or_warn,
     residual_of,
 )
@@ -28,11 +27,13 @@ from diffeo_calib.calibration.identification.registration import (
     with_large_offsets,
 )
 from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, RobotError, few, sentence, shown, warn_user
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import joint_name_fix
 
@@ -154,6 +155,32 @@ def check_identification(data: Measurements, identification: Identification) -> 
         mistake=likely_mistake(identification.geometry.chain, data, typical),
         otherwise=NO_MISTAKE_FOUND if doubtful else None,
     )
+
+
+def marker_column(geometry: Geometry, data: Measurements) -> tuple[str, str] | None:
+    """A column that was not read, and why it names which of several markers a row shows; None without one.
+
+    Rows of another marker than that of the geometry are off by a constant in the frame of its tip.
+    """
+    if data.markers > 1 or not isinstance(data.origin, TableOrigin) or bool(data.points.isnan().any()):
+        return None
+    error, columns = (data.points - geometry.points(data.q))[:, 0].cpu(), data.origin.columns
+    in_tip = (geometry.marker_poses(data.q)[:, 0, :3, :3].cpu().mT @ error[:, :, None])[:, :, 0]
+    for column, texts in data.origin.texts(data.line_numbers).items():
+        names = list(dict.fromkeys(texts))
+        if not 1 < len(names) <= gates.MOST_MARKERS or column in {*columns.names, columns.table.session}:
+            continue
+        rows = torch.tensor([[text == name for name in names] for text in texts], dtype=error.dtype, device=HOST)
+        if float(rows.sum(0).min()) < gates.MARKER_ROWS or "" in names:
+            continue
+        means = [rows.mT @ own / rows.sum(0)[:, None] for own in (in_tip, error)]
+        left = [float((own - rows @ mean).norm()) for own, mean in zip((in_tip, error), means, strict=True)]
+        alone, freedom = float(in_tip.norm()), ((len(texts) - 1) / (len(texts) - len(names))) ** 0.5
+        if left[0] * freedom < gates.MARKERS_LEFT * min(alone, left[1] * freedom):
+            jump, per_row = 1e3 * float(torch.cdist(means[0], means[0]).max()), 1e3 / len(texts) ** 0.5
+            words = f"{len(names)} values between which the points jump by {jump:.3g} mm on the tool (RMS error "
+            return column, f"{words}{alone * per_row:.3g} mm, and {left[0] * per_row:.3g} mm without these jumps)"
+    return None
 
 
 def _typical(identification: Identification, data: Measurements) -> float:

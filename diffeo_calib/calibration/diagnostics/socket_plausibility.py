@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.conventions import Seen, conventions, socket_projector
 from diffeo_calib.calibration.diagnostics.likely_mistakes import (
-    convention_words,
-    corrections_of_angles,
-    corrections_of_units,
+    Reading,
+    likely_mistake,
+    other_conventions,
+    other_units,
     refuse_or_warn,
 )
 from diffeo_calib.calibration.identification.identification import Identification
@@ -143,22 +143,12 @@ def check_registration(
     """
     median, motion = float(found.distances.median()), _motion(robot, data.q)
     far = median > gates.SOCKET_FAR * robot.reach
-    tried = corrections_of_units(robot, data.q) if far else corrections_of_angles(robot, data.q)
-    best, mistake = min(gates.OTHER_READING_LEFT * median / motion, gates.RIGHT_READING), ""
-    socket = data.socket_numbers
+    tried = (other_units, other_conventions) if far and around is None else (other_units,)
 
-    def left(q: Tensor) -> float:
-        again = register_sockets(robot if around is None else around, q, socket)
-        return float(again.distances.median()) / _motion(robot, q)
+    def left(reading: Reading) -> tuple[float, float]:
+        again = register_sockets(robot if around is None else around, reading.q, data.socket_numbers)
+        return float(again.distances.median()), _motion(robot, reading.q)
 
-    for q, words in tried:
-        share = left(q)
-        best, mistake = (share, words) if share < best else (best, mistake)
-    if far and not mistake and around is None:
-        rows = (socket >= 0).nonzero()[:, 0]
-        seen = Seen(0, rows, lambda chosen: socket_projector(socket[rows[chosen]]), "rad", left)
-        kinds = conventions(robot, data.q, seen)
-        mistake = convention_words(kinds, None) if kinds else ""
     fix = (
         "check the unit and the order of the joints, and that rows carry the names of their own sockets: of the place "
     )
@@ -166,7 +156,7 @@ def check_registration(
         "these rows do not fit the robot" + ": the ball is in no socket" * far,
         expected=f"a spread within sockets well below the {1e3 * motion:.3g} mm that the tip moves",
         got=f"a median of {1e3 * median:.3g} mm",
-        mistake=mistake,
+        mistake=likely_mistake(robot, data, median, tried, left),
         otherwise=fix + "and of the socket in it" if far else None,
     )
     _check_tilt(found)

@@ -8,8 +8,9 @@ problem regular whatever the poses are. Rows may share shifts c with the prior N
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import sqrt
 from typing import Any, NamedTuple
 
@@ -26,9 +27,6 @@ from diffeo_calib.robots.cartesian import is_cartesian, turns_nowhere
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import Devices
-
-MEDIAN_CHI2_3 = 2.37
-"""Median of chi-squared with 3 degrees of freedom."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ class EstimationLimits:
 
 
 LIMITS = EstimationLimits()
-PRECISE = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-12)
+PRECISE: dict[str, Any] = {"xtol": 1e-12, "ftol": 1e-12, "gtol": 1e-12, "max_nfev": 200}
 
 
 @dataclass(frozen=True)
@@ -103,6 +101,7 @@ class Identification:
         theta: (K,) estimated parameters of the geometry that the search started from [m, rad].
         prior: the prior, given or estimated.
         tails: weights of the measurements (N, P), 1 where they are hidden; all 1 if the noise was given or is Gaussian.
+        devices: those of readings that were found with it, in the order of their tables.
     """
 
     geometry: Geometry
@@ -114,6 +113,7 @@ class Identification:
     theta: Tensor
     prior: Prior
     tails: Tails
+    devices: tuple[Devices, ...] = ()
 
     @property
     def deviations(self) -> Tensor:
@@ -174,26 +174,13 @@ def identify(
     Note:
         Cost: some ten singular value decompositions of a (3 N P + K) x K matrix.
     """
-    q, points = q.detach().cpu(), points.detach().cpu()
     held = held_parameters(geometry) if held is None else held
-    own = MeasuredPoints(q, points, points.new_zeros(*points.shape, 0) if shared is None else shared)
-    rows = Rows(geometry, (own,))
-    if noise is not None:
-        sigma, used = points.new_full(points.shape[:2], noise), prior or Prior()
-        fit = solve(rows, sigma, used.root(geometry, held), **PRECISE)
-        left = fit.errors
-        tails, level = Tails.none(*points.shape[:2], device=points.device), noise
-    else:
-        fit, used, tails, level = _estimate(Rows(geometry, (own.sample(),)), prior, held)
-        left = rows.errors(fit.theta, fit.shifts)
-        if len(tails.weights) < len(q):
-            tails = reweight(body_squares(left) / level**2, 3)
-    how = "estimated" if noise is None else "given"
-    rms = float(body_squares(left).nanmean().sqrt())
-    ended = f"{'converged' if fit.converged else 'stopped before converging'} after {fit.iterations} steps"
-    status = f"{ended}: {in_mm(rms, level, how)}."
-    found = geometry.absorb(fit.theta)
-    return Identification(found, rms, level, fit.covariance, fit.iterations, status, fit.theta, used, tails)
+    rows = Rows(geometry, (MeasuredPoints.of(q, points, shared),))
+    if noise is None:
+        return estimated(rows, held, prior)
+    sigma, used = torch.full(points.shape[:2], noise, dtype=torch.float64), prior or Prior()
+    fit = solve(rows, sigma, used.root(geometry, held), **PRECISE)
+    return _identification(rows, fit, noise, "given", prior=used, tails=Tails.none(*points.shape[:2]))
 
 
 class MeasuredPoints(NamedTuple):
@@ -202,6 +189,12 @@ class MeasuredPoints(NamedTuple):
     q: Tensor
     points: Tensor
     effects: Tensor
+
+    @classmethod
+    def of(cls, q: Tensor, points: Tensor, shared: Tensor | None = None) -> MeasuredPoints:
+        """Markers without shifts by default."""
+        q, points = q.detach().cpu(), points.detach().cpu()
+        return cls(q, points, points.new_zeros(*points.shape, 0) if shared is None else shared)
 
     @property
     def freedom(self) -> int:
@@ -224,12 +217,16 @@ class MeasuredPoints(NamedTuple):
         index = torch.randperm(len(self.q), generator=seeded(0), device=self.q.device)[:count].sort().values
         return MeasuredPoints(*(own[index] for own in self))
 
+    def devices(self, shifts: Tensor) -> tuple[Devices, ...]:
+        """The devices of readings after shifts (c,)."""
+        return ()
+
 
 class ReadRows(NamedTuple):
     """Readings of one kind of the first marker, a ball, and devices around which their places are sought."""
 
     data: Readings
-    devices: Devices
+    around: Devices
 
     @property
     def q(self) -> Tensor:
@@ -237,20 +234,23 @@ class ReadRows(NamedTuple):
 
     @property
     def freedom(self) -> int:
-        return self.devices.freedom
+        return self.around.freedom
 
-    def moved(self, shifts: Tensor) -> Devices:
-        """The devices after shifts, in units of their deviations."""
-        return self.devices.moved(shifts.view(len(self.devices.names), -1) * self.devices.deviations)
+    def devices(self, shifts: Tensor) -> tuple[Devices, ...]:
+        around = self.around  # shifts are in units of their deviations
+        return (around.moved(shifts.view(len(around.names), -1) * around.deviations),)
 
     def errors(self, points: Tensor, shifts: Tensor) -> Tensor:
-        return -self.moved(shifts).errors(self.data, points[:, 0])[:, None]
+        return -self.devices(shifts)[0].errors(self.data, points[:, 0])[:, None]
 
     def slopes(self, points: Tensor, by_errors: Tensor, shifts: Tensor) -> Tensor:
-        devices, ball = self.moved(shifts), points[:, 0]
+        (devices,), ball = self.devices(shifts), points[:, 0]
         device = devices.numbers(self.data)
         own = devices.observation(device).slope(ball) @ by_errors[:, 0]
         return torch.cat([own, devices.shared(ball, device)], 2)[:, None]
+
+    def sample(self) -> ReadRows:
+        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,40 +259,50 @@ class Rows:
 
     Args:
         geometry: the start. parts: the rows.
-        tips: (N, P, 4, 4) their poses at the rows of every part where errors of joints and base stay zero, so
-            that only the markers move; None where they may not.
+        rigid: whether errors of joints and base stay zero, so that only the markers move on their tips.
     """
 
     geometry: Geometry
     parts: tuple[MeasuredPoints | ReadRows, ...]
-    tips: Sequence[Tensor] | None = None
+    rigid: bool = False
+
+    @cached_property
+    def tips(self) -> list[Tensor]:
+        """Poses (N, P, 4, 4) of the markers' tips at the rows of every part, without errors."""
+        return [self.geometry.marker_poses(own.q) for own in self.parts]
 
     def points(self, theta: Tensor) -> list[Tensor]:
         """The markers (N, P, 3) at the rows of every part, m."""
-        if self.tips is None:
+        if not self.rigid:
             return [self.geometry.points(own.q, theta) for own in self.parts]
         tool = self.geometry.tool + theta[self.geometry.slices["tool"]].view(-1, 3)
         return [(T[..., :3, :3] @ tool[..., None])[..., 0] + T[..., :3, 3] for T in self.tips]
 
     def by_errors(self, theta: Tensor, root: Tensor) -> list[Tensor]:
         """Derivatives (N, P, 3, f) of these by unknowns u, theta = root u; with known poses of the only marker."""
-        if self.tips is None:
+        if not self.rigid:
             return [self.geometry.sensitivities(own.q, theta) @ root for own in self.parts]
         return [T[..., :3, :3] @ root[self.geometry.slices["tool"]] for T in self.tips]
 
-    def split(self, shifts: Tensor) -> tuple[Tensor, ...]:
-        """Shifts of every part."""
-        return shifts.split([own.freedom for own in self.parts])
+    @property
+    def freedom(self) -> list[int]:
+        """Number of shifts of every part."""
+        return [own.freedom for own in self.parts]
+
+    def devices(self, shifts: Tensor) -> tuple[Devices, ...]:
+        """Those of all readings after all shifts."""
+        each = zip(self.parts, shifts.split(self.freedom), strict=True)
+        return tuple(one for own, some in each for one in own.devices(some))
 
     def errors(self, theta: Tensor, shifts: Tensor) -> list[Tensor]:
         """Predicted minus measured numbers of every part, m."""
-        each = zip(self.parts, self.points(theta), self.split(shifts), strict=True)
+        each = zip(self.parts, self.points(theta), shifts.split(self.freedom), strict=True)
         return [own.errors(points, own_shifts) for own, points, own_shifts in each]
 
     def slopes(self, theta: Tensor, shifts: Tensor, root: Tensor) -> list[Tensor]:
         """Derivatives of all numbers by the unknowns u (f,), theta = root u, then by all shifts."""
-        sizes, found, f = [own.freedom for own in self.parts], [], root.shape[1]
-        each = zip(self.parts, self.points(theta), self.by_errors(theta, root), self.split(shifts), strict=True)
+        sizes, found, f = self.freedom, [], root.shape[1]
+        each = zip(self.parts, self.points(theta), self.by_errors(theta, root), shifts.split(sizes), strict=True)
         for place, (own, points, by_errors, own_shifts) in enumerate(each):
             slopes = own.slopes(points, by_errors, own_shifts)
             around = sum(sizes[:place]), sum(sizes[place + 1 :])
@@ -300,48 +310,52 @@ class Rows:
         return found
 
 
-def body_squares(errors: Sequence[Tensor]) -> Tensor:
-    """Squares (N, B) of errors (N, B, d) of several kinds of rows; NaN where hidden."""
-    return torch.cat([own.square().sum(2) for own in errors])
-
-
-def _estimate(rows: Rows, prior: Prior | None, held: Sequence[int]) -> tuple[Fit, Prior, Tails, float]:
-    """Parameters, prior deviations, tails and noise level together."""
-    zero = rows.geometry.tool.new_zeros(rows.geometry.size)
-    start = body_squares(rows.errors(zero, zero.new_zeros(rows.parts[0].freedom)))
-    # The median, so that a few gross outliers do not set the level.
-    level = max(sqrt(float(start.nanmedian()) / MEDIAN_CHI2_3), LIMITS.smallest_noise_m)
-    used, fits = prior or Prior(), list[Fit]()
-
-    def solved(sigma: Tensor) -> Fit:
-        nonlocal used
-        root = used.root(rows.geometry, held)
-        fits.append(solve(rows, sigma, root, start=fits[-1].theta if fits else None, **PRECISE))
-        used = used if prior else _scaled(used, root, rows.geometry, fits[-1])
-        return fits[-1]
-
-    fit, tails, level = weighed_fits(solved, (level, reweight(start / level**2, 3)))
-    return fit._replace(iterations=sum(each.iterations for each in fits)), used, tails, level
-
-
-def weighed_fits(solved: Callable[[Tensor], Fit], start: tuple[float, Tails]) -> tuple[Fit, Tails, float]:
-    """A fit with the noise level and the degrees of freedom of Student's t that it leaves: expectation maximisation.
+def estimated(rows: Rows, held: Sequence[int], prior: Prior | None = None) -> Identification:
+    """Parameters and devices, with noise level and degrees of freedom of Student's t: expectation maximisation.
 
     Args:
-        solved: least squares for standard deviations (N, B) of the bodies, m. start: the noise level, m, and tails.
+        rows: of any kinds. held: see :func:`identify`. prior: its deviations of the joints' errors are estimated too
+            by default.
     """
-    level, tails = start
+    some = replace(rows, parts=tuple(own.sample() for own in rows.parts))
+    used, steps, zero = prior or Prior(), 0, rows.geometry.tool.new_zeros(rows.geometry.size)
+    at = zero, zero.new_zeros(sum(rows.freedom))
+    errors = some.errors(*at)
+    dim = torch.cat([torch.full_like(own[..., 0], own.shape[2]) for own in errors])
+    # The median, so that a few gross outliers do not set the level; that of chi-squared by Wilson and Hilferty.
+    typical = (body_squares(errors) / (dim * (1.0 - 2.0 / (9.0 * dim)) ** 3)).nanmedian()
+    level = max(sqrt(float(typical)), LIMITS.smallest_noise_m)
+    tails = reweight(body_squares(errors) / level**2, dim)
     for _ in range(LIMITS.rounds):
-        fit = solved(level / tails.weights.sqrt())
+        root = used.root(rows.geometry, held)
+        fit = solve(some, level / tails.weights.sqrt(), root, start=at, **PRECISE)
+        at = fit.theta, fit.shifts
+        used, steps = used if prior else _scaled(used, root, rows.geometry, fit), steps + fit.iterations
         determined = float(fit.leverage.sum())  # number of parameters that the data determine
         squares, numbers = body_squares(fit.errors), sum(int((~own.isnan()).sum()) for own in fit.errors)
         total = float((tails.weights * squares).nansum())
         before, level = level, max(sqrt(total / max(numbers - determined, 1.0)), LIMITS.smallest_noise_m)
-        dim = torch.cat([torch.full_like(own[..., 0], own.shape[2]) for own in fit.errors])
         tails = reweight(squares / level**2 + fit.leverage / tails.weights, dim)
         if abs(level - before) < LIMITS.noise_change * level:
             break
-    return fit, tails, level
+    fit = fit._replace(iterations=steps, errors=rows.errors(*at))
+    if len(tails.weights) < sum(len(own) for own in fit.errors):
+        tails = reweight(body_squares(fit.errors) / level**2, 3)
+    return _identification(rows, fit, level, "estimated", prior=used, tails=tails)
+
+
+def _identification(rows: Rows, fit: Fit, level: float, how: str, *, prior: Prior, tails: Tails) -> Identification:
+    """A fit, with the errors of all rows."""
+    rms = float(body_squares(fit.errors).nanmean().sqrt())
+    ended = f"{'converged' if fit.converged else 'stopped before converging'} after {fit.iterations} steps"
+    status = f"{ended}: {in_mm(rms, level, how)}."
+    known = fit.covariance, fit.iterations, status, fit.theta, prior, tails, rows.devices(fit.shifts)
+    return Identification(rows.geometry.absorb(fit.theta), rms, level, *known)
+
+
+def body_squares(errors: Sequence[Tensor]) -> Tensor:
+    """Squares (N, B) of errors (N, B, d) of several kinds of rows; NaN where hidden."""
+    return torch.cat([own.square().sum(2) for own in errors])
 
 
 def _scaled(prior: Prior, root: Tensor, geometry: Geometry, fit: Fit) -> Prior:
@@ -371,74 +385,54 @@ class Fit(NamedTuple):
     converged: bool
 
 
-def solve(rows: Rows, sigma: Tensor, root: Tensor, *, start: Tensor | None = None, **options: Any) -> Fit:
+def solve(
+    rows: Rows, sigma: Tensor, root: Tensor, *, start: tuple[Tensor, Tensor] | None = None, **options: Any
+) -> Fit:
     """Fit errors theta = root u, and shifts: the prior is then one row of the identity per unknown without units.
 
     Args:
         rows: see :class:`Rows`. sigma: (N, B) standard deviations of the bodies of all rows, m.
-        root: (K, f) square root of the prior covariance of the errors, its columns orthogonal. start: (K,).
+        root: (K, f) square root of the prior covariance of the errors, its columns orthogonal.
+        start: theta (K,) and shifts; zero by default.
         options: of scipy.
+
+    Raises:
+        InputError: a start that cannot be measured.
     """
-    f = root.shape[1]
-    u0 = root.new_zeros(f + sum(own.freedom for own in rows.parts))
-    u0[:f] = 0.0 if start is None else (root.mT @ start) / root.square().sum(0)
-    hidden = [own.isnan() for own in rows.errors(root @ u0[:f], u0[f:])]
-    weights = [1 / own[..., None] for own in sigma.split([len(own) for own in hidden])]
-
-    def errors(u: Tensor) -> Tensor:
-        each = zip(weights, rows.errors(root @ u[:f], u[f:]), hidden, strict=True)
-        return torch.cat([(w * own).masked_fill(h, 0.0).flatten() for w, own, h in each])
-
-    def slopes(u: Tensor) -> Tensor:
-        each = zip(weights, rows.slopes(root @ u[:f], u[f:], root), hidden, strict=True)
-        return torch.cat([(w[..., None] * own).masked_fill(h[..., None], 0.0).flatten(0, 2) for w, own, h in each])
-
-    found = least_squares_of(errors, slopes, u0, **options)
-    theta, shifts, known = root @ found.u[:f], found.u[f:], root @ found.root[:f]
-    parts = zip(found.leverage.split([own.numel() for own in hidden]), hidden, strict=True)
-    leverage = torch.cat([own.view(h.shape).sum(2) for own, h in parts])
-    left = rows.errors(theta, shifts)
-    return Fit(theta, known @ known.mT, shifts, left, leverage, found.iterations, found.converged)
-
-
-class Minimum(NamedTuple):
-    """The least squares of errors (M,) and of the unknowns u (k,) themselves.
-
-    Args:
-        root: (k, k), its square is the covariance of u. leverage: (M,) of the errors.
-    """
-
-    u: Tensor
-    root: Tensor
-    leverage: Tensor
-    iterations: int
-    converged: bool
-
-
-def least_squares_of(
-    errors: Callable[[Tensor], Tensor], slopes: Callable[[Tensor], Tensor], u0: Tensor, **options: Any
-) -> Minimum:
-    """Unknowns u (k,) with the prior N(0, 1) that explain errors (M,) of unit variance; options are those of scipy."""
     from scipy.optimize import least_squares  # noqa: PLC0415  # slow to import, not needed to use a model
 
-    size = len(errors(u0)) + len(u0)  # raises where the start cannot be measured
+    f = root.shape[1]
+    u0 = root.new_zeros(f + sum(rows.freedom))
+    if start is not None:
+        u0 = torch.cat([(root.mT @ start[0]) / root.square().sum(0), start[1]])
+    hidden = [own.isnan() for own in rows.errors(root @ u0[:f], u0[f:])]
+    weights = [1 / own[..., None] for own in sigma.split([len(own) for own in hidden])]
+    size = len(u0) + sum(own.numel() for own in hidden)
 
     def residual(u: np.ndarray) -> np.ndarray:
+        at = torch.from_numpy(u).clone()
         try:
-            return np.concatenate([errors(torch.from_numpy(u).clone()).numpy(), u])
+            each = zip(weights, rows.errors(root @ at[:f], at[f:]), hidden, strict=True)
         except InputError:  # behind a camera: scipy shortens the step
             return np.full(size, np.inf)
+        return torch.cat([*((w * own).masked_fill(h, 0.0).flatten() for w, own, h in each), at]).numpy()
 
     def jacobian(u: np.ndarray) -> np.ndarray:
-        return np.concatenate([slopes(torch.from_numpy(u).clone()).numpy(), np.eye(len(u))])
+        at = torch.from_numpy(u).clone()
+        each = zip(weights, rows.slopes(root @ at[:f], at[f:], root), hidden, strict=True)
+        slopes = [(w[..., None] * own).masked_fill(h[..., None], 0.0).flatten(0, 2) for w, own, h in each]
+        return torch.cat([*slopes, torch.eye(len(u), dtype=at.dtype)]).numpy()
 
     derivatives: Any = jacobian  # scipy's stubs know its names of difference schemes only
     with torch_alone():
-        fit = least_squares(residual, u0.numpy(), derivatives, **options)
-        U, s, Vt = np.linalg.svd(jacobian(fit.x), full_matrices=False)  # s >= 1 by the prior rows
-    leverage = torch.from_numpy(np.square(U[: -len(fit.x)]).sum(1))
-    u, root = torch.from_numpy(fit.x).clone(), torch.from_numpy(Vt.T / s).clone()  # aligned: the same digits every time
-    return Minimum(u, root, leverage, int(fit.nfev), fit.status > 0)
+        found = least_squares(residual, u0.numpy(), derivatives, **options)
+        U, s, Vt = np.linalg.svd(jacobian(found.x), full_matrices=False)  # s >= 1 by the prior rows
+    u, V = torch.from_numpy(found.x).clone(), torch.from_numpy(Vt.T / s).clone()  # aligned: the same digits every time
+    theta, shifts, known = root @ u[:f], u[f:], root @ V[:f]
+    leverage = torch.from_numpy(np.square(U[: -len(u)]).sum(1)).split([own.numel() for own in hidden])
+    each = torch.cat([own.view(h.shape).sum(2) for own, h in zip(leverage, hidden, strict=True)])
+    left = rows.errors(theta, shifts)
+    return Fit(theta, known @ known.mT, shifts, left, each, int(found.nfev), found.status > 0)
 
 
 def in_mm(rms: float, noise: float, how: str) -> str:

@@ -18,6 +18,7 @@ therefore estimated before it, together with base and markers, as one constant p
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import sqrt
 from typing import Any
@@ -27,7 +28,6 @@ from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import (
     LIMITS,
-    MEDIAN_CHI2_3,
     Identification,
     MeasuredPoints,
     Prior,
@@ -100,24 +100,14 @@ def can_register(points: Tensor) -> bool:
 
 def _registered(geometry: Geometry, q: Tensor, points: Tensor, iterations: int) -> Identification:
     """Residual, covariance and status of a registration."""
-    parts = geometry.slices
-    held, every = held_parameters(geometry), range(geometry.size)
-    places = [number for number in (*every[parts["base"]], *every[parts["tool"]]) if number not in held]
-    sought = torch.tensor(places, dtype=torch.int64, device=q.device)
+    parts, held = geometry.slices, held_parameters(geometry)
+    every = [number for name in ("base", "tool") for number in range(geometry.size)[parts[name]]]
+    sought = [number for number in every if number not in held]
     rms = float((geometry.points(q) - points).square().sum(-1).nanmean().sqrt())
     slopes = geometry.sensitivities(q)[..., sought][seen_markers(points)].flatten(0, 1)  # (3 S, 6 + 3 P)
     s = torch.linalg.svdvals(slopes)
-    count, coordinates = len(slopes) // 3, len(slopes)  # S sightings of markers
-    kept = s > UNDETERMINED_MOTION_M * sqrt(count)
-    rank = int(kept.sum())
-    noise = rms * sqrt(count / max(coordinates - rank, 1))
-    # The errors of a nominal robot vary slowly with its configuration, so that many rows share them.
-    error = points.new_full(points.shape[:2], max(noise, LIMITS.smallest_noise_m) * sqrt(count))
-    places = {"base_translation": PLACES.open_base_m, "base_rotation": PLACES.open_base_rad}
-    prior = Prior(**places, tool=sqrt(geometry.markers) * PLACES.marker_m)
-    root = prior.root(geometry, [*every[parts["joints"]], *held])
-    own = MeasuredPoints(q, points, points.new_zeros(*points.shape, 0))
-    covariance = solve(Rows(geometry, (own,)), error, root, max_nfev=1).covariance
+    rank = int((s > UNDETERMINED_MOTION_M * sqrt(len(slopes) / 3)).sum())  # of S sightings of markers
+    noise = rms * sqrt(len(slopes) / 3 / max(len(slopes) - rank, 1))
     done = "converged" if iterations < MAX_ITERATIONS else "stopped before converging"
     status = f"{done} after {iterations} steps: {in_mm(rms, noise, 'estimated')}"
     if rank < len(sought):
@@ -125,20 +115,49 @@ def _registered(geometry: Geometry, q: Tensor, points: Tensor, iterations: int) 
             f"; these poses leave {len(sought) - rank} of {len(sought)} directions of base and markers undetermined"
             " (chosen so that the markers are close to the tip): turn more joints, above all the wrist"
         )
-    elif coordinates == rank:
+    elif len(slopes) == rank:
         status += (
             "; there are only as many coordinates as unknowns, so other bases and markers may fit as well: measure "
             "more poses"
         )
-    tails = Tails.none(len(q), geometry.markers, device=q.device)
-    theta = torch.zeros(geometry.size, dtype=q.dtype, device=q.device)
-    return Identification(geometry, rms, noise, covariance, iterations, status + ".", theta, Prior(), tails)
+    return _start(geometry, (rms, noise), slopes, sought, rows=len(q), status=f"{status}.", iterations=iterations)
+
+
+def _start(
+    geometry: Geometry,
+    errors: tuple[float, float],
+    slopes: Tensor,
+    sought: Sequence[int],
+    *,
+    rows: int,
+    status: str,
+    iterations: int = 0,
+) -> Identification:
+    """Places that were found in closed form, as a geometric calibration is described; all weights are 1.
+
+    Args:
+        errors: RMS distance and noise, m. slopes: (3 S, k) of the coordinates by the parameters that were sought.
+    """
+    rms, noise = errors
+    # The errors of a nominal robot vary slowly with its configuration, so that many rows share them.
+    error = max(noise, LIMITS.smallest_noise_m) * sqrt(len(slopes) / 3)
+    places = {"base_translation": PLACES.open_base_m, "base_rotation": PLACES.open_base_rad}
+    prior = Prior(**places, tool=sqrt(geometry.markers) * PLACES.marker_m).deviations(geometry)[sought]
+    white = torch.cat([slopes * prior / error, prior.new_ones(len(prior)).diag()])
+    s, Vt = torch.linalg.svd(white, full_matrices=False)[1:]
+    root = prior[:, None] * Vt.mT / s
+    covariance = slopes.new_zeros(geometry.size, geometry.size)
+    covariance[torch.tensor(sought)[:, None], sought] = root @ root.mT
+    theta, tails = slopes.new_zeros(geometry.size), Tails.none(rows, geometry.markers, device=slopes.device)
+    return Identification(geometry, rms, noise, covariance, iterations, status, theta, Prior(), tails)
 
 
 ROUNDS = 30
 """Most rounds of weighing rows."""
 SETTLED = 1e-6
 """Largest change of a weight at which these rounds end."""
+MEDIAN_CHI2_3 = 2.37
+"""Median of chi-squared with 3 degrees of freedom."""
 HALF_WEIGHT_MEDIANS = 2.0
 """Distance, in medians, at which a row has half its weight."""
 
@@ -184,8 +203,13 @@ def register_sockets(robot: Tree | Geometry, q: Tensor, socket: Tensor) -> Socke
         if float((weights - before).abs().max()) < SETTLED:
             break
     seen = R @ ball + t
-    tilt = torch.linalg.svdvals(A.flatten(0, 1)) / len(A) ** 0.5
-    found = _identification(bare.with_tool(ball[None]), A, distances, int(weights.numel()))
+    slopes, geometry = A.flatten(0, 1), bare.with_tool(ball[None])
+    tilt = torch.linalg.svdvals(slopes) / len(A) ** 0.5
+    rms, median = float(distances.square().mean().sqrt()), float(distances.median())
+    errors = rms, max(median / sqrt(MEDIAN_CHI2_3), LIMITS.smallest_noise_m)
+    status = f"spread within sockets {1e3 * rms:.4g} mm RMS, median {1e3 * median:.4g} mm."
+    ball = range(geometry.size)[geometry.slices["tool"]]
+    found = _start(geometry, errors, slopes, [*ball], rows=len(A), status=status)
     return SocketRegistration(found, _means(seen, socket, weights), distances, tilt)
 
 
@@ -204,21 +228,6 @@ def _means(values: Tensor, socket: Tensor, weights: Tensor) -> Tensor:
     shape = (-1, *[1] * (values.ndim - 1))
     total = values.new_zeros(count, *values.shape[1:]).index_add(0, socket, values * weights.view(shape))
     return total / weights.new_zeros(count).index_add(0, socket, weights).view(shape)
-
-
-def _identification(geometry: Geometry, A: Tensor, distances: Tensor, rows: int) -> Identification:
-    """The registration as other registrations are described. Errors of the robot do not average out over its rows."""
-    rms = float(distances.square().mean().sqrt())
-    median = float(distances.median())
-    noise = max(median / sqrt(MEDIAN_CHI2_3), LIMITS.smallest_noise_m)
-    white = A.flatten(0, 1) * PLACES.marker_m / (noise * sqrt(rows))
-    eye = torch.eye(3, dtype=A.dtype, device=A.device)
-    covariance = A.new_zeros(geometry.size, geometry.size)
-    tool = geometry.slices["tool"]
-    covariance[tool, tool] = PLACES.marker_m**2 * torch.linalg.inv(eye + white.mT @ white)
-    status = f"spread within sockets {1e3 * rms:.4g} mm RMS, median {1e3 * median:.4g} mm."
-    theta, tails = A.new_zeros(geometry.size), Tails.none(rows, 1, device=A.device)
-    return Identification(geometry, rms, noise, covariance, 0, status, theta, Prior(), tails)
 
 
 OFFSET_STD, FREE_STD = 0.5, 10.0
@@ -257,7 +266,7 @@ def fit_joint_offsets(
     twists, parts = offset_twists(geometry), geometry.slices
     places = torch.eye(geometry.size, dtype=twists.dtype, device=twists.device)
     root = torch.cat([deviation * twists, FREE_STD * places[:, parts["base"]], FREE_STD * places[:, parts["tool"]]], 1)
-    rows = Rows(geometry, (MeasuredPoints(q, points, points.new_zeros(*points.shape, 0)),))
+    rows = Rows(geometry, (MeasuredPoints.of(q, points),))
     fit = solve(rows, torch.ones_like(points[..., 0]) * noise, root, **options)
     return (twists.mT @ fit.theta) / twists.square().sum(0)
 

@@ -29,7 +29,7 @@ from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
     identify_readings,
     reading_sets,
-    with_ball_of,
+    stages_beside,
     with_freed_devices,
 )
 from diffeo_calib.calibration.placing.sessions import Sessions
@@ -51,7 +51,7 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import errors_of_kinds
 from diffeo_calib.sensors.devices import ROW, Devices
 from diffeo_calib.sensors.errors import Evaluations, shown_unit
-from diffeo_calib.sensors.places import Places, fitting_devices
+from diffeo_calib.sensors.places import Places
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings, check_poses, divided, with_markers
 
 
@@ -129,9 +129,8 @@ class Placed:
     Args:
         data: the table. coordinates: its rows that tell coordinates, in that frame, sockets at their places.
         placement: the devices.
-        registration: base and markers, or ball and devices. identification: the geometric calibration.
-        registered, identified: the devices of readings at the registration and after the geometric calibration, in the
-            order of their sets.
+        registration: base and markers, or ball and devices. identification: the geometric calibration. Both have the
+            devices of readings as they were then, in the order of their sets.
     """
 
     data: Any
@@ -139,8 +138,6 @@ class Placed:
     placement: Placement
     registration: Identification
     identification: Identification
-    registered: tuple[Devices, ...] = ()
-    identified: tuple[Devices, ...] = ()
 
     @property
     def readings(self) -> list[ReadingDevices]:
@@ -176,24 +173,30 @@ class Placed:
 
     def row_like(self, q: Tensor) -> int:
         """Number of the last row as which some of the configurations q (M, n) can be measured; else the very last."""
-        last, points = len(self.data) - 1, self.identification.geometry.points(q)
-        return next((row for row in range(last, -1, -1) if bool(self.placement.sees(row, points).any())), last)
+        last = len(self.data) - 1
+        return next((row for row in range(last, -1, -1) if bool(self.sees(row, q).any())), last)
 
     def sees(self, row: int, q: Tensor) -> Tensor:
         """(M,) boolean: configurations that can be measured as a row was, by a camera that sees its board."""
-        return self.placement.sees(row, self.identification.geometry.points(q))
+        points, views = self.identification.geometry.points(q), self.placement.views()
+        every = torch.ones(len(q), dtype=torch.bool, device=q.device)
+        return torch.stack([every, *(own.sees(row, points, views) for own in self.placement)]).all(0)
 
     def places_to_reach(self, row: int) -> dict[str, Tensor]:
         """Where configurations bring the ball that are measured as a row was: see :func:`candidates`."""
-        found, geometry = self.placement.places_at(row), self.identification.geometry
-        if found is None:
-            return {}
-        base = geometry.base.to(found)
-        return {"places": (found - base[:3, 3]) @ base[:3, :3], "ball": geometry.tool[-1]}
+        geometry = self.identification.geometry
+        for own in self.placement:
+            if (found := own.places_at(row)) is not None:
+                base = geometry.base.to(found)
+                return {"places": (found - base[:3, 3]) @ base[:3, :3], "ball": geometry.tool[-1]}
+        return {}
 
     def measured_at(self, row: int, like: Any, q: Tensor) -> Any:
         """M copies ``like`` of a row as it would be measured at q (M, n), rad or m."""
-        return self.placement.measured_at(row, like, self.identification.geometry.points(q))
+        points, views = self.identification.geometry.points(q), self.placement.views()
+        for own in self.placement:
+            like = own.measured_at(row, like, points, views)
+        return like
 
     def settled(self, fitted: Fit, fitted_map: FittedMap, chosen: ChosenScales) -> Placed:
         """The same with the devices where a fit puts them, and with all markers of the model.
@@ -207,9 +210,7 @@ class Placed:
         own = self.coordinates
         if own is not None:
             table = with_markers(own.table, self.registration.geometry.markers)
-            for one in placement:
-                table = one.at_places(table)
-            own = own._replace(table=table)
+            own = own._replace(table=placement.at_places(table))
         return replace(self, placement=placement, coordinates=own)
 
     def stage_rms(self, model: Callable[[Tensor], Tensor]) -> list[float | None]:
@@ -223,7 +224,8 @@ class Placed:
     @property
     def devices_by_stage(self) -> list[tuple[Devices, ...]]:
         """The devices of readings at the registration, after the geometric calibration, and now."""
-        return [self.registered, self.identified, tuple(own.devices for own in self.readings)]
+        stages = self.registration.devices, self.identification.devices
+        return [*stages, tuple(own.devices for own in self.readings)]
 
     def tangent_data(self) -> TangentData:
         """The rows around the geometric calibration, weighted by its residuals."""
@@ -274,20 +276,18 @@ class Placed:
         Raises:
             MeasurementError: rows of another device.
         """
-        coordinates, readings = divided(data)
-        centre = like.points.unflatten(1, (-1, 3)).mean((0, 1))
-        other = OtherRows(data, coordinates, readings, len(data), centre)
-        placement = Placement(one.with_rows(other) for one in self.placement)
+        (coordinates, readings), aligned = divided(data), None
         if coordinates is not None:
-            table = placement.aligned(coordinates.table)
-            for one in placement:
-                table = one.at_places(table)
-            coordinates = coordinates._replace(table=table)
-            placement = Placement(one.in_own_frame(table) for one in placement)
-        count = len(data if coordinates is None else coordinates.rows)
-        tails = Tails.none(count, self.identification.tails.weights.shape[1])
+            table = self.placement.at_places(self.placement.aligned(coordinates.table))
+            aligned = coordinates._replace(table=table)
+        centre = like.points.unflatten(1, (-1, 3)).mean((0, 1))
+        other = OtherRows(data, coordinates, aligned, readings, centre)
+        placement = Placement(one.with_rows(other) for one in self.placement)
+        tails = Tails.none(
+            len(data if coordinates is None else coordinates.rows), self.identification.tails.weights.shape[1]
+        )
         found = replace(self.identification, tails=tails)
-        own = replace(self, data=data, coordinates=coordinates, placement=placement, identification=found)
+        own = replace(self, data=data, coordinates=aligned, placement=placement, identification=found)
         rows = own._rows(like.nominal.under(data.payload), like.theta)
         rows = replace(rows, held=like.held, adrift=like.adrift)
         return own, replace(rows, shared=placement.shared(rows))
@@ -350,13 +350,11 @@ def _by_coordinates(
     LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", *(1e3 * stage.rms for stage in stages))
     warn_of_joints_below_tip(robot, table)
     warn_of_open_directions(robot, table, stages[0])
-    tables = [one.table for one in readings]
-    stages = with_ball_of(tables, table, stages)
-    at = [tuple(fitting_devices(own, stage.geometry.points(own.q)) for own in tables) for stage in stages]
-    sets = reading_sets(readings, at[1], table)
+    stages = stages_beside(stages, readings, table)
+    sets = reading_sets(readings, stages[1].devices, table)
     cameras = LensAndBoard.of_table(table, own.rows, stages[0], sessions)
     placement = Placement((*sessions, *sockets, *cameras, *sets))
-    return Placed(data, own._replace(table=table), placement, *stages, *at)
+    return Placed(data, own._replace(table=table), placement, *stages)
 
 
 def _by_readings(robot: Tree, data: Any, readings: list[OtherReadings], progress: Progress) -> Placed:
@@ -365,13 +363,10 @@ def _by_readings(robot: Tree, data: Any, readings: list[OtherReadings], progress
     LOG.info("calibrating %s with %r", robot.name, data)
     tables = [one.table for one in readings]
     bare = Geometry.nominal(robot, 1, () if tables[0].on is None else (tables[0].on,))
-    found = identify_readings(bare, tables)
-    LOG.info("registration RMS %.4f mm, geometry %.4f mm", 1e3 * found.registration.rms, 1e3 * found.identification.rms)
-    freed = with_freed_devices(tables, found)
+    stages = identify_readings(bare, tables)
+    LOG.info("registration RMS %.4f mm, geometry %.4f mm", *(1e3 * stage.rms for stage in stages))
+    freed = with_freed_devices(tables, stages[0])
     if freed is not None:
         for devices in freed.devices:
-            devices.check_freed(found.identification.noise, freed.identification.noise)
-    sets = reading_sets(readings, found.devices)
-    return Placed(
-        data, None, Placement(sets), found.registration, found.identification, found.registered, found.devices
-    )
+            devices.check_freed(stages[1].noise, freed.noise)
+    return Placed(data, None, Placement(reading_sets(readings, stages[1].devices)), *stages)

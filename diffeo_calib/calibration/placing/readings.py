@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,16 +17,15 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_size
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import (
-    LIMITS,
     Fit,
     Identification,
     Prior,
     ReadRows,
     Rows,
+    body_squares,
+    estimated,
     held_parameters,
-    in_mm,
     solve,
-    weighed_fits,
 )
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
@@ -36,8 +36,8 @@ from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.devices import Devices, Hypothesis, check_devices
 from diffeo_calib.sensors.kinds import kind_of
-from diffeo_calib.sensors.places import PlacedDevices
-from diffeo_calib.sensors.tables import OtherReadings
+from diffeo_calib.sensors.places import PlacedDevices, fitting_devices
+from diffeo_calib.sensors.tables import OtherReadings, ball_tip
 
 ROUGH_M = 2e-3
 """Errors of a robot before its calibration, to compare starts."""
@@ -129,23 +129,11 @@ class ReadingDevices(DeviceSet):
         return {"devices": found}
 
 
-@dataclass(frozen=True, eq=False)
-class FoundReadings:
-    """Ball, devices and geometric errors.
-
-    Args:
-        registration: ball and devices with errors of joints zero; its geometry has the ball as marker.
-        identification: with errors of joints.
-        registered, devices: the devices of every table of readings at these two stages.
-    """
-
-    registration: Identification
-    identification: Identification
-    registered: tuple[Devices, ...]
-    devices: tuple[Devices, ...]
+Stages = tuple[Identification, Identification]
+"""Ball and devices with errors of joints zero, the ball as marker of the geometry; and with errors of joints."""
 
 
-def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool = False) -> FoundReadings:
+def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool = False) -> Stages:
     """Find ball, devices and geometric errors.
 
     Args:
@@ -159,73 +147,63 @@ def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool
     Warns:
         DiffeoCalibWarning: readings that no place of ball and devices explains in either unit.
     """
-    held, joints = held_parameters(bare, adrift=True), range(bare.size)[bare.slices["joints"]]
-    root, still = Prior().root(bare, held), Prior().root(bare, [*held, *joints])
-    poses = [bare.marker_poses(data.q) for data in tables]
-    found = _rough_fits(bare, still, _starts(bare.tool[0], tables, poses), poses)
-    if found and min(one[0] for one in found)[0] > LARGEST_SHARE * bare.chain.reach:  # one kind is lost: place it anew
-        balls = [rows.geometry.absorb(rough.theta).tool[0] for _, rough, rows in found]
-        again = [(ball, _around(ball, tables, poses)) for ball in balls]
-        found += _rough_fits(bare, still, again, poses)
+    found, most = _rough_fits(_starts(bare, tables)), LARGEST_SHARE * bare.chain.reach
+    if found and min(one.worst for one in found)[0] > most:  # one kind is lost: place it anew
+        balls = [one.rows.geometry.absorb(one.fit.theta).tool[0] for one in found]
+        found += _rough_fits([_around(bare, tables, ball) for ball in balls])
     if not found:
         raise MeasurementError.of(UNEXPLAINED, fix=CHECK)
-    worst, rough, rows = min(found, key=lambda one: one[0])
-    each = zip(tables, rough.errors, strict=True)
+    best = min(found, key=lambda one: one.worst)
+    fit, geometry = best.fit, best.rows.geometry.absorb(best.fit.theta)
+    each = zip(tables, fit.errors, strict=True)
     doubted = [kind_of(data).doubts_unit(data, own[:, 0]) for data, own in each]
-    if any(doubted) or worst[0] > LARGEST_SHARE * bare.chain.reach:
-        _doubt(bare, tables, still, poses, worst)
-    rms, start = _rms(rough.errors), rows.geometry.absorb(rough.theta)
-    nothing, tails = torch.zeros_like(rough.covariance), Tails.none(sum(map(len, tables)), 1)
-    status = "ball and devices found."
-    registration = Identification(start, rms, rms, nothing, 0, status, nothing[0], Prior(), tails)
-    rows = Rows(start, _moved(rows, rough.shifts), rows.tips if rigid else None)
-    return _estimate(rows, still if rigid else root, registration)
+    if any(doubted) or best.worst[0] > most:
+        _doubt(bare, tables, best.worst)
+    devices, squares = best.rows.devices(fit.shifts), body_squares(fit.errors)
+    noise = float((squares.sum() / sum(own.numel() for own in fit.errors)).sqrt())
+    nothing, tails = torch.zeros_like(fit.covariance), Tails.none(len(squares), 1)
+    known = 0, "ball and devices found.", nothing[0], Prior(), tails, devices
+    registration = Identification(geometry, float(squares.mean().sqrt()), noise, nothing, *known)
+    rows = Rows(geometry, tuple(map(ReadRows, tables, devices)), rigid=rigid)
+    return registration, estimated(rows, _all_but_ball(bare) if rigid else held_parameters(bare, adrift=True), Prior())
 
 
-def _rough_fits(
-    bare: Geometry, root: Tensor, starts: Sequence[tuple[Tensor, list[ReadRows]]], poses: Sequence[Tensor]
-) -> list[tuple[tuple[float, str], Fit, Rows]]:
-    """Ball and devices from each start that leads anywhere, after the largest median residual of a device and its name.
+class RoughFit(NamedTuple):
+    """Ball and devices from one start, and the largest median residual of a device, m, with its name.
 
-    One wrong plane of three shows in it, m.
+    One wrong plane of three shows in it.
     """
+
+    worst: tuple[float, str]
+    fit: Fit
+    rows: Rows
+
+
+def _rough_fits(starts: Sequence[Rows]) -> list[RoughFit]:
+    """From each start that leads anywhere."""
     found = []
-    for ball, parts in starts:
-        rows = Rows(bare.with_tool(ball[None]), tuple(parts), poses)
-        sigma = ball.new_full((sum(len(own.q) for own in parts), 1), ROUGH_M)
+    for rows in starts:
+        sigma = rows.geometry.tool.new_full((sum(len(own.q) for own in rows.parts), 1), ROUGH_M)
+        root = Prior().root(rows.geometry, _all_but_ball(rows.geometry))
         with suppress(InputError):  # the start has the ball at a fixed point or behind a camera
-            rough = solve(rows, sigma, root, max_nfev=STARTS_STEPS, loss="soft_l1")
+            fit = solve(rows, sigma, root, max_nfev=STARTS_STEPS, loss="soft_l1")
             worst = max(
-                (float(own[:, 0].norm(dim=1)[data.device == number].median()), name)
-                for (data, _), own in zip(parts, rough.errors, strict=True)
-                for number, name in enumerate(data.names)
+                (float(errors[:, 0].norm(dim=1)[own.data.device == number].median()), name)
+                for own, errors in zip(rows.parts, fit.errors, strict=True)
+                for number, name in enumerate(own.data.names)
             )
-            found.append((worst, rough, rows))
+            found.append(RoughFit(worst, fit, rows))
     return found
 
 
-def with_ball_of(
-    readings: Sequence[Readings], table: Measurements, stages: tuple[Identification, Identification]
-) -> tuple[Identification, Identification]:
-    """Stages of rows that tell coordinates, with the ball of readings if these alone show it."""
-    readings = [own for own in readings if kind_of(own).seen_points == 1]
-    if not readings or table.sockets is not None:
-        return stages
-    geometry, tip = stages[1].geometry, readings[0].on
-    bare = geometry.with_tool(geometry.tool[:1] * 0.0, geometry.on[-1:] if tip is None else (tip,))
-    ball = identify_readings(bare, readings, rigid=True).identification
-    return stages[0].with_ball(ball), stages[1].with_ball(ball)
-
-
-def ball_of(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Tensor | None:
-    """(3,) the ball of readings in the frame of a tip of a known robot, m; None without readings of a ball."""
+def ball_of(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Identification | None:
+    """The ball of readings on a tip of a known robot, as its only marker; None without readings of a ball."""
     for one in readings:
         check_devices(one)
     readings = [own for own in readings if kind_of(own).seen_points == 1]
     if not readings:
         return None
-    bare = geometry.with_tool(geometry.tool[-1:], (tip,))
-    return identify_readings(bare, readings, rigid=True).identification.geometry.tool[0]
+    return identify_readings(geometry.with_tool(geometry.tool[-1:], (tip,)), readings, rigid=True)[1]
 
 
 def reading_sets(
@@ -239,81 +217,68 @@ def reading_sets(
     )
 
 
-def with_freed_devices(tables: Sequence[Readings], found: FoundReadings) -> FoundReadings | None:
-    """The same with what was said to be known of the devices left open; None if there is nothing."""
-    freed = [devices.freed() for devices in found.registered]
+def stages_beside(stages: Stages, readings: Sequence[OtherReadings], table: Measurements) -> Stages:
+    """Stages of rows that tell coordinates, with the devices of readings around them, and their ball.
+
+    A ball that rested in sockets is known from these.
+    """
+    tables, geometry = [one.table for one in readings], stages[1].geometry
+    ball = None
+    if table.sockets is None:
+        ball = ball_of(tables, geometry, ball_tip(None, readings, geometry.on[-1]))
+    whole = [stage if ball is None else stage.with_ball(ball) for stage in stages]
+    before, after = (
+        replace(own, devices=tuple(fitting_devices(one, own.geometry.points(one.q)) for one in tables)) for own in whole
+    )
+    return before, after
+
+
+def with_freed_devices(tables: Sequence[Readings], found: Identification) -> Identification | None:
+    """A geometric calibration with what was said to be known of devices left open; None if there is nothing.
+
+    Args:
+        tables: readings. found: their registration.
+    """
+    freed = [devices.freed() for devices in found.devices]
     if all(devices is None for devices in freed):
         return None
-    each, geometry = zip(tables, found.registered, freed, strict=True), found.registration.geometry
+    each = zip(tables, found.devices, freed, strict=True)
     parts = tuple(ReadRows(data, own if free is None else free) for data, own, free in each)
-    root = Prior().root(geometry, held_parameters(geometry, adrift=True))
-    return _estimate(Rows(geometry, parts), root, found.registration)
+    return estimated(Rows(found.geometry, parts), held_parameters(found.geometry, adrift=True), Prior())
 
 
-def _starts(usual: Tensor, tables: Sequence[Readings], poses: Sequence[Tensor]) -> list[tuple[Tensor, list[ReadRows]]]:
-    """Balls (3,) in the tip's frame, m, and devices: in closed form by each device, and with the ball where it was."""
-    found = [(usual, _around(usual, tables, poses))]
-    for place, (data, T) in enumerate(zip(tables, poses, strict=True)):
+def _all_but_ball(geometry: Geometry) -> range:
+    return range(geometry.slices["tool"].start)
+
+
+def _starts(bare: Geometry, tables: Sequence[Readings]) -> list[Rows]:
+    """Balls and devices: in closed form by each device, and with the ball where it was."""
+    found = [_around(bare, tables, bare.tool[0])]
+    for place, data in enumerate(tables):
+        T, kind = bare.marker_poses(data.q)[:, 0], kind_of(data)
         rows = [data.device == number for number in range(len(data.names))]
-        kind = kind_of(data)
-        alone = [kind.alone(data.rows(own), T[own, 0, :3, :3], T[own, 0, :3, 3]) for own in rows]
+        alone = [kind.alone(data.rows(own), T[own, :3, :3], T[own, :3, 3]) for own in rows]
         each = [one for one in alone if one is not None]
-        found += [(ball, _around(ball, tables, poses)) for ball, _ in each if float(ball.norm()) < LONGEST_TOOL_M]
+        found += [_around(bare, tables, ball) for ball, _ in each if float(ball.norm()) < LONGEST_TOOL_M]
         if len(each) == len(rows):
-            middle = torch.stack([ball for ball, _ in each]).median(0).values
-            parts = _around(middle, tables, poses)
-            parts[place] = ReadRows(data, kind.of(data, torch.stack([constants for _, constants in each])))
-            found.append((middle, parts))
+            start = _around(bare, tables, torch.stack([ball for ball, _ in each]).median(0).values)
+            own = ReadRows(data, kind.of(data, torch.stack([constants for _, constants in each])))
+            found.append(replace(start, parts=(*start.parts[:place], own, *start.parts[place + 1 :])))
     return found
 
 
-def _around(ball: Tensor, tables: Sequence[Readings], poses: Sequence[Tensor]) -> list[ReadRows]:
+def _around(bare: Geometry, tables: Sequence[Readings], ball: Tensor) -> Rows:
     """The devices in closed form for a ball (3,) in the tip's frame, m."""
-    points = [T[:, 0, :3, :3] @ ball + T[:, 0, :3, 3] for T in poses]
-    return [ReadRows(data, kind_of(data).at(data, z)) for data, z in zip(tables, points, strict=True)]
+    geometry = bare.with_tool(ball[None])
+    parts = [ReadRows(data, kind_of(data).at(data, geometry.points(data.q)[:, 0])) for data in tables]
+    return Rows(geometry, tuple(parts), rigid=True)
 
 
-def _estimate(rows: Rows, root: Tensor, registration: Identification) -> FoundReadings:
-    """Errors, devices, tails and noise level together."""
-    count = sum(len(own.q) for own in rows.parts)
-    start = max(registration.rms, LIMITS.smallest_noise_m), Tails.none(count, 1, device=root.device)
-    fit, tails, level = weighed_fits(lambda sigma: solve(rows, sigma, root, max_nfev=STARTS_STEPS), start)
-    rms = _rms(fit.errors)
-    identification = replace(
-        registration,
-        geometry=rows.geometry.absorb(fit.theta),
-        theta=fit.theta,
-        noise=level,
-        rms=rms,
-        tails=tails,
-        status=f"{in_mm(rms, level, 'estimated')}.",
-    )
-    each = [
-        tuple(own.devices for own in parts if isinstance(own, ReadRows))
-        for parts in (rows.parts, _moved(rows, fit.shifts))
-    ]
-    return FoundReadings(registration, identification, *each)
-
-
-def _rms(errors: Sequence[Tensor]) -> float:
-    """Root mean square of all numbers, m."""
-    return float(torch.cat([own.flatten() for own in errors]).square().mean().sqrt())
-
-
-def _moved(rows: Rows, shifts: Tensor) -> tuple[ReadRows, ...]:
-    """All rows with their devices after shifts."""
-    each = zip(rows.parts, rows.split(shifts), strict=True)
-    return tuple(own._replace(devices=own.moved(some)) for own, some in each if isinstance(own, ReadRows))
-
-
-def _doubt(
-    bare: Geometry, tables: Sequence[Readings], root: Tensor, poses: Sequence[Tensor], worst: tuple[float, str]
-) -> None:
+def _doubt(bare: Geometry, tables: Sequence[Readings], worst: tuple[float, str]) -> None:
     """Raise MeasurementError for readings that fit in mm or m, in place of the other unit; warn if they do not.
 
     Args:
-        bare, tables, root, poses: see :func:`_rough_fits`. worst: median residual, m, of the device where it is
-            largest, and its name.
+        bare, tables: see :func:`identify_readings`. worst: see :class:`RoughFit`.
     """
     (median, device), most = worst, LARGEST_SHARE * bare.chain.reach
     said = {
@@ -322,8 +287,8 @@ def _doubt(
     }
     for factor, words in ((1e3, "small"), (1e-3, "large")):
         other = [replace(own, values=factor * own.values) if own.unit[0] == "mm" else own for own in tables]
-        found = _rough_fits(bare, root, _starts(bare.tool[0], other, poses), poses)
-        if found and min(one[0] for one in found)[0] < min(most, FAR_BETTER * median):
+        found = _rough_fits(_starts(bare, other))
+        if found and min(one.worst for one in found)[0] < min(most, FAR_BETTER * median):
             fix = f"they seem to be 1000 times too {words}: check the units of the readings (mm or m)"
             raise MeasurementError.of(UNEXPLAINED, **said, fix=fix)
     if median > most:

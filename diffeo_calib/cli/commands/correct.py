@@ -23,7 +23,8 @@ from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, warn_outsi
 from diffeo_calib.kinematics.tool import checked_tip, covariance_without_placement, tool_transform
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.joints import PoseColumns
-from diffeo_calib.measurements.csv.writing import Column, Program
+from diffeo_calib.measurements.csv.lines import read_cells
+from diffeo_calib.measurements.csv.writing import Column, write_columns
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
 from diffeo_calib.robots.cartesian import is_cartesian
@@ -99,7 +100,7 @@ class ToolOnTip:
 def run(options: CorrectOptions) -> None:
     """Read a program, correct it, write it and print a summary; units that are not typed are those of the fit."""
     _check(options)
-    model = load_laden(options.model, options.payload_mass)
+    model = load_laden(options.model, options.payload)
     stated = as_fitted(model, None, options.units)[1]
     source = ProgramTable(options.program, joints_of(stated), table_format(stated), options.targets)
     table, tips = source.written(), options.tip or ()
@@ -109,7 +110,7 @@ def run(options: CorrectOptions) -> None:
     robot, tools = model.robot, _tools(model, options, replace(source.table, **turned))
     names = joint_columns(source.joints, robot)
     columns = Columns.of(table.joints_only(names, robot.kinds))
-    sheet = Program.read(options.program, table, columns.names)
+    sheet = read_cells(options.program, table.sep, columns.names)
     if isinstance(names, PoseColumns) and names.is_program:
         columns = Columns.of(table.joints_only(names.written, robot.kinds))
         sheet = sheet.without(names.columns)  # they would be those of the program before
@@ -138,10 +139,10 @@ def run(options: CorrectOptions) -> None:
         added |= tool.added(robot, found, own, table)
     place = {"command": 0, "status": 1, "miss": 2, "angle": 2, "std": 3}
     added = {name: added[name] for name in sorted(added, key=lambda name: place[name.split("_")[0]])}
-    sheet.write(options.output, columns.from_si({"q": found.q}) | added, table)
+    write_columns(options.output, sheet, columns.from_si({"q": found.q}) | added, table)
     misses = {tool.tip: {"miss_m": tool.own(found.miss), "angle_miss_deg": _degrees(found, tool)} for tool in tools}
     record.add(rows=len(found), statuses=found.counts, misses=misses, files={"program": options.output})
-    _summarise(robot, found, tools, sheet.lines)
+    _summarise(robot, found, tools, [line for line, _ in sheet.rows])
     where = "robot's base" if options.frame == "base" else "measuring frame"
     say(*(_how_well_known(tool, *own, where) for tool, own in zip(tools, known, strict=True) if own is not None))
     frames = ", ".join(f"of the tool on {tool.tip}, in the frame of {robot.base}" for tool in tools)

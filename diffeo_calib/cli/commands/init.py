@@ -12,7 +12,7 @@ from pathlib import Path
 from statistics import median
 from typing import NamedTuple
 
-from diffeo_calib.calibration.diagnostics.likely_mistakes import UNMOVED_JOINT_RANGE
+from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.cli import commanded_poses, proposals
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.declarations import InitOptions
@@ -263,7 +263,7 @@ def _with_tip(robot: Path, found: Explained) -> Explained:
         count = len(arm.joints) - 1
         shorter, last = arm.first(count), arm.joints[count]
         without = replace(seen, robot=load_robot(robot, shorter.links), joints=seen.joints[:count])
-        if moved[count] < UNMOVED_JOINT_RANGE:
+        if moved[count] < gates.FIXED_RANGE:
             left_out.append(f"{last} hardly moves in the table")
         else:
             # its axis may run through the marker, and a pose shows that it turns where a place does not

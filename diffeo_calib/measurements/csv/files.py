@@ -70,7 +70,7 @@ def read_observations(
         found = sensor.table(here).with_line_numbers(own.lines).with_payload(own.values.get("payload"))
         tables.append(found.with_covariates(**{name: own.values.get(name) for name in ("time", "temperature")}))
     data, sha256 = tables[0] if alone else joined_tables(tables), file_sha256(file)
-    data = (data if alone else data.rows(data.lines.argsort(stable=True))).with_columns(file_sha256=sha256)
+    data = (data if alone else data.rows(data.line_numbers.argsort(stable=True))).with_columns(file_sha256=sha256)
     if alone and table.position is not None:
         marker = table.marker and f"{table.marker.partition('=')[0]}={','.join(data.marker_names)}"
         numbers = replace(numbers, table=replace(numbers.table, marker=marker))
@@ -98,7 +98,7 @@ def _divided(rows: FileRows, sensors: Sequence[SensorColumns]) -> list[tuple[Sen
 
 def _without_copies(path: Path, data: Rows, drop: bool) -> Rows:
     """Drop or refuse the rows that repeat an earlier one exactly."""
-    copies, at = data.copies(), data.lines.tolist()
+    copies, at = data.copies(), data.line_numbers.tolist()
     if copies and not drop:
         pairs = few([f"{at[row]} repeats {at[earlier]}" for earlier, row in copies])
         what = f"file '{path}': {len(copies)} line(s) repeat an earlier line exactly: line {pairs}"

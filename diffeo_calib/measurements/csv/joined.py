@@ -23,7 +23,7 @@ import numpy as np
 
 from diffeo_calib.common.errors import MeasurementError, few, shown
 from diffeo_calib.measurements.csv.cells import find_columns, number
-from diffeo_calib.measurements.csv.lines import Lines, read_cells
+from diffeo_calib.measurements.csv.lines import TextTable, read_cells
 from diffeo_calib.measurements.stops import LIMITS, NOISE_FACTOR, Recording, StopLimits, stops
 
 SEPARATORS = (",", ";", "\t", "|")
@@ -51,12 +51,11 @@ class JoinedFile(pathlib.WindowsPath if os.name == "nt" else pathlib.PosixPath):
 
 
 class _Table(NamedTuple):
-    """A file to be joined: its columns, its lines, and the texts of the common column, with the place of that."""
+    """A file to be joined: its cells, the common column, and the texts of this."""
 
     path: Path
-    header: list[str]
-    lines: Lines
-    by: int
+    sheet: TextTable
+    by: str
     keys: list[str]
 
     @classmethod
@@ -64,16 +63,15 @@ class _Table(NamedTuple):
         """The file, with the first usual separator with which it has the common column."""
         for mark in (sep, *SEPARATORS):
             with suppress(MeasurementError):
-                header, lines = read_cells(path, mark, (by,))
-                if by in header:
-                    at = header.index(by)
-                    return cls(path, header, lines, at, [cells[at] for _, cells in lines])
-        header, lines = read_cells(path, sep, (by,))
-        return cls(path, header, lines, find_columns(path, header, [by], sep)[0], [])  # says what is wrong
+                sheet = read_cells(path, mark, (by,))
+                if by in sheet.header:
+                    return cls(path, sheet, by, sheet.column(by))
+        find_columns(path, read_cells(path, sep, (by,)).header, [by], sep)  # says what is wrong
+        raise AssertionError("a file without the column")
 
-    def numbers(self, place: int, decimal: str) -> Array:
+    def numbers(self, column: str, decimal: str) -> Array:
         """(N,) of a column, NaN for cells that are no numbers."""
-        values = [number(cells[place], decimal) for _, cells in self.lines]
+        values = [number(cell, decimal) for cell in self.sheet.column(column)]
         return np.array([np.nan if value is None else value for value in values])
 
 
@@ -143,7 +141,7 @@ def _nearest(times: Array, time: float) -> int:
 
 def _motion(own: _Table, times: Array, decimal: str) -> Recording:
     """The columns of numbers that do not always grow, in units of what is no motion; the clearest ones first."""
-    columns = [own.numbers(place, decimal) for place in range(len(own.header)) if place != own.by]
+    columns = [own.numbers(name, decimal) for name in own.sheet.header if name != own.by]
     moving = [v for v in columns if np.isfinite(v).all() and np.ptp(v) > 0.0 and not (np.diff(v) > 0).all()]
     if not moving:
         fix = "join the files by names, or remove the lines with empty cells"
@@ -157,25 +155,29 @@ def _refuse_several(tables: Sequence[_Table], pairs: Pairs, *, several: bool) ->
     for k in (1,) if several else (0, 1):
         row, count = Counter(pair[k] for pair in pairs).most_common(1)[0]
         if count > 1:
-            own, other, (line, cells) = tables[k], tables[1 - k], tables[k].lines[row]
-            got = f"lines {few([other.lines[pair[1 - k]][0] for pair in pairs if pair[k] == row])} of '{other.path}'"
+            own, other = tables[k], tables[1 - k]
+            lines = [other.sheet.rows[pair[1 - k]][0] for pair in pairs if pair[k] == row]
             fix = "remove the lines that do not belong there"
             fix += "; if they are of several markers, name the column of these (--marker)" * (k == 0)
-            what = f"file '{own.path}', line {line}, {tables[k].header[own.by]} {shown(cells[own.by])}"
-            raise MeasurementError.of(what, expected="one partner", got=got, fix=fix)
+            what = f"file '{own.path}', line {own.sheet.rows[row][0]}, {own.by} {shown(own.keys[row])}"
+            raise MeasurementError.of(
+                what, expected="one partner", got=f"lines {few(lines)} of '{other.path}'", fix=fix
+            )
 
 
 def _write(file: TextIO, tables: Sequence[_Table], pairs: Pairs, sep: str) -> None:
     """Write the joined lines under the numbers of those of the places; a name in both files says of which it is."""
-    table, measured = tables
-    kept = [place for place in range(len(measured.header)) if place != measured.by]
-    both = ("joints", table.header), ("places", [measured.header[place] for place in kept])
-    twice = {*both[0][1]} & {*both[1][1]}
-    names = [f"{of}.{name}" if name in twice else name for of, own in both for name in own]
+    table, measured = tables[0].sheet, tables[1].sheet.without([tables[1].by])
+    twice = {*table.header} & {*measured.header}
+    names = [
+        f"{of}.{name}" if name in twice else name
+        for of, own in zip(("joints", "places"), (table, measured), strict=True)
+        for name in own.header
+    ]
     writer, at = csv.writer(file, delimiter=sep, lineterminator="\n"), 2
     writer.writerow(names)
     for row, place in pairs:
-        line, cells = measured.lines[place]
+        line, cells = measured.rows[place]
         file.write("\n" * (line - at))
-        writer.writerow([" ".join(cell.split()) for cell in (*table.lines[row][1], *(cells[k] for k in kept))])
+        writer.writerow([" ".join(cell.split()) for cell in (*table.rows[row][1], *cells)])
         at = line + 1

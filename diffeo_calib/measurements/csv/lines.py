@@ -14,8 +14,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations, islice
 from math import isnan
 from pathlib import Path
+from typing import NamedTuple
 
-from diffeo_calib.common.errors import MeasurementError, few
+from diffeo_calib.common.errors import MeasurementError, few, listed
 from diffeo_calib.measurements.csv.cells import number, repeated
 from diffeo_calib.measurements.csv.sheets import MARKS, as_text
 
@@ -184,10 +185,35 @@ def _text(path: Path, sep: str) -> tuple[str, list[str]]:
         return data.decode("cp1252", "replace"), ["text in cp1252, not UTF-8"]
 
 
-def read_cells(path: Path, sep: str, wanted: Sequence[str] = ()) -> tuple[list[str], Lines]:
-    """Read a table as text: the header, and number and cells of every row; MeasurementError as :class:`CsvLines`."""
+class TextTable(NamedTuple):
+    """A table as text: names of its columns, and the lines below, blank ones left out."""
+
+    header: list[str]
+    rows: Lines
+
+    def column(self, name: str) -> list[str]:
+        """The cells of a column."""
+        place = self.header.index(name)
+        return [cells[place] for _, cells in self.rows]
+
+    def without(self, names: Sequence[str]) -> TextTable:
+        """The same without some columns."""
+        kept = [k for k, name in enumerate(self.header) if name not in names]
+        rows = [(line, [cells[k] for k in kept]) for line, cells in self.rows]
+        return TextTable([self.header[k] for k in kept], rows)
+
+    def check_free(self, names: Sequence[str]) -> None:
+        """Raise MeasurementError if a column that is to be added to a program is there already."""
+        taken = [name for name in names if name in self.header]
+        if taken:
+            what = f"the program already has the column(s) {listed(taken)}, which the output adds"
+            raise MeasurementError.of(what, fix="rename or remove them, unless the program has been corrected already")
+
+
+def read_cells(path: Path, sep: str, wanted: Sequence[str] = ()) -> TextTable:
+    """Read a table as text, whose header is known by names of wanted columns; errors as of :class:`CsvLines`."""
     file = CsvLines(path, sep, wanted)
-    return file.header, file.rows()
+    return TextTable(file.header, file.rows())
 
 
 def _named(lines: Lines, comments: Sequence[bool], start: int, sizes: Sequence[int]) -> tuple[int, list[str]]:

@@ -59,12 +59,12 @@ class TableOrigin:
         try:
             if self.sha256 is None or file_sha256(self.path) != self.sha256:
                 return {}
-            header, rows = read_cells(self.path, self.columns.table.sep, self.columns.names)
-        except (OSError, MeasurementError):
+            sheet = read_cells(self.path, self.columns.table.sep, self.columns.names)
+            known = dict(sheet.rows)
+            wanted = [known[line] for line in line_numbers.tolist()]
+        except (OSError, MeasurementError, KeyError):
             return {}
-        cells = dict(rows)
-        wanted = [cells.get(line, []) for line in line_numbers.tolist()]
-        return {name: [row[place] for row in wanted] for place, name in enumerate(header)} if all(wanted) else {}
+        return dict(zip(sheet.header, map(list, zip(*wanted, strict=True)), strict=True))
 
 
 FEW_ROWS = 2000

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import isfinite
 from os import PathLike
 from pathlib import Path
@@ -19,7 +19,7 @@ from diffeo_calib.common.errors import MeasurementError, listed
 from diffeo_calib.common.files import WholeFile
 from diffeo_calib.measurements.csv.cells import repeated
 from diffeo_calib.measurements.csv.columns import check_count
-from diffeo_calib.measurements.csv.lines import read_cells
+from diffeo_calib.measurements.csv.lines import TextTable
 from diffeo_calib.measurements.csv.sensors import (
     CAMERA,
     IMAGE,
@@ -110,45 +110,14 @@ def csv_text(rows: Iterable[Iterable[object]], sep: str, end: str = "\r\n") -> b
 Column = Sequence[str] | Sequence[float]
 
 
-@dataclass(frozen=True)
-class Program:
-    """The cells of a table.
+def write_columns(path: Path, sheet: TextTable, cells: Mapping[str, Column], table: TableFormat) -> None:
+    """Write a table with other and more columns; overwrites.
 
-    Args:
-        header: names of the columns. rows: cells of every line below that is not blank.
-        lines: line number of every row in the file.
+    ``cells``: name -> texts, or numbers in the units of the file, of which NaN is an empty cell.
     """
-
-    header: list[str]
-    rows: list[list[str]]
-    lines: list[int]
-
-    @classmethod
-    def read(cls, path: Path, table: TableFormat, wanted: Sequence[str] = ()) -> Program:
-        """Read all cells as text; ``wanted`` are names of columns, by which the header is known."""
-        header, lines = read_cells(path, table.sep, wanted)
-        return cls(header, [cells for _, cells in lines], [line for line, _ in lines])
-
-    def without(self, names: Sequence[str]) -> Program:
-        """The same without some columns."""
-        kept = [k for k, name in enumerate(self.header) if name not in names]
-        return Program([self.header[k] for k in kept], [[row[k] for k in kept] for row in self.rows], self.lines)
-
-    def check_free(self, names: Sequence[str]) -> None:
-        """Raise MeasurementError if a column that is to be added is there already."""
-        taken = [name for name in names if name in self.header]
-        if taken:
-            what = f"the program already has the column(s) {listed(taken)}, which the output adds"
-            raise MeasurementError.of(what, fix="rename or remove them, unless the program has been corrected already")
-
-    def write(self, path: Path, cells: Mapping[str, Column], table: TableFormat) -> None:
-        """Write the program with other and more columns; overwrites.
-
-        ``cells``: name -> texts, or numbers in the units of the file, of which NaN is an empty cell.
-        """
-        added = {name: own for name, own in cells.items() if name not in self.header}
-        kept = [cells.get(name, [row[k] for row in self.rows]) for k, name in enumerate(self.header)]
-        write_rows(path, [*self.header, *added], [list(zip(*kept, *added.values(), strict=True))], table)
+    added = {name: own for name, own in cells.items() if name not in sheet.header}
+    kept = [cells.get(name, [row[k] for _, row in sheet.rows]) for k, name in enumerate(sheet.header)]
+    write_rows(path, [*sheet.header, *added], [list(zip(*kept, *added.values(), strict=True))], table)
 
 
 SOCKET, SESSION = "socket", "session"
