@@ -85,7 +85,7 @@ class Bench:
     @property
     def mass(self) -> list[str]:
         """The option of commands that need one payload."""
-        return ["--payload-mass", "4"] * (self.kind.name == "payloads")
+        return ["--payload", "4"] * (self.kind.name == "payloads")
 
     @property
     def one_tip(self) -> list[str]:
@@ -242,7 +242,7 @@ def _(bench: Bench) -> None:
         assert 1e3 * each[0].rms < 2 * kind.source.worst_mm
     enough, too_little = {"images": ("50px", "0.0001px")}.get(kind.name, ("20mm", "0.00001mm"))
     table, options = kind.table("new")
-    found = bench.judged("evaluate", kind.file, table, *options, "--residuals", path, "--fail-above", enough)
+    found = bench.judged("evaluate", kind.file, table, *options, "--residuals", path, "--tolerance", enough)
     assert found["accepted"]
     for one in each:
         assert 0.0 < one.rms < math.inf
@@ -262,7 +262,7 @@ def _(bench: Bench) -> None:
         assert {"rad", "deg", "mrad"} & {row["unit"] for row in rows}
     assert ("expected over the joint ranges" in found["said"]) == (kind.name in FREE and kind.name != "images")  # px
     if kind.name in (*QUICK, "images"):
-        bench.run("evaluate", kind.file, table, *options, "--fail-above", too_little, code=4)
+        bench.run("evaluate", kind.file, table, *options, "--tolerance", too_little, code=4)
 
 
 # --- where the device stands ----------------------------------------------------------------------------------------
@@ -270,7 +270,7 @@ def _(bench: Bench) -> None:
 
 @verb("register")
 def _(bench: Bench) -> None:
-    """In Python, and by `evaluate --register`, which writes the same model."""
+    """In Python, and by `evaluate --free both`, which writes the same model."""
     kind, path = bench.kind, bench.folder / "moved.safetensors"
     check_accuracy(kind, kind.registered, NEW_ROWS_FACTOR)
     table, options = kind.table("moved")
@@ -284,7 +284,7 @@ def _(bench: Bench) -> None:
     shared = kind.name not in (*THROUGHOUT, *numbered_anew)
     if shared:
         bench.command.monkeypatch.setattr(dc.CalibratedKinematics, "registered", registered)
-    bench.run("evaluate", kind.file, table, *options, "--register", "-o", path)
+    bench.run("evaluate", kind.file, table, *options, "--free", "both", "-o", path)
     model: Any = dc.load(path)
     if shared:  # what is written is what was found
         one, other = (found.map.deformation(kind.q(5)) for found in (model, kind.registered))
@@ -323,7 +323,7 @@ def _(bench: Bench) -> None:
     kind, path = bench.kind, bench.folder / "report.html"
     leave_undrawn(bench.command.monkeypatch)
     table, options = kind.table()
-    found = bench.json("report", kind.file, "-o", path, "--data", table, *options)
+    found = bench.json("report", kind.file, table, "-o", path, *options)
     assert found["left_out"]
     assert tuple(found["errors"]) in ((), STAGES)
     assert "<svg" in path.read_text(encoding="utf-8")
@@ -360,12 +360,12 @@ def _(bench: Bench) -> None:
 @verb("compare with a table")
 def _(bench: Bench) -> None:
     kind = bench.kind
-    share_places(kind, "compare", bench.command.monkeypatch)
+    share_places(kind, "recalibrate", bench.command.monkeypatch)
     found: Any = dc.compare(kind.model, kind.moved)
     assert not found.changes.found
     bench.command.monkeypatch.setattr("diffeo_calib.cli.commands.recalibrate.compare", lambda *_, **__: found)
     table, options = kind.table("moved")
-    bench.judged("compare", kind.file, table, *options)
+    bench.judged("recalibrate", kind.file, table, *options)
 
 
 @verb("compare two models")

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import MISSING, dataclass
+from dataclasses import MISSING
 from pathlib import Path
 from typing import Literal
 
 from diffeo_calib.cli.options import (
     CONVENTION,
+    MASS,
     PAYLOAD,
     ROBOT,
     ROTATION_ANGLE,
     SEED,
     Angle,
     Candidates,
-    ChangeTests,
     Convention,
     Length,
     Links,
@@ -37,7 +37,6 @@ CSV = "Table with a header, one configuration per row."
 NOTE = "Text to keep in the model file, such as a serial number."
 MODEL = "Model file written by `fit`."
 TOOL_FROM = "Frame of --tool: the tip of the robot, or the measured frame of a model of poses, which is better known."
-MASS = "Mass that the robot carries, for a model with payloads."
 OLD = "Model file of an earlier calibration."
 
 
@@ -45,7 +44,6 @@ class Command(Options):
     """The options of a command; its work is ``run`` of the module of its name in ``commands``, which takes them."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class FitOptions(Command):
     """Calibrate a robot, test it on held-out rows, save the model.
 
@@ -79,13 +77,12 @@ class FitOptions(Command):
     duplicates: str = option("Exactly repeated rows: error, keep or drop.", default="error")
 
 
-@dataclass(frozen=True, kw_only=True)
 class CampaignOptions(Command):
     """Judge rows while they are measured.
 
     Follows a table that another program appends to: every row gets a verdict, the expected error of the robot and
     the best poses to measure next. A journal beside the table keeps what was decided: after a crash the same
-    command goes on where it stopped. Ends with exit code 0 when --target is reached, 4 if the rows end before.
+    command goes on where it stopped. Ends with exit code 0 when --tolerance is reached, 4 if the rows end before.
 
     A campaign file (`diffeo-calib campaign campaign.toml`, see `init`) may take the place of CSV: it can hold all
     options, the required ones too; those that are typed as well win.
@@ -95,7 +92,7 @@ class CampaignOptions(Command):
     robot: Robot
     units: Units
     rows: Rows
-    target: str | None = option("End when the error is below this with 95 % probability: 0.15mm.", "LENGTH")
+    tolerance: str | None = option("End when the error is below this with 95 % probability: 0.15mm.", "LENGTH")
     stdin: bool = option(
         "Append rows from standard input to CSV, one JSON object a line: see campaign/feeds.py.", default=False
     )
@@ -105,11 +102,10 @@ class CampaignOptions(Command):
     once: bool = option("Judge the rows that are there, and do not wait for more.", default=False)
     candidates: Path | None = option("Table of poses that can be measured; within the joint limits by default.", "CSV")
     page: str | None = option("Show the campaign to this machine's browser at this port; 0 for any.", "[HOST:]PORT")
-    next: int = option("Number of poses that are proposed after each row.", default=1, min=0)
+    count: int = option("Number of poses that are proposed after each row.", default=1, min=0)
     accepted: Path | None = written("Table of the accepted rows to write when the campaign ends, for `fit`.", "CSV")
 
 
-@dataclass(frozen=True, kw_only=True)
 class RecordOptions(Command):
     """Turn a ROS bag into a table, one row for each stop.
 
@@ -132,11 +128,10 @@ class RecordOptions(Command):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class EvaluateOptions(Command):
     """Measure the errors of a model on a table of measurements.
 
-    The table is read as that of the model's fit, unless options say otherwise. --register first finds where the
+    The table is read as that of the model's fit, unless options say otherwise. --free first finds where the
     measuring device and the markers are now, and keeps everything else.
     """
 
@@ -144,18 +139,16 @@ class EvaluateOptions(Command):
     csv: Path = argument(CSV, "CSV")
     units: Units
     rows: Rows
-    register: bool = option("First find the measuring device and the markers anew from these rows.", default=False)
-    free: Free | None = option("With --register: what may have moved; base is the device's or the robot's.")
-    output: Path | None = written("With --register: write the registered model to this file.", "MODEL")
-    fail_above: str | None = option(
+    free: Free | None = option("First find anew what may have moved; base is the device's or the robot's.")
+    output: Path | None = written("With --free: write the registered model to this file.", "MODEL")
+    tolerance: str | None = option(
         "Exit with code 4 if the RMS error of the rows that were not used in the fit is larger, such as 0.15mm.", "RMS"
     )
     residuals: Path | None = written("Write the error of every row to this file: measured minus predicted.", "TABLE")
-    needs = (("--free -o", "--register"),)
-    excludes = (("--fail-above --residuals", "--register"),)
+    needs = (("-o", "--free"),)
+    excludes = (("--tolerance --residuals", "--free"),)
 
 
-@dataclass(frozen=True, kw_only=True)
 class InitOptions(Command):
     """Propose the options of `fit` for a table and a robot.
 
@@ -171,7 +164,6 @@ class InitOptions(Command):
     force: bool = option("Replace a campaign file that was edited.", default=False)
 
 
-@dataclass(frozen=True, kw_only=True)
 class ImagesOptions(Command):
     """Find a printed board in a folder of images.
 
@@ -196,12 +188,11 @@ class ImagesOptions(Command):
     board_std: float = option(
         "Standard deviation of the board's size, as a share: 0.001 as printed, 0.0002 measured.", default=0.001
     )
-    overview: Path | None = written("Write a page with all images and their corners.", "HTML")
+    report: Path | None = written("Write a page with all images and their corners.", "HTML")
     sep: str = option("Separator of both tables.", default=",")
     decimal: str = option("Decimal mark of both tables.", default=".")
 
 
-@dataclass(frozen=True, kw_only=True)
 class PredictOptions(Command):
     """Predict positions or poses for a table of joint values.
 
@@ -218,7 +209,6 @@ class PredictOptions(Command):
     payload: str | None = option(PAYLOAD, "COLUMN")
 
 
-@dataclass(frozen=True, kw_only=True)
 class CorrectOptions(Command):
     """Correct a program, so that the robot goes where it is told.
 
@@ -259,10 +249,9 @@ class CorrectOptions(Command):
     rate: float | None = option(
         "The rows are a path: the correction of a joint changes by at most this many degrees from row to row.", "DEG"
     )
-    payload_mass: float | None = option(MASS, "MASS")
+    payload: float | None = option(MASS, "MASS")
 
 
-@dataclass(frozen=True, kw_only=True)
 class ExportOptions(Command):
     """Write a model in the formats of other programs.
 
@@ -311,7 +300,7 @@ class ExportOptions(Command):
     )
     tip: str | None = option("Tip at the end of --c and --dh, for a model with several tips.", "LINK")
     robot: Path | None = option("The robot's description, if the model file does not hold it or it was edited.", "URDF")
-    payload_mass: float | None = option(MASS, "MASS")
+    payload: float | None = option(MASS, "MASS")
     length: Length = option("Unit of lengths in the CSV files written.", default="m")
     angle: Angle = option("Unit of angles in the CSV files written.", default="rad")
     needs = (
@@ -323,7 +312,6 @@ class ExportOptions(Command):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class PlanOptions(Command):
     """Plan which poses to measure, and say how many are needed.
 
@@ -357,68 +345,58 @@ class PlanOptions(Command):
         "Noise is as that of the rows of MODEL.",
         "KIND[=NUMBERS]",
     )
-    payload_mass: float | None = option(MASS, "MASS")
-    needs = (("--payload-mass --free", "MODEL"),)
+    payload: float | None = option(MASS, "MASS")
+    needs = (("--payload --free", "MODEL"),)
     excludes = (
         ("--robot --base --tip --load --dh-convention --marker", "MODEL"),
         ("--draw --range --tracker --floor --column --collisions", "--candidates"),
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class RecalibrateOptions(Command):
-    """Calibrate a robot anew, starting from an old model.
+    """Say what has changed since a fit, or calibrate anew.
 
-    The measuring device may stand anywhere. Twenty rows do what about a hundred do without the old model. The table
-    is read as that of the old fit, unless options say otherwise. Says where device and markers are now and what has
-    changed in the robot, offsets with signs as `compare` states them, and writes a model that knows old rows and
-    new ones.
-    """
+    The measuring device may stand anywhere. Twenty rows do what about a hundred do without the old model. A table is
+    read as that of the old fit, unless options say otherwise. Says where device and markers are now, and tests every
+    joint, the load and the geometry. With -o the robot is calibrated anew, from old rows and new ones. Without, OTHER
+    may be a model: the same test of what it predicts at rows of the fits, with its uncertainty.
 
-    old: Path = argument(OLD, "OLD")
-    csv: Path = argument(CSV, "CSV")
-    units: Units
-    output: Path = written("Model file to write.", "MODEL", MISSING)
-    rows: Rows
-    tests: ChangeTests
-    drift: Literal["tested", "none"] = option(
-        "tested: what a test names may have changed; none: device and markers only.", default="tested"
-    )
-    note: str = option(NOTE, "TEXT", "")
-
-
-@dataclass(frozen=True, kw_only=True)
-class CompareOptions(Command):
-    """Say what has changed since a calibration.
-
-    With a table: a test for every joint, the load and the geometry. It is read as that of the old fit, unless
-    options say otherwise. With a model: the same test of what it predicts at rows of the fits, with its
-    uncertainty. An offset is added to what the joint reads: after a change by +0.5 mrad the joint stands 0.5 mrad
-    farther in its positive direction than the old model has it at the same reading. The exit code is 0 whether or
-    not something has changed: with --json, programs read `changes` and `rows_can_tell`.
+    An offset is added to what the joint reads: after a change by +0.5 mrad the joint stands 0.5 mrad farther in its
+    positive direction than the old model has it at the same reading. The exit code is 0 whether or not something has
+    changed: with --json, programs read `changes` and `rows_can_tell`.
     """
 
     old: Path = argument(OLD, "OLD")
     other: Path = argument("Table of new measurements, or another model file of the same robot.", "OTHER")
     units: Units
+    output: Path | None = written("Calibrate anew, and write the model to this file.", "MODEL")
     rows: Rows
-    tests: ChangeTests
+    marker_freedom: Literal["evidence", "same", "moved", "other"] = option(
+        "Whether the markers are the same (0.05 mm: nobody touched them), have moved a little (1 mm: remounted) or are "
+        "other ones (anywhere); by default the rows decide.",
+        default="evidence",
+    )
+    seed: int = option("Seed of the tests for changes.", **SEED)
+    drift: Literal["tested", "none"] = option(
+        "tested: what a test names may have changed; none: device and markers only.", default="tested"
+    )
+    note: str = option(NOTE, "TEXT", "")
+    needs = (("--drift --note", "-o"),)
 
 
-@dataclass(frozen=True, kw_only=True)
 class ReportOptions(Command):
     """Write a report about a model, for a browser or a printer.
 
-    One HTML file: how good the model is, where, why, whether it can be trusted, and what to do next. Rows of --data
-    that were used in the fit are left out; the table is read as that of the fit, unless options say otherwise.
+    One HTML file: how good the model is, where, why, whether it can be trusted, and what to do next. Rows that were
+    used in the fit are left out; the table is read as that of the fit, unless options say otherwise.
     """
 
     model: Path = argument(MODEL, "MODEL")
     output: Path = written("Page to write.", "HTML", MISSING)
     units: Units
     rows: Rows
-    data: Path | None = option(
-        "Measurements to judge the model by; by default the rows of its fit, each predicted by all others.", "TABLE"
+    csv: Path | None = argument(
+        "Measurements to judge the model by; by default the rows of its fit, each predicted by all others.", "CSV", None
     )
     against: list[str] | None = option(
         "Further column of the table to show errors against; repeat for more. Time and temperature are found by their "
@@ -428,10 +406,9 @@ class ReportOptions(Command):
     tolerance: str | None = option(
         "Largest RMS error that is good enough, such as 0.15mm: the page says whether it is.", "RMS"
     )
-    needs = (("--position --socket --reading --length --angle --against", "--data"),)
+    needs = (("--position --socket --reading --length --angle --against", "CSV"),)
 
 
-@dataclass(frozen=True, kw_only=True)
 class DemoOptions(Command):
     """Simulate a robot and calibrate it as a user would.
 
@@ -439,7 +416,7 @@ class DemoOptions(Command):
     """
 
     output: Path = option("Folder to write everything to.", "FOLDER", Path("demo_output"), kind="folder")
-    rows: int = option("Number of simulated measurements.", default=300, min=20)
+    count: int = option("Number of simulated measurements.", default=300, min=20)
     seed: int = option("Seed of the arm and the noise.", **SEED)
 
 

@@ -56,8 +56,13 @@ JOINED = ("rotation-std",)
 """Entries that may be lists of columns although the option can be repeated."""
 LONGEST_FILE = 1 << 20
 """Bytes: a file of options is short."""
-IN_FILE_OF = {"compare": "recalibrate", "report": "fit", "record": "images", "demo": "fit"}
+IN_FILE_OF = {"report": "fit", "record": "images", "demo": "fit"}
 """Command -> that whose file holds its work."""
+FORMER = {"compare": "recalibrate"}
+"""Former name of a command -> that which does the same now."""
+RENAMED = {"target": "tolerance", "fail-above": "tolerance", "payload-mass": "payload", "next": "count"}
+RENAMED |= {"rows": "count", "overview": "report", "register": "free=both", "data": ""}
+"""Former name of an option -> the present one, nothing for an argument."""
 DECLARED: dict[str, dict[str, Any]] = {}
 """Command -> name of an option or argument, without dashes -> type of its value."""
 _arguments: list[str] = []
@@ -89,7 +94,7 @@ class FlagsOff(TyperGroup):
         running = not (others or options.get("resilient_parsing")) and not {"-h", "--help"} & set(args)
         if running:
             remove_earlier(args)
-        _arguments[:] = expanded(args)
+        _arguments[:] = expanded(renamed(args))
         if running:
             remove_earlier(_arguments)
         return super().make_context(info_name, list(_arguments), *others, **options)
@@ -195,16 +200,36 @@ def common(
 # --- campaign files ---------------------------------------------------------------------------------------------------
 
 
+def _place_of_command(words: Sequence[str]) -> int:
+    return next((place for place, word in enumerate(words) if not word.startswith("-")), len(words))
+
+
+def renamed(words: Sequence[str]) -> list[str]:
+    """The same command line without former names of commands and options."""
+    at = _place_of_command(words)
+    command, rest, first = [FORMER.get(word, word) for word in words[at : at + 1]], list[str](), list[str]()
+    for word in words[at + 1 :]:
+        name, equal, value = word.partition("=")
+        now = RENAMED.get(name[2:]) if name.startswith("--") else None
+        if now is None:
+            rest.append(word)
+        elif "=" in now:
+            first.append(f"--{now}")  # before what was typed as well
+        elif now or value:
+            rest.append(f"--{now}{equal}{value}" if now else value)
+    return [*words[:at], *command, *first, *rest]
+
+
 def expanded(arguments: Sequence[str]) -> list[str]:
     """The same command line with a campaign file written out, for `campaign` without what only `fit` knows."""
     words = list(arguments)
-    at = next((place for place, word in enumerate(words) if not word.startswith("-")), 0)
+    at = _place_of_command(words)
     if len(words) < at + 2 or words[at] not in (COMMAND, LIVE) or not words[at + 1].lower().endswith(SUFFIX):
         return words
     path = Path(words[at + 1])
     options = DECLARED[words[at]]
     of_fit = {*DECLARED[COMMAND]} - {*options}
-    entries = {name: value for name, value in _entries(path).items() if name not in of_fit}
+    entries = {RENAMED.get(name, name): value for name, value in _entries(path).items() if name not in of_fit}
     if unknown := [name for name in entries if name not in options]:
         expected = f"options of `{words[at]}`: {', '.join(options)}"
         raise InputError.of(f"{path}: {', '.join(unknown)}", expected=expected, fix="correct the names")

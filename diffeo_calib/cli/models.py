@@ -76,7 +76,7 @@ def load_laden(path: Path, mass: float | None) -> CalibratedKinematics:
     model = load_kinematics(path)
     if model.payload is not None and mass is None:
         what = f"{path} was calibrated with payloads"
-        raise InputError.of(what, expected="--payload-mass", fix="name the mass that the robot carries, 0 without load")
+        raise InputError.of(what, expected="--payload", fix="name the mass that the robot carries, 0 without load")
     return model if mass is None else model.with_payload(mass)
 
 
@@ -86,7 +86,7 @@ def planned(model: CalibratedKinematics, mass: float | None) -> tuple[Calibrated
     if mass is not None:
         model = model.with_payload(mass)
     elif model.payload is not None:
-        say(f"planned with a payload of {model.payload:g}, the median of the fit; --payload-mass for another one")
+        say(f"planned with a payload of {model.payload:g}, the median of the fit; --payload for another one")
     return model, model.geometry.tool
 
 

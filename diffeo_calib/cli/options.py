@@ -1,6 +1,6 @@
 """What an option is, and the groups of options that several commands share. Imports nothing slow: help appears at once.
 
-A group is a frozen dataclass whose fields are options, or groups of more of them.
+The fields of a group are options, or groups of more of them.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from dataclasses import MISSING, Field, dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
+
+from typing_extensions import dataclass_transform
 
 from diffeo_calib.common.errors import InputError
 
@@ -75,8 +77,9 @@ class Option(NamedTuple):
         return cls(own.name, hint, own.default, names, (*names, how["metavar"])[0], kind, how)
 
 
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(option, argument, written))
 class Options:
-    """A group of options.
+    """A group of options: a frozen dataclass.
 
     Attributes:
         needs: options, and others of which each of them needs one. excludes: and others that it cannot stand beside.
@@ -85,6 +88,9 @@ class Options:
     needs: ClassVar[tuple[tuple[str, str], ...]] = ()
     excludes: ClassVar[tuple[tuple[str, str], ...]] = ()
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    def __init_subclass__(cls) -> None:
+        dataclass(frozen=True, kw_only=True)(cls)
 
     @classmethod
     @cache
@@ -134,10 +140,10 @@ CONVENTION = (
 )
 ROTATION_ANGLE = "Unit of Euler angles and rotation vectors."
 PAYLOAD = "Column with the known mass that the robot carried, in any unit."
+MASS = "Mass that the robot carries, for a model with payloads."
 ROBOT = "The robot's description: a URDF, or a table of its Denavit-Hartenberg parameters, one line per joint."
 
 
-@dataclass(frozen=True, kw_only=True)
 class Units(Options):
     """How tables are written; a model knows that of the table of its fit."""
 
@@ -161,7 +167,6 @@ class Units(Options):
     decimal: str | None = option("Decimal mark, by default that of the model, or a point.")
 
 
-@dataclass(frozen=True, kw_only=True)
 class Places(Options):
     """Measured places in a file of their own."""
 
@@ -176,7 +181,6 @@ class Places(Options):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class Rows(Places):
     """Columns of the measurements in a table, of any kinds."""
 
@@ -253,7 +257,6 @@ class Rows(Places):
         return any(text.startswith(CORNERS) for text in self.reading or ())
 
 
-@dataclass(frozen=True, kw_only=True)
 class Links(Options):
     """Which part of the robot in a file."""
 
@@ -269,7 +272,6 @@ class Links(Options):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class Robot(Options):
     """Which robot was measured; none where --robot-pose names commanded poses."""
 
@@ -277,7 +279,6 @@ class Robot(Options):
     robot: Path | None = option(ROBOT, "FILE")
 
 
-@dataclass(frozen=True, kw_only=True)
 class Targets(Options):
     """Columns of the poses that a tool shall have."""
 
@@ -289,7 +290,6 @@ class Targets(Options):
     rotation_angle: Angle | None = option(ROTATION_ANGLE)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Candidates(Options):
     """Configurations to choose from: a table, or random ones within what the cell allows."""
 
@@ -314,15 +314,3 @@ class Candidates(Options):
         default=False,
     )
     seed: int = option("Seed of the random candidates.", **SEED)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ChangeTests(Options):
-    """How changes since an old fit are tested."""
-
-    marker_freedom: Literal["evidence", "same", "moved", "other"] = option(
-        "Whether the markers are the same (0.05 mm: nobody touched them), have moved a little (1 mm: remounted) or are "
-        "other ones (anywhere); by default the rows decide.",
-        default="evidence",
-    )
-    seed: int = option("Seed of the tests for changes.", **SEED)

@@ -32,7 +32,7 @@ WIDEST = 1000
 MOST_OUTLIERS = 10
 """Most lines about single rows."""
 EXIT_ABOVE = 4
-"""The errors are larger than --fail-above."""
+"""The errors are larger than --tolerance."""
 UNITS = {"mm": ("m", 1e3), "um": ("m", 1e6), "m": ("m", 1.0), "px": ("px", 1.0)}
 """Unit of a limit -> unit in which it is compared, and how many are one of these; own kinds of readings have others."""
 
@@ -212,7 +212,7 @@ class Limit(NamedTuple):
     unit: str
 
 
-def parsed_limit(text: str | None, option: str = "--fail-above") -> Limit | None:
+def parsed_limit(text: str | None) -> Limit | None:
     """A length with its unit, such as 0.15mm, or pixels; None without one."""
     if text is None:
         return None
@@ -224,16 +224,16 @@ def parsed_limit(text: str | None, option: str = "--fail-above") -> Limit | None
         value = -1.0
     if not 0.0 < value < inf:
         expected = "a length above zero with its unit, such as 0.15mm, or pixels, such as 0.5px"
-        raise InputError.of(f"{option} {text}", expected=expected)
+        raise InputError.of(f"--tolerance {text}", expected=expected)
     unit, per_unit = units[name]
     return Limit(value / per_unit, unit)
 
 
-def parsed_length(text: str | None, option: str) -> float | None:
+def parsed_length(text: str | None) -> float | None:
     """A length with its unit in m; None without one."""
-    limit = parsed_limit(text, option)
+    limit = parsed_limit(text)
     if limit is not None and limit.unit != "m":
-        raise InputError.of(f"{option} {text}", expected="a length, such as 0.15mm")
+        raise InputError.of(f"--tolerance {text}", expected="a length, such as 0.15mm")
     return None if limit is None else limit.value
 
 

@@ -230,7 +230,7 @@ def some_rows(data: Measurements) -> Measurements:
 
 def causes_of(model: CalibratedKinematics, some: Measurements, errors: Evaluation) -> list[str]:
     """What moved, or that these are no errors of a calibrated robot."""
-    fix = "register the model first: `model.registered`, evaluate --register"
+    fix = "register the model first: `model.registered`, evaluate --free both"
     causes = [sentence(motion.sentence, fix=fix) for motion in motions(model, some)]
     return causes or [text for text in [implausible(model, some, errors)] if text is not None]
 
@@ -263,7 +263,7 @@ def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluat
                 got=f"{per_unit * median:.3g} {unit}",
                 fix=f"check `length` and `angle`, the order of the columns{options}, and that neither the measuring "
                 "device nor the markers have moved: a model predicts in the measuring frame of its fit (if they "
-                "have, register the model: `model.registered`, evaluate --register; or recalibrate it)",
+                "have, register the model: `model.registered`, evaluate --free both; or recalibrate it)",
             )
     return None
 

@@ -17,7 +17,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.reports.analysis.findings import Findings, find
 from diffeo_calib.reports.analysis.stages import Kinematics
 from diffeo_calib.reports.html import sections, sentences
-from diffeo_calib.reports.html.document import Page
+from diffeo_calib.reports.html.document import page
 from diffeo_calib.sensors.places import Places
 
 LOG = logging.getLogger(__name__)
@@ -73,7 +73,7 @@ def write_report(
     if warnings is None:
         warnings = (summary.warnings or "").splitlines() if summary else []
     sha256 = None if data is None or not found.shown.new else data.sha256
-    page = Page(
+    text = page(
         title=printable(title or f"Robot {robot.name}, {robot.base} to {robot.tip}"),
         subtitle=f"{fit}. Errors: {rows}.",
         verdict=sentences.verdict(found, tolerance),
@@ -82,6 +82,6 @@ def write_report(
         figures=dict(sentences.figures(found)),
         sections=[*sections.sections(found, progress), sections.record(model, sha256)],
     )
-    write_whole(path, page.html().encode())
+    write_whole(path, text.encode())
     LOG.info("report written to %s", shown(path))
     return found

@@ -23,8 +23,8 @@ from diffeo_calib.sensors.set_ups import KINDS, MOUNTING, SESSION, SetUps
 
 BALL_IS_THE_MARKER = (
     "the model was calibrated without a measuring device: the frame of these positions was found from them, 6 numbers, "
-    "as if the marker were the ball; if it is another one, register the model first (`model.registered`, evaluate "
-    "--register)"
+    "as if the marker were the ball; if it is another one, register the model first (`model.registered`, "
+    "evaluate --free both)"
 )
 
 

@@ -83,7 +83,7 @@ def main(folder: Path) -> None:
     seen = photograph(folder)
     command(
         *(folder, "images", ".", "joints.csv", "--board", BOARD, "--board-std", "0.0002", "--length", "mm"),
-        *("-o", "corners.csv", "--overview", "overview.html"),
+        *("-o", "corners.csv", "--report", "overview.html"),
     )
     command(
         *(folder, "fit", "corners.csv", "--robot", "robot.urdf", "--base", "base_link", "--tip", "flange", *TABLE),

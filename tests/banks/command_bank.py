@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
@@ -44,7 +44,7 @@ def leave_undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """
     monkeypatch.setattr("diffeo_calib.reports.analysis.stages.CONFIGURATIONS", FEW_CONFIGURATIONS)
     path = "diffeo_calib.reports.html.sections.panel"
-    monkeypatch.setattr(path, lambda _, label, *__, **___: replace(UNDRAWN, label=label))
+    monkeypatch.setattr(path, lambda _, label, *__, **___: UNDRAWN._replace(label=label))
 
 
 @dataclass(frozen=True)

@@ -199,7 +199,7 @@ def folder(tmp_path: Path) -> Path:
 def test_a_folder_becomes_a_table(folder: Path, command: Command) -> None:
     out, page = folder / "corners.csv", folder / "page.html"
     words = ["images", folder, folder / "joints.csv", "--board", BOARD, "--length", "mm", "-o", out]
-    done = command(*words, "--overview", page)
+    done = command(*words, "--report", page)
     assert done.code == 0, done.err
     assert "small.png: a resized" in done.out
     assert "text.png: cannot be read" in done.out
@@ -224,7 +224,7 @@ def test_ctrl_c_among_images_leaves_the_files(folder: Path, command: Command, mo
         (folder / name).write_text("old")
     before = {path: path.read_bytes() for path in folder.iterdir()}
     words = ["images", folder, folder / "joints.csv", "--board", BOARD, "--length", "mm", "-o", folder / "corners.csv"]
-    assert command(*words, "--overview", folder / "page.html").code == 130
+    assert command(*words, "--report", folder / "page.html").code == 130
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 

@@ -224,7 +224,7 @@ def test_lines_that_are_no_rows() -> None:
 def test_the_command_ends_at_its_target_and_goes_on(tmp_path: Path, lines: list[str], command: Command) -> None:
     (tmp_path / "run.csv").write_text("".join(lines[:15]) + lines[15][:20])
     words = ["campaign", tmp_path / "campaign.toml", "--once"]
-    first = command(*words, "--target", "1um")
+    first = command(*words, "--tolerance", "1um")
     assert first.code == 4
     (tmp_path / "run.csv").write_text("".join([*lines[:3], "1,2,three\n", *lines[3:]]))
     assert "changed after" in command(*words).error
@@ -237,7 +237,7 @@ def test_the_command_ends_at_its_target_and_goes_on(tmp_path: Path, lines: list[
     assert "line 23 left out" in done.out
     kept = [line for number, line in enumerate(lines) if number != WRONG + 1]
     assert (tmp_path / "accepted.csv").read_text() == "".join(kept)
-    assert command(*words, "--target", "50mm").code == 0
+    assert command(*words, "--tolerance", "50mm").code == 0
 
 
 def test_rows_that_are_there_before_are_judged_as_with_once(
@@ -284,7 +284,7 @@ def test_a_campaign_goes_on_as_it_was_begun(tmp_path: Path, lines: list[str], co
     assert "another header than it" in command(*words).error
     (tmp_path / "run.csv").write_text("".join(lines[:6]))
     assert (tmp_path / "run.csv.journal").read_bytes() == journal
-    assert command(*words, "--joints", ",".join(lines[0].split(",")[:6]), "--target", "1mm").code == 4
+    assert command(*words, "--joints", ",".join(lines[0].split(",")[:6]), "--tolerance", "1mm").code == 4
     old = journal.split(b"\n", 1)[1]  # of versions that did not say it
     (tmp_path / "run.csv.journal").write_bytes(old)
     assert command(*words).code == 0

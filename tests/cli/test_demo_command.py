@@ -12,7 +12,7 @@ from command_bank import Command
 @pytest.mark.slow
 @pytest.mark.usefixtures("given_scales")
 def test_demo(command: Command, tmp_path: Path) -> None:
-    done = command("demo", "--output", tmp_path / "demo", "--rows", 30)
+    done = command("demo", "--output", tmp_path / "demo", "--count", 30)
     assert (done.code, done.err.strip()) == (0, "")
     names = {path.name for path in (tmp_path / "demo").iterdir()}
     assert names == {"arm.urdf", "measurements.csv", "model.safetensors", "calibration.png", "report.html"}

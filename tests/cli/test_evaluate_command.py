@@ -147,7 +147,7 @@ def test_blocks_do_not_change_predictions_or_errors(
 
 def test_an_acceptance_limit_has_an_exit_code(fitted: Outcome, site: Site, command: Command) -> None:
     assert fitted.code == 0
-    arguments = ["evaluate", site.folder / "model.safetensors", site.csv, *TABLE, "--fail-above"]
+    arguments = ["evaluate", site.folder / "model.safetensors", site.csv, *TABLE, "--tolerance"]
     rms = command(*arguments, "1m").numbers("12 not used in the fit")[0]
     done = command(*arguments, f"{1.01 * rms:.6f}mm")
     assert done.code == 0
@@ -156,7 +156,7 @@ def test_an_acceptance_limit_has_an_exit_code(fitted: Outcome, site: Site, comma
     assert done.code == 4
     assert "above the limit of" in done.out
     for wrong in ("0.1", "-1mm", "nanmm", "mm", "1 inch", "0m"):
-        assert "--fail-above" in command(*arguments, wrong).error
+        assert "--tolerance" in command(*arguments, wrong).error
 
 
 def test_residuals_of_every_row(
@@ -178,6 +178,6 @@ def test_residuals_of_every_row(
     np.testing.assert_allclose(cells[:, 2:5], away, atol=2e-4)
     np.testing.assert_allclose(cells[:, 5], np.linalg.norm(cells[:, 2:5], axis=1), rtol=1e-12)
     refused = command(
-        "evaluate", site.folder / "model.safetensors", site.csv, *TABLE, "--register", "--residuals", path
+        "evaluate", site.folder / "model.safetensors", site.csv, *TABLE, "--free", "both", "--residuals", path
     )
     assert "--residuals beside --register" in refused.error

@@ -37,7 +37,7 @@ from diffeo_calib.measurements.table_format import TableFormat
             "turn",
         ],
         ["demo", "--seed", "-1"],
-        ["demo", "--rows", "3"],
+        ["demo", "--count", "3"],
     ],
 )
 def test_wrong_usage_is_exit_2(arguments: list[str], command: Command) -> None:

@@ -33,7 +33,7 @@ def test_old_files_stay(name: str, server: Server, small_site: Site, sound_path:
     (old, *_) = paths = outputs(tmp_path, "a.c", "a.h", "a.urdf")
     arguments: dict[str, list[object]] = {
         "predict": ["predict", model, csv, *units, "-o", old],
-        "register": ["evaluate", model, csv, *TABLE, "--register", "-o", old],
+        "register": ["evaluate", model, csv, *TABLE, "--free", "both", "-o", old],
         "correct": ["correct", model, csv, *units, "-o", old],
         "export": ["export", model, "--urdf", paths[2], "--dh", tmp_path / "new.csv"],
         "c": ["export", model, "--c", old],

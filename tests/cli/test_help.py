@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 from command_bank import Command
 
+from diffeo_calib.cli.main import renamed
+
 UNITS = "--length --angle --joint-length --joints --robot-pose --sep --decimal"
 ROWS = (
     "--position --rotation --convention --rotation-angle --lever --camera-on-tool --std --rotation-std --socket "
@@ -16,32 +18,31 @@ TEXTS = {
         "--duplicates --figure --note --scales-of --report"
     ),
     "campaign": (
-        f"{ROWS} {UNITS} CSV --robot --base --tip --load --dh-convention --target --stdin --json-lines "
-        "--once --candidates --page --next --accepted"
+        f"{ROWS} {UNITS} CSV --robot --base --tip --load --dh-convention --tolerance --stdin --json-lines "
+        "--once --candidates --page -n --count --accepted"
     ),
     "record": "BAG --seen -o --output --joints --still --shortest --offset",
-    "evaluate": f"{ROWS} {UNITS} MODEL CSV --register --free -o --output --fail-above --residuals",
+    "evaluate": f"{ROWS} {UNITS} MODEL CSV --free -o --output --tolerance --residuals",
     "init": "CSV ROBOT --places --by -o --output --force",
-    "images": "FOLDER JOINTS --board --length -o --output --board-std --overview --sep --decimal",
+    "images": "FOLDER JOINTS --board --length -o --output --board-std --report --sep --decimal",
     "predict": f"{UNITS} MODEL CSV --convention --rotation-angle --payload -o --output",
     "correct": (
         f"{UNITS} MODEL PROGRAM --position --rotation --convention --rotation-angle -o --output --tip --tool "
-        "--tool-from --frame --limit --rate --payload-mass"
+        "--tool-from --frame --limit --rate --payload"
     ),
     "export": (
         "MODEL --urdf --mjcf --dh --dh-convention --ur-kinematics --ur-hash --joint-offsets "
         "--correction-tables --with-tables --robot --length --angle --c --torch --onnx --camera --tool "
-        "--tool-from --frame --payload-mass --tip --field --grid"
+        "--tool-from --frame --payload --tip --field --grid"
     ),
     "plan": (
         f"{UNITS} MODEL --robot --base --tip --load --dh-convention --marker -n --count -o --output --free --seed "
         "--candidates --target-poses --measured --draw --range --tracker --floor --column --collisions "
-        "--sensor --payload-mass"
+        "--sensor --payload"
     ),
-    "recalibrate": f"{ROWS} {UNITS} OLD CSV -o --output --marker-freedom --drift --seed --note",
-    "compare": f"{ROWS} {UNITS} OLD OTHER --marker-freedom --seed",
-    "report": f"{ROWS} {UNITS} MODEL -o --output --data --against --tolerance",
-    "demo": "-o --output --rows --seed",
+    "recalibrate": f"{ROWS} {UNITS} OLD OTHER -o --output --marker-freedom --drift --seed --note",
+    "report": f"{ROWS} {UNITS} MODEL CSV -o --output --against --tolerance",
+    "demo": "-o --output -n --count --seed",
 }
 OPTIONS = {name: [*text.split(), "--json"] for name, text in TEXTS.items()}
 
@@ -82,6 +83,23 @@ def test_help_explains_every_option(name: str, command: Command) -> None:
     found = entries(done.out)
     assert set(found) == {*OPTIONS[name], "-h", "--help"}
     assert all(len(found[option].split()) >= 3 for option in OPTIONS[name])
+
+
+@pytest.mark.parametrize(
+    ("former", "present"),
+    [
+        ("compare old new", "recalibrate old new"),
+        ("-v correct --payload-mass 4 m p", "-v correct --payload 4 m p"),
+        ("evaluate m t --fail-above=1mm --register -o x", "evaluate --free=both m t --tolerance=1mm -o x"),
+        ("report m --data t -o p", "report m t -o p"),
+        ("report m --data=t", "report m t"),
+        ("demo --rows 20", "demo --count 20"),
+        ("-h", "-h"),
+    ],
+)
+def test_former_names_stand_for_present_ones(former: str, present: str) -> None:
+    assert renamed(former.split()) == present.split()
+    assert renamed(present.split()) == present.split()
 
 
 def test_help_shows_units_defaults_ranges_and_what_is_required(command: Command) -> None:

@@ -50,14 +50,14 @@ def test_the_schema_is_one() -> None:
 
 
 def test_evaluate(folder: Path, command: Command, arm: Case) -> None:
-    written = ran(command, folder, "evaluate", "arm.safetensors", "new.csv", *TABLE, "--fail-above", "1mm")
+    written = ran(command, folder, "evaluate", "arm.safetensors", "new.csv", *TABLE, "--tolerance", "1mm")
     found, errors = written["results"]["errors"]["all"], dc.evaluate(arm.model, arm.test[:30])
     assert found["rows"] == 30
     assert found["rms_m"] == pytest.approx(errors.rms, rel=1e-5)
     assert found["p95_m"] == pytest.approx(errors.p95, rel=1e-5)
     assert found["angle_rms_deg"] is None
     assert written["results"]["accepted"] is True
-    refused = ran(command, folder, "evaluate", "arm.safetensors", "new.csv", *TABLE, "--fail-above", "1um", code=4)
+    refused = ran(command, folder, "evaluate", "arm.safetensors", "new.csv", *TABLE, "--tolerance", "1um", code=4)
     assert refused["results"]["accepted"] is False
     same = ran(command, folder, "evaluate", "arm.safetensors", "train.csv", *TABLE)
     assert set(same["results"]["errors"]) == {"all", "used_in_the_fit"} or "all" in same["results"]["errors"]

@@ -71,8 +71,8 @@ def test_programs_carry_the_mass_that_is_named(folder: Path, command: Command) -
     out = "-o", folder / "c.csv"
     refused = command("correct", folder / "m.safetensors", folder / "t.csv", *UNITS, *out)
     assert refused.code == 1
-    assert "--payload-mass" in refused.err
-    done = command("correct", folder / "m.safetensors", folder / "t.csv", *UNITS, *out, "--payload-mass", "10")
+    assert "--payload" in refused.err
+    done = command("correct", folder / "m.safetensors", folder / "t.csv", *UNITS, *out, "--payload", "10")
     assert done.code == 0, done.err
     laden = dc.load(folder / "m.safetensors").with_payload(10.0)  # pyright: ignore[reportAttributeAccessIssue]
     arm = SimulatedArm(seed=2).nominal
@@ -84,7 +84,7 @@ def test_programs_carry_the_mass_that_is_named(folder: Path, command: Command) -
     q = torch.tensor([[float(row[name]) for name in arm.joint_names] for row in rows], dtype=torch.float64).deg2rad()
     reached = laden.tool_poses(q[held])
     torch.testing.assert_close(reached[:, :3, 3], arm(data.q[held])[:, :3, 3], rtol=0, atol=1e-6)
-    export = command("export", folder / "m.safetensors", "--c", folder / "robot.c", "--payload-mass", "10")
+    export = command("export", folder / "m.safetensors", "--c", folder / "robot.c", "--payload", "10")
     assert export.code == 0, export.err
 
 

@@ -36,17 +36,17 @@ def test_a_new_model_and_what_has_changed(files: dict[str, str], command: Comman
     assert "the markers are taken to be where they were (these rows show that to 0.0" in done.out
     assert "no change was found but the places of device and markers" in done.out
     assert len(dc.load(files["new.safetensors"]).configurations) == 75
-    compared = command("compare", files["old.safetensors"], files["new.safetensors"])
+    compared = command("recalibrate", files["old.safetensors"], files["new.safetensors"])
     assert compared.code == 0
     assert "RMS from the model, device and markers found anew: position 0.0" in compared.out
     assert "no change was found" in compared.out
 
 
 def test_a_table_needs_its_columns(files: dict[str, str], command: Command) -> None:
-    done = command("compare", files["old.safetensors"], files["new.csv"])
+    done = command("recalibrate", files["old.safetensors"], files["new.csv"])
     assert done.code == 1
     assert "--length and --angle missing" in done.error
-    done = command("compare", files["old.safetensors"], files["new.csv"], "--position", POSITION)
+    done = command("recalibrate", files["old.safetensors"], files["new.csv"], "--position", POSITION)
     assert done.code == 1
     assert "--length and --angle missing" in done.error
 
@@ -65,7 +65,7 @@ def test_other_markers_that_the_rows_leave_open(files: dict[str, str], tmp_path:
     table = written(tmp_path / "upright.csv", q)
     options = *TABLE, "--marker-freedom", "other"
     found = command("recalibrate", files["old.safetensors"], table, *options, "-o", str(tmp_path / "new.safetensors"))
-    compared = command("compare", files["old.safetensors"], table, *options)
+    compared = command("recalibrate", files["old.safetensors"], table, *options)
     for done in (found, compared):
         assert done.code == 0
         assert re.search(r"the place of the marker on 'flange' along \(.*\) is known to \d\d mm only", done.err)
@@ -81,7 +81,7 @@ def test_rows_that_test_no_change(arm: Case, files: dict[str, str], tmp_path: Pa
     q[4:, 2] = high[2] + 0.05 * (high[2] - low[2])
     entry = tmp_path / "result.json"
     table = written(tmp_path / "new.csv", q)
-    done = command("compare", files["old.safetensors"], table, *TABLE, "--json", str(entry))
+    done = command("recalibrate", files["old.safetensors"], table, *TABLE, "--json", str(entry))
     assert done.code == 0
     assert "warning: only 4 rows lie within the joint ranges that the model knows" in done.err
     assert "a change of the robot, which was not tested, would be in them" in done.out

@@ -1,4 +1,4 @@
-"""`diffeo-calib evaluate --register`, and errors that are named as motions without it."""
+"""`diffeo-calib evaluate --free both`, and errors that are named as motions without it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_a_moved_device_is_named(fitted: Outcome, site: Site, command: Command, 
     (line,) = done.warnings
     found = re.fullmatch(
         r"warning: moving the measuring device by (\S+) mm and (\S+) degrees explains (\S+) % of the squared error; "
-        r"register the model first: `model.registered`, evaluate --register\.",
+        r"register the model first: `model.registered`, evaluate --free both\.",
         line,
     )
     assert done.code == 0
@@ -65,7 +65,7 @@ def test_register_prints_and_writes_the_registered_model(
 ) -> None:
     assert fitted.code == 0
     path, output = table(site, tmp_path / "new.csv", MOVE, 8), tmp_path / "there.safetensors"
-    done = command("evaluate", site.folder / "model.safetensors", path, *TABLE, "--register", "-o", output)
+    done = command("evaluate", site.folder / "model.safetensors", path, *TABLE, "--free", "both", "-o", output)
     assert (done.code, done.err.strip()) == (0, "")
     before, after = done.numbers("8 with the places of the fit")[0], done.numbers("8 with places found anew")[0]
     assert before > 10.0
@@ -89,16 +89,16 @@ def test_register_prints_and_writes_the_registered_model(
 def test_options_of_the_registration(fitted: Outcome, site: Site, command: Command, tmp_path: Path) -> None:
     assert fitted.code == 0
     model, path = site.folder / "model.safetensors", table(site, tmp_path / "new.csv", MOVE, 8)
-    done = command("evaluate", model, path, *TABLE, "--register", "--free", "base")
+    done = command("evaluate", model, path, *TABLE, "--free", "base")
     assert done.code == 0
     assert "in the frame of 'flange'" not in done.out
     for options in (["--free", "base"], ["-o", tmp_path / "m"]):
         refused = command("evaluate", model, path, *TABLE, *options)
         assert refused.code == 1
         assert refused.error.startswith(f"error: {options[0]} without --register; ")
-    onto = command("evaluate", model, path, *TABLE, "--register", "-o", model)
+    onto = command("evaluate", model, path, *TABLE, "--free", "both", "-o", model)
     assert onto.error == f"error: -o {model} is the file of MODEL; name another file."
-    few = command("evaluate", model, table(site, tmp_path / "two.csv", MOVE, 2), *TABLE, "--register")
+    few = command("evaluate", model, table(site, tmp_path / "two.csv", MOVE, 2), *TABLE, "--free", "both")
     assert few.code == 1
     assert "expected at least 3 rows, got 2" in few.error
 

@@ -57,7 +57,7 @@ def test_from_a_campaign_file_to_errors(folder: Path, command: Command, monkeypa
     found = json.loads(Path("e.json").read_text())["results"]
     assert 1e3 * dc.evaluate(model, data).rms == pytest.approx(found["kinds"]["socket"]["all"]["rms"], rel=1e-9)
     assert not found["errors"]  # a spread is none
-    strict = command("evaluate", "m.safetensors", "t.csv", *SOCKETS, *units, "--fail-above", "0.1um")
+    strict = command("evaluate", "m.safetensors", "t.csv", *SOCKETS, *units, "--tolerance", "0.1um")
     assert strict.code == 4
 
 

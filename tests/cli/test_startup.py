@@ -54,7 +54,6 @@ def test_help_and_version_load_nothing_slow(arguments: list[str]) -> None:
                 "export",
                 "plan",
                 "recalibrate",
-                "compare",
                 "report",
                 "demo",
             ],

@@ -94,7 +94,7 @@ def test_work_is_done_whatever_happens_to_the_output(
     arguments: dict[str, list[object]] = {
         "predict": ["predict", model, csv, *UNITS, "-o"],
         "evaluate": ["evaluate", model, csv, *TABLE],
-        "register": ["evaluate", model, csv, *TABLE, "--register", "-o"],
+        "register": ["evaluate", model, csv, *TABLE, "--free", "both", "-o"],
         "correct": ["correct", model, csv, *UNITS, "-o"],
         "export": ["export", model, "--dh"],
     }

@@ -147,7 +147,7 @@ def files(arm: Case, tmp_path: Path) -> tuple[Path, Path]:
 def test_the_command(files: tuple[Path, Path], tmp_path: Path, command: Command, arm: Case) -> None:
     model, table = files
     out = tmp_path / "report.html"
-    done = command("report", model, "-o", out, "--data", table, *POSITION, "--against", "humidity")
+    done = command("report", model, table, "-o", out, *POSITION, "--against", "humidity")
     assert (done.code, done.err) == (0, "")
     assert f"report: {out}" in done.out
     assert "40 rows that the model has not seen" in done.out.replace("\n", " ")
@@ -166,11 +166,11 @@ def test_what_is_refused(files: tuple[Path, Path], tmp_path: Path, command: Comm
     fitted = arm.train[:30].with_joint_names(arm.robot.joint_names)
     write_measurements(old, fitted, TableFormat("mm", "deg"), position=("x", "y", "z"))
     wrong: tuple[tuple[list[object], str], ...] = (
-        (["--against", "humidity"], "--data"),
-        ([*POSITION], "--data"),
-        (["--data", table], "--length and --angle missing"),
-        (["--data", table, *POSITION, "--against", "pressure"], "pressure"),
-        (["--data", old, *POSITION, "--tolerance", "5mm"], "30 that did"),
+        (["--against", "humidity"], "CSV"),
+        ([*POSITION], "CSV"),
+        ([table], "--length and --angle missing"),
+        ([table, *POSITION, "--against", "pressure"], "pressure"),
+        ([old, *POSITION, "--tolerance", "5mm"], "30 that did"),
         *((["--tolerance", text], f"--tolerance {text}") for text in ("0.5px", "0.15", "-1mm")),
     )
     for words, text in wrong:
@@ -210,7 +210,7 @@ def test_a_tolerance_is_judged(files: tuple[Path, Path], tmp_path: Path, command
     model, table = files
     out = tmp_path / "report.html"
     for tolerance, sentence in (("5mm", "Within the tolerance of 5 mm"), ("10um", "Above the tolerance of 0.01 mm")):
-        done = command("report", model, "-o", out, "--data", table, *POSITION, "--tolerance", tolerance)
+        done = command("report", model, table, "-o", out, *POSITION, "--tolerance", tolerance)
         assert done.code == 0, done.err
         assert sentence in done.out
         assert sentence in out.read_text(encoding="utf-8").replace("\u00a0", " ")

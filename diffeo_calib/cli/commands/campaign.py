@@ -269,7 +269,7 @@ class Live:
             entry |= {"more_rows": more, "target_reached": self.campaign.reached}
         names = joint_columns(self.source.joints, robot)
         columns = Columns.of(self.source.table.joints_only(names, robot.kinds))
-        poses = [] if found is None else columns.joints_from_si(found.q[: self.given.next]).tolist()
+        poses = [] if found is None else columns.joints_from_si(found.q[: self.given.count]).tolist()
         return entry | {"next": [dict(zip(columns.joints.columns, q, strict=True)) for q in poses]}
 
     @property
@@ -277,7 +277,7 @@ class Live:
         """The next poses, and the forecast."""
         now = self.campaign.models, [(one.accepted, one.again) for one in self.campaign.verdicts]
         if self._found is None or self._found[0] != now:
-            self._found = now, self.campaign.next(max(self.given.next, 1))
+            self._found = now, self.campaign.next(max(self.given.count, 1))
         return self._found[1]
 
     @property
@@ -314,7 +314,7 @@ def run(given: CampaignOptions) -> None:
         fix = "give every row in one line of one file, with columns for each marker"
         raise InputError.of("--places or --marker, of a table that grows line by line", fix=fix)
     source = measured_table(given.csv, given.rows, given.units)
-    goal = parsed_length(given.target, "--target")
+    goal = parsed_length(given.tolerance)
     if isinstance(source.joints, PoseColumns):
         fix = "measure with --robot and joint values, or fit the table when it is complete"
         raise InputError.of("--robot-pose of a table that grows: the middle of all poses is not known yet", fix=fix)

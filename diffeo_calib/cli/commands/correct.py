@@ -100,7 +100,7 @@ class ToolOnTip:
 def run(options: CorrectOptions) -> None:
     """Read a program, correct it, write it and print a summary; units that are not typed are those of the fit."""
     _check(options)
-    model = load_laden(options.model, options.payload_mass)
+    model = load_laden(options.model, options.payload)
     stated = as_fitted(model, None, options.units)[1]
     source = ProgramTable(options.program, joints_of(stated), table_format(stated), options.targets)
     table, tips = source.written(), options.tip or ()

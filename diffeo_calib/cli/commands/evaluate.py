@@ -57,11 +57,11 @@ def run(options: EvaluateOptions) -> None:
     """Run the command."""
     model = load_kinematics(options.model)
     source = table_of(model, options.csv, options.rows, options.units)
-    limit = parsed_limit(options.fail_above)
+    limit = parsed_limit(options.tolerance)
     check_payload_column(model, source.table.payload)
     say(*provenance_lines(model))
     data = source.read(model.robot)
-    if options.register:
+    if options.free is not None:
         return _registered(model, data, options)
     check_rows(model, data)
     places = place(model, data, every_session=source.table.session is not None)

@@ -138,7 +138,7 @@ def run(given: ExportOptions) -> None:
     wanted: dict[str, Path] = {option: path for option, path in files.items() if path is not None}
     if not wanted:
         raise typer.BadParameter(f"name at least one file to write: {', '.join(files)}")
-    model = load_laden(given.model, given.payload_mass)
+    model = load_laden(given.model, given.payload)
     own = tool_in_tip(model, given.tool, given.tool_from, TableFormat(given.length, given.angle))
     tool = None if given.tool is None else own
     source = None if given.c is None else c_files(model, given.c, tool, given.frame or "base", tip=given.tip)

@@ -227,11 +227,11 @@ def _show_findings(result: CalibrationResult, rows: int) -> None:
 def run_report(wanted: ReportOptions) -> None:
     """Write the page, and say its first line."""
     model, data = load_kinematics(wanted.model), None
-    if wanted.data is not None:
-        data = table_of(model, wanted.data, wanted.rows, wanted.units).read(model.robot)
-    tolerance = parsed_length(wanted.tolerance, "--tolerance")
+    if wanted.csv is not None:
+        data = table_of(model, wanted.csv, wanted.rows, wanted.units).read(model.robot)
+    tolerance = parsed_length(wanted.tolerance)
     if tolerance is not None and data is not None and not bool(unseen(model, data.q).any()):
-        expected, fix = "rows that took no part in fit and registration", "measure more rows, or leave --data out"
+        expected, fix = "rows that took no part in fit and registration", "measure more rows, or leave the table out"
         raise InputError.of("rows to hold against --tolerance", expected=expected, got=f"{len(data)} that did", fix=fix)
     how = {"against": wanted.against or [], "tolerance": tolerance}
     with progress_bar() as progress:
@@ -257,7 +257,7 @@ def run_demo(given: DemoOptions) -> None:
     arm = SimulatedArm(seed=given.seed)
     urdf, csv = folder / "arm.urdf", folder / "measurements.csv"
     arm.write_urdf(urdf)
-    data = Measurements(*arm.measure(given.rows, seed=given.seed), arm.nominal.joint_names)
+    data = Measurements(*arm.measure(given.count, seed=given.seed), arm.nominal.joint_names)
     write_measurements(csv, data, TableFormat("mm", "deg"), position=POSITION)
     lines = [
         ["fit", csv, "--robot", urdf, "--base", arm.nominal.base, "--tip", arm.nominal.tip],
@@ -266,6 +266,6 @@ def run_demo(given: DemoOptions) -> None:
         ["--report", folder / "report.html"],
     ]
     command = [list(map(str, line)) for line in lines]
-    say(f"{given.rows} simulated measurements written to {csv}. Now running:\n")
+    say(f"{given.count} simulated measurements written to {csv}. Now running:\n")
     say("  diffeo-calib " + " \\\n      ".join(map(shlex.join, command)) + "\n")
     app([word for line in command for word in line])

@@ -36,8 +36,8 @@ def run(given: ImagesOptions) -> None:
         own = {f"{one.name}/{image.name}" if several else image.name: image.refused for image in one.images}
         refused |= {name: reason for name, reason in own.items() if reason}
     contents[output] = csv_text(lines, table.sep)
-    if given.overview is not None:
-        contents[given.overview] = page(found).encode()
+    if given.report is not None:
+        contents[given.report] = page(found).encode()
     write_together(contents)
     for name, reason in refused.items():
         say(f"{name}: {reason}: left out")

@@ -72,7 +72,7 @@ def run(given: PlanOptions) -> None:
         markers = markers / table.per_metre if numbers else markers
         source = model or load_robot(begin, given.links)
         if model is not None:
-            source, markers = planned(model, given.payload_mass)
+            source, markers = planned(model, given.payload)
         robot = source.robot if isinstance(source, CalibratedKinematics) else source
         names = joint_columns(joints_of(stated), robot)
 
@@ -163,6 +163,6 @@ def _show(found: Plan, *, of_positions: bool, free: str | None) -> None:
     if fewest:
         say(f"fewer than {fewest} poses do not show where {free} now")
     if free is not None:
-        say("these errors are expected if nothing else has changed since the fit: test that by `compare`")
+        say("these errors are expected if nothing else has changed since the fit: test that by `recalibrate`")
     if found.assumed:
         say(f"{found.caution}: measure the first 20 poses, fit them, and plan the next with the model")

@@ -32,7 +32,7 @@ ROWS_AT_ONCE = 2048
 """A multiple of the rows that predictions linearise together: blocks do not change their last digits."""
 OWN_FRAME = (
     "no device measured positions: they are in the model's own frame, and 95 % regions hold true points only after one "
-    "rigid motion of all of them; `evaluate --register` with measured positions finds it"
+    "rigid motion of all of them; `evaluate --free both` with measured positions finds it"
 )
 
 

@@ -1,4 +1,4 @@
-"""`diffeo-calib recalibrate`: an old model and a few new rows become one model; `compare`: what has changed since."""
+"""`diffeo-calib recalibrate`: what has changed since a calibration; old and new rows as one model."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from diffeo_calib.calibration.recalibration.offsets import HiddenOffset
 from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
 from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
 from diffeo_calib.cli.console import progress_bar, say
-from diffeo_calib.cli.declarations import CompareOptions, RecalibrateOptions
+from diffeo_calib.cli.declarations import RecalibrateOptions
 from diffeo_calib.cli.models import another_date_lines, load_kinematics, made_by_command, provenance_lines, table_of
 from diffeo_calib.cli.printed import frame_lines, motion_lines, placement_lines
 from diffeo_calib.cli.record import entries_by_kind, record
@@ -26,9 +26,11 @@ from diffeo_calib.kinematics.joint_ranges import warn_outside_range
 
 def run(given: RecalibrateOptions) -> None:
     """Recalibrate, write the model, say what has changed, and end with the exit code of the fit."""
-    model, tests = load_kinematics(given.old), given.tests
-    source = table_of(model, given.csv, given.rows, given.units)
-    how: Any = {"marker": tests.marker_freedom, "seed": tests.seed, "drift": given.drift, "note": given.note}
+    if given.output is None:
+        return _compare(given)
+    model = load_kinematics(given.old)
+    source = table_of(model, given.other, given.rows, given.units)
+    how: Any = {"marker": given.marker_freedom, "seed": given.seed, "drift": given.drift, "note": given.note}
     say(*provenance_lines(model), *another_date_lines(model))
     with progress_bar() as progress:
         data = source.read(model.robot)
@@ -94,7 +96,7 @@ def change_lines(changes: Changes, none: object = None) -> list[str]:
     return [f"  {change}" for change in changes.found] or [str(none or changes), *smallest[: len(changes.smallest)]]
 
 
-def run_compare(given: CompareOptions) -> None:
+def _compare(given: RecalibrateOptions) -> None:
     """Compare a model with new measurements, or with another model."""
     model, other = load_kinematics(given.old), given.other
     if _is_model(other):
@@ -107,7 +109,7 @@ def run_compare(given: CompareOptions) -> None:
         source = table_of(model, other, given.rows, given.units)
         say(*provenance_lines(model), *another_date_lines(model))
         rows = source.read(model.robot)
-    found = compare(model, rows, marker=given.tests.marker_freedom, seed=given.tests.seed)
+    found = compare(model, rows, marker=given.marker_freedom, seed=given.seed)
     kinds = {kind: {"found": one, "expected": found.expectations[kind]} for kind, one in found.errors.items()}
     moved = {} if found.moved is None else {"transform": found.moved.transform}
     record.add(**change_entries(found.changes, found.hidden), **moved, **entries_by_kind(kinds))

@@ -47,6 +47,8 @@ STEPS = 4
 """Of the analysis, as they are told."""
 PROBE_CONFIGURATIONS = 60
 """Configurations at which the share of the markers in the expected variance is judged."""
+FAR_RATIO = 3.0
+"""Ratio of expected errors anywhere to those like the measured ones from which the reason is told."""
 COLUMN_WORDS = ("temp", "time", "stamp", "date", "hour")
 """Parts of the names of columns against which errors are shown without being asked."""
 
@@ -128,6 +130,21 @@ class Findings:
         return next((stages for stages in kinds if next(iter(stages.values())).what == ERRORS), {})
 
     @property
+    def calibrated(self) -> Evaluation | None:
+        """The last of these: errors of the model."""
+        return list(self.errors.values())[-1] if self.errors else None
+
+    @property
+    def rms(self) -> Mapping[str, float]:
+        """RMS error of positions by stage, m: measured, or the expected one where none were."""
+        return {name: one.rms for name, one in self.errors.items()} or self.expected
+
+    @property
+    def unlike(self) -> bool:
+        """Whether poses unlike the measured ones are much less certain than these."""
+        return self.deviations.error.whole >= FAR_RATIO * self.deviations.error.measured
+
+    @property
     def count(self) -> int:
         """Number of rows shown."""
         return sum(len(one.lines) for one in self.own)
@@ -144,12 +161,16 @@ class Findings:
         """Twice the rows of the fit and the error there, m; None if it cannot be told."""
         return forecast(self.learning_curve, self.limit)
 
+    @property
+    def tool(self) -> Tensor:
+        """Numbers of the parameters that place the markers of the fit."""
+        geometry = self.model.nominal.geometry
+        return torch.arange(geometry.size, device=self.rows.q.device)[geometry.slices["tool"]]
+
     @cached_property
     def share_of_tool(self) -> float:
         """Share of the expected variance that knowing the markers would remove."""
-        geometry = self.model.nominal.geometry
-        tool = torch.arange(geometry.size, device=self.rows.q.device)[geometry.slices["tool"]]
-        return self.rows.map.explained_by(tool, self.deviations.q[:PROBE_CONFIGURATIONS])
+        return self.rows.map.explained_by(self.tool, self.deviations.q[:PROBE_CONFIGURATIONS])
 
     @property
     def telling(self) -> Repeats | None:

@@ -13,7 +13,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import ceil, nan
+from math import ceil, hypot, log, nan
+from statistics import linear_regression
 from typing import Any
 
 import torch
@@ -95,7 +96,7 @@ class FitRows:
             return measured.masked_fill(~self.map.noise.visible, nan).unflatten(1, (-1, 3))
         if self._measured is None:
             what = "the model has fewer control points than rows, and keeps no trace of the errors of its rows"
-            raise InputError.of(what, fix="pass measurements (--data)")
+            raise InputError.of(what, fix="pass measurements")
         return self._measured.points.to(HOST)
 
     @cached_property
@@ -193,7 +194,8 @@ class FitRows:
             for node in data.joint:
                 total += kernel.gram(q, node.weight * along, q, along)
                 cross += kernel.gram(node.points, node.weight * node.effect, q, along)
-        covariance = total - regression.explained(cross.T[None])[0]
+        solved = regression.solve(cross.view(*data.sensitivity.shape[:2], -1))
+        covariance = total - cross.T @ solved.flatten(0, 1)
         return (centred @ covariance @ centred).diagonal().clamp(min=0.0).sqrt()
 
     @cached_property
@@ -221,18 +223,11 @@ def forecast(curve: Sequence[tuple[int, float]], limit: float) -> tuple[int, flo
 
     Above the repeatability ``limit`` [m] errors fall like a power of the number of rows; None if they do not fall.
     """
-    if len(curve) < 3:
+    counts, above = [log(count) for count, _ in curve[-4:]], [max(e**2 - limit**2, 0.0) ** 0.5 for _, e in curve[-4:]]
+    if len(curve) < 3 or min(above) <= 0:
         return None
-    counts = torch.tensor([count for count, _ in curve[-4:]], dtype=torch.float64, device="cpu").log()
-    above = torch.tensor([max(e**2 - limit**2, 0.0) ** 0.5 for _, e in curve[-4:]], dtype=torch.float64, device="cpu")
-    if float(above.min()) <= 0:
-        return None
-    x, y = counts - counts.mean(), above.log()
-    slope = float((x * y).sum() / x.square().sum())
-    if slope >= 0:
-        return None
-    rows, _ = curve[-1]
-    return 2 * rows, float((above[-1] * 2.0**slope).square() + limit**2) ** 0.5
+    slope = linear_regression(counts, list(map(log, above))).slope
+    return None if slope >= 0 else (2 * curve[-1][0], hypot(above[-1] * 2.0**slope, limit))
 
 
 @dataclass(frozen=True, eq=False)

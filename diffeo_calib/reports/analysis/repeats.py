@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.kinematics.evaluation import at_payloads
 from diffeo_calib.measurements.table import Measurements
@@ -66,38 +67,32 @@ def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: floa
     if not bool(repeated.any()):
         return None
     data = data.rows(repeated)
-    points = data.origins
     at_rows = {name: at_payloads(kinematics, data)(data.q).detach() for name, kinematics in stages.items()}
     predicted = {name: data.bodies.origins(found) for name, found in at_rows.items()}  # (N, B, 3) m
-    labels = data.groups()
-    counts = torch.bincount(labels)
     *_, best = predicted.values()
-    still = [
-        label
-        for label in (counts > 1).nonzero()[:, 0].tolist()
-        if float((best[labels == label] - best[labels == label][:1]).norm(dim=-1).max()) < noise
-        and int((~points[labels == label].isnan().any(2)).sum(0).max()) > 1
-    ]
-    if not still:
-        return None
-    repeated = torch.tensor(still, dtype=labels.dtype, device=labels.device)
-    first, repeatability, squares, freedom = [], list[Tensor](), 0.0, 0
+    points, labels, squares, freedom = data.origins, data.groups(), 0.0, 0
+    first, counts, repeatability = list[int](), list[int](), list[Tensor]()
     accuracy: dict[str, list[Tensor]] = {name: [] for name in stages}
-    for label in repeated.tolist():
+    for label in labels.unique().tolist():
         rows = (labels == label).nonzero()[:, 0]
         middle = points[rows].nanmean(0)
         distances = (points[rows] - middle).norm(dim=-1)  # (n, B), NaN for hidden markers
         seen = (~distances.isnan()).sum(0)
+        if int(seen.max()) < 2 or float((best[rows] - best[rows[:1]]).norm(dim=-1).max()) >= noise:
+            continue
         variances = (distances - distances.nanmean(0)).square().nansum(0) / (seen - 1).clamp(min=1)
         repeatability.append((distances.nanmean(0) + 3.0 * variances.sqrt())[seen > 1].max())
         squares += float(distances.square().nansum())
         freedom += int((seen - 1).clamp(min=0).sum())
         first.append(int(rows[0]))
+        counts.append(len(rows))
         for name, places in predicted.items():
             accuracy[name].append(largest_known((middle - places[rows].mean(0)).norm(dim=-1), 0))
+    if not first:
+        return None
     return Repeats(
         data.line_numbers[first],
-        counts[repeated],
+        torch.tensor(counts, dtype=torch.int64, device=HOST),
         torch.stack(repeatability),
         {name: torch.stack(values) for name, values in accuracy.items()},
         (squares / freedom) ** 0.5,

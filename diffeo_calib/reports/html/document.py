@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import io
-import json
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -31,47 +30,20 @@ from diffeo_calib.robots.tree import Tree
 FOLDER = Path(__file__).parent
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A drawing of the page.
-
-    Args:
-        svg: the drawing. label: what it shows, in words.
-    """
+class Picture(NamedTuple):
+    """A drawing of the page as SVG, and what it shows in words."""
 
     svg: str
     label: str
 
 
-@dataclass(frozen=True)
-class Table:
-    """Rows of text under a header.
-
-    Args:
-        caption: what the table shows. header: names of the columns. rows: cells. numeric: columns of numbers.
-    """
+class Table(NamedTuple):
+    """Rows of text under the names of their columns; ``numeric``: all but the first hold numbers."""
 
     caption: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
     numeric: bool = True
-
-
-@dataclass(frozen=True)
-class Scene:
-    """Points in space with errors as arrows, to be turned by the reader.
-
-    Args:
-        points: (N, 3) in m. errors: name of each stage -> (N, 3) in m, all drawn with one scale.
-    """
-
-    points: Sequence[Sequence[float]]
-    errors: Mapping[str, Sequence[Sequence[float]]]
-
-    @property
-    def json(self) -> str:
-        """The scene as the page's script reads it."""
-        return json.dumps({"points": self.points, "errors": self.errors}, separators=(",", ":")).replace("</", "<\\/")
 
 
 @dataclass(frozen=True)
@@ -81,6 +53,7 @@ class Section:
     Args:
         name: its anchor. title: its heading. see: one sentence about what to see here.
         tables, pictures, notes, text: its contents, in this order; ``scene`` comes before the pictures.
+        scene: points (N, 3) in m, and errors of each stage as arrows there (N, 3) in m, drawn with one scale.
         text: lines to be shown as they are.
     """
 
@@ -88,42 +61,22 @@ class Section:
     title: str
     see: str
     tables: Sequence[Table] = ()
-    scene: Scene | None = None
+    scene: Mapping[str, Any] | None = None
     pictures: Sequence[Picture] = ()
     notes: Sequence[str] = ()
     text: Sequence[str] = ()
 
 
-@dataclass(frozen=True)
-class Page:
-    """A report.
+def page(**parts: Any) -> str:
+    """A report as HTML, with its styles and scripts inside; ``parts`` are what the template names."""
+    from jinja2 import Environment, FileSystemLoader  # noqa: PLC0415  # needed here only
 
-    Args:
-        title: of the page. subtitle: where the numbers come from. verdict: the result in one line.
-        warnings: what the fit warned of.
-        advice: what to do next. figures: name -> value, the numbers at the top.
-        sections: in the order of the page.
-    """
-
-    title: str
-    subtitle: str
-    verdict: str
-    advice: Sequence[str]
-    figures: Mapping[str, str]
-    warnings: Sequence[str] = ()
-    sections: Sequence[Section] = field(default_factory=tuple)
-
-    def html(self) -> str:
-        """The page, with its styles and scripts inside."""
-        from jinja2 import Environment, FileSystemLoader  # noqa: PLC0415  # needed here only
-
-        made = Environment(loader=FileSystemLoader(FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True)
-        parts: dict[str, Any] = {
-            name: (FOLDER / file).read_text(encoding="utf-8")
-            for name, file in (("style", "report.css"), ("script", "scene.js"))
-        }
-        text = made.get_template("report.html.jinja").render(page=self, **parts)
-        return re.sub(r"(?<=\d) (?=(?:%|mm|m)\b|%)", "\u00a0", text)  # numbers stay with their units
+    made = Environment(loader=FileSystemLoader(FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    made.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
+    for name, file in (("style", "report.css"), ("script", "scene.js")):
+        parts[name] = (FOLDER / file).read_text(encoding="utf-8")
+    text = made.get_template("report.html.jinja").render(parts)
+    return re.sub(r"(?<=\d) (?=(?:%|mm|m)\b|%)", "\u00a0", text)  # numbers stay with their units
 
 
 DOT = 0.2
@@ -183,11 +136,6 @@ def _with_classes(svg: str, name: str) -> str:
     return svg.replace(">", f"><style>{rules}</style>", 1) if rules else svg
 
 
-def listed(values: Tensor, digits: int) -> list[list[float]]:
-    """Rows of numbers, rounded."""
-    return [[round(value, digits) for value in row] for row in values.tolist()]
-
-
 def millimetres(metres: float) -> str:
     """A length in mm, as text."""
     return f"{1e3 * metres:.3f}"
@@ -200,11 +148,8 @@ def marker_name(number: int, tips: Sequence[str]) -> str:
 
 def joint_values_by_row(robot: Tree, q: Tensor) -> list[list[str]]:
     """Joint values (M, n), a line of a table for each joint: its name and unit, then its M values (no -0.0)."""
-    values = [joint_values(robot, joint, q[:, joint]).tolist() for joint in range(robot.n)]
-    return [
-        [joint_label(robot, joint), *(f"{round(value, 1) + 0.0:.1f}" for value in values[joint])]
-        for joint in range(robot.n)
-    ]
+    values = [joint_values(robot, joint, own).tolist() for joint, own in enumerate(q.mT)]
+    return [[joint_label(robot, joint), *(f"{round(x, 1) + 0.0:.1f}" for x in own)] for joint, own in enumerate(values)]
 
 
 def rough_millimetres(metres: float) -> str:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from math import isfinite
+from typing import Any
 
 import torch
+from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.outliers import Outlier
 from diffeo_calib.common.errors import PACKAGE, printable
@@ -23,11 +25,9 @@ from diffeo_calib.reports.analysis.stages import Kinematics
 from diffeo_calib.reports.html import sentences
 from diffeo_calib.reports.html.document import (
     Picture,
-    Scene,
     Section,
     Table,
     joint_values_by_row,
-    listed,
     marker_name,
     millimetres,
     panel,
@@ -40,6 +40,7 @@ from diffeo_calib.reports.plots.joints import (
     draw_parts,
     draw_transmission,
     joint_label,
+    joint_unit,
     joint_values,
     short,
 )
@@ -104,16 +105,13 @@ def sections(found: Findings, progress: Progress = silent) -> Iterator[Section]:
 def how_good(found: Findings) -> Section:
     """Errors of every kind of rows by stage."""
     limit = None if found.repeats is None else found.repeats.deviation
-    pictures = [
-        picture
-        for number, stages in enumerate(found.kinds.values())
-        for picture in stage_pictures(
-            stages, f"-{number}", limit if next(iter(stages.values())).what == ERRORS else None
-        )
-    ]
+    pictures = list[Picture]()
+    for number, stages in enumerate(found.kinds.values()):
+        own = limit if next(iter(stages.values())).what == ERRORS else None
+        pictures += stage_pictures(stages, f"-{number}", own)
     see = f"Errors on {sentences.rows_of(found)}: each stage should lie well to the left of the one before it."
     see += " Each kind has its own unit; units are never mixed." * (len(found.kinds) > 1)
-    see = see if found.kinds else "No rows were passed: pass some (--data) to see errors of each kind in its own unit."
+    see = see if found.kinds else "No rows were passed: pass some to see errors of each kind in its own unit."
     notes = [
         "Nominal: the robot's description, placed where it fits best. Geometric: joint axes and links corrected, the "
         "classical calibration. Calibrated: gravity sag, transmission errors and remaining errors as well."
@@ -123,7 +121,7 @@ def how_good(found: Findings) -> Section:
     if found.kinds and not found.shown.new:
         notes.append(
             "Nominal and geometric kinematics were fitted to these poses too, with so few parameters that it hardly "
-            "matters. Measurements of new poses (--data) are the stronger proof."
+            "matters. Measurements of new poses are the stronger proof."
         )
     return Section("errors", "How good", see, [stage_table(own) for own in found.kinds.values()], None, pictures, notes)
 
@@ -150,27 +148,27 @@ def where(found: Findings) -> Section:
     tables = [Table("Expected error of positions by stage", ["stage", "RMS [mm]"], rows)]
     notes = [*sentences.unlike_poses(found), *sentences.worst_range(found)]
     if plan is not None:
-        q = plan.q[plan.rank.argsort()]
+        q, then = plan.q[plan.rank.argsort()], rough_millimetres(float(plan.expected_rms[-1]))
         caption = f"Where to measure next: {len(q)} poses that would lower the expected error most"
         ranks = ["rank", *(str(rank) for rank in range(1, len(q) + 1))]
         tables.append(Table(caption, ranks, joint_values_by_row(robot, q)))
-        then = rough_millimetres(float(plan.expected_rms[-1]))
-        notes.append(
-            f"After the {len(q)} poses to measure next the model expects {then} mm anywhere in the "
-            "ranges. Check them in the robot's cell before you move there."
-        )
+        after = f"After the {len(q)} poses to measure next the model expects {then} mm anywhere in the ranges"
+        notes.append(f"{after}. Check them in the robot's cell before you move there.")
     return Section("where", "Where", f"{see}.", tables, scene, pictures, notes)
 
 
-def _scene(stages: Mapping[str, Kinematics], seen: Predictions) -> Scene:
+def _scene(stages: Mapping[str, Kinematics], seen: Predictions) -> dict[str, Any]:
     there = ~seen.measured.isnan().any(2)  # of the sightings
-    step, errors = -(-int(there.sum()) // MOST_POINTS), {}
+    step, away = -(-int(there.sum()) // MOST_POINTS), dict[str, Tensor]()
     *before, (last, _) = stages.items()
     for name, kinematics in before:
-        predicted = seen.data.bodies.origins(at_payloads(kinematics, seen.data)(seen.data.q).detach())
-        errors[name] = listed((seen.measured - predicted)[there][::step], SCENE_DECIMALS + 2)
-    errors[last] = listed(seen.away[there][::step], SCENE_DECIMALS + 2)
-    return Scene(listed(seen.measured[there][::step], SCENE_DECIMALS), errors)
+        away[name] = seen.measured - seen.data.bodies.origins(at_payloads(kinematics, seen.data)(seen.data.q).detach())
+
+    def listed(values: Tensor, digits: int) -> list[list[float]]:
+        return [[round(value, digits) for value in row] for row in values[there][::step].tolist()]
+
+    errors = {name: listed(own, SCENE_DECIMALS + 2) for name, own in (away | {last: seen.away}).items()}
+    return {"points": listed(seen.measured, SCENE_DECIMALS), "errors": errors}
 
 
 def why(found: Findings) -> Section:
@@ -179,26 +177,21 @@ def why(found: Findings) -> Section:
     frame = Frame((PART_WIDTH, 0.9 + 0.24 * len(found.parts)), left=left)
     label = "What each part of the model explains (parts may cancel)."
     pictures = [panel("parts", label, draw_parts, found.parts, frame=frame)]
+    label = "motion beyond its reading, with its 95 % band; below, where the joint was measured."
     for joint, name in enumerate(found.model.robot.joint_names):
-        label = (
-            f"{printable(name)}: motion beyond its reading, with its 95 % band; below, where the joint was measured."
-        )
-        pictures.append(panel(f"transmission-{joint}", label, draw_transmission, found.model, found.rows, joint))
-    see = "A wide band means that the joint was measured too little there."
+        what = draw_transmission, found.model, found.rows, joint
+        pictures.append(panel(f"transmission-{joint}", f"{printable(name)}: {label}", *what))
+    see, tables = "A wide band means that the joint was measured too little there.", list[Table]()
     notes = ["Coupled joint errors depend on several joints, task space on the place of the marker."]
-    if is_cartesian(found.model.robot):  # joints without links, gears and weight
-        return Section("why", "Why", see, [], None, pictures, notes)
-    see = (
-        "A wave of one period per turn is eccentricity of a gear or an encoder, of two its ovality, faster ones are "
-        f"meshing. {see}"
-    )
-    notes = [
-        f"Gravity sag is elastic: {payload_sentence(found.model.nominal.payload)}.",
-        *notes,
-        *(f"{line.sentence}, not in the pictures above." for line in gear_lines(found.model)),
-        "Corrections are open where the rows do not tell them; those of parallel axes stand for one another.",
-    ]
-    return Section("why", "Why", see, [_corrections(found.model, found.rows)], None, pictures, notes)
+    if not is_cartesian(found.model.robot):  # whose joints have no links, gears and weight
+        waves = "A wave of one period per turn is eccentricity of a gear or an encoder, of two its ovality"
+        see, tables = f"{waves}, faster ones are meshing. {see}", [_corrections(found.model, found.rows)]
+        notes.insert(0, f"Gravity sag is elastic: {payload_sentence(found.model.nominal.payload)}.")
+        notes += [f"{line.sentence}, not in the pictures above." for line in gear_lines(found.model)]
+        notes.append(
+            "Corrections are open where the rows do not tell them; those of parallel axes stand for one another."
+        )
+    return Section("why", "Why", see, tables, None, pictures, notes)
 
 
 def _corrections(model: CalibratedKinematics, fit_rows: FitRows) -> Table:
@@ -239,17 +232,14 @@ def trust(found: Findings) -> Section:
     tables += [_largest(found, own) for own in found.own]
     notes = list(shown.moved)
     if registered is not None:
-        notes.append(
-            f"The model was registered anew with {registered.rows} rows, RMS {millimetres(registered.rms_after)} mm; "
-            f"each predicted by the others {millimetres(registered.left_out_rms)} mm."
-        )
+        each = f"each predicted by the others {millimetres(registered.left_out_rms)} mm"
+        after = f"{registered.rows} rows, RMS {millimetres(registered.rms_after)} mm"
+        notes.append(f"The model was registered anew with {after}; {each}.")
     elif not notes and shown.predictions is not None:
         notes.append("No device or marker moved, and no block of rows is wrong.")
     if not shown.outliers and not shown.moved and shown.predictions is not None:
-        notes.append(
-            "No row looks wrong: none is further from its prediction than chance allows in a table of this size (1 %), "
-            "by the model's own deviations."
-        )
+        none = "No row looks wrong: none is further from its prediction than chance allows in a table of this size"
+        notes.append(f"{none} (1 %), by the model's own deviations.")
     pictures = list[Picture]()
     if shown.predictions is not None:
         label = "Found against claimed shares of errors; on the diagonal the claims are true."
@@ -311,32 +301,26 @@ def repeatability(found: Findings) -> Section:
     repeats = found.repeats
     if repeats is None:
         see = "No pose was measured twice: pose accuracy and repeatability (ISO 9283) cannot be told from these rows."
-        note = "Repeat five poses, 30 times each, and pass the table with --data."
+        note = "Repeat five poses, 30 times each, and pass the table."
         return Section("repeatability", "Repeatability", see, notes=[note])
     header = ["pose", "measured", "RP [mm]", *(f"AP {name} [mm]" for name in repeats.accuracy)]
-    columns = [repeats.repeatability, *repeats.accuracy.values()]
-    rows = [
-        [f"row {int(line)}", str(int(count)), *(millimetres(float(values[k])) for values in columns)]
-        for k, (line, count) in enumerate(zip(repeats.lines, repeats.counts, strict=True))
-    ][:MOST_REPEATS]
-    worst = ["worst", "", *(millimetres(float(values.max())) for values in columns)]
-    mean = ["mean", "", *(millimetres(float(values.mean())) for values in columns)]
-    see = (
-        f"{len(repeats.counts)} poses were measured several times: single measurements are "
-        f"{millimetres(repeats.deviation)} mm RMS away from their mean, which limits the RMS error of any model."
-    )
-    few = int(repeats.counts.min()) < STANDARD_REPEATS
-    notes = [
+    values = torch.stack([repeats.repeatability, *repeats.accuracy.values()], 1)  # (G, 1 + stages) m
+    some = zip(repeats.lines.tolist(), repeats.counts.tolist(), values, strict=True)
+    named = [(f"row {line}", str(count), own) for line, count, own in some][:MOST_REPEATS]
+    named += [("worst", "", values.amax(0)), ("mean", "", values.mean(0))]
+    rows = [[pose, count, *map(millimetres, own.tolist())] for pose, count, own in named]
+    poses, away = f"{len(values)} poses were measured several times", f"{millimetres(repeats.deviation)} mm RMS away"
+    see = f"{poses}: single measurements are {away} from their mean, which limits the RMS error of any model."
+    few = f", from fewer than its {STANDARD_REPEATS} attainments" * (int(repeats.counts.min()) < STANDARD_REPEATS)
+    note = (
         "As ISO 9283 defines them for positions: pose accuracy AP is the distance of the mean measured place from the "
         "commanded one, repeatability RP the mean distance of the measurements from their mean plus three standard "
-        "deviations of it"
-        + f", from fewer than its {STANDARD_REPEATS} attainments" * few
-        + ". Accuracy with the model is predicted: measure it again after the commands are corrected."
-    ]
-    caption = "Pose accuracy (AP) and repeatability (RP)" + f", the first {MOST_REPEATS} poses" * (
-        len(repeats.counts) > MOST_REPEATS
+        f"deviations of it{few}. Accuracy with the model is predicted: measure it again after the commands are "
+        "corrected."
     )
-    return Section("repeatability", "Repeatability", see, [Table(caption, header, [*rows, worst, mean])], notes=notes)
+    caption = "Pose accuracy (AP) and repeatability (RP)"
+    caption += f", the first {MOST_REPEATS} poses" * (len(values) > MOST_REPEATS)
+    return Section("repeatability", "Repeatability", see, [Table(caption, header, rows)], notes=[note])
 
 
 def record(model: CalibratedKinematics, data_sha256: str | None) -> Section:
@@ -368,7 +352,7 @@ def _fit(model: CalibratedKinematics) -> Iterator[str]:
     yield f"fitted to     {len(model.configurations)} rows, {measured_words(model)}"
     for joint, name in enumerate(robot.joint_names):
         low, high = (float(joint_values(robot, joint, end[joint])) for end in limits)
-        yield f"  {printable(name)}: {low:.2f} to {high:.2f} {'mm' if robot.kinds[joint] == 'prismatic' else 'deg'}"
+        yield f"  {printable(name)}: {low:.2f} to {high:.2f} {joint_unit(robot, joint)}"
     summary = model.summary
     if summary is not None:
         residuals = f"coupling {summary.coupling_residual:.1e}, end {summary.end_residual:.1e} (residuals)"

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import torch
-
 from diffeo_calib.calibration.expected_errors import STILL_RANGE
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.quantiles import binomial_band, largest_known
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.html.document import rough_millimetres
-from diffeo_calib.reports.plots.joints import in_bins, joint_values
+from diffeo_calib.reports.plots.joints import in_bins, joint_unit, joint_values
 from diffeo_calib.sensors.errors import ERRORS
 
 WORTHWHILE_ERROR_FACTOR = 1.1
 """More rows are not worth it where the forecast is less than this factor below the error now."""
-FAR_RATIO = 3.0
-"""Ratio of expected errors anywhere to those like the measured ones from which the reason is told."""
 BLAMED_VARIANCE_SHARE = 0.5
 """Share of the expected variance that knowing the markers would remove, from which they are blamed."""
 OPEN_M = 1e-3
@@ -46,20 +42,17 @@ def rows_of(found: Findings, count: int | None = None) -> str:
 
 def verdict(found: Findings, tolerance: float | None = None) -> str:
     """The result in one line: whether a tolerance, m, is kept, errors by stage, and those of every other kind."""
-    stages = {name: one.rms for name, one in found.errors.items()} or found.expected
-    *before, (_, own) = stages.items()
-    listed = "".join(f"{1e3 * value:.2f} mm {printable(name)}, " for name, value in before)
-    text = f"{listed}{1e3 * own:.3f} mm calibrated"
-    if not found.errors:
-        text = f"{text}: RMS errors of positions that the model expects over the joint ranges of its rows."
+    *before, (_, own) = found.rms.items()
+    text = "".join(f"{1e3 * value:.2f} mm {printable(name)}, " for name, value in before)
+    text += f"{1e3 * own:.3f} mm calibrated"
+    if (errors := found.calibrated) is None:
+        text += ": RMS errors of positions that the model expects over the joint ranges of its rows."
     else:
-        *_, errors = found.errors.values()
         many = errors.count >= ENOUGH_FOR_P95
         most = f"95 % of errors are below {1e3 * errors.p95:.3f}" if many else f"The largest is {1e3 * errors.max:.3f}"
         what = "noise of a measurement" if found.telling is None else "repeatability"
-        text = f"{text} (RMS), on {rows_of(found, len(errors.errors))}. {most} mm;"
-        text = f"{text} {what} about {1e3 * found.limit:.3f} mm."
-    text = " ".join([text, "; ".join(f"{name}: {value} RMS" for name, value in _others(found))]).strip()
+        text += f" (RMS), on {rows_of(found, len(errors.errors))}. {most} mm; {what} about {1e3 * found.limit:.3f} mm."
+    text = f"{text} {'; '.join(f'{name}: {value} RMS' for name, value in _others(found))}".strip()
     if tolerance is None:
         return text
     judged = found.judged
@@ -77,24 +70,20 @@ def _others(found: Findings) -> Iterator[tuple[str, str]]:
 
 def figures(found: Findings) -> Iterator[tuple[str, str]]:
     """Name and value of the numbers at the top."""
-    if not found.errors:
-        for name, value in found.expected.items():
-            yield f"expected error, {name}", f"{1e3 * value:.3f} mm"
-    else:
-        for name, errors in found.errors.items():
-            yield f"{name}, RMS", f"{1e3 * errors.rms:.3f} mm"
-        *_, own = found.errors.values()
-        if own.angle_rms is not None:
-            yield "orientation, RMS", f"{own.angle_rms:.4f}\u00b0"
-        if own.count >= ENOUGH_FOR_P95:
-            yield "95 % of errors below", f"{1e3 * own.p95:.3f} mm"
+    own = found.calibrated
+    for name, value in found.rms.items():
+        yield f"expected error, {name}" if own is None else f"{name}, RMS", f"{1e3 * value:.3f} mm"
+    if own is not None and own.angle_rms is not None:
+        yield "orientation, RMS", f"{own.angle_rms:.4f}\u00b0"
+    if own is not None and own.count >= ENOUGH_FOR_P95:
+        yield "95 % of errors below", f"{1e3 * own.p95:.3f} mm"
     for name, value in _others(found):
         yield f"{name}, RMS", value
     if found.shown.predictions is not None:
         inside, count = found.shown.predictions.inside()
         yield "inside claimed 95 % regions", f"{inside} of {count} ({100 * inside / count:.0f} %)"
-    error = found.deviations.error
-    if error.whole > FAR_RATIO * error.measured:
+    if found.unlike:
+        error = found.deviations.error
         apart = f" ({rough_millimetres(error.whole)} with what the rows leave open)" * bool(error.open_places)
         yield "expected in poses unlike the measured", f"{rough_millimetres(error.workspace)} mm{apart}"
     if found.telling is not None:
@@ -122,21 +111,19 @@ def advice(found: Findings) -> Iterator[str]:
             of = f"{own.title}: the" if len(found.kinds) > 1 else "The"
             yield f"{of} model is no better than the {before} one on these rows: measure more poses."
     if found.kinds and not shown.new and not found.errors:
-        yield "These are rows of the fit: pass rows that the model has not seen (--data)."
+        yield "These are rows of the fit: pass rows that the model has not seen."
     if not found.learning_curve or found.learning_curve[-1][0] < len(found.rows):
         return
     if found.forecast is None:
         yield f"More poses like these will hardly lower the error{_unless_planned(found)}."
         return
-    rows, error = found.forecast
-    now = found.learning_curve[-1][1]
+    (rows, error), (_, now) = found.forecast, found.learning_curve[-1]
+    change = f"{1e3 * error:.3f} mm instead of {1e3 * now:.3f} mm"
     if now > WORTHWHILE_ERROR_FACTOR * error:
-        yield (
-            f"Twice as many poses ({rows}) would bring about {1e3 * error:.3f} mm instead of {1e3 * now:.3f} mm; "
-            "the poses that help most are listed under Where."
-        )
+        most = "the poses that help most are listed under Where"
+        yield f"Twice as many poses ({rows}) would bring about {change}; {most}."
     else:
-        change = f"{1e3 * error:.3f} mm instead of {1e3 * now:.3f} mm{_unless_planned(found)}"
+        change += _unless_planned(found)
         yield f"More poses like these will hardly help: twice as many ({rows}) would bring {change}."
 
 
@@ -152,25 +139,20 @@ def _unless_planned(found: Findings) -> str:
 
 def unlike_poses(found: Findings) -> Iterator[str]:
     """A sentence about poses unlike the measured ones if they are much less certain, and why."""
-    expected, model = found.deviations, found.model
-    if expected.error.whole < FAR_RATIO * expected.error.measured:
+    if not found.unlike:
         return
-    tool = torch.arange(model.nominal.geometry.size, device=found.rows.q.device)
-    tool = tool[model.nominal.geometry.slices["tool"]]
-    open_directions = found.rows.map.open_directions[tool]
-    variances = found.rows.map.parameter_covariance(tool).diagonal() + open_directions.square().sum(1)
+    rows, tool = found.rows, found.tool
+    open_directions = rows.map.open_directions[tool]
+    variances = rows.map.parameter_covariance(tool).diagonal() + open_directions.square().sum(1)
     number, axis = divmod(int(variances.argmax()), 3)
-    far = rough_millimetres(expected.error.whole)
-    far = f"Use the model near the measured poses: elsewhere errors of {far} mm are expected"
+    why, what = "", "unlike them"
     if found.share_of_tool > BLAMED_VARIANCE_SHARE or bool((open_directions.abs() > OPEN_M).any()):
-        what = model.bodies.name(number, len(found.rows.on))
-        along = f"along {'xyz'[axis]} of {printable(found.rows.on[number])}"
-        yield (
-            f"{far}, because {what} and base can hardly be told apart {along}. To change that, measure poses in which "
-            "the tool is turned about other axes, such as those listed under Where."
-        )
-    else:
-        yield f"{far}. To change that, measure poses unlike them, such as those listed under Where."
+        marker, along = found.model.bodies.name(number, len(rows.on)), f"{'xyz'[axis]} of {printable(rows.on[number])}"
+        why = f", because {marker} and base can hardly be told apart along {along}"
+        what = "in which the tool is turned about other axes"
+    far = f"elsewhere errors of {rough_millimetres(found.deviations.error.whole)} mm are expected{why}"
+    what = f"To change that, measure poses {what}, such as those listed under Where."
+    yield f"Use the model near the measured poses: {far}. {what}"
 
 
 def still_joints(found: Findings) -> Iterator[str]:
@@ -178,12 +160,9 @@ def still_joints(found: Findings) -> Iterator[str]:
     q, robot = found.rows.q, found.model.robot
     for joint, name in enumerate(robot.joint_names):
         if float(q[:, joint].max() - q[:, joint].min()) < STILL_RANGE:
-            place, unit = float(joint_values(robot, joint, q[:, joint]).mean()), "deg"
-            unit = "mm" if robot.kinds[joint] == "prismatic" else unit
-            yield (
-                f"{printable(name)} never moved in the fit: nothing is known about it away from {place:.1f} {unit}. "
-                "Measure poses in which it moves."
-            )
+            place = f"{float(joint_values(robot, joint, q[:, joint]).mean()):.1f} {joint_unit(robot, joint)}"
+            nothing = f"never moved in the fit: nothing is known about it away from {place}"
+            yield f"{printable(name)} {nothing}. Measure poses in which it moves."
 
 
 def worst_range(found: Findings) -> Iterator[str]:
@@ -191,29 +170,22 @@ def worst_range(found: Findings) -> Iterator[str]:
     seen, robot = found.shown.predictions, found.model.robot
     if seen is None:
         return
-    lengths, worst = 1e3 * largest_known(seen.errors.errors), (BAD_RATIO * 1e3 * seen.errors.rms, "")
+    lengths, most, where = 1e3 * largest_known(seen.errors.errors), BAD_RATIO * 1e3 * seen.errors.rms, ""
     for joint, name in enumerate(robot.joint_names):
-        values = joint_values(robot, joint, seen.data.q[:, joint])
-        middles, groups = in_bins(values, lengths)
-        half = 0.5 * (middles[1] - middles[0])
-        unit = "mm" if robot.kinds[joint] == "prismatic" else "deg"
-        for middle, group in zip(middles, groups, strict=True):
+        for low, high, group in in_bins(joint_values(robot, joint, seen.data.q[:, joint]), lengths):
             rms = float(group.square().mean().sqrt())
-            if rms > worst[0]:
-                low, high = middle - half, middle + half
-                where = f"{name} between {low:.0f} and {high:.0f} {unit} ({len(group)} rows)"
-                worst = (rms, f"The largest errors are found with {where}: {rms:.3f} mm RMS.")
-    if worst[1]:
-        yield worst[1]
+            if rms > most:
+                unit, most = joint_unit(robot, joint), rms
+                where = f"{name} between {low:.0f} and {high:.0f} {unit} ({len(group)} rows): {rms:.3f} mm RMS"
+    if where:
+        yield f"The largest errors are found with {where}."
 
 
 def judged(found: Findings) -> str:
     """Whether the claimed regions can be believed, as far as the number of rows tells."""
     if found.shown.predictions is None:
-        return (
-            "No position was measured that the model has not seen, so the regions that it claims cannot be compared "
-            "with errors."
-        )
+        none = "No position was measured that the model has not seen, so the regions that it claims cannot be"
+        return f"{none} compared with errors."
     inside, count = found.shown.predictions.inside()
     low, high = binomial_band(count, 0.95, MISCALIBRATION_PROBABILITY)
     if inside < low:
@@ -223,7 +195,5 @@ def judged(found: Findings) -> str:
     else:
         what = "these, which contain the noise of a measurement, agree with that for poses like the ones shown"
     hold = f"{low} to {high}" if low < high else f"all {high}"
-    return (
-        f"{inside} of {count} errors lie in the regions that claim 95 %. Of {count} errors, regions of the right size "
-        f"hold {hold} in nine cases of ten; {what}."
-    )
+    right = f"Of {count} errors, regions of the right size hold {hold} in nine cases of ten; {what}."
+    return f"{inside} of {count} errors lie in the regions that claim 95 %. {right}"

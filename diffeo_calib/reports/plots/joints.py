@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from math import nan
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -65,8 +65,7 @@ def draw_transmission(axes: Axes, model: CalibratedKinematics, rows: FitRows, jo
     heights, bottom = 0.5 * most * counts / counts.max(), -1.75 * most
     axes.stairs(bottom + heights, edges, baseline=bottom, fill=True, color=GREY, alpha=0.6, lw=0)
     axes.set_ylim(-1.75 * most, 1.15 * most)
-    what = "mm" if robot.kinds[joint] == "prismatic" else "mrad"
-    finish(axes, x=joint_label(robot, joint), y=f"transmission error [{what}]")
+    finish(axes, x=joint_label(robot, joint), y=f"transmission error [{joint_unit(robot, joint, 'mrad')}]")
 
 
 def explained(model: CalibratedKinematics, title: str = "") -> Figure:
@@ -116,9 +115,7 @@ def draw_expected(axes: Axes, robot: Tree, joint: int, found: Deviations, *, key
         (values, lengths, LOOKS[1], "anywhere in the ranges"),
         (near, short, LOOKS[2], "as measured"),
     ):
-        middles, groups = in_bins(x, y)
-        rms = [float(group.square().mean().sqrt()) for group in groups]
-        axes.plot(middles, rms, color=look.colour, ls=look.line, lw=look.width, label=label)
+        axes.plot(*rms_in_bins(x, y), color=look.colour, ls=look.line, lw=look.width, label=label)
     wide = float(lengths.max()) > WIDE_RATIO * float(short.min())
     if not wide:
         axes.set_ylim(0, 1.3 * float(lengths.max()))
@@ -130,13 +127,19 @@ def draw_expected(axes: Axes, robot: Tree, joint: int, found: Deviations, *, key
         legend(axes, loc="upper left", ncols=2)
 
 
-def in_bins(values: Tensor, lengths: Tensor) -> tuple[list[float], list[Tensor]]:
-    """Middles of intervals of values, and the lengths there: not a number where there are fewer than three."""
+def in_bins(values: Tensor, lengths: Tensor) -> Iterator[tuple[float, float, Tensor]]:
+    """Ends of intervals of values, and the lengths there: none where there are fewer than three."""
     edges = torch.linspace(float(values.min()), float(values.max()), BINS + 1, dtype=values.dtype, device=values.device)
     number = torch.bucketize(values, edges[1:-1])
-    groups = [lengths[number == k] for k in range(BINS)]
-    middles = [float(edges[k : k + 2].mean()) for k in range(BINS)]
-    return middles, [group if len(group) >= FEWEST_IN_BIN else group.new_tensor([nan]) for group in groups]
+    for k, (low, high) in enumerate(pairwise(edges.tolist())):
+        group = lengths[number == k]
+        yield low, high, group if len(group) >= FEWEST_IN_BIN else group[:0]
+
+
+def rms_in_bins(values: Tensor, lengths: Tensor) -> tuple[list[float], list[float]]:
+    """Middles of intervals of values, and the RMS of the lengths there."""
+    found = [((low + high) / 2, float(group.square().mean().sqrt())) for low, high, group in in_bins(values, lengths)]
+    return [middle for middle, _ in found], [rms for _, rms in found]
 
 
 def short(name: str) -> str:
@@ -146,9 +149,14 @@ def short(name: str) -> str:
 
 def joint_values(robot: Tree, joint: int, values: Tensor) -> Tensor:
     """Values of a joint in degrees, or in mm for a slide."""
-    return 1e3 * values if robot.kinds[joint] == "prismatic" else values.rad2deg()
+    return values.rad2deg() if robot.periodic[joint] else 1e3 * values
+
+
+def joint_unit(robot: Tree, joint: int, turn: str = "deg") -> str:
+    """Unit in which values of a joint are shown: ``turn``, or mm for a slide."""
+    return turn if robot.periodic[joint] else "mm"
 
 
 def joint_label(robot: Tree, joint: int) -> str:
     """Name and unit of a joint."""
-    return f"{short(robot.joint_names[joint])} [{'mm' if robot.kinds[joint] == 'prismatic' else 'deg'}]"
+    return f"{short(robot.joint_names[joint])} [{joint_unit(robot, joint)}]"

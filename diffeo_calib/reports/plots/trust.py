@@ -11,7 +11,7 @@ from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.predictions import SHARES, FitRows, Predictions
-from diffeo_calib.reports.plots.joints import in_bins, joint_label, joint_values
+from diffeo_calib.reports.plots.joints import joint_label, joint_values, rms_in_bins
 from diffeo_calib.reports.plots.style import BLUE, GREEN, GREY, ORANGE, dots, finish, legend, note, panels
 from diffeo_calib.sensors.errors import Evaluation
 
@@ -75,10 +75,7 @@ def draw_residuals(axes: Axes, values: Tensor, errors: Evaluation, label: str, *
     values, lengths = values[there], lengths[there]
     dots(axes, values, lengths, colour=BLUE)
     if len(values) >= FEWEST_BINNED and float(values.max()) > float(values.min()):
-        middles, groups = in_bins(values, lengths)
-        axes.plot(
-            middles, [float(g.square().mean().sqrt()) for g in groups], color=ORANGE, ls="--", lw=1.8, label="RMS"
-        )
+        axes.plot(*rms_in_bins(values, lengths), color=ORANGE, ls="--", lw=1.8, label="RMS")
         if key:
             legend(axes, loc="upper right")
     axes.set_ylim(bottom=0)
