@@ -77,10 +77,6 @@ class Observations(RowGroups):
         return self._texts([part.device_names for part in self.parts])
 
     @property
-    def _devices(self) -> list[str]:
-        return self._texts([[name and f"{part.kind} {name}" for name in part.device_names] for part in self.parts])
-
-    @property
     def session_names(self) -> tuple[str, ...]:
         """Names of the devices and set-ups, in order of first appearance."""
         return tuple(dict.fromkeys(name for name in self.device_names if name))
