@@ -68,7 +68,7 @@ class Observations(RowGroups):
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """(N,) what each row is: "position", "pose", "socket", or the kind of its readings."""
+        """(N,) "position", "pose", "socket", or the kind of readings."""
         return tuple(self._texts([[part.kind] * len(part) for part in self.parts]))
 
     @property
