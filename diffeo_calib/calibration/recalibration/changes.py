@@ -284,6 +284,10 @@ class Drift(NamedTuple):
     part: ChangedPart
     variance: float
 
+    def root(self, at: Linearisation) -> Tensor:
+        """(M, m, c) columns whose products are the covariance of the change at M configurations, m."""
+        return self.variance**0.5 * self.part.root(at)
+
 
 SOMETHING = "something"
 """A change whose part rows do not tell."""
@@ -360,8 +364,8 @@ def _changes_of(rows: WeighedRows, *, level: float, seed: int) -> tuple[Changes,
         name = min(ratios, key=lambda each: (ratios[each].probability, -ratios[each].value))
         if ratios[name].probability > level:
             break
-        rows = rows.drifting([ratios[name].variance ** 0.5 * roots.pop(name)])
         drifts.append(Drift(parts[name], ratios[name].variance))
+        rows = rows.drifting([drifts[-1].variance ** 0.5 * roots.pop(name)])
         found[name] = ratios[name]
         least = ratios[name].value - gates.OFFSETS_TOLD_APART
         as_good = [each for each in ratios if each != name and parts[each].offset and ratios[each].value > least]

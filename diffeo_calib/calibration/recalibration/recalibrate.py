@@ -169,24 +169,14 @@ def recalibrate(
     if drift == "tested":
         drifts = [*drifts, *usual_drift(rows, drifts)]
     if drifts:
-        rows = rows.if_drifting([each.variance**0.5 * each.part.root(rows.at) for each in drifts])
+        rows = rows.if_drifting([each.root(rows.at) for each in drifts])
     warn_of_contradictions(rows, rows.excess if before.registration is None else before.registration.excess)
-    fitted = fit_both(rows, drifts, progress)
+    problem, start = both_dates(rows, rows.inflation, [each.root for each in drifts])
+    solver, integrator = GaussNewton(tolerance=RESIDUAL_TOLERANCE), rows.fitted.geodesic.integrator
+    fitted = fit(problem, solver, integrator, start=start, progress=progress)
     if fitted.solution.interrupted:
         raise KeyboardInterrupt  # half-way the covariance would be that of the optimum: nothing is worth keeping
     return _result(model, before, rows, changes, fitted=fitted, note=note)
-
-
-def fit_both(rows: WeighedRows, drifts: list[Drift], progress: Progress) -> Fit:
-    """The exact model of old and new rows with the old scales."""
-    old, drifted = rows.fitted, list[Tensor]()
-    if drifts:
-        at = old.geodesic.linearise(None if old.data is None else old.x)
-        at = at if old.slopes is None else at.projected(old.slopes)
-        drifted = [each.variance**0.5 * each.part.root(at) for each in drifts]
-    problem, start = both_dates(rows.before.nominal, rows, rows.new_noise, drifted, rows.inflation)
-    solver = GaussNewton(tolerance=RESIDUAL_TOLERANCE)
-    return fit(problem, solver, old.geodesic.integrator, start=start, progress=progress)
 
 
 def _result(
@@ -338,7 +328,7 @@ def usual_drift(rows: WeighedRows, named: Sequence[Drift]) -> list[Drift]:
     if not groups:
         return []
     roots = [torch.cat([part.root(rows.at) for part in parts], 2) for parts in groups.values()]
-    known = [each.variance**0.5 * each.part.root(rows.at) for each in named]
+    known = [each.root(rows.at) for each in named]
     doubted, sizes = rows.if_drifting([*known, *roots]), list[float]()
     for weighed, least in ((rows, gates.DRIFT_ODDS_OF_INLIERS), (doubted, gates.DRIFT_ODDS)):
         sizes, odds = _likeliest(rows.changed(tails=weighed.tails).drifting(known), roots)
