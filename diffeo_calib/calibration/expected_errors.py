@@ -1,7 +1,7 @@
 """The errors that a calibrated model expects over the joint ranges of its rows, and what they consist of.
 
 Without a measuring device rigid motions that remain in the fields say nothing about the robot, and are taken out of all
-covariances (regression/rigid_motions.py). A device that measured other rows holds the frame.
+covariances (regression/conditional.py). A device that measured other rows holds the frame.
 
 Scales are chosen, and the model is fitted, with base and markers near their registration and with joint errors of the
 size that the rows show. Where the rows cannot show them (a tool that never turns, joints that stand still) this is no
@@ -32,7 +32,6 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 from diffeo_calib.robots.placement import PLACES, rigid_fit
 from diffeo_calib.sensors.tables import device_coordinates
 
@@ -259,14 +258,11 @@ def _places(model_map: FittedMap) -> tuple[Tensor, Tensor, Tensor]:
     own = torch.tensor(nominal.places, dtype=torch.int64, device=fitted.x.device)
     opened = fitted.open_directions[own]
     conditional, q = fitted.conditional, fitted.everywhere
-    inner = conditional.conditional if isinstance(conditional, WithoutRigidMotions) else conditional
-    known = inner.posterior(fitted.parameters_as_points(own))[0] + opened @ opened.mT
+    known = conditional.inner.posterior(fitted.parameters_as_points(own))[0] + opened @ opened.mT
     values, vectors = torch.linalg.eigh(known)
     theta = q.new_zeros(nominal.parameters)
     anywhere = nominal.sensitivities(q, theta)[..., own].flatten(0, 1)
-    if isinstance(conditional, WithoutRigidMotions):
-        turned = conditional.reference.sensitivity.flatten(0, 1)[:, conditional.base]
-        anywhere = anywhere - turned @ (conditional.fit @ anywhere)
+    anywhere = conditional.compared_slopes(anywhere)
     root = vectors * values.clamp(min=0).sqrt()
     if registration is not None:  # its rows may show what those of the fit left open
         rows = nominal.sensitivities(registration.q.to(q), theta)[..., own]

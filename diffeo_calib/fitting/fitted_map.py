@@ -22,10 +22,8 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.regression.choose import condition, condition_controls
-from diffeo_calib.regression.conditional import Conditional, of_parameters
-from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegression
+from diffeo_calib.regression.conditional import Conditional, WithoutRigidMotions, of_parameters
 from diffeo_calib.regression.control_points import ControlPointRegression
-from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 
 PREDICT_ROWS, WORKSPACE_ROWS = 1024, 100  # number of configurations that are linearised together for their covariances
 OPEN_TURN_RAD = 1.0
@@ -229,12 +227,10 @@ class FittedMap:
             at: linearisation of the points. effects: (M, r, k) of k shifts of unit prior variance on them.
             columns: (c,) boolean, which of the shifts of the fit these are.
         """
-        known, K = self.conditional.inner, len(self.geodesic.spec.prior_variance)
-        if isinstance(known, ConjugateGradientRegression):
-            known.features(at)  # which it has not
+        K = len(self.geodesic.spec.prior_variance)
         slopes = of_parameters(at, K + len(columns)).clone()
         slopes[..., K:][..., columns] = effects
-        return known.posterior(replace(at, sensitivity=slopes))
+        return self.conditional.inner.posterior(replace(at, sensitivity=slopes))
 
     @of_origin
     def fitted_points(self) -> Tensor:
@@ -335,13 +331,8 @@ class FittedMap:
 
     def shift_covariance(self) -> Tensor:
         """(c, c) posterior covariance of the shifts that rows of the fit share, in units of their deviations."""
-        Z, first = self.noise.shared, len(self.geodesic.spec.prior_variance)
-        known = self.conditional.inner
-        if not isinstance(known, ConjugateGradientRegression):
-            return self.parameter_covariance(first + torch.arange(Z.shape[2], device=Z.device))
-        alone = ConjugateGradientRegression(known.linearisation, self.noise.own)  # 1 - Z^T K^-1 Z would lose all digits
-        eye = torch.eye(Z.shape[2], dtype=Z.dtype, device=Z.device)
-        return torch.linalg.inv(eye + torch.einsum("nmc,nmk->ck", Z, alone.solve(Z)))
+        first = len(self.geodesic.spec.prior_variance)
+        return self.parameter_covariance(first + torch.arange(self.noise.shared.shape[2], device=self.x.device))
 
     def explained_by(self, which: Tensor, x: Tensor) -> float:
         """Share of the posterior variance of k1 at x (M, n) that knowing these parameters would remove."""

@@ -92,14 +92,14 @@ class Noise:
         """The blocks alone, without what rows share."""
         return Noise(self.covariance) if self.shared.shape[2] else self
 
-    def solve(self, residual: Tensor) -> Tensor:
-        """R^-1 r: (N, m) -> (N, m)."""
-        alone = torch.cholesky_solve(residual[:, :, None], self._factor)
+    def solve(self, values: Tensor) -> Tensor:
+        """R^-1 values: (N, m) or (N, m, k), of the same shape."""
+        alone = torch.cholesky_solve(values.view(*values.shape[:2], -1), self._factor)
         if self.shared.shape[2]:
-            inner = torch.einsum("imc,imk->ck", self.shared, alone)
+            inner = self.shared.flatten(0, 1).T @ alone.flatten(0, 1)
             shift = torch.cholesky_solve(inner, self._core)
             alone = alone - torch.cholesky_solve(self.shared @ shift, self._factor)
-        return alone[:, :, 0]
+        return alone.view_as(values)
 
     def multiply(self, values: Tensor) -> Tensor:
         """R values: (N, m, k) -> (N, m, k)."""
@@ -108,10 +108,6 @@ class Noise:
     def whiten(self, values: Tensor, rows: Tensor | slice = slice(None)) -> Tensor:
         """C_i^-1 values with R_i = C_i C_i^T, for all configurations or for ``rows``: (N, m, k) -> (N, m, k)."""
         return torch.linalg.solve_triangular(self._factor[rows], values, upper=False)
-
-    def unwhiten(self, values: Tensor) -> Tensor:
-        """C_i^-T values with R_i = C_i C_i^T: (N, m, k) -> (N, m, k)."""
-        return torch.linalg.solve_triangular(self._factor.mT, values, upper=True)
 
     def add_to(self, gram: Tensor) -> Tensor:
         """G + R: (N m, N m)."""

@@ -1,15 +1,4 @@
-"""Conditioning by one Cholesky factor, with the parameters apart from the fields.
-
-A parameter such as the place of the base has a prior deviation of decimetres, and predictions deviate by micrometres:
-the difference G(x, x) - G(x, data) (G + R)^-1 G(data, x) loses eight digits and more. With G = F + S Lambda^-1 S^T, F
-the covariance of the fields, it is
-
-    F(x, x) - F(x, data) (F + R)^-1 F(data, x) + D (Lambda + S^T (F + R)^-1 S)^-1 D^T
-    D = S(x) - F(x, data) (F + R)^-1 S
-
-(Rasmussen & Williams, "Gaussian Processes for Machine Learning", 2006, section 2.7), in which
-nothing large cancels. Shifts that rows share (:class:`Noise`) are parameters, too.
-"""
+"""Conditioning by one Cholesky factor of G + R."""
 
 from __future__ import annotations
 
@@ -18,11 +7,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.threads import large_work
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.conditional import DataConditional, Features, diagonal_blocks, of_parameters
+from diffeo_calib.regression.conditional import DataConditional, diagonal_blocks
 from diffeo_calib.regression.factor import Factor
 
 
@@ -40,18 +28,22 @@ class CholeskyRegression(DataConditional):
     """
 
     def __init__(self, linearisation: Linearisation, noise: Noise) -> None:
-        super().__init__(linearisation)
-        visible, shared = noise.visible, noise.shared
+        super().__init__(linearisation, noise)
+        visible = noise.visible
         self.seen = slice(None) if bool(visible.all()) else visible.flatten().nonzero()[:, 0]
-        self.deviations = linearisation.spec.prior_variance.sqrt()  # Lambda^-1/2
         matrix = noise.own.add_to(linearisation.fields.gram())
-        slopes = torch.cat([linearisation.sensitivity * self.deviations, shared], 2).flatten(0, 1)
-        self.deviations = torch.cat([self.deviations, shared.new_ones(shared.shape[2])])
-        self.factor = Factor.of(matrix[self.seen][:, self.seen], slopes[self.seen])
+        self.factor = Factor.of(matrix[self.seen][:, self.seen], self.slopes[self.seen])
 
     def solve(self, values: Tensor) -> Tensor:
         """(G + R)^-1 values: (N, m, k) -> (N, m, k); zero where nothing was measured."""
         return self._spread(self.factor.solve(values.flatten(0, 1)[self.seen])).view_as(values)
+
+    def white(self, values: Tensor) -> Tensor:
+        return self.factor.white(values[self.seen])
+
+    @property
+    def apart(self) -> tuple[Tensor, Tensor]:
+        return self.factor.W, self.factor.B
 
     def momenta(self, target: Tensor) -> Momenta:
         """Fields by mu, transported back to time 0; parameters apart, since S^T mu would lose their digits."""
@@ -73,16 +65,6 @@ class CholeskyRegression(DataConditional):
         inverse[at[:, None], at] = self.factor.inverse
         own = torch.linalg.inv(diagonal_blocks(inverse, len(target)))
         return (own @ self.mu(target)[:, :, None])[:, :, 0], own
-
-    def features(self, at: Linearisation) -> Features:
-        """Information of the data about the fields (M r, S), and about the parameters without it (M r, K + c)."""
-        L, W, B = self.factor.L, self.factor.W, self.factor.B
-        cross = self.linearisation.fields.gram(at.fields).T[:, self.seen]
-        with large_work(cross.numel()):
-            known = torch.linalg.solve_triangular(L.T, cross, upper=True, left=False)  # (M r, S)
-        unknown = of_parameters(at, len(B)).flatten(0, 1) * self.deviations - known @ W  # D Lambda^-1/2
-        unknown = torch.linalg.solve_triangular(B.T, unknown, upper=True, left=False)
-        return Features.of((known.T, -1), (unknown.T, 1))
 
     def _spread(self, flat: Tensor) -> Tensor:
         """Values (S, ...) of what was measured as those of all, zero elsewhere: (N m, ...)."""

@@ -40,13 +40,17 @@ class Factor:
                 raise NumericalError.of("the covariance of the rows is not positive definite", fix=NOISE_ADVICE)
             return cls(L, torch.linalg.solve_triangular(L, H, upper=False))
 
+    def white(self, values: Tensor) -> Tensor:
+        """L^-1 values (M, k)."""
+        return torch.linalg.solve_triangular(self.L, values, upper=False)
+
     def solve(self, values: Tensor) -> Tensor:
         """K^-1 values (M, k)."""
         return self.solved(values)[0]
 
     def solved(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """K^-1 values (M, k) and H^T K^-1 values (K, k), in which nothing cancels."""
-        white = torch.linalg.solve_triangular(self.L, values, upper=False)
+        white = self.white(values)
         shift = torch.cholesky_solve(self.W.T @ white, self.B)
         return torch.linalg.solve_triangular(self.L.T, white - self.W @ shift, upper=True), shift
 

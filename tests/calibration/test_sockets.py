@@ -26,7 +26,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.rows import with_attributes
-from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
+from diffeo_calib.regression.conditional import WithoutRigidMotions
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
 
@@ -94,7 +94,7 @@ def test_covariances_by_the_projection_written_out(arm: SimulatedArm, result: An
     model, q = result.model, arm.sample(4, seed=3)
     found, at = gauge(model), model.map.geodesic.linearise(q)
     both = model.map.geodesic.linearise(torch.cat([q, found.reference.joint[0].points]))
-    C = found.conditional.covariance_between(both)
+    C = found.inner.covariance_between(both)
     B = both.sensitivity.flatten(0, 1)[:, :6]
     motion = torch.cat([torch.zeros(6, 12, dtype=C.dtype), torch.linalg.pinv(B[12:])], 1)
     P = (torch.eye(len(C), dtype=C.dtype) - B @ motion)[:12]

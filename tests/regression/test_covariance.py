@@ -21,7 +21,7 @@ from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.regression import conditional
+from diffeo_calib.regression import conditional, conjugate_gradients
 from diffeo_calib.regression.cholesky import CholeskyRegression
 from diffeo_calib.regression.conditional import Conditional
 from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegression
@@ -59,6 +59,14 @@ WAYS: dict[str, Callable[[Problem, GeodesicDeformation], Conditional]] = {
     "iterative": lambda problem, at: ConjugateGradientRegression(at.linearise(), problem.noise),
     "reduced": lambda problem, at: ControlPointRegression(at, problem.x, problem.noise),
 }
+
+
+@pytest.fixture(autouse=True)
+def fields_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The factor of conjugate gradients explains all of the fields."""
+    monkeypatch.setattr(conjugate_gradients, "NEGLIGIBLE_VARIANCE_RATIO", 1e-12)
+
+
 every_way = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS.keys())
 
 

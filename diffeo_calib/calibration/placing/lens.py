@@ -65,13 +65,10 @@ class CameraErrors(DeviceSet):
         return found
 
     def with_rows(self, other: OtherRows) -> Any:
-        if other.coordinates is None:
+        if other.aligned is None:
             raise MeasurementError.of("rows of a camera", expected="images", got="none")
-        return replace(self.in_own_frame(other.coordinates.table), rows=other.coordinates.rows)
-
-    def in_own_frame(self, table: Measurements) -> Any:
-        (shared,) = table.shared_errors()
-        return replace(self, shared=shared)
+        (shared,) = other.aligned.table.shared_errors()
+        return replace(self, shared=shared, rows=other.aligned.rows)
 
 
 @dataclass(frozen=True, eq=False)

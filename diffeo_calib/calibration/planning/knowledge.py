@@ -45,7 +45,6 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.conditional import NOISE_ADVICE, diagonal_blocks
-from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
@@ -310,9 +309,7 @@ def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Start:
         model: fitted, or registered anew. q: (M, n) configurations.
         free: what may have moved since the fit, besides what a registration has left free.
     """
-    fitted, registration, conditional = model.map, model.map.registration, model.map.conditional
-    if isinstance(conditional, WithoutRigidMotions):  # devices and robot have them in common
-        conditional = conditional.conditional
+    fitted, registration, conditional = model.map, model.map.registration, model.map.conditional.inner
     if registration is not None and free != registration.free:
         free = registration.free if free is None else "both"
     noise, nominal, adrift = fitted.new_noise, fitted.geodesic.spec.nominal, fitted.workspace is not None

@@ -25,7 +25,7 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
 from diffeo_calib.calibration.diagnostics.row_order import find_block
-from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows
+from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, WeighedRows
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import sentence, warn_user, with_deviation
 from diffeo_calib.kernels.radial import RadialKernel
@@ -79,13 +79,13 @@ class ChangedPart:
         return at.joint_to_start[:, :, self.joint, None] * self.shapes(at)[:, None]
 
 
-def offsets_of(rows: NewRows) -> list[ChangedPart]:
+def offsets_of(rows: WeighedRows) -> list[ChangedPart]:
     """The offsets of all joints, which are tested beside the parts: the geometry has them, among much else."""
     chain = rows.points.fitted.geometry.chain
     return [ChangedPart(f"the offset of {name}", joint) for joint, name in enumerate(chain.joint_names)]
 
 
-def parts_of(rows: NewRows) -> list[ChangedPart]:
+def parts_of(rows: WeighedRows) -> list[ChangedPart]:
     """The parts of the model: every joint with a transmission term, gravity, geometry."""
     spec, nominal = rows.fitted.geodesic.spec, rows.points.fitted
     chain, prior = nominal.geometry.chain, spec.prior_variance
@@ -128,7 +128,7 @@ class Ratio(NamedTuple):
         return Ratio(min(self.value, other.value), max(self.probability, other.probability), self.variance)
 
 
-def likelihood_ratios(rows: NewRows, roots: dict[str, Tensor], seed: int) -> tuple[dict[str, Ratio], float]:
+def likelihood_ratios(rows: WeighedRows, roots: dict[str, Tensor], seed: int) -> tuple[dict[str, Ratio], float]:
     """Ratios of all parts.
 
     Args:
@@ -138,7 +138,8 @@ def likelihood_ratios(rows: NewRows, roots: dict[str, Tensor], seed: int) -> tup
     Returns:
         name -> ratio, and the likeliest standard deviation of the noise without a change, relative to that of the rows.
     """
-    base = rows.posterior
+    given = rows.given
+    base = given.C + given.slopes @ given.prior @ given.slopes.T
     R = torch.block_diag(*rows.weighted_noise)
     seen = rows.visible.flatten()  # what was not measured has no noise whose level may change
     R, base, residual = R[seen][:, seen], base[seen][:, seen], rows.residual.flatten()[seen, None]
@@ -288,7 +289,7 @@ SOMETHING = "something"
 """A change whose part rows do not tell."""
 
 
-def find_changes(rows: NewRows, *, level: float = LEVEL, seed: int = 0) -> tuple[Changes, list[Drift]]:
+def find_changes(rows: WeighedRows, *, level: float = LEVEL, seed: int = 0) -> tuple[Changes, list[Drift]]:
     """Test new rows for changes: all together, and every session and block of rows that do not fit by itself.
 
     Rows that follow one another, or are a session of their own, and deviate together are no outliers.
@@ -320,7 +321,7 @@ def find_changes(rows: NewRows, *, level: float = LEVEL, seed: int = 0) -> tuple
     return replace(changes, found=tuple(found)), []
 
 
-def groups_of(rows: NewRows) -> dict[str, tuple[Tensor, bool]]:
+def groups_of(rows: WeighedRows) -> dict[str, tuple[Tensor, bool]]:
     """Rows that were measured together, by their names: their numbers, and whether hardly any fits the old model.
 
     Sessions, if there are several, and else the block of rows that hardly count.
@@ -340,7 +341,7 @@ def groups_of(rows: NewRows) -> dict[str, tuple[Tensor, bool]]:
     return {f"rows {first} to {last}": (block, True)}
 
 
-def _changes_of(rows: NewRows, *, level: float, seed: int) -> tuple[Changes, list[Drift]]:
+def _changes_of(rows: WeighedRows, *, level: float, seed: int) -> tuple[Changes, list[Drift]]:
     """Test rows together; arguments as of :func:`find_changes`."""
     rows = rows.kept(within_old_range(rows))
     if len(rows) < FEWEST_ROWS:
@@ -379,7 +380,7 @@ LARGEST_OFFSET_RAD_M = 5e-3
 """The largest one that is tested, see SIZES."""
 
 
-def _smallest(rows: NewRows) -> tuple[SmallestOffset, ...]:
+def _smallest(rows: WeighedRows) -> tuple[SmallestOffset, ...]:
     """See :class:`Changes`."""
     chain, found = rows.points.fitted.geometry.chain, []
     for joint, part in enumerate(offsets_of(rows)):
@@ -390,14 +391,14 @@ def _smallest(rows: NewRows) -> tuple[SmallestOffset, ...]:
     return tuple(found)
 
 
-def within_old_range(rows: NewRows) -> Tensor:
+def within_old_range(rows: WeighedRows) -> Tensor:
     """(k,) numbers of the rows within the ranges of the joints in the old rows."""
     low, high = rows.fitted.x.amin(0), rows.fitted.x.amax(0)
     margin = RANGE_MARGIN * (high - low)
     return ((rows.q >= low - margin) & (rows.q <= high + margin)).all(1).nonzero()[:, 0]
 
 
-def _change(rows: NewRows, drift: Drift, *, probability: float, others: tuple[str, ...]) -> Change:
+def _change(rows: WeighedRows, drift: Drift, *, probability: float, others: tuple[str, ...]) -> Change:
     """The change with its expected size."""
     (part, variance), kinds = drift, rows.points.fitted.geometry.chain.kinds
     evidence = rows.evidence(part.root(rows.at))

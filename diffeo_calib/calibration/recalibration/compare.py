@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.recalibration.changes import FEWEST_ROWS, LEVEL, Changes, find_changes
-from diffeo_calib.calibration.recalibration.new_rows import NewRows
+from diffeo_calib.calibration.recalibration.new_rows import WeighedRows
 from diffeo_calib.calibration.recalibration.new_set_up import (
     Marker,
     check_arguments,
@@ -29,7 +29,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.re_registration.register_again import find_place
+from diffeo_calib.kinematics.re_registration.find_place import find_place
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration, moved
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.cartesian import is_cartesian, pose_inputs, turns_nowhere
@@ -151,7 +151,7 @@ def _usual_deviation(model: CalibratedKinematics) -> float:
     return float(covariance.diagonal(dim1=-2, dim2=-1).mean().clamp(min=0).sqrt())
 
 
-def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) -> NewRows:
+def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) -> WeighedRows:
     """What another model predicts of the markers of a model, at configurations of both fits that both know."""
     if model.robot.joint_names != other.robot.joint_names:
         expected, got = ", ".join(model.robot.joint_names), ", ".join(other.robot.joint_names)

@@ -22,7 +22,7 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.placing.placement import Placement
 from diffeo_calib.calibration.recalibration.changes import ChangedPart, Changes, Drift, find_changes, parts_of
-from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows
+from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, WeighedRows
 from diffeo_calib.calibration.recalibration.new_set_up import (
     Before,
     Marker,
@@ -43,12 +43,8 @@ from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.provenance import Provenance, check_note
 from diffeo_calib.kinematics.re_registration.both_dates import both_dates
-from diffeo_calib.kinematics.re_registration.register_again import (
-    MARKER_DEVIATIONS,
-    UNMOVED_LOG_ODDS,
-    carried_devices,
-    devices_beside,
-)
+from diffeo_calib.kinematics.re_registration.find_place import MARKER_DEVIATIONS, UNMOVED_LOG_ODDS
+from diffeo_calib.kinematics.re_registration.register_again import carried_devices, devices_beside
 from diffeo_calib.kinematics.re_registration.registered_map import Registration, moved
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.sensors.errors import Evaluations
@@ -181,7 +177,7 @@ def recalibrate(
     return _result(model, before, rows, changes, fitted=fitted, note=note)
 
 
-def fit_both(rows: NewRows, drifts: list[Drift], progress: Progress) -> Fit:
+def fit_both(rows: WeighedRows, drifts: list[Drift], progress: Progress) -> Fit:
     """The exact model of old and new rows with the old scales."""
     old, drifted = rows.fitted, list[Tensor]()
     if drifts:
@@ -194,7 +190,7 @@ def fit_both(rows: NewRows, drifts: list[Drift], progress: Progress) -> Fit:
 
 
 def _result(
-    model: CalibratedKinematics, place: Before, rows: NewRows, changes: Changes, *, fitted: Fit, note: str
+    model: CalibratedKinematics, place: Before, rows: WeighedRows, changes: Changes, *, fitted: Fit, note: str
 ) -> Recalibration:
     """The model in the new frame, and everything that was found."""
     found, new = place.registration, place.data
@@ -236,7 +232,7 @@ def _result(
 
 
 def _with_settled(
-    placement: tuple[PlacedDevices, ...], model: CalibratedKinematics, place: Before, rows: NewRows, fitted: Fit
+    placement: tuple[PlacedDevices, ...], model: CalibratedKinematics, place: Before, rows: WeighedRows, fitted: Fit
 ) -> tuple[PlacedDevices, ...]:
     """The devices with the new rows that each measured, set-ups where the fit puts them."""
     first, found = len(fitted.problem.y) - len(rows), list(placement)
@@ -259,14 +255,14 @@ def _ball_measured(before: Before) -> bool:
     return before.ball is None and own is not None and not bool(own.table.points[:, -1].isnan().all())
 
 
-def _left_over(fitted: Fit, rows: NewRows) -> Tensor:
+def _left_over(fitted: Fit, rows: WeighedRows) -> Tensor:
     """(M, R) residuals of the new rows after the fit, their devices where it puts them, m; NaN where hidden."""
     shared = fitted.problem.noise.shared[-len(rows) :]
     left = (fitted.residual[-len(rows) :] - shared @ fitted.shifts)[:, : rows.y.shape[1]]
     return left.masked_fill(~rows.visible, nan)
 
 
-def weighed(before: Before, marker: str) -> NewRows:
+def weighed(before: Before, marker: str) -> WeighedRows:
     """The new rows with their weights, and with the markers as free as is asked or as is most probable."""
     own, place, ball = before.own_markers, before.place, None if before.new_ball else before.ball
     if place is None and ball is None:
@@ -280,15 +276,15 @@ def weighed(before: Before, marker: str) -> NewRows:
     if marker != "evidence":
         return _rows(before, places[marker], marker).with_weights()
     if place is not None:
-        name = next(name for name, (first, _) in MARKER_DEVIATIONS.items() if first == place.best.metres)
+        name = next(name for name, (first, _) in MARKER_DEVIATIONS.items() if first == place.metres)
         return _rows(before, places[name], name).with_weights()
     every = {name: _rows(before, at, name).with_weights() for name, at in places.items()}
     return max(every.items(), key=lambda each: each[1].given.log_evidence() + UNMOVED_LOG_ODDS * (each[0] == "same"))[1]
 
 
-def _rows(before: Before, markers: Tensor, marker: str) -> NewRows:
+def _rows(before: Before, markers: Tensor, marker: str) -> WeighedRows:
     """The new rows with all weights 1, the markers near these places (P, 3)."""
-    rows = NewRows.of(before, markers, marker)
+    rows = WeighedRows.of(before, markers, marker)
     if rows.observe is None and before.fitted.slopes is None:
         return rows
     return rows.levelled([part.root(rows.at) for part in parts_of(rows)])
@@ -308,7 +304,7 @@ def warn_of_groups(changes: Changes) -> None:
         warn_user(sentence(what, fix="check what happened between them, and recalibrate with the rows since then"))
 
 
-def warn_of_contradictions(rows: NewRows, excess: float) -> None:
+def warn_of_contradictions(rows: WeighedRows, excess: float) -> None:
     """Warn if half of the rows hardly count, and errors are larger than those of worn joints."""
     bad = int((rows.tails.weights < OUTLIER_WEIGHT).any(1).sum())
     if bad >= LARGEST_OUTLIER_PART * len(rows) and excess > LARGEST_EXCESS:
@@ -324,7 +320,7 @@ LOG_SIZES = torch.linspace(-12.0, 4.0, 65, dtype=torch.float64, device="cpu")
 ROUNDS = 10
 
 
-def usual_drift(rows: NewRows, named: Sequence[Drift]) -> list[Drift]:
+def usual_drift(rows: WeighedRows, named: Sequence[Drift]) -> list[Drift]:
     """What may differ between the dates, besides what a test named: temperature, wear and screws change everything.
 
     In each of three groups, the geometry, the load and the transmissions of all joints, errors may differ from the old
@@ -351,7 +347,7 @@ def usual_drift(rows: NewRows, named: Sequence[Drift]) -> list[Drift]:
     return [Drift(part, size) for parts, size in zip(groups.values(), sizes, strict=True) for part in parts]
 
 
-def _likeliest(rows: NewRows, roots: list[Tensor]) -> tuple[list[float], float]:
+def _likeliest(rows: WeighedRows, roots: list[Tensor]) -> tuple[list[float], float]:
     """The sizes s^2 of changes with these columns (M, R, c), each in turn the likeliest beside the others; log odds."""
     sizes, chosen = LOG_SIZES.exp().to(rows.y), [0] * len(roots)
     prior = -0.5 * ((LOG_SIZES.to(rows.y) - USUAL_LOG) / EFOLDS).square()

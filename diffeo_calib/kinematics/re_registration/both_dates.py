@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap, SessionMarkers
-from diffeo_calib.kinematics.re_registration.linear_rows import NewDate
+from diffeo_calib.kinematics.re_registration.new_rows import NewRows
 from diffeo_calib.kinematics.re_registration.registered_map import place_slopes
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.noise import Noise, without_hidden
@@ -31,7 +31,7 @@ def joins(old: FittedMap, count: int) -> bool:
 
 
 def both_dates(
-    nominal: GeometryMap, new: NewDate, new_noise: Tensor, drifted: list[Tensor], factor: float
+    nominal: GeometryMap, new: NewRows, new_noise: Tensor, drifted: list[Tensor], factor: float
 ) -> tuple[Problem, Momenta]:
     """The problem of old and new rows, and the old momenta as its start.
 
@@ -71,7 +71,7 @@ def both_dates(
     return problem, Momenta(b, p, theta)
 
 
-def _together(new: NewDate) -> tuple[Tensor, Tensor, Observation | None]:
+def _together(new: NewRows) -> tuple[Tensor, Tensor, Observation | None]:
     """Numbers (N + M, R), m, their noise (N + M, R, R), and what they are of the points.
 
     Old rows are what was measured of k1 to first order around the fit; the old fit's own numbers if it knows.
@@ -93,7 +93,7 @@ def _together(new: NewDate) -> tuple[Tensor, Tensor, Observation | None]:
     return numbers, without_hidden(torch.cat(noise), seen), Stacked(N + M, size, m, parts)
 
 
-def _shared(nominal: GeometryMap, new: NewDate, drifted: list[Tensor]) -> Tensor:
+def _shared(nominal: GeometryMap, new: NewRows, drifted: list[Tensor]) -> Tensor:
     """(N, r, c) shifts of the old rows: those they shared already, device and markers since, what has drifted since."""
     old = new.fitted
     deformation = old.geodesic.with_nominal(FlangePoints(nominal, nominal.geometry.tool, same=True))
@@ -103,7 +103,7 @@ def _shared(nominal: GeometryMap, new: NewDate, drifted: list[Tensor]) -> Tensor
     return torch.cat([old.noise.shared, moved if old.slopes is None else old.slopes @ moved, *drifted], 2)
 
 
-def _sessions(tool: Tensor, new: NewDate, newest: GeometryMap) -> SessionMarkers:
+def _sessions(tool: Tensor, new: NewRows, newest: GeometryMap) -> SessionMarkers:
     """k0 at the controls: every session with its own markers, every row with its own payload."""
     by_row, x = new.fitted.geodesic.spec.at_controls, new.fitted.deformation.x
     session, tools = torch.zeros(len(x), dtype=torch.int64, device=x.device), tool[None]

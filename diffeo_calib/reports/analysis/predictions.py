@@ -194,7 +194,8 @@ class FitRows:
             for node in data.joint:
                 total += kernel.gram(q, node.weight * along, q, along)
                 cross += kernel.gram(node.points, node.weight * node.effect, q, along)
-        covariance = total - regression.explained(cross.T[None])[0]
+        solved = regression.solve(cross.view(*data.sensitivity.shape[:2], -1))
+        covariance = total - cross.T @ solved.flatten(0, 1)
         return (centred @ covariance @ centred).diagonal().clamp(min=0.0).sqrt()
 
     @cached_property
