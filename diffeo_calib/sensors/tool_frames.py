@@ -1,4 +1,4 @@
-"""What else shows a tool whose poses are measured: a tracker's marker, a ball in a socket, the other hand that holds it.
+"""What else shows a tool whose poses are measured: a tracker's marker, a ball in a socket, the robot's other hand.
 
 With the measured pose T of the tool, a point p that is fixed to it, and a device in the place B that is not known,
 
