@@ -15,7 +15,7 @@ from torch.testing import assert_close
 
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.measurements.csv.files import read_measurements, write_measurements
-from diffeo_calib.measurements.pose_frames import directions_of_frames, frames_of_points, points_of_frames
+from diffeo_calib.measurements.poses import directions_of_frames, frames_of_points, points_of_frames
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
 

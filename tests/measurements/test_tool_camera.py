@@ -15,8 +15,7 @@ import diffeo_calib as dc
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.csv.files import read_measurements, write_measurements
-from diffeo_calib.measurements.pose_frames import camera_jacobian, inverse_poses
-from diffeo_calib.measurements.poses import mark_points
+from diffeo_calib.measurements.poses import camera_jacobian, inverse_poses, mark_points
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.se3 import rotation, transforms
 
