@@ -208,9 +208,9 @@ class Readings(RowTable):
         shapes = [(N,), (N, 1)] if numbers == 1 else [(N, numbers)]
         fix = f"pass {numbers} per row" + ", in m" * (unit == MILLIMETRES and numbers == 1)
         read = checks.copied(given, name, *shapes, fix=fix).reshape(N, numbers).to(angles.device)
-        whose, names = checks.session_numbers([ONE_DEVICE] * N if devices is None else devices, N)
-        if whose is None:
-            raise MeasurementError.of("`devices`", expected=f"{N} names, one per row", got="none")
+        if devices is None:
+            devices = [ONE_DEVICE] * N
+        whose, names = checks.numbered(devices, N)
         known = checks.deviations(std, "std", read)
         found = cls(kind, angles, read, whose.to(HOST), names, joint_names=joints, std=known, unit=unit)
         return found.doubted(doubt)
