@@ -30,7 +30,7 @@ from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.measurements.checks import in_other_unit
-from diffeo_calib.measurements.pose_frames import own_blocks
+from diffeo_calib.measurements.poses import own_blocks
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES

@@ -31,8 +31,7 @@ from diffeo_calib.kinematics.re_registration.registered_map import HARDLY, Regis
 from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_points, tool_transform
 from diffeo_calib.maps.noise import measured_coordinates, without_hidden
 from diffeo_calib.measurements.bodies import Bodies
-from diffeo_calib.measurements.pose_frames import kind_of_points, own_blocks
-from diffeo_calib.measurements.poses import poses_from_marks
+from diffeo_calib.measurements.poses import kind_of_points, own_blocks, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES, place, rigid_fit
 from diffeo_calib.robots.se3 import skew

@@ -34,7 +34,7 @@ from diffeo_calib.kinematics.re_registration.registered_map import place_slopes,
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, mean_block
 from diffeo_calib.maps.observation import Observation
-from diffeo_calib.measurements.pose_frames import block_diagonal, own_blocks
+from diffeo_calib.measurements.poses import block_diagonal, own_blocks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.regression.factor import Factor
