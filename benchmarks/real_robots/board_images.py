@@ -50,7 +50,7 @@ from simulated_head import SeeingHead
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.measurements.pose_frames import own_blocks
+from diffeo_calib.measurements.poses import own_blocks
 from diffeo_calib.robots.se3 import skew
 
 COUNTS, NOISES_PX, TEST_ROWS = (30, 60, 120), (0.1, 0.3), 200

@@ -33,8 +33,7 @@ from robot_data import BUILT_IN, data_folder, read
 from simulated_camera import camera_arm
 
 import diffeo_calib as dc
-from diffeo_calib.measurements.pose_frames import inverse_poses
-from diffeo_calib.measurements.poses import poses_from_marks
+from diffeo_calib.measurements.poses import inverse_poses, poses_from_marks
 from diffeo_calib.robots.tree import Tree
 
 FRANKA = "franka_fr3"

@@ -42,7 +42,7 @@ from rich.console import Console
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.measurements.pose_frames import own_blocks
+from diffeo_calib.measurements.poses import own_blocks
 from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.se3 import skew
 

@@ -30,7 +30,7 @@ from simulated_body import HANDS, SimulatedUpperBody
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.measurements.pose_frames import by_frame
+from diffeo_calib.measurements.poses import by_frame
 
 ROBOTS = {"chain": (HANDS[:1], ()), "load": (HANDS[:1], HANDS[1:]), "both": (HANDS, ())}
 ROBOTS |= {"load_poses": ROBOTS["load"], "both_poses": ROBOTS["both"]}

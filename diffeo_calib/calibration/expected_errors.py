@@ -30,8 +30,8 @@ from diffeo_calib.common.errors import printable
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.placement import PLACES, rigid_fit
 from diffeo_calib.sensors.tables import device_coordinates
 
@@ -53,6 +53,8 @@ def stands_free(model: CalibratedKinematics) -> bool:
 OPEN_RATIO = 10.0
 """A direction of base and markers is open if it moves points anywhere by this factor more than in the rows, or than
 their noise."""
+MARKER_SHARE = 0.3
+"""Shift of a marker relative to that of the base from which the marker is named."""
 MOST_ROWS = 300
 """Rows of a fit that show what their configurations determine and what is expected there."""
 
@@ -85,21 +87,24 @@ class ExpectedError:
     def of(cls, model: CalibratedKinematics) -> ExpectedError:
         """That of a model."""
         fitted, q, found = model.map, model.map.everywhere, OpenPlaces.of(model.map)
-        shown, own = _shown(model), fitted.unregistered
+        shown, own, some = _shown(model), fitted.unregistered, _some_rows(fitted.x)
+
+        def rms(covariance: Tensor) -> float:
+            return _distance(shown @ covariance @ shown.mT)
+
         points, at = own.geodesic.linearised_value(q)
-        size = _deviation_of_size(own, points, at)
-        whole = _distance(shown @ fitted.posterior(q, noise=False)[1] @ shown.mT)
-        expected = whole
-        if found.motions.shape[1]:
-            left = found.without(fitted.joint_covariance(q))
-            expected = min(whole, _distance(shown @ _blocks(left, len(q)) @ shown.mT))
-        rows = _some_rows(fitted.x)
-        measured = _distance(shown @ fitted.posterior(fitted.x[rows], noise=False)[1] @ shown.mT)
         away = points[:, -3:] - points[:, -3:].mean(0)
-        share = min(size * _length(away) / max(expected, 1e-12), 1.0)
+        last = torch.eye(own.m, dtype=points.dtype, device=points.device)[-3:].expand(len(points), -1, -1)
+        along = (away / away.square().sum()).flatten()  # of a growth of the robot about the middle of its points
+        size = float((along @ own.covariance_between(at.projected(last)) @ along).clamp(min=0).sqrt())
+        whole = expected = rms(fitted.posterior(q, noise=False)[1])
+        if found.motions.shape[1]:
+            left = found.without(found.without(fitted.joint_covariance(q)).mT)
+            expected = min(whole, rms(diagonal_blocks(left, len(q))))
+        share = min(size * float(away.square().sum(1).mean().sqrt()) / max(expected, 1e-12), 1.0)
         doubt = 0.0 if model.summary is None else model.summary.length_in_doubt or 0.0
-        wider = hypot(expected, doubt), hypot(whole, doubt)
-        return cls(*wider, measured, found.names_on(model), size, share, doubt)
+        measured = rms(fitted.posterior(fitted.x[some], noise=False)[1])
+        return cls(hypot(expected, doubt), hypot(whole, doubt), measured, found.names_on(model), size, share, doubt)
 
     @property
     def sentence(self) -> str:
@@ -146,7 +151,7 @@ def expected_errors(
     places = model(q).detach().flatten(1)
 
     def from_truth(points: Tensor) -> float:
-        apart = found.left_of(points.flatten(1) - places) + places
+        apart = found.without((points.flatten(1) - places).reshape(-1, 1)).view(places.shape) + places
         apart, targets = ((shown @ each[:, :, None]).view(-1, 3) for each in (apart, places))
         apart = fitted.conditional.compared(apart, targets, rigid_fit)
         bodies = len(shown) // 3
@@ -165,24 +170,6 @@ def _shown(model: CalibratedKinematics) -> Tensor:
 def _distance(covariance: Tensor) -> float:
     """Root mean square distance, m, of covariances (M, 3 P, 3 P), m^2."""
     return float((3 * covariance.diagonal(dim1=1, dim2=2).mean()).clamp(min=0).sqrt())
-
-
-def _length(vectors: Tensor) -> float:
-    """Root mean square length of vectors (N, 3)."""
-    return float(vectors.square().sum(1).mean().sqrt())
-
-
-def _blocks(covariance: Tensor, count: int) -> Tensor:
-    """(M m, M m) -> (M, m, m) on the diagonal."""
-    return covariance.unflatten(0, (count, -1)).unflatten(2, (count, -1)).diagonal(dim1=0, dim2=2).movedim(-1, 0)
-
-
-def _deviation_of_size(fitted: FittedMap, points: Tensor, at: Linearisation) -> float:
-    """Standard deviation of the robot's size, relative, by the last of its points (M, m)."""
-    own = torch.eye(fitted.m, dtype=points.dtype, device=points.device)[-3:].expand(len(points), -1, -1)
-    away = points[:, -3:] - points[:, -3:].mean(0)
-    weight = (away / away.square().sum()).flatten()
-    return float((weight @ fitted.covariance_between(at.projected(own)) @ weight).clamp(min=0).sqrt())
 
 
 def _some_rows(x: Tensor) -> Tensor:
@@ -208,8 +195,7 @@ class OpenPlaces:
     @classmethod
     def of(cls, fitted: FittedMap) -> OpenPlaces:
         """Those of a fitted map, by the rows of its registration if it has one."""
-        other = fitted.registration is not None and not fitted.registration.same
-        root, anywhere, rows = _registered_places(fitted) if other else _places(fitted)
+        root, anywhere, rows = _places(fitted)
         A, B = ((S @ root) / S.shape[0] ** 0.5 for S in (anywhere, rows))
         noise = fitted.new_noise.diagonal().mean()
         factor = torch.linalg.cholesky(B.mT @ B + noise * torch.eye(B.shape[1], dtype=B.dtype, device=B.device))
@@ -219,75 +205,56 @@ class OpenPlaces:
         directions = root @ torch.linalg.solve_triangular(factor.mT, open_, upper=True)
         return cls(anywhere @ directions, directions)
 
-    def left_of(self, errors: Tensor) -> Tensor:
-        """Errors (M, m) at the workspace after the best motion along what is open."""
-        return self._without(errors.reshape(-1, 1)).view(errors.shape)
-
-    def without(self, covariance: Tensor) -> Tensor:
-        """The covariance (M m, M m) of errors after this motion."""
-        return self._without(self._without(covariance).mT)
-
-    def _without(self, columns: Tensor) -> Tensor:
+    def without(self, errors: Tensor) -> Tensor:
+        """Errors (M m, E) at the workspace after the best motions along what is open."""
         basis, _ = torch.linalg.qr(self.motions)
-        return columns - basis @ (basis.mT @ columns)
+        return errors - basis @ (basis.mT @ errors)
 
     def names_on(self, model: CalibratedKinematics) -> tuple[str, ...]:
         """The places in words, each once: a marker that moves together with the base is what a turn would show."""
-        return tuple(dict.fromkeys(_name(direction, model) for direction in self.directions.mT))
-
-
-MARKER_SHARE = 0.3
-"""Shift of a marker relative to that of the base from which the marker is named."""
-
-
-def _name(direction: Tensor, model: CalibratedKinematics) -> str:
-    """The place (6 + 3 P,) that is open, in words."""
-    base, markers = direction[:3], direction[6:].view(-1, 3)
-    number = int(markers.norm(dim=1).argmax()) if len(markers) else 0
-    if not len(markers) or float(markers[number].norm()) < MARKER_SHARE * float(base.norm()):
-        return "the place of the measuring frame"
-    what = model.bodies.name(number, len(model.geometry.on))
-    axis = "xyz"[int(markers[number].abs().argmax())]
-    return f"the place of the {what} on '{printable(model.geometry.on[number])}' along {axis}"
+        names = []
+        for direction in self.directions.mT:
+            base, markers = direction[:3], direction[6:].view(-1, 3)
+            shifts = markers.norm(dim=1)
+            if not len(markers) or float(shifts.max()) < MARKER_SHARE * float(base.norm()):
+                names.append("the place of the measuring frame")
+            else:
+                number = int(shifts.argmax())
+                what, on = model.bodies.name(number, len(model.geometry.on)), printable(model.geometry.on[number])
+                names.append(f"the place of the {what} on '{on}' along {'xyz'[int(markers[number].abs().argmax())]}")
+        return tuple(dict.fromkeys(names))
 
 
 def _places(model_map: FittedMap) -> tuple[Tensor, Tensor, Tensor]:
     """Square root of the covariance of base and markers, and derivatives anywhere and in the rows, see the class."""
     registration, fitted = model_map.registration, model_map.unregistered
-    nominal = fitted.geodesic.spec.nominal
+    q = fitted.everywhere
+    if registration is not None and not registration.same:  # it found other markers
+        slopes: Any = model_map.place_slopes  # pyright: ignore[reportAttributeAccessIssue]
+        return (_root(registration.covariance.to(fitted.x)), *(slopes(at) for at in (q, registration.q)))
+    nominal, conditional = fitted.geodesic.spec.nominal, fitted.conditional
     own = torch.tensor(nominal.places, dtype=torch.int64, device=fitted.x.device)
-    opened = fitted.open_directions[own]
-    conditional, q = fitted.conditional, fitted.everywhere
-    known = conditional.inner.posterior(fitted.parameters_as_points(own))[0] + opened @ opened.mT
-    values, vectors = torch.linalg.eigh(known)
-    theta = q.new_zeros(nominal.parameters)
-    anywhere = nominal.sensitivities(q, theta)[..., own].flatten(0, 1)
-    anywhere = conditional.compared_slopes(anywhere)
-    root = vectors * values.clamp(min=0).sqrt()
+    opened, theta = fitted.open_directions[own], q.new_zeros(nominal.parameters)
+    anywhere = conditional.compared_slopes(nominal.sensitivities(q, theta)[..., own].flatten(0, 1))
+    root = _root(conditional.inner.posterior(fitted.parameters_as_points(own))[0] + opened @ opened.mT)
     if registration is not None:  # its rows may show what those of the fit left open
-        rows = nominal.sensitivities(registration.q.to(q), theta)[..., own]
-        return root, anywhere, rows.flatten(0, 1)
+        return root, anywhere, nominal.sensitivities(registration.q.to(q), theta)[..., own].flatten(0, 1)
     some = _some_rows(fitted.x)
     rows = nominal.sensitivities(fitted.x[some], theta)[..., own]
     rows = rows if fitted.slopes is None else fitted.slopes[some] @ rows
-    rows = rows * fitted.noise.visible[some, :, None]
-    return root, anywhere, _unshared(rows, fitted.noise.shared[some])
+    rows, shared = (
+        (each * fitted.noise.visible[some, :, None]).flatten(0, 1) for each in (rows, fitted.noise.shared[some])
+    )
+    if shared.shape[1]:  # without what devices that the rows share would take up
+        shared = shared / shared.norm(dim=0).clamp(min=1e-12)
+        rows = rows - shared @ torch.linalg.lstsq(shared, rows, rcond=1e-6, driver="gelsd").solution
+    return root, anywhere, rows
 
 
-def _unshared(rows: Tensor, shared: Tensor) -> Tensor:
-    """Derivatives (N, r, k) as (N r, k) without what devices that the rows share (N, r, c) would take up."""
-    flat, columns = rows.flatten(0, 1), shared.flatten(0, 1)
-    if not columns.shape[1]:
-        return flat
-    columns = columns / columns.norm(dim=0).clamp(min=1e-12)
-    return flat - columns @ torch.linalg.lstsq(columns, flat, rcond=1e-6, driver="gelsd").solution
-
-
-def _registered_places(fitted: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """The same where a registration found other markers."""
-    found = fitted.registration
-    values, vectors = torch.linalg.eigh(found.covariance.to(fitted.x))
-    return (vectors * values.clamp(min=0).sqrt(), *(fitted.place_slopes(q) for q in (fitted.everywhere, found.q)))
+def _root(covariance: Tensor) -> Tensor:
+    """A square root (k, k) of a covariance that may be singular."""
+    values, vectors = torch.linalg.eigh(covariance)
+    return vectors * values.clamp(min=0).sqrt()
 
 
 STILL_RANGE = 0.05
@@ -306,44 +273,33 @@ BASE_PER_DEVIATION = 3.0
 def with_open_directions(fitted: FittedMap, measurements: Measurements, registration: Identification) -> FittedMap:
     """The same map whose covariances hold in directions that the rows leave open; the map itself if there are none.
 
+    No prior variance of theta is smaller than before.
+
     Args:
         fitted: the fitted model of a robot. measurements: what it was fitted to.
         registration: base and markers by themselves, with deviations.
     """
-    nominal = fitted.geodesic.spec.nominal
-    before = fitted.geodesic.spec.prior_variance
+    nominal, before, q = fitted.geodesic.spec.nominal, fitted.geodesic.spec.prior_variance, measurements.q
     if not isinstance(nominal, GeometryMap):
         return fitted
-    some_open = bool(undetermined_places(nominal.geometry.chain, measurements, registration))
-    variance = _variances(before, nominal, registration, measurements.q, every_joint=some_open)
-    if torch.equal(variance, before):
-        return fitted
-    return fitted.with_deformation(fitted.geodesic.with_prior(variance))
-
-
-def _variances(
-    before: Tensor, nominal: GeometryMap, registration: Identification, q: Tensor, *, every_joint: bool
-) -> Tensor:
-    """Prior variances (K,) of theta, none smaller than before; ``every_joint``: those of all joints count as unseen."""
     parts, chain, prior = nominal.geometry.slices, nominal.geometry.chain, Prior()
-    found = registration.deviations.to(before)
-    after = before.clone()
+    found, least = registration.deviations.to(before), torch.zeros_like(before)
     most = before.new_tensor([PLACES.open_base_m] * 3 + [PLACES.open_base_rad] * 3)
-    base = torch.minimum(BASE_PER_DEVIATION * found[parts["base"]], most)
-    after[parts["base"]] = torch.maximum(before[parts["base"]], base.square())
-    after[parts["tool"]] = torch.maximum(before[parts["tool"]], found[parts["tool"]].square())
+    least[parts["base"]] = torch.minimum(BASE_PER_DEVIATION * found[parts["base"]], most)
+    least[parts["tool"]] = found[parts["tool"]]
     still = (q.amax(0) - q.amin(0)) < STILL_RANGE
-    driven = (chain.coupling.to(before) != 0) & ~still  # (n_all, n)
+    unseen = ~((chain.coupling.to(before) != 0) & ~still).any(1)  # (n_all,)
+    if undetermined_places(chain, measurements, registration):
+        unseen = torch.ones_like(unseen)
     twist = before.new_tensor([prior.translation] * 3 + [prior.rotation] * 3)
-    joints = after[parts["joints"]].view(-1, 6)
-    seen = driven.any(1)[:, None] & (not every_joint)
-    after[parts["joints"]] = torch.where(seen, joints, torch.maximum(joints, twist.square())).flatten()
-    after[nominal.sag] = torch.maximum(after[nominal.sag], _unseen_sag(nominal, q))
-    return after
+    least[parts["joints"]] = (unseen[:, None] * twist).flatten()
+    least[nominal.sag] = _unseen_sag(nominal, q)
+    variance = torch.maximum(before, least.square())
+    return fitted if torch.equal(variance, before) else fitted.with_deformation(fitted.geodesic.with_prior(variance))
 
 
 def _unseen_sag(nominal: GeometryMap, q: Tensor) -> Tensor:
-    """Variances of the coefficients of sag: those of any robot for joints whose sag the rows do not show, else zero.
+    """Deviations of the coefficients of sag: those of any robot for joints whose sag the rows do not show, else zero.
 
     Where the features of a joint's sag vary little in the rows, sag is nearly constant there, and geometric errors take
     its place. How large it is elsewhere the rows do not say. Joints whose sag varies as in any poses keep their scale.
@@ -353,12 +309,12 @@ def _unseen_sag(nominal: GeometryMap, q: Tensor) -> Tensor:
         return q.new_zeros(0)
     anywhere = sag.features(sampled_configurations(nominal.geometry.chain)).to(q)
     rows, after = sag.features(q), q.new_zeros(sag.size)
-    own, joints = sag.own.to(q.device), sag.joints.to(q.device)
+    unladen, joints = sag.own.to(q.device) & ~sag.loaded.to(q.device), sag.joints.to(q.device)
     for joint in range(nominal.geometry.chain.moving):
-        mine = own & (joints == joint) & ~sag.loaded.to(q.device)
+        mine = unladen & (joints == joint)
         if bool(mine.any()) and _share(rows[:, mine], anywhere[:, mine]) < SHOWN_SHARE:
             effect = float(anywhere[:, mine].square().sum(1).mean())
-            after[mine] = SAG_DEVIATION**2 / max(effect, SMALLEST_EFFECT)
+            after[mine] = SAG_DEVIATION / max(effect, SMALLEST_EFFECT) ** 0.5
     return after
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
-from math import inf, nan
+from math import ceil, inf, nan
 from pathlib import Path
 
 import torch
@@ -39,8 +39,10 @@ MOST_ROWS, STEPS = 40, (1, 3)
 JOINTS = "q0", "q1"
 """First names of four numbers before a place that are joint values rather than a quaternion."""
 MOST_WAYS, FEW_WAYS = 60, 6
-"""Ways to read the rows that are tried with a registration; where there are more, nothing about rotations is sure."""
+"""Ways to read the rows that are tried with a registration; if half of so many are right, no rotation is sure."""
 TURNED = "robot-pose", "angle", "convention", "rotation-angle", "camera-on-tool"
+GOOD_MOTIONS = 0.75
+"""Share of the motions that are compared: those that agree best."""
 ALIKE, EXACT = 6.0, 1e-6
 """Ways that leave more than so many times what the best one leaves are wrong; and shares that are as good as none."""
 
@@ -159,7 +161,7 @@ def choices(csv: Path, sheet: Sheet) -> tuple[Source, list[Choice], list[Choice]
     texts = dict.fromkeys(one.joints.text for one in alike)
     columns = [Choice("robot-pose", text, first, sure=len(texts) == 1) for text in texts]
     units = [*_units(alike, _lengths(machine.place, _numbers(csv, sheet, machine.place)), why)]
-    if len(found) >= MOST_WAYS:
+    if 2 * len(alike) >= len(found) >= MOST_WAYS:
         both = [[one._replace(sure=one.sure and one.name not in TURNED) for one in own] for own in (columns, units)]
         columns, units = both
     return alike[0], columns, units
@@ -260,7 +262,8 @@ def _alike(
     size = max(float((place - place.mean(0)).norm(dim=1).mean()) for place, _ in bodies) or 1.0
     own, others = (_screws(*body, size) for body in bodies)
     whole = own.abs().mean(1)[:, None] + others.abs().mean(1)  # small where radians are read as degrees
-    left = ((own[:, None] - others).abs().mean(2) / whole.clamp(min=EXACT)).flatten().tolist()
+    away = (own[:, None] - others).abs().sort(dim=2).values  # the worst may be of gross rows
+    left = (away[:, :, : ceil(GOOD_MOTIONS * away.shape[2])].mean(2) / whole.clamp(min=EXACT)).flatten().tolist()
     found = sorted(zip(left, product(commanded[1], seen[1]), strict=True), key=lambda entry: entry[0])
     alike = [pair for one, pair in found if one <= ALIKE * max(found[0][0], EXACT)][: MOST_WAYS // 2]
     return [(*pair, camera) for pair in alike for camera in (False, True)]

@@ -18,7 +18,7 @@ from diffeo_calib.interop.model_file import load
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.csv.files import read_poses
 from diffeo_calib.measurements.csv.joints import PoseColumns
-from diffeo_calib.measurements.pose_frames import POINTS, by_frame
+from diffeo_calib.measurements.poses import POINTS, by_frame
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.cartesian import cartesian
 from diffeo_calib.robots.dh_file import DHFile

@@ -21,8 +21,7 @@ from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
-from diffeo_calib.measurements.pose_frames import POINTS, middles
-from diffeo_calib.measurements.poses import rotation_numbers
+from diffeo_calib.measurements.poses import POINTS, middles, rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.errors import SIZES, Evaluation, shown_unit
 from diffeo_calib.sensors.kinds import known_kinds

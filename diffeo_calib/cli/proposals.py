@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates, likely_mistakes
-from diffeo_calib.calibration.diagnostics.plausibility import unmeasured_markers
+from diffeo_calib.calibration.diagnostics.plausibility import marker_column, unmeasured_markers
 from diffeo_calib.calibration.identification.registration import register, register_sockets, spread
 from diffeo_calib.calibration.placing.readings import identify_readings
 from diffeo_calib.cli.column_names import column
@@ -75,7 +75,7 @@ def marker(source: Source) -> Choice | None:
     alone = len(source.rows.markers) == 1 and not (source.rows.sockets or source.rows.readings)
     for _, _, data in source.in_units() if alone else ():
         with quiet(), suppress(DiffeoCalibError):
-            found = likely_mistakes.marker_column(register(source.robot, data.q, data.points).geometry, data)
+            found = marker_column(register(source.robot, data.q, data.points).geometry, data)
             if found is not None:
                 return Choice("marker", found[0], f"names the marker of each row: {found[1]}")
     return None

@@ -19,8 +19,7 @@ from diffeo_calib.calibration.calibrate import Controls, calibrate
 from diffeo_calib.calibration.result import CalibrationResult
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.measurements.pose_frames import POINTS
-from diffeo_calib.measurements.poses import poses_from_marks
+from diffeo_calib.measurements.poses import POINTS, poses_from_marks
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.scales import Hyperparameters

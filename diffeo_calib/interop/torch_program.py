@@ -32,8 +32,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.kinematics.tool import TOOL_LEVER, ToolKinematics, tool_points, tool_transform
 from diffeo_calib.maps.geodesic import GeodesicDeformation
-from diffeo_calib.measurements.pose_frames import POINTS, of_frames
-from diffeo_calib.measurements.poses import poses_of_triangles
+from diffeo_calib.measurements.poses import POINTS, of_frames, poses_of_triangles
 from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.runtime.chain import tip_poses
 from diffeo_calib.runtime.flow import advanced

@@ -29,7 +29,7 @@ from diffeo_calib.kinematics.re_registration.registered_map import Registration,
 from diffeo_calib.kinematics.tool import ToolKinematics, checked_tip, tool_transform
 from diffeo_calib.kinematics.transmission import transmission
 from diffeo_calib.measurements.bodies import Bodies
-from diffeo_calib.measurements.pose_frames import (
+from diffeo_calib.measurements.poses import (
     POINTS,
     directions_of_frames,
     frames_of_points,

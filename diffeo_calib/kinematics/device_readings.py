@@ -21,7 +21,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
 from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.measurements.pose_frames import block_diagonal
+from diffeo_calib.measurements.poses import block_diagonal
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import MOUNTING, seen_mounted

@@ -20,8 +20,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.images import ONLY_CAMERA
-from diffeo_calib.measurements.pose_frames import inverse_poses
-from diffeo_calib.measurements.poses import pose_directions, poses_from_marks, rotation_numbers
+from diffeo_calib.measurements.poses import inverse_poses, pose_directions, poses_from_marks, rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import skew
 from diffeo_calib.sensors.set_ups import NUMBERS_OF_A_FRAME, SESSION, TRANSFORMS, frame_slopes, own_slopes

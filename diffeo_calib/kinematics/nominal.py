@@ -50,8 +50,8 @@ class GeometryMap(NominalMap):
     ) -> None:
         waves.check(geometry.chain.n)
         load = payload or NO_PAYLOAD
-        if not elastic:
-            load.check_elastic()
+        if load and not elastic:
+            raise InputError.of("a payload of a rigid robot", expected="elastic=True", fix="leave the payload out")
         self.geometry = geometry
         self.elasticity = GravitySag(geometry.chain, payload) if elastic else None
         self.waves, self.rigid = waves, rigid

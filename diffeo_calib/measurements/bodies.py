@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, printable
-from diffeo_calib.measurements import pose_frames
-from diffeo_calib.measurements.poses import angle_between, check_lever, mark_points, rotation_numbers
+from diffeo_calib.measurements import poses as pose_math
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.sockets import BALL
 
@@ -53,12 +52,12 @@ class Bodies:
 
     def __post_init__(self) -> None:
         if self.lever is not None:
-            check_lever(self.lever)
+            pose_math.check_lever(self.lever)
 
     @property
     def points(self) -> int:
         """Points of one of them."""
-        return 1 if self.lever is None else pose_frames.POINTS
+        return 1 if self.lever is None else pose_math.POINTS
 
     @property
     def numbers(self) -> int:
@@ -84,10 +83,10 @@ class Bodies:
         if self.lever is None:
             mean, covariance = model.predict(q, noise=noise)
             return Predicted(mean, mean, covariance, NUMBERS[:3])
-        frames, covariance = map(pose_frames.by_frame, model.predict_poses(q, noise=noise))
-        turns = rotation_numbers(frames[..., :3, :3], "rotvec")
+        frames, covariance = map(pose_math.by_frame, model.predict_poses(q, noise=noise))
+        turns = pose_math.rotation_numbers(frames[..., :3, :3], "rotvec")
         mean = torch.cat([frames[..., :3, 3], turns.to(frames)], 2)
-        return Predicted(pose_frames.points_of_frames(frames, self.lever), mean, covariance, NUMBERS)
+        return Predicted(pose_math.points_of_frames(frames, self.lever), mean, covariance, NUMBERS)
 
     def written(self, model: Any, q: Tensor) -> tuple[Tensor, Tensor]:
         """The same as files hold it: markers (N, B, 3) m, or poses; covariances."""
@@ -95,12 +94,12 @@ class Bodies:
 
     def origins(self, points: Tensor) -> Tensor:
         """Origins (N, B, 3) of bodies with points (N, P, 3), m."""
-        return points if self.lever is None else pose_frames.middles(points)
+        return points if self.lever is None else pose_math.middles(points)
 
     def averaging(self, like: Tensor) -> Tensor:
         """The origins (3 B,) as linear functions of all coordinates (m,) of points: (3 B, m), m that of ``like``."""
         mean = torch.eye(3, dtype=like.dtype, device=like.device).repeat(1, self.points) / self.points
-        return pose_frames.block_diagonal(mean.expand(1, like.shape[-1] // (3 * self.points), -1, -1))[0]
+        return pose_math.block_diagonal(mean.expand(1, like.shape[-1] // (3 * self.points), -1, -1))[0]
 
     def claimed(self, points: Tensor, covariance: Tensor, usual: Tensor) -> tuple[Tensor, Tensor]:
         """Origins (N, B, 3) of points (N, P, 3), m, and their covariances, from those of all points (N, 3 P, 3 P).
@@ -108,10 +107,10 @@ class Bodies:
         ``usual``: (N, P, 3), in place of points that are hidden.
         """
         if self.lever is None:
-            return points, pose_frames.own_blocks(covariance, points.shape[1])
-        frames = pose_frames.frames_of_points(points.where(~points.isnan(), usual), self.lever)
-        along = pose_frames.directions_of_frames(frames, self.lever)
-        whole = pose_frames.own_blocks(along @ covariance @ along.mT, frames.shape[1])
+            return points, pose_math.own_blocks(covariance, points.shape[1])
+        frames = pose_math.frames_of_points(points.where(~points.isnan(), usual), self.lever)
+        along = pose_math.directions_of_frames(frames, self.lever)
+        whole = pose_math.own_blocks(along @ covariance @ along.mT, frames.shape[1])
         return frames[..., :3, 3], whole[..., :3, :3]
 
     def noise_rms(self, noise: Tensor) -> float:
@@ -123,33 +122,27 @@ class Bodies:
         """(N, B, k) measured minus predicted by points (N, P, 3), m and rad; NaN where hidden."""
         if self.lever is None:
             return data.points - points
-        mean = pose_frames.frames_of_points(points, self.lever)
+        mean = pose_math.frames_of_points(points, self.lever)
         shift = data.frames[..., :3, 3] - mean[..., :3, 3]
-        turned = rotation_numbers(data.frames[..., :3, :3] @ mean[..., :3, :3].mT, "rotvec")
+        turned = pose_math.rotation_numbers(data.frames[..., :3, :3] @ mean[..., :3, :3].mT, "rotvec")
         return torch.cat([shift, turned], 2)
-
-    def turns(self, data: Any, points: Tensor) -> Tensor:
-        """(N, T) angles, rad, from T measured frames to those of points (N, P, 3); T is 0 for markers."""
-        if self.lever is None:
-            return points.new_zeros(len(points), 0)
-        return angle_between(pose_frames.frames_of_points(points, self.lever)[..., :3, :3], data.frames[..., :3, :3])
 
     def modes(self, data: Any) -> Tensor | None:
         """(N, T, 9, 6) displacements of points by a shift and a turn, zero where hidden; None for markers."""
         if self.lever is None:
             return None
-        return pose_frames.pose_jacobian(data.frames, self.lever, data.board).nan_to_num(0.0)
+        return pose_math.pose_jacobian(data.frames, self.lever, data.board).nan_to_num(0.0)
 
     def modes_of(self, data: Any, points: Tensor) -> Tensor | None:
         """The same of other rows of the device, whose points (K, P, 3) are known, m: a camera sees its board there."""
         if self.lever is None:
             return None
-        frames, seen = pose_frames.frames_of_points(points, self.lever), seen_board(data)
+        frames, seen = pose_math.frames_of_points(points, self.lever), seen_board(data)
         board = None
         if seen is not None:
             away = seen.origins.mean(0) - frames[:, 0, :3, 3]
             board = (frames[:, 0, :3, :3].mT @ away[..., None])[..., 0]
-        return pose_frames.pose_jacobian(frames, self.lever, board)
+        return pose_math.pose_jacobian(frames, self.lever, board)
 
     def moved_words(self, points: int) -> str:
         """Name in messages for this number of points of the tool that may have moved."""
@@ -168,13 +161,13 @@ class Bodies:
         count = data.markers // self.points
         if self.lever is None:
             return [(number if count > 1 else None, None) for number in range(count)]
-        return [(None, tip if count > 1 else None) for tip in pose_frames.frame_tips(data.on or on, count)]
+        return [(None, tip if count > 1 else None) for tip in pose_math.frame_tips(data.on or on, count)]
 
     def represented(self, data: Any) -> Any:
         """The rows with the points of these bodies."""
         if self.lever is None or data.frames is None or data.lever == self.lever:
             return data
-        return with_attributes(data, points=pose_frames.points_of_frames(data.frames, self.lever), lever=self.lever)
+        return with_attributes(data, points=pose_math.points_of_frames(data.frames, self.lever), lever=self.lever)
 
     def check_points(self, points: int) -> None:
         """Raise InputError for a number of points of a model that no such bodies have."""
@@ -193,7 +186,7 @@ class Bodies:
         if self.lever is None:
             return like.new_zeros(points, 3)
         eye = torch.eye(4, dtype=like.dtype, device=like.device)
-        return mark_points(eye, self.lever).repeat(points // pose_frames.POINTS, 1)
+        return pose_math.mark_points(eye, self.lever).repeat(points // pose_math.POINTS, 1)
 
     def prefixes(self, model: Any) -> list[str]:
         """Nothing for a single marker or frame; marker1_, ... and ball_ for the ball, TIP_ of frames."""
@@ -201,7 +194,7 @@ class Bodies:
         if count == 1:
             return [""]
         if self.lever is not None:
-            return [f"{tip}_" for tip in pose_frames.frame_tips(model.on, count)]
+            return [f"{tip}_" for tip in pose_math.frame_tips(model.on, count)]
         seen = count - model.ball
         return [*("marker_" if seen == 1 else f"marker{k + 1}_" for k in range(seen)), *[f"{BALL}_"] * model.ball]
 
@@ -209,7 +202,7 @@ class Bodies:
         """Where the bodies of a model are in the frames of their tips, for a record."""
         geometry = model.geometry
         if self.lever is not None:
-            frames = pose_frames.by_frame(model.measured_frame[None])[0]
+            frames = pose_math.by_frame(model.measured_frame[None])[0]
             for tip, frame in zip(self.tips(geometry.on), frames, strict=True):
                 yield f"measured frame in the frame of {printable(tip)}, 4 x 4 [m]:"
                 yield from matrix_lines(frame)
@@ -249,6 +242,6 @@ def matrix_lines(transform: Tensor) -> Iterator[str]:
     """A transform (4, 4) as a matrix, and as a place and a rotation vector."""
     for row in transform.tolist():
         yield "  " + " ".join(f"{value: .8f}" for value in row)
-    turn = rotation_numbers(transform[None, :3, :3], "rotvec")[0]
+    turn = pose_math.rotation_numbers(transform[None, :3, :3], "rotvec")[0]
     numbers = torch.cat([transform[:3, 3], turn]).tolist()
     yield "  x y z rx ry rz [m, rad]: " + " ".join(f"{value:.6f}" for value in numbers)

@@ -14,7 +14,7 @@ from diffeo_calib.cameras.images import Camera, Images, Sights, sighted, sighted
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, listed, sentence, warn_user
 from diffeo_calib.measurements import checks
-from diffeo_calib.measurements.pose_frames import of_frames, points_of_frames, pose_jacobian
+from diffeo_calib.measurements.poses import of_frames, points_of_frames, pose_jacobian
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.sockets import ONE_SESSION, SocketTable
 
@@ -90,7 +90,7 @@ class ImageTable(SocketTable):
                 a camera of which nothing is said.
         """
         angles, joints = checks.joint_table(q, joint_names)
-        numbers, names = checks.session_numbers(seen_by, len(angles))
+        numbers, names = (None, ()) if seen_by is None else checks.numbered(seen_by, len(angles))
         known = _known(names or (ONLY_CAMERA,), camera)
         given = torch.as_tensor(corners, dtype=torch.float64, device=HOST).detach().clone()
         if given.ndim != 3 or given.shape[2] != 5:
@@ -252,7 +252,7 @@ def _sights(corners: Sequence[Tensor], known: Mapping[str, Known], board: BoardP
 
 def errors_of_poses(poses: Tensor, covariance: Tensor, shared: Tensor, *, camera_on_tool: bool) -> dict[str, Tensor]:
     """The columns ``OF_POSES`` of boards at poses (N, 4, 4), m, in the cameras: see :class:`ImageTable`."""
-    sign = -1.0 if camera_on_tool else 1.0  # of inverse poses, see pose_frames.py
+    sign = -1.0 if camera_on_tool else 1.0  # of inverse poses, see poses.py
     larger = torch.cat([poses[:, :3, 3], torch.zeros_like(poses[:, :3, 3])], 1)[..., None]
     return dict(zip(OF_POSES, (covariance, sign * shared, sign * larger), strict=True))
 

@@ -2,12 +2,13 @@
 
 A measured pose is represented by three points fixed to its frame, an equilateral triangle around the frame's origin.
 The kinematics predict points, and flows of space move points; the rigid motion that fits the three points best gives
-the pose back.
+the pose back. One frame is measured or one on each of several tips: (N, T, 4, 4), 3 T points. Users pass and get
+(N, 4, 4) where there is a single one. A frame that a row does not show is NaN as a whole, and so are its points.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -16,7 +17,7 @@ from diffeo_calib.common.checks import as_tensor, check_number, real_tensor, wra
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.measurements.checks import quiet
 from diffeo_calib.robots import se3
-from diffeo_calib.robots.se3 import transforms
+from diffeo_calib.robots.se3 import skew, transforms
 
 ANGLE_UNITS = ("rad", "deg")
 NUMBERS = {"rotvec": 3, "quat_xyzw": 4, "quat_wxyz": 4, "matrix": 9}
@@ -28,6 +29,8 @@ LEVER = 0.1
 """Default distance [m] from a pose's origin to the three points that represent it: the size of usual tools."""
 MARKS = ((1.0, 0.0, 0.0), (-0.5, 0.75**0.5, 0.0), (-0.5, -(0.75**0.5), 0.0))
 """Directions u_k from the frame's origin to its three points, one per row: their sum is zero."""
+POINTS = 3
+"""Points that represent a frame."""
 ROUNDING = 2e-15
 """Entries of R^T R - 1 that are rounding alone: such matrices are rotations already."""
 FLATTEST_TRIANGLE_LEVERS = 1e-3
@@ -44,8 +47,11 @@ def marks(device: torch.device) -> Tensor:
     return torch.tensor(MARKS, dtype=torch.float64, device=device)
 
 
-def numbers_of(convention: object) -> int:
-    """How many numbers one rotation takes: 3, 4 or 9; InputError for an unknown convention."""
+def numbers_of(convention: object, angle: object = "rad") -> int:
+    """How many numbers one rotation takes: 3, 4 or 9; InputError for an unknown convention, or unit of angles."""
+    if angle not in ANGLE_UNITS:
+        fix = "pass the unit of the rotations"
+        raise InputError.of("`angle`", expected="'rad' or 'deg'", got=as_written(angle), fix=fix)
     if isinstance(convention, str) and convention in NUMBERS:
         return NUMBERS[convention]
     if not is_euler(convention):
@@ -87,7 +93,7 @@ def rotation_matrices(values: object, convention: str, *, angle: str = "rad", pl
         InputError: unknown convention or unit, another number of columns, values that are not finite, quaternions
             whose length is not 1 or matrices that are not orthonormal to 0.001 (row named).
     """
-    count = _numbers_in_unit(convention, angle)
+    count = numbers_of(convention, angle)
     fix = f"pass the {count} numbers of {convention!r} in every row"
     table = as_tensor(values, "rotations", ("N", count), fix=fix).detach()
     if count == 9:
@@ -118,7 +124,7 @@ def rotation_numbers(matrices: Tensor, convention: str, *, angle: str = "rad") -
     Raises:
         InputError: unknown convention or unit, or no rotation matrices.
     """
-    count, given = _numbers_in_unit(convention, angle), real_tensor(matrices, "rotations").detach()
+    count, given = numbers_of(convention, angle), real_tensor(matrices, "rotations").detach()
     if given.ndim < 3 or given.shape[-2:] != (3, 3):
         raise InputError.of("`rotations` has the wrong shape", expected="(N, 3, 3)", got=tuple(given.shape))
     seen = ~given.isnan().flatten(-2).any(-1)
@@ -228,11 +234,7 @@ def mark_jacobian(poses: Tensor, lever: float) -> Tensor:
 
     dp_k = dt + dw x (p_k - t), about the axes of the measuring frame; coordinates of a point are adjacent.
     """
-    eye = torch.eye(3, dtype=poses.dtype, device=poses.device)
-    arms = _arms(poses, lever)[..., None, :]  # (..., point, axis of the rotation, 3)
-    arms = arms.expand(*arms.shape[:-2], 3, 3)
-    by_turn = torch.linalg.cross(eye.expand_as(arms), arms).mT
-    return torch.cat([eye.expand_as(by_turn), by_turn], dim=-1).flatten(-3, -2)
+    return _by_motion(_arms(poses, lever)).flatten(-3, -2)
 
 
 def pose_directions(poses: Tensor, lever: float) -> Tensor:
@@ -260,9 +262,131 @@ def _arms(poses: Tensor, lever: float) -> Tensor:
     return lever * (marks(poses.device) @ poses[..., :3, :3].mT)
 
 
-def _numbers_in_unit(convention: str, angle: object) -> int:
-    """Numbers of a rotation; InputError for an unknown unit."""
-    if angle not in ANGLE_UNITS:
-        fix = "pass the unit of the rotations"
-        raise InputError.of("`angle`", expected="'rad' or 'deg'", got=as_written(angle), fix=fix)
-    return numbers_of(convention)
+def by_frame(values: Tensor) -> Tensor:
+    """Poses (N, 4, 4) or (N, T, 4, 4), or covariances of the same form, as those of T frames: (N, T, k, k)."""
+    return values if values.ndim == 4 else values[:, None]
+
+
+def of_frames(values: Tensor) -> Tensor:
+    """The inverse of :func:`by_frame`."""
+    return values[:, 0] if values.shape[1] == 1 else values
+
+
+def checked_frames(poses: object) -> Tensor:
+    """Check poses (N, 4, 4) or (N, T, 4, 4) and return the nearest rigid ones (N, T, 4, 4), NaN where hidden.
+
+    Raises:
+        InputError: wrong shape, values that are not finite, no rigid transform, or a row without any frame.
+    """
+    given = real_tensor(poses, "poses").detach()
+    if given.ndim != 4 or given.shape[1] < 2:
+        return rigid_poses(given[:, 0] if given.ndim == 4 and given.shape[1] == 1 else given)[:, None]
+    if given.shape[2:] != (4, 4):
+        expected, got = "shape (N, 4, 4) or (N, T, 4, 4)", tuple(given.shape)
+        raise InputError.of("`poses` has the wrong shape", expected=expected, got=got, fix=ONE_POSE)
+    hidden = given.isnan().flatten(2).all(2)
+    rows = hidden.all(1).nonzero()[:, 0].tolist()
+    if rows:
+        what = f"`poses`, row {rows[0]}: no frame was seen"
+        raise InputError.of(what, expected="at least one in every row", fix="leave this row out")
+    eye = torch.eye(4, dtype=given.dtype, device=given.device)
+    count = given.shape[1]
+    flat = torch.where(hidden[..., None, None], eye, given).flatten(0, 1)
+    frames = rigid_poses(flat, lambda k: f"`poses`, row {k // count}, frame {k % count}").unflatten(0, (-1, count))
+    return frames.masked_fill(hidden[..., None, None], torch.nan)
+
+
+def points_of_frames(frames: Tensor, lever: float) -> Tensor:
+    """The points that represent T frames, those of a frame adjacent: (N, T, 4, 4) -> (N, 3 T, 3) m."""
+    return mark_points(frames, lever).flatten(1, 2)
+
+
+def frames_of_points(points: Tensor, lever: float) -> Tensor:
+    """The frames (N, T, 4, 4), NaN where hidden, of points (N, 3 T, 3), m; see :func:`poses_from_marks`."""
+    triples = points.unflatten(1, (-1, POINTS))
+    if wrapped(points):
+        check_lever(lever)
+        return poses_of_triangles(triples)
+    hidden = triples.isnan().flatten(2).any(2)
+    if not bool(hidden.any()):
+        return poses_from_marks(triples.flatten(0, 1), lever).unflatten(0, triples.shape[:2])
+    found = triples.new_full((*hidden.shape, 4, 4), torch.nan)
+    found[~hidden] = poses_from_marks(triples[~hidden], lever)
+    return found
+
+
+def middles(points: Tensor) -> Tensor:
+    """The origins (N, T, 3) of frames that 3 T points (N, 3 T, 3) represent, m."""
+    return points.unflatten(1, (-1, POINTS)).mean(2)
+
+
+def transforms_of_frames(rotations: Tensor, places: Tensor) -> Tensor:
+    """Poses (N, T, 4, 4) of rotations (N, T, 3, 3) and places (N, T, 3), m; NaN as a whole where either is."""
+    frames = transforms(rotations, places)
+    return frames.masked_fill(frames.isnan().any(3, keepdim=True).any(2, keepdim=True), torch.nan)
+
+
+def directions_of_frames(frames: Tensor, lever: float) -> Tensor:
+    """Derivatives of all (dt, dw) by all points, see :func:`pose_directions`: (N, T, 4, 4) -> (N, 6 T, 9 T)."""
+    return block_diagonal(pose_directions(frames, lever))
+
+
+def block_diagonal(blocks: Tensor) -> Tensor:
+    """Blocks (N, T, a, b) along the diagonal of matrices (N, T a, T b)."""
+    eye = torch.eye(blocks.shape[1], dtype=blocks.dtype, device=blocks.device)
+    return torch.einsum("ntab,ts->ntasb", blocks, eye).flatten(3, 4).flatten(1, 2)
+
+
+def own_blocks(matrix: Tensor, count: int) -> Tensor:
+    """The ``count`` blocks on the diagonal of matrices (N, m, m): (N, count, m / count, m / count)."""
+    index, size = torch.arange(count, device=matrix.device), matrix.shape[1] // count
+    return matrix.view(len(matrix), count, size, count, size)[:, index, :, index, :].movedim(0, 1)
+
+
+def frame_tips(on: Sequence[str] | None, frames: int) -> tuple[str, ...]:
+    """Names of measured frames: those of their tips, or frame1, frame2, ... where these are not known.
+
+    Args:
+        on: names of the tips of their points, in threes. frames: how many there are.
+    """
+    tips = tuple(on[::POINTS]) if on is not None else ()
+    return tips if len(set(tips)) == frames else tuple(f"frame{k + 1}" for k in range(frames))
+
+
+def kind_of_points(points: int, lever: float | None) -> str:
+    """Phrase for a number of points, such as "2 marker(s)", "poses" or "poses on 2 tips"."""
+    frames = points // POINTS
+    return f"{points} marker(s)" if lever is None else f"poses on {frames} tips" if frames > 1 else "poses"
+
+
+def inverse_poses(poses: Tensor) -> Tensor:
+    """Camera in the board's frame from board in the camera's frame, or the other way round: (..., 4, 4)."""
+    turned = poses[..., :3, :3].mT
+    found = transforms(turned, -(turned @ poses[..., :3, 3:])[..., 0])
+    return torch.where(poses.isnan(), poses, found)
+
+
+def camera_jacobian(poses: Tensor, lever: float, board: Tensor) -> Tensor:
+    """Derivatives (N, 9, 6) of the points of cameras at poses (N, 4, 4), m, by errors (-dt, -dw) of the board's pose.
+
+    Shift, m, and turn, rad, are along and about the axes of the camera, in whose frame the board's origin is at
+    ``board`` (N, 3), m; coordinates of a point are adjacent.
+    """
+    axes = poses[:, :3, :3]
+    arms = lever * marks(poses.device) - board[:, None]  # (N, point, 3) from the board, in the camera's frame
+    return (axes[:, None] @ _by_motion(arms)).flatten(1, 2)
+
+
+def _by_motion(arms: Tensor) -> Tensor:
+    """Derivatives (..., 3, 6) of points at arms (..., 3) by a shift and a small rotation of what carries them."""
+    return torch.cat([torch.eye(3, dtype=arms.dtype, device=arms.device).expand(*arms.shape, 3), -skew(arms)], -1)
+
+
+def pose_jacobian(poses: Tensor, lever: float, board: Tensor | None) -> Tensor:
+    """Derivatives (N, T, 9, 6) of the three points of each frame by the errors of measured poses.
+
+    Args:
+        poses: (N, T, 4, 4), m, NaN where hidden; T is 1 for a camera. lever: distance of the points, m.
+        board: see :func:`camera_jacobian`; None if the measuring device stood and saw the tool.
+    """
+    return mark_jacobian(poses, lever) if board is None else camera_jacobian(poses[:, 0], lever, board)[:, None]

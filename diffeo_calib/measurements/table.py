@@ -16,14 +16,14 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few
-from diffeo_calib.measurements import checks, pose_frames
+from diffeo_calib.measurements import checks
+from diffeo_calib.measurements import poses as pose_math
 from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.images import ImageTable
 from diffeo_calib.measurements.observations import Observations, joined_tables
-from diffeo_calib.measurements.poses import LEVER, rotation_numbers
 from diffeo_calib.measurements.readings import Readings, as_readings
 from diffeo_calib.measurements.rows import NO_SOCKET, set_attributes, value_range, with_attributes
-from diffeo_calib.measurements.sockets import ONE_SESSION, Distances, socket_numbers
+from diffeo_calib.measurements.sockets import ONE_SESSION, Distances, Sockets
 
 XYZ, TURNS = ("x", "y", "z"), ("rx", "ry", "rz")
 
@@ -110,7 +110,7 @@ class Measurements(ImageTable):
         joint_names: Sequence[str] | None = None,
         *,
         on: Sequence[str] | None = None,
-        lever: float = LEVER,
+        lever: float = pose_math.LEVER,
         position_std: object = None,
         rotation_std: object = None,
         camera_on_tool: bool = False,
@@ -133,7 +133,7 @@ class Measurements(ImageTable):
                 in the same shapes.
             camera_on_tool: the poses are those of a fixed board in the frame of a camera on the tool, as detectors of
                 boards return them, and deviations are along the camera's axes. They are kept inverted, as the camera's
-                poses in the board's frame, see :mod:`~diffeo_calib.measurements.pose_frames`.
+                poses in the board's frame, see :mod:`~diffeo_calib.measurements.poses`.
             doubt: whether to warn about rows and values that look wrong.
 
         Raises:
@@ -142,19 +142,19 @@ class Measurements(ImageTable):
         """
         angles, joints = checks.joint_table(q, joint_names)
         with checks.of_measurements():
-            frames, board = pose_frames.checked_frames(poses).to(angles.device), None
+            frames, board = pose_math.checked_frames(poses).to(angles.device), None
             if camera_on_tool:
                 if frames.shape[1] > 1:
                     what, fix = "poses of a camera on the tool", "calibrate each arm with its own camera, or give the"
                     fix += " poses of the cameras in the board's frame"
                     raise MeasurementError.of(what, expected="one tip", got=frames.shape[1], fix=fix)
-                frames, board = pose_frames.inverse_poses(frames), frames[:, 0, :3, 3]
-            points = pose_frames.points_of_frames(frames, lever)
+                frames, board = pose_math.inverse_poses(frames), frames[:, 0, :3, 3]
+            points = pose_math.points_of_frames(frames, lever)
         checks.check_rows(angles, frames, "poses")
         places = frames[..., :3, 3]
         like = places if places.shape[1] > 1 else places[:, 0]
         known = checks.deviations(position_std, "position_std", like)
-        found = {"poses": pose_frames.of_frames(frames), "lever": float(lever), "board": board}
+        found = {"poses": pose_math.of_frames(frames), "lever": float(lever), "board": board}
         found["std"] = known if known is None else known.view(places.shape)
         found["rotation_std"] = checks.deviations(rotation_std, "rotation_std", like)
         data = cls(angles, points, joints, doubt=False)
@@ -165,8 +165,8 @@ class Measurements(ImageTable):
         """Rows of markers (N, P, 3), m, or of the frames that these points stand for with a lever, m; NaN: hidden."""
         if lever is None:
             return cls(q, points, on=on, doubt=False)
-        poses = pose_frames.of_frames(pose_frames.frames_of_points(points, lever))
-        tips = None if on is None else on[:: pose_frames.POINTS]
+        poses = pose_math.of_frames(pose_math.frames_of_points(points, lever))
+        tips = None if on is None else on[:: pose_math.POINTS]
         return cls.from_poses(q, poses, on=tips, lever=lever, doubt=False)
 
     @classmethod
@@ -200,7 +200,8 @@ class Measurements(ImageTable):
                 distance without a standard deviation, or the other way round; else as the constructor.
         """
         angles, joints = checks.joint_table(q, joint_names)
-        numbers, known = socket_numbers(sockets, len(angles), distances, distance_std)
+        numbers, names = checks.numbered(sockets, len(angles), "`sockets`")
+        known = Sockets.of(names, distances, distance_std)
         nowhere = torch.zeros(len(angles), 1, 3, dtype=torch.float64, device=angles.device)
         data = cls(angles, nowhere, joints, doubt=doubt)
         return with_attributes(data, points=torch.full_like(nowhere, torch.nan), socket=numbers, sockets=known)
@@ -211,7 +212,7 @@ class Measurements(ImageTable):
 
         These are rows with the same columns, and measured positions beside rows in sockets, of one tool, whose ball is
         then the last marker. Rows of other kinds become :class:`Observations`. Beside images of a board positions
-        and rows in sockets become readings of points of the same tool, see sensors/beside_poses.py.
+        and rows in sockets become readings of points of the same tool, see sensors/tool_frames.py.
 
         Raises:
             MeasurementError: tables that differ in joints, payloads, markers or known deviations.
@@ -228,23 +229,23 @@ class Measurements(ImageTable):
 
         Coordinates of a marker are adjacent. An error dt of a pose's position and a small error w of its orientation
         move the point at arm a by dt + w x a: the covariance of its nine coordinates has rank 6, or 3 if only one of
-        these errors is known. A camera on the tool errs about the board, see measurements/pose_frames.py.
+        these errors is known. A camera on the tool errs about the board, see measurements/poses.py.
         """
         frames, std, rotation_std = self.frames, self.std, self.rotation_std
         if frames is None or self.lever is None:
             return None if std is None else torch.diag_embed(std.nan_to_num(0.0).flatten(1).square())
         if self.pose_covariance is not None:
-            slopes = pose_frames.pose_jacobian(frames, self.lever, self.board)[:, 0]
+            slopes = pose_math.pose_jacobian(frames, self.lever, self.board)[:, 0]
             return slopes @ self.pose_covariance @ slopes.mT
         if std is None and rotation_std is None:
             return None
         zero = torch.zeros_like(frames[..., :3, 3])
         position = zero if std is None else std
         rotation = zero if rotation_std is None else rotation_std.view_as(zero)
-        slopes = pose_frames.pose_jacobian(frames, self.lever, self.board)
+        slopes = pose_math.pose_jacobian(frames, self.lever, self.board)
         factor = slopes * torch.cat([position, rotation], dim=-1)[..., None, :]
         factor = factor.nan_to_num(0.0)  # hidden frames
-        return pose_frames.block_diagonal(factor @ factor.mT)
+        return pose_math.block_diagonal(factor @ factor.mT)
 
     @property
     def sha256(self) -> str:
@@ -263,7 +264,7 @@ class Measurements(ImageTable):
     @property
     def frames(self) -> Tensor | None:
         """(N, T, 4, 4) the measured poses, T = 1 included, m; NaN where hidden; None for points."""
-        return None if self.poses is None else pose_frames.by_frame(self.poses)
+        return None if self.poses is None else pose_math.by_frame(self.poses)
 
     @property
     def visible(self) -> Tensor:
@@ -302,8 +303,8 @@ class Measurements(ImageTable):
         """Names of markers or frames in messages, such as "marker 0", "the frame on 'hand'"."""
         if self.lever is None:
             return [f"marker {name}" for name in self.marker_names or range(self.markers)]
-        frames = self.markers // pose_frames.POINTS
-        tips = pose_frames.frame_tips(self.on, frames)
+        frames = self.markers // pose_math.POINTS
+        tips = pose_math.frame_tips(self.on, frames)
         return ["the frame"] if frames == 1 else [f"the frame on '{tip}'" for tip in tips]
 
     @property
@@ -338,7 +339,7 @@ class Measurements(ImageTable):
         """Beginnings of the columns of each marker or frame: none for a single one, else NAME_, TIP_; not of a ball."""
         if self.frames is not None:
             frames = self.frames.shape[1]
-            return [""] if frames == 1 else [f"{tip}_" for tip in pose_frames.frame_tips(self.on, frames)]
+            return [""] if frames == 1 else [f"{tip}_" for tip in pose_math.frame_tips(self.on, frames)]
         seen = self.markers - (self.sockets is not None)
         plain = [""] if seen == 1 else [f"marker{k + 1}_" for k in range(seen)]
         return plain if self.marker_names is None else [f"{name}_" for name in self.marker_names[:seen]]
@@ -353,7 +354,9 @@ class Measurements(ImageTable):
         names, turns = ([f"{prefix}{name}" for prefix in self.prefixes for name in own] for own in (XYZ, TURNS))
         columns |= zip(names, self.origins.flatten(1).T, strict=False)
         if self.frames is not None:
-            columns |= zip(turns, rotation_numbers(self.frames[..., :3, :3], "rotvec").flatten(1).T, strict=False)
+            columns |= zip(
+                turns, pose_math.rotation_numbers(self.frames[..., :3, :3], "rotvec").flatten(1).T, strict=False
+            )
         for known, own in ((self.std, names), (self.rotation_std, turns)):
             columns |= {} if known is None else zip([f"std_{name}" for name in own], known.flatten(1).T, strict=False)
         return columns if self.session is None else columns | {"session": self.device_names}
@@ -367,7 +370,7 @@ class Measurements(ImageTable):
 
     def with_tips(self, on: Sequence[str] | None) -> Measurements:
         """Return the same measurements with markers or poses on these tips, a name for each, else MeasurementError."""
-        points = 1 if self.poses is None else pose_frames.POINTS
+        points = 1 if self.poses is None else pose_math.POINTS
         return with_attributes(self, on=checks.tip_names(on, self.markers // points, points))
 
     def with_sessions(self, names: Sequence[str] | None, *, remounted: bool = False) -> Measurements:
@@ -385,7 +388,8 @@ class Measurements(ImageTable):
             MeasurementError: not one name per row, or poses with markers mounted anew, but for those of a camera on the
                 tool; several cameras on the tool, in several set-ups.
         """
-        numbers, known = checks.session_numbers(self.set_ups(names, remounted=remounted), len(self))
+        names = self.set_ups(names, remounted=remounted)
+        numbers, known = (None, ()) if names is None else checks.numbered(names, len(self))
         if remounted and self.lever is not None and self.board is None:
             fix = "give their positions alone (leave the rotation out)"
             raise MeasurementError.of("markers that were mounted anew", expected="positions", got="poses", fix=fix)

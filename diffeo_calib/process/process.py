@@ -21,8 +21,7 @@ from torch import Tensor
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import large_work
 from diffeo_calib.kernels.spaces import Space
-from diffeo_calib.process.covariance import Covariance
-from diffeo_calib.process.numbers import Numbers
+from diffeo_calib.process.numbers import Covariance, Numbers
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.regression.conditional import NOISE_ADVICE
 from diffeo_calib.regression.factor import Factor

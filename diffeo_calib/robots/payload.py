@@ -20,7 +20,7 @@ ABSURD, BEYOND = 1000.0, 1.1
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """Masses at one place of a robot."""
+    """Masses at one place of a robot; false where none is known, see :data:`NO_PAYLOAD`."""
 
     link: str  # name of the tip, or of the branch without markers (`load`), at whose origin the mass sits
     masses: Tensor  # of the robot everywhere (), or of N rows (N,), in any unit
@@ -56,6 +56,9 @@ class Payload:
             warn_user(sentence(f"{what} weight", fix="measure with different payloads if the robot will carry others"))
         return cls(link, masses, largest)
 
+    def __bool__(self) -> bool:
+        return bool(self.link)
+
     @property
     def by_row(self) -> bool:
         """Whether every row has a mass of its own."""
@@ -76,19 +79,30 @@ class Payload:
     @property
     def typical(self) -> Payload:
         """The median mass of all rows."""
-        return self.weighing(self.masses.median())
+        return self.weighing(self.masses.median()) if self.by_row else self
 
     def weighing(self, mass: Tensor) -> Payload:
-        """Another mass at the same place."""
+        """Another mass at the same place; InputError where the sag under a payload is not known."""
+        if not self:
+            what = "this model was calibrated without payloads: it does not know the sag under one"
+            fix = "calibrate with measurements that name their payload, Measurements.with_payload"
+            raise InputError.of(what, fix=fix)
         return replace(self, masses=mass)
 
     @property
     def mass(self) -> float | None:
         """The mass, the median of rows; None if none is known."""
-        return float(self.masses.median())
+        return float(self.masses.median()) if self else None
 
     def under(self, masses: Tensor | None) -> Payload:
-        """The same place with the masses () or (N,) of new rows; MeasurementError for rows without payload."""
+        """The same place with the masses () or (N,) of new rows; MeasurementError for payloads on one side only."""
+        if not self:
+            what, fix = (
+                "the measurements have payloads, the model was calibrated without",
+                "calibrate with payloads too",
+            )
+            check_unladen(masses, what, fix=f"{fix}, or leave them out")
+            return self
         if masses is None:
             fix = "name their column (`payload`), or pass data.with_payload(mass)"
             raise MeasurementError.of("the model was calibrated with payloads, the measurements have none", fix=fix)
@@ -105,42 +119,8 @@ class Payload:
             warn_user(sentence(what, fix="measure rows with such a payload too"))
         return self
 
-    def check_elastic(self) -> None:
-        """Raise InputError: a robot that does not bend has no sag under a payload."""
-        raise InputError.of("a payload of a rigid robot", expected="elastic=True", fix="leave the payload out")
 
-
-class NoPayload(Payload):
-    """In place of a :class:`Payload` where none is known; false."""
-
-    by_row, mass, typical = False, None, property(lambda self: self)  # pyright: ignore[reportAssignmentType]
-
-    def __init__(self) -> None:
-        super().__init__("", torch.zeros(0, dtype=torch.float64, device=HOST), 1.0)
-
-    def __bool__(self) -> bool:
-        return False
-
-    def rows(self, index: Tensor | slice) -> NoPayload:
-        """None of some rows."""
-        return self
-
-    def weighing(self, mass: Tensor) -> Payload:
-        """Raise InputError: the sag under a payload is not known."""
-        fix = "calibrate with measurements that name their payload, Measurements.with_payload"
-        raise InputError.of("this model was calibrated without payloads: it does not know the sag under one", fix=fix)
-
-    def under(self, masses: Tensor | None) -> NoPayload:
-        """None; MeasurementError for rows with payloads."""
-        fix = "calibrate with payloads too, or leave them out"
-        check_unladen(masses, "the measurements have payloads, the model was calibrated without", fix=fix)
-        return self
-
-    def check_elastic(self) -> None:
-        """Any robot may do without."""
-
-
-NO_PAYLOAD = NoPayload()
+NO_PAYLOAD = Payload("", torch.zeros((), dtype=torch.float64, device=HOST), 1.0)
 
 
 def check_same_load(masses: Tensor | None, what: str, got: object, *, fix: str) -> None:

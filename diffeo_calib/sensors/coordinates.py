@@ -16,8 +16,7 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few, listed
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake, rare_names
-from diffeo_calib.measurements.pose_frames import frames_of_points
-from diffeo_calib.measurements.poses import angle_between, rotation_numbers
+from diffeo_calib.measurements.poses import angle_between, frames_of_points, rotation_numbers
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.sockets import Sockets

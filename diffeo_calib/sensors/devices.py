@@ -20,8 +20,7 @@ from diffeo_calib.common.checks import wrapped
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.maps.observation import Observation, ReadPoints
 from diffeo_calib.measurements.checks import numbers_of, rare_names
-from diffeo_calib.measurements.pose_frames import POINTS, of_frames
-from diffeo_calib.measurements.poses import poses_of_triangles
+from diffeo_calib.measurements.poses import POINTS, of_frames, poses_of_triangles
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 from diffeo_calib.measurements.rows import FEWEST_PER_DEVICE
 from diffeo_calib.robots.placement import PLACES

@@ -19,8 +19,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.measurements.checks import numbers_of, rare_names
-from diffeo_calib.measurements.pose_frames import frames_of_points
-from diffeo_calib.measurements.poses import angle_between, poses_from_marks, poses_of_triangles
+from diffeo_calib.measurements.poses import angle_between, frames_of_points, poses_from_marks, poses_of_triangles
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES, rigid_fit

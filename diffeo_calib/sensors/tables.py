@@ -9,7 +9,7 @@ import torch
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.measurements.observations import Observations, Rows, unmixed
-from diffeo_calib.measurements.pose_frames import POINTS, kind_of_points, points_of_frames
+from diffeo_calib.measurements.poses import POINTS, kind_of_points, points_of_frames
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.table import Measurements

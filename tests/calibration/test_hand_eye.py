@@ -28,7 +28,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_sentences
 from diffeo_calib.measurements.csv.files import write_measurements
-from diffeo_calib.measurements.pose_frames import inverse_poses
+from diffeo_calib.measurements.poses import inverse_poses
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.se3 import rotation, twist_transform
 

@@ -17,8 +17,7 @@ from diffeo_calib.calibration.choose_scales import robot_problem
 from diffeo_calib.calibration.scales.differing_noise import differing_factor, noise_of_new_rows
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.maps.noise import HIDDEN_VARIANCE
-from diffeo_calib.measurements.pose_frames import pose_jacobian
-from diffeo_calib.measurements.poses import LEVER, mark_jacobian, mark_points
+from diffeo_calib.measurements.poses import LEVER, mark_jacobian, mark_points, pose_jacobian
 from diffeo_calib.regression.regions import region_factor
 
 DRAWS = 20000

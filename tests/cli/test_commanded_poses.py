@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from math import pi
 from pathlib import Path
 from typing import Any
 
@@ -385,14 +386,24 @@ def test_a_tool_is_a_rotation_vector_whatever_the_poses_are(tmp_path: Path, comm
     assert_close(*written, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize(("noise", "wrong"), [(0.017, 0.0), (0.0, 0.2)])
-def test_noise_of_a_degree_or_a_wrong_row(noise: float, wrong: float, tmp_path: Path, init: Any) -> None:
-    """Radians that are read as degrees make all turns small, and with these what they leave."""
+@pytest.mark.parametrize(
+    ("noise", "wrong", "flipped"),
+    [(0.017, [], []), (0.0, [5], []), (0.0, [5, 14], []), (0.017, [5, 6], []), (0.0, [], [4, 13])],
+)
+def test_noise_of_a_degree_and_wrong_rows(
+    noise: float, wrong: list[int], flipped: list[int], tmp_path: Path, init: Any
+) -> None:
+    """Radians that are read as degrees make all turns small, and with these what they leave.
+
+    Rows are off by 30 degrees and 10 cm, or show the board from its other end.
+    """
     commanded = flange()
     found = seen(commanded, camera_on_tool=False)
     found[:, :3, :3] = turned(noise * drawn(len(found), 3, seed=11)) @ found[:, :3, :3]
-    found[5, :3, :3] = turned(torch.full((1, 3), wrong, dtype=torch.float64))[0] @ found[5, :3, :3]
-    found[5, :3, 3] += wrong / 4
+    found[wrong, :3, :3] = turned(torch.full((1, 3), 0.3, dtype=torch.float64)) @ found[wrong, :3, :3]
+    found[wrong, :3, 3] += 0.1
+    half = transforms(turned(torch.tensor([[0.0, 0.0, pi]])), torch.tensor([[0.2, 0.15, 0.0]]))
+    found[flipped] = found[flipped] @ half
     turns = [rotation_numbers(own[:, :3, :3], "rotvec") for own in (commanded, found)]
     poses = {"X_Y_Z": commanded[:, :3, 3], "RX_RY_RZ": turns[0], "tx_ty_tz": found[:, :3, 3]}
     proposed, _ = init(write_columns(tmp_path / "t.csv", **poses, **{"rvec_x|rvec_y|rvec_z": turns[1]}))

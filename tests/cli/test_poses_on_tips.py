@@ -17,7 +17,7 @@ from two_arms_bank import HANDS, TwoArms, robot
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.measurements.csv.files import write_measurements
-from diffeo_calib.measurements.pose_frames import points_of_frames
+from diffeo_calib.measurements.poses import points_of_frames
 
 pytestmark = pytest.mark.slow
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 import torch
 from deformation_bank import deformation_of, model_of, waves_of
-from math_bank import central_difference
 from robots_bank import CHAINS, draw, every_chain
 from torch import Tensor
 from torch.testing import assert_close
@@ -57,29 +56,6 @@ def test_values_are_those_of_the_deflected_geometry(chain: Chain) -> None:
 
 
 @every_chain
-def test_jacobian_against_autograd(chain: Chain) -> None:
-    nominal, x, theta = setting(chain)
-    live = x.clone().requires_grad_()
-    expected = by_rows(nominal(live, theta), live)
-    torch.testing.assert_close(nominal.jacobian(x, theta), expected, rtol=1e-11, atol=1e-12)
-
-
-@every_chain
-@pytest.mark.parametrize("size", [0.0, 1.0])
-def test_sensitivities_against_autograd(chain: Chain, size: float) -> None:
-    """Also at zero, where nothing is deflected."""
-    nominal, x, theta = setting(chain)
-    live = (size * theta).requires_grad_()
-    values = nominal(x, live).flatten()
-    rows = [torch.autograd.grad(value, live, retain_graph=True)[0] for value in values]
-    expected = torch.stack(rows).view(N, 6, nominal.parameters)
-    actual = nominal.sensitivities(x, size * theta)
-    torch.testing.assert_close(actual, expected, rtol=1e-11, atol=1e-12)
-    if nominal.parameters > nominal.geometry.size:
-        assert float(actual[..., nominal.geometry.size :].abs().max()) > 1e-3
-
-
-@every_chain
 def test_without_elasticity_it_is_the_geometry(chain: Chain) -> None:
     geometry = geometry_of(chain)
     rigid, x, theta = GeometryMap(geometry), draw(N, chain.n, seed=13), draw(geometry.size, seed=14, size=0.1)
@@ -115,18 +91,6 @@ def test_sensitivities_per_row_are_derivatives_of_that_row() -> None:
 
 
 # --- waves of gears in the nominal map: derivatives, names, transmission errors -------------------------------------
-
-
-@every_chain
-@pytest.mark.parametrize("elastic", [True, False])
-def test_derivatives(chain: Chain, elastic: bool) -> None:
-    nominal = deformation_of(chain, elastic=elastic, waves=True).spec.nominal
-    x, theta = draw(4, chain.n, seed=1, size=2.0), draw(nominal.parameters, seed=2, size=0.03)
-    dx, dtheta = draw(4, chain.n, seed=3), draw(nominal.parameters, seed=4)
-    by_x = central_difference(lambda q: nominal(q, theta), x, dx)
-    assert_close((nominal.jacobian(x, theta) @ dx[:, :, None])[..., 0], by_x, rtol=0, atol=1e-7)
-    by_theta = central_difference(lambda t: nominal(x, t), theta, dtheta)
-    assert_close(nominal.sensitivities(x, theta) @ dtheta, by_theta, rtol=0, atol=1e-9)
 
 
 def test_a_wave_turns_its_joint_and_nothing_else() -> None:

@@ -15,7 +15,7 @@ from torch.testing import assert_close
 
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.measurements.csv.files import read_measurements, write_measurements
-from diffeo_calib.measurements.pose_frames import directions_of_frames, frames_of_points, points_of_frames
+from diffeo_calib.measurements.poses import directions_of_frames, frames_of_points, points_of_frames
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
 
@@ -169,3 +169,10 @@ def test_wrong_tables_are_one_clear_error(
     given = {"rotation": [["a", "b", "c"], ["A", "B", "C"]], "convention": "rotvec", "rotation_angle": "rad"} | options
     with pytest.raises(MeasurementError, match=says(*message)):
         read_measurements(path, ["q"], [["x", "y", "z"], ["X", "Y", "Z"]], length="m", angle="rad", **given)
+
+
+def test_points_become_poses_with_a_lever() -> None:
+    data = table(known=False)
+    again = Measurements.of_points(data.q, data.points, data.on, data.lever)
+    assert_close(held(again.poses), held(data.poses), equal_nan=True)
+    assert Measurements.of_points(data.q, data.points, None, None).poses is None

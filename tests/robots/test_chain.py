@@ -1,56 +1,16 @@
-"""Chains: poses and Jacobians against Pinocchio, derivatives, shapes, messages."""
+"""Chains: attributes, shapes, messages; joints check themselves. Poses and derivatives: test_laws.py."""
 
 import re
 from math import inf, nan, pi
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
 import pytest
 import torch
-from mimic_bank import CHAIN
+from robots_bank import CROOKED
 
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.robots import Chain, Joint, SimulatedArm, load_urdf
-from diffeo_calib.robots.se3 import skew
-
-# torch compiles its forward-mode rules on first use with torch.jit.script, which it has deprecated.
-pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
-
-# Slides and turns about crooked axes, a fixed joint in the middle, and a side branch that must be ignored.
-CROOKED = """<robot name="crooked">
-  <link name="world"/><link name="root"/><link name="a"/><link name="b"/><link name="plate"/>
-  <link name="c"/><link name="d"/><link name="end"/><link name="finger"/>
-  <joint name="stand" type="fixed"><parent link="world"/><child link="root"/>
-    <origin xyz="1 -2 0.5" rpy="0.3 -0.7 2.1"/></joint>
-  <joint name="slide" type="prismatic"><parent link="root"/><child link="a"/>
-    <origin xyz="0.1 0.2 0.3" rpy="1 2 3"/><axis xyz="0.36 0.48 0.8"/>
-    <limit lower="-0.4" upper="0.7" effort="1" velocity="1"/></joint>
-  <joint name="turn" type="revolute"><parent link="a"/><child link="b"/>
-    <origin xyz="-0.2 0.05 0.4" rpy="-0.4 0.9 0.2"/><axis xyz="-0.48 0.6 0.64"/>
-    <limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
-  <joint name="plate_mount" type="fixed"><parent link="b"/><child link="plate"/>
-    <origin xyz="0.3 0.1 -0.2" rpy="0.5 0.6 -0.7"/><axis xyz="0 0 0"/></joint>
-  <joint name="spin" type="continuous"><parent link="plate"/><child link="c"/>
-    <origin xyz="0 0 0.2" rpy="0 0.1 0"/><axis xyz="0 -1 0"/></joint>
-  <joint name="lift" type="prismatic"><parent link="c"/><child link="d"/><axis xyz="0 0 1"/>
-    <limit lower="0" upper="0.2" effort="1" velocity="1"/></joint>
-  <joint name="tool" type="fixed"><parent link="d"/><child link="end"/><origin xyz="0 0.05 0.1" rpy="0.2 0 0"/></joint>
-  <joint name="grip" type="revolute"><parent link="d"/><child link="finger"/><axis xyz="1 0 0"/>
-    <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
-</robot>"""
-
-
-@pytest.fixture(params=["crooked", "crooked from the middle", "simulated arm", "ur10"])
-def case(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, str, str]:
-    path = tmp_path / "robot.urdf"
-    if request.param == "ur10":
-        return request.getfixturevalue("ur10_folder") / "ur10_robot.urdf", "base_link", "ee_link"
-    if request.param == "simulated arm":
-        SimulatedArm().write_urdf(path)
-        return path, "base_link", "flange"
-    path.write_text(CROOKED)
-    return path, ("world" if request.param == "crooked" else "a"), "end"
 
 
 @pytest.fixture
@@ -59,60 +19,10 @@ def crooked(tmp_path: Path) -> Chain:
     return load_urdf(tmp_path / "robot.urdf", "world", "end")
 
 
-@pytest.fixture(params=["crooked", "mimic joints"])
-def chain(request: pytest.FixtureRequest, crooked: Chain) -> Chain:
-    return crooked if request.param == "crooked" else CHAIN
-
-
 def draw(chain: Chain, count: int, seed: int = 0) -> torch.Tensor:
     return (
         2 * pi * (torch.rand(count, chain.n, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) - 0.5)
     )
-
-
-def test_poses_and_jacobian_agree_with_pinocchio(case: tuple[Path, str, str]) -> None:
-    pin = pytest.importorskip("pinocchio")
-    path, base, tip = case
-    chain = load_urdf(path, base, tip)
-    model = pin.buildModelFromUrdf(str(path))
-    data = model.createData()
-    columns = [model.joints[model.getJointId(name)].idx_v for name in chain.joint_names]
-    q = draw(chain, 25)
-    poses, jacobians = chain(q), chain.jacobian(q)
-    for row in range(len(q)):
-        step = np.zeros(model.nv)
-        step[columns] = q[row].numpy()
-        configuration = pin.integrate(model, pin.neutral(model), step)
-        pin.computeJointJacobians(model, data, configuration)
-        pin.updateFramePlacements(model, data)
-        from_base = data.oMf[model.getFrameId(base)]
-        expected = from_base.actInv(data.oMf[model.getFrameId(tip)]).homogeneous
-        torch.testing.assert_close(poses[row], torch.from_numpy(expected), rtol=0, atol=1e-12)
-        turned = np.kron(np.eye(2), from_base.rotation.T)
-        world = pin.getFrameJacobian(model, data, model.getFrameId(tip), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
-        expected = torch.from_numpy((turned @ world)[:, columns])
-        torch.testing.assert_close(jacobians[row], expected, rtol=0, atol=1e-12)
-
-
-def test_jacobian_is_the_derivative_by_autograd(chain: Chain) -> None:
-    q = draw(chain, 4)
-    slopes = torch.func.vmap(torch.func.jacfwd(lambda x: chain(x[None])[0]))(q)  # (N, 4, 4, n)
-    jacobian = chain.jacobian(q)
-    torch.testing.assert_close(jacobian[:, :3], slopes[:, :3, 3], rtol=0, atol=1e-13)
-    spin = torch.einsum("nabj,ncb->njac", slopes[:, :3, :3], chain(q)[:, :3, :3])
-    torch.testing.assert_close(skew(jacobian[:, 3:].mT), spin, rtol=0, atol=1e-13)
-
-
-def test_derivatives_pass_through_every_transform(chain: Chain) -> None:
-    q, v = draw(chain, 3), draw(chain, 3, seed=1)
-    forward = torch.func.jvp(chain, (q,), (v,))[1]
-    each = torch.func.vmap(lambda x, u: torch.func.jvp(lambda z: chain(z[None])[0], (x,), (u,))[1])(q, v)
-    torch.testing.assert_close(each, forward)
-    torch.testing.assert_close(torch.einsum("nij,nj->ni", chain.jacobian(q), v)[:, :3], forward[:, :3, 3])
-    weight = torch.rand(3, 4, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-    backward = torch.autograd.grad((weight * chain(q.requires_grad_())).sum(), q)[0]
-    torch.testing.assert_close((backward * v).sum(), (weight * forward).sum())
-    assert torch.autograd.gradgradcheck(lambda x: chain.jacobian(x)[:, :3], (q[:1].detach().requires_grad_(),))
 
 
 def test_attributes_and_repr(crooked: Chain) -> None:

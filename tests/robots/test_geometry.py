@@ -62,20 +62,6 @@ def test_poses_carry_the_markers(geometry: Geometry) -> None:
     torch.testing.assert_close(geometry.points(q), expected)
 
 
-def test_sensitivities_are_the_derivatives_by_theta(geometry: Geometry, theta: Tensor) -> None:
-    q = draw(4, geometry.chain.n, seed=6)
-    expected = torch.func.jacrev(lambda x: geometry.points(q, x))(theta)
-    torch.testing.assert_close(geometry.sensitivities(q, theta), expected, rtol=0, atol=1e-11)
-    forward = torch.func.jacfwd(lambda x: geometry.points(q, x))(theta)
-    torch.testing.assert_close(geometry.sensitivities(q, theta), forward, rtol=0, atol=1e-11)
-
-
-def test_jacobian_is_the_derivative_by_the_joints(geometry: Geometry, theta: Tensor) -> None:
-    q = draw(4, geometry.chain.n, seed=6)
-    expected = torch.func.vmap(torch.func.jacrev(lambda x: geometry.points(x[None], theta)[0]))(q)
-    torch.testing.assert_close(geometry.jacobian(q, theta), expected, rtol=0, atol=1e-11)
-
-
 def test_absorbing_theta_changes_no_point(geometry: Geometry, theta: Tensor) -> None:
     q = draw(6, geometry.chain.n, seed=7)
     absorbed = geometry.absorb(theta)
@@ -83,19 +69,6 @@ def test_absorbing_theta_changes_no_point(geometry: Geometry, theta: Tensor) -> 
     torch.testing.assert_close(absorbed.jacobian(q), geometry.jacobian(q, theta), rtol=0, atol=1e-13)
     again = draw(geometry.size, seed=8, size=0.01)
     torch.testing.assert_close(absorbed.absorb(again).points(q), absorbed.points(q, again), rtol=0, atol=1e-13)
-
-
-def test_second_derivatives_exist_at_zero(geometry: Geometry) -> None:
-    q = draw(1, geometry.chain.n, seed=6)
-    zero = torch.zeros(geometry.size, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x: geometry.sensitivities(q, x), (zero,))
-    assert torch.autograd.gradcheck(lambda x: geometry.jacobian(x, zero), (q.requires_grad_(),))
-
-
-def test_sensitivities_pass_through_vmap(geometry: Geometry) -> None:
-    q = draw(3, geometry.chain.n)
-    each = torch.func.vmap(lambda x: geometry.sensitivities(x[None])[0])(q)
-    torch.testing.assert_close(each, geometry.sensitivities(q))
 
 
 def test_wrong_input_is_explained(chain: Chain) -> None:

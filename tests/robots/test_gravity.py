@@ -101,33 +101,6 @@ def test_amounts_are_moments_of_weights_at_the_places(chain: Chain) -> None:
 # --- twists, features and slopes ----------------------------------------------------------------------------------
 
 
-@every_chain
-def test_slopes_of_the_twists_against_autograd(chain: Chain) -> None:
-    sag, q = GravitySag(chain), draw(5, chain.n)
-    w, live = draw(sag.size, seed=5), q.clone().requires_grad_()
-    twists = sag.twists(live, w) + 0.0 * live.sum()  # a graph where nothing depends on q, too
-    rows = [
-        torch.autograd.grad(twists[:, joint, part].sum(), live, retain_graph=True)[0]
-        for joint in range(chain.moving)
-        for part in range(6)
-    ]
-    expected = torch.stack(rows, 1).view(5, chain.moving, 6, chain.n)
-    torch.testing.assert_close(sag.twist_slopes(q, w), expected, rtol=1e-11, atol=1e-12)
-
-
-@every_chain
-def test_sensitivities_are_derivatives_by_the_coefficients(chain: Chain) -> None:
-    sag, q = GravitySag(chain), draw(4, chain.n)
-    by_twist = draw(4, 9, chain.moving, 6, seed=6)
-
-    def response(w: Tensor) -> Tensor:
-        return torch.einsum("nmjc,njc->nm", by_twist, sag.twists(q, w))
-
-    expected = torch.func.jacrev(response)(draw(sag.size, seed=7))
-    assert isinstance(expected, Tensor)
-    torch.testing.assert_close(sag.sensitivities(q, by_twist), expected, rtol=1e-12, atol=1e-13)
-
-
 # --- the compliances of a chain --------------------------------------------------------------------------------------
 
 

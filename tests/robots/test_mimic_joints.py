@@ -1,4 +1,4 @@
-"""Mimic joints, driven by other joints: values, poses and limits of chains, DH tables and URDF files that have them."""
+"""Mimic joints, driven by other joints: values and limits of chains, DH tables and URDF files that have them."""
 
 import json
 import re
@@ -7,12 +7,10 @@ from math import inf, nan
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from mimic_bank import CHAIN, FREE, KINDS, MOVING, build, crooked_joints, expand
-from robots_bank import draw
-from torch import Tensor
+from robots_bank import LIFT, draw
 
 from diffeo_calib.common.errors import RobotError
 from diffeo_calib.robots import Chain, DHRow, Joint, from_dh, load_urdf
@@ -21,28 +19,6 @@ from diffeo_calib.robots.tree import robot_from_config
 
 # torch compiles its forward-mode rules on first use with torch.jit.script, which it has deprecated.
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
-
-
-def motion(joint: Joint, value: float) -> Tensor:
-    """The motion of one joint as a matrix exponential."""
-    x, y, z = joint.axis.tolist()
-    twist = torch.zeros(4, 4, dtype=torch.float64)
-    if joint.kind == "prismatic":
-        twist[:3, 3] = joint.axis
-    else:
-        twist[:3, :3] = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
-    return torch.linalg.matrix_exp(value * twist)
-
-
-def test_poses_multiply_out_with_the_values_of_all_joints() -> None:
-    q = draw(4, 3)
-    for row, values in zip(CHAIN(q), expand(q).tolist(), strict=True):
-        value = dict(zip(MOVING, values, strict=True))
-        pose = torch.eye(4, dtype=torch.float64)
-        for joint in CHAIN.joints:
-            pose = pose @ joint.origin
-            pose = pose if joint.kind == "fixed" else pose @ motion(joint, value[joint.name])
-        torch.testing.assert_close(row, pose, rtol=0, atol=1e-13)
 
 
 def test_coupling_is_constant_and_resolved_to_active_joints() -> None:
@@ -145,31 +121,9 @@ def test_rows_of_a_table_with_mimic(convention: str) -> None:
     torch.testing.assert_close(without_offset(q), expected(full), rtol=0, atol=1e-14)
 
 
-URDF = """<robot name="lift">
-  <link name="floor"/><link name="a"/><link name="b"/><link name="c"/><link name="d"/><link name="e"/><link name="f"/>
-  <link name="hand"/><link name="finger"/>
-  <joint name="turn" type="revolute"><parent link="floor"/><child link="a"/><origin xyz="1 0.1 0" rpy="1 2 3"/>
-    <axis xyz="0.6 0.8 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
-  <joint name="counter" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0 0.2 0.3" rpy="0.4 0 1"/>
-    <axis xyz="0 0.6 0.8"/><limit lower="-2" upper="2" effort="1" velocity="1"/>
-    <mimic joint="turn" multiplier="-0.5" offset="0.3"/></joint>
-  <joint name="rack" type="prismatic"><parent link="b"/><child link="c"/><axis xyz="0.48 0.6 0.64"/>
-    <limit lower="-2" upper="2" effort="1" velocity="1"/><mimic joint="turn" multiplier="0.1"/></joint>
-  <joint name="mount" type="fixed"><parent link="c"/><child link="d"/><origin xyz="0 0 0.4" rpy="0 1 0"/></joint>
-  <joint name="lift" type="prismatic"><parent link="d"/><child link="e"/><axis xyz="0 1 0"/>
-    <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
-  <joint name="twin" type="prismatic"><parent link="e"/><child link="f"/><origin xyz="0.1 0 0" rpy="0.2 0.3 0"/>
-    <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/><mimic joint="lift" offset="-0.1"/></joint>
-  <joint name="wrist" type="revolute"><parent link="f"/><child link="hand"/><axis xyz="1 0 0"/>
-    <origin xyz="0 0.1 0.1" rpy="0 0.1 0.2"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
-  <joint name="grip" type="revolute"><parent link="hand"/><child link="finger"/><axis xyz="1 0 0"/>
-    <limit lower="-1" upper="1" effort="1" velocity="1"/><mimic joint="wrist" multiplier="2"/></joint>
-</robot>"""
-
-
 @pytest.fixture
 def urdf(tmp_path: Path) -> Path:
-    (tmp_path / "lift.urdf").write_text(URDF)
+    (tmp_path / "lift.urdf").write_text(LIFT)
     return tmp_path / "lift.urdf"
 
 
@@ -181,24 +135,6 @@ def test_urdf_files_with_mimic_are_read(urdf: Path) -> None:
     assert chain.coupling.tolist() == expected
     assert chain.coupling_offset.tolist() == [0, 0.3, 0, 0, -0.1, 0]
     assert load_urdf(urdf, "floor", "finger").coupling[-1].tolist() == [0, 0, 2]
-
-
-def test_poses_and_jacobian_agree_with_pinocchio(urdf: Path) -> None:
-    pin = pytest.importorskip("pinocchio")
-    chain, model = load_urdf(urdf, "floor", "hand"), pin.buildModelFromUrdf(str(urdf), mimic=True)
-    data, hand = model.createData(), model.getFrameId("hand")
-    columns = [model.joints[model.getJointId(name)].idx_v for name in chain.joint_names]
-    q = draw(20, 3)
-    poses, jacobians = chain(q), chain.jacobian(q)
-    for row in range(len(q)):
-        configuration = np.zeros(model.nq)
-        configuration[columns] = q[row].numpy()
-        pin.computeJointJacobians(model, data, configuration)
-        pin.updateFramePlacements(model, data)
-        pose = torch.from_numpy(data.oMf[hand].homogeneous)
-        torch.testing.assert_close(poses[row], pose, rtol=0, atol=1e-12)
-        world = pin.getFrameJacobian(model, data, hand, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)[:, columns]
-        torch.testing.assert_close(jacobians[row], torch.from_numpy(world), rtol=0, atol=1e-12)
 
 
 def test_a_driver_off_the_path_is_a_column(urdf: Path) -> None:
@@ -220,14 +156,14 @@ def rotation_about(axis: torch.Tensor, angles: torch.Tensor) -> torch.Tensor:
 
 
 def test_a_driver_that_is_not_there_is_explained(urdf: Path) -> None:
-    urdf.write_text(URDF.replace('<mimic joint="turn" multiplier="-0.5"', '<mimic joint="twist" multiplier="-0.5"'))
+    urdf.write_text(LIFT.replace('<mimic joint="turn" multiplier="-0.5"', '<mimic joint="twist" multiplier="-0.5"'))
     message = "joint 'counter' of robot 'lift' mimics 'twist', which is not a joint between 'a' and 'hand'; choose a"
     with pytest.raises(RobotError, match=re.escape(message)):
         load_urdf(urdf, "a", "hand")
 
 
 def test_a_mimic_without_a_joint_is_explained_on_the_path_only(urdf: Path) -> None:
-    urdf.write_text(URDF.replace('<mimic joint="wrist" multiplier="2"/>', "<mimic/>"))
+    urdf.write_text(LIFT.replace('<mimic joint="wrist" multiplier="2"/>', "<mimic/>"))
     assert load_urdf(urdf, "floor", "hand").n == 3
     with pytest.raises(RobotError, match=r"<mimic> of joint 'grip' in '.*' has no attribute 'joint'; add it"):
         load_urdf(urdf, "floor", "finger")

@@ -63,23 +63,6 @@ def test_one_payload_on_a_branch_is_one_of_the_unknown_masses() -> None:
     assert moved.tolist() == own.tolist()  # its torso and its arm, not the other one
 
 
-@every_chain
-def test_derivatives_of_a_laden_robot_against_autograd(chain: Chain) -> None:
-    markers = draw(2, 3, seed=6, size=0.1)
-    geometry = Geometry.nominal(chain, 2).with_tool(markers)
-    nominal = GeometryMap(geometry, elastic=True, payload=Payload(chain.tip, MASSES, UNIT))
-    q, theta = draw(5, chain.n), draw(nominal.parameters, seed=7, size=0.02)
-
-    def one(x: Tensor, t: Tensor, row: int) -> Tensor:
-        return nominal.rows(torch.tensor([row]))(x[None], t)[0]
-
-    jacobian, sensitivities = nominal.jacobian(q, theta), nominal.sensitivities(q, theta)
-    for row in range(5):
-        by_q, by_theta = torch.autograd.functional.jacobian(lambda x, t, row=row: one(x, t, row), (q[row], theta))
-        torch.testing.assert_close(jacobian[row], by_q, rtol=1e-9, atol=1e-11)
-        torch.testing.assert_close(sensitivities[row], by_theta, rtol=1e-9, atol=1e-11)
-
-
 def test_wrong_payloads() -> None:
     arm = SimulatedArm().nominal
     with pytest.raises(InputError, match="the link of the payload: expected flange, got wrist"):

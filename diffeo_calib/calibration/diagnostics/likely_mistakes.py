@@ -47,6 +47,9 @@ from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import moving_joints_below, read_urdf
 
+GROSS_MEDIANS, KEPT_ROWS, TRIMMINGS = 3.0, 0.75, 2
+"""Distance, in medians, beyond which the rows that are the farthest off may spoil a registration: it is repeated with
+the share of rows that are closest, at most so often."""
 MOST_COLUMNS = 4
 """Most columns that are tried in the place of another one: every try is a registration."""
 NO_MISTAKE_FOUND = (
@@ -87,16 +90,28 @@ Group = Callable[[Tree, Measurements, Judge], Iterator[Reading]]
 
 
 def registered(reading: Reading) -> tuple[float, float]:
-    """Median distance after registration of a random subset of the rows, m, infinite if that cannot be done; spread."""
+    """Median distance after registration of a random subset of the rows, m, infinite if that cannot be done; spread.
+
+    Gross rows are left out of the registration, a few rounds long those that are the farthest off (P. Rousseeuw,
+    K. Van Driessen, "Computing LTS regression for large data sets", 2006).
+    """
     q, points = reading.q, reading.points
     rows = torch.randperm(len(q), generator=seeded(0), device=HOST)[: gates.REGISTERED_ROWS]
     if len(known(points)) < 2 * (6 + 3 * points.shape[1]) or not can_register(points[rows]):
         return inf, 1.0
-    try:
-        geometry = register(reading.robot, q[rows], points[rows], reading.on).geometry
-    except DiffeoCalibError:
-        return inf, 1.0
-    return float((geometry.points(q[rows]) - points[rows]).norm(dim=-1).nanmedian()), spread(points)
+    q, points, typical = q[rows], points[rows], inf
+    kept = torch.ones(len(q), dtype=torch.bool, device=q.device)
+    for _ in range(1 + TRIMMINGS):
+        try:
+            geometry = register(reading.robot, q[kept], points[kept], reading.on).geometry
+        except DiffeoCalibError:
+            break
+        off = (geometry.points(q) - points).norm(dim=-1)
+        typical, worst = min(typical, float(off.nanmedian())), off.nan_to_num(0.0).amax(1)
+        if float(worst.max()) <= GROSS_MEDIANS * typical:
+            break
+        kept = worst <= worst.quantile(KEPT_ROWS)
+    return typical, spread(reading.points) if typical < inf else 1.0
 
 
 def residual_of(robot: Tree, data: Measurements) -> float:

@@ -137,7 +137,7 @@ def check_identification(data: Measurements, identification: Identification) -> 
         fix = f"name the column: --marker {column} (in Python `marker`)"
         raise MeasurementError.of(f"column '{column}' takes {words}: which marker does a row show", fix=fix)
     size, typical = spread(data.points), _typical(identification, data)
-    angles = known(data.bodies.turns(data, identification.geometry.points(data.q)))
+    angles = known(data.bodies.errors(data, identification.geometry.points(data.q))[..., 3:].norm(dim=-1))
     if len(angles) and float((angles > gates.ORIENTATION_RAD).double().mean()) > gates.ORIENTATION_SHARE:
         what = "measured orientations"
         expected = f"errors well below {math.degrees(gates.ORIENTATION_RAD):.0f} degrees"

@@ -17,8 +17,7 @@ from diffeo_calib.cameras.board import LENS
 from diffeo_calib.cameras.images import Camera, expected, sees
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
 from diffeo_calib.measurements.images import SharedErrors
-from diffeo_calib.measurements.pose_frames import inverse_poses
-from diffeo_calib.measurements.poses import poses_from_marks
+from diffeo_calib.measurements.poses import inverse_poses, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera, Explained, camera_sentences
 from diffeo_calib.sensors.devices import OUTLIER_MEDIANS, ROW, Hypothesis, median_weights
@@ -65,13 +64,10 @@ class CameraErrors(DeviceSet):
         return found
 
     def with_rows(self, other: OtherRows) -> Any:
-        if other.coordinates is None:
+        if other.aligned is None:
             raise MeasurementError.of("rows of a camera", expected="images", got="none")
-        return replace(self.in_own_frame(other.coordinates.table), rows=other.coordinates.rows)
-
-    def in_own_frame(self, table: Measurements) -> Any:
-        (shared,) = table.shared_errors()
-        return replace(self, shared=shared)
+        (shared,) = other.aligned.table.shared_errors()
+        return replace(self, shared=shared, rows=other.aligned.rows)
 
 
 @dataclass(frozen=True, eq=False)

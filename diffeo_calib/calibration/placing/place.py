@@ -173,24 +173,30 @@ class Placed:
 
     def row_like(self, q: Tensor) -> int:
         """Number of the last row as which some of the configurations q (M, n) can be measured; else the very last."""
-        last, points = len(self.data) - 1, self.identification.geometry.points(q)
-        return next((row for row in range(last, -1, -1) if bool(self.placement.sees(row, points).any())), last)
+        last = len(self.data) - 1
+        return next((row for row in range(last, -1, -1) if bool(self.sees(row, q).any())), last)
 
     def sees(self, row: int, q: Tensor) -> Tensor:
         """(M,) boolean: configurations that can be measured as a row was, by a camera that sees its board."""
-        return self.placement.sees(row, self.identification.geometry.points(q))
+        points, views = self.identification.geometry.points(q), self.placement.views()
+        every = torch.ones(len(q), dtype=torch.bool, device=q.device)
+        return torch.stack([every, *(own.sees(row, points, views) for own in self.placement)]).all(0)
 
     def places_to_reach(self, row: int) -> dict[str, Tensor]:
         """Where configurations bring the ball that are measured as a row was: see :func:`candidates`."""
-        found, geometry = self.placement.places_at(row), self.identification.geometry
-        if found is None:
-            return {}
-        base = geometry.base.to(found)
-        return {"places": (found - base[:3, 3]) @ base[:3, :3], "ball": geometry.tool[-1]}
+        geometry = self.identification.geometry
+        for own in self.placement:
+            if (found := own.places_at(row)) is not None:
+                base = geometry.base.to(found)
+                return {"places": (found - base[:3, 3]) @ base[:3, :3], "ball": geometry.tool[-1]}
+        return {}
 
     def measured_at(self, row: int, like: Any, q: Tensor) -> Any:
         """M copies ``like`` of a row as it would be measured at q (M, n), rad or m."""
-        return self.placement.measured_at(row, like, self.identification.geometry.points(q))
+        points, views = self.identification.geometry.points(q), self.placement.views()
+        for own in self.placement:
+            like = own.measured_at(row, like, points, views)
+        return like
 
     def settled(self, fitted: Fit, fitted_map: FittedMap, chosen: ChosenScales) -> Placed:
         """The same with the devices where a fit puts them, and with all markers of the model.
@@ -204,9 +210,7 @@ class Placed:
         own = self.coordinates
         if own is not None:
             table = with_markers(own.table, self.registration.geometry.markers)
-            for one in placement:
-                table = one.at_places(table)
-            own = own._replace(table=table)
+            own = own._replace(table=placement.at_places(table))
         return replace(self, placement=placement, coordinates=own)
 
     def stage_rms(self, model: Callable[[Tensor], Tensor]) -> list[float | None]:
@@ -272,20 +276,18 @@ class Placed:
         Raises:
             MeasurementError: rows of another device.
         """
-        coordinates, readings = divided(data)
-        centre = like.points.unflatten(1, (-1, 3)).mean((0, 1))
-        other = OtherRows(data, coordinates, readings, len(data), centre)
-        placement = Placement(one.with_rows(other) for one in self.placement)
+        (coordinates, readings), aligned = divided(data), None
         if coordinates is not None:
-            table = placement.aligned(coordinates.table)
-            for one in placement:
-                table = one.at_places(table)
-            coordinates = coordinates._replace(table=table)
-            placement = Placement(one.in_own_frame(table) for one in placement)
-        count = len(data if coordinates is None else coordinates.rows)
-        tails = Tails.none(count, self.identification.tails.weights.shape[1])
+            table = self.placement.at_places(self.placement.aligned(coordinates.table))
+            aligned = coordinates._replace(table=table)
+        centre = like.points.unflatten(1, (-1, 3)).mean((0, 1))
+        other = OtherRows(data, coordinates, aligned, readings, centre)
+        placement = Placement(one.with_rows(other) for one in self.placement)
+        tails = Tails.none(
+            len(data if coordinates is None else coordinates.rows), self.identification.tails.weights.shape[1]
+        )
         found = replace(self.identification, tails=tails)
-        own = replace(self, data=data, coordinates=coordinates, placement=placement, identification=found)
+        own = replace(self, data=data, coordinates=aligned, placement=placement, identification=found)
         rows = own._rows(like.nominal.under(data.payload), like.theta)
         rows = replace(rows, held=like.held, adrift=like.adrift)
         return own, replace(rows, shared=placement.shared(rows))

@@ -18,11 +18,13 @@ from torch import Tensor
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import few, sentence
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.sensors.devices import Hypothesis
 from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import SetUps, View
@@ -54,14 +56,15 @@ class OtherRows(NamedTuple):
     """Rows of devices that are known, as they were measured.
 
     Args:
-        data: all of them. coordinates: those that tell coordinates. readings: the others, by kind. count: of all.
+        data: all of them. coordinates: those that tell coordinates. aligned: the same in the frame of the model, a ball
+            in sockets at its places. readings: the others, by kind.
         centre: (3,) the middle of the rows with which the devices were found, m.
     """
 
     data: Any
     coordinates: Coordinates | None
+    aligned: Coordinates | None
     readings: list[OtherReadings]
-    count: int
     centre: Tensor
 
 
@@ -84,6 +87,13 @@ class Settled(NamedTuple):
     transform: Tensor
     chosen: ChosenScales | None = None
     known: SetUps | None = None
+
+
+def by_row(count: int, rows: Tensor, device: Tensor) -> Tensor:
+    """(N,) numbers of the devices of ``count`` rows: those (M,) of some rows (M,), -1 elsewhere."""
+    found = torch.full((count,), NO_SOCKET, dtype=torch.int64, device=HOST)
+    found[rows] = device
+    return found
 
 
 class DeviceSet(ABC):
@@ -114,10 +124,6 @@ class DeviceSet(ABC):
         """Rows that tell coordinates where these devices put them."""
         return table
 
-    def in_own_frame(self, table: Any) -> Any:
-        """The same for rows that tell coordinates, brought into the frame of the model; see :meth:`with_rows`."""
-        return self
-
     def placed(self) -> PlacedDevices | None:
         """Their entries for the model file; None for nothing."""
         return None
@@ -141,10 +147,6 @@ class DeviceSet(ABC):
     def bodies(self) -> Mapping[str, str]:
         """Better names of what stands, and of what is on the tool, than those of diagnostics/moved_devices.py."""
         return {}
-
-    def groups(self) -> Iterable[tuple[str, Tensor]]:
-        """Rows that were measured in one set-up, (k,) row numbers, by its name; none if all were."""
-        return ()
 
     def views(self) -> Mapping[str, View]:
         """Name of a set-up -> how it sees poses of the model; none if there is one set-up."""
@@ -195,25 +197,9 @@ class Placement(tuple[DeviceSet, ...]):
         """See :attr:`DeviceSet.bodies`."""
         return {name: words for own in self for name, words in own.bodies.items()}
 
-    def sees(self, row: int, points: Tensor) -> Tensor:
-        """(M,) boolean: whether points (M, P, 3) of the model, m, can be measured as a row of the table was."""
-        views, found = self.views(), torch.ones(len(points), dtype=torch.bool, device=points.device)
-        for own in self:
-            found &= own.sees(row, points, views)
-        return found
-
     def views(self) -> dict[str, View]:
         """Those of all devices, see :meth:`DeviceSet.views`."""
         return {name: view for own in self for name, view in own.views().items()}
-
-    def measured_at(self, row: int, like: T, points: Tensor) -> T:
-        views = self.views()
-        for own in self:
-            like = own.measured_at(row, like, points, views)
-        return like
-
-    def places_at(self, row: int) -> Tensor | None:
-        return next((places for own in self if (places := own.places_at(row)) is not None), None)
 
     def shared(self, data: Seen) -> Tensor | None:
         """Effects of all devices, side by side: (N, R, c); None without any."""
@@ -239,6 +225,12 @@ class Placement(tuple[DeviceSet, ...]):
         """Measured positions in the frame of the model; unchanged where one set-up measured all."""
         for own in self:
             data = own.aligned(data)
+        return data
+
+    def at_places(self, data: T) -> T:
+        """Rows that tell coordinates, a ball in sockets at its places."""
+        for own in self:
+            data = own.at_places(data)
         return data
 
     def sentences(self) -> list[str]:

@@ -19,8 +19,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register, register_inliers
-from diffeo_calib.calibration.placing.placement import DeviceSet, OtherLabel, OtherRows, Seen, Settled
-from diffeo_calib.common.device import HOST
+from diffeo_calib.calibration.placing.placement import DeviceSet, OtherLabel, OtherRows, Seen, Settled, by_row
 from diffeo_calib.common.errors import MeasurementError, few, listed, sentence, warn_user
 from diffeo_calib.fitting.result import Progress
 from diffeo_calib.measurements.checks import numbers_of
@@ -83,24 +82,26 @@ class Sessions(DeviceSet):
             raise MeasurementError.of("rows with sockets", expected="no sessions", got=got, fix=fix)
         progress("sessions", 0, 1)
         rows = table.device_rows()
-        found = cls.find(robot, rows, set_up_kind(rows))
+        found, median = cls.find(robot, rows, set_up_kind(rows))
         if rows.lever is None:
-            _doubt(robot, rows, found)
+            _doubt(robot, rows, median)
         return [found.of_rows(own.rows[table.socket_numbers < 0], count)], found.aligned(table)
 
     @classmethod
-    def find(cls, robot: Tree, data: Measurements, kind: type[SetUps]) -> Sessions:
-        """Find what differs by geometric calibrations.
+    def find(cls, robot: Tree, data: Measurements, kind: type[SetUps]) -> tuple[Sessions, float]:
+        """What differs, by geometric calibrations, and the median distance of the session that fits worst, m.
 
         Raises:
             MeasurementError: a session with too few rows, or rows that do not fit the robot.
         """
         geometry = register_inliers(robot, data.largest_session())[0].geometry
-        found = cls.around(data, kind, geometry, geometry.points(data.q))
-        for _ in range(ROUNDS - 1):  # a better geometry gives better places
-            geometry = _geometry(robot, found.aligned(data))
+        for _ in range(ROUNDS):  # a better geometry gives better places
             found = cls.around(data, kind, geometry, geometry.points(data.q))
-        return found
+            together = found.aligned(data)
+            start = register(robot, data.q, together.points, marker_tips(robot, data)).geometry
+            geometry = identify(start, data.q, together.points).geometry
+        away, numbers = (geometry.points(data.q) - together.points).norm(dim=2), found.session
+        return found, max(float(away[numbers == number].nanmedian()) for number in numbers.unique().tolist())
 
     @classmethod
     def around(cls, data: Measurements, kind: type[SetUps], geometry: Geometry, seen: Tensor) -> Sessions:
@@ -113,7 +114,7 @@ class Sessions(DeviceSet):
     @staticmethod
     def beside(
         own: Coordinates, device: Coordinates, geometry: Geometry, seen: Tensor, count: int
-    ) -> tuple[list[DeviceSet], Coordinates]:
+    ) -> tuple[list[Sessions], Coordinates]:
         """The sessions of new rows, and these as of the largest one; none for one session.
 
         Args:
@@ -141,6 +142,7 @@ class Sessions(DeviceSet):
         return self.set_ups.aligned(data)
 
     def groups(self) -> list[tuple[str, Tensor]]:
+        """Rows (k,) of each session by its name in words."""
         return [(f"session '{name}'", (self.session == k).nonzero()[:, 0]) for k, name in enumerate(self.names)]
 
     @property
@@ -202,10 +204,11 @@ class Sessions(DeviceSet):
         return self.set_ups.sentences()
 
     def with_rows(self, other: OtherRows) -> Sessions:
-        session = torch.full((other.count,), NO_SOCKET, dtype=torch.int64, device=HOST)
         device = None if other.coordinates is None else measured_rows(other.coordinates.table)
-        if other.coordinates is not None and device is not None:
-            session[other.coordinates.rows[device.rows]] = self.numbers(device.table)
+        if other.coordinates is None or device is None:
+            session = self.session.new_full((len(other.data),), NO_SOCKET)
+        else:
+            session = by_row(len(other.data), other.coordinates.rows[device.rows], self.numbers(device.table))
         return replace(self, session=session, centre=other.centre)
 
     def numbers(self, data: Any) -> Tensor:
@@ -221,16 +224,17 @@ class Sessions(DeviceSet):
 
     def of_rows(self, rows: Tensor, count: int) -> Sessions:
         """The same for ``count`` rows of a calibration, of which these (M,) have sessions."""
-        session = torch.full((count,), NO_SOCKET, dtype=torch.int64, device=HOST)
-        session[rows] = self.session
-        return replace(self, session=session)
+        return replace(self, session=by_row(count, rows, self.session))
 
 
-def _doubt(robot: Tree, data: Measurements, found: Sessions) -> None:
-    """Warn where rows fit far better if the markers were mounted anew and the device stayed, or the other way round."""
+def _doubt(robot: Tree, data: Measurements, median: float) -> None:
+    """Warn where rows fit far better if the markers were mounted anew and the device stayed, or the other way round.
+
+    Args:
+        robot: n joints. data: rows of sessions. median: of their distances, see :meth:`Sessions.find`.
+    """
     with suppress(MeasurementError):
-        other = Sessions.find(robot, data, MeasuringFrames if data.remounted else MountedMarkers)
-        ratio = _largest_median(robot, data, other) / _largest_median(robot, data, found)
+        ratio = Sessions.find(robot, data, MeasuringFrames if data.remounted else MountedMarkers)[1] / median
         if ratio < TOLD_APART:
             moved = ("markers were mounted anew", "device"), ("device was moved", "markers")
             what, stayed = moved[data.remounted]
@@ -238,17 +242,3 @@ def _doubt(robot: Tree, data: Measurements, found: Sessions) -> None:
             option = "leave out" if data.remounted else "add"
             fix = f"{option} --remounted (in Python `remounted=True` of `with_sessions`) if that is so"
             warn_user(sentence(words, fix=fix))
-
-
-def _geometry(robot: Tree, data: Measurements) -> Geometry:
-    """Geometric calibration by all rows."""
-    start = register(robot, data.q, data.points, marker_tips(robot, data))
-    return identify(start.geometry, data.q, data.points).geometry
-
-
-def _largest_median(robot: Tree, data: Measurements, sessions: Sessions) -> float:
-    """Median distance of a session's rows from the geometric calibration of all, m: that of the worst session."""
-    together = sessions.aligned(data)
-    away = (_geometry(robot, together).points(data.q) - together.points).norm(dim=2)
-    numbers = sessions.numbers(data)
-    return max(float(away[numbers == number].nanmedian()) for number in numbers.unique().tolist())

@@ -33,8 +33,7 @@ from diffeo_calib.calibration.identification.registration import (
     register_sockets,
     socket_means,
 )
-from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
-from diffeo_calib.common.device import HOST
+from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled, by_row
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -112,21 +111,16 @@ class SocketDevices(DeviceSet):
     def around(cls, data: Measurements, positions: Tensor) -> SocketDevices:
         """The sockets of a table, wide around positions (S, 3), and with the known distances linearised there [m]."""
         eye = torch.eye(positions.numel(), dtype=positions.dtype, device=positions.device)
-        precision, sockets = eye / PLACES.found_m_rad**2, data.known_sockets
-        push = torch.zeros_like(positions).flatten()
+        precision, push, sockets = eye / PLACES.found_m_rad**2, positions.new_zeros(len(eye)), data.known_sockets
+        one_hot = torch.eye(len(positions), dtype=positions.dtype, device=positions.device)
         for known in sockets.blocks:
-            U = positions.new_zeros(len(known), *positions.shape)
-            errors = positions.new_zeros(len(known))
-            for number, (first, second, length) in enumerate(known):
-                away = positions[second] - positions[first]
-                U[number, second] = away / away.norm()
-                U[number, first] = -U[number, second]
-                errors[number] = length - float(away.norm())
-            U = U.flatten(1)
+            first, second, lengths = (list(each) for each in zip(*known, strict=True))
+            away = positions[second] - positions[first]
+            U = (one_hot[second] - one_hot[first])[:, :, None] * torch.nn.functional.normalize(away)[:, None]
+            errors, U = away.new_tensor(lengths) - away.norm(dim=1), U.flatten(1)
             own = torch.eye(len(known), dtype=U.dtype, device=U.device) * ALIKE**2
             weighed = torch.linalg.solve((1.0 + own) * (sockets.distance_std or 1.0) ** 2, U).mT
-            precision = precision + weighed @ U
-            push = push + weighed @ errors
+            precision, push = precision + weighed @ U, push + weighed @ errors
         factor = torch.linalg.cholesky(precision)
         root = torch.linalg.solve_triangular(factor, eye, upper=False).mT
         places = positions + (root @ (root.mT @ push)).view(-1, 3)
@@ -148,9 +142,7 @@ class SocketDevices(DeviceSet):
 
     def of_rows(self, rows: Tensor, count: int) -> SocketDevices:
         """The same for ``count`` rows of a calibration, of which these (M,) are the rows here."""
-        socket = torch.full((count,), NO_SOCKET, dtype=torch.int64, device=HOST)
-        socket[rows] = self.socket
-        return replace(self, socket=socket)
+        return replace(self, socket=by_row(count, rows, self.socket))
 
     def shared(self, coordinates: int) -> Tensor:
         """Uncertainty of the places, as errors of the last marker that rows share: (N, 3 P, 3 S), m."""
@@ -225,10 +217,9 @@ class SocketDevices(DeviceSet):
         )
 
     def with_rows(self, other: OtherRows) -> SocketDevices:
-        socket = torch.full((other.count,), NO_SOCKET, dtype=torch.int64, device=HOST)
+        socket = self.socket.new_full((len(other.data),), NO_SOCKET)
         if other.coordinates is not None:
-            table = self.named(other.coordinates.table)
-            socket[other.coordinates.rows] = table.socket_numbers
+            socket = by_row(len(other.data), other.coordinates.rows, self.named(other.coordinates.table).socket_numbers)
         return replace(self, socket=socket)
 
     def named(self, table: Measurements) -> Measurements:

@@ -17,8 +17,7 @@ from diffeo_calib.calibration.planning.sensors import Options, Scene, Sensor, Wh
 from diffeo_calib.cameras.images import Camera, expected, sees
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.hand_eye import SetUp
-from diffeo_calib.measurements.pose_frames import camera_jacobian, inverse_poses
-from diffeo_calib.measurements.poses import mark_jacobian, poses_from_marks
+from diffeo_calib.measurements.poses import camera_jacobian, inverse_poses, mark_jacobian, poses_from_marks
 from diffeo_calib.sensors.board_camera import BoardCamera
 from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import TRANSFORMS

@@ -1,19 +1,19 @@
 """New rows as a calibrated model expects them: residuals, and their covariance. Everything is in the model's frame.
 
 They are residuals y - h(k1(q; m)) of what was measured, h, from devices and markers that were found before
-(new_set_up.py), and whose places are known by their prior deviations (linear_rows.py).
+(new_set_up.py), and whose places are known by their prior deviations (kinematics/re_registration/new_rows.py).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from math import log
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
 from diffeo_calib.calibration.placing.lens import CameraErrors
@@ -22,16 +22,11 @@ from diffeo_calib.calibration.placing.placement import DeviceSet, Placement, See
 from diffeo_calib.calibration.placing.readings import ReadingDevices, reading_sets
 from diffeo_calib.calibration.placing.sockets import SocketDevices
 from diffeo_calib.calibration.recalibration.new_set_up import Before
+from diffeo_calib.calibration.recalibration.parts import parts_of
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.kinematics.nominal import FlangePoints
-from diffeo_calib.kinematics.re_registration.linear_rows import (
-    LinearRows,
-    NewDate,
-    larger,
-    noise_of_rows,
-    typical_noise,
-)
-from diffeo_calib.kinematics.re_registration.register_again import MARKER_DEVIATIONS
+from diffeo_calib.kinematics.re_registration.find_place import MARKER_DEVIATIONS, UNMOVED_LOG_ODDS
+from diffeo_calib.kinematics.re_registration.new_rows import NewRows, larger, noise_of_rows, typical_noise
 from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails, reweight
@@ -53,14 +48,13 @@ NOISE_EFOLDS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class NewRows(NewDate):
-    """Rows of a new set-up, brought into the frame of the old model.
+class WeighedRows(NewRows):
+    """Rows of a new set-up of any kinds, brought into the frame of the old model, with their weights.
 
     Args:
         before: the old map, and where devices and markers are. noise_model: how the rows were measured.
         marker: which the markers are, see MARKER_DEVIATIONS. tails: weights of the rows.
         placement: devices that stand around the old model; what is not known of them, rows share.
-        drifts: (M R, c) columns of unit variance of what has changed in the robot since, m.
     """
 
     before: Before
@@ -68,10 +62,9 @@ class NewRows(NewDate):
     marker: str
     tails: Tails
     placement: Placement
-    drifts: Tensor | None = None
 
     @classmethod
-    def of(cls, before: Before, markers: Tensor, marker: str) -> NewRows:
+    def of(cls, before: Before, markers: Tensor, marker: str) -> WeighedRows:
         """The rows with the noise of a typical old row, or their own where it is larger, all weights 1.
 
         Args:
@@ -79,53 +72,40 @@ class NewRows(NewDate):
         """
         points = FlangePoints(before.nominal.under(before.data.payload), markers, same=True)
         seen = before.fitted.geodesic.with_nominal(points)(before.data.q).detach()
-        model, noise, known = _measured(before, seen)
+        model, noise, measured = _measured(before, seen)
         frame = seen.new_full((6,), 0.0 if before.place is None else PLACES.found_m_rad)
         moved = MARKER_DEVIATIONS[marker][1] * before.seen_before.repeat_interleave(3).to(frame)
+        nothing = torch.diag(0.0 * torch.cat([frame, moved]))
         rows = cls(
-            before.fitted,
-            points,
-            before.data.q,
+            fitted=before.fitted,
+            points=points,
+            transform=before.transform,
+            q=before.data.q,
             noise=noise,
-            visible=model.coordinates(known["y"]),
+            visible=model.coordinates(measured["y"]),
             shared=noise[..., :0],
             deviations=torch.cat([frame, moved]),
+            away=nothing[0],
+            known=nothing,
+            by_fit=nothing[6:, 6:],
             centre=seen.view(-1, 3).mean(0),
+            drifts=noise[..., :0].flatten(0, 1),
             before=before,
             noise_model=model,
             marker=marker,
             tails=Tails.none(len(seen), model.bodies, device=seen.device),
-            **known,
+            **measured,
         )
-        by_tool = torch.nn.functional.pad(rows.by_places[..., 6:], (before.nominal.geometry.slices["tool"].start, 0))
+        by_tool = pad(rows.by_places[..., 6:], (before.nominal.geometry.slices["tool"].start, 0))
         shared = rows.placement.shared(SeenRows(before.nominal, rows.y, rows.seen[0], rows.slopes, by_tool))
         return rows if shared is None else rows.changed(shared=shared)
 
-    @cached_property
-    def shifts(self) -> Tensor:
-        """(M, R, c) effect of frame, markers and devices, each with unit prior variance, m."""
-        return torch.cat([(self.by_places * self.deviations)[..., self.deviations > 0], self.shared], 2)
-
-    @cached_property
-    def given(self) -> LinearRows:
-        """The rows to first order, with their weights."""
-        k, C = self.shifts.shape[2], self.fit_covariance
-        C = C if self.drifts is None else C + self.drifts @ self.drifts.T
-        none, prior = C.new_zeros(k, k), torch.eye(k, dtype=C.dtype, device=C.device)
-        return LinearRows(self.residual, self.shifts, C, self.weighted_noise, self.visible, prior, none.sum(0), none)
-
-    @property
-    def posterior(self) -> Tensor:
-        """(M R, M R) covariance of the rows without noise, devices and markers free, m^2."""
-        total = self.given.C + self.given.slopes @ self.given.slopes.T
-        return 0.5 * (total + total.T)
-
     @property
     def weighted_noise(self) -> Tensor:
-        """(M, m, m) covariance of the rows with their weights, m^2."""
+        """(M, R, R) R with the noise of every body divided by its weight, m^2."""
         return self.noise_model.weighted(self.noise, self.tails)
 
-    def with_weights(self) -> NewRows:
+    def with_weights(self) -> WeighedRows:
         """The same rows with the weights of Student's t, by expectation maximisation."""
         rows = self
         for _ in range(ROUNDS):
@@ -136,31 +116,21 @@ class NewRows(NewDate):
                 break
         return rows
 
-    def kept(self, index: Tensor) -> NewRows:
-        """Some of the rows."""
+    def kept(self, index: Tensor) -> WeighedRows:
+        """Some of the rows (k,), with their weights."""
         if len(index) == len(self):
             return self
-        own: dict[str, Any] = {name: getattr(self, name)[index] for name in ("q", "y", "noise", "visible", "shared")}
-        own |= {"noise_model": self.noise_model.rows(index), "tails": self.tails.rows(index)}
-        own["drifts"] = None if self.drifts is None else self.drifts.unflatten(0, self.y.shape)[index].flatten(0, 1)
-        other = replace(self, **own, observe=None if self.observe is None else self.observe.rows(index))
-        points, at = self.seen
-        vars(other).update(seen=(points[index], at.rows(index)), by_places=self.by_places[index])
-        return other
+        own = {"noise_model": self.noise_model.rows(index), "tails": self.tails.rows(index)}
+        return super().kept(index).changed(**own)
 
-    def drifting(self, roots: Sequence[Tensor]) -> NewRows:
+    def drifting(self, roots: Sequence[Tensor]) -> WeighedRows:
         """The rows where parts with these columns (M, R, c) of their covariance drift, m."""
-        own = [] if self.drifts is None else [self.drifts]
-        return self.changed(drifts=torch.cat([*own, *(root.flatten(0, 1) for root in roots)], 1)) if roots else self
+        return self.changed(drifts=torch.cat([self.drifts, *(root.flatten(0, 1) for root in roots)], 1))
 
     def evidence(self, root: Tensor) -> Evidence:
         """Of unknowns with these effects (M, R, c)."""
         E = root.flatten(0, 1)
         return Evidence(E.T @ self.given.solved.flatten(), E.T @ self.given.factor.solve(E))
-
-    def if_drifting(self, roots: Sequence[Tensor]) -> NewRows:
-        """The same with weights that hold then: a change is no outlier."""
-        return self.drifting(roots).with_weights()
 
     @property
     def new_noise(self) -> Tensor:
@@ -217,23 +187,42 @@ class NewRows(NewDate):
         squares = (self.given.solved * self.given.left_out).nansum(1) / self.given.visible.sum(1)
         return float(squares.median().sqrt())
 
-    def levelled(self, roots: list[Tensor]) -> NewRows:
-        """The rows with the likeliest noise of every kind of device that the old fit does not know.
-
-        Args:
-            roots: (M, R, c) columns of parts that may have changed: a change is no noise.
-        """
-        kinds = self.noise_model.kinds
+    def levelled(self) -> WeighedRows:
+        """The rows with the likeliest noise of every kind of device that the old fit does not know."""
+        kinds, known = self.noise_model.kinds, self.fitted.slopes is None
         kinds = torch.zeros_like(self.tails.weights, dtype=torch.int64) if kinds is None else kinds
-        rows = self.drifting(roots)
-        for kind in range(int(self.fitted.slopes is None), int(kinds.max()) + 1):
-            own = (kinds == kind).repeat_interleave(self.y.shape[1] // kinds.shape[1], 1)
-            own = own & self.visible
+        unknown = range(int(known), int(kinds.max()) + 1) if self.observe is not None or not known else ()
+        rows = self.drifting([part.root(self.at) for part in parts_of(self.fitted)] if unknown else [])  # no noise
+        for kind in unknown:
+            own = (kinds == kind).repeat_interleave(self.y.shape[1] // kinds.shape[1], 1) & self.visible
             levels = [rows.changed(noise=_scaled(rows.noise, own, float(f))) for f in NOISE_LEVELS]
             prior = [-0.5 * (log(float(f)) / NOISE_EFOLDS) ** 2 for f in NOISE_LEVELS]
             logs = [each.given.log_evidence() + p for each, p in zip(levels, prior, strict=True)]
             rows = levels[logs.index(max(logs))]
         return self.changed(noise=rows.noise)
+
+
+def weighed(before: Before, marker: str) -> WeighedRows:
+    """The new rows with their weights, and with the markers as free as is asked or as is most probable.
+
+    Args:
+        before: the old map, and where devices and markers are. marker: see :func:`diffeo_calib.recalibrate`.
+    """
+    own, place, ball = before.own_markers, before.place, None if before.new_ball else before.ball
+    other, known = own.clone(), slice(len(own) - before.new_ball)
+    if place is not None:
+        other[known] = place.registration.markers[known]
+    elif ball is not None:
+        other[-1] = ball
+    places = {"same": own, "moved": own, "other": other}
+    if place is None and ball is None:
+        names = ["same"]
+    elif marker != "evidence":
+        names = [marker]
+    else:
+        names = [name for name, (first, _) in MARKER_DEVIATIONS.items() if place is None or first == place.metres]
+    found = [WeighedRows.of(before, places[name], name).levelled().with_weights() for name in names]
+    return max(found, key=lambda one: one.given.log_evidence() + UNMOVED_LOG_ODDS * (one.marker == "same"))
 
 
 def _scaled(noise: Tensor, own: Tensor, factor: float) -> Tensor:

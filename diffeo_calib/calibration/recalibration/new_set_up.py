@@ -13,7 +13,6 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.placing.placement import DeviceSet
 from diffeo_calib.calibration.placing.readings import ball_of
 from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.placing.sockets import ball_in_sockets
@@ -24,14 +23,14 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import rows_used_in_fit
 from diffeo_calib.kinematics.joint_ranges import check_same_robot
 from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
-from diffeo_calib.kinematics.re_registration.linear_rows import NewDate
-from diffeo_calib.kinematics.re_registration.register_again import MARKER_DEVIATIONS, FoundPlace, find_place, warn_about
+from diffeo_calib.kinematics.re_registration.find_place import MARKER_DEVIATIONS, FoundPlace, find_place, warn_about
+from diffeo_calib.kinematics.re_registration.new_rows import NewRows
 from diffeo_calib.kinematics.re_registration.registered_map import Registration, robot_map
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.measurements.checks import in_other_unit
-from diffeo_calib.measurements.pose_frames import own_blocks
+from diffeo_calib.measurements.poses import own_blocks
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES
@@ -70,7 +69,7 @@ class Before:
     coordinates: Coordinates | None
     readings: list[OtherReadings]
     place: FoundPlace | None
-    sessions: list[DeviceSet]
+    sessions: list[Sessions]
     ball: Tensor | None
     new_ball: bool
 
@@ -134,7 +133,7 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
     if ball is not None and new_ball:
         old = with_ball(old, nominal, ball, ball_tip(own, readings, tip), PLACES.found_m_rad)
         nominal = robot_map(old)
-    place, sessions = None, list[DeviceSet]()
+    place, sessions = None, list[Sessions]()
     if own is not None:
         table = with_markers(own.table, nominal.geometry.markers, model.lever)
         own = own._replace(table=mounted_of(model).in_any_frame(table))
@@ -179,7 +178,7 @@ def _place_of_device(
     largest = device.largest_session()
     check_size(predicted(largest), largest.points)
     place = find_place(old, nominal, lever, largest, marker_std=marker_std)
-    warn_of_scale(place.best.date)
+    warn_of_scale(place.rows)
     turn, T = float(place.registration.frame_deviations[3:].max()), place.registration.transform
     if turn > LARGEST_TURN_RAD:
         raise MeasurementError.of(
@@ -288,7 +287,7 @@ def size_ratio(predicted: Tensor, measured: Tensor) -> float:
     return float((found[far] / expected[far]).median()) if bool((expected[far] > 0).all()) and len(expected) else 1.0
 
 
-def warn_of_scale(rows: NewDate) -> None:
+def warn_of_scale(rows: NewRows) -> None:
     """Warn if distances between points that a device measured differ by a factor that no robot has."""
     measured = rows.y.masked_fill(~rows.visible, nan)
     ratio = size_ratio(*(each.unflatten(1, (-1, 3)) for each in (rows.seen[0], measured)))

@@ -21,7 +21,7 @@ from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.maps.noise import without_hidden
-from diffeo_calib.measurements.pose_frames import own_blocks
+from diffeo_calib.measurements.poses import own_blocks
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.regression.regions import CONFIDENCE, region_factor
 

@@ -31,8 +31,7 @@ from diffeo_calib.calibration.identification.identification import Identificatio
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.noise import mean_block, without_hidden
 from diffeo_calib.measurements.bodies import seen_board
-from diffeo_calib.measurements.pose_frames import block_diagonal, inverse_poses, own_blocks
-from diffeo_calib.measurements.poses import poses_from_marks
+from diffeo_calib.measurements.poses import block_diagonal, inverse_poses, own_blocks, poses_from_marks
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.scales import Hyperparameters

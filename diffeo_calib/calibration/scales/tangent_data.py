@@ -23,8 +23,7 @@ from diffeo_calib.kinematics.nominal import GeometryMap, rigid_motions
 from diffeo_calib.maps.deformation import ModelSpec
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.maps.observation import LinearFunctionals, Observation
-from diffeo_calib.process.covariance import Covariance
-from diffeo_calib.process.numbers import Numbers
+from diffeo_calib.process.numbers import Covariance, Numbers
 from diffeo_calib.process.process import Expected, Process
 from diffeo_calib.process.scales import GearLine, Hyperparameters
 from diffeo_calib.process.tails import Tails

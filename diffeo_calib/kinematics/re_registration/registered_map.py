@@ -46,7 +46,7 @@ from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap
-from diffeo_calib.measurements.pose_frames import POINTS, own_blocks
+from diffeo_calib.measurements.poses import POINTS, own_blocks
 from diffeo_calib.regression.conditional import Conditional
 from diffeo_calib.robots.se3 import nearest_rotations, skew, transforms
 from diffeo_calib.sensors.set_ups import frame_slopes

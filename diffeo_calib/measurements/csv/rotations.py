@@ -12,8 +12,14 @@ from torch import Tensor
 from diffeo_calib.common.errors import shown
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.tables import TableOrigin
-from diffeo_calib.measurements.pose_frames import POINTS, inverse_poses, points_of_frames, transforms_of_frames
-from diffeo_calib.measurements.poses import EULER, rotation_matrices
+from diffeo_calib.measurements.poses import (
+    EULER,
+    POINTS,
+    inverse_poses,
+    points_of_frames,
+    rotation_matrices,
+    transforms_of_frames,
+)
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import flat_names
 

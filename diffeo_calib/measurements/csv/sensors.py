@@ -17,8 +17,13 @@ from diffeo_calib.measurements.csv.cells import bad_cells
 from diffeo_calib.measurements.csv.columns import DEVIATION, Body, Check, Columns, Group
 from diffeo_calib.measurements.csv.tables import FileRows
 from diffeo_calib.measurements.images import Known
-from diffeo_calib.measurements.pose_frames import inverse_poses, of_frames, transforms_of_frames
-from diffeo_calib.measurements.poses import rotation_matrices, rotation_numbers
+from diffeo_calib.measurements.poses import (
+    inverse_poses,
+    of_frames,
+    rotation_matrices,
+    rotation_numbers,
+    transforms_of_frames,
+)
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 from diffeo_calib.measurements.sockets import SEPARATOR, Distances
 from diffeo_calib.measurements.table import Measurements

@@ -31,7 +31,7 @@ from diffeo_calib.measurements.csv.sensors import (
     text_columns,
 )
 from diffeo_calib.measurements.observations import Observations
-from diffeo_calib.measurements.pose_frames import by_frame
+from diffeo_calib.measurements.poses import by_frame
 from diffeo_calib.measurements.readings import ONE_DEVICE
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
 

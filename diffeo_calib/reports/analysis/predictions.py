@@ -29,7 +29,7 @@ from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import place, residuals
 from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.measurements.pose_frames import POINTS
+from diffeo_calib.measurements.poses import POINTS
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.cholesky import CholeskyRegression
 from diffeo_calib.sensors.coordinates import sensor_of

@@ -1,0 +1,420 @@
+"""Find where the measuring device stands and where the markers sit, from a few rows and a calibrated model.
+
+With everything else kept, the rows see the model through a small motion of the measuring frame and of the markers, see
+new_rows.py, after a start in closed form (robots/placement.py). A marker either stayed where it was (within 0.01 mm),
+moved a little (1 mm), or is another one (0.3 m): the marginal likelihood of the rows chooses. The base may be anywhere.
+
+Leaving rows J out lowers their quadratic form by mu_J^T (K^-1)_JJ^-1 mu_J. Compared with what remains, this is an F
+test (externally studentised residuals), so that an outlier does not hide itself. Single rows are tried first, then
+pairs, which may hide each other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import exp, log
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.checks import check_number
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few, sentence, warn_user
+from diffeo_calib.common.quantiles import known
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
+from diffeo_calib.kinematics.re_registration.new_rows import NewRows, noise_of_rows
+from diffeo_calib.kinematics.re_registration.registered_map import HARDLY, Registration, turned, undetermined
+from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_points, tool_transform
+from diffeo_calib.maps.noise import measured_coordinates, without_hidden
+from diffeo_calib.measurements.bodies import Bodies
+from diffeo_calib.measurements.poses import kind_of_points, own_blocks, poses_from_marks
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.placement import PLACES, place, rigid_fit
+from diffeo_calib.robots.se3 import skew
+from diffeo_calib.sensors.coordinates import check_joint_order
+
+FREE = ("both", "base", "marker")
+MARKER_DEVIATIONS = {
+    "same": (PLACES.same_registered_m, PLACES.same_m),
+    "moved": (PLACES.remounted_m, PLACES.remounted_m),
+    "other": (PLACES.other_registered_m, PLACES.other_m),
+}
+"""Prior standard deviations, m, of markers from where they were, in a registration, and from where it found them."""
+SAME_PLACE, OTHER_MARKER = MARKER_DEVIATIONS["same"][0], MARKER_DEVIATIONS["other"][0]
+UNMOVED_LOG_ODDS = log(10.0)
+"""Before the rows are seen: markers that nobody names as moved have not been touched."""
+MOST_ROWS = 200
+"""Of more rows, so many evenly spaced ones take part."""
+LARGEST_OUTLIER_PART = 0.34
+"""Largest part of the rows that are taken for outliers."""
+NEGLIGIBLE_PROBABILITY = 0.01
+"""Priors that are less probable count no more."""
+LEAST_POINTS = 3
+"""Points that determine where a frame is."""
+
+
+class FoundPlace(NamedTuple):
+    """Result of a registration: rows around the most probable places, with their prior, and the record.
+
+    Args:
+        metres: prior deviation of the markers from their old places.
+    """
+
+    rows: NewRows
+    metres: float
+    registration: Registration
+
+
+def find_place(
+    model: FittedMap,
+    nominal: GeometryMap,
+    lever: float | None,
+    data: Measurements,
+    *,
+    free: str = "both",
+    marker_std: float | None = None,
+    ball: bool = False,
+) -> FoundPlace:
+    """Find where the device stands and where the markers sit.
+
+    Args:
+        model: the map, placed anew before or not. nominal: that of the fit. lever: of its frames, m; None for markers.
+        data: the rows. free, marker_std: see :meth:`CalibratedKinematics.registered`.
+        ball: whether the last marker is a ball that no row shows, and that stays where it was on the tool.
+
+    Raises:
+        InputError: arguments of another kind, or markers that are to stay, but other ones were measured.
+        MeasurementError: no more coordinates than unknowns without a prior.
+    """
+    _check_arguments(nominal, data, free, marker_std)
+    data = data.to(HOST)
+    evenly = [round(k * (len(data) - 1) / (MOST_ROWS - 1)) for k in range(MOST_ROWS)]
+    some = data if len(data) <= MOST_ROWS else data.rows(evenly)
+    nominal = nominal.under(some.payload)
+    model = model.with_nominal(nominal)
+    set_up = SetUp.of(model, nominal, lever, some, free, ball=ball)
+    priors = _priors(free, marker_std, known=set_up.known)
+    starts = set_up.starts(max(priors))
+    found = {metres: _likeliest(starts, set_up.deviations(metres), metres) for metres in priors}
+    kept, outliers = torch.arange(len(some), device=some.q.device), list[int]()
+    while True:
+        odds = _odds(found)
+        metres = max(odds, key=odds.__getitem__)
+        worst = worst_rows(found[metres])
+        if not worst or len(outliers) + len(worst) > LARGEST_OUTLIER_PART * len(some):
+            break
+        outliers += kept[worst].tolist()
+        stay = kept.new_tensor([row for row in range(len(kept)) if row not in worst])
+        kept, found = kept[stay], {one: rows.kept(stay).settled() for one, rows in found.items()}
+    said = {
+        "lever": set_up.data.lever,
+        "free": free,
+        "outliers": tuple(some.line_numbers[sorted(outliers)].tolist()) if outliers else (),
+        "rms_before": _rms(model(some.q).unflatten(1, (-1, 3)) - some.points) if set_up.known else None,
+        "same_place": odds.get(SAME_PLACE, 0.0) if len(priors) > 1 else None,
+    }
+    return FoundPlace(found[metres], metres, _record(found[metres], said, known=set_up.known))
+
+
+def _check_arguments(nominal: GeometryMap, data: Measurements, free: str, marker_std: float | None) -> None:
+    if free not in FREE:
+        raise InputError.of("`free`", expected=" or ".join(map(repr, FREE)), got=as_written(free))
+    chain = nominal.geometry.chain
+    check_joint_order(chain, data)
+    chain.joint_values(data.to(HOST).q)
+    if marker_std is not None:
+        check_number(marker_std, "`marker_std`, in m", above=0.0)
+
+
+def _priors(free: str, marker_std: float | None, *, known: bool) -> tuple[float, ...]:
+    """Prior standard deviations of the markers to try, m."""
+    if free == "base":
+        return (SAME_PLACE,)  # not used: the markers stay
+    if marker_std is not None:
+        return (marker_std,)
+    return tuple(first for first, _ in MARKER_DEVIATIONS.values()) if known else (OTHER_MARKER,)
+
+
+@dataclass(frozen=True, eq=False)
+class SetUp:
+    """What may be open in rows of a new set-up, and where a search for it may begin.
+
+    Args:
+        model: the map, placed anew before or not. nominal: that of the fit, under the payloads of the rows.
+        data: M rows that show P points. old: (P, 3) where the model has them, or at the tip, m.
+        known: whether they may be there. free: (6 + 3 P,) boolean, which unknowns of frame and points may have moved.
+    """
+
+    model: FittedMap
+    nominal: GeometryMap
+    data: Measurements
+    old: Tensor
+    known: bool
+    free: Tensor
+
+    @classmethod
+    def of(
+        cls, model: FittedMap, nominal: GeometryMap, lever: float | None, data: Measurements, free: str, *, ball: bool
+    ) -> SetUp:
+        """The rows beside a model; arguments and errors as of :func:`find_place`."""
+        before, theta = model.registration, model.unregistered.deformation.momenta.theta
+        markers = nominal.geometry.tool + theta[nominal.geometry.slices["tool"]].view(-1, 3)
+        markers = markers if before is None else before.markers
+        own, seen = Bodies(lever), data.bodies
+        known = own.kind == seen.kind and data.markers == len(markers)
+        if known:
+            data, seen = own.represented(data), own
+        elif free == "base":
+            what, fix = 'free="base" keeps the markers', 'pass free="both" for other markers'
+            got = kind_of_points(data.markers, data.lever)
+            raise InputError.of(what, expected=kind_of_points(len(markers), lever), got=got, fix=fix)
+        old = markers if known else seen.nowhere(data.markers, data.points)
+        numbers = torch.arange(6 + old.numel(), device=data.q.device)
+        may = torch.where(numbers < 6, free != "marker", free != "base") & (numbers < len(numbers) - 3 * ball)
+        _check_enough(data, framed=free != "marker", known=known)
+        return cls(model, nominal, data, old, known, may)
+
+    @property
+    def same(self) -> bool:
+        """Whether the markers are those of the fit."""
+        before = self.model.registration
+        return self.known and (before is None or before.same)
+
+    def deviations(self, metres: float) -> Tensor:
+        """(6 + 3 P,) of frame and points before the rows, for a deviation of the markers from their old places, m."""
+        own = [PLACES.sought_base_m_rad] * 6 + [metres] * self.old.numel()
+        return self.free * self.old.new_tensor(own)
+
+    def starts(self, widest: float) -> list[NewRows]:
+        """With the markers at their old places, if they are known; with markers anywhere, if they may be."""
+        framed, points = bool(self.free[0]), self.data.points
+        starts = [self.at_old_places()] if self.known or not framed else []
+        may = self.free[6:].view(points.shape[1], -1).any(1)
+        shown = (~points.isnan()).any(2).any(0) | ~may  # else some marker could be anywhere
+        # as many coordinates as unknowns would fit any place
+        if framed and bool(may.any()) and bool(shown.all()) and widest >= OTHER_MARKER:
+            starts += [self.anywhere()] if len(known(points)) > len(self.free) else []
+        return [self.rows(widest, *start) for start in starts]
+
+    def rows(self, metres: float, T: Tensor, markers: Tensor) -> NewRows:
+        """The rows around a frame (4, 4) and markers (P, 3), m."""
+        centre, noise = self._seen(self.rough).flatten(0, 1).nanmean(0), self.noise
+        there = self.data.in_frames(torch.linalg.inv(self.rough).expand(len(self.data), -1, -1))
+        nothing = noise.new_zeros(*noise.shape[:2], 0)
+        return NewRows(
+            fitted=self.model.unregistered,
+            points=FlangePoints(self.nominal, markers, same=self.same),
+            transform=T,
+            q=self.data.q,
+            y=self._seen(T).flatten(1).nan_to_num(0.0),
+            noise=noise,
+            visible=measured_coordinates(noise),
+            shared=torch.cat([nothing, *(errors.slopes for errors in there.shared_errors())], 2),
+            deviations=self.deviations(metres),
+            away=torch.cat([centre.new_zeros(6), (self.old - markers).flatten()]),
+            known=self._earlier(centre),
+            by_fit=self._by_fit(),
+            centre=centre,
+            observe=None,
+            drifts=nothing.flatten(0, 1),
+        )
+
+    def _seen(self, T: Tensor) -> Tensor:
+        """The measured points in the frame of the map, T^-1 y, m; NaN where hidden."""
+        return (self.data.points - T[:3, 3]) @ T[:3, :3]
+
+    @cached_property
+    def rough(self) -> Tensor:
+        """(4, 4) from the frame of the map to the measuring frame, in closed form, m."""
+        return (self.at_old_places() if self.known else self.anywhere())[0]
+
+    @cached_property
+    def noise(self) -> Tensor:
+        """(M, 3 P, 3 P) covariance of the rows, m^2, without information where hidden.
+
+        For another number of markers each has the mean covariance of the fitted ones.
+        """
+        block, fit, size = self.model.new_noise, self.model.unregistered, 3 * self.data.markers
+        factor = float(block.trace() / fit.new_noise.trace()) if self.known else None
+        if len(block) != size:
+            block = torch.block_diag(*[own_blocks(block[None], len(block) // 3)[0].mean(0)] * self.data.markers)
+        total = noise_of_rows(fit, self.data, self.rough, block, factor)
+        return without_hidden(total, self.data.visible.repeat_interleave(3, 1))
+
+    def _earlier(self, centre: Tensor) -> Tensor:
+        """(6 + 3 P, 6 + 3 P) covariance of frame and points by an earlier registration; zero without one."""
+        before, found = self.model.registration, centre.new_zeros(len(self.free), len(self.free))
+        if before is None:
+            return found
+        size = len(found) if self.known else 6
+        to = torch.eye(size, dtype=found.dtype, device=found.device)
+        to[:3, 3:6] = -skew(centre - before.centre)
+        found[:size, :size] = to @ before.covariance[:size, :size] @ to.mT
+        return found
+
+    def _by_fit(self) -> Tensor:
+        """(3 P, 3 P) covariance of the points' old places by the fit where it hardly knew them; a part of C."""
+        if not self.same:
+            return self.old.new_zeros(self.old.numel(), self.old.numel())
+        fitted, part = self.model.unregistered, self.nominal.geometry.slices["tool"]
+        numbers = torch.arange(part.start, part.stop, device=self.old.device)
+        variances, Q = torch.linalg.eigh(fitted.with_nominal(self.nominal.typical).parameter_covariance(numbers))
+        return (Q * (variances * (variances > HARDLY**2 * fitted.new_noise.diagonal().mean()))) @ Q.mT
+
+    def at_old_places(self) -> tuple[Tensor, Tensor]:
+        """Frame (4, 4) in closed form, m, and the points where they were."""
+        T = torch.eye(4, dtype=self.data.q.dtype, device=self.data.q.device)
+        if bool(self.free[0]):
+            points = FlangePoints(self.nominal, self.old, same=self.same)
+            model = self.model.unregistered.geodesic.with_nominal(points)
+            T = rigid_fit(model(self.data.q).view(-1, 3), self.data.points.flatten(0, 1))
+        return T, self.old
+
+    def anywhere(self) -> tuple[Tensor, Tensor]:
+        """Frame (4, 4) and points in closed form, m; what never moves stays."""
+        own, points = self.nominal.geometry, self.data.points
+        tips = list(dict.fromkeys(own.on)) if len(own.on) == points.shape[1] else [own.on[0]]
+        corners = tool_points(tool_transform(None).to(points.device)).repeat(len(tips), 1)
+        marks = FlangePoints(self.nominal, corners, on=tuple(tip for tip in tips for _ in range(3)))
+        seen = self.model.unregistered.geodesic.with_nominal(marks)(self.data.q)
+        poses = poses_from_marks(seen.view(-1, 3, 3), TOOL_LEVER)
+        carrying = [tips.index(tip) for tip in own.on] if len(tips) > 1 else [0] * points.shape[1]
+        found = place(poses.view(-1, len(tips), 4, 4)[:, carrying], points)
+        shown = (~points.isnan()).any(2).any(0)
+        return found.base, torch.where(shown[:, None], found.tool, self.old)
+
+
+def _check_enough(data: Measurements, *, framed: bool, known: bool) -> None:
+    """Raise MeasurementError unless there are more coordinates than unknowns without a prior."""
+    bodies = data.bodies
+    each = bodies.numbers * float(data.seen_bodies.sum()) / len(data)
+    unknowns = 6 * framed + bodies.numbers * (data.markers // bodies.points) * (not known)
+    points = -(-LEAST_POINTS // data.markers) if framed else 1
+    least = max(int(unknowns // each) + 1, points)  # one coordinate more than unknowns: a contradiction can show
+    if len(data) < least:
+        what, fix = "these rows do not determine where everything is", "measure 6 to 10 poses"
+        raise MeasurementError.of(what, expected=f"at least {least} rows", got=len(data), fix=fix)
+
+
+def _likeliest(starts: list[NewRows], deviations: Tensor, metres: float) -> NewRows:
+    """The likeliest places under a prior."""
+    usable = starts if metres >= OTHER_MARKER else starts[:1]
+    found = [start.changed(deviations=deviations).settled() for start in usable]
+    return max(found, key=lambda each: each.given.log_evidence())
+
+
+def _odds(found: dict[float, NewRows]) -> dict[float, float]:
+    """Probabilities of the priors that count. Errors as large as those under the widest prior are no evidence."""
+    scale = max(1.0, float(scale_of(found[max(found)])[0]))
+    logs = {metres: each.given.log_evidence(scale) for metres, each in found.items()}
+    logs |= {SAME_PLACE: logs[SAME_PLACE] + UNMOVED_LOG_ODDS} if SAME_PLACE in logs else {}
+    odds = {metres: exp(each - max(logs.values())) for metres, each in logs.items()}
+    likely = {metres: each for metres, each in odds.items() if each > NEGLIGIBLE_PROBABILITY * sum(odds.values())}
+    return {metres: each / sum(likely.values()) for metres, each in likely.items()}
+
+
+PRIOR_FREEDOM = 10.0
+"""The model's own covariance counts as an estimate of the scale with so many degrees of freedom."""
+FALSE_ALARM_PROBABILITY = 0.001
+"""Probability that clean rows have an outlier."""
+MOST_PAIRS = 800
+
+
+def scale_of(rows: NewRows, falls: Tensor | float = 0.0, coordinates: Tensor | int = 0) -> tuple[Tensor, Tensor]:
+    """Square of the residuals' scale in units of what model and noise lead to expect, and degrees of freedom.
+
+    Args:
+        falls: of the quadratic form by rows that are left out. coordinates: how many these have.
+    """
+    given = rows.given
+    determined = len(given.prior) - torch.cholesky_inverse(given.factor.B).trace()
+    freedom = (given.visible.sum() - coordinates - determined).clamp(min=0.0) + PRIOR_FREEDOM
+    return ((given.target @ given.solved.flatten() - falls).clamp(min=0.0) + PRIOR_FREEDOM) / freedom, freedom
+
+
+def worst_rows(rows: NewRows) -> list[int]:
+    """The one or two rows that contradict all others, or none."""
+    from scipy.special import fdtrc  # noqa: PLC0415  # slow to import, not needed to use a model
+
+    given = rows.given
+    (M, m), visible = given.residual.shape, given.visible
+    for size in (1, 2):
+        sets = torch.combinations(torch.arange(M, device=visible.device), size)
+        if M - size < 3 or len(sets) > MOST_PAIRS:
+            continue
+        at = (sets[..., None] * m + torch.arange(m, device=sets.device)).flatten(1)  # (K, size m)
+        blocks, chosen = given.factor.inverse[at[:, :, None], at[:, None, :]], given.solved.flatten()[at]
+        falls = (chosen * torch.linalg.solve(blocks, chosen[..., None])[..., 0]).sum(1)
+        coordinates = visible.sum(1)[sets].sum(1).to(falls)
+        variances, freedom = scale_of(rows, falls, coordinates)
+        numbers = (each.numpy(force=True) for each in (coordinates, freedom, falls / coordinates / variances))
+        chances = fdtrc(*numbers)
+        best = int(np.lexsort((-falls.numpy(force=True), chances))[0])  # of equal chances the largest fall
+        if chances[best] * len(sets) < FALSE_ALARM_PROBABILITY:
+            return sets[best].tolist()
+    return []
+
+
+def _record(best: NewRows, said: dict[str, object], *, known: bool) -> Registration:
+    """Everything in the new measuring frame; ``known``: whether the markers may be where they were."""
+    given, markers, free, T = best.given, best.points.points, best.free, best.transform
+    R, k = T[:3, :3], len(best.free)
+    whole, gain = best.known.clone(), given.gain.new_zeros(len(best.known), given.gain.shape[1])
+    whole[free], whole[:, free], gain[free] = 0.0, 0.0, given.gain[:k]
+    whole[free[:, None], free] = given.covariance[:k, :k] * best.inflation
+    out = torch.block_diag(R, R, torch.eye(markers.numel(), dtype=R.dtype, device=R.device))
+    covariance = out @ whole @ out.mT
+    covariance = 0.5 * (covariance + covariance.mT)
+    usual = float((best.inflation * given.V.diagonal()[given.visible.flatten()].median()).sqrt())
+    arm = float((given.shown(best.y).unflatten(1, (-1, 3)) - best.centre).square().sum(-1).nanmean().sqrt())
+    geometry, count, rigid = best.points.fitted.geometry, len(markers), said["lever"] is not None
+    tips = geometry.on if len(geometry.on) == count else (geometry.chain.tip,) * count
+    values = {
+        "transform": T,
+        "markers": markers,
+        "same": best.points.same,
+        "shift": -best.away[6:].view(-1, 3) if known else None,
+        "covariance": covariance,
+        "centre": R @ best.centre + T[:3, 3],
+        "q": best.q,
+        "gain": ((out @ gain).unflatten(1, (-1, 3)) @ R.mT).flatten(1),
+        "noise": turned(best.inflation * best.mean_noise, R),
+        "rms_after": _rms(given.shown(given.residual).unflatten(1, (-1, 3))),
+        "left_out_rms": _rms(given.left_out.unflatten(1, (-1, 3))),
+        "excess": float(scale_of(best)[0]) ** 0.5,
+        "undetermined": undetermined(covariance, markers, arm, usual, tips, rigid=rigid),
+    }
+    return Registration(**values | said)  # pyright: ignore[reportArgumentType]
+
+
+def _rms(errors: Tensor) -> float:
+    """Root mean square length of vectors (..., 3), NaN left out."""
+    return float(errors.norm(dim=-1).square().nanmean().sqrt())
+
+
+def warn_about(found: Registration, *, outliers: bool = True, excess: bool = True) -> None:
+    """Warn of outliers, of exchanged markers, of directions that rows do not determine, and of errors that remain.
+
+    Args:
+        found: the registration.
+        outliers: whether to name the rows that took no part. excess: whether to warn of errors that remain.
+    """
+    if found.outliers and outliers:
+        what = f"{len(found.outliers)} row(s) contradict all others and took no part: row {few(found.outliers)}"
+        warn_user(sentence(what, fix="measure these poses again"))
+    if found.exchanged:
+        what = (
+            f"markers {few(found.exchanged)}, or axes of a measured frame, seem to be exchanged: each is where another "
+        )
+        what += "one was"
+        warn_user(sentence(what, fix="put their columns in the order of the fit, unless they were mounted so"))
+    for text in found.undetermined:
+        warn_user(f"{text}.")
+    if found.doubtful and excess:
+        what = f"after registration the errors are {found.excess:.1f} times as large as the model leads to expect"
+        fix = "something else has changed, or the rows are wrong: measure more poses and calibrate again"
+        warn_user(sentence(what, fix=fix))

@@ -1,0 +1,325 @@
+"""Laws of every robot: poses of pinocchio, exact derivatives, descriptions that come back, the view from its tip."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from math import pi
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import torch
+from mimic_bank import CHAIN
+from robots_bank import CHAINS, CROOKED, LIFT, draw, every_chain
+from simulated_body import HANDS, URDF_FILE
+from torch import Tensor
+from torch.func import jacfwd, jacrev, jvp, vmap
+from torch.testing import assert_close
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError, RobotError
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.measurements.poses import LEVER, mark_points, poses_from_marks
+from diffeo_calib.robots import DHRow, Geometry, SimulatedArm, from_dh, load_urdf
+from diffeo_calib.robots.gear_waves import GearWaves
+from diffeo_calib.robots.gravity import GravitySag
+from diffeo_calib.robots.payload import Payload
+from diffeo_calib.robots.se3 import skew, twist_transform
+from diffeo_calib.robots.tree import Ends, Tree, robot_from_config
+
+# torch compiles its forward-mode rules on first use with torch.jit.script, which it has deprecated.
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
+
+VIEWS = {
+    "both hands": ("pelvis", [*HANDS], []),
+    "one hand, the other as load": ("pelvis", ["left_hand"], ["right_hand"]),
+    "hand to hand": ("left_hand", ["right_hand"], []),
+    "hand to hand on a torso": ("left_hand", ["right_hand"], ["pelvis"]),
+    "hand to pelvis": ("right_hand", ["pelvis"], ["left_hand"]),
+    "from the middle": ("chest", ["left_hand", "pelvis"], ["right_hand"]),
+}
+
+
+def two_arms() -> Tree:
+    """A turning column with two arms of three joints, one with a slide."""
+    arm = [(0.3, 0.4, 0.1), (0.25, -pi / 2, 0.05), (0.2, 0.3, 0.0)]
+    left = [DHRow(*row, parent=parent) for row, parent in zip(arm, (0, 1, 2), strict=True)]
+    right = [DHRow(*row[:3], theta=0.5, parent=parent) for row, parent in zip(arm, (0, 4, 5), strict=True)]
+    right[1] = DHRow(0.1, pi / 3, 0.2, 0.1, "prismatic", parent=4)
+    return from_dh([DHRow(0.1, pi / 2, 0.6), *left, *right], tips={"left": 3, "right": 6})
+
+
+BODY = {name: load_urdf(URDF_FILE, *view) for name, view in VIEWS.items()}
+every_view = pytest.mark.parametrize("robot", BODY.values(), ids=BODY.keys())
+ROBOTS: dict[str, Tree] = {**CHAINS, "every mimic": CHAIN, "two arms": two_arms(), **BODY}
+every_robot = pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS.keys())
+
+
+# --- poses ----------------------------------------------------------------------------------------------------------
+
+FILES = {"crooked": ("world", "end"), "crooked from the middle": ("a", "end"), "lift": ("floor", "hand")}
+
+
+@pytest.mark.parametrize("name", [*FILES, "simulated arm", "ur10", *VIEWS])
+def test_poses_and_jacobians_are_those_of_pinocchio(name: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    """Of tips in the base; the Jacobian where the base stands on the ground."""
+    path, (base, tips, loads) = (
+        tmp_path / "robot.urdf",
+        VIEWS.get(name, (*FILES.get(name, ("base_link", "flange")), [])),
+    )
+    if name == "ur10":
+        path, tips = request.getfixturevalue("ur10_folder") / "ur10_robot.urdf", "ee_link"
+    elif name == "simulated arm":
+        SimulatedArm().write_urdf(path)
+    elif name in VIEWS:
+        path = URDF_FILE
+    else:
+        path.write_text(LIFT if name == "lift" else CROOKED)
+    robot, model = load_urdf(path, base, tips, loads), pin.buildModelFromUrdf(str(path), mimic=True)
+    data, q = model.createData(), draw(20, robot.n)
+    columns = [model.joints[model.getJointId(joint)].idx_v for joint in robot.joint_names]
+    poses, slopes = robot.tip_poses(q), robot.jacobian(q).view(len(q), len(robot.tips), 6, robot.n)
+    for row in range(len(q)):
+        step = np.zeros(model.nv)
+        step[columns] = q[row].numpy()
+        pin.computeJointJacobians(model, data, pin.integrate(model, pin.neutral(model), step))
+        pin.updateFramePlacements(model, data)
+        start = data.oMf[model.getFrameId(base)]
+        for number, tip in enumerate(robot.tips):
+            frame = model.getFrameId(tip)
+            expected = start.actInv(data.oMf[frame]).homogeneous
+            assert_close(poses[row, number], torch.from_numpy(expected), rtol=0, atol=1e-12)
+            if robot.ground_place is None:
+                world = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)[:, columns]
+                turned = torch.from_numpy(np.kron(np.eye(2), start.rotation.T) @ world)
+                assert_close(slopes[row, number], turned, rtol=0, atol=1e-12)
+
+
+def test_shapes_of_one_tip_and_of_several() -> None:
+    both, left = BODY["both hands"], BODY["one hand, the other as load"]
+    q = draw(3, both.n)
+    assert both(q).shape == (3, 2, 4, 4)
+    assert both.jacobian(q).shape == (3, 2, 6, 17)
+    assert left(q).shape == (3, 4, 4)
+    assert left.jacobian(q).shape == (3, 6, 17)
+    assert_close(both(q)[:, 0], left(q), rtol=0, atol=0)
+    with pytest.warns(dc.DiffeoCalibWarning, match=r"left out: 'right_shoulder_pitch'.*; pass load=\['right_hand'\]"):
+        serial = dc.load_urdf(URDF_FILE, "pelvis", "left_hand")
+    assert isinstance(serial, dc.Chain)
+    assert serial.n == 10
+    assert_close(serial(q[:, :10]), left(q), rtol=0, atol=0)
+
+
+def reordered(q: Tensor, robot: Tree, other: Tree) -> Tensor:
+    """Configurations of one robot in the order of the joints of another."""
+    return q[:, [robot.joint_names.index(name) for name in other.joint_names]]
+
+
+@every_chain
+def test_a_reversed_chain_has_inverse_poses(chain: dc.Chain) -> None:
+    back, q = chain.reversed(), draw(5, chain.n, size=0.5)
+    own = reordered(q, chain, back)
+    assert (back.base, back.tips) == (chain.tip, (chain.base,))
+    assert_close(back(own), torch.linalg.inv(chain(q)), rtol=0, atol=1e-13)
+    again = back.reversed()
+    assert again.serial
+    assert again.tips == chain.tips
+    assert_close(again(reordered(q, chain, again)), chain(q), rtol=0, atol=1e-13)
+
+
+def test_hand_to_hand_of_a_table_is_that_of_both_arms() -> None:
+    robot = two_arms()
+    held, q = robot.reversed("left"), draw(6, robot.n)
+    both = robot.tip_poses(q)
+    assert_close(held(reordered(q, robot, held)), torch.linalg.inv(both[:, 0]) @ both[:, 1], rtol=0, atol=1e-14)
+    assert held.joint_names[-4:] == ("joint_1", "joint_5", "joint_6", "joint_7")
+    for tip in (None, "middle"):
+        with pytest.raises(RobotError, match=r"`tip`: expected one of left, right"):
+            robot.reversed(tip)
+
+
+@every_robot
+def test_descriptions_come_back(robot: Tree) -> None:
+    again = robot_from_config(json.loads(json.dumps(robot.to_config())))
+    assert type(again) is type(robot)
+    assert repr(again) == repr(robot)
+    q = draw(4, robot.n)
+    assert_close(again.places(q), robot.places(q), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("tips", "loads", "message"),
+    [
+        ([], [], "`tip`: expected the name of a link, or a list of names"),
+        (["left_hand", "left_hand"], [], r"`tip` names \['left_hand'\] twice"),
+        (["left_hand"], ["left_hand"], r"`load` names \['left_hand'\], which `tip` names too"),
+        (["left_hand"], ["tail"], "`load`: .* has no link 'tail'"),
+        (["left_hand", "pelvis"], [], "has no moving joint from 'pelvis' to 'pelvis'"),
+    ],
+)
+def test_wrong_ends_are_explained(tips: list[str], loads: list[str], message: str) -> None:
+    with pytest.raises((InputError, RobotError), match=message):
+        dc.load_urdf(URDF_FILE, "pelvis", tips, loads)
+
+
+# --- derivatives ----------------------------------------------------------------------------------------------------
+
+
+@every_robot
+def test_jacobians_are_derivatives(robot: Tree) -> None:
+    q = draw(3, robot.n)
+    slopes = vmap(jacfwd(lambda row: robot.tip_poses(row[None])[0]))(q)  # (N, tips, 4, 4, n)
+    found = robot.jacobian(q).view(3, len(robot.tips), 6, robot.n)
+    assert_close(found[:, :, :3], slopes[..., :3, 3, :], rtol=0, atol=1e-13)
+    spin = torch.einsum("ntabj,ntcb->ntjac", slopes[..., :3, :3, :], robot.tip_poses(q)[..., :3, :3])
+    assert_close(skew(found[:, :, 3:].mT), spin, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", ["every mimic", "slides"])
+def test_derivatives_pass_through_every_transform(name: str) -> None:
+    chain = ROBOTS[name]
+    q, v = draw(3, chain.n), draw(3, chain.n, seed=1)
+    forward = jvp(chain, (q,), (v,))[1]
+    each = vmap(lambda x, u: jvp(lambda z: chain(z[None])[0], (x,), (u,))[1])(q, v)
+    assert_close(each, forward)
+    weight = draw(3, 4, 4, seed=2)
+    backward = torch.autograd.grad((weight * chain(q.requires_grad_())).sum(), q)[0]
+    assert_close((backward * v).sum(), (weight * forward).sum())
+    assert torch.autograd.gradgradcheck(lambda x: chain.jacobian(x)[:, :3], (q[:1].detach().requires_grad_(),))
+
+
+def in_general_position(robot: Tree) -> Geometry:
+    """Nothing is the identity; two markers on every tip."""
+    twists, on = (
+        twist_transform(draw(robot.moving + 1, 6, seed=11, size=0.3)),
+        [tip for tip in robot.tips for _ in "ab"],
+    )
+    bare = Geometry.nominal(robot, len(on), tuple(on))
+    return replace(bare, base=twists[0], joint_errors=twists[1:], tool=draw(len(on), 3, seed=12))
+
+
+def laden(robot: Tree) -> GeometryMap:
+    """Elastic, with waves, and with a weight at its last end."""
+    payload = Payload(list(robot.ends)[-1], torch.tensor(3.0, dtype=torch.float64), 5.0)
+    waves = GearWaves((robot.n - 1, 0), (7.3, 5.1))
+    return GeometryMap(in_general_position(robot), elastic=True, waves=waves, payload=payload)
+
+
+@every_robot
+@pytest.mark.parametrize("size", [0.0, 1e-9, 0.05, 0.5])
+def test_errors_sag_and_waves_have_exact_derivatives(robot: Tree, size: float) -> None:
+    nominal = laden(robot)
+    q, theta = draw(3, robot.n), draw(nominal.parameters, seed=14, size=size)
+    by_joint = vmap(jacrev(lambda row: nominal(row[None], theta)[0]))(q)
+    assert_close(nominal.jacobian(q, theta), by_joint, rtol=1e-11, atol=1e-12)
+    by_theta = jacrev(lambda values: nominal(q, values))(theta)
+    found = nominal.sensitivities(q, theta)
+    assert_close(found, by_theta, rtol=1e-11, atol=1e-12)
+    assert nominal.sag.start == nominal.sag.stop or float(found[..., nominal.sag].abs().max()) > 1e-3
+
+
+def test_second_derivatives_exist_at_zero_and_pass_through_vmap() -> None:
+    geometry, q = in_general_position(CHAIN), draw(2, CHAIN.n, seed=6)
+    zero = torch.zeros(geometry.size, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: geometry.sensitivities(q[:1], x), (zero,))
+    assert torch.autograd.gradcheck(lambda x: geometry.jacobian(x, zero), (q[:1].clone().requires_grad_(),))
+    each = vmap(lambda x: geometry.sensitivities(x[None])[0])(q)
+    assert_close(each, geometry.sensitivities(q))
+
+
+# --- gravity --------------------------------------------------------------------------------------------------------
+
+
+def moment_about(robot: Tree, q: Tensor, joint: int, e: Tensor, masses: Tensor) -> Tensor:
+    """e . sum (o_f - o_l) x m_f g over what the joint moves on the ground, by a second derivation: potential energy.
+
+    The moment is minus the derivative of the masses' potential energy by a turn of everything that the joint carries.
+    """
+    ground = robot.ground_place
+    places = robot.places(q)
+    places = places if ground is None else torch.linalg.inv(places[:, ground])[:, None] @ places
+    frame = places[:, joint]
+    axis = (frame[:, :3, :3] @ e[:, None])[..., 0]
+    carried = torch.from_numpy(robot.arrays.moved[:, joint]).to(q)
+    h = 1e-5
+    energies = []
+    for sign in (1.0, -1.0):
+        turn = torch.matrix_exp(sign * h * skew(axis))
+        arms = places[..., :3, 3] - frame[:, None, :3, 3]
+        moved = (turn[:, None] @ arms[..., None])[..., 0]
+        energies.append(((masses * carried)[:, None] * 9.81 * moved)[..., 2].sum(1))
+    return (energies[1] - energies[0]) / (2 * h)
+
+
+@every_view
+def test_features_are_moments_of_everything_that_a_joint_carries(robot: Tree) -> None:
+    sag, q = GravitySag(robot), draw(12, robot.n)
+    masses = draw(len(robot.before), seed=1).abs()
+    masses[~torch.from_numpy(robot.arrays.moved).any(1)] = 0.0
+    features = sag.features(q).split([c.size for c in sag.compliances], dim=1)
+    for compliance, values in zip(sag.compliances, features, strict=True):
+        only = torch.zeros_like(masses)
+        places = list(compliance.places)
+        only[places] = masses[places]
+        expected = moment_about(robot, q, compliance.joint, torch.from_numpy(compliance.axis), only)
+        found = -9.81 * (values.view(len(q), -1, 3)[..., 2] * masses[places]).sum(1)
+        assert_close(found, expected, rtol=0, atol=2e-8)
+
+
+def own_features(robot: Tree, q: Tensor) -> dict[str, Tensor]:
+    """Gravity features of every joint about its own axis, by its name."""
+    sag = GravitySag(robot)
+    parts = sag.features(q).split([compliance.size for compliance in sag.compliances], 1)
+    return {robot.moving_names[c.joint]: part for c, part in zip(sag.compliances, parts, strict=True) if c.own}
+
+
+def contained(here: dict[str, Tensor], there: dict[str, Tensor]) -> float:
+    """Largest part of one robot's features that no combination of the same joint's features of the other gives."""
+    left = [
+        float((there[name] @ torch.linalg.lstsq(there[name], one, driver="gelsd").solution - one).abs().max())
+        for name, one in here.items()
+        if name in there
+    ]
+    assert left
+    return max(left)
+
+
+@pytest.mark.parametrize("name", ["serial", "arm", "two arms"])
+def test_gravity_is_that_of_the_ground(name: str) -> None:
+    """What a joint's sag can be does not depend on the link from which one looks, unless the ground is forgotten."""
+    robot = ROBOTS[name]
+    back, q = robot.reversed(robot.tips[0]), draw(80, robot.n)
+    own = reordered(q, robot, back)
+    here = own_features(robot, q)
+    assert contained(here, own_features(back, own)) < 1e-10
+    loads = {load: back.ends[load] for load in back.loads}
+    hanging = Tree("x", back.base, back.joints, back.parents, Ends({tip: back.ends[tip] for tip in back.tips}, loads))
+    assert contained(here, own_features(hanging, own)) > 1e-2
+
+
+def test_a_urdf_read_from_hand_to_hand_is_its_reversed_tree() -> None:
+    both, read = BODY["both hands"], BODY["hand to hand on a torso"]
+    held, q = both.reversed("left_hand"), draw(80, both.n, size=0.5)
+    assert_close(held(reordered(q, both, held)), read(reordered(q, both, read)), rtol=0, atol=1e-14)
+    here, there = own_features(held, reordered(q, both, held)), own_features(read, reordered(q, both, read))
+    assert set(here) == set(there)
+    assert contained(here, there) < 1e-10
+
+
+@pytest.mark.slow
+def test_a_chain_seen_from_its_tool_is_calibrated(tmp_path: Path) -> None:
+    """A tracker on the flange of the simulated arm sees a marker on the floor."""
+    arm, q = SimulatedArm(seed=1, markers=3), SimulatedArm().sample(120, seed=1)
+    arm.truth = replace(arm.truth, tool=mark_points(torch.eye(4, dtype=torch.float64)[None], LEVER)[0])
+    marker = torch.tensor([0.3, 0.2, 0.1, 1.0], dtype=torch.float64)
+    seen = (torch.linalg.inv(poses_from_marks(arm.true_points(q), LEVER)) @ marker)[:, :3]
+    robot = arm.nominal.reversed()
+    data = dc.Measurements(reordered(q, arm.nominal, robot), seen + draw(120, 3, size=2e-5), robot.joint_names)
+    result, test = dc.calibrate(robot, data[:80]), data[80:]
+    assert dc.evaluate(result.model, test).rms < 0.3 * dc.evaluate(result.identification.geometry.points, test).rms
+    dc.save(result.model, tmp_path / "a.safetensors")
+    loaded = dc.load(tmp_path / "a.safetensors")
+    assert isinstance(loaded, dc.CalibratedKinematics)
+    assert_close(loaded(test.q), result.model(test.q), rtol=0, atol=0)
