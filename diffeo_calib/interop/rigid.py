@@ -23,7 +23,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.identification.identification import LIMITS, PRECISE, Identification, Prior, identify
+from diffeo_calib.calibration.identification.identification import (
+    PRECISE,
+    SMALLEST_NOISE_M,
+    Identification,
+    Prior,
+    identify,
+)
 from diffeo_calib.calibration.identification.registration import fit_joint_offsets, register, with_joint_offsets
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -187,7 +193,7 @@ def _with_errors(
 
 def _noise(rms: float) -> float:
     """The RMS of one coordinate, m."""
-    return max(rms / sqrt(3), LIMITS.smallest_noise_m)
+    return max(rms / sqrt(3), SMALLEST_NOISE_M)
 
 
 def _refit(model: CalibratedKinematics, on: Compared, *, like: Identification) -> Geometry:
@@ -208,7 +214,7 @@ def _placed(model: CalibratedKinematics, joint_errors: Tensor | None, on: Compar
     best = register(start, on.x, on.y)
     prior = Prior(FIXED_STD, FIXED_STD, base_translation=PLACE_STD, base_rotation=PLACE_STD, tool=PLACE_STD)
     near = identify(start, on.x, on.y, noise=_noise(best.rms), prior=prior)
-    found = near if near.rms < TOLERATED_RMS_RATIO * best.rms + LIMITS.smallest_noise_m else best
+    found = near if near.rms < TOLERATED_RMS_RATIO * best.rms + SMALLEST_NOISE_M else best
     return replace(found.geometry, joint_errors=start.joint_errors)
 
 

@@ -85,18 +85,11 @@ def unlikely_units(what: str, values: Tensor, unit: str, option: str, *, kinds_k
     return [f"{text}; pass {option}='{other}' if they are."]
 
 
-def unlikely_si_joints(q: Tensor, joint_names: Sequence[str] | None) -> list[str]:
-    """Sentences about joint values (N, n) that should be in rad and m; the kinds of the joints are not known."""
-    largest, joint = (float(value) for value in q.abs().amax(dim=0).max(dim=0))
-    if largest <= LARGEST_JOINT_ANGLE_RAD:
-        return []
-    name = f" ('{joint_names[int(joint)]}')" if joint_names else ""
-    text = f"`q`, column {int(joint)}{name} reaches {largest:g}: values look like degrees, or like millimetres of a"
-    return [f"{text} prismatic joint; convert them to rad or m if they are."]
+def numbered(names: object, rows: int, what: str = "the names of sessions") -> tuple[Tensor, tuple[str, ...]]:
+    """Numbers (N,) of the names of rows in order of first appearance, and these names.
 
-
-def row_names(names: object, rows: int, what: str) -> list[str]:
-    """Names of rows as texts; MeasurementError if not one per row, or for None, NaN or an empty text."""
+    MeasurementError if there is not one per row, or for None, NaN or an empty text.
+    """
     names = names.tolist() if isinstance(names, Tensor) else names
     given = list(names) if isinstance(names, Iterable) and not isinstance(names, str) else []
     if len(given) != rows:
@@ -107,7 +100,8 @@ def row_names(names: object, rows: int, what: str) -> list[str]:
     if unnamed:
         text = f"{what}: {len(unnamed)} row(s) have no name, the first is row {unnamed[0]}"
         raise MeasurementError.of(text, fix="name every row")
-    return texts
+    known = tuple(dict.fromkeys(texts))
+    return numbers_of(texts, known), known
 
 
 LARGEST_SI = 1e9
@@ -212,25 +206,6 @@ def deviations(value: object, name: str, like: Tensor) -> Tensor | None:
     return found.masked_fill(empty, torch.nan)
 
 
-def covariates(given: Mapping[str, object], q: Tensor) -> dict[str, object]:
-    """Attributes of a table for columns (N,) by name beside its configurations (N, n); None for those not known."""
-    fix, known = "pass a finite number for each row", {name: own for name, own in given.items() if own is not None}
-    found = [copied(values, name, (len(q),), fix=fix).to(q.device) for name, values in known.items()]
-    return {"covariates": torch.stack(found, 1) if found else None, "covariate_names": tuple(known)}
-
-
-def payloads(value: object, q: Tensor) -> Tensor:
-    """Masses (N,), one for each of the rows q (N, n), given so or as one for all."""
-    fix = "pass one mass for all rows, or one for each"
-    given = copied(value, "payload", (), (len(q),), fix=fix).to(q.device)
-    negative = (given.reshape(-1) < 0).nonzero().flatten().tolist()
-    if negative:
-        what = f"`payload`, row {negative[0]}" if given.ndim else "`payload`"
-        got = f"{float(given.reshape(-1)[negative[0]]):g}"
-        raise MeasurementError.of(what, expected="a mass of 0 or more", got=got, fix="correct it")
-    return given.expand(len(q)).clone()
-
-
 def copied(value: object, name: str, shape: Shape, *also: Shape, fix: str) -> Tensor:
     """Return a checked, detached float64 copy."""
     with of_measurements():
@@ -253,15 +228,6 @@ def numbers_of(names: Sequence[str], known: Sequence[str]) -> Tensor:
     """(N,) int64, numbers of names among the known ones, -1 for "": the inverse of :func:`texts_of`."""
     numbers = {"": -1} | {name: number for number, name in enumerate(known)}
     return torch.tensor([numbers[name] for name in names], dtype=torch.int64, device=HOST)
-
-
-def session_numbers(names: Sequence[str] | None, rows: int) -> tuple[Tensor | None, tuple[str, ...]]:
-    """Numbers (N,) of the sessions of rows in order of first appearance, and their names; None for no names."""
-    if names is None:
-        return None, ()
-    texts = row_names(names, rows, "the names of sessions")
-    known = tuple(dict.fromkeys(texts))
-    return numbers_of(texts, known), known
 
 
 def checked_names(

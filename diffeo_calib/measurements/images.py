@@ -90,7 +90,7 @@ class ImageTable(SocketTable):
                 a camera of which nothing is said.
         """
         angles, joints = checks.joint_table(q, joint_names)
-        numbers, names = checks.session_numbers(seen_by, len(angles))
+        numbers, names = (None, ()) if seen_by is None else checks.numbered(seen_by, len(angles))
         known = _known(names or (ONLY_CAMERA,), camera)
         given = torch.as_tensor(corners, dtype=torch.float64, device=HOST).detach().clone()
         if given.ndim != 3 or given.shape[2] != 5:

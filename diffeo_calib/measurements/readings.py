@@ -190,7 +190,7 @@ class Readings(RowTable):
 
         Args:
             kind: of the devices, such as "line distance"; "held tool" where two hands hold a rigid tool, six zeros a
-                row, see sensors/held_tool.py.
+                row, see sensors/tool_frames.py.
             q: (N, n) joint values, rad or m. values: (N,) or (N, r) readings, m or rad, or one for all rows.
             devices: (N,) name of each row's device; one for all rows by default.
             joint_names: n names, in the order of the columns of ``q``.
@@ -208,9 +208,9 @@ class Readings(RowTable):
         shapes = [(N,), (N, 1)] if numbers == 1 else [(N, numbers)]
         fix = f"pass {numbers} per row" + ", in m" * (unit == MILLIMETRES and numbers == 1)
         read = checks.copied(given, name, *shapes, fix=fix).reshape(N, numbers).to(angles.device)
-        whose, names = checks.session_numbers([ONE_DEVICE] * N if devices is None else devices, N)
-        if whose is None:
-            raise MeasurementError.of("`devices`", expected=f"{N} names, one per row", got="none")
+        if devices is None:
+            devices = [ONE_DEVICE] * N
+        whose, names = checks.numbered(devices, N)
         known = checks.deviations(std, "std", read)
         found = cls(kind, angles, read, whose.to(HOST), names, joint_names=joints, std=known, unit=unit)
         return found.doubted(doubt)
@@ -304,7 +304,7 @@ MARKER, CONTACT = "marker", "contact"
 
 
 def as_readings(table: Any) -> list[tuple[Readings, Tensor]]:
-    """Positions of markers, or a ball in sockets, as readings, see sensors/beside_poses.py, with their rows (M,).
+    """Positions of markers, or a ball in sockets, as readings, see sensors/tool_frames.py, with their rows (M,).
 
     Every marker of every set-up is that of a device of its own, as is every socket; distances of sockets are not used.
     """

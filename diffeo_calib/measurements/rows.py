@@ -133,7 +133,16 @@ class RowGroups:
         Raises:
             MeasurementError: not one per row, negative, or not finite.
         """
-        return self.with_columns(payload=None if payload is None else checks.payloads(payload, self.q), payload_at=at)
+        if payload is None:
+            return self.with_columns(payload=None, payload_at=at)
+        fix = "pass one mass for all rows, or one for each"
+        masses = checks.copied(payload, "payload", (), (len(self),), fix=fix).to(self.q.device)
+        negative = (masses.reshape(-1) < 0).nonzero().flatten().tolist()
+        if negative:
+            what = f"`payload`, row {negative[0]}" if masses.ndim else "`payload`"
+            got = f"{float(masses.reshape(-1)[negative[0]]):g}"
+            raise MeasurementError.of(what, expected="a mass of 0 or more", got=got, fix="correct it")
+        return self.with_columns(payload=masses.expand(len(self)).clone(), payload_at=at)
 
     def with_covariates(self, *, time: object = None, temperature: object = None) -> Self:
         """The same rows with columns (N,), in any unit, with which device or arm may drift; None if not known.
@@ -144,7 +153,11 @@ class RowGroups:
         Raises:
             MeasurementError: not one per row, or not finite.
         """
-        return self.with_columns(**checks.covariates({"time": time, "temperature": temperature}, self.q))
+        known = {name: own for name, own in (("time", time), ("temperature", temperature)) if own is not None}
+        fix = "pass a finite number for each row"
+        found = [checks.copied(own, name, (len(self),), fix=fix).to(self.q.device) for name, own in known.items()]
+        columns = torch.stack(found, 1) if found else None
+        return self.with_columns(covariates=columns, covariate_names=tuple(known))
 
     def with_load(self, load: Payload) -> Self:
         """The same rows with the masses of a payload, if there is one."""
@@ -350,8 +363,11 @@ class RowTable(RowGroups):
             where = f"first row {pairs[0][1]}, of row {pairs[0][0]}"
             text = f"{len(pairs)} of {len(self)} rows repeat an earlier row exactly: {where}"
             warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
-        for text in checks.unlikely_si_joints(self.q, self.joint_names) if doubt else ():
-            warn_user(text)
+        largest, joint = (float(value) for value in self.q.abs().amax(dim=0).max(dim=0))
+        if doubt and largest > checks.LARGEST_JOINT_ANGLE_RAD:  # the kinds of the joints are not known
+            name = f" ('{self.joint_names[int(joint)]}')" if self.joint_names else ""
+            text = f"`q`, column {int(joint)}{name} reaches {largest:g}: values look like degrees, or like millimetres"
+            warn_user(f"{text} of a prismatic joint; convert them to rad or m if they are.")
         return self
 
     @classmethod

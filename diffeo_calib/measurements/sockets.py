@@ -17,7 +17,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import number_of
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written, few, listed
-from diffeo_calib.measurements.checks import numbers_of, row_names, texts_of
+from diffeo_calib.measurements.checks import numbers_of, texts_of
 from diffeo_calib.measurements.rows import NO_SOCKET, RowTable, with_attributes
 
 if TYPE_CHECKING:
@@ -51,6 +51,33 @@ class Sockets:
     names: tuple[str, ...]
     distances: tuple[tuple[int, int, float], ...] = ()
     distance_std: float | None = None
+
+    @classmethod
+    def of(cls, names: tuple[str, ...], distances: Distances | None, std: float | None) -> Sockets:
+        """Sockets with known distances [m], see :meth:`Measurements.from_sockets`."""
+        if distances is not None and not isinstance(distances, Mapping):
+            fix = 'pass {("0", "1"): 0.05} for sockets that are 50 mm apart'
+            raise MeasurementError.of("`distances`", expected="a dictionary", got=as_written(distances), fix=fix)
+        if not distances:
+            if std is not None:
+                what, fix = "`distance_std` without `distances`", "pass the distances, or leave it out"
+                raise MeasurementError.of(what, fix=fix)
+            return cls(names)
+        deviation = number_of(std)
+        if deviation is None or not 0.0 < deviation < inf:
+            fix = "pass how well the distances are known, such as 3e-5 for a printed block, measured with a caliper"
+            raise MeasurementError.of("`distance_std`", expected="a positive number in m", got=as_written(std), fix=fix)
+        found: dict[tuple[int, int], float] = {}
+        for pair, length in distances.items():
+            metres = number_of(length)
+            if metres is None or not 0.0 < metres < inf:
+                raise MeasurementError.of(f"the distance of {pair}", expected="metres above 0", got=as_written(length))
+            for both in _pairs(names, pair):
+                if found.setdefault(both, metres) != metres:
+                    where = " and ".join(names[number] for number in both)
+                    got = f"{found[both]:g} and {length:g} m"
+                    raise MeasurementError.of(f"the distance of {where}", expected="one value", got=got)
+        return cls(names, tuple((*both, length) for both, length in found.items()), deviation)
 
     @property
     def blocks(self) -> list[tuple[tuple[int, int, float], ...]]:
@@ -218,15 +245,6 @@ class SocketTable(RowTable):
         return super().of_one_layout(found)
 
 
-def socket_numbers(
-    names: Sequence[str], rows: int, distances: Distances | None, distance_std: float | None
-) -> tuple[Tensor, Sockets]:
-    """Numbers (N,) of the sockets of rows, and these in order of appearance; see :meth:`Measurements.from_sockets`."""
-    texts = row_names(names, rows, "`sockets`")
-    known = tuple(dict.fromkeys(texts))
-    return numbers_of(texts, known), Sockets(known, *_checked_distances(known, distances, distance_std))
-
-
 def _padded(values: Tensor, before: int, after: int) -> Tensor:
     """Values (N, P, 3) with hidden markers before and after."""
     return torch.nn.functional.pad(values, (0, 0, before, after), value=torch.nan)
@@ -234,34 +252,6 @@ def _padded(values: Tensor, before: int, after: int) -> Tensor:
 
 def _place(name: str) -> str:
     return name.rpartition(SEPARATOR)[0] or name
-
-
-def _checked_distances(
-    names: tuple[str, ...], distances: Distances | None, std: float | None
-) -> tuple[tuple[tuple[int, int, float], ...], float | None]:
-    """Numbers of two sockets with their distance [m], and the standard deviation [m]."""
-    if distances is not None and not isinstance(distances, Mapping):
-        fix = 'pass {("0", "1"): 0.05} for sockets that are 50 mm apart'
-        raise MeasurementError.of("`distances`", expected="a dictionary", got=as_written(distances), fix=fix)
-    if not distances:
-        if std is not None:
-            raise MeasurementError.of("`distance_std` without `distances`", fix="pass the distances, or leave it out")
-        return (), None
-    deviation = number_of(std)
-    if deviation is None or not 0.0 < deviation < inf:
-        fix = "pass how well the distances are known, such as 3e-5 for a printed block that was measured with a caliper"
-        raise MeasurementError.of("`distance_std`", expected="a positive number in m", got=as_written(std), fix=fix)
-    found: dict[tuple[int, int], float] = {}
-    for pair, length in distances.items():
-        metres = number_of(length)
-        if metres is None or not 0.0 < metres < inf:
-            raise MeasurementError.of(f"the distance of {pair}", expected="metres above 0", got=as_written(length))
-        for both in _pairs(names, pair):
-            if found.setdefault(both, metres) != metres:
-                where = " and ".join(names[number] for number in both)
-                got = f"{found[both]:g} and {length:g} m"
-                raise MeasurementError.of(f"the distance of {where}", expected="one value", got=got)
-    return tuple((*both, length) for both, length in found.items()), deviation
 
 
 def _pairs(names: tuple[str, ...], pair: object) -> list[tuple[int, int]]:

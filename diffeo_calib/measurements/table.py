@@ -23,7 +23,7 @@ from diffeo_calib.measurements.images import ImageTable
 from diffeo_calib.measurements.observations import Observations, joined_tables
 from diffeo_calib.measurements.readings import Readings, as_readings
 from diffeo_calib.measurements.rows import NO_SOCKET, set_attributes, value_range, with_attributes
-from diffeo_calib.measurements.sockets import ONE_SESSION, Distances, socket_numbers
+from diffeo_calib.measurements.sockets import ONE_SESSION, Distances, Sockets
 
 XYZ, TURNS = ("x", "y", "z"), ("rx", "ry", "rz")
 
@@ -200,7 +200,8 @@ class Measurements(ImageTable):
                 distance without a standard deviation, or the other way round; else as the constructor.
         """
         angles, joints = checks.joint_table(q, joint_names)
-        numbers, known = socket_numbers(sockets, len(angles), distances, distance_std)
+        numbers, names = checks.numbered(sockets, len(angles), "`sockets`")
+        known = Sockets.of(names, distances, distance_std)
         nowhere = torch.zeros(len(angles), 1, 3, dtype=torch.float64, device=angles.device)
         data = cls(angles, nowhere, joints, doubt=doubt)
         return with_attributes(data, points=torch.full_like(nowhere, torch.nan), socket=numbers, sockets=known)
@@ -211,7 +212,7 @@ class Measurements(ImageTable):
 
         These are rows with the same columns, and measured positions beside rows in sockets, of one tool, whose ball is
         then the last marker. Rows of other kinds become :class:`Observations`. Beside images of a board positions
-        and rows in sockets become readings of points of the same tool, see sensors/beside_poses.py.
+        and rows in sockets become readings of points of the same tool, see sensors/tool_frames.py.
 
         Raises:
             MeasurementError: tables that differ in joints, payloads, markers or known deviations.
@@ -387,7 +388,8 @@ class Measurements(ImageTable):
             MeasurementError: not one name per row, or poses with markers mounted anew, but for those of a camera on the
                 tool; several cameras on the tool, in several set-ups.
         """
-        numbers, known = checks.session_numbers(self.set_ups(names, remounted=remounted), len(self))
+        names = self.set_ups(names, remounted=remounted)
+        numbers, known = (None, ()) if names is None else checks.numbered(names, len(self))
         if remounted and self.lever is not None and self.board is None:
             fix = "give their positions alone (leave the rotation out)"
             raise MeasurementError.of("markers that were mounted anew", expected="positions", got="poses", fix=fix)

@@ -184,8 +184,8 @@ def data() -> dc.Measurements:
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """Samples of a few rows."""
-    for module in (identification, choose_scales):
-        monkeypatch.setattr(module, "LIMITS", replace(module.LIMITS, coordinates=3 * SAMPLED))
+    monkeypatch.setattr(identification, "COORDINATES", 3 * SAMPLED)
+    monkeypatch.setattr(choose_scales, "LIMITS", replace(choose_scales.LIMITS, coordinates=3 * SAMPLED))
     monkeypatch.setattr(fitting, "SAMPLE_COORDINATES", 3 * SAMPLED)
     monkeypatch.setattr(calibrate, "MAX_DENSE", 3 * SAMPLED)
     monkeypatch.setattr(calibrate, "AUTO_CONTROLS", 40)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import torch
@@ -13,7 +13,6 @@ from torch.testing import assert_close
 
 from diffeo_calib.measurements.csv.files import read_measurements
 from diffeo_calib.measurements.poses import angle_between
-from diffeo_calib.measurements.rows import REPEAT_TOLERANCE
 from diffeo_calib.measurements.table import Measurements
 
 UR10_JOINTS = [
@@ -85,20 +84,3 @@ def test_fr3_poses_are_read(ur10_folder: Path) -> None:
     reported = [f"tcp_{4 * i + j}" for i in range(3) for j in range(3)]
     tcp = read_measurements(path, joints, ["tcp_3", "tcp_7", "tcp_11"], rotation=reported, **options)
     assert float(relative_spread(held(data.poses), held(tcp.poses)).median()) < math.radians(1.0)
-
-
-def test_ur10_is_read(ur10: Measurements) -> None:
-    assert (len(ur10), ur10.n, ur10.markers) == (632, 6, 1)
-    assert_close(ur10.points[0, 0], torch.tensor([2.3367643, -0.90576441, -0.45463664], dtype=torch.float64))
-    assert_close(ur10.q[0, :2], torch.tensor([0.934319, -1.79251], dtype=torch.float64))
-    assert cast(tuple[str, ...], ur10.joint_names)[2] == "elbow_joint"
-
-
-def test_ur10_repeats_stay_together(ur10: Measurements) -> None:
-    assert len(ur10.groups().unique()) < 632  # some configurations do repeat
-    for seed in range(4):
-        train, test = ur10.split(0.7, seed)
-        assert len(train) + len(test) == 632
-        assert abs(len(train) - 442) <= 1
-        nearest = torch.cdist(train.q, test.q, p=math.inf).min()
-        assert float(nearest) > REPEAT_TOLERANCE

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import csv
 import math
+import os
+import threading
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-from table_bank import HEADER, JOINTS, POSITION, ROWS, Reader, says
+from product_bank import sliding_measurements, sliding_robot
+from table_bank import HEADER, JOINTS, POSITION, ROWS, Reader, read_table, says
 from torch.testing import assert_close
 
+import diffeo_calib as dc
+from diffeo_calib.cli.options import Targets, Units
+from diffeo_calib.cli.tables import MeasuredTable, ProgramTable, table_format
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
-from diffeo_calib.measurements.csv.files import read_joints, read_measurements
+from diffeo_calib.measurements.csv.files import read_joints, read_measurements, write_measurements
+from diffeo_calib.measurements.csv.writing import write_predictions
 from diffeo_calib.measurements.table_format import TableFormat
 
 
@@ -215,3 +224,116 @@ def test_joints_alone_may_repeat_and_are_those_of_the_measurements(tmp_path: Pat
     q = read_joints(tmp_path / "table.csv", JOINTS, TableFormat("m", "rad", convention="rotvec"))
     assert q.dtype == torch.float64
     assert_close(q, data.q, rtol=0, atol=0)
+
+
+SI = TableFormat("m", "rad")
+COUNT = 25
+
+
+def lines(count: int = COUNT) -> list[str]:
+    return [f"{0.1 * k!r},-0.5,{k},2,3" for k in range(count)]
+
+
+def written(folder: Path, rows: list[str], header: str = HEADER) -> Path:
+    (folder / "table.csv").write_text(header + "\n".join(rows) + "\n")
+    return folder / "table.csv"
+
+
+def test_units_are_judged_by_all_rows(tmp_path: Path) -> None:
+    path = written(tmp_path, [*lines(), "90,0,1,2,3", *lines()])
+    with pytest.warns(DiffeoCalibWarning, match="90 rad"):
+        read_joints(path, JOINTS, SI)
+
+
+def test_a_pipe_is_read_once(tmp_path: Path) -> None:
+    path, pipe = written(tmp_path, lines()), tmp_path / "pipe"
+    os.mkfifo(pipe)
+    feeder = threading.Thread(target=lambda: pipe.write_bytes(path.read_bytes()))
+    feeder.start()
+    q = read_joints(pipe, JOINTS, SI)
+    feeder.join()
+    assert_close(q, read_joints(path, JOINTS, SI), rtol=0, atol=0)
+
+
+def test_a_pipe_that_is_no_text(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    feeder = threading.Thread(target=lambda: pipe.write_bytes(b"PK\x03\x04\xff\xfe"))
+    feeder.start()
+    with pytest.raises(MeasurementError, match=says("no text", "save it as .xlsx or CSV")):
+        read_joints(pipe, JOINTS, SI)
+    feeder.join()
+
+
+def test_a_device_without_an_end_is_refused() -> None:
+    with pytest.raises(MeasurementError, match="'/dev/zero' is no text but binary"):
+        read_joints("/dev/zero", JOINTS, SI)
+
+
+ROBOT = SimpleNamespace(joint_names=("q1", "q2"), kinds=("prismatic", "revolute"))
+MIXED = TableFormat("mm", "deg", joint_length="m")
+
+
+def test_slides_in_metres_beside_positions_in_millimetres(read: Reader) -> None:
+    data = read(HEADER + "0.25,90,1000,0,500\n", joints=ROBOT, length="mm", angle="deg", joint_length="m")
+    assert_close(data.q, torch.tensor([[0.25, torch.pi / 2]], dtype=torch.float64))
+    assert data.points.tolist() == [[[1.0, 0.0, 0.5]]]
+
+
+@pytest.mark.parametrize("units", [("mm", "m"), ("m", "mm")])
+def test_what_is_written_is_read_back(units: tuple[str, str], tmp_path: Path) -> None:
+    robot = sliding_robot()
+    data = sliding_measurements(robot, 12)
+    table = TableFormat(units[0], "deg", joint_length=units[1])
+    write_measurements(tmp_path / "t.csv", data, table, joints=robot)
+    again = read_table(tmp_path / "t.csv", robot, ["x", "y", "z"], table)
+    assert_close(again.q, data.q, rtol=1e-14, atol=1e-15)
+    assert_close(again.points, data.points, rtol=1e-14, atol=1e-15)
+    with pytest.warns(DiffeoCalibWarning, match="prismatic joints reach"):
+        plain = read_table(tmp_path / "t.csv", robot, ["x", "y", "z"], replace(table, joint_length=units[0]))
+    factor = 1000.0 if units[0] == "m" else 1e-3
+    assert_close(plain.q[:, 2], factor * data.q[:, 2])  # the file's own numbers differ
+
+
+def test_programs_and_predictions_keep_the_unit(tmp_path: Path) -> None:
+    robot, q = sliding_robot(), sliding_measurements(sliding_robot(), 3).q
+    path, table = (tmp_path / "program.csv", table_format(Units(length="mm", angle="deg", joint_length="m")))
+    assert table == MIXED
+    points = torch.ones(3, 1, 3, dtype=torch.float64)
+    write_predictions(path, [(q, points, 1e-3 * points)], table, joints=robot.joint_names, kinds=robot.kinds)
+    source = ProgramTable(path, None, table, Targets())
+    assert_close(source.commands(robot), q, rtol=1e-14, atol=1e-15)
+    header, first, *_ = list(csv.reader(path.read_text().splitlines()))
+    cells = dict(zip(header, first, strict=True))
+    assert float(cells["slide"]) == pytest.approx(float(q[0, 2]))
+    assert float(cells["x"]) == 1000.0
+    measured = MeasuredTable(path, None, replace(table, position=[["x", "y", "z"]])).read(robot)
+    assert_close(measured.q, q, rtol=1e-14, atol=1e-15)
+
+
+def test_units_that_look_wrong_are_doubted(read: Reader) -> None:
+    with pytest.warns(DiffeoCalibWarning, match="prismatic joints reach only 0.25 mm: they look like metres; pass j"):
+        read(HEADER + "0.25,90,1000,0,500\n", joints=ROBOT, length="mm", angle="deg")
+    with pytest.warns(DiffeoCalibWarning, match=r"reach 250 m: they look like millimetres; pass joint_length='mm'"):
+        read(HEADER + "250,90,1,0,0.5\n", joints=ROBOT, length="m", angle="deg")
+
+
+def test_wrong_use_is_explained(read: Reader) -> None:
+    for options, message in (
+        ({"joints": ROBOT, "joint_length": "km"}, "`joint_length`: expected 'm' or 'mm' or 'cm' or 'inch', got 'km'"),
+        ({"joint_length": "m"}, "`joint_length` without the kinds of the joints: .*; pass the robot, or `kinds`"),
+    ):
+        with pytest.raises(MeasurementError, match=message):
+            read(HEADER + "0.25,90,1000,0,500\n", **options)
+
+
+@pytest.mark.slow
+def test_slides_in_the_wrong_unit_are_refused_with_the_unit_named() -> None:
+    robot = sliding_robot()
+    data = sliding_measurements(robot, 15)
+    q = data.q.clone()
+    q[:, 2] *= 1e3
+    with pytest.raises(
+        MeasurementError, match=r"values of prismatic joints seem to be 1000 times too .*\(`joint_length`\)"
+    ):
+        dc.calibrate(robot, dc.Measurements(q, data.points, doubt=False))

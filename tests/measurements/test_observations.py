@@ -16,6 +16,7 @@ import diffeo_calib as dc
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.rows import with_attributes
 
 NAMES = ("a", "b")
 Tables = dict[str, Any]
@@ -229,3 +230,26 @@ def test_readings_that_look_wrong_are_doubted() -> None:
     with pytest.warns(dc.DiffeoCalibWarning, match="degrees"):
         Readings.distances(100 * q, 1.0)
     assert len(Readings.distances(100 * q, 1.0, doubt=False)) == 3
+
+
+MARKERS = dc.Measurements(values(7, 2), values(7, 2, 3), doubt=False)
+SOCKETS = dc.Measurements.from_sockets(values(7, 2), ["a/0"] * 3 + ["b/0"] * 4, doubt=False)
+
+
+def test_places_are_absent_as_numbers() -> None:
+    assert MARKERS.places.tolist() == MARKERS.socket_numbers.tolist() == [-1] * 7
+    assert SOCKETS.places.tolist() == [0] * 3 + [1] * 4
+    whole = dc.Observations.joined([MARKERS, dc.Readings.heights(values(7, 2), values(7), doubt=False)])
+    assert whole.places.tolist() == [-1] * (2 * 7)
+    assert (len(MARKERS.masses), len(MARKERS.with_payload(2.0).masses)) == (0, 7)
+
+
+def test_a_row_in_a_socket_says_why_it_is_far() -> None:
+    places = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)[SOCKETS.places][:, None]
+    placed = with_attributes(SOCKETS, points=places)
+    predicted = places.clone()
+    predicted[0] = torch.tensor([1.0, 1e-3, 0.0])
+    predicted[1] = torch.tensor([0.0, 0.4, 0.0])
+    assert "'b/0'" in (placed.other_socket(0, predicted, 0.01) or "")
+    assert "its socket" in (placed.other_socket(1, predicted, 0.01) or "")
+    assert MARKERS.other_socket(0, MARKERS.points, 0.01) is None

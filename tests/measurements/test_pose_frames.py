@@ -169,3 +169,10 @@ def test_wrong_tables_are_one_clear_error(
     given = {"rotation": [["a", "b", "c"], ["A", "B", "C"]], "convention": "rotvec", "rotation_angle": "rad"} | options
     with pytest.raises(MeasurementError, match=says(*message)):
         read_measurements(path, ["q"], [["x", "y", "z"], ["X", "Y", "Z"]], length="m", angle="rad", **given)
+
+
+def test_points_become_poses_with_a_lever() -> None:
+    data = table(known=False)
+    again = Measurements.of_points(data.q, data.points, data.on, data.lever)
+    assert_close(held(again.poses), held(data.poses), equal_nan=True)
+    assert Measurements.of_points(data.q, data.points, None, None).poses is None

@@ -21,7 +21,7 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.outliers import Outlier, flagged
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.identification.registration import (
-    ROBUST,
+    CONSISTENT,
     can_register,
     largest_distances,
     register,
@@ -127,7 +127,7 @@ def check_row_order(robot: Tree, data: Measurements, registration: Identificatio
     """
     own, geometry = largest_distances(registration.geometry, data), registration.geometry
     typical = float(own.median())
-    if typical > ROBUST.consistent_residual * spread(data.points):
+    if typical > CONSISTENT * spread(data.points):
         found = next(_consistent(robot, data), None)
         if found is None:
             return
@@ -148,7 +148,7 @@ def check_row_order(robot: Tree, data: Measurements, registration: Identificatio
 
 def _consistent(robot: Tree, data: Measurements) -> Iterator[tuple[Geometry, float]]:
     """Registrations of consecutive rows at some lag that are consistent, and their median distances, m."""
-    limit, order = ROBUST.consistent_residual * spread(data.points), data.line_numbers.argsort().to(data.q.device)
+    limit, order = CONSISTENT * spread(data.points), data.line_numbers.argsort().to(data.q.device)
     windows = [rows for parts in gates.WINDOW_PARTS for rows in order.tensor_split(parts)]
     for lag, rows in product(gates.WINDOW_LAGS, windows):
         own, other = _paired(data.line_numbers[rows], lag)

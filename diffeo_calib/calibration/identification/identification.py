@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import sqrt
+from math import nan, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,29 +28,15 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import Devices
 
-
-@dataclass(frozen=True)
-class EstimationLimits:
-    """When the joint estimation of noise, tails and prior ends, and the range of its results.
-
-    Args:
-        smallest_noise_m: lower bound of the noise; no device that measures a robot resolves less.
-        rounds: largest number of fits.
-        noise_change: relative change of the noise at which the estimation has converged.
-        smallest_prior: lower bound of estimated prior deviations, m or rad. largest_prior: their upper bound.
-        coordinates: measured coordinates of the random rows that stand for all rows where there are more. What a
-            rigid geometry cannot explain is larger than the error that noise then leaves in its few parameters.
-    """
-
-    smallest_noise_m: float = 1e-6
-    rounds: int = 10
-    noise_change: float = 3e-3
-    smallest_prior: float = 1e-5
-    largest_prior: float = 0.1
-    coordinates: int = 8000
-
-
-LIMITS = EstimationLimits()
+SMALLEST_NOISE_M = 1e-6
+"""Lower bound of the noise; no device that measures a robot resolves less."""
+ROUNDS, NOISE_CHANGE = 10, 3e-3
+"""Most rounds of estimation, and the relative change of the noise at which they have converged."""
+SMALLEST_PRIOR, LARGEST_PRIOR = 1e-5, 0.1
+"""Range of estimated prior deviations, m or rad."""
+COORDINATES = 8000
+"""Measured coordinates of the random rows that stand for all rows where there are more. What a rigid geometry cannot
+explain is larger than the error that noise then leaves in its few parameters."""
 PRECISE: dict[str, Any] = {"xtol": 1e-12, "ftol": 1e-12, "gtol": 1e-12, "max_nfev": 200}
 
 
@@ -102,6 +88,7 @@ class Identification:
         prior: the prior, given or estimated.
         tails: weights of the measurements (N, P), 1 where they are hidden; all 1 if the noise was given or is Gaussian.
         devices: those of readings that were found with it, in the order of their tables.
+        left_out: root mean square distance of the measured points, each predicted by the others to first order [m].
     """
 
     geometry: Geometry
@@ -114,6 +101,7 @@ class Identification:
     prior: Prior
     tails: Tails
     devices: tuple[Devices, ...] = ()
+    left_out: float = nan
 
     @property
     def deviations(self) -> Tensor:
@@ -211,7 +199,7 @@ class MeasuredPoints(NamedTuple):
 
     def sample(self) -> MeasuredPoints:
         """Random rows that stand for all of them, if there are many."""
-        count = max(1, LIMITS.coordinates // self.points[0].numel())
+        count = max(1, COORDINATES // self.points[0].numel())
         if len(self.q) <= count:
             return self
         index = torch.randperm(len(self.q), generator=seeded(0), device=self.q.device)[:count].sort().values
@@ -324,9 +312,9 @@ def estimated(rows: Rows, held: Sequence[int], prior: Prior | None = None) -> Id
     dim = torch.cat([torch.full_like(own[..., 0], own.shape[2]) for own in errors])
     # The median, so that a few gross outliers do not set the level; that of chi-squared by Wilson and Hilferty.
     typical = (body_squares(errors) / (dim * (1.0 - 2.0 / (9.0 * dim)) ** 3)).nanmedian()
-    level = max(sqrt(float(typical)), LIMITS.smallest_noise_m)
+    level = max(sqrt(float(typical)), SMALLEST_NOISE_M)
     tails = reweight(body_squares(errors) / level**2, dim)
-    for _ in range(LIMITS.rounds):
+    for _ in range(ROUNDS):
         root = used.root(rows.geometry, held)
         fit = solve(some, level / tails.weights.sqrt(), root, start=at, **PRECISE)
         at = fit.theta, fit.shifts
@@ -334,14 +322,16 @@ def estimated(rows: Rows, held: Sequence[int], prior: Prior | None = None) -> Id
         determined = float(fit.leverage.sum())  # number of parameters that the data determine
         squares, numbers = body_squares(fit.errors), sum(int((~own.isnan()).sum()) for own in fit.errors)
         total = float((tails.weights * squares).nansum())
-        before, level = level, max(sqrt(total / max(numbers - determined, 1.0)), LIMITS.smallest_noise_m)
+        before, level = level, max(sqrt(total / max(numbers - determined, 1.0)), SMALLEST_NOISE_M)
         tails = reweight(squares / level**2 + fit.leverage / tails.weights, dim)
-        if abs(level - before) < LIMITS.noise_change * level:
+        if abs(level - before) < NOISE_CHANGE * level:
             break
+    left_out = body_squares(fit.errors) / (1.0 - fit.leverage / dim).square()
     fit = fit._replace(iterations=steps, errors=rows.errors(*at))
     if len(tails.weights) < sum(len(own) for own in fit.errors):
         tails = reweight(body_squares(fit.errors) / level**2, 3)
-    return _identification(rows, fit, level, "estimated", prior=used, tails=tails)
+    found = _identification(rows, fit, level, "estimated", prior=used, tails=tails)
+    return replace(found, left_out=float(left_out.nanmean().sqrt()))
 
 
 def _identification(rows: Rows, fit: Fit, level: float, how: str, *, prior: Prior, tails: Tails) -> Identification:
@@ -364,7 +354,7 @@ def _scaled(prior: Prior, root: Tensor, geometry: Geometry, fit: Fit) -> Prior:
     parts = ((part * free)[geometry.slices["joints"]] for part in (squares, torch.ones_like(squares)))
     total, count = (part.view(-1, 2, 3).sum(dim=(0, 2)) for part in parts)
     deviations = (total / count.clamp(min=1.0)).sqrt()
-    translation, rotation = deviations.clamp(LIMITS.smallest_prior, LIMITS.largest_prior).tolist()
+    translation, rotation = deviations.clamp(SMALLEST_PRIOR, LARGEST_PRIOR).tolist()
     return replace(prior, translation=translation, rotation=rotation)
 
 

@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import (
-    LIMITS,
+    SMALLEST_NOISE_M,
     Identification,
     MeasuredPoints,
     Prior,
@@ -140,7 +140,7 @@ def _start(
     """
     rms, noise = errors
     # The errors of a nominal robot vary slowly with its configuration, so that many rows share them.
-    error = max(noise, LIMITS.smallest_noise_m) * sqrt(len(slopes) / 3)
+    error = max(noise, SMALLEST_NOISE_M) * sqrt(len(slopes) / 3)
     places = {"base_translation": PLACES.open_base_m, "base_rotation": PLACES.open_base_rad}
     prior = Prior(**places, tool=sqrt(geometry.markers) * PLACES.marker_m).deviations(geometry)[sought]
     white = torch.cat([slopes * prior / error, prior.new_ones(len(prior)).diag()])
@@ -206,7 +206,7 @@ def register_sockets(robot: Tree | Geometry, q: Tensor, socket: Tensor) -> Socke
     slopes, geometry = A.flatten(0, 1), bare.with_tool(ball[None])
     tilt = torch.linalg.svdvals(slopes) / len(A) ** 0.5
     rms, median = float(distances.square().mean().sqrt()), float(distances.median())
-    errors = rms, max(median / sqrt(MEDIAN_CHI2_3), LIMITS.smallest_noise_m)
+    errors = rms, max(median / sqrt(MEDIAN_CHI2_3), SMALLEST_NOISE_M)
     status = f"spread within sockets {1e3 * rms:.4g} mm RMS, median {1e3 * median:.4g} mm."
     ball = range(geometry.size)[geometry.slices["tool"]]
     found = _start(geometry, errors, slopes, [*ball], rows=len(A), status=status)
@@ -236,8 +236,6 @@ and of base and markers beside them, no constraint."""
 INLIER_ERROR = 0.1
 """Error of a coordinate, relative to the median distance, beyond which Huber's loss grows linearly."""
 MAX_EVALUATIONS = 100
-FOLDS = 4
-"""Parts of the rows that are left out in turn to compare calibrations with joint offsets and without."""
 
 
 def find_joint_offsets(geometry: Geometry, q: Tensor, points: Tensor) -> Tensor:
@@ -286,41 +284,20 @@ def with_joint_offsets(geometry: Geometry, offsets: Tensor) -> Geometry:
     return geometry.absorb(offset_twists(geometry) @ offsets)
 
 
-@dataclass(frozen=True)
-class RegistrationLimits:
-    """Which rows take part in a registration, and when joint offsets are estimated with it.
-
-    A residual is a median distance; "relative" means relative to the spread of the markers.
-
-    Args:
-        gross_distances: number of median distances from which a row is a gross outlier and does not take part.
-        rounds: largest number of registrations of the rows that take part.
-        draws: number of registrations of random rows that are tried if there may be many gross outliers.
-        surplus: size of these draws, as a multiple of the rows that are needed. With 30 % outliers all of six rows
-            are inliers with probability 0.12, so that 50 draws are enough.
-        consistent_residual: relative residual with which rows without gross outliers need no draws.
-        examined_residual: relative residual from which joint offsets are estimated.
-        remaining: largest part of the residual that may remain with offsets that are accepted.
-        accepted_residual: largest relative residual that may remain with them.
-        largest_offset_rad: largest offset of a turning joint that is accepted. left_out: largest error of left-out rows
-            after a geometric calibration, in that of one without these offsets.
-        reported: smallest offset that is reported, as a part of the largest.
-    """
-
-    gross_distances: float = 10.0
-    rounds: int = 5
-    draws: int = 50
-    surplus: int = 2
-    consistent_residual: float = 0.02
-    examined_residual: float = 0.01
-    remaining: float = 0.3
-    accepted_residual: float = 0.02
-    largest_offset_rad: float = 0.8
-    left_out: float = 1.1
-    reported: float = 0.2
-
-
-ROBUST = RegistrationLimits()
+GROSS_DISTANCES, GROSS_ROUNDS = 10.0, 5
+"""Median distances from which a row is a gross outlier and does not take part, and most registrations of the others."""
+DRAWS, SURPLUS = 50, 2
+"""Registrations of random rows that are tried if there may be many gross outliers, and their size as a multiple of the
+rows that are needed: with 30 % outliers all of six rows are inliers with probability 0.12."""
+CONSISTENT = 0.02
+"""Residual, a median distance relative to the spread of the markers, with which rows need no draws."""
+EXAMINED, ACCEPTED, REMAINING = 0.01, 0.02, 0.3
+"""Such residuals from which joint offsets are estimated and that may remain with them, and which part may remain."""
+LARGEST_OFFSET_RAD, LEFT_OUT = 0.8, 1.1
+"""Largest offset of a turning joint that is accepted, and the largest error of left-out points after a geometric
+calibration, in that of one without these offsets."""
+REPORTED = 0.2
+"""Smallest offset that is reported, as a part of the largest."""
 
 
 def register_robustly(robot: Tree, data: Measurements) -> Identification:
@@ -352,15 +329,15 @@ def largest_distances(geometry: Geometry, data: Measurements) -> Tensor:
 def spread(points: Tensor) -> float:
     """Root mean square distance of the markers from their centre without gross outliers and hidden markers, m."""
     squares = (points - points.nanmedian(dim=0, keepdim=True).values).square().sum(-1)
-    return float(squares[squares <= ROBUST.gross_distances**2 * squares.nanmedian()].mean().sqrt())
+    return float(squares[squares <= GROSS_DISTANCES**2 * squares.nanmedian()].mean().sqrt())
 
 
 def _registered_by(robot: Tree | Geometry, data: Measurements, inliers: Tensor, on: tuple[str, ...]) -> Identification:
     """Registration without gross outliers, from a first guess (N,) of the inliers; ``on``: tips of the markers."""
-    for _ in range(ROBUST.rounds):
+    for _ in range(GROSS_ROUNDS):
         registration = register(robot, data.q[inliers], data.points[inliers], on)
         largest = largest_distances(registration.geometry, data)
-        near = largest <= ROBUST.gross_distances * float(largest.median())
+        near = largest <= GROSS_DISTANCES * float(largest.median())
         few_rows = int(near.sum()) < 0.5 * len(data) or not can_register(data.points[near])
         if bool((near == inliers).all()) or few_rows:
             break
@@ -372,18 +349,17 @@ def with_large_offsets(data: Measurements, registration: Identification, inliers
     """The registration, with joint offsets if these explain far more; then with a warning."""
     geometry, before = registration.geometry, float(distances(registration.geometry, data).nanmedian())
     chain, size = geometry.chain, spread(data.points)
-    if before <= ROBUST.examined_residual * size or len(data) < 2 * (2 + chain.n):
+    if before <= EXAMINED * size or len(data) < 2 * (2 + chain.n):
         return registration
     offsets = find_joint_offsets(geometry, data.q[inliers], data.points[inliers])
     again = _registered_by(with_joint_offsets(geometry, offsets), data, inliers, geometry.on)
     after = float(distances(again.geometry, data).nanmedian())
-    explained = after <= min(ROBUST.remaining * before, ROBUST.accepted_residual * size)
+    explained = after <= min(REMAINING * before, ACCEPTED * size)
     turned = offsets[torch.tensor(chain.periodic, dtype=torch.bool, device=offsets.device)]
-    if not explained or bool((turned.abs() > ROBUST.largest_offset_rad).any()):
+    if not explained or bool((turned.abs() > LARGEST_OFFSET_RAD).any()):
         return registration
-    q, points = data.q[inliers], data.points[inliers]
-    errors = [_left_out(geometry, q, points, with_offsets=tried) for tried in (True, False)]
-    if errors[0] > ROBUST.left_out * errors[1]:
+    plain, other = (identify(one, data.q[inliers], data.points[inliers]) for one in (geometry, again.geometry))
+    if other.left_out > LEFT_OUT * plain.left_out:
         return registration
     text = sentence(
         f"joint offsets are far from the robot's description: {_large_offsets(chain, offsets)}",
@@ -394,27 +370,9 @@ def with_large_offsets(data: Measurements, registration: Identification, inliers
     return again
 
 
-def _left_out(geometry: Geometry, q: Tensor, points: Tensor, *, with_offsets: bool) -> float:
-    """RMS distance, m, of rows from a geometric calibration of the others, with joint offsets before it or without.
-
-    Args:
-        geometry: a registered robot. q: (N, n). points: (N, P, 3) m.
-    """
-    found, fold = [], torch.arange(len(q), device=q.device) % FOLDS
-    for number in range(FOLDS):
-        train, own = (q[fold != number], points[fold != number]), fold == number
-        if not can_register(train[1]):
-            continue
-        start = register(geometry, *train, geometry.on).geometry
-        if with_offsets:
-            start = register(with_joint_offsets(start, find_joint_offsets(start, *train)), *train, geometry.on).geometry
-        found.append((identify(start, *train).geometry.points(q[own]) - points[own]).norm(dim=-1))
-    return float(torch.cat(found).square().nanmean().sqrt()) if found else torch.inf
-
-
 def _large_offsets(chain: Tree, offsets: Tensor) -> str:
     """The largest offsets (n,), with names and units."""
-    smallest = ROBUST.reported * float(offsets.abs().max())
+    smallest = REPORTED * float(offsets.abs().max())
     named = zip(chain.joint_names, offsets.tolist(), chain.periodic, strict=True)
     return ", ".join(
         f"{name} by {math.degrees(offset):.1f} degrees" if turns else f"{name} by {1e3 * offset:.1f} mm"
@@ -433,14 +391,14 @@ def _inliers(robot: Tree, data: Measurements, on: tuple[str, ...]) -> Tensor:
     """
     start = largest_distances(register(robot, data.q, data.points, on).geometry, data)
     every = torch.ones_like(start, dtype=torch.bool)
-    gross = ROBUST.gross_distances
-    if float(start.max()) <= gross * float(start.median()) <= gross * ROBUST.consistent_residual * spread(data.points):
+    gross = GROSS_DISTANCES
+    if float(start.max()) <= gross * float(start.median()) <= gross * CONSISTENT * spread(data.points):
         return every
     best = start
     generator = seeded(0)
     seen = data.visible.double().mean()
-    drawn = ROBUST.surplus * math.ceil((2.0 / data.markers + 1.0) / float(seen))  # 6 + 3 P unknowns, 3 P coordinates
-    for _ in range(ROBUST.draws if len(data) > 2 * drawn else 0):
+    drawn = SURPLUS * math.ceil((2.0 / data.markers + 1.0) / float(seen))  # 6 + 3 P unknowns, 3 P coordinates
+    for _ in range(DRAWS if len(data) > 2 * drawn else 0):
         rows = torch.randperm(len(data), generator=generator, device=HOST)[:drawn]
         if not can_register(data.points[rows]):
             continue
