@@ -208,7 +208,7 @@ class Measurements(ImageTable):
 
         These are rows with the same columns, and measured positions beside rows in sockets, of one tool, whose ball is
         then the last marker. Rows of other kinds become :class:`Observations`. Beside images of a board positions
-        and rows in sockets become readings of points of the same tool, see sensors/beside_poses.py.
+        and rows in sockets become readings of points of the same tool, see sensors/tool_frames.py.
 
         Raises:
             MeasurementError: tables that differ in joints, payloads, markers or known deviations.
