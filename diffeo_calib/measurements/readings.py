@@ -96,10 +96,10 @@ class Readings(RowTable):
 
         Args:
             q: (N, n) joint values, rad or m. lengths: (N,) distances, m, or one for all rows of a ball bar.
-            devices, joint_names: as in :meth:`of`.
+            devices, joint_names, doubt: as in :meth:`of`.
             offset_std: standard deviation in m of a length that all readings of a device lack, as those of an
                 interferometer or a wire with an unknown zero; 0 if they are absolute.
-            std: known standard deviations of the lengths, m: one for all, or (N,). doubt: as in :meth:`of`.
+            std: known standard deviations of the lengths, m: one for all, or (N,).
 
         Raises:
             MeasurementError: as :meth:`of`, or a length that is not positive.
@@ -190,7 +190,7 @@ class Readings(RowTable):
 
         Args:
             kind: of the devices, such as "line distance"; "held tool" where two hands hold a rigid tool, six zeros a
-                row, see sensors/held_tool.py.
+                row, see sensors/tool_frames.py.
             q: (N, n) joint values, rad or m. values: (N,) or (N, r) readings, m or rad, or one for all rows.
             devices: (N,) name of each row's device; one for all rows by default.
             joint_names: n names, in the order of the columns of ``q``.
@@ -304,7 +304,7 @@ MARKER, CONTACT = "marker", "contact"
 
 
 def as_readings(table: Any) -> list[tuple[Readings, Tensor]]:
-    """Positions of markers, or a ball in sockets, as readings, see sensors/beside_poses.py, with their rows (M,).
+    """Positions of markers, or a ball in sockets, as readings, see sensors/tool_frames.py, with their rows (M,).
 
     Every marker of every set-up is that of a device of its own, as is every socket; distances of sockets are not used.
     """

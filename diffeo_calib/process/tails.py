@@ -24,25 +24,11 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 
-
-@dataclass(frozen=True)
-class FreedomPrior:
-    """Log-normal prior of the degrees of freedom nu, and the range in which they are sought.
-
-    Args:
-        centre: most probable nu, safe for clean data and for data with outliers.
-        width_efolds: standard deviation of log nu; wide, since a handful of errors hardly determines the tails.
-        smallest: lower bound of nu; below 2 the variance is infinite.
-        gaussian: nu from which noise counts as Gaussian.
-    """
-
-    centre: float = 4.0
-    width_efolds: float = 2.0
-    smallest: float = 2.0
-    gaussian: float = 100.0
-
-
-FREEDOM_PRIOR = FreedomPrior()
+FREEDOM_CENTRE, FREEDOM_EFOLDS = 4.0, 2.0
+"""Log-normal prior of nu: the most probable one, safe for clean data and for data with outliers, and the standard
+deviation of log nu; wide, since a handful of errors hardly determines the tails."""
+SMALLEST_FREEDOM, GAUSSIAN_FREEDOM = 2.0, 100.0
+"""Bound below which the variance would be infinite, and nu from which noise counts as Gaussian."""
 FREEDOM_GRID_POINTS = 400
 """Points of the logarithmic grid of nu: steps of one percent."""
 BLOCK = 1 << 16
@@ -73,38 +59,42 @@ class Tails:
         return replace(self, weights=self.weights[index])
 
 
-def reweight(squares: Tensor, dim: int | Tensor, prior: FreedomPrior = FREEDOM_PRIOR) -> Tails:
+def reweight(squares: Tensor, dim: int | Tensor) -> Tails:
     """One round of expectation maximisation: the most probable nu for these errors, and the weights it implies.
+
+    nu maximises the likelihood of the errors alone, times the prior, on a logarithmic grid. That of errors and weights
+    together would converge slowly (C. Liu, D. Rubin, "The ECME algorithm", 1994): after ten rounds clean data would
+    still count as heavy-tailed.
 
     Args:
         squares: (N, P) squared distances of the errors in units of the noise; NaN where hidden, with weight 1.
         dim: k, coordinates of each error, the same for all or (N, P).
-        prior: prior and range of nu.
     """
-    seen = ~squares.isnan()
-    freedom = _freedom(squares[seen], dim if isinstance(dim, int) else dim[seen], prior)
-    if freedom >= prior.gaussian:
+    low, high = log(SMALLEST_FREEDOM), log(1.01 * GAUSSIAN_FREEDOM)
+    grid = torch.logspace(low, high, FREEDOM_GRID_POINTS, base=torch.e, dtype=squares.dtype, device=squares.device)
+    prior = -0.5 * ((grid / FREEDOM_CENTRE).log() / FREEDOM_EFOLDS).square()
+    freedom = float(grid[int((prior + _student(*_seen(squares, dim), grid)).argmax())])
+    if freedom >= GAUSSIAN_FREEDOM:
         return Tails(inf, torch.ones_like(squares))
     return Tails(freedom, ((freedom + dim) / (freedom + squares)).nan_to_num(1.0))
 
 
-def _freedom(squares: Tensor, dim: int | Tensor, prior: FreedomPrior) -> float:
-    """Maximise the likelihood of t-distributed errors, times the prior, over nu on a logarithmic grid.
+def _seen(squares: Tensor, dim: int | Tensor) -> tuple[Tensor, Tensor]:
+    """Squares and numbers of coordinates of the errors that are not hidden: (n,) each."""
+    seen = ~squares.isnan()
+    return squares[seen], torch.as_tensor(dim, dtype=squares.dtype, device=squares.device).expand_as(squares)[seen]
 
-    The likelihood is that of the errors alone. That of errors and weights together would converge slowly (C. Liu,
-    D. Rubin, "The ECME algorithm", 1994): after ten rounds clean data would still count as heavy-tailed.
-    """
-    low, high = log(prior.smallest), log(1.01 * prior.gaussian)
-    grid = torch.logspace(low, high, FREEDOM_GRID_POINTS, base=torch.e, dtype=squares.dtype, device=squares.device)
-    value = -0.5 * ((grid / prior.centre).log() / prior.width_efolds).square()
-    of_dim = {dim: squares} if isinstance(dim, int) else {int(k): squares[dim == k] for k in dim.unique()}
-    for k, own in of_dim.items():
-        half = (grid + k) / 2.0
-        parts = grid[:, None].split(max(1, BLOCK // max(1, own.numel())))
+
+def _student(squares: Tensor, dim: Tensor, freedoms: Tensor) -> Tensor:
+    """Log likelihood (F,) of n errors under Student's t of each nu (F,), relative to (2 pi)^(-k/2) of each error."""
+    value = torch.zeros_like(freedoms)
+    for k in dim.unique().tolist():
+        own, half = squares[dim == k], 0.5 * (freedoms + k)
+        parts = freedoms[:, None].split(max(1, BLOCK // len(own)))
         distances = torch.cat([(own / nu).log1p().sum(1) for nu in parts])
-        density = torch.lgamma(half) - torch.lgamma(grid / 2.0) - 0.5 * k * grid.log()
-        value = value + own.numel() * density - half * distances
-    return float(grid[int(value.argmax())])
+        density = torch.lgamma(half) - torch.lgamma(0.5 * freedoms) - 0.5 * k * (0.5 * freedoms).log()
+        value = value + len(own) * density - half * distances
+    return value
 
 
 FACTORS = tuple(25.0 * 4e4 ** (i / 34) for i in range(35))
@@ -121,15 +111,12 @@ def gross_weights(squares: Tensor, dim: int | Tensor) -> Tensor | None:
 
     Squares and dim as of :func:`reweight`, of left-out errors: those under the posterior hold the fields' uncertainty.
     """
-    seen = ~squares.isnan()
-    d2, k = squares[seen], torch.as_tensor(dim, dtype=squares.dtype, device=squares.device).expand_as(squares)[seen]
+    d2, k = _seen(squares, dim)
     shares, factors = squares.new_tensor(SHARES)[:, None, None], squares.new_tensor(FACTORS)[:, None]
-    freedoms, best, found, student = squares.new_tensor(FREEDOMS)[:, None], -inf, (0.0, 1.0, 1.0), -inf
-    half = 0.5 * (freedoms + k)
-    level = (torch.lgamma(half) - torch.lgamma(0.5 * freedoms) - 0.5 * k * (0.5 * freedoms).log()).sum(1)
+    freedoms, best, found, student = squares.new_tensor(FREEDOMS), -inf, (0.0, 1.0, 1.0), -inf
     for s in VARIANCES:
         scale = 0.5 * float(k.sum()) * log(s)
-        student = max(student, float((level - (half * (d2 / (s * freedoms)).log1p()).sum(1)).max()) - scale)
+        student = max(student, float(_student(d2 / s, k, freedoms).max()) - scale)
         good, gross = -0.5 * d2 / s, -0.5 * (d2 / (factors * s) + k * factors.log())
         value = torch.logaddexp((1.0 - shares).log() + good, shares.log() + gross).sum(2) - scale
         if float(value.max()) > best:
@@ -140,6 +127,6 @@ def gross_weights(squares: Tensor, dim: int | Tensor) -> Tensor | None:
     share, c, s = found
     odds = log((1.0 - share) / share) + 0.5 * dim * log(c) - 0.5 * squares / s * (1.0 - 1.0 / c)
     good = torch.sigmoid(odds)
-    if float(good[seen].mean()) < 0.5:  # noise that is said to be far too small is not gross
+    if float(good.nanmean()) < 0.5:  # noise that is said to be far too small is not gross
         return None
     return (good + (1.0 - good) / c).nan_to_num(1.0)

@@ -12,12 +12,11 @@ from importlib.metadata import entry_points
 
 from diffeo_calib.common.errors import InputError, MeasurementError, listed
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.sensors.beside_poses import Contacts, Trackers
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.height import Planes
-from diffeo_calib.sensors.held_tool import HeldTools
 from diffeo_calib.sensors.image import Cameras
 from diffeo_calib.sensors.range import FixedPoints
+from diffeo_calib.sensors.tool_frames import Contacts, HeldTools, Trackers
 
 KINDS: dict[str, type[Devices]] = {
     kind.kind: kind for kind in (FixedPoints, Planes, Cameras, HeldTools, Trackers, Contacts)

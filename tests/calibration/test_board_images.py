@@ -29,7 +29,7 @@ from diffeo_calib.measurements.poses import LEVER, mark_points, poses_from_marks
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation, transforms
-from diffeo_calib.sensors.beside_poses import Contacts, Trackers
+from diffeo_calib.sensors.tool_frames import Contacts, Trackers
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 

@@ -28,8 +28,8 @@ from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.sensors.devices import Devices
-from diffeo_calib.sensors.held_tool import HeldTools
 from diffeo_calib.sensors.kinds import KINDS, kind_of, register
+from diffeo_calib.sensors.tool_frames import HeldTools
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 

@@ -11,8 +11,7 @@ from tangent_bank import normal
 from torch import Tensor
 from torch.testing import assert_close
 
-from diffeo_calib.process.covariance import Covariance, joint_weights
-from diffeo_calib.process.numbers import Numbers
+from diffeo_calib.process.numbers import Covariance, Numbers, joint_weights
 from diffeo_calib.process.scales import Hyperparameters
 
 

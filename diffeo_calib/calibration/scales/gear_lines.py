@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.process.covariance import joint_weights
+from diffeo_calib.process.numbers import joint_weights
 from diffeo_calib.process.scales import GearLine, Hyperparameters
 
 MEDIAN_OF_CHANCE = 2.0 * log(2.0)

@@ -1,10 +1,15 @@
-"""Points of a tool whose poses are measured, as other devices show them: a tracker's marker, and a ball in a socket.
+"""What else shows a tool whose poses are measured: a tracker's marker, a ball in a socket, the robot's other hand.
 
 With the measured pose T of the tool, a point p that is fixed to it, and a device in the place B that is not known,
 
     y = B T p (marker),        0 = T p - c (contact in a socket at c).
 
-A tracker holds lengths, as a printed board does; contacts do not.
+A tracker holds lengths, as a printed board does; contacts do not. A rigid tool that two hands hold at once does not let
+them move to each other, whatever the joints do: with their poses T_1, T_2 and the transform X between them,
+
+    X^-1 T_1^-1 T_2 = 1,
+
+whose shift and turn, times the lever of measured poses, are readings of value zero: rows without a device.
 """
 
 from __future__ import annotations
@@ -14,7 +19,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from diffeo_calib.measurements.poses import LEVER, POINTS
 from diffeo_calib.robots.placement import place
+from diffeo_calib.robots.se3 import nearest_rotations
 from diffeo_calib.sensors.devices import Devices, least_squares, moved_pose, numbers_text
 
 
@@ -59,10 +66,6 @@ class Contacts(Devices):
     def read(constants: Tensor, body: Tensor) -> Tensor:
         return body[:3, :3] @ constants[3:] + body[:3, 3] - constants[:3]
 
-    @staticmethod
-    def changed(constants: Tensor, increments: Tensor) -> Tensor:
-        return constants + increments
-
     @classmethod
     def start(cls, values: Tensor, bodies: Tensor) -> Tensor:
         eye = torch.eye(3, dtype=values.dtype, device=values.device).expand(len(bodies), 3, 3)
@@ -74,3 +77,43 @@ class Contacts(Devices):
         std = 1e3 * float(deviations[:3].norm())
         what = f"socket '{self.names[number]}': {place} +- {std:.3f} mm in {frame}"
         return f"{what}, the ball at {ball} mm in the measured frame"
+
+
+@dataclass(frozen=True, eq=False)
+class HeldTools(Devices):
+    """Tools: constants are the rows (12) of the transform from the second hand to the first."""
+
+    kind = "held tool"
+    size_fix = "measure poses too: a held tool holds no lengths"
+    seen_points, numbers_each, increments_each = 2 * POINTS, 6, 6
+
+    @staticmethod
+    def read(constants: Tensor, body: Tensor) -> Tensor:
+        """Shift and, to first order, turn of the second hand from where the tool would have it, m."""
+        left, right, held = body[0], body[1], constants.view(3, 4)
+        R = left[:3, :3].mT @ right[:3, :3]
+        shift = left[:3, :3].mT @ (right[:3, 3] - left[:3, 3]) - held[:, 3]
+        turned = held[:, :3].mT @ R
+        skewed = turned - turned.mT
+        return torch.cat(
+            [held[:, :3].mT @ shift, 0.5 * LEVER * torch.stack([skewed[2, 1], skewed[0, 2], skewed[1, 0]])]
+        )
+
+    @staticmethod
+    def changed(constants: Tensor, increments: Tensor) -> Tensor:
+        """Shifted and turned in the first hand's frame."""
+        return moved_pose(constants, increments)
+
+    @classmethod
+    def start(cls, values: Tensor, bodies: Tensor) -> Tensor:
+        """The mean of T_1^-1 T_2."""
+        left, right = bodies[:, 0], bodies[:, 1]
+        R = nearest_rotations((left[:, :3, :3].mT @ right[:, :3, :3]).mean(0))
+        shift = (left[:, :3, :3].mT @ (right[:, :3, 3:] - left[:, :3, 3:])).mean(0)
+        return torch.cat([R, shift], 1).flatten()
+
+    def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
+        place = (1e3 * self.constants[number].view(3, 4)[:, 3]).tolist()
+        shift, turn = 1e3 * float(deviations[:3].norm()), 1e3 * float(deviations[3:].norm())
+        what = f"held tool '{self.names[number]}': the second hand at {numbers_text(place)} +- {shift:.3f} mm"
+        return f"{what}, +- {turn:.2f} mrad in the frame of the first"
