@@ -19,139 +19,63 @@ from diffeo_calib.common.lazy import lazy_names
 
 if TYPE_CHECKING:
     from diffeo_calib import interop as interop
-    from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
-    from diffeo_calib.calibration.planning.candidates import Tracker, candidates
-    from diffeo_calib.calibration.planning.plan import Plan, plan
-    from diffeo_calib.calibration.planning.sensors import Sensor
-    from diffeo_calib.calibration.recalibration.compare import Comparison, compare
-    from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
-    from diffeo_calib.campaign.campaign import Campaign
-    from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
-    from diffeo_calib.fitting.fit import fit
-    from diffeo_calib.fitting.gauss_newton import GaussNewton
-    from diffeo_calib.fitting.lbfgs import LBFGS
-    from diffeo_calib.fitting.problem import Problem
-    from diffeo_calib.fitting.result import Fit
-    from diffeo_calib.flows.integrators import RK4, RK8
-    from diffeo_calib.flows.torchdiffeq import TorchDiffEq
-    from diffeo_calib.interop.model_file import load, save
-    from diffeo_calib.kernels.base import Kernel
-    from diffeo_calib.kernels.radial import Cauchy, Gaussian, Matern, PerJoint, VonMises
-    from diffeo_calib.kernels.spaces import Space
-    from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-    from diffeo_calib.kinematics.compensation.compensate import Compensation, compensate
-    from diffeo_calib.kinematics.evaluation import evaluate, rows_used_in_fit
-    from diffeo_calib.kinematics.joint_ranges import joints_outside_range
-    from diffeo_calib.measurements.csv.files import read_measurements, read_readings
-    from diffeo_calib.measurements.observations import Observations
-    from diffeo_calib.measurements.readings import Readings
-    from diffeo_calib.measurements.table import Measurements
-    from diffeo_calib.paper.gradient_descent import GradientDescent
-    from diffeo_calib.process.scales import Hyperparameters
+    from diffeo_calib.calibration.calibrate import CalibrationResult as CalibrationResult
+    from diffeo_calib.calibration.calibrate import calibrate as calibrate
+    from diffeo_calib.calibration.planning.candidates import Tracker as Tracker
+    from diffeo_calib.calibration.planning.candidates import candidates as candidates
+    from diffeo_calib.calibration.planning.plan import Plan as Plan
+    from diffeo_calib.calibration.planning.plan import plan as plan
+    from diffeo_calib.calibration.planning.sensors import Sensor as Sensor
+    from diffeo_calib.calibration.recalibration.compare import Comparison as Comparison
+    from diffeo_calib.calibration.recalibration.compare import compare as compare
+    from diffeo_calib.calibration.recalibration.recalibrate import Recalibration as Recalibration
+    from diffeo_calib.calibration.recalibration.recalibrate import recalibrate as recalibrate
+    from diffeo_calib.campaign.campaign import Campaign as Campaign
+    from diffeo_calib.common.errors import DiffeoCalibError as DiffeoCalibError
+    from diffeo_calib.common.errors import DiffeoCalibWarning as DiffeoCalibWarning
+    from diffeo_calib.fitting.fit import fit as fit
+    from diffeo_calib.fitting.gauss_newton import GaussNewton as GaussNewton
+    from diffeo_calib.fitting.lbfgs import LBFGS as LBFGS
+    from diffeo_calib.fitting.problem import Problem as Problem
+    from diffeo_calib.fitting.result import Fit as Fit
+    from diffeo_calib.flows.integrators import RK4 as RK4
+    from diffeo_calib.flows.integrators import RK8 as RK8
+    from diffeo_calib.flows.torchdiffeq import TorchDiffEq as TorchDiffEq
+    from diffeo_calib.interop.model_file import load as load
+    from diffeo_calib.interop.model_file import save as save
+    from diffeo_calib.kernels.base import Kernel as Kernel
+    from diffeo_calib.kernels.radial import Cauchy as Cauchy
+    from diffeo_calib.kernels.radial import Gaussian as Gaussian
+    from diffeo_calib.kernels.radial import Matern as Matern
+    from diffeo_calib.kernels.radial import PerJoint as PerJoint
+    from diffeo_calib.kernels.radial import VonMises as VonMises
+    from diffeo_calib.kernels.spaces import Space as Space
+    from diffeo_calib.kinematics.calibrated import CalibratedKinematics as CalibratedKinematics
+    from diffeo_calib.kinematics.compensation.compensate import Compensation as Compensation
+    from diffeo_calib.kinematics.compensation.compensate import compensate as compensate
+    from diffeo_calib.kinematics.evaluation import evaluate as evaluate
+    from diffeo_calib.kinematics.evaluation import rows_used_in_fit as rows_used_in_fit
+    from diffeo_calib.kinematics.joint_ranges import joints_outside_range as joints_outside_range
+    from diffeo_calib.measurements.csv.files import read_measurements as read_measurements
+    from diffeo_calib.measurements.csv.files import read_readings as read_readings
+    from diffeo_calib.measurements.observations import Observations as Observations
+    from diffeo_calib.measurements.readings import Readings as Readings
+    from diffeo_calib.measurements.table import Measurements as Measurements
+    from diffeo_calib.paper.gradient_descent import GradientDescent as GradientDescent
+    from diffeo_calib.process.scales import Hyperparameters as Hyperparameters
     from diffeo_calib.reports import plots as plots
-    from diffeo_calib.reports.report import write_report
-    from diffeo_calib.robots.cartesian import cartesian, pose_inputs
-    from diffeo_calib.robots.dh import DHRow, from_dh
-    from diffeo_calib.robots.tree import Chain, Tree
-    from diffeo_calib.robots.urdf import load_urdf
+    from diffeo_calib.reports.report import write_report as write_report
+    from diffeo_calib.robots.cartesian import cartesian as cartesian
+    from diffeo_calib.robots.cartesian import pose_inputs as pose_inputs
+    from diffeo_calib.robots.dh import DHRow as DHRow
+    from diffeo_calib.robots.dh import from_dh as from_dh
+    from diffeo_calib.robots.tree import Chain as Chain
+    from diffeo_calib.robots.tree import Tree as Tree
+    from diffeo_calib.robots.urdf import load_urdf as load_urdf
 
 __version__ = "0.1.0"
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())  # the program that imports this decides what is shown
 
-__all__ = [
-    "LBFGS",
-    "RK4",
-    "RK8",
-    "CalibratedKinematics",
-    "CalibrationResult",
-    "Campaign",
-    "Cauchy",
-    "Chain",
-    "Comparison",
-    "Compensation",
-    "DHRow",
-    "DiffeoCalibError",
-    "DiffeoCalibWarning",
-    "Fit",
-    "GaussNewton",
-    "Gaussian",
-    "GradientDescent",
-    "Hyperparameters",
-    "Kernel",
-    "Matern",
-    "Measurements",
-    "Observations",
-    "PerJoint",
-    "Plan",
-    "Problem",
-    "Readings",
-    "Recalibration",
-    "Sensor",
-    "Space",
-    "TorchDiffEq",
-    "Tracker",
-    "Tree",
-    "VonMises",
-    "calibrate",
-    "candidates",
-    "cartesian",
-    "compare",
-    "compensate",
-    "evaluate",
-    "fit",
-    "from_dh",
-    "joints_outside_range",
-    "load",
-    "load_urdf",
-    "plan",
-    "pose_inputs",
-    "read_measurements",
-    "read_readings",
-    "recalibrate",
-    "rows_used_in_fit",
-    "save",
-    "write_report",
-]
-
 if not TYPE_CHECKING:  # type checkers see the imports above, and report unknown names
-    __getattr__, __dir__ = lazy_names(
-        __name__,
-        {
-            "calibration.calibrate": "CalibrationResult calibrate",
-            "calibration.planning.candidates": "Tracker candidates",
-            "calibration.planning.plan": "Plan plan",
-            "calibration.planning.sensors": "Sensor",
-            "calibration.recalibration.compare": "Comparison compare",
-            "calibration.recalibration.recalibrate": "Recalibration recalibrate",
-            "process.scales": "Hyperparameters",
-            "campaign.campaign": "Campaign",
-            "common.errors": "DiffeoCalibError DiffeoCalibWarning",
-            "fitting.fit": "fit",
-            "fitting.gauss_newton": "GaussNewton",
-            "fitting.lbfgs": "LBFGS",
-            "fitting.problem": "Problem",
-            "fitting.result": "Fit",
-            "flows.integrators": "RK4 RK8",
-            "flows.torchdiffeq": "TorchDiffEq",
-            "interop.model_file": "load save",
-            "kernels.base": "Kernel",
-            "kernels.radial": "Cauchy Gaussian Matern PerJoint VonMises",
-            "kernels.spaces": "Space",
-            "kinematics.calibrated": "CalibratedKinematics",
-            "kinematics.compensation.compensate": "Compensation compensate",
-            "kinematics.evaluation": "evaluate rows_used_in_fit",
-            "kinematics.joint_ranges": "joints_outside_range",
-            "measurements.csv.files": "read_measurements read_readings",
-            "measurements.observations": "Observations",
-            "measurements.readings": "Readings",
-            "measurements.table": "Measurements",
-            "paper.gradient_descent": "GradientDescent",
-            "reports": "plots",
-            "reports.report": "write_report",
-            "robots.cartesian": "cartesian pose_inputs",
-            "robots.dh": "DHRow from_dh",
-            "robots.tree": "Chain Tree",
-            "robots.urdf": "load_urdf",
-        },
-    )
+    __getattr__, __dir__, __all__ = lazy_names(__name__)

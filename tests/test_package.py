@@ -35,6 +35,7 @@ SLOW = (
     "typer",
 )
 """Libraries that a bare import does not load."""
+NAMES: list[str] = vars(dc)["__all__"]
 
 
 def run(code: str) -> str:
@@ -57,11 +58,11 @@ def test_models_are_used_without_scipy() -> None:
 
 
 def test_every_public_name_is_loaded_and_listed() -> None:
-    assert set(dc.__all__) <= set(dir(dc))
+    assert set(NAMES) <= set(dir(dc))
     assert not {"TYPE_CHECKING", "annotations", "import_module", "logging"} & set(dir(dc))
-    for name in dc.__all__:
+    for name in NAMES:
         assert getattr(dc, name).__module__.startswith("diffeo_calib.")
-    assert len(set(dc.__all__)) == len(dc.__all__)
+    assert len(set(NAMES)) == len(NAMES)
 
 
 SUBMODULES_FIRST = """
@@ -92,7 +93,7 @@ def test_names_seen_by_type_checkers_are_those_that_are_loaded() -> None:
         node for node in ast.walk(checking) if isinstance(node, ast.ImportFrom) and "diffeo_calib." in str(node.module)
     ]
     seen = {alias.name: node.module for node in imports for alias in node.names}
-    assert set(seen) == {*dc.__all__, "plots"}
+    assert set(seen) == {*NAMES, "plots"}, "the only list of names"
     for name, module in seen.items():
         assert getattr(sys.modules[str(module)], name) is getattr(dc, name), "the table names another module"
 

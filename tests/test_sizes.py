@@ -60,7 +60,7 @@ def parameters(function: Function) -> int:
 
 def may_have_many(function: Function, owner: str) -> bool:
     """Public names and commands: their parameters are what users can say."""
-    public = {function.name, owner} & set(diffeo_calib.__all__)
+    public = {function.name, owner} & set(vars(diffeo_calib)["__all__"])
     command = any("command" in ast.unparse(decorator) for decorator in function.decorator_list)
     return bool(public) or command
 

@@ -1,6 +1,6 @@
 """What an option is, and the groups of options that several commands share. Imports nothing slow: help appears at once.
 
-The fields of a group are options, or groups of more of them.
+A group is a frozen dataclass whose fields are options, or groups of more of them.
 """
 
 from __future__ import annotations
@@ -10,8 +10,6 @@ from dataclasses import MISSING, Field, dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
-
-from typing_extensions import dataclass_transform
 
 from diffeo_calib.common.errors import InputError
 
@@ -77,9 +75,8 @@ class Option(NamedTuple):
         return cls(own.name, hint, own.default, names, (*names, how["metavar"])[0], kind, how)
 
 
-@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(option, argument, written))
 class Options:
-    """A group of options: a frozen dataclass.
+    """A group of options.
 
     Attributes:
         needs: options, and others of which each of them needs one. excludes: and others that it cannot stand beside.
@@ -88,9 +85,6 @@ class Options:
     needs: ClassVar[tuple[tuple[str, str], ...]] = ()
     excludes: ClassVar[tuple[tuple[str, str], ...]] = ()
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
-
-    def __init_subclass__(cls) -> None:
-        dataclass(frozen=True, kw_only=True)(cls)
 
     @classmethod
     @cache
@@ -144,6 +138,7 @@ MASS = "Mass that the robot carries, for a model with payloads."
 ROBOT = "The robot's description: a URDF, or a table of its Denavit-Hartenberg parameters, one line per joint."
 
 
+@dataclass(frozen=True, kw_only=True)
 class Units(Options):
     """How tables are written; a model knows that of the table of its fit."""
 
@@ -167,6 +162,7 @@ class Units(Options):
     decimal: str | None = option("Decimal mark, by default that of the model, or a point.")
 
 
+@dataclass(frozen=True, kw_only=True)
 class Places(Options):
     """Measured places in a file of their own."""
 
@@ -181,6 +177,7 @@ class Places(Options):
     )
 
 
+@dataclass(frozen=True, kw_only=True)
 class Rows(Places):
     """Columns of the measurements in a table, of any kinds."""
 
@@ -257,6 +254,7 @@ class Rows(Places):
         return any(text.startswith(CORNERS) for text in self.reading or ())
 
 
+@dataclass(frozen=True, kw_only=True)
 class Links(Options):
     """Which part of the robot in a file."""
 
@@ -272,6 +270,7 @@ class Links(Options):
     )
 
 
+@dataclass(frozen=True, kw_only=True)
 class Robot(Options):
     """Which robot was measured; none where --robot-pose names commanded poses."""
 
@@ -279,6 +278,7 @@ class Robot(Options):
     robot: Path | None = option(ROBOT, "FILE")
 
 
+@dataclass(frozen=True, kw_only=True)
 class Targets(Options):
     """Columns of the poses that a tool shall have."""
 
@@ -290,6 +290,7 @@ class Targets(Options):
     rotation_angle: Angle | None = option(ROTATION_ANGLE)
 
 
+@dataclass(frozen=True, kw_only=True)
 class Candidates(Options):
     """Configurations to choose from: a table, or random ones within what the cell allows."""
 

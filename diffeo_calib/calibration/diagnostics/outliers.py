@@ -108,7 +108,7 @@ def outliers(
         shown = errors_of_kinds(left_out.errors, None, [one]).main
         unit, per_unit = shown.shown
         for number in bad[one.rows, 0].nonzero()[:, 0].tolist():
-            row, line = int(one.rows[number]), int(one.data.lines[number])
+            row, line = int(one.rows[number]), int(one.data.line_numbers[number])
             reading = per_unit * float(shown.errors[number, 0]), unit
             found.append(Outlier(row, None, line, float(sizes[number]), float(weights[row, 0]), FAR, reading=reading))
     return sorted(found, key=lambda outlier: -outlier.distance)

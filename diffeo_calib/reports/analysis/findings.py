@@ -321,7 +321,7 @@ def _of_table(
     LOG.info("judged by %d rows it has not seen, %d were used before", int(mask.sum()), int((~mask).sum()))
     mask = mask if new else ~mask
     errors = {name: found.rows(mask) for name, found in every.items()}
-    shown = Shown(errors, data.q[mask], data.lines[mask], new, devices=own.found)
+    shown = Shown(errors, data.q[mask], data.line_numbers[mask], new, devices=own.found)
     raw = measured_positions(data)  # as read: those of `measured` are moved by a drift that the model knows
     if measured is None or raw is None or not new or not bool((seen := unseen(model, raw.q)).any()):
         return shown
@@ -361,7 +361,7 @@ def _left_out(model: CalibratedKinematics, rows: FitRows, stages: Mapping[str, K
     outliers, moved = found.outliers(model), list[str]()
     if model.registration is None:  # else the rows of its fit are in another place
         moved = [common_cause(model, found.data, outliers) or ""]
-    return Shown(errors, found.data.q, found.data.lines, False, found, outliers, list(filter(None, moved)))
+    return Shown(errors, found.data.q, found.data.line_numbers, False, found, outliers, list(filter(None, moved)))
 
 
 def _columns(data: Measurements | None, against: Sequence[str]) -> dict[str, Tensor]:
