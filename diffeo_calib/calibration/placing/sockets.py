@@ -42,8 +42,8 @@ from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.sockets import SEPARATOR, Sockets
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails
+from diffeo_calib.regression.cholesky import Factor
 from diffeo_calib.regression.conditional import diagonal_blocks
-from diffeo_calib.regression.factor import Factor
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
