@@ -147,7 +147,7 @@ def test_deviations_grow_where_places_contradict_each_other(data: dc.Measurement
     """The ratio of squared errors of left-out places, by conditioning on the rows of the others."""
     from tangent_bank import covariance
 
-    from diffeo_calib.calibration.scales.cross_validation import inflation_by_places
+    from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places
     from diffeo_calib.calibration.scales.selection import defaults
     from diffeo_calib.regression.regions import region_factor
 
