@@ -7,8 +7,8 @@ errors are three times as large; `slip` of the camera on the tool, mm; `focus`, 
 image, %; `print`, a board that is bent by 0.5 mm at its edge.
 
 Fields of a record: `case`, `size`, `seed`; `said`: what warnings name; `right`: whether that is the cause, and nothing
-else (no warning for `none` and `print`, none or one of a link for `arm`); `true_mm` and `expected_mm`: error of the model
-at 300 other poses, as it is and as the model says (a slip: of the camera's place with most images).
+else (no warning for `none` and `print`, none or one of a link for `arm`); `true_mm` and `expected_mm`: error of the
+model at 300 other poses, as it is and as the model says (a slip: of the camera's place with most images).
 """
 
 from __future__ import annotations
