@@ -68,17 +68,13 @@ class Observations(RowGroups):
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """(N,) what each row is: "position", "pose", "socket", or the kind of its readings."""
+        """(N,) "position", "pose", "socket", or the kind of readings."""
         return tuple(self._texts([[part.kind] * len(part) for part in self.parts]))
 
     @property
     def device_names(self) -> list[str]:
         """(N,) name of the device of each row, or of its set-up; "" without one. Kinds have devices of their own."""
         return self._texts([part.device_names for part in self.parts])
-
-    @property
-    def _devices(self) -> list[str]:
-        return self._texts([[name and f"{part.kind} {name}" for name in part.device_names] for part in self.parts])
 
     @property
     def session_names(self) -> tuple[str, ...]:

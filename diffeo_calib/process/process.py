@@ -98,6 +98,9 @@ class Process:
     def expected(self, new: Numbers, before: Expected | None = None) -> Expected:
         """Numbers as the rows so far predict them; ``before``: the same by the first of these rows alone."""
         L, W = self.factor.L, self.factor.W
+        if not len(L):
+            U = new.S * self.variance.sqrt()
+            return Expected(new, torch.zeros_like(new.target), self._covariance(new, new), U, U.new_zeros(0, len(U)), U)
         if before is None:
             n, F, U = 0, self._covariance(new, new), new.S * self.variance.sqrt()
             V = X = torch.linalg.solve_triangular(L, self._covariance(self.numbers, new), upper=False)
@@ -147,6 +150,16 @@ class Process:
     def inverse(self) -> Tensor:
         """(M, M) K^-1."""
         return self.factor.inverse
+
+    @property
+    def slope(self) -> Tensor:
+        """Derivative (M, M) of the evidence by K."""
+        return self.inverse.addr(self.mu, self.mu, beta=-0.5, alpha=0.5)
+
+    @property
+    def by_log_variance(self) -> Tensor:
+        """Derivative (K,) of the evidence by the logarithms of the unknowns' prior variances."""
+        return self.factor.by_variance(self.variance.sqrt() * (self.numbers.S.T @ self.mu))
 
     @property
     def evidence(self) -> float:

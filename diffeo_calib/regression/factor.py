@@ -40,6 +40,12 @@ class Factor:
                 raise NumericalError.of("the covariance of the rows is not positive definite", fix=NOISE_ADVICE)
             return cls(L, torch.linalg.solve_triangular(L, H, upper=False))
 
+    @property
+    def matrix(self) -> Tensor:
+        """K (M, M)."""
+        H = self.L @ self.W
+        return self.L @ self.L.T + H @ H.T
+
     def white(self, values: Tensor) -> Tensor:
         """L^-1 values (M, k)."""
         return torch.linalg.solve_triangular(self.L, values, upper=False)

@@ -18,8 +18,8 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.recalibration.changes import NOISE_FACTORS, SIZES, likelihood_ratios
 from diffeo_calib.calibration.recalibration.compare import Comparison
+from diffeo_calib.calibration.recalibration.find_changes import NOISE_FACTORS, SIZES, likelihood_ratios
 
 OFFSET = 1e-3
 """Of a joint, rad."""
@@ -105,7 +105,9 @@ def test_ratios_are_those_of_the_definition() -> None:
     base, noise = shapes @ shapes.T, noise @ noise.mT
     residual = 3.0 * roots["a"] @ normal(2) + normal(6, 3)
     seen = torch.ones_like(residual, dtype=torch.bool)
-    rows: Any = SimpleNamespace(weighted_noise=noise, visible=seen, residual=residual, posterior=base)
+    none = base.new_zeros(0)
+    given = SimpleNamespace(C=base, slopes=base[:, :0], prior=none.view(0, 0))
+    rows: Any = SimpleNamespace(weighted_noise=noise, visible=seen, residual=residual, given=given)
     found, level = likelihood_ratios(rows, roots, seed=0)
 
     def densities(root: Tensor, sizes: Tensor) -> Tensor:  # (noise, sizes)

@@ -14,13 +14,14 @@ from product_bank import Case, simulated
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.campaign import quantum, warn_of_rounding
 from diffeo_calib.calibration.diagnostics.outliers import stuck_columns
 from diffeo_calib.calibration.diagnostics.plausibility import (
     check_identification,
     check_markers,
     marker_column,
+    quantum,
     unmeasured_markers,
+    warn_of_rounding,
 )
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.placing.place import place

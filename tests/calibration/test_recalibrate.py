@@ -17,7 +17,8 @@ from table_bank import refused
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.recalibration.recalibrate import place_again, weighed
+from diffeo_calib.calibration.recalibration.new_rows import weighed
+from diffeo_calib.calibration.recalibration.new_set_up import place_again
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation, transforms

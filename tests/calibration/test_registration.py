@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.campaign import warn_of_open_directions
+from diffeo_calib.calibration.diagnostics.open_directions import warn_of_open_directions
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import (
     find_joint_offsets,

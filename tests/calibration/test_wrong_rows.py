@@ -16,9 +16,9 @@ from simulated_sockets import rest_in_sockets
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.diagnostics.open_directions import warn_of_flat_places
 from diffeo_calib.calibration.diagnostics.outliers import contradicted
 from diffeo_calib.calibration.diagnostics.row_order import block_text, check_row_order, find_block, steps_of
-from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_flat_places
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError

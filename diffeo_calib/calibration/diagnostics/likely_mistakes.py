@@ -11,20 +11,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import SequenceMatcher
 from itertools import combinations, permutations
-from math import inf
+from math import degrees, inf
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.conventions import (
-    Convention,
-    Seen,
-    conventions,
-    frame_projector,
-    socket_projector,
-)
+from diffeo_calib.calibration.diagnostics.conventions import Convention, conventions, frame_projector, socket_projector
 from diffeo_calib.calibration.identification.registration import can_register, register, spread
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import (
@@ -295,10 +289,11 @@ def conventions_of(robot: Tree, data: Measurements, angle: str, judge: Judge = r
         return residual / size
 
     def projector(chosen: Tensor) -> Tensor:
-        return socket_projector(socket[rows[chosen]]) if free else frame_projector(places[rows[chosen]])
+        return socket_projector(socket[chosen]) if free else frame_projector(places[chosen])
 
     tip = robot.tips.index(data.on[marker]) if data.on else 0
-    return conventions(robot, data.q, Seen(tip, rows, projector, angle, left))
+    per_rad = degrees(1.0) if angle == "deg" else 1.0
+    return conventions(robot, data.q, left, rows, projector, tip=tip, per_rad=per_rad)
 
 
 def _convention_words(found: Sequence[Convention], columns: Columns | None) -> str:

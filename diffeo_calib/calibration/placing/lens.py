@@ -255,7 +255,7 @@ def _places(data: Measurements, rows: Tensor, registration: Identification, sess
     geometry = registration.geometry
     slopes = geometry.sensitivities(data.q).flatten(1, 2)
     base, tool = (slopes[..., geometry.slices[name]] for name in ("base", "tool"))
-    own = [one.own_places(data, tool, rows) for one in sessions]
+    own = [one.increments(data.points, tool, data.points.mean((0, 1)), rows) for one in sessions]
     return torch.cat([base, tool, *own], 2)
 
 

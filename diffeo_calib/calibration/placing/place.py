@@ -16,15 +16,15 @@ from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.campaign import warn_of_open_directions
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
 from diffeo_calib.calibration.diagnostics.moved_devices import Variation, variation
+from diffeo_calib.calibration.diagnostics.open_directions import warn_of_open_directions
 from diffeo_calib.calibration.diagnostics.outliers import Outlier
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_readings
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters
 from diffeo_calib.calibration.placing.drift import Drift
 from diffeo_calib.calibration.placing.lens import LensAndBoard
-from diffeo_calib.calibration.placing.placement import OtherLabel, OtherRows, Placement, label_text
+from diffeo_calib.calibration.placing.placement import OtherLabel, OtherRows, Placement
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
     identify_readings,
@@ -36,6 +36,7 @@ from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.placing.sockets import SocketDevices, coordinate_stages
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.common.errors import few, sentence
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit, Progress
 from diffeo_calib.kinematics.evaluation import residuals
@@ -245,13 +246,29 @@ class Placed:
             return None
         table, flags = own.table, torch.zeros(len(self.data), dtype=torch.bool, device=own.rows.device)
         flags[[one.row for one in wrong]] = True
-        seen = model.at_payloads(table.payload)(table.q).detach()
+        seen, flags = model.at_payloads(table.payload)(table.q).detach(), flags[own.rows]
         labels = [label for one in self.placement for label in one.labels(own, seen)]
         masses = table.masses.unique().tolist()
         for mass in masses if len(masses) <= gates.MOST_MASSES else ():
             away = model.with_payload(mass)(table.q).detach() - table.points
             labels.append(OtherLabel(f"a payload of {mass:g}", table.masses != mass, away.norm(dim=-1).nanmean(1)))
-        return label_text((seen - table.points).norm(dim=-1).nanmean(1), flags[own.rows], table.line_numbers, labels)
+        errors = (seen - table.points).norm(dim=-1).nanmean(1)
+        fit = [flags & one.applies & (one.errors < gates.REMAINING_UNDER_LABEL * errors) for one in labels]
+        count, rows, label = max(
+            zip([int(one.sum()) for one in fit], fit, labels, strict=True),
+            key=lambda one: one[0],
+            default=(0, flags, None),
+        )
+        if label is None or count < gates.LABEL_ROWS:
+            return None
+        lines = few(table.line_numbers[rows.to(table.line_numbers.device)].tolist(), 5)
+        before, after = (1e3 * float(each[rows].median()) for each in (errors, label.errors))
+        what, expected = (
+            f"{count} rows look wrong and fit {label.name}: lines {lines}",
+            "rows that fit under their own label",
+        )
+        got = f"median errors of {before:.3g} mm, and of {after:.3g} mm so"
+        return sentence(what, expected=expected, got=got, fix="correct these labels")
 
     def drifting(self) -> Placed | None:
         """The same with what may drift with columns of the table; None without such columns."""

@@ -13,16 +13,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.recalibration.changes import FEWEST_ROWS, LEVEL, Changes, find_changes
-from diffeo_calib.calibration.recalibration.new_rows import WeighedRows
+from diffeo_calib.calibration.recalibration.changes import LEVEL, Changes, HiddenOffset, hidden_offsets
+from diffeo_calib.calibration.recalibration.find_changes import FEWEST_ROWS, find_changes
+from diffeo_calib.calibration.recalibration.new_rows import WeighedRows, weighed
 from diffeo_calib.calibration.recalibration.new_set_up import (
     Marker,
     check_arguments,
     place_again,
     warn_of_places,
 )
-from diffeo_calib.calibration.recalibration.offsets import HiddenOffset, hidden_offsets
-from diffeo_calib.calibration.recalibration.recalibrate import weighed
 from diffeo_calib.common.checks import check_number, check_seed
 from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError
@@ -139,7 +138,7 @@ def compare(
         errors=rows.by_kind(rows.placed_residual),
         expectations=rows.by_kind(rows.expected_residual),
         usual=rows.by_kind(usual),
-        hidden=hidden_offsets(model.robot, rows.before, changes) if measured else (),
+        hidden=hidden_offsets(model.robot, rows.before.place, changes) if measured else (),
         payload=payload,
     )
 
@@ -183,7 +182,7 @@ def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) ->
     rows = weighed(place_again(model, new, "other"), "other")
     values, vectors = torch.linalg.eigh(FittedMap.joint_covariance(placed, there))
     errors = vectors * values.clamp(min=0.0).sqrt()
-    return rows.if_drifting([errors.unflatten(0, (len(q), -1))])
+    return rows.drifting([errors.unflatten(0, (len(q), -1))]).with_weights()
 
 
 def _inputs(robot: Tree, other: Tree, q: Tensor) -> Tensor:

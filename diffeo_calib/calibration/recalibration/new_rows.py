@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
 from diffeo_calib.calibration.placing.lens import CameraErrors
@@ -21,9 +22,10 @@ from diffeo_calib.calibration.placing.placement import DeviceSet, Placement, See
 from diffeo_calib.calibration.placing.readings import ReadingDevices, reading_sets
 from diffeo_calib.calibration.placing.sockets import SocketDevices
 from diffeo_calib.calibration.recalibration.new_set_up import Before
+from diffeo_calib.calibration.recalibration.parts import parts_of
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.kinematics.nominal import FlangePoints
-from diffeo_calib.kinematics.re_registration.find_place import MARKER_DEVIATIONS
+from diffeo_calib.kinematics.re_registration.find_place import MARKER_DEVIATIONS, UNMOVED_LOG_ODDS
 from diffeo_calib.kinematics.re_registration.new_rows import NewRows, larger, noise_of_rows, typical_noise
 from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.measurements.table import Measurements
@@ -94,7 +96,7 @@ class WeighedRows(NewRows):
             tails=Tails.none(len(seen), model.bodies, device=seen.device),
             **measured,
         )
-        by_tool = torch.nn.functional.pad(rows.by_places[..., 6:], (before.nominal.geometry.slices["tool"].start, 0))
+        by_tool = pad(rows.by_places[..., 6:], (before.nominal.geometry.slices["tool"].start, 0))
         shared = rows.placement.shared(SeenRows(before.nominal, rows.y, rows.seen[0], rows.slopes, by_tool))
         return rows if shared is None else rows.changed(shared=shared)
 
@@ -129,10 +131,6 @@ class WeighedRows(NewRows):
         """Of unknowns with these effects (M, R, c)."""
         E = root.flatten(0, 1)
         return Evidence(E.T @ self.given.solved.flatten(), E.T @ self.given.factor.solve(E))
-
-    def if_drifting(self, roots: Sequence[Tensor]) -> WeighedRows:
-        """The same with weights that hold then: a change is no outlier."""
-        return self.drifting(roots).with_weights()
 
     @property
     def new_noise(self) -> Tensor:
@@ -189,23 +187,42 @@ class WeighedRows(NewRows):
         squares = (self.given.solved * self.given.left_out).nansum(1) / self.given.visible.sum(1)
         return float(squares.median().sqrt())
 
-    def levelled(self, roots: list[Tensor]) -> WeighedRows:
-        """The rows with the likeliest noise of every kind of device that the old fit does not know.
-
-        Args:
-            roots: (M, R, c) columns of parts that may have changed: a change is no noise.
-        """
-        kinds = self.noise_model.kinds
+    def levelled(self) -> WeighedRows:
+        """The rows with the likeliest noise of every kind of device that the old fit does not know."""
+        kinds, known = self.noise_model.kinds, self.fitted.slopes is None
         kinds = torch.zeros_like(self.tails.weights, dtype=torch.int64) if kinds is None else kinds
-        rows = self.drifting(roots)
-        for kind in range(int(self.fitted.slopes is None), int(kinds.max()) + 1):
-            own = (kinds == kind).repeat_interleave(self.y.shape[1] // kinds.shape[1], 1)
-            own = own & self.visible
+        unknown = range(int(known), int(kinds.max()) + 1) if self.observe is not None or not known else ()
+        rows = self.drifting([part.root(self.at) for part in parts_of(self.fitted)] if unknown else [])  # no noise
+        for kind in unknown:
+            own = (kinds == kind).repeat_interleave(self.y.shape[1] // kinds.shape[1], 1) & self.visible
             levels = [rows.changed(noise=_scaled(rows.noise, own, float(f))) for f in NOISE_LEVELS]
             prior = [-0.5 * (log(float(f)) / NOISE_EFOLDS) ** 2 for f in NOISE_LEVELS]
             logs = [each.given.log_evidence() + p for each, p in zip(levels, prior, strict=True)]
             rows = levels[logs.index(max(logs))]
         return self.changed(noise=rows.noise)
+
+
+def weighed(before: Before, marker: str) -> WeighedRows:
+    """The new rows with their weights, and with the markers as free as is asked or as is most probable.
+
+    Args:
+        before: the old map, and where devices and markers are. marker: see :func:`diffeo_calib.recalibrate`.
+    """
+    own, place, ball = before.own_markers, before.place, None if before.new_ball else before.ball
+    other, known = own.clone(), slice(len(own) - before.new_ball)
+    if place is not None:
+        other[known] = place.registration.markers[known]
+    elif ball is not None:
+        other[-1] = ball
+    places = {"same": own, "moved": own, "other": other}
+    if place is None and ball is None:
+        names = ["same"]
+    elif marker != "evidence":
+        names = [marker]
+    else:
+        names = [name for name, (first, _) in MARKER_DEVIATIONS.items() if place is None or first == place.metres]
+    found = [WeighedRows.of(before, places[name], name).levelled().with_weights() for name in names]
+    return max(found, key=lambda one: one.given.log_evidence() + UNMOVED_LOG_ODDS * (one.marker == "same"))
 
 
 def _scaled(noise: Tensor, own: Tensor, factor: float) -> Tensor:

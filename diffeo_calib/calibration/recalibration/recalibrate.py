@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import nan
 from typing import Any, Literal
@@ -18,11 +17,11 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE
-from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.placing.placement import Placement
-from diffeo_calib.calibration.recalibration.changes import ChangedPart, Changes, Drift, find_changes, parts_of
-from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, WeighedRows
+from diffeo_calib.calibration.recalibration.changes import Changes, HiddenOffset, hidden_offsets
+from diffeo_calib.calibration.recalibration.find_changes import find_changes, usual_drift
+from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, WeighedRows, weighed
 from diffeo_calib.calibration.recalibration.new_set_up import (
     Before,
     Marker,
@@ -32,7 +31,6 @@ from diffeo_calib.calibration.recalibration.new_set_up import (
     place_again,
     warn_of_places,
 )
-from diffeo_calib.calibration.recalibration.offsets import HiddenOffset, hidden_offsets
 from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, as_written, sentence, warn_user
@@ -43,7 +41,6 @@ from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.provenance import Provenance, check_note
 from diffeo_calib.kinematics.re_registration.both_dates import both_dates
-from diffeo_calib.kinematics.re_registration.find_place import MARKER_DEVIATIONS, UNMOVED_LOG_ODDS
 from diffeo_calib.kinematics.re_registration.register_again import carried_devices, devices_beside
 from diffeo_calib.kinematics.re_registration.registered_map import Registration, moved
 from diffeo_calib.process.tails import Tails
@@ -169,24 +166,14 @@ def recalibrate(
     if drift == "tested":
         drifts = [*drifts, *usual_drift(rows, drifts)]
     if drifts:
-        rows = rows.if_drifting([each.variance**0.5 * each.part.root(rows.at) for each in drifts])
+        rows = rows.drifting([each.root(rows.at) for each in drifts]).with_weights()
     warn_of_contradictions(rows, rows.excess if before.registration is None else before.registration.excess)
-    fitted = fit_both(rows, drifts, progress)
+    problem, start = both_dates(rows, rows.inflation, [each.root for each in drifts])
+    solver, integrator = GaussNewton(tolerance=RESIDUAL_TOLERANCE), rows.fitted.geodesic.integrator
+    fitted = fit(problem, solver, integrator, start=start, progress=progress)
     if fitted.solution.interrupted:
         raise KeyboardInterrupt  # half-way the covariance would be that of the optimum: nothing is worth keeping
     return _result(model, before, rows, changes, fitted=fitted, note=note)
-
-
-def fit_both(rows: WeighedRows, drifts: list[Drift], progress: Progress) -> Fit:
-    """The exact model of old and new rows with the old scales."""
-    old, drifted = rows.fitted, list[Tensor]()
-    if drifts:
-        at = old.geodesic.linearise(None if old.data is None else old.x)
-        at = at if old.slopes is None else at.projected(old.slopes)
-        drifted = [each.variance**0.5 * each.part.root(at) for each in drifts]
-    problem, start = both_dates(rows.before.nominal, rows, rows.new_noise, drifted, rows.inflation)
-    solver = GaussNewton(tolerance=RESIDUAL_TOLERANCE)
-    return fit(problem, solver, old.geodesic.integrator, start=start, progress=progress)
 
 
 def _result(
@@ -227,7 +214,7 @@ def _result(
         inflation=rows.inflation,
         fit=fitted,
         shift=None if found is None else (again.geometry.tool - place.own_markers) * place.seen_before[:, None],
-        hidden=hidden_offsets(model.robot, place, changes),
+        hidden=hidden_offsets(model.robot, place.place, changes),
     )
 
 
@@ -262,34 +249,6 @@ def _left_over(fitted: Fit, rows: WeighedRows) -> Tensor:
     return left.masked_fill(~rows.visible, nan)
 
 
-def weighed(before: Before, marker: str) -> WeighedRows:
-    """The new rows with their weights, and with the markers as free as is asked or as is most probable."""
-    own, place, ball = before.own_markers, before.place, None if before.new_ball else before.ball
-    if place is None and ball is None:
-        return _rows(before, own, "same").with_weights()
-    other, known = own.clone(), slice(len(own) - before.new_ball)
-    if place is not None:
-        other[known] = place.registration.markers[known]
-    elif ball is not None:
-        other[-1] = ball
-    places = {"same": own, "moved": own, "other": other}
-    if marker != "evidence":
-        return _rows(before, places[marker], marker).with_weights()
-    if place is not None:
-        name = next(name for name, (first, _) in MARKER_DEVIATIONS.items() if first == place.metres)
-        return _rows(before, places[name], name).with_weights()
-    every = {name: _rows(before, at, name).with_weights() for name, at in places.items()}
-    return max(every.items(), key=lambda each: each[1].given.log_evidence() + UNMOVED_LOG_ODDS * (each[0] == "same"))[1]
-
-
-def _rows(before: Before, markers: Tensor, marker: str) -> WeighedRows:
-    """The new rows with all weights 1, the markers near these places (P, 3)."""
-    rows = WeighedRows.of(before, markers, marker)
-    if rows.observe is None and before.fitted.slopes is None:
-        return rows
-    return rows.levelled([part.root(rows.at) for part in parts_of(rows)])
-
-
 LARGEST_OUTLIER_PART = 0.5
 """Part of the rows that may hardly count: with more of them it is not clear which rows are wrong."""
 LARGEST_EXCESS = 10.0
@@ -311,58 +270,3 @@ def warn_of_contradictions(rows: WeighedRows, excess: float) -> None:
         what = f"{bad} of {len(rows)} new rows contradict the old model"
         fix = "check that the table belongs to this robot; if it was damaged or rebuilt, calibrate it afresh"
         warn_user(sentence(what, expected="rows of the same robot, most of them right", fix=fix))
-
-
-USUAL_LOG, EFOLDS = -6.0, 2.5
-"""Log-normal prior of s^2: the logarithm of its centre, and the standard deviation of its logarithm."""
-LOG_SIZES = torch.linspace(-12.0, 4.0, 65, dtype=torch.float64, device="cpu")
-"""Logarithms of the s^2 that are tried."""
-ROUNDS = 10
-
-
-def usual_drift(rows: WeighedRows, named: Sequence[Drift]) -> list[Drift]:
-    """What may differ between the dates, besides what a test named: temperature, wear and screws change everything.
-
-    In each of three groups, the geometry, the load and the transmissions of all joints, errors may differ from the old
-    ones by s^2 times their old prior variance; the sizes s^2 maximise the evidence of the new rows with a wide prior
-    below one percent.
-
-    Args:
-        rows: the new rows as the old model sees them. named: parts that have changed, which are free already.
-    """
-    free = {each.part.name for each in named}
-    groups: dict[str, list[ChangedPart]] = {}
-    for part in parts_of(rows):
-        if part.name not in free:
-            groups.setdefault(part.name if part.joint is None else "transmissions", []).append(part)
-    if not groups:
-        return []
-    roots = [torch.cat([part.root(rows.at) for part in parts], 2) for parts in groups.values()]
-    known = [each.variance**0.5 * each.part.root(rows.at) for each in named]
-    doubted, sizes = rows.if_drifting([*known, *roots]), list[float]()
-    for weighed, least in ((rows, gates.DRIFT_ODDS_OF_INLIERS), (doubted, gates.DRIFT_ODDS)):
-        sizes, odds = _likeliest(rows.changed(tails=weighed.tails).drifting(known), roots)
-        if odds < least:
-            return []
-    return [Drift(part, size) for parts, size in zip(groups.values(), sizes, strict=True) for part in parts]
-
-
-def _likeliest(rows: WeighedRows, roots: list[Tensor]) -> tuple[list[float], float]:
-    """The sizes s^2 of changes with these columns (M, R, c), each in turn the likeliest beside the others; log odds."""
-    sizes, chosen = LOG_SIZES.exp().to(rows.y), [0] * len(roots)
-    prior = -0.5 * ((LOG_SIZES.to(rows.y) - USUAL_LOG) / EFOLDS).square()
-
-    def scaled(k: int) -> Tensor:
-        return sizes[chosen[k]].sqrt() * roots[k]
-
-    every = range(len(roots))
-    for _ in range(ROUNDS):
-        before = list(chosen)
-        for k in every:
-            beside = rows.drifting([scaled(j) for j in every if j != k])
-            chosen[k] = int((beside.evidence(roots[k]).log_odds(sizes) + prior).argmax())
-        if chosen == before:
-            break
-    together = torch.cat([scaled(k) for k in every], 2)
-    odds = rows.evidence(together).log_odds(sizes.new_ones(1)) + prior[chosen].sum()
-    return sizes[chosen].tolist(), float(odds)

@@ -304,16 +304,17 @@ class TangentData:
         """What is known before these rows."""
         return Process.prior(scales, self.space, self.unknowns_variance(scales), self.numbers)
 
-    def expected(self, scales: Hyperparameters) -> Expected:
-        """The numbers as they are expected before the rows."""
-        return self._kept("_expected", scales, lambda: self.prior(scales).expected(self.numbers))
+    def expected(self, scales: Hyperparameters) -> tuple[Process, Expected]:
+        """What is known before these rows, and their numbers as they are expected then: the same for all weights."""
+        prior = self.prior(scales)
+        return self._kept("_expected", scales, lambda: (prior, prior.expected(self.numbers)))
 
     def process(self, scales: Hyperparameters) -> Process:
         """What is known by these rows with their weights."""
 
         def given() -> Process:
-            noise = self.numbers.blocks_of_table(self.told.weighted_noise(scales))
-            return self.prior(scales).given(self.numbers, noise, self.expected(scales))
+            prior, expected = self.expected(scales)
+            return prior.given(self.numbers, self.numbers.blocks_of_table(self.told.weighted_noise(scales)), expected)
 
         return self._kept("_process", scales, given)
 

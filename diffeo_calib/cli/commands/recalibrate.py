@@ -9,9 +9,8 @@ from typing import Any
 
 import typer
 
-from diffeo_calib.calibration.recalibration.changes import Changes
+from diffeo_calib.calibration.recalibration.changes import Changes, HiddenOffset
 from diffeo_calib.calibration.recalibration.compare import compare
-from diffeo_calib.calibration.recalibration.offsets import HiddenOffset
 from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
 from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
 from diffeo_calib.cli.console import progress_bar, say

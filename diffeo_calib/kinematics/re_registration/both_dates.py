@@ -7,6 +7,8 @@ The old rows follow from the old momenta (:meth:`FittedMap.measured`), from whic
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -15,8 +17,9 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap, SessionMarkers
 from diffeo_calib.kinematics.re_registration.new_rows import NewRows
-from diffeo_calib.kinematics.re_registration.registered_map import place_slopes
+from diffeo_calib.kinematics.re_registration.registered_map import place_slopes, robot_map
 from diffeo_calib.maps.deformation import Momenta
+from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.maps.observation import LinearFunctionals, Observation, Part, Stacked
 from diffeo_calib.regression.choose import MAX_DENSE
@@ -31,24 +34,24 @@ def joins(old: FittedMap, count: int) -> bool:
 
 
 def both_dates(
-    nominal: GeometryMap, new: NewRows, new_noise: Tensor, drifted: list[Tensor], factor: float
+    new: NewRows, factor: float, drifts: Sequence[Callable[[Linearisation], Tensor]] = ()
 ) -> tuple[Problem, Momenta]:
     """The problem of old and new rows, and the old momenta as its start.
 
     Args:
-        nominal: that of the fit. new: the rows. new_noise: (m, m) of a new measurement, m^2.
-        drifted: (N, r, c) columns of what the old rows share besides places, m.
-        factor: on all variances, which changes the uncertainty, but not the optimum.
+        new: the rows. factor: on all variances, which changes the uncertainty, but not the optimum.
+        drifts: columns (N, r, c) of what old rows share besides places, m, from their linearisation.
     """
-    old = new.fitted
-    spec, theta, x = old.geodesic.spec, old.deformation.momenta.theta, old.deformation.x
-    geometry, count = nominal.geometry, len(new.q)
+    old, count = new.fitted, len(new)
+    spec, (b, p, theta), x = old.geodesic.spec, old.deformation.momenta.tensors, old.deformation.x
+    nominal = robot_map(old).typical
+    geometry = nominal.geometry
     newest = nominal.with_geometry(geometry.with_tool(new.points.points - theta[geometry.slices["tool"]].view(-1, 3)))
     prior = spec.prior_variance.clone()
     if bool(new.deviations[:6].any()):  # a device says where the base is
         prior[geometry.slices["base"]] = prior[geometry.slices["base"]].clamp(min=PLACES.found_m_rad**2)
     y, noise, observe = _together(new)
-    before, rows = _shared(nominal, new, drifted), y.shape[1]
+    before, rows = _shared(nominal, new, drifts), y.shape[1]
     before = pad(before, (0, new.shared.shape[2], 0, rows - before.shape[1]))
     since = pad(new.shared, (before.shape[2] - new.shared.shape[2], 0, 0, rows - new.shared.shape[1]))
     problem = Problem(
@@ -60,13 +63,12 @@ def both_dates(
         noise=Noise(factor * noise, factor**0.5 * torch.cat([before, since])),
         markers=geometry.markers,
         prior_variance=factor * prior,
-        new_noise=factor * new_noise,
+        new_noise=factor * new.new_noise,
         observe=observe,
     )
     problem = problem.with_nominal_of_rows(_sessions(geometry.tool, new, newest))
     if old.data is not None or problem.y.numel() > MAX_DENSE:
         problem = problem.with_controls(torch.cat([x, new.q]))
-    b, p, _ = old.deformation.momenta.tensors
     b, p = pad(b, (0, 0, 0, count)) / factor, pad(p, (0, 0, 0, count * geometry.markers)) / factor
     return problem, Momenta(b, p, theta)
 
@@ -93,14 +95,17 @@ def _together(new: NewRows) -> tuple[Tensor, Tensor, Observation | None]:
     return numbers, without_hidden(torch.cat(noise), seen), Stacked(N + M, size, m, parts)
 
 
-def _shared(nominal: GeometryMap, new: NewRows, drifted: list[Tensor]) -> Tensor:
+def _shared(nominal: GeometryMap, new: NewRows, drifts: Sequence[Callable[[Linearisation], Tensor]]) -> Tensor:
     """(N, r, c) shifts of the old rows: those they shared already, device and markers since, what has drifted since."""
     old = new.fitted
-    deformation = old.geodesic.with_nominal(FlangePoints(nominal, nominal.geometry.tool, same=True))
+    around = old.geodesic.with_nominal(FlangePoints(nominal, nominal.geometry.tool, same=True))
     places = old.measured() if old.slopes is None else old.fitted_points
-    at = deformation.linearise(old.x)
-    moved = (place_slopes(deformation, at, places, new.centre) * new.deviations)[..., new.deviations > 0]
-    return torch.cat([old.noise.shared, moved if old.slopes is None else old.slopes @ moved, *drifted], 2)
+    moved = place_slopes(around, around.linearise(old.x), places, new.centre) * new.deviations
+    at = old.geodesic.linearise(None if old.data is None else old.x) if drifts else None
+    if old.slopes is not None:
+        moved, at = old.slopes @ moved, None if at is None else at.projected(old.slopes)
+    drifted = [] if at is None else [columns(at) for columns in drifts]
+    return torch.cat([old.noise.shared, moved[..., new.free], *drifted], 2)
 
 
 def _sessions(tool: Tensor, new: NewRows, newest: GeometryMap) -> SessionMarkers:

@@ -223,6 +223,11 @@ class NewRows:
         return torch.where(both, self.fitted.new_noise, found) if bool(unseen.any()) else found
 
     @property
+    def new_noise(self) -> Tensor:
+        """(m, m) covariance of a new measurement in the new set-up, m^2."""
+        return self.mean_noise
+
+    @property
     def free(self) -> Tensor:
         """(k,) numbers of what may have moved of frame and markers."""
         return self.deviations.nonzero()[:, 0]

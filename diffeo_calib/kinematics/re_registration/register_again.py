@@ -56,20 +56,20 @@ def register_again(
     if not (learn and joins(fit, len(found.rows))):
         placed = moved(fit, registration.transform).inflated(found.rows.inflation)
         return RegisteredMap(placed, registration), registration
-    learnt = moved(_learnt(fit, nominal, found), registration.transform)
+    learnt = moved(_learnt(fit, found), registration.transform)
     own, old = robot_map(learnt), found.rows.old_markers
     markers = own.geometry.tool + learnt.deformation.momenta.theta[own.geometry.slices["tool"]].view(-1, 3)
     return learnt, replace(registration, markers=markers, shift=markers - old)
 
 
-def _learnt(fit: FittedMap, nominal: GeometryMap, found: FoundPlace) -> FittedMap:
+def _learnt(fit: FittedMap, found: FoundPlace) -> FittedMap:
     """The fit conditioned on the rows that took part, too, in its own frame, as if nothing but places had changed."""
     new, same = found.rows, found.metres == SAME_PLACE
     known = torch.full_like(new.deviations, PLACES.found_m_rad)
     known[6:] = PLACES.same_m if same else found.metres
     points = FlangePoints(new.points.fitted, new.old_markers, same=True) if same else new.points
     new = replace(new, points=points, deviations=known * (new.deviations > 0))
-    problem, start = both_dates(nominal, new, new.mean_noise, [], found.rows.inflation)
+    problem, start = both_dates(new, found.rows.inflation)
     solution = STEPS.solve(problem, fit.geodesic.integrator, start)
     if solution.interrupted:
         raise KeyboardInterrupt  # half-way the covariance would be that of the optimum

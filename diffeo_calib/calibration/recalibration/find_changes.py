@@ -1,0 +1,289 @@
+"""Changes since a robot was calibrated: likelihood ratios for every joint, its offset, the load, the geometry.
+
+The residuals r of new rows are N(0, K_0) if only device and markers have moved; if part k has changed, too, they are
+N(0, K_0 + s^2 G_k), with G_k the covariance of that part in the old model and s^2 the variance of the change relative
+to it. The noise may have changed by a factor f. Part k is named if
+
+    LR_k = 2 max_{s, f} log N(r; 0, K_0(f) + s^2 G_k) - 2 max_f log N(r; 0, K_0(f))
+
+is larger than for all but 1 % of samples from K_0, in each of which the largest ratio of all parts counts and s and f
+are found anew. Rows are weighted twice, as if everything might have changed and as if nothing had, so that neither a
+change counts as outliers nor outliers as a change; the larger probability counts. What was named may then drift, and
+the test is repeated for the rest. Rows outside the joint ranges of the old rows take no part: errors there are
+extrapolation, not change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import inf
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
+from diffeo_calib.calibration.diagnostics.row_order import find_block
+from diffeo_calib.calibration.recalibration.changes import LEVEL, Change, Changes, SmallestOffset
+from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, WeighedRows
+from diffeo_calib.calibration.recalibration.parts import (
+    OFFSET_DEVIATION_RAD_M,
+    ChangedPart,
+    Drift,
+    offsets_of,
+    parts_of,
+)
+from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.common.errors import sentence, warn_user
+
+SIMULATED_DRAWS = 2000
+NOISE_FACTORS = 0.4 * 30.0 ** (torch.arange(12, dtype=torch.float64, device="cpu") / 11)
+"""Factors 0.4 to 12 on the variance of the noise: another device, another day."""
+SIZES = 0.03 * 1e4 ** (torch.arange(25, dtype=torch.float64, device="cpu") / 24)
+"""Variances 0.03 to 300 of a change, relative to the old variance of its part."""
+
+
+class Ratio(NamedTuple):
+    """The likelihood ratio of one part.
+
+    Args:
+        value: 2 log of the ratio. probability: that chance makes the largest ratio of all parts as large.
+        variance: likeliest variance of the change, relative to the old variance of its part.
+    """
+
+    value: float
+    probability: float
+    variance: float
+
+    def least_certain(self, other: Ratio) -> Ratio:
+        """This ratio with the larger probability, and the smaller value, of both."""
+        return Ratio(min(self.value, other.value), max(self.probability, other.probability), self.variance)
+
+
+def likelihood_ratios(rows: WeighedRows, roots: dict[str, Tensor], seed: int) -> tuple[dict[str, Ratio], float]:
+    """Ratios of all parts.
+
+    Args:
+        rows: the new rows, with the changes that are known already.
+        roots: name -> (M, m, c) columns of each part's covariance, m. seed: of the samples.
+
+    Returns:
+        name -> ratio, and the likeliest standard deviation of the noise without a change, relative to that of the rows.
+    """
+    given = rows.given
+    base = given.C + given.slopes @ given.prior @ given.slopes.T
+    R = torch.block_diag(*rows.weighted_noise)
+    seen = rows.visible.flatten()  # what was not measured has no noise whose level may change
+    R, base, residual = R[seen][:, seen], base[seen][:, seen], rows.residual.flatten()[seen, None]
+    factors = [torch.linalg.cholesky(base + f * R) for f in NOISE_FACTORS.to(base)]
+
+    def white(values: Tensor) -> list[Tensor]:
+        return [torch.linalg.solve_triangular(factor, values, upper=False) for factor in factors]
+
+    def densities(whitened: list[Tensor]) -> Tensor:
+        """(noise, k) log densities without a change, but for a constant."""
+        each = zip(whitened, factors, strict=True)
+        return torch.stack([-0.5 * r.square().sum(0) - factor.diagonal().log().sum() for r, factor in each])
+
+    likeliest = int(densities(white(residual)).argmax())
+    draws = torch.randn(len(R), SIMULATED_DRAWS, generator=seeded(seed), dtype=base.dtype, device=HOST).to(base.device)
+    samples = white(torch.cat([residual, factors[likeliest] @ draws], 1))
+    plain, sizes, ratios, variances = densities(samples), SIZES.to(base), dict[str, Tensor](), dict[str, float]()
+    for name, root in roots.items():
+        each = zip(white(root.flatten(0, 1)[seen]), samples, plain, strict=True)
+        changed = torch.cat([own + Evidence((E.T @ r).mT, E.T @ E).log_odds(sizes) for E, r, own in each])
+        ratios[name] = 2.0 * (changed.amax(0) - plain.amax(0))
+        variances[name] = float(SIZES[int(changed[:, 0].argmax()) % len(SIZES)])
+    largest = torch.stack(list(ratios.values())).amax(0)[1:]
+    found = {}
+    for name, values in ratios.items():
+        value = float(values[0])
+        found[name] = Ratio(value, (1 + int((largest >= value).sum())) / (1 + SIMULATED_DRAWS), variances[name])
+    return found, float(NOISE_FACTORS[likeliest].sqrt())
+
+
+FEWEST_ROWS = 5
+MOST_OUTLIERS = 0.5
+"""Share of the rows of a session that hardly count, from which it deviates as a whole."""
+RANGE_MARGIN = 0.02
+"""Rows may lie outside of the old joint ranges by this share of them."""
+SOMETHING = "something"
+"""A change whose part rows do not tell."""
+
+
+def find_changes(rows: WeighedRows, *, level: float = LEVEL, seed: int = 0) -> tuple[Changes, list[Drift]]:
+    """Test new rows for changes: all together, and every session and block of rows that do not fit by itself.
+
+    Rows that follow one another, or are a session of their own, and deviate together are no outliers.
+
+    Args:
+        rows: seen by the old model. level: see :class:`Changes`. seed: of the samples.
+
+    Returns:
+        what was found, and what may drift: nothing where only a part of the rows shows a change.
+
+    Warns:
+        DiffeoCalibWarning: too few rows within the old joint ranges for a test.
+    """
+    changes, drifts = _changes_of(rows, level=level, seed=seed)
+    if not changes.tested:
+        what = f"{changes.few}: changes of the robot were not tested, and the places that were found may hide one"
+        warn_user(sentence(what, fix=f"measure {FEWEST_ROWS} poses or more within these ranges"))
+    groups = groups_of(rows)
+    if changes.found or not groups:
+        return changes, drifts
+    found = []
+    for where, (index, deviates) in groups.items():
+        own, _ = _changes_of(group := rows.kept(index), level=level / len(groups), seed=seed)
+        found += [replace(one, where=where) for one in own.found]
+        if deviates and not own.found:
+            numbers = 3 if rows.noise_model.size % 3 == 0 else rows.noise_model.size
+            size = float(group.residual.unflatten(1, (-1, numbers)).square().sum(2).mean().sqrt())  # m at the tool
+            found.append(Change(SOMETHING, size, angle=False, displacement=size, probability=level, where=where))
+    return replace(changes, found=tuple(found)), []
+
+
+def groups_of(rows: WeighedRows) -> dict[str, tuple[Tensor, bool]]:
+    """Rows that were measured together, by their names: their numbers, and whether hardly any fits the old model.
+
+    Sessions, if there are several, and else the block of rows that hardly count.
+    """
+    data, flags = rows.before.data, (rows.tails.weights < OUTLIER_WEIGHT).any(1).to(HOST)
+    named = [group for one in rows.before.sessions for group in one.groups()]
+    if named:
+        return {name: (own, float(flags[own].double().mean()) > MOST_OUTLIERS) for name, own in named}
+    distinct = len(data.line_numbers.unique()) == len(data)
+    numbers = data.line_numbers.to(HOST) if distinct else torch.arange(len(data), device=HOST)
+    order = numbers.argsort()
+    place = find_block(flags[order])
+    if place is None or place[1] - place[0] < FEWEST_ROWS:
+        return {}
+    block = order[place[0] : place[1]]
+    first, *_, last = numbers[block].tolist()
+    return {f"rows {first} to {last}": (block, True)}
+
+
+def _changes_of(rows: WeighedRows, *, level: float, seed: int) -> tuple[Changes, list[Drift]]:
+    """Test rows together; arguments as of :func:`find_changes`."""
+    rows = rows.kept(within_old_range(rows))
+    if len(rows) < FEWEST_ROWS:
+        return Changes((), {}, 1.0, len(rows), level), []
+    parts = {part.name: part for part in (*parts_of(rows.fitted), *offsets_of(rows.fitted))}
+    roots = {name: part.root(rows.at) for name, part in parts.items()}
+    rows = rows.changed(tails=rows.drifting(list(roots.values())).with_weights().tails)
+    drifts, found, first, noise = list[Drift](), list[tuple[float, tuple[str, ...]]](), dict[str, float](), 1.0
+    while roots:
+        ratios, factor = likelihood_ratios(rows, roots, seed)
+        # A few outliers look like a change, and a change looks like outliers: it must stand out with either weights.
+        strict, _ = likelihood_ratios(rows.with_weights(), roots, seed)
+        ratios = {name: each.least_certain(strict[name]) for name, each in ratios.items()}
+        if not first:
+            first, noise = {name: ratio.probability for name, ratio in ratios.items()}, factor
+        name = min(ratios, key=lambda each: (ratios[each].probability, -ratios[each].value))
+        best = ratios.pop(name)
+        if best.probability > level:
+            break
+        drifts.append(Drift(parts[name], best.variance))
+        rows = rows.drifting([best.variance**0.5 * roots.pop(name)])
+        least = best.value - gates.OFFSETS_TOLD_APART if parts[name].offset else inf
+        as_good = [each for each, own in ratios.items() if parts[each].offset and own.value > least]
+        found.append((best.probability, tuple(as_good)))
+    changes = tuple(_change(rows, drift, *why) for drift, why in zip(drifts, found, strict=True))
+    return Changes(changes, first, noise, len(rows), level, () if drifts else _smallest(rows)), drifts
+
+
+SHOWN = 5.5
+"""Standard deviations of an offset that is named in nine cases of ten at a level of 1 %."""
+LARGEST_OFFSET_RAD_M = 5e-3
+"""The largest one that is tested, see SIZES."""
+
+
+def _smallest(rows: WeighedRows) -> tuple[SmallestOffset, ...]:
+    """See :class:`Changes`."""
+    chain, found = rows.points.fitted.geometry.chain, []
+    for joint, part in enumerate(offsets_of(rows.fitted)):
+        evidence = rows.evidence(part.root(rows.at))
+        size = SHOWN * OFFSET_DEVIATION_RAD_M / float(evidence.H.sqrt())
+        size = size if size < LARGEST_OFFSET_RAD_M else inf
+        found.append(SmallestOffset(chain.joint_names[joint], size, chain.kinds[joint] != "prismatic"))
+    return tuple(found)
+
+
+def within_old_range(rows: WeighedRows) -> Tensor:
+    """(k,) numbers of the rows within the ranges of the joints in the old rows."""
+    low, high = rows.fitted.x.amin(0), rows.fitted.x.amax(0)
+    margin = RANGE_MARGIN * (high - low)
+    return ((rows.q >= low - margin) & (rows.q <= high + margin)).all(1).nonzero()[:, 0]
+
+
+def _change(rows: WeighedRows, drift: Drift, probability: float, others: tuple[str, ...]) -> Change:
+    """The change with its expected size."""
+    (part, variance), kinds = drift, rows.points.fitted.geometry.chain.kinds
+    evidence = rows.evidence(part.root(rows.at))
+    moved = part.root(rows.seen[1]) @ (variance * evidence.g)
+    size = displacement = float(moved.unflatten(1, (-1, 3)).square().sum(-1).mean().sqrt())
+    deviation = None
+    if part.joint is not None:
+        errors = part.shapes(rows.at) @ (variance * evidence.g)
+        size = float(errors[0]) if part.offset else float(errors.square().mean().sqrt())
+    if part.offset:
+        deviation = OFFSET_DEVIATION_RAD_M * (variance * max(1.0 - variance * float(evidence.H), 0.0)) ** 0.5
+    angle = part.joint is not None and kinds[part.joint] != "prismatic"
+    return Change(part.name, size, angle, displacement, probability, deviation, others)
+
+
+USUAL_LOG, EFOLDS = -6.0, 2.5
+"""Log-normal prior of s^2: the logarithm of its centre, and the standard deviation of its logarithm."""
+LOG_SIZES = torch.linspace(-12.0, 4.0, 65, dtype=torch.float64, device="cpu")
+"""Logarithms of the s^2 that are tried."""
+ROUNDS = 10
+
+
+def usual_drift(rows: WeighedRows, named: Sequence[Drift]) -> list[Drift]:
+    """What may differ between the dates, besides what a test named: temperature, wear and screws change everything.
+
+    In each of three groups, the geometry, the load and the transmissions of all joints, errors may differ from the old
+    ones by s^2 times their old prior variance; the sizes s^2 maximise the evidence of the new rows with a wide prior
+    below one percent.
+
+    Args:
+        rows: the new rows as the old model sees them. named: parts that have changed, which are free already.
+    """
+    free = {each.part.name for each in named}
+    groups: dict[str, list[ChangedPart]] = {}
+    for part in parts_of(rows.fitted):
+        if part.name not in free:
+            groups.setdefault(part.name if part.joint is None else "transmissions", []).append(part)
+    if not groups:
+        return []
+    roots = [torch.cat([part.root(rows.at) for part in parts], 2) for parts in groups.values()]
+    known = [each.root(rows.at) for each in named]
+    doubted, sizes = rows.drifting([*known, *roots]).with_weights(), list[float]()
+    for weighed, least in ((rows, gates.DRIFT_ODDS_OF_INLIERS), (doubted, gates.DRIFT_ODDS)):
+        sizes, odds = _likeliest(rows.changed(tails=weighed.tails).drifting(known), roots)
+        if odds < least:
+            return []
+    return [Drift(part, size) for parts, size in zip(groups.values(), sizes, strict=True) for part in parts]
+
+
+def _likeliest(rows: WeighedRows, roots: list[Tensor]) -> tuple[list[float], float]:
+    """The sizes s^2 of changes with these columns (M, R, c), each in turn the likeliest beside the others; log odds."""
+    sizes, chosen = LOG_SIZES.exp().to(rows.y), [0] * len(roots)
+    prior = -0.5 * ((LOG_SIZES.to(rows.y) - USUAL_LOG) / EFOLDS).square()
+
+    def scaled(k: int) -> Tensor:
+        return sizes[chosen[k]].sqrt() * roots[k]
+
+    every = range(len(roots))
+    for _ in range(ROUNDS):
+        before = list(chosen)
+        for k in every:
+            beside = rows.drifting([scaled(j) for j in every if j != k])
+            chosen[k] = int((beside.evidence(roots[k]).log_odds(sizes) + prior).argmax())
+        if chosen == before:
+            break
+    together = torch.cat([scaled(k) for k in every], 2)
+    odds = rows.evidence(together).log_odds(sizes.new_ones(1)) + prior[chosen].sum()
+    return sizes[chosen].tolist(), float(odds)
