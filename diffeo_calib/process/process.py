@@ -18,13 +18,10 @@ from math import nan
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import NumericalError
-from diffeo_calib.common.threads import large_work
 from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.process.numbers import Covariance, Numbers
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.regression.conditional import NOISE_ADVICE
-from diffeo_calib.regression.factor import Factor
+from diffeo_calib.regression.cholesky import Factor, lower_root
 
 
 @dataclass(frozen=True)
@@ -82,11 +79,7 @@ class Process:
             NumericalError: their covariance is not positive definite in float64.
         """
         at = self.expected(new) if at is None else at
-        F = new.add_blocks(at.fields.clone(), noise)
-        with large_work(F.numel()):
-            L, info = torch.linalg.cholesky_ex(F)
-        if int(info):
-            raise NumericalError.of("the covariance of the rows is not positive definite", fix=NOISE_ADVICE)
+        L = lower_root(new.add_blocks(at.fields.clone(), noise))
         right = torch.cat([(new.target - at.white.T @ self.alpha)[:, None], at.unknowns], 1)
         right, n = torch.linalg.solve_triangular(L, right, upper=False), len(self.alpha)
         if n:

@@ -21,8 +21,7 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.choose_scales import robot_problem
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register
-from diffeo_calib.calibration.scales.cross_validation import left_out_squares
-from diffeo_calib.calibration.scales.leave_one_out import leave_one_out
+from diffeo_calib.calibration.scales.leave_one_out import leave_one_out, left_out_squares
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import MeasurementError

@@ -20,7 +20,7 @@ from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.placing.sockets import stages_by_sockets
 from diffeo_calib.calibration.result import errors_by_kind
-from diffeo_calib.calibration.scales.cross_validation import inflation_by_places
+from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places
 from diffeo_calib.calibration.scales.selection import defaults, log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import MeasurementError
