@@ -131,13 +131,13 @@ class Positions(Sensor):
         names = dict.fromkeys(name for name in data.device_names if name)
         frames, new = known.only(names), [name for name in names if name not in known.names]
         sought = data.remounted or len(names) > 1 or beside.every_session or beside.unplaced
-        if new and (sought or known.names):
-            rows = of_devices(data, new)
-            frames = frames.beside(type(known).of(beside.points(rows), rows, beside.turns))
-        if not frames.names:
-            return Places()
-        found = [BALL_IS_THE_MARKER] if frames.names == (ROWS,) else frames.found_sentences()
-        return Places(frames, found=tuple(found), numbers=frames.fitted_numbers)
+        if not new or not (sought or known.names):
+            return Places(frames) if frames.names else Places()
+        rows = of_devices(data, new)
+        found = type(known).of(beside.points(rows), rows, beside.turns)
+        frames = frames.beside(found)
+        said = [BALL_IS_THE_MARKER] if frames.names == (ROWS,) else found.found_sentences()
+        return Places(frames, found=tuple(said), numbers=found.fitted_numbers)
 
     def errors(self, data: Measurements, points: Tensor, places: Places) -> Evaluation:
         names, data = data.device_names, places.aligned(data)
