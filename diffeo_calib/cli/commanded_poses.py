@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.cli import proposals
 from diffeo_calib.cli.column_names import WORDS, column, whole
 from diffeo_calib.cli.guesses import ROTATIONS, Choice, RowColumns, Sheet, entries, matrix_in, rows_in
-from diffeo_calib.cli.proposals import Source
+from diffeo_calib.cli.proposals import LARGEST_RESIDUAL, Source, percent, ranked
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.checks import quiet
@@ -119,11 +118,11 @@ def machine_of(bodies: Sequence[Body]) -> Body:
     return max(bodies, key=rank)
 
 
-def choices(csv: Path, sheet: Sheet) -> tuple[Source, list[Choice], list[Choice]]:
-    """The table read as poses of a machine; entries about its columns, and about units and conventions.
+def source_of(csv: Path, sheet: Sheet) -> Source:
+    """The table read as poses of a machine.
 
     Raises:
-        InputError: no poses, nothing that was measured, or no reading of the rows that is clear.
+        InputError: no poses, nothing that was measured, or no way to read the rows that is clear.
     """
     bodies = bodies_in(csv, sheet)
     if not bodies:
@@ -140,35 +139,34 @@ def choices(csv: Path, sheet: Sheet) -> tuple[Source, list[Choice], list[Choice]
     if body is not None and body.turn and len(rows.markers) > 1:  # poses of one frame
         left = [f"{few(names)}: beside the pose of {few(body.place)}" for names in rows.markers[1:]]
         rows = replace(rows, markers=rows.markers[:1], left=[*rows.left, *left])
-    tried = list[list[tuple[float, Source]]]()
+    tried = list[list[Source]]()
     for lengths in UNUSUAL_LENGTHS:
-        tried.append(sorted(_read(csv, sheet, machine, rows, body, lengths=lengths), key=lambda entry: entry[0]))
-        if tried[-1] and tried[-1][0][0] <= proposals.LARGEST_RESIDUAL:
+        tried.append(ranked(_ways(csv, sheet, machine, rows, body, lengths=lengths)))
+        if tried[-1] and tried[-1][0].left <= LARGEST_RESIDUAL:
             break
-    found = min(tried, key=lambda own: own[0][0] if own else inf)
-    if found and found[0][0] == inf:
-        found[0][1].read_residual(found[0][1].table)  # says why
-    if not found or found[0][0] > proposals.LARGEST_RESIDUAL:
-        got = "no way to read them" if not found else f"{100 * found[0][0]:.3g} % of what the rows vary unexplained"
+    found = min(tried, key=lambda own: own[0].left if own else inf)
+    if found and found[0].left == inf:
+        found[0].share()  # says why
+    if not found or found[0].left > LARGEST_RESIDUAL:
+        got = f"{percent(found[0].left)} of what the rows vary unexplained" if found else "no way to read them"
         what = f"poses of the machine in {few(used, 16)}"
         fix = "check that the rows belong together, or write the campaign file yourself; for joints name the robot"
         raise InputError.of(what, expected="a convention and units that explain the rows", got=got, fix=fix)
-    size, limit = found[0][0], gates.READINGS_TOLD_APART * found[0][0]
-    alike, worse = [one for left, one in found if left < limit], [left for left, _ in found if left >= limit]
-    why = f"the machine's poses explain the rows but for {100 * size:.2g} % of what they vary"
-    why += f", read in any other way {100 * min(worse):.3g} %" if worse else ""
-    first = f"{why}; by their names, commanded poses in place of joint values"
-    texts = dict.fromkeys(one.joints.text for one in alike)
-    columns = [Choice("robot-pose", text, first, sure=len(texts) == 1) for text in texts]
-    units = [*_units(alike, _lengths(machine.place, _numbers(csv, sheet, machine.place)), why)]
+    limit = gates.READINGS_TOLD_APART * found[0].left
+    alike, worse = [one for one in found if one.left < limit], [one.left for one in found if one.left >= limit]
+    why = f"the machine's poses explain the rows but for {percent(found[0].left, 2)} of what they vary"
+    why += f", read in any other way {percent(worse[0])}" if worse else ""
+    said = [*_entries(alike, _lengths(machine.place, _numbers(csv, sheet, machine.place)), why)]
     if 2 * len(alike) >= len(found) >= MOST_WAYS:
-        both = [[one._replace(sure=one.sure and one.name not in TURNED) for one in own] for own in (columns, units)]
-        columns, units = both
-    return alike[0], columns, units
+        said = [one._replace(sure=one.sure and one.name not in TURNED) for one in said]
+    return alike[0].saying(*said)
 
 
-def _units(alike: Sequence[Source], lengths: Sequence[str], why: str) -> Iterator[Choice]:
-    """Units and conventions of the ways to read a table that explain it as well as each other."""
+def _entries(alike: Sequence[Source], lengths: Sequence[str], why: str) -> Iterator[Choice]:
+    """Columns, units and conventions of the ways to read a table that explain it as well as each other."""
+    texts = dict.fromkeys(one.joints.text for one in alike)
+    named = f"{why}; by their names, commanded poses in place of joint values"
+    yield from (Choice("robot-pose", text, named, sure=len(texts) == 1) for text in texts)
     tables = [one.table for one in alike]
     size, several = "the size of the numbers", len(lengths) > 1 and tables[0].joint_length is None
     size += "; which machine it is, they do not tell" * several
@@ -181,10 +179,10 @@ def _units(alike: Sequence[Source], lengths: Sequence[str], why: str) -> Iterato
     yield from entries(tables, camera_on_tool="what stands is seen from the flange")
 
 
-def _read(
+def _ways(
     csv: Path, sheet: Sheet, machine: Body, rows: RowColumns, body: Body | None, *, lengths: tuple[str, str]
-) -> Iterator[tuple[float, Source]]:
-    """The likeliest ways to read the table, and the share of what the rows vary that each leaves unexplained.
+) -> Iterator[Source]:
+    """The likeliest ways to read the table.
 
     ``lengths``: units of the machine's places and of those measured; empty for the likeliest.
     """
@@ -211,8 +209,7 @@ def _read(
             table = replace(table, rotation=turn, convention=measured.convention, rotation_angle=unit)
         with quiet(), suppress(DiffeoCalibError):
             robot = cartesian(read_poses(csv, pose, table))
-            source = Source(csv, robot, replace(pose, robot=robot), rows, table, sheet.numbers)
-            yield source.residual(table), source
+            yield Source(csv, sheet, robot, replace(pose, robot=robot), rows, table)
 
 
 def _numbers(csv: Path, sheet: Sheet, names: Sequence[str]) -> Tensor:
