@@ -32,7 +32,6 @@ from diffeo_calib.cli.guesses import (
     Sheet,
     entries,
     guess_deviations,
-    guess_rotation,
 )
 from diffeo_calib.cli.options import Rows
 from diffeo_calib.cli.tables import readings_columns
@@ -271,14 +270,14 @@ def with_measured(source: Source) -> Source:
     With the column that names the marker of each row, if the nominal robot explains the rows by several alone.
     """
     rows, found = source.rows, dict[int, str]()
-    for _, data in source.positions() if len(rows.markers) > 1 else ():
+    for _, data in source.positions() if len(rows.bodies) > 1 else ():
         every = unmeasured_markers(source.robot, data)
         found = found or {marker: words for marker, words, proved in every if proved}
-    kept = [k for k in range(len(rows.markers)) if k not in found]
+    kept = [k for k in range(len(rows.bodies)) if k not in found]
     left = [f"{few(rows.markers[k])}: {words} (counted from 0)" for k, words in found.items()]
-    rows = replace(rows, markers=[rows.markers[k] for k in kept], left=[*rows.left, *left])
+    rows = replace(rows, bodies=[rows.bodies[k] for k in kept], left=[*rows.left, *left])
     source = replace(source, rows=rows, tips=[source.tips[k] for k in kept] if source.tips else source.tips)
-    alone = len(rows.markers) == 1 and not (rows.sockets or rows.readings or source.value("marker"))
+    alone = len(rows.bodies) == 1 and not (rows.sockets or rows.readings or source.value("marker"))
     for _, data in source.positions() if alone else ():
         with quiet(), suppress(DiffeoCalibError):
             several = marker_column(register(source.robot, data.q, data.points).geometry, data)
@@ -377,28 +376,18 @@ def _with_meanings(best: Source) -> Source:
     return best
 
 
-def rotations(source: Source) -> list[tuple[Sequence[str], str]]:
-    """The columns of a rotation of each marker, by their names, and what these usually mean."""
-    rows = source.rows
-    if rows.matrix:
-        return [(rows.matrix, "a matrix")]
-    used = {*source.joints, *(name for triple in rows.markers for name in triple)}
-    others = [name for name in source.sheet.numbers if name not in used]
-    guessed = [guess_rotation(others, marker) for marker in rows.markers]
-    return [one for one in guessed if one is not None]
-
-
 def with_rotation(source: Source, *, camera: bool = False) -> Source:
     """In the convention with which the nominal robot explains the poses clearly better than with all others.
 
     With ``camera`` in any units too, as poses of a fixed board in the frame of a camera on the tool. The same if there
     are no columns of a rotation; with a remark, but for a camera, if no convention is clearly better.
     """
-    found = rotations(source)
+    bodies = source.rows.bodies
+    found = [own for own in bodies if own.turn]
     if not found or source.value("marker") is not None:
         return source
-    each, names = [list(own) for own, _ in found], list(dict.fromkeys(name for own, _ in found for name in own))
-    own_body = len(source.rows.markers) == max(len(source.tips), 1) == len(each) and len(names) == sum(map(len, each))
+    each = [own.turn for own in found]
+    own_body = len(bodies) == max(len(source.tips), 1) == len(each)
     conventions = [name for name in ALL_CONVENTIONS if numbers_of(name) == len(each[0])] if own_body else []
     turns = list(product(conventions, ("deg", "rad") if len(each[0]) == 3 else (None,)))
     units = source.in_units() if camera else [source]
@@ -407,7 +396,7 @@ def with_rotation(source: Source, *, camera: bool = False) -> Source:
     if not ways or not is_clear(ways, gates.READINGS_TOLD_APART):
         what = "rotations of no convention that is clearly better than others"
         what = what if own_body else "rotations, but not one for each marker"
-        usual = " or ".join(dict.fromkeys(words for _, words in found))
+        usual, names = " or ".join(dict.fromkeys(own.usual for own in found)), [name for own in each for name in own]
         remark = Choice("", "", f"{few(names, 9)}: {what}; not used; such names usually mean {usual}")
         return source if camera else source.saying(remark)
     best, *worse = ways

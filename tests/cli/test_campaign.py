@@ -15,12 +15,7 @@ from trackerless_bank import write_socket_table, write_wire_table
 from typer.main import get_command
 
 import diffeo_calib as dc
-from diffeo_calib.cli.guesses import (
-    guess_deviations,
-    guess_positions,
-    guess_rotation,
-    guess_sheet,
-)
+from diffeo_calib.cli.guesses import guess_deviations, guess_sheet
 from diffeo_calib.cli.main import app, expanded
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.csv.files import write_measurements
@@ -227,12 +222,7 @@ def test_deviations_are_proposed_if_they_can_be_some(tmp_path: Path, command: Co
         assert ("# std_x, std_y, std_z: no standard deviations" in text) is not proposed
 
 
-def test_names_of_rotations_and_deviations() -> None:
-    header = ["Goal roll", "Goal pitch", "Goal yaw", "a_rx", "a_ry", "a_rz", "b_rx [deg]", "b_ry [deg]", "b_rz [deg]"]
-    found = [guess_rotation(header, [name]) for name in ("a_x", "b_x")]
-    assert [one[0] for one in found if one] == [header[3:6], header[6:]]
-    assert guess_rotation(["x", "y", "z", "rx", "ry"], ["x"]) is None
-    assert guess_positions(["rot_x", "rot_y", "rot_z", "x", "y", "z"])[0] == [["x", "y", "z"]]
+def test_names_of_deviations() -> None:
     triples = [["m_x", "m_y", "m_z"]]
     assert guess_deviations(["m_std_x", "m_std_z", "m_std_y", "m_x"], triples) == ["m_std_x", "m_std_y", "m_std_z"]
     assert guess_deviations(["m_std_x", "m_std_y", "m_x"], triples) is None

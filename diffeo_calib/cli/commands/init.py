@@ -35,7 +35,6 @@ from diffeo_calib.cli.proposals import (
     is_clear,
     percent,
     ranked,
-    rotations,
     with_deviations,
     with_distances,
     with_joint_columns,
@@ -191,7 +190,7 @@ def _with_tip(robot: Path, source: Source, arm: Arm) -> Source:
             left_out.append(f"{last} hardly moves in the table")
         else:
             # its axis may run through the marker, and a pose shows that it turns where a place does not
-            an_arm_s = moved[count] > median(moved) / 2 or bool(rotations(source))
+            an_arm_s = moved[count] > median(moved) / 2 or any(own.turn for own in source.rows.bodies)
             raised = 1 / CLEAR_RATIO if an_arm_s else NOT_RAISED
             if source.left > LARGEST_RESIDUAL or without.left > raised * source.left:
                 break
