@@ -17,11 +17,17 @@ from functools import partial
 from typing import Any, Literal
 
 from diffeo_calib.calibration.choose_scales import LIMITS as SCALE_LIMITS
-from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE, ChosenScales, choose_scales, robot_problem
+from diffeo_calib.calibration.choose_scales import (
+    RESIDUAL_TOLERANCE,
+    ChosenScales,
+    check_models,
+    choose_scales,
+    robot_problem,
+)
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.campaign import warn_of_rounding
 from diffeo_calib.calibration.diagnostics.hypotheses import lengths, warn_of_lengths, worth_it
 from diffeo_calib.calibration.diagnostics.moved_devices import change_during
+from diffeo_calib.calibration.diagnostics.open_directions import warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.outliers import (
     Outlier,
     outliers,
@@ -33,14 +39,13 @@ from diffeo_calib.calibration.diagnostics.plausibility import (
     check_joints,
     check_limits,
     warn_of_no_errors,
+    warn_of_rounding,
 )
 from diffeo_calib.calibration.diagnostics.row_order import warn_of_contradictions
-from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_what_is_open
 from diffeo_calib.calibration.expected_errors import with_open_directions
 from diffeo_calib.calibration.findings import Part, parts
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.result import CalibrationResult
-from diffeo_calib.calibration.scales.of_models import check_models
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.checks import check_count, check_seed
 from diffeo_calib.common.device import outside_inference_mode

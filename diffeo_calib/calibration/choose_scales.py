@@ -10,6 +10,9 @@
 
 Of many rows, a random sample goes through all of this; then all rows get their weights.
 
+Of models of other robots of the same type, the geometric mean of length scales and factors is taken, of standard
+deviations the root mean square: a part of the model that one robot does not need counts there as zero.
+
 The fitting problem of the exact model of a robot.
 """
 
@@ -19,28 +22,29 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.calibration.scales.cross_validation import cross_validated_inflation, inflation_by_places
-from diffeo_calib.calibration.scales.differing_noise import new_noise
 from diffeo_calib.calibration.scales.gear_lines import LIMITS as LINE_LIMITS
 from diffeo_calib.calibration.scales.gear_lines import find_gear_lines
 from diffeo_calib.calibration.scales.leave_one_out import (
     LeaveOneOut,
+    cross_validated_inflation,
     estimate_tails,
+    inflation_by_places,
     leave_one_out,
 )
-from diffeo_calib.calibration.scales.of_models import scales_of_models
 from diffeo_calib.calibration.scales.selection import Selection, defaults, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.errors import sentence, warn_user
+from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.common.quantiles import chi2_median
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.process.scales import Hyperparameters
+from diffeo_calib.process.scales import DEVIATIONS, SCALES, GearLine, Hyperparameters
+from diffeo_calib.robots.tree import Tree
 
 
 @dataclass(frozen=True)
@@ -279,7 +283,7 @@ def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
 
     Rows that carry payloads have a nominal map of their own; elsewhere the robot carries the median of them.
     """
-    problem = _problem(data, scales, new_noise(data, scales))
+    problem = _problem(data, scales, data.noise_of_any_row(scales))
     return problem if data.told is data else _problem(data.told, scales, problem.new_noise).standing_for(problem)
 
 
@@ -298,3 +302,46 @@ def _problem(data: TangentData, scales: Hyperparameters, noise: Tensor | None) -
         observe=data.observe,
     )
     return problem.with_nominal_of_rows(data.nominal)
+
+
+def check_models(models: object, robot: Tree) -> None:
+    """Raise InputError unless these are models, with scales, of robots with the same kinds of joints."""
+    if not isinstance(models, Sequence):
+        raise InputError.of("`scales_of`", expected="a list of models", got=type(models).__name__)
+    for number, model in enumerate(models):
+        what = f"`scales_of`, model {number + 1}"
+        if not isinstance(model, CalibratedKinematics):
+            expected = "a calibrated robot, such as `result.model`"
+            raise InputError.of(what, expected=expected, got=type(model).__name__)
+        own, other = (tuple(each.periodic) for each in (robot, model.robot))
+        if own != other or robot.moving != model.robot.moving:
+            got = f"{model.robot.n} joints, {sum(other)} of them revolute, {model.robot.moving} moving"
+            expected = f"{robot.n} joints, {sum(own)} of them revolute, {robot.moving} moving, as of '{robot.name}'"
+            raise InputError.of(what, expected=expected, got=got, fix="pass models of the same type of robot")
+        if model.scales is None:
+            fix = "calibrate it again with this version"
+            raise InputError.of(f"{what} has no scales: an earlier version wrote it", fix=fix)
+
+
+def scales_of_models(models: Sequence[CalibratedKinematics], like: Hyperparameters) -> Hyperparameters:
+    """The mean scales of models, shaped ``like`` the defaults of the measurements, with the gear lines of all models.
+
+    Args:
+        models: see :func:`check_models`.
+        like: the defaults, of which the noise of further devices is kept.
+    """
+    vectors = torch.stack([model.scales for model in models if model.scales is not None]).to(like.sensor_noise)
+    deviations = torch.cat(
+        [torch.full_like(getattr(like, name).reshape(-1), name in DEVIATIONS, dtype=torch.bool) for name in SCALES]
+    )
+    mean = torch.where(deviations, vectors.square().mean(0).sqrt(), vectors.log().mean(0).exp())
+    share = len(models) ** -0.5
+    lines = tuple(replace(line, amplitude=share * line.amplitude) for model in models for line in _lines(model))
+    return replace(like.with_vector(mean), lines=lines)
+
+
+def _lines(model: CalibratedKinematics) -> list[GearLine]:
+    """Gear lines of a model with their prior amplitudes."""
+    waves = model.nominal.waves
+    amplitudes = model.map.unregistered.deformation.spec.prior_variance.sqrt()[-waves.size :: 2] if waves.size else ()
+    return [GearLine(*each) for each in zip(waves.joints, waves.frequencies, map(float, amplitudes), strict=True)]

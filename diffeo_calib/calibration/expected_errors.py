@@ -24,7 +24,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.campaign import sampled_configurations, undetermined_places
+from diffeo_calib.calibration.diagnostics.open_directions import sampled_configurations, undetermined_places
 from diffeo_calib.calibration.identification.identification import Identification, Prior
 from diffeo_calib.common.errors import printable
 from diffeo_calib.fitting.fitted_map import FittedMap

@@ -85,8 +85,13 @@ def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluat
     if refusal is not None or causes:
         return Judgement(refusal, causes)
     wrong = contradicted(model, some)
-    block = block_text(model, some, wrong)
-    causes = [block] if block is not None else larger_than_expected(model, seen, found.positions) * (not wrong)
+    block, errors = block_text(model, some, wrong), found.positions
+    causes, usual = [block] if block is not None else [], expected_rms(model, seen, errors.errors.shape[1])
+    if not causes and not wrong and errors.rms >= gates.LARGE_PER_EXPECTED * usual:
+        what = f"the errors are {errors.rms / usual:.1f} times as large as the model expects: "
+        fix = "something has changed since the fit, or these poses are unlike those of the fit: compare, or recalibrate"
+        size = f"RMS {1e3 * errors.rms:.3f} mm"
+        causes = [sentence(what + size, expected=f"about {1e3 * usual:.3f} mm", fix=fix)]
     return Judgement(None, causes, wrong, len(some))
 
 
@@ -98,16 +103,6 @@ def expected_rms(model: CalibratedKinematics, data: Measurements, bodies: int) -
     """
     covariance = expected(model, data).places[:, :bodies]
     return float(covariance.diagonal(dim1=-2, dim2=-1).sum(-1).mean().sqrt())
-
-
-def larger_than_expected(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> list[str]:
-    """A sentence about errors above twice the expected ones."""
-    usual = expected_rms(model, data, errors.errors.shape[1])
-    if errors.rms < gates.LARGE_PER_EXPECTED * usual:
-        return []
-    what = f"the errors are {errors.rms / usual:.1f} times as large as the model expects: RMS {1e3 * errors.rms:.3f} mm"
-    fix = "something has changed since the fit, or these poses are unlike those of the fit: compare, or recalibrate"
-    return [sentence(what, expected=f"about {1e3 * usual:.3f} mm", fix=fix)]
 
 
 @dataclass(frozen=True)
@@ -146,10 +141,8 @@ def accuracy(
     """
     judged = list(errors)
     own = [one for one in judged if one.unit == unit and one.count]
-    labels = ["" if one.what == ERRORS else f"({one.label}) " for one in own]
-    measured = [
-        Accuracy(one.rms, unit, f"{label}on {one.count} rows{which}") for one, label in zip(own, labels, strict=True)
-    ]
+    of = ["" if one.what == ERRORS else f"({one.label}) " for one in own]
+    measured = [Accuracy(one.rms, unit, f"{of[k]}on {one.count} rows{which}") for k, one in enumerate(own)]
     if unit != "m" and measured:
         return measured[0]
     if unit != "m":
@@ -157,6 +150,6 @@ def accuracy(
         got = ", ".join(one.kind for one in judged)
         raise InputError.of(f"a limit in {unit}", expected="rows in this unit", got=got, fix=fix)
     if not any(one.what == ERRORS for one in own):
-        of = "expected over the joint ranges of the fit, without measured positions"
-        measured.append(Accuracy((expected or ExpectedError.of(model)).whole, unit, of))
+        how = "expected over the joint ranges of the fit, without measured positions"
+        measured.append(Accuracy((expected or ExpectedError.of(model)).whole, unit, how))
     return max(measured, key=lambda one: one.value)

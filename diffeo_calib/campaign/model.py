@@ -213,11 +213,9 @@ class CampaignModel:
 
         def at(logarithms: Tensor) -> tuple[Tensor, float]:
             """Covariance of the rows, and log RMS error over the target."""
-            process = some.process(scales := self.scales.from_logarithms(logarithms))
+            process = some.process(self.scales.from_logarithms(logarithms))
             errors = self.compared @ process.expected(self.target.numbers).covariance
-            noise = some.numbers.blocks_of_table(some.told.weighted_noise(scales))
-            K = some.numbers.add_blocks(some.expected(scales).covariance, noise)
-            return K, 0.5 * float((errors * self.compared).sum().log())
+            return process.factor.matrix, 0.5 * float((errors * self.compared).sum().log())
 
         low = torch.linalg.cholesky(at(point)[0])
         for step in LOG_SCALE_STEP * torch.eye(len(point), dtype=point.dtype, device=point.device):

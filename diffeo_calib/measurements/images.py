@@ -74,16 +74,14 @@ class ImageTable(SocketTable):
         the tool share one frame, and each has its own place there: that of the one with most images is the model's.
 
         Args:
-            q: as in the constructor.
+            q, joint_names, doubt: as in the constructor.
             corners: (N, K, 5) x, y, z of the board's corners in its plane, m, and their pixels u, v (column and row, 0
                 in the middle of the first pixel); NaN for corners that an image does not show.
             camera: width and height of its images, pixels, or what is known of its lens and board, such as
                 ``measurements.camera`` of an earlier calibration; of several cameras by their names.
-            joint_names: n names, in the order of the columns of ``q``.
             seen_by: name of the camera of each image (N,); None for one. All of them see the same board.
             camera_on_tool: whether the camera is on the tool and the board stands; otherwise the board is on the tool.
             board: prior of a board that is not known yet.
-            doubt: see :meth:`from_poses`.
 
         Raises:
             MeasurementError: as the constructor; too few corners in an image, or corners that are not in a plane;

@@ -57,7 +57,7 @@ class Observations(RowGroups):
             MeasurementError: no table; tables that differ in joints or payloads; positions with other markers, poses
                 on other tips, other sockets, or a ball on another tip.
         """
-        return _observations(_pieces(parts))
+        return joined_tables(parts, apart=True)
 
     @property
     def sha256(self) -> str:
@@ -68,17 +68,13 @@ class Observations(RowGroups):
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """(N,) what each row is: "position", "pose", "socket", or the kind of its readings."""
+        """(N,) "position", "pose", "socket", or the kind of readings."""
         return tuple(self._texts([[part.kind] * len(part) for part in self.parts]))
 
     @property
     def device_names(self) -> list[str]:
         """(N,) name of the device of each row, or of its set-up; "" without one. Kinds have devices of their own."""
         return self._texts([part.device_names for part in self.parts])
-
-    @property
-    def _devices(self) -> list[str]:
-        return self._texts([[name and f"{part.kind} {name}" for name in part.device_names] for part in self.parts])
 
     @property
     def session_names(self) -> tuple[str, ...]:
@@ -148,18 +144,6 @@ class Observations(RowGroups):
         return [found[place] for place in torch.cat(self.index).argsort().tolist()]
 
 
-def joined_tables(tables: Sequence[Any]) -> Any:
-    """The rows of several tables in order: one table of measurements or readings if it can hold them."""
-    pieces = _pieces(tables)
-    kinds = {piece.table.kind for piece in pieces}
-    if any(kinds <= one for one in ONE_TABLE):
-        whole = type(pieces[0].table).in_one([piece.table for piece in pieces])
-        return whole.rows(torch.cat([piece.rows for piece in pieces]).argsort())
-    found = _observations(pieces)
-    part, rows = next(zip(found.parts, found.index, strict=True))
-    return found if len(found.parts) > 1 else part.rows(rows.argsort())
-
-
 class Rows(NamedTuple):
     """A table of one kind, or a mixture of positions and sockets, and its row numbers (M,) in the whole."""
 
@@ -183,8 +167,16 @@ def _pieces(tables: Sequence[Any]) -> list[Rows]:
     return found
 
 
-def _observations(pieces: Sequence[Rows]) -> Observations:
-    """The pieces as observations, those of the same kind as one part."""
+def joined_tables(tables: Sequence[Any], *, apart: bool = False) -> Any:
+    """The rows of several tables in order: one table of measurements or readings if it can hold them, unless ``apart``.
+
+    Rows of the same kind are one part.
+    """
+    pieces = _pieces(tables)
+    kinds = {piece.table.kind for piece in pieces}
+    if not apart and any(kinds <= one for one in ONE_TABLE):
+        whole = type(pieces[0].table).in_one([piece.table for piece in pieces])
+        return whole.rows(torch.cat([piece.rows for piece in pieces]).argsort())
     groups: dict[object, list[Rows]] = {}
     whole = [Rows(*pure) for piece in pieces for pure in unmixed(*piece)]
     if any("corners" in piece.table.columns for piece in whole):
@@ -192,7 +184,8 @@ def _observations(pieces: Sequence[Rows]) -> Observations:
     for pure in whole:
         groups.setdefault(pure.table.column_kind, []).append(pure)
     parts = [type(group[0].table).in_one([piece.table for piece in group]) for group in groups.values()]
-    return Observations(parts, [torch.cat([piece.rows for piece in group]) for group in groups.values()])
+    rows = [torch.cat([piece.rows for piece in group]) for group in groups.values()]
+    return Observations(parts, rows) if apart or len(parts) > 1 else parts[0].rows(rows[0].argsort())
 
 
 def unmixed(table: Any, rows: Tensor) -> list[tuple[Any, Tensor]]:

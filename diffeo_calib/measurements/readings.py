@@ -96,10 +96,10 @@ class Readings(RowTable):
 
         Args:
             q: (N, n) joint values, rad or m. lengths: (N,) distances, m, or one for all rows of a ball bar.
-            devices, joint_names: as in :meth:`of`.
+            devices, joint_names, doubt: as in :meth:`of`.
             offset_std: standard deviation in m of a length that all readings of a device lack, as those of an
                 interferometer or a wire with an unknown zero; 0 if they are absolute.
-            std: known standard deviations of the lengths, m: one for all, or (N,). doubt: as in :meth:`of`.
+            std: known standard deviations of the lengths, m: one for all, or (N,).
 
         Raises:
             MeasurementError: as :meth:`of`, or a length that is not positive.

@@ -243,9 +243,11 @@ class RowGroups:
         Raises:
             MeasurementError: fraction outside (0, 1), or one configuration or place, so that a part would be empty.
         """
-        held, labels = self._divided
-        units, names, test = labels.numpy(), np.array(self._devices), np.zeros(len(self.q), dtype=bool)
-        test[held] = out = ~in_train(labels, fraction, seed, self._kind)
+        held, labels, kind = self._divided
+        units, names, test = labels.numpy(), np.full(len(self), "", dtype=object), np.zeros(len(self), dtype=bool)
+        for part, rows in zip(self.parts, self.index, strict=True):  # devices of other kinds are others
+            names[rows.numpy()] = [name and f"{part.kind} {name}" for name in part.device_names]
+        test[held] = out = ~in_train(labels, fraction, seed, kind)
         for name in np.unique(names[test]):
             own = (names == name) & (name != "")
             for unit in np.unique(units[out & own[held]]) if own.sum() >= FEWEST_PER_DEVICE else ():
@@ -261,28 +263,22 @@ class RowGroups:
         Raises:
             MeasurementError: k below 2, or fewer distinct configurations than folds.
         """
-        held, units = self._divided
-        fold = np.full(len(self.q), -1)
-        fold[held] = fold_numbers(units, k, seed, self._kind)
+        held, units, kind = self._divided
+        fold = np.full(len(self), -1)
+        fold[held] = fold_numbers(units, k, seed, kind)
         return [(self.rows(fold != i), self.rows(fold == i)) for i in range(k)]
 
     @property
-    def _devices(self) -> Sequence[str]:
-        """The device of each row; those of other kinds are others."""
-        return self.device_names
+    def _divided(self) -> tuple[np.ndarray, Tensor, str]:
+        """The rows (M,) that splits divide, labels (M,) of those that stay together, and a word for these.
 
-    @property
-    def _divided(self) -> tuple[np.ndarray, Tensor]:
-        """The rows (M,) that splits divide, and labels (M,) of those that stay together: repeats, rows of a place."""
+        Together stay repeats, and the rows of a place.
+        """
         resting = self.places != NO_SOCKET
         rows = (resting | True if self.without_device else ~resting).nonzero()[:, 0]
         alone = int(self.places.max()) + 1 + torch.arange(len(self), device=HOST)
-        return rows.numpy(), connected(torch.where(resting, self.places, alone)[rows], self.rows(rows).groups())
-
-    @property
-    def _kind(self) -> str:
-        """Word for what a split keeps together here."""
-        return PLACES if self.without_device and bool((self.places >= 0).all()) else CONFIGURATIONS
+        labels = connected(torch.where(resting, self.places, alone)[rows], self.rows(rows).groups())
+        return rows.numpy(), labels, PLACES if bool(resting.all()) else CONFIGURATIONS
 
 
 @methods_outside_inference_mode

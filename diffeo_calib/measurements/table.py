@@ -119,11 +119,10 @@ class Measurements(ImageTable):
         """N joint configurations and the measured poses of a frame fixed on the tool, or of one on each of T tips.
 
         Args:
-            q: as in the constructor.
+            q, joint_names, doubt: as in the constructor.
             poses: (N, 4, 4) or (N, T, 4, 4) rigid transforms from the tool's frame to the measuring frame, m. Rotations
                 may be off by 0.001, since files have few digits: the nearest rotations are used. Of several frames one
                 that is hidden in a row is NaN; every row shows some frame.
-            joint_names: n names, in the order of the columns of ``q``.
             on: names of the tips that carry the frames, T of them, for a robot with several tips.
             lever: distance from the frame's origin to the three points that represent a pose, m. It weighs
                 orientation against position: with 0.1 m, an error of 1 mrad counts as much as one of 0.1 mm.
@@ -133,8 +132,7 @@ class Measurements(ImageTable):
                 in the same shapes.
             camera_on_tool: the poses are those of a fixed board in the frame of a camera on the tool, as detectors of
                 boards return them, and deviations are along the camera's axes. They are kept inverted, as the camera's
-                poses in the board's frame, see :mod:`~diffeo_calib.measurements.poses`.
-            doubt: whether to warn about rows and values that look wrong.
+                poses in the board's frame, see :func:`~diffeo_calib.measurements.poses.camera_jacobian`.
 
         Raises:
             MeasurementError: as the constructor; a transform that is not rigid (its row is named); a lever or a
@@ -183,14 +181,12 @@ class Measurements(ImageTable):
         """N joint configurations in which a ball on the tool rested in sockets. No position was measured.
 
         Args:
-            q: as in the constructor.
+            q, joint_names, doubt: as in the constructor.
             sockets: name of the socket of each row (N,), such as "front/0": the place where the block stood, a slash,
                 and the socket in the block. Splits hold out whole places.
-            joint_names: n names, in the order of the columns of ``q``.
             distances: known distances, m, by the names of two sockets: ``("front/0", "front/1")``, or ``("0", "1")`` at
                 every place that has both. Without one, the size of the robot is that of its description.
             distance_std: standard deviation of the known distances, m.
-            doubt: whether to warn about rows and values that look wrong.
 
         Returns:
             measurements whose ``points`` are NaN, and whose ``socket`` (N,) holds numbers of ``sockets.names``.
@@ -231,34 +227,31 @@ class Measurements(ImageTable):
         move the point at arm a by dt + w x a: the covariance of its nine coordinates has rank 6, or 3 if only one of
         these errors is known. A camera on the tool errs about the board, see measurements/poses.py.
         """
-        frames, std, rotation_std = self.frames, self.std, self.rotation_std
+        frames, std, turn_std = self.frames, self.std, self.rotation_std
         if frames is None or self.lever is None:
             return None if std is None else torch.diag_embed(std.nan_to_num(0.0).flatten(1).square())
+        slopes = pose_math.pose_jacobian(frames, self.lever, self.board)
         if self.pose_covariance is not None:
-            slopes = pose_math.pose_jacobian(frames, self.lever, self.board)[:, 0]
-            return slopes @ self.pose_covariance @ slopes.mT
-        if std is None and rotation_std is None:
+            return slopes[:, 0] @ self.pose_covariance @ slopes[:, 0].mT
+        if std is None and turn_std is None:
             return None
         zero = torch.zeros_like(frames[..., :3, 3])
-        position = zero if std is None else std
-        rotation = zero if rotation_std is None else rotation_std.view_as(zero)
-        slopes = pose_math.pose_jacobian(frames, self.lever, self.board)
-        factor = slopes * torch.cat([position, rotation], dim=-1)[..., None, :]
-        factor = factor.nan_to_num(0.0)  # hidden frames
+        known = torch.cat([zero if own is None else own.view_as(zero) for own in (std, turn_std)], dim=-1)
+        factor = (slopes * known[..., None, :]).nan_to_num(0.0)  # hidden frames
         return pose_math.block_diagonal(factor @ factor.mT)
 
     @property
     def sha256(self) -> str:
         """SHA-256 of the file that the rows were read from, or of the arrays if they come from Python."""
         measured = {"points": self.points} if self.poses is None else {"poses": self.poses}
-        measured = {} if self.without_device else measured
-        arrays = {"q": self.q, **measured, "std": self.std, "rotation_std": self.rotation_std, "corners": self.corners}
+        arrays = {"q": self.q, **({} if self.without_device else measured), "std": self.std}
+        arrays |= {"rotation_std": self.rotation_std, "corners": self.corners}
         arrays |= {"seen_by": self.seen_by if len(self.cameras) > 1 else None}
+        arrays |= {"payload": self.payload, "board": self.board}
         sockets = None
         if self.sockets is not None:
             known = self.sockets.distances, self.sockets.distance_std
             sockets = {"sockets": repr((self.row_sockets, known)).encode()}
-        arrays |= {"payload": self.payload, "board": self.board}
         return self.file_sha256 or checks.arrays_sha256(arrays, sockets)
 
     @property
@@ -322,15 +315,13 @@ class Measurements(ImageTable):
     def __repr__(self) -> str:
         counts = (len(self), "row"), (self.n, "joint"), (self.markers, "marker")
         parts = [f"{count} {thing}" + "s" * (count != 1) for count, thing in counts]
-        if self.socket is not None and self.sockets is not None:
-            named, resting = f"{len(self.sockets.names)} sockets", int((self.socket != NO_SOCKET).sum())
-            if self.without_device:
-                return f"Measurements({', '.join(parts[:2])}, {named})"
-            return f"Measurements({', '.join(parts)}, the last one in {named} in {resting} of the rows)"
-        if self.frames is not None:
-            frames = self.frames.shape[1]
-            parts = [*parts[:2], f"poses on {frames} tips" if frames > 1 else "poses"]
         hidden = int((~self.seen_bodies).sum())
+        if self.sockets is not None:
+            named, resting = f"{len(self.sockets.names)} sockets", int((self.socket_numbers != NO_SOCKET).sum())
+            words = [f"the last one in {named} in {resting} of the rows"]
+            parts, hidden = [*parts[:2], named] if self.without_device else parts + words, 0
+        if self.frames is not None:
+            parts[2] = pose_math.kind_of_points(self.markers, self.lever)
         parts += [f"{hidden} of {self.seen_bodies.numel()} sightings hidden"] * bool(hidden)
         return f"Measurements({', '.join(parts)})"
 

@@ -18,13 +18,10 @@ from math import nan
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import NumericalError
-from diffeo_calib.common.threads import large_work
 from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.process.numbers import Covariance, Numbers
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.regression.conditional import NOISE_ADVICE
-from diffeo_calib.regression.factor import Factor
+from diffeo_calib.regression.cholesky import Factor, lower_root
 
 
 @dataclass(frozen=True)
@@ -82,11 +79,7 @@ class Process:
             NumericalError: their covariance is not positive definite in float64.
         """
         at = self.expected(new) if at is None else at
-        F = new.add_blocks(at.fields.clone(), noise)
-        with large_work(F.numel()):
-            L, info = torch.linalg.cholesky_ex(F)
-        if int(info):
-            raise NumericalError.of("the covariance of the rows is not positive definite", fix=NOISE_ADVICE)
+        L = lower_root(new.add_blocks(at.fields.clone(), noise))
         right = torch.cat([(new.target - at.white.T @ self.alpha)[:, None], at.unknowns], 1)
         right, n = torch.linalg.solve_triangular(L, right, upper=False), len(self.alpha)
         if n:
@@ -98,6 +91,9 @@ class Process:
     def expected(self, new: Numbers, before: Expected | None = None) -> Expected:
         """Numbers as the rows so far predict them; ``before``: the same by the first of these rows alone."""
         L, W = self.factor.L, self.factor.W
+        if not len(L):
+            U = new.S * self.variance.sqrt()
+            return Expected(new, torch.zeros_like(new.target), self._covariance(new, new), U, U.new_zeros(0, len(U)), U)
         if before is None:
             n, F, U = 0, self._covariance(new, new), new.S * self.variance.sqrt()
             V = X = torch.linalg.solve_triangular(L, self._covariance(self.numbers, new), upper=False)
@@ -147,6 +143,16 @@ class Process:
     def inverse(self) -> Tensor:
         """(M, M) K^-1."""
         return self.factor.inverse
+
+    @property
+    def slope(self) -> Tensor:
+        """Derivative (M, M) of the evidence by K."""
+        return self.inverse.addr(self.mu, self.mu, beta=-0.5, alpha=0.5)
+
+    @property
+    def by_log_variance(self) -> Tensor:
+        """Derivative (K,) of the evidence by the logarithms of the unknowns' prior variances."""
+        return self.factor.by_variance(self.variance.sqrt() * (self.numbers.S.T @ self.mu))
 
     @property
     def evidence(self) -> float:

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple
+from types import SimpleNamespace
 
 import torch
 from torch import Tensor
@@ -112,8 +112,8 @@ class GravitySag:
     def twist_slopes(self, q: Tensor, w: Tensor) -> Tensor:
         """Derivatives of the twists by the joints: (N, n_all, 6, n)."""
         sag, chain = self._on(q).sag(w), self.chain
-        moved, signs = torch.from_numpy(chain.arrays.moved), torch.from_numpy(chain.arrays.signs)
-        robot = _Robot(*(part.to(q.device) for part in (chain.axes, chain.revolute, moved, signs)))
+        seen = {name: torch.from_numpy(getattr(chain.arrays, name)) for name in ("axes", "revolute", "moved", "signs")}
+        robot = SimpleNamespace(**{name: part.to(q.device) for name, part in seen.items()})
         by_moving = load_slopes(robot, sag, self._frames(q))
         slopes = chain.by_active(self._loads(q)[..., None] * by_moving)  # (N, compliances, n)
         return (sag.directions.mT @ slopes).unflatten(1, (-1, 6))
@@ -157,15 +157,6 @@ class GravitySag:
         """All places in the ground's frame: (N, F, 4, 4)."""
         places, ground = self.chain.places(q), self.chain.ground_place
         return places if ground is None else torch.linalg.inv(places[:, ground])[:, None] @ places
-
-
-class _Robot(NamedTuple):
-    """Some of :class:`diffeo_calib.runtime.chain.NominalChain`."""
-
-    axes: Tensor
-    revolute: Tensor
-    moved: Tensor
-    signs: Tensor
 
 
 def _under_payload(chain: Tree, link: str) -> list[Compliance]:

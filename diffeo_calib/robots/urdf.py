@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
@@ -53,21 +52,17 @@ def load_urdf(path: str | PathLike[str], base: str | None = None, tip: Names | N
     """
     path = Path(path)
     content = read_regular(path, "URDF", LARGEST_FILE, RobotError)
-    urdf = URDF.parse(content, path)
-    end = _only_end(urdf, "tip") if tip is None else tip
-    paths = _Paths.between(urdf, _only_end(urdf, "base") if base is None else base, end, load)
-    ignored = urdf.ignored + [fault for step in paths.steps for fault in harmless_faults(step.joint)]
+    robot, urdf, steps = _read(content, path, base, tip, load)
+    ignored = urdf.ignored + [fault for step in steps for fault in harmless_faults(step.joint)]
     if ignored:
         warn_user(sentence(f"'{path}': ignored {few(ignored, MOST_NAMES)}", fix="correct the file if this is wrong"))
-    robot = paths.robot(content.decode("utf-8", "surrogateescape"))
-    _warn_of_branches(urdf, paths)
+    _warn_of_branches(urdf, robot, steps)
     return robot
 
 
 def read_urdf(content: bytes, base: str, tip: Names, path: Path, load: Names = ()) -> Tree:
     """As :func:`load_urdf`, from the content of a file, without warnings; ``path`` is its name in messages."""
-    paths = _Paths.between(URDF.parse(content, path), base, tip, load)
-    return paths.robot(content.decode("utf-8", "surrogateescape"))
+    return _read(content, path, base, tip, load)[0]
 
 
 def moving_joints_below(content: bytes, links: Iterable[str]) -> list[tuple[str, str]]:
@@ -126,47 +121,35 @@ class _Step(NamedTuple):
         return self.end == self.joint.parent
 
 
-@dataclass(frozen=True)
-class _Paths:
-    """The steps from the base to all tips and loads, each after the one before it; every joint once."""
+def _read(
+    content: bytes, path: Path, base: str | None, tip: Names | None, load: Names
+) -> tuple[Tree, URDF, list[_Step]]:
+    """The robot between links, its file, and the steps from the base to all tips and loads; every joint once.
 
-    urdf: URDF
-    base: str
-    tips: tuple[str, ...]
-    loads: tuple[str, ...]
-    steps: list[_Step]
-
-    @classmethod
-    def between(cls, urdf: URDF, base: str, tip: Names, load: Names) -> _Paths:
-        """Find the steps. Raises RobotError: unknown links, links that are not connected, a link with two parents."""
-        tips, loads = _names("tip", tip), _names("load", load)
-        for role, name in (("base", base), *(("tip", tip) for tip in tips), *(("load", load) for load in loads)):
+    Raises RobotError: unknown links, links that are not connected, a link with two parents.
+    """
+    urdf = URDF.parse(content, path)
+    tips = _names("tip", _only_end(urdf, "tip") if tip is None else tip)
+    base, loads = _only_end(urdf, "base") if base is None else base, _names("load", load)
+    for role, names in (("base", (base,)), ("tip", tips), ("load", loads)):
+        for name in names:
             urdf.check_link(role, name)
-        if both := sorted(set(tips) & set(loads)):
-            raise InputError.of(f"`load` names {both}, which `tip` names too", fix="leave tips out of the loads")
-        above, steps = _parents(urdf), dict[str, _Step]()
-        for end in (*tips, *loads):
-            for step in _way(urdf, above, base, end):
-                steps.setdefault(step.joint.name, step)
-        return cls(urdf, base, tips, loads, list(steps.values()))
-
-    @property
-    def top(self) -> str:
-        """The link nearest to the root of the file, where gravity is constant."""
-        return [self.base, *(step.end for step in self.steps if step.up)][-1]
-
-    def robot(self, source: str) -> Tree:
-        """The robot of these joints."""
-        steps = [(joint_of(step.joint, self.urdf.path), step.start, step.end, step.up) for step in self.steps]
-        joints, parents, last = along(steps, self.base)
-        name, drivers = self.urdf.name, _drivers(self.urdf, joints)
-        if len(self.tips) == 1 and not self.loads and self.top == self.base:
-            return Chain(name, self.base, self.tips[0], joints, drivers=drivers, source=source)
-        tips, loads = ({link: last[link] for link in links} for links in (self.tips, self.loads))
-        if self.top != self.base:
-            loads[self.base] = BASE  # it moves as seen from the ground
-        ends = Ends(tips, loads, last[self.top])
-        return Tree(name, self.base, joints, parents, ends, drivers=drivers, source=source)
+    if both := sorted(set(tips) & set(loads)):
+        raise InputError.of(f"`load` names {both}, which `tip` names too", fix="leave tips out of the loads")
+    above, passed = _parents(urdf), dict[str, _Step]()
+    for end in (*tips, *loads):
+        for step in _way(urdf, above, base, end):
+            passed.setdefault(step.joint.name, step)
+    steps = list(passed.values())
+    top = [base, *(step.end for step in steps if step.up)][-1]  # nearest to the root, where gravity is constant
+    joints, parents, last = along([(joint_of(step.joint, path), step.start, step.end, step.up) for step in steps], base)
+    given = {"drivers": _drivers(urdf, joints), "source": content.decode("utf-8", "surrogateescape")}
+    if len(tips) == 1 and not loads and top == base:
+        return Chain(urdf.name, base, tips[0], joints, **given), urdf, steps
+    places, weights = ({link: last[link] for link in links} for links in (tips, loads))
+    if top != base:
+        weights[base] = BASE  # it moves as seen from the ground
+    return Tree(urdf.name, base, joints, parents, Ends(places, weights, last[top]), **given), urdf, steps
 
 
 def _parents(urdf: URDF) -> dict[str, JointElement]:
@@ -221,9 +204,9 @@ def _drivers(urdf: URDF, joints: Sequence[Joint]) -> list[Joint]:
     return found
 
 
-def _warn_of_branches(urdf: URDF, paths: _Paths) -> None:
+def _warn_of_branches(urdf: URDF, robot: Tree, steps: Sequence[_Step]) -> None:
     """Warn if joints hang on moving links before the tips and are left out: their weight bends the robot."""
-    above, passed = _parents(urdf), {step.joint.name for step in paths.steps}
+    above, passed = _parents(urdf), {step.joint.name for step in steps}
 
     def body(link: str) -> str:
         """The topmost link that is fixed to a link."""
@@ -232,15 +215,15 @@ def _warn_of_branches(urdf: URDF, paths: _Paths) -> None:
                 link = above[link].parent
         return link
 
-    carried = {body(step.end) for step in paths.steps}
-    carried -= {body(link) for link in (paths.base, paths.top, *paths.tips, *paths.loads)}
+    top = [step.end for step in steps if step.up][-1:]
+    carried = {body(step.end) for step in steps} - {body(link) for link in (robot.base, *robot.ends, *top)}
     hanging = [joint for joint in urdf.joints if joint.name not in passed and body(joint.parent) in carried]
     left_out = [joint for joint in hanging if joint.kind in MOVING and joint.driver not in passed]
     if left_out:
         names = few([f"'{joint.name}'" for joint in left_out], MOST_NAMES)
-        what = f"'{urdf.path}': joints that hang on links between '{paths.base}' and '{', '.join(paths.tips)}' are "
+        what = f"'{urdf.path}': joints that hang on links between '{robot.base}' and '{robot.tip}' are "
         what += f"left out: {names}; where they move, their weight bends the robot in ways that its model does not know"
-        loads = [*paths.loads, *(_farthest(urdf, joint) for joint in left_out)]
+        loads = [*(load for load in robot.loads if load != robot.base), *(_farthest(urdf, joint) for joint in left_out)]
         fix = f"pass load={loads} (on the command line --load) if the measurements have their values"
         warn_user(sentence(what, fix=fix))
 

@@ -76,9 +76,9 @@ class Sensor(ABC):
     def check_angles(self, data: Any, model: Any) -> None:  # noqa: B027
         """Raise MeasurementError for rows that fit a model far better with joint values in another unit of angles."""
 
-    @abstractmethod
     def with_points(self, data: Any, model: Any) -> Any:
         """The rows with all points of a model: those that they do not tell are hidden."""
+        return data
 
     @abstractmethod
     def place(self, data: Any, beside: Beside) -> Places:
@@ -88,12 +88,12 @@ class Sensor(ABC):
     def errors(self, data: Any, points: Tensor, places: Places) -> Evaluation:
         """Measured minus predicted values, for points (N, P, 3) of the tool, m."""
 
-    @abstractmethod
     def set_up(self, data: Any, known: Callable[[Measurements], Measurements]) -> Measurements | None:
         """The rows of one set-up whose device says where the robot stands; None where none does.
 
         ``known``: rows whose tool a model knows as those of the model's, see :meth:`SetUps.in_any_frame`.
         """
+        return None
 
     @abstractmethod
     def settled(self, data: Any, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
@@ -131,13 +131,13 @@ class Positions(Sensor):
         names = dict.fromkeys(name for name in data.device_names if name)
         frames, new = known.only(names), [name for name in names if name not in known.names]
         sought = data.remounted or len(names) > 1 or beside.every_session or beside.unplaced
-        if new and (sought or known.names):
-            rows = of_devices(data, new)
-            frames = frames.beside(type(known).of(beside.points(rows), rows, beside.turns))
-        if not frames.names:
-            return Places()
-        found = [BALL_IS_THE_MARKER] if frames.names == (ROWS,) else frames.found_sentences()
-        return Places(frames, found=tuple(found), numbers=frames.fitted_numbers)
+        if not new or not (sought or known.names):
+            return Places(frames) if frames.names else Places()
+        rows = of_devices(data, new)
+        found = type(known).of(beside.points(rows), rows, beside.turns)
+        frames = frames.beside(found)
+        said = [BALL_IS_THE_MARKER] if frames.names == (ROWS,) else found.found_sentences()
+        return Places(frames, found=tuple(said), numbers=found.fitted_numbers)
 
     def errors(self, data: Measurements, points: Tensor, places: Places) -> Evaluation:
         names, data = data.device_names, places.aligned(data)
@@ -168,9 +168,6 @@ class Poses(Positions):
     """Poses of frames on the tool in the frame of a device."""
 
     options, fix = ", `convention` and `rotation_angle`", "leave the rotation out"
-
-    def with_points(self, data: Measurements, model: Any) -> Measurements:
-        return data
 
     def _errors(self, whole: Evaluation, data: Measurements, points: Tensor) -> Evaluation:
         if data.frames is None:
@@ -233,9 +230,6 @@ class Contacts(Sensor):
         size, lines, names = away.norm(dim=1, keepdim=True), data.line_numbers, data.row_sockets
         return Evaluation(size, None, away[:, None], lines, distances, what=SPREAD, kind="socket", devices=names)
 
-    def set_up(self, data: Measurements, known: Callable[[Measurements], Measurements]) -> None:
-        """None: a ball in a socket is where the robot brought it."""
-
     def settled(self, data: Measurements, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
         """The middles of the sockets, with their standard deviations; a single row deviates as those of others do."""
         socket, known = sockets_of(data)
@@ -262,9 +256,6 @@ class OtherDevices(Sensor):
                 raise InputError.of(f"{data.kind}s", expected=f"a model of poses of {needed} frames", got=known)
             return
         check_ball(model, "readings of a ball", "such readings", "readings")
-
-    def with_points(self, data: Readings, model: Any) -> Readings:
-        return data
 
     def place(self, data: Readings, beside: Beside) -> Places:
         known = beside.devices.get(data.kind)
@@ -296,9 +287,6 @@ class OtherDevices(Sensor):
         away = per_unit * devices.in_unit(data, errors)
         size, names, lines = away.norm(dim=1, keepdim=True), data.device_names, data.line_numbers
         return Evaluation(size, None, away[:, None], lines, what=READINGS, kind=data.kind, unit=unit, devices=names)
-
-    def set_up(self, data: Readings, known: Callable[[Measurements], Measurements]) -> None:
-        """None: these devices are placed around the robot."""
 
     def settled(self, data: Readings, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
         """The devices, with the standard deviations of their increments."""

@@ -8,7 +8,7 @@ new kind of device is a subclass of :class:`Devices` in a file of its own, regis
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
@@ -263,10 +263,6 @@ class Devices(ABC):
     def errors(self, data: Readings, points: Tensor) -> Tensor:
         """Measured minus predicted readings (N, r), m, of the ball at points (N, 3), m."""
         return self.values(data) - self.observation(self.numbers(data)).value(points)
-
-    def distances(self, data: Readings, model: Callable[[Tensor], Tensor]) -> Tensor:
-        """Absolute errors (N, 1), m, of a model of the ball: (N, n) joint values -> (N, 1, 3) m."""
-        return self.errors(data, self.points_of(model(data.q).detach())).norm(dim=1, keepdim=True)
 
     def in_unit(self, data: Readings, values: Tensor) -> Tensor:
         """Values (N, r) in m as readings in the unit in which these are shown."""

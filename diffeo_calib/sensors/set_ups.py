@@ -56,7 +56,6 @@ class SetUps(ABC):
     Args:
         names: S set-ups. constants: (S, c). deviations: (S, k) of increments of these, m and rad.
         turns: of the tips; None for kinematics that do not tell.
-        new: names of the set-ups that were found from the rows that are judged.
         increments_each: numbers of a set-up that a fit leaves open.
     """
 
@@ -72,7 +71,6 @@ class SetUps(ABC):
     constants: Tensor
     deviations: Tensor
     turns: Turns | None = None
-    new: tuple[str, ...] = ()
     increments_each: int = 0
 
     @classmethod
@@ -153,7 +151,7 @@ class SetUps(ABC):
         """The same, one of them the model's."""
         own = torch.arange(len(self.names), device=HOST)[:, None] == reference
         constants, deviations = torch.where(own, self.same, self.constants), self.deviations.masked_fill(own, 0.0)
-        return replace(self, constants=constants, deviations=deviations, new=())
+        return replace(self, constants=constants, deviations=deviations)
 
     def only(self, names: Collection[str]) -> Self:
         """Those with some names."""
@@ -166,23 +164,23 @@ class SetUps(ABC):
         if not self.names:
             return other
         values = {k: torch.cat([getattr(self, k), getattr(other, k)]) for k in ("constants", "deviations")}
-        return replace(self, names=(*self.names, *other.names), new=(*self.new, *other.new), **values)
+        return replace(self, names=(*self.names, *other.names), **values)
 
     @property
     def fitted_numbers(self) -> int:
-        """How many numbers were found from the rows that are judged."""
-        return len(self.new) * (self.deviations.shape[1] or NUMBERS_OF_A_FRAME)
+        """How many numbers these set-ups took, if they were found from the rows that are judged."""
+        return len(self.names) * (self.deviations.shape[1] or NUMBERS_OF_A_FRAME)
 
     def sentences(self) -> list[str]:
         """What is known of every set-up but the model's."""
         return [self.sentence(number) for number in self.elsewhere.nonzero()[:, 0].tolist()]
 
     def found_sentences(self) -> list[str]:
-        """What was found from the rows that are judged."""
-        count = len(self.new)
+        """That these set-ups were found from the rows that are judged, and what is known of them."""
+        count = len(self.names)
         what = f"the {self.what} of {'one session' if count == 1 else f'{count} sessions'} were found from these rows"
         line = f"{what}, {self.fitted_numbers} numbers in all: with few rows the errors look smaller than they are"
-        return [line, *(self.sentence(self.names.index(name)) for name in self.new)] if count else []
+        return [line, *map(self.sentence, range(count))]
 
     def entry(self) -> dict[str, object]:
         """Constants by name, for programs."""
@@ -210,7 +208,7 @@ class MeasuringFrames(SetUps):
         found = torch.stack([robust_fit(predicted[some], data.points[some]).to(HOST) for some in rows]).flatten(1)
         cameras = set(data.session_names) <= set(data.cameras)  # nothing on the tool was mounted again between these
         free = NUMBERS_OF_A_FRAME + 3 * data.markers * (not cameras)
-        return cls(names, found, found[:, :0], turns, names, free)
+        return cls(names, found, found[:, :0], turns, free)
 
     def aligned(self, data: Measurements) -> Measurements:
         return data.in_frames(torch.linalg.inv(self.of_rows(data).unflatten(1, (4, 4))))
@@ -251,7 +249,7 @@ class MountedMarkers(SetUps):
         away = _turned(turns, data)[:, :P].mT @ (data.points[:, :P] - predicted[:, :P])[..., None]
         found = [_middle(away[whose == number][..., 0]) for number in range(len(names))]
         shifts, deviations = (torch.stack(each).flatten(1).to(HOST) for each in zip(*found, strict=True))
-        return cls(names, shifts, deviations, turns, names, 3 * data.markers)
+        return cls(names, shifts, deviations, turns, 3 * data.markers)
 
     def aligned(self, data: Measurements) -> Measurements:
         shifts = self.of_rows(data).unflatten(1, (-1, 3))
@@ -295,7 +293,7 @@ class MountedFrames(SetUps):
         points, deviations = (torch.stack(each).to(HOST) for each in zip(*found, strict=True))
         shifts = deviations.square().mean(1).sqrt()
         M = poses_from_marks(points, lever).flatten(1)
-        return cls(names, M, torch.cat([shifts, shifts / lever], 1), turns, names, NUMBERS_OF_A_FRAME)
+        return cls(names, M, torch.cat([shifts, shifts / lever], 1), turns, NUMBERS_OF_A_FRAME)
 
     def aligned(self, data: Measurements) -> Measurements:
         return data.on_frames(self.of_rows(data).unflatten(1, (4, 4)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 
@@ -58,36 +58,24 @@ def measured_rows(table: Measurements) -> Coordinates | None:
     return Coordinates(with_attributes(table.rows(rows), socket=None, sockets=None), rows)
 
 
-class Shown(NamedTuple):
-    """What a model shows: its markers, the lever of its frames, whether the last marker is a ball, and what to do.
-
-    Args:
-        other: advice for rows of other markers.
-    """
-
-    markers: int
-    lever: float | None
-    ball: bool
-    other: str
-
-
-def check_markers(model: Shown, own: Coordinates | None, readings: Sequence[OtherReadings]) -> None:
-    """Raise InputError for rows that show other markers than a model."""
+def check_markers(model: Any, own: Coordinates | None, readings: Sequence[OtherReadings], other: str) -> None:
+    """Raise InputError for rows that show other markers than a calibrated model; ``other``: what to do about these."""
+    markers, lever, ball = model.nominal.geometry.markers, model.lever, model.ball
     table = None if own is None else own.table
     frames = [one.table.kind for one in readings if sees_frame(one.table)]
-    if model.lever is None and frames:
-        raise InputError.of(f"{frames[0]}s", expected="a model of poses", got="one of markers", fix=model.other)
+    if lever is None and frames:
+        raise InputError.of(f"{frames[0]}s", expected="a model of poses", got="one of markers", fix=other)
     balls = len(frames) < len(readings)
-    if model.lever is not None and (balls or (table is not None and table.sockets is not None)):
+    if lever is not None and (balls or (table is not None and table.sockets is not None)):
         fix = "measure poses again, or calibrate again with all rows"
         raise InputError.of("the new rows", expected="poses", got="rows that show a ball", fix=fix)
     if table is None or table.without_device:
         return
     seen = table.markers - (table.sockets is not None)
-    same = (table.lever is None) == (model.lever is None)
-    if not same or seen not in {model.markers, model.markers - model.ball}:
-        kinds = [kind_of_points(*one) for one in ((model.markers, model.lever), (seen, table.lever))]
-        raise InputError.of("the new rows", expected=kinds[0], got=kinds[1], fix=model.other)
+    same = (table.lever is None) == (lever is None)
+    if not same or seen not in {markers, markers - ball}:
+        kinds = [kind_of_points(*one) for one in ((markers, lever), (seen, table.lever))]
+        raise InputError.of("the new rows", expected=kinds[0], got=kinds[1], fix=other)
 
 
 def measured_positions(data: Any) -> Measurements | None:

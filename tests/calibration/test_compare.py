@@ -63,22 +63,28 @@ def test_the_smallest_offset_that_rows_show() -> None:
     assert waist.size == inf  # the device's place hides it
     assert 2e-5 < elbow.size < 3e-4
     for factor in (0.2, 1.5):
-        found = compared_with(with_offset(rows, 2, factor * elbow.size))
-        assert [one.part for one in found.changes.found] == [f"the offset of {elbow.joint}"] * (factor > 1)
+        found = compared_with(with_offset(rows, 2, factor * elbow.size)).changes.found
+        assert [one.part for one in found] == [f"the offset of {elbow.joint}"] * (factor > 1)
+        for one in found:
+            assert one.others == ()
+            assert one.deviation is not None
+            assert abs(one.size - factor * elbow.size) < 4 * one.deviation < 4e-4
 
 
-def test_an_offset_between_two_models_is_named() -> None:
-    old, rows = model(positions), positions(arm(), 60, seed=7)
-    for data, joints in ((rows, []), (with_offset(rows, 2, 0.4 * OFFSET), [2])):
+def test_a_change_between_two_models_is_named() -> None:
+    """An offset, or wear."""
+    old, rows, name = model(positions), positions(arm(), 60, seed=7), arm().nominal.joint_names[2]
+    offset, worn = with_offset(rows, 2, 0.4 * OFFSET), positions(arm().worn(2, 3.0), 60, seed=7)
+    for data, parts in ((rows, []), (offset, [f"the offset of {name}"]), (worn, [name])):
         new = dc.calibrate(arm().nominal, data, hyperparameters=usual_scales(arm().nominal)).model
         compared = dc.compare(old, new)
         ratio = compared.rms / compared.expected
-        assert 1.0 / 2.0 < ratio < 1.5 if not joints else ratio > 2.0  # a change does not explain itself
+        assert 1.0 / 2.0 < ratio < 1.5 if not parts else ratio > 2.0  # a change does not explain itself
         assert compared.telling
         found = compared.changes.found
-        assert [one.part for one in found] == [f"the offset of {arm().nominal.joint_names[joint]}" for joint in joints]
+        assert [one.part for one in found] == parts
         for one in found:
-            assert one.size == pytest.approx(0.4 * OFFSET, abs=4 * one.deviation)
+            assert one.deviation is None or one.size == pytest.approx(0.4 * OFFSET, abs=4 * one.deviation)
             assert one.part in str(compared)
 
 

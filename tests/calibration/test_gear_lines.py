@@ -15,10 +15,10 @@ from tangent_bank import covariance
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.choose_scales import scales_of_models
 from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.scales.gear_lines import LIMITS, _fall, _Scan, find_gear_lines
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
-from diffeo_calib.calibration.scales.of_models import scales_of_models
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics

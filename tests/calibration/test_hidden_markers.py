@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from functools import cache
-from math import log, nan, pi
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,8 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.choose_scales import robot_problem
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register
-from diffeo_calib.calibration.scales.cross_validation import left_out_squares
-from diffeo_calib.calibration.scales.leave_one_out import estimate_tails, leave_one_out
+from diffeo_calib.calibration.scales.leave_one_out import leave_one_out, left_out_squares
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
-from diffeo_calib.calibration.scales.selection import log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.fit import fit
@@ -102,32 +100,6 @@ both = pytest.mark.parametrize("known", [False, True])
 
 
 @both
-def test_posterior_is_that_of_the_seen_coordinates_alone(known: bool) -> None:
-    one = case(known)
-    G, R = one.covariance()
-    seen, target = one.seen, one.target()
-    K = (G + R)[seen][:, seen]
-    mean = G[:, seen] @ torch.linalg.solve(K, target[seen])
-    covariance = G - G[:, seen] @ torch.linalg.solve(K, G[seen])
-    process, numbers = one.data.process(one.scales), one.data.numbers
-    mu, cross = numbers.in_table(process.mu).flatten(), G[:, numbers.cells]
-    assert_close(G @ mu, mean, rtol=1e-6, atol=1e-11)
-    assert_close(G - cross @ process.inverse @ cross.T, covariance, rtol=1e-6, atol=1e-15)
-
-
-@both
-def test_likelihood_is_that_of_the_seen_coordinates_alone(known: bool) -> None:
-    one = case(known)
-    for seed in (5, 6):
-        other = Case(one.setting, one.data, shaken(one.scales, seed, 0.2))
-        G, R = other.covariance()
-        K, r = (G + R)[one.seen][:, one.seen], one.target()[one.seen]
-        expected = -0.5 * float(r @ torch.linalg.solve(K, r) + torch.logdet(K)) - 0.5 * len(r) * log(2 * pi)
-        found = log_posterior(other.scales.logarithms(), one.scales, one.data)
-        assert found.likelihood == pytest.approx(expected, abs=1e-5, rel=1e-8)
-
-
-@both
 def test_rows_left_out_are_predicted_from_the_seen_coordinates_of_the_others(known: bool) -> None:
     one = case(known)
     G, R = one.covariance()
@@ -154,19 +126,6 @@ def test_rows_left_out_are_predicted_from_the_seen_coordinates_of_the_others(kno
     rows = torch.arange(0, ROWS, 5)
     squares = left_out_squares(one.data, one.scales, torch.isin(torch.arange(ROWS), rows).to(torch.int64) - 1)[rows]
     assert bool((squares.isnan() == torch.from_numpy(HIDDEN)[rows]).all())
-
-
-def test_what_stands_in_hidden_coordinates_has_no_influence() -> None:
-    one = case()
-    y = one.data.y.clone()
-    y[~one.seen.view_as(y)] += 0.3
-    other = replace(one.data, y=y)
-    first, second = (leave_one_out(data, one.scales) for data in (one.data, other))
-    seen = one.seen.view_as(y)
-    assert_close(second.errors[seen], first.errors[seen], rtol=1e-6, atol=1e-12)
-    first, second = (estimate_tails(data, one.scales) for data in (one.data, other))
-    assert_close(second.weights, first.weights, rtol=1e-6, atol=0)
-    assert bool((first.weights[torch.from_numpy(HIDDEN)] == 1.0).all())
 
 
 def test_exact_model_is_conditioned_on_the_seen_coordinates_alone() -> None:

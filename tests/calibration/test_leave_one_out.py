@@ -15,15 +15,17 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales.cross_validation import (
+from diffeo_calib.calibration.scales.leave_one_out import (
     FoldLimits,
+    LeaveOneOut,
     cross_validated_inflation,
+    estimate_tails,
+    leave_one_out,
     left_out_squares,
     motions,
-    noise_of_new_rows,
+    random_blocks,
     random_folds,
 )
-from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, estimate_tails, leave_one_out, random_blocks
 from diffeo_calib.calibration.scales.selection import SearchLimits, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.process.tails import Tails, reweight
@@ -217,7 +219,7 @@ def parted(data: TangentData, *parts: Tensor) -> Tensor:
 def test_folds_are_predicted_from_all_other_rows(setting: Setting) -> None:
     """By the formulas for conditional Gaussians, one marker or pose after the other."""
     whole, scales, rows = narrow(setting), setting.scales, torch.tensor([1, 4, 7])
-    data, new = whole.told, whole.blocks_in_numbers(noise_of_new_rows(whole, scales))
+    data, new = whole.told, whole.blocks_in_numbers(whole.noise_of_new_rows(scales))
     m = data.y.shape[1]
     inside = torch.isin(torch.arange(data.y.numel()) // m, rows)
     K, y = covariance(data, scales), data.target.flatten()

@@ -20,7 +20,7 @@ from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.placing.sockets import stages_by_sockets
 from diffeo_calib.calibration.result import errors_by_kind
-from diffeo_calib.calibration.scales.cross_validation import inflation_by_places
+from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places
 from diffeo_calib.calibration.scales.selection import defaults, log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import MeasurementError
@@ -127,29 +127,6 @@ def test_equivariance_under_motions_of_the_device(
     torch.testing.assert_close(second.model(q), first.model(q) @ T[:3, :3].mT + T[:3, 3], rtol=0, atol=2e-6)
     places = first.sockets.positions @ T[:3, :3].mT + T[:3, 3]
     torch.testing.assert_close(second.sockets.positions, places, rtol=0, atol=2e-6)
-
-
-def test_the_posterior_of_independent_equations(tangent: TangentData) -> None:
-    """The regression with hidden coordinates and shared shifts, against one of the measured coordinates alone."""
-    data, scales = tangent, defaults(tangent, 3e-4, Prior())
-    kinds, shared = data.noise_model.row_kinds, data.shared
-    resting = kinds == 1
-    assert not bool(shared[~resting].any()), "no position that was measured shares a shift"
-    assert not bool(shared[:, :3].any())
-    assert bool(shared[resting][:, 3:].any(2).all())
-    scales = replace(scales, other_noise=3.0 * scales.sensor_noise)
-    data = data.with_tails(replace(data.tails, weights=torch.ones_like(data.tails.weights)))
-    seen = data.visible.flatten()
-    levels = torch.where(resting, 3.0, 1.0).double() * scales.sensor_noise
-    J = data.jacobian.flatten(0, 1)[seen]
-    own = torch.arange(len(resting)).repeat_interleave(6)[seen]
-    same = (own[:, None] == own).double()
-    R = same * (J @ torch.diag(scales.joint_noise.square()) @ J.mT)
-    R = R + torch.diag(levels[own].square() + 1e-14)
-    G, Z = data.linearisation(scales).gram()[seen][:, seen], shared.flatten(0, 1)[seen]
-    mu = torch.linalg.solve(G + R + Z @ Z.mT, data.target.flatten()[seen])
-    found = data.numbers.in_table(data.process(scales).mu).flatten()[seen]
-    assert float((found - mu).norm() / mu.norm()) < 1e-6
 
 
 def test_the_noise_of_sockets_is_searched(tangent: TangentData) -> None:

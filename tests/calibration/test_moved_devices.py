@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import warnings
 from dataclasses import replace
@@ -61,17 +60,13 @@ def test_a_wrong_scale_is_named_with_its_size(factors: tuple[float, ...], name: 
     assert result.expected.workspace == pytest.approx(float(wrong.square().sum(-1).mean().sqrt()), rel=0.3)
 
 
-def test_right_scales_are_not_warned_about() -> None:
-    result, texts = clean()
-    assert texts == []
-    assert abs(result.lengths[0].value) < 3 * result.lengths[0].deviation < 0.004
-
-
 @pytest.mark.parametrize(("share", "noticed"), [(0.6, False), (1.5, True)])
 def test_the_result_tells_which_scales_pass_without_a_warning(share: float, noticed: bool) -> None:
     """The size that is told apart from none, of the clean rows: rows in a tracker's wrong scale are judged by it."""
     q, y = ARM.measure(ROWS, seed=1)
-    found = clean()[0].lengths[0]
+    (right, silent), found = clean(), clean()[0].lengths[0]
+    assert silent == []
+    assert abs(right.lengths[0].value) < 3 * right.lengths[0].deviation < 0.004
     wrong, texts = warned(dc.Measurements(q, y * (1 + share * found.unnoticed - found.value)))
     assert bool(texts) == noticed
     moved = (y - y.mean((0, 1))).square().sum(-1).mean().sqrt() * found.unnoticed
@@ -107,7 +102,7 @@ def test_the_scale_of_a_wire_is_checked_in_the_same_way() -> None:
     assert warned(data)[1] == []
 
 
-@pytest.mark.parametrize("step", [0.0, 1e-6, 1e-4])
+@pytest.mark.parametrize("step", [0.0, 1e-4])
 def test_the_controllers_own_positions_are_warned_about(step: float) -> None:
     q = ARM.sample(ROWS, 1)
     y = ARM.nominal(q)[:, None, :3, 3] + torch.tensor([0.5, 0.2, 0.1], dtype=torch.float64)
@@ -118,18 +113,6 @@ def test_the_controllers_own_positions_are_warned_about(step: float) -> None:
     for data in (dc.Measurements(q, y, doubt=False), posed)[: 1 + (step == 1e-4)]:
         with pytest.warns(DiffeoCalibWarning, match="show no errors of the robot.*if they were computed"):
             dc.calibrate(ARM.nominal, data, hyperparameters=scales())
-
-
-def test_rounded_positions_of_a_real_robot_are_not_refused() -> None:
-    q, y = ARM.measure(ROWS, seed=1)
-    data = dc.Measurements(q, (y / 1e-4).round() * 1e-4, doubt=False)
-    assert math.isfinite(dc.calibrate(ARM.nominal, data, hyperparameters=scales()).left_out_rms)
-
-
-def test_a_robot_without_errors_is_said_to_have_none() -> None:
-    perfect = SimulatedArm(2, geometry=0, transmission=0, gravity=0)
-    with pytest.warns(DiffeoCalibWarning, match="show no errors of the robot"):
-        dc.calibrate(perfect.nominal, dc.Measurements(*perfect.measure(ROWS)), hyperparameters=scales())
 
 
 @pytest.mark.parametrize("lever", [10.0, 1e-4])
@@ -157,10 +140,7 @@ def test_sizes_are_those_of_weighted_least_squares() -> None:
     assert float(FOUND.gain) == pytest.approx(float(white[:, UNKNOWNS].square().sum() - left.square().sum()))
     assert FOUND.excess == pytest.approx(float(left.square().mean()))
     assert FOUND.excess > 1.0
-
-
-def test_errors_that_are_smaller_than_expected_are_no_excess() -> None:
-    assert Evidence.by(E, 1e-3 * R, torch.linalg.cholesky(K)).excess == 1.0
+    assert Evidence.by(E, 1e-3 * R, torch.linalg.cholesky(K)).excess == 1.0, "smaller errors are no excess"
 
 
 @pytest.mark.parametrize("variance", [1e-3, 1.0, 1e3])
@@ -309,19 +289,6 @@ def test_three_set_ups_are_no_drift() -> None:
     found = re.search(r"moved more than once, near rows (\d+) and (\d+)", text)
     assert found is not None, text
     assert [int(row) for row in found.groups()] == pytest.approx([30, 60], abs=3)
-
-
-def test_the_chance_of_a_jump_is_that_of_white_noise() -> None:
-    """Of 2000 draws of 100 rows with one and three unknowns."""
-    draws = torch.from_numpy(np.random.default_rng(0).standard_normal((2000, 100, 3)))
-    count = torch.arange(1, 101, dtype=torch.float64)[:, None]
-    sums = (draws - draws.mean(1, keepdim=True)).cumsum(1)  # the mean is an unknown as well
-    draws = (sums / (1 - count / 100).sqrt())[:, :99]
-    count = count[:99]
-    for unknowns in (1, 3):
-        gains = (draws[..., :unknowns].square() / count).sum(2)[:, 4:95].amax(1)
-        level = float(gains.quantile(0.98))
-        assert 0.01 < chance_of_jump(level, unknowns, 0.05) < 0.04
 
 
 @pytest.mark.parametrize(("gain", "unknowns", "level"), [(8.68, 1, 0.05), (12.16, 1, 0.01), (18.3, 5, 0.05)])

@@ -14,8 +14,7 @@ from tangent_bank import built, normal
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import robot_problem
-from diffeo_calib.calibration.scales.differing_noise import differing_factor, noise_of_new_rows
-from diffeo_calib.calibration.scales.noise_model import NoiseModel
+from diffeo_calib.calibration.scales.noise_model import NoiseModel, differing_factor
 from diffeo_calib.maps.noise import HIDDEN_VARIANCE
 from diffeo_calib.measurements.poses import LEVER, mark_jacobian, mark_points, pose_jacobian
 from diffeo_calib.regression.regions import region_factor
@@ -211,6 +210,6 @@ def test_rows_with_known_deviations_keep_their_own() -> None:
     each = blocks(*plain.y.shape, seed=8) * 1e-8
     data = replace(plain, noise_model=replace(plain.noise_model, known=each))
     wanted = data.noise(scales) * region_factor(data.tails.freedom, 3)
-    torch.testing.assert_close(noise_of_new_rows(data, scales), wanted, rtol=1e-12, atol=0.0)
-    found = noise_of_new_rows(plain, scales)
+    torch.testing.assert_close(data.noise_of_new_rows(scales), wanted, rtol=1e-12, atol=0.0)
+    found = plain.noise_of_new_rows(scales)
     torch.testing.assert_close(found, found[:1].expand_as(found))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -75,10 +76,11 @@ def test_the_right_reading_of_rotations(
 
 
 @pytest.mark.slow
-def test_inverted_rotations(posed: tuple[SimulatedArm, dc.Measurements]) -> None:
+def test_inverted_rotations_and_poses(posed: tuple[SimulatedArm, dc.Measurements]) -> None:
     arm, data = posed
     turned = transforms(data.poses[:, :3, :3].mT, data.poses[:, :3, 3])
-    assert "the rotations alone seem to be inverted" in advice(arm.nominal, dc.Measurements.from_poses(data.q, turned))
+    for poses, words in ((turned, "the rotations alone seem"), (torch.linalg.inv(data.poses), "seen from the tool")):
+        assert words in advice(arm.nominal, dc.Measurements.from_poses(data.q, poses))
 
 
 def gantry() -> dc.Chain:
@@ -149,29 +151,38 @@ def test_a_joint_below_the_tip(tmp_path: Path) -> None:
         warn_of_joints_below_tip(short, still.with_columns(line_numbers=read.line_numbers, origin=read.origin))
 
 
-@pytest.mark.slow
-def test_prismatic_joints_in_another_unit() -> None:
+def with_joint(q: Tensor, joint: int, factor: float, offset: float = 0.0) -> Tensor:
+    return q.index_copy(1, torch.tensor([joint]), factor * q[:, [joint]] + offset)
+
+
+MISTAKES: dict[str, Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]] = {
+    "100 times too small": lambda q, y: (q, 0.01 * y),
+    "10 times too large": lambda q, y: (q, 10 * y),
+    "1000 times too large": lambda q, y: (q, 1e3 * y),
+    "radians that were converted": lambda q, y: (q.deg2rad(), y),
+    "seems to be left-handed": lambda q, y: (q, y[..., [1, 0, 2]]),
+    "joints='waist_joint,shoulder_joint,wrist_bend_joint,": lambda q, y: (q[:, [0, 1, 4, 3, 2, 5]], y),
+    "pi/180*{elbow_joint},": lambda q, y: (with_joint(q, 2, 180 / math.pi), y),
+    "-{shoulder_joint}": lambda q, y: (with_joint(q, 1, -1.0), y),
+    "-{wrist_roll_joint}": lambda q, y: (with_joint(q, 5, -1.0), y),
+    ",{elbow_joint}-90,": lambda q, y: (with_joint(q, 2, 1.0, math.pi / 2), y),
+    "-{elbow_joint}": lambda q, y: (with_joint(with_joint(q, 2, -1.0), 4, -1.0), y),
+}
+
+
+@pytest.mark.parametrize("words", [*MISTAKES])
+def test_what_joint_values_and_units_mean(words: str) -> None:
+    arm = SimulatedArm(seed=3)
+    assert words in advice(arm.nominal, dc.Measurements(*MISTAKES[words](*arm.measure(40, seed=4)), doubt=False))
+
+
+def test_joints_of_a_slide() -> None:
+    """Honest measurements have no mistake."""
     robot = sliding_robot()
     data = sliding_measurements(robot, 40)
-    q = data.q.clone()
-    q[:, 2] *= 1e-3
-    assert "1000 times too small: check their unit (`joint_length`)" in advice(robot, dc.Measurements(q, data.points))
-
-
-def test_honest_measurements_have_no_mistake() -> None:
-    robot = sliding_robot()
-    assert advice(robot, sliding_measurements(robot, 8)) == ""
-
-
-def test_what_joint_values_and_units_mean() -> None:
-    """A column in degrees, and centimetres."""
-    arm = SimulatedArm(seed=3)
-    q, points = arm.measure(40, seed=4)
-    one = torch.ones(6, dtype=torch.float64)
-    one[2] = 180 / math.pi
-    assert "pi/180*{elbow_joint}," in advice(arm.nominal, dc.Measurements(q * one, points, doubt=False))
-    assert "100 times too small" in advice(arm.nominal, dc.Measurements(q, 0.01 * points))
-    assert "10 times too large" in advice(arm.nominal, dc.Measurements(q, 10 * points))
+    assert advice(robot, data) == ""
+    read = dc.Measurements(with_joint(data.q, 2, 1e-3), data.points)
+    assert "1000 times too small: check their unit (`joint_length`)" in advice(robot, read)
 
 
 def test_hidden_markers_do_not_spoil_a_diagnosis(tmp_path: Path) -> None:

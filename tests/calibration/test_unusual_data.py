@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from product_bank import Case, simulated, with_usual_scales
-from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
@@ -46,20 +45,13 @@ def test_few_poses_with_many_repeats_are_few_poses() -> None:
     assert float((squares < 7.81).double().mean()) > 0.85
 
 
-def repeated(rows: int, times: int) -> tuple[dc.Chain, dc.Measurements, dc.Measurements, dc.Measurements]:
-    """Robot, measurements of ``rows`` configurations, each of these measured ``times`` times, measurements to test."""
-    arm, train, test = simulated(rows)
-    rng = np.random.default_rng(1)
-    q = train.q.repeat(times, 1)
-    points = arm.true_points(q) + 2e-5 * torch.from_numpy(rng.standard_normal((len(q), 1, 3)))
-    read = q + 1e-6 * torch.from_numpy(rng.standard_normal(tuple(q.shape)))
-    return arm.nominal, train, dc.Measurements(read, points), test
-
-
 @pytest.mark.slow
 def test_repeats_do_not_break_the_fit() -> None:
-    robot, _, often, test = repeated(15, 3)
-    many = dc.calibrate(robot, often)
+    arm, train, test = simulated(15)
+    rng, q = np.random.default_rng(1), train.q.repeat(3, 1)
+    points = arm.true_points(q) + 2e-5 * torch.from_numpy(rng.standard_normal((len(q), 1, 3)))
+    read = q + 1e-6 * torch.from_numpy(rng.standard_normal(tuple(q.shape)))
+    many = dc.calibrate(arm.nominal, dc.Measurements(read, points))
     assert many.fit.converged
     assert many.outliers == []
     assert held_out(many, test) < dc.evaluate(many.identification.geometry.points, test).rms
@@ -67,18 +59,13 @@ def test_repeats_do_not_break_the_fit() -> None:
     assert float(noise) == pytest.approx(2e-5, rel=0.3)
 
 
-def mixed() -> tuple[dc.Chain, Tensor, Tensor, Tensor, dc.Measurements]:
-    """Every other row measured fifty times worse: robot, q, points, standard deviations, test."""
-    arm, train, test = simulated(44)
-    std = torch.where(torch.arange(44) % 2 == 0, 1e-3, 2e-5).double()
-    draw = torch.from_numpy(np.random.default_rng(5).standard_normal((44, 1, 3)))
-    return arm.nominal, train.q, arm.true_points(train.q) + std[:, None, None] * draw, std, test
-
-
 @pytest.mark.slow
 def test_known_deviations_weigh_the_rows() -> None:
-    """Rows that are known to be bad do no harm."""
-    robot, q, points, std, test = mixed()
+    """Every other row is fifty times worse: rows that are known to be bad do no harm."""
+    arm, train, test = simulated(44)
+    robot, q, std = arm.nominal, train.q, torch.where(torch.arange(44) % 2 == 0, 1e-3, 2e-5).double()
+    draw = torch.from_numpy(np.random.default_rng(5).standard_normal((44, 1, 3)))
+    points = arm.true_points(q) + std[:, None, None] * draw
     given = with_usual_scales(robot, dc.Measurements(q, points, std=std))
     unknown = dc.calibrate(robot, dc.Measurements(q, points))
     assert held_out(given, test) < 0.8 * held_out(unknown, test)
@@ -88,14 +75,6 @@ def test_known_deviations_weigh_the_rows() -> None:
     noise = given.model.map.noise.covariance.diagonal(dim1=1, dim2=2).mean(1).sqrt()
     assert float(noise[::2].min()) > 0.9e-3
     assert float(noise[1::2].max()) < 2e-4
-
-
-@pytest.mark.slow
-def test_known_deviations_that_are_too_small_leave_the_rest_to_be_estimated(arm: Case) -> None:
-    data = dc.Measurements(arm.train.q, arm.train.points, std=1e-9)
-    result = dc.calibrate(arm.robot, data)
-    assert held_out(result, arm.test) < 1.1 * arm.held_out()[2]
-    assert float(result.selection.scales.sensor_noise) > 5e-6
 
 
 @pytest.mark.slow
@@ -114,10 +93,9 @@ def test_deviations_of_each_coordinate(arm: Case) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rows", [3, 5])
-def test_few_poses_with_honest_deviations_are_not_refused(rows: int) -> None:
+def test_few_poses_with_honest_deviations_are_not_refused() -> None:
     """Base and marker alone fit three poses exactly, which does not contradict the deviations."""
-    arm, train, _ = simulated(rows)
+    arm, train, _ = simulated(3)
     with pytest.warns(DiffeoCalibWarning, match="too few to select scales"):
         dc.calibrate(arm.nominal, dc.Measurements(train.q, train.points, std=2e-5))
 

@@ -10,15 +10,22 @@ from typing import Any
 import pytest
 import torch
 from kind_bank import kind_named
+from math_bank import normal
 from product_bank import Case, simulated
 from reading_bank import scales
 from simulated_sockets import rest_in_sockets
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.outliers import contradicted
-from diffeo_calib.calibration.diagnostics.row_order import block_text, check_row_order, find_block, steps_of
-from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_flat_places
+from diffeo_calib.calibration.diagnostics.open_directions import warn_of_flat_places
+from diffeo_calib.calibration.diagnostics.outliers import contradicted, excluded
+from diffeo_calib.calibration.diagnostics.row_order import (
+    block_text,
+    check_row_order,
+    find_block,
+    out_of_step,
+    steps_of,
+)
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
@@ -69,14 +76,12 @@ def test_a_block_of_rows_that_moved_together(rows: slice, words: str, arm: Case)
     assert "moving the measuring device by 200 mm" in text
 
 
-@pytest.mark.parametrize("share", [0.02, 0.1, 0.3])
-def test_random_rows_are_rarely_a_block(share: float) -> None:
-    generator = torch.Generator().manual_seed(1)
-    found = [find_block(torch.rand(80, generator=generator) < share) for _ in range(300)]
-    assert sum(place is not None for place in found) <= 2
-
-
 def test_the_block_is_where_the_wrong_rows_are() -> None:
+    """Random rows are rarely one."""
+    generator = torch.Generator().manual_seed(1)
+    for share in (0.02, 0.1, 0.3):
+        found = [find_block(torch.rand(80, generator=generator) < share) for _ in range(300)]
+        assert sum(place is not None for place in found) <= 2
     wrong = torch.zeros(100, dtype=torch.bool)
     wrong[40:50] = True
     wrong[[3, 77]] = True
@@ -241,19 +246,11 @@ def shifted(data: dc.Measurements, first: int, lag: int) -> dc.Measurements:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("first", "lag", "words"),
-    [
-        (20, -1, "from line 22 on the measured values belong to the joints 1 line above"),
-        (10, 2, "from line 12 on the measured values belong to the joints 2 lines below"),
-        (34, -1, "from line 36 on the measured values belong to the joints 1 line above"),
-    ],
-)
-def test_from_a_line_on(first: int, lag: int, words: str) -> None:
-    """Whether these are most of the rows, or the last few."""
+def test_a_table_that_is_out_of_step_is_refused() -> None:
     arm, train, _ = simulated(40)
-    with pytest.raises(MeasurementError, match=f"do not fit this robot: {words}: got .* rows that fit there.*; pair"):
-        dc.calibrate(arm.nominal, shifted(train, first, lag))
+    words = "do not fit this robot: from line 22 on the measured values belong to the joints 1 line above: got .* rows"
+    with pytest.raises(MeasurementError, match=words):
+        dc.calibrate(arm.nominal, shifted(train, 20, -1))
 
 
 @pytest.mark.slow
@@ -265,3 +262,89 @@ def test_tables_that_are_right_pass() -> None:
     points[[8, 15, 30]] += 0.2
     data = dc.Measurements(train.q, points)
     check_row_order(arm.nominal, data, register(arm.nominal, data.q, data.points))
+
+
+NOISE = 1e-3
+TYPICAL = 1.5 * NOISE
+"""Median length of three coordinates."""
+
+
+def out_of_step_table(rows: int, first: int, last: int, lag: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """Predictions, measured values of which the rows first ... last - 1 belong ``lag`` rows below, and line numbers."""
+    predicted, wanted = normal(rows, 1, 3, seed=seed), torch.arange(rows)
+    wanted[first:last] += lag
+    kept = (wanted >= 0) & (wanted < rows)
+    measured = predicted[wanted.clamp(0, rows - 1)] + NOISE * normal(rows, 1, 3, seed=seed + 1)
+    return predicted[kept], measured[kept], torch.arange(2, rows + 2)[kept]
+
+
+@pytest.mark.parametrize("lag", [-5, -1, 2])
+@pytest.mark.parametrize("first", [5, 25])
+def test_from_a_line_on(first: int, lag: int) -> None:
+    (step,) = out_of_step(*out_of_step_table(40, first, 40, lag), typical=TYPICAL)
+    assert (step.first, step.lag, step.to_the_end) == (first + 2, lag, True)
+    there = 40 - first - 2 * max(lag, 0)  # the last rows have lost their measured values
+    assert there - 2 <= step.rows <= there
+
+
+def test_a_block_in_the_middle() -> None:
+    (step,) = out_of_step(*out_of_step_table(40, 10, 22, -1), typical=TYPICAL)
+    assert (step.first, step.last, step.lag, step.to_the_end) == (12, 23, -1, False)
+    assert step.sentence().startswith("in lines 12 to 23 the measured values belong to the joints 1 line above")
+
+
+def test_rows_in_any_order_and_with_gaps() -> None:
+    """As after a split: 70 % of the rows, and thus half of the pairs."""
+    tables = out_of_step_table(100, 50, 100, -1)
+    rows = torch.randperm(100, generator=torch.Generator().manual_seed(3))[:70]
+    (step,) = out_of_step(*(part[rows] for part in tables), typical=TYPICAL)
+    assert step.lag == -1
+    assert abs(step.first - 52) <= 2
+    assert step.to_the_end
+
+
+@pytest.mark.parametrize("rows", [4, 60])
+def test_nothing_in_tables_that_are_right(rows: int) -> None:
+    """With heavy tails, with every fifth row far off, and with a pair of rows exchanged."""
+    for seed in range(10):
+        predicted, measured, lines = out_of_step_table(rows, 0, 0, 0, seed=seed)
+        assert out_of_step(predicted, measured, lines, TYPICAL) == []
+        measured = measured + NOISE * normal(rows, 1, 3, seed=seed + 50) / normal(rows, 1, 1, seed=seed + 60).abs()
+        measured[::5] += 0.2
+        measured[[1, 2]] = measured[[2, 1]]
+        assert out_of_step(predicted, measured, lines, TYPICAL) == []
+
+
+def test_nothing_on_a_slow_path() -> None:
+    """Where the next row is nearer than the error of the nominal robot."""
+    t = torch.linspace(0, 1, 200, dtype=torch.float64)
+    predicted = torch.stack([t.cos(), t.sin(), t], 1)[:, None]
+    measured = predicted + 5e-3 * torch.stack([(3 * t).sin(), (2 * t).cos(), t], 1)[:, None]
+    typical = float((predicted - measured).norm(dim=-1).median())
+    assert out_of_step(predicted, measured, torch.arange(200), typical) == []
+
+
+# --- the rule that says which rows look wrong, on clean errors and beside gross ones ----------------------------------
+
+TABLES = 1500
+
+
+@pytest.mark.parametrize("freedom", [1, 3, 6])
+@pytest.mark.parametrize("rows", [5, 40])
+@pytest.mark.parametrize("expected", [0.05, 20.0])
+def test_one_of_a_hundred_clean_tables_is_suspected_however_few_its_rows(
+    freedom: int, rows: int, expected: float
+) -> None:
+    """Whatever the model expects of the errors: the others tell how large they are."""
+    drawn = torch.Generator().manual_seed(rows)
+    squares = expected * torch.randn(TABLES, rows, freedom, generator=drawn, dtype=torch.float64).square().sum(2)
+    each = torch.full((rows, 1), float(freedom), dtype=torch.float64)
+    suspected = sum(bool(excluded(one[:, None], each, least=0.0).any()) for one in squares)
+    assert suspected < 0.02 * TABLES
+
+
+def test_a_gross_error_is_named_and_hidden_markers_are_not() -> None:
+    squares = torch.randn(30, 2, 3, generator=torch.Generator().manual_seed(0)).double().square().sum(2)
+    squares[4, 1], squares[7, 0] = 100.0, torch.nan
+    found = excluded(squares, torch.full_like(squares, 3.0))
+    assert found.nonzero().tolist() == [[4, 1]]

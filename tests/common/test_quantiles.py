@@ -1,13 +1,16 @@
-"""Quantiles are those of scipy.stats, which is not imported for them."""
+"""Quantiles are those of scipy.stats, which is not imported for them; statistics leave missing values out."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+from math import inf, nan
 
 import pytest
+import torch
+from torch.testing import assert_close
 
-from diffeo_calib.common.quantiles import chi2_above, chi2_median, f_below
+from diffeo_calib.common.quantiles import chi2_above, chi2_median, f_below, known, largest_known
 
 
 @pytest.mark.parametrize("freedom", [1, 2, 3, 6, 17.5, 400])
@@ -24,3 +27,11 @@ def test_scipy_stats_stays_away() -> None:
     program = "import sys\nfrom diffeo_calib.common import quantiles as q\nq.chi2_median(3)\nq.f_below(0.9, 3, 9)\n"
     done = subprocess.run([sys.executable, "-c", program + "sys.exit('scipy.stats' in sys.modules)"], check=False)
     assert done.returncode == 0
+
+
+def test_largest_known_value() -> None:
+    values = torch.tensor([[1.0, nan, 3.0], [nan, nan, nan], [-5.0, -7.0, nan], [inf, nan, 0.0]], dtype=torch.float64)
+    expected = torch.tensor([3.0, nan, -5.0, inf], dtype=torch.float64)
+    assert_close(largest_known(values), expected, rtol=0, atol=0, equal_nan=True)
+    assert_close(largest_known(values.T, 0), expected, rtol=0, atol=0, equal_nan=True)
+    assert known(values).tolist() == [1.0, 3.0, -5.0, -7.0, inf, 0.0]

@@ -1,16 +1,32 @@
 """Solvers of the exact model: Gauss-Newton and L-BFGS find the same optimum, and report how they stopped."""
 
+from collections.abc import Callable
 from contextlib import suppress
+from itertools import pairwise
 from typing import Any
 
 import pytest
 import torch
 from fit_bank import random_start, stop_at
-from math_bank import K_V, K_W, planar_two_markers, real_two_markers, rr_problem, tensor, two_marker_problem, uniform
+from math_bank import (
+    K_V,
+    K_W,
+    few_points,
+    normal,
+    planar_two_markers,
+    real_two_markers,
+    rr_problem,
+    tensor,
+    two_marker_problem,
+    uniform,
+)
 from torch import Tensor
+from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import NumericalError
+from diffeo_calib.fitting import gauss_newton
+from diffeo_calib.fitting.gauss_newton import MIXING_DEPTH, Mixing
 from diffeo_calib.fitting.problem import Problem, tangent
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.maps.deformation import Momenta
@@ -223,3 +239,145 @@ def test_a_start_whose_flows_overflow_is_no_success(
     problem = unguarded()
     with suppress(NumericalError):
         assert not dc.fit(problem, solver, integrator, start=random_start(problem, 100.0)).converged
+
+
+# --- L-BFGS --------------------------------------------------------------------------------------------------------
+
+Run = Callable[[Momenta, dc.RK4], GeodesicDeformation]
+
+
+def test_lbfgs_stays_at_the_gauss_newton_optimum(small: Fit, fine: Fit) -> None:
+    after = dc.fit(small.problem, dc.LBFGS(max_iterations=10), dc.RK4(2), start=small.momenta)
+    assert after.energy <= small.energy
+    assert after.energy == pytest.approx(small.energy, rel=1e-6)
+    after = dc.fit(fine.problem, dc.LBFGS(max_iterations=5), dc.RK4(8), start=fine.momenta)
+    assert after.energy <= fine.energy
+    assert after.energy == pytest.approx(fine.energy, rel=1e-8)
+
+
+@pytest.mark.slow
+def test_lbfgs_descends_from_the_tangent_model_to_the_same_optimum() -> None:
+    problem = few_points()
+    fit = dc.fit(problem, dc.LBFGS(), dc.RK4(1))
+    first = problem.energy(problem.deform(tangent(problem).momenta(), dc.RK4(1))).total
+    assert fit.history[0] == pytest.approx(float(first), rel=1e-12)
+    assert all(after <= before for before, after in pairwise(fit.history))
+    assert fit.converged
+    other = dc.fit(problem, dc.GaussNewton(), dc.RK4(1))
+    assert fit.energy == pytest.approx(other.energy, rel=1e-9)
+    torch.testing.assert_close(fit.momenta.flatten(), other.momenta.flatten(), rtol=0, atol=1e-5)
+
+
+def test_lbfgs_keeps_its_best_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interrupted during a line search: further evaluations never make the result worse."""
+    energies = []
+    for calls in range(2, 12):  # the first evaluation is the start; the third overshoots
+        problem, left = rr_problem(3), [calls]
+        deform = problem.deform
+
+        def interrupted(
+            momenta: Momenta, integrator: dc.RK4, left: list[int] = left, run: Run = deform
+        ) -> GeodesicDeformation:
+            left[0] -= 1
+            if left[0] == 0:
+                raise KeyboardInterrupt
+            return run(momenta, integrator)
+
+        start = random_start(problem)
+        monkeypatch.setattr(problem, "deform", interrupted)
+        energies.append(dc.fit(problem, dc.LBFGS(), dc.RK4(1), start=start).energy)
+    assert all(after <= before for before, after in pairwise(energies))
+    assert energies[-1] < energies[0]
+
+
+@pytest.mark.slow
+def test_overflowing_steps_of_lbfgs_are_shortened(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the flows overflow, the line search turns back and the descent continues."""
+    calls, deform = [0], Problem.deform
+
+    def overflowing(problem: Problem, *arguments: Any, **options: Any) -> GeodesicDeformation:
+        calls[0] += 1
+        if calls[0] in (5, 6):
+            raise NumericalError("too far")
+        return deform(problem, *arguments, **options)
+
+    problem, solver = few_points(), dc.LBFGS()
+    start = problem.zero()
+    start = start.unflatten(0.05 * normal(start.flatten().numel(), seed=9))
+    expected = dc.fit(problem, dc.GaussNewton(), dc.RK4(1)).energy
+    monkeypatch.setattr(Problem, "deform", overflowing)
+    fit = dc.fit(problem, solver, dc.RK4(1), start=start)
+    assert calls[0] > 6
+    assert fit.energy == pytest.approx(expected, rel=1e-6)
+
+
+# --- Mixed steps ---------------------------------------------------------------------------------------------------
+
+
+def momenta(task: Tensor) -> Momenta:
+    """Task momenta alone, b and theta that follow from them linearly."""
+    return Momenta(2.0 * task[:, :2], task, task.sum(0))
+
+
+def contraction(rates: list[float], size: int = 4) -> tuple[Tensor, Tensor]:
+    """A symmetric matrix with some eigenvalues beside zeros, and the fixed point of x -> A x + (1 - A) x*."""
+    generator = torch.Generator().manual_seed(0)
+    vectors = torch.linalg.qr(torch.randn(3 * size, 3 * size, dtype=torch.float64, generator=generator)).Q
+    values = torch.zeros(3 * size, dtype=torch.float64)
+    values[: len(rates)] = torch.tensor(rates, dtype=torch.float64)
+    return vectors * values @ vectors.T, torch.randn(3 * size, dtype=torch.float64, generator=generator)
+
+
+def iterates(rates: list[float], steps: int) -> tuple[Momenta, Tensor]:
+    """The last point of a mixed linear iteration from zero, and its fixed point."""
+    A, fixed = contraction(rates)
+    mixing, x = Mixing(), torch.zeros_like(fixed)
+    point = momenta(x.view(-1, 3))
+    for _ in range(steps):
+        target = momenta((A @ x + fixed - A @ fixed).view(-1, 3))
+        point = mixing.mixed(point, target) or target
+        x = point.task.flatten()
+    return point, fixed
+
+
+@pytest.mark.parametrize("rates", [[0.3], [0.5, -0.8], [0.9, 0.4, -0.2], [1.5, 0.5]])
+def test_a_linear_iteration_ends_after_one_step_for_each_rate(rates: list[float]) -> None:
+    """Two more for start and end; also one that diverges by itself."""
+    point, fixed = iterates(rates, len(rates) + 2)
+    assert_close(point.task.flatten(), fixed, rtol=1e-9, atol=1e-9)
+    assert_close(point.joint, 2.0 * point.task[:, :2], rtol=1e-9, atol=1e-9)
+    assert_close(point.theta, point.task.sum(0), rtol=1e-9, atol=1e-9)
+
+
+def test_a_converged_iteration_stays() -> None:
+    """Also after more steps than are kept: differences of steps are rounding then."""
+    point, fixed = iterates([0.5, 0.2], 2 * MIXING_DEPTH)
+    assert_close(point.task.flatten(), fixed, rtol=1e-9, atol=1e-9)
+
+
+def fitted(monkeypatch: pytest.MonkeyPatch, below: float) -> Fit:
+    monkeypatch.setattr(gauss_newton, "MIXED_RESIDUAL", below)
+    return dc.fit(rr_problem(8), dc.GaussNewton(tolerance=1e-6), dc.RK8(2))
+
+
+def test_the_optimum_is_the_same_after_fewer_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain, mixed = fitted(monkeypatch, 0.0), fitted(monkeypatch, 0.1)
+    assert mixed.converged
+    assert mixed.iterations < plain.iterations
+    assert mixed.energy == pytest.approx(plain.energy, rel=1e-6)
+
+
+def test_a_mixed_point_that_is_no_better_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Then the plain step is taken, and mixing starts again."""
+    plain, asked = fitted(monkeypatch, 0.0), []
+
+    def far(self: Mixing, current: Momenta, target: Momenta) -> Momenta:
+        asked.append(1)
+        return current.towards(target, -0.5)
+
+    monkeypatch.setattr(Mixing, "mixed", far)
+    found = fitted(monkeypatch, 0.1)
+    assert asked
+    assert found.iterations == plain.iterations
+    assert found.history == plain.history
+    assert found.evaluations > plain.evaluations

@@ -19,6 +19,7 @@ from diffeo_calib.kernels.profiles import GaussianProfile
 from diffeo_calib.kernels.reductions import backends, distributed
 from diffeo_calib.kernels.reductions.distributed import LostRankError, Ranks
 from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, Formula
+from diffeo_calib.kernels.reductions.fused import FUSED
 from diffeo_calib.kernels.reductions.tiled import Tiled
 
 ROOT = Path(__file__).parents[2]
@@ -101,15 +102,18 @@ def test_ranks_with_other_data_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("count", [1, 2, 3, 5])
 @pytest.mark.parametrize("formula", [FIELD, GRADIENT])
 def test_shares_add_up(count: int, formula: Formula) -> None:
-    """Of points with themselves and with others, for small and for large tiles."""
-    many, profile = points(101, 1), GaussianProfile()
-    for rows in (None, points(67, 2)):
-        for tiles in (Tiled(36), Tiled(1000), Tiled(100_000)):
-            shares = [tiles.share(formula, profile, rows, many, Ranks(own, count).mine) for own in range(count)]
-            expected = tiles.reduce(formula, profile, rows, many)
+    """Of points with themselves and with others, for small and for large tiles, and for compiled loops."""
+    many, profile, ranks = points(701, 1), GaussianProfile(), [Ranks(own, count).mine for own in range(count)]
+    for rows in (None, points(467, 2)):
+        at, expected = many if rows is None else rows, Tiled().reduce(formula, profile, rows, many)
+        for tiles in (Tiled(360), Tiled(10_000), Tiled(1_000_000)):
+            shares = [tiles.share(formula, profile, rows, many, mine) for mine in ranks]
             sums = [torch.stack(parts).sum(0) for parts in zip(*shares, strict=True)]
-            found = formula.finish(sums, many if rows is None else rows)
-            torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
+            torch.testing.assert_close(formula.finish(sums, at), expected, rtol=1e-12, atol=1e-10)
+        compiled = FUSED.program(formula, profile, rows, many)
+        if compiled is not None:
+            total = torch.stack([compiled.totals(rows, many, mine) for mine in ranks]).sum(0)
+            torch.testing.assert_close(compiled.results(total, len(at.features)), expected, rtol=1e-12, atol=1e-10)
 
 
 def test_work_is_dealt_evenly() -> None:
@@ -126,12 +130,6 @@ def test_one_process_needs_torchrun(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(InputError, match=r"several processes: got no RANK, .* start it with `torchrun"):
         backends.evaluate(FIELD, GaussianProfile(), *apart(), "distributed")
-
-
-def test_small_sums_are_not_shared(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(distributed, "ranks", lambda: Ranks(1, 2))
-    expected = backends.evaluate(FIELD, GaussianProfile(), *apart(), "dense")
-    torch.testing.assert_close(backends.evaluate(FIELD, GaussianProfile(), *apart(), "distributed"), expected)
 
 
 def test_a_failed_message_names_the_rank(monkeypatch: pytest.MonkeyPatch) -> None:

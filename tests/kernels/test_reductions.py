@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from math_bank import torch_threads
 from sum_bank import (
     FAR,
     NAIVE,
@@ -15,8 +16,8 @@ from sum_bank import (
     assert_same,
     every_formula,
     every_profile,
-    kappa,
     mapped,
+    needs_llvmlite,
     points,
     sides,
     torch_backends,
@@ -27,7 +28,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile, Profile
 from diffeo_calib.kernels.reductions import backends
 from diffeo_calib.kernels.reductions.backends import Backend
-from diffeo_calib.kernels.reductions.formulas import FIELD, Formula
+from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Formula
 
 
 @every_profile
@@ -38,14 +39,6 @@ def test_sums_are_those_of_a_loop_over_pairs(
 ) -> None:
     i, j = apart()
     assert_same(backends.evaluate(formula, profile, i, j, backend), naive(profile, i, j), atol)
-
-
-@every_profile
-def test_profile_matrix_is_made_pair_by_pair(profile: Profile) -> None:
-    i, j = (p.features for p in apart())
-    expected = torch.stack([torch.stack([kappa(profile, e, f, 0) for f in j]) for e in i])
-    for shift in (0.0, FAR):
-        assert_same([backends.profile_matrix(profile, i + shift, j + shift)], [expected])
 
 
 @every_formula
@@ -104,6 +97,20 @@ def test_single_precision_stays_single(formula: Formula, profile: Profile, backe
         torch.testing.assert_close(single.double(), double, rtol=0, atol=atol * scale)
 
 
+@pytest.mark.parametrize("backend", ["tiled", pytest.param("fused", marks=needs_llvmlite)])
+@pytest.mark.parametrize("formula", [FIELD, GRADIENT, HESSIAN_PRODUCT])
+def test_the_number_of_threads_changes_no_digit(formula: Formula, backend: str) -> None:
+    """2100 points, of themselves and of others: enough for several threads."""
+    i, j, found = points(2100, 1), points(2100, 2), []
+    for count in (1, 2, 3):
+        with torch_threads(count):
+            sums = [backends.BACKENDS[backend].reduce(formula, GaussianProfile(), rows, j) for rows in (None, i)]
+            found.append([result for each in sums for result in each or ()])
+    assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other, strict=True))
+    dense = [backends.BACKENDS["dense"].reduce(formula, GaussianProfile(), rows, j) for rows in (None, i)]
+    assert_same(found[0], [result for each in dense for result in each or ()], 1e-9)
+
+
 # --- Dispatch ---------------------------------------------------------------------------------------------------
 
 
@@ -126,12 +133,6 @@ def test_auto_chooses_by_size_and_device(
         assert backends.choose("dense", rows, 7, here) == "dense"
         assert backends.choose("tiled", rows, 7, here) == "tiled"
         assert backends.choose("keops", rows, 7, here) == large
-
-
-def test_small_sums_do_not_import_keops(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(backends.BACKENDS["keops"], "usable", lambda: pytest.fail("pykeops was imported"))
-    backends.evaluate(FIELD, GaussianProfile(), *apart())
-    assert backends.choose("auto", 1000, 1000, torch.device("cpu")) in {"fused", "tiled"}
 
 
 @pytest.mark.parametrize("name", ["numpy", "", "Dense", None])

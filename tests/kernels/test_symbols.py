@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import pytest
-import torch
-from math_bank import normal
-from sum_bank import COLUMNS, ROWS, apart, assert_same, every_formula, every_profile, needs_llvmlite, points
+from sum_bank import apart, assert_same, needs_llvmlite
 
 from diffeo_calib.kernels.profiles import GaussianProfile, Profile
-from diffeo_calib.kernels.reductions import tiled
-from diffeo_calib.kernels.reductions.formulas import GRADIENT, Dense, Formula, matrices
+from diffeo_calib.kernels.reductions.formulas import GRADIENT, Dense, Formula
 from diffeo_calib.kernels.reductions.fused import Fused
 from diffeo_calib.kernels.reductions.symbols import recorded
 from diffeo_calib.kernels.reductions.tiled import Tiled
@@ -64,33 +60,3 @@ def test_symbols_calculate_like_tensors(operation: Callable[[Any, Any], Any], ba
     assert recorded(formula, GaussianProfile()) is not None
     found = backend.reduce(formula, GaussianProfile(), i, j)
     assert_same(found, Dense().reduce(formula, GaussianProfile(), i, j), 1e-11)
-
-
-@every_profile
-@every_formula
-def test_buffers_are_recycled_and_weights_hold_until_the_next_tile(formula: Formula, profile: Profile) -> None:
-    i, j = apart()
-    weights, elements = recorded(formula, profile), ROWS * COLUMNS + 5
-    assert weights is not None
-    tiled.BUFFERS.free.clear()
-    made: set[int] = set()
-    for k in range(3):
-        found, scales = tiled._recycled(weights, elements, i, j)
-        expected = formula.weigh(matrices(i, j), profile)
-        assert_same([w * c for w, c in zip(found, scales, strict=True)], expected, 1e-12)
-        free = tiled.BUFFERS.free[elements, torch.float64, i.features.device]
-        now = {b.data_ptr() for b in (*free, *found)}
-        assert not {w.data_ptr() for w in found} & {b.data_ptr() for b in free}
-        assert k == 0 or now == made  # one more tile needs no new buffer
-        made = now
-
-
-def test_every_size_type_and_thread_has_its_own_buffers() -> None:
-    one = normal(1)
-    found = [tiled.BUFFERS.of(8, one), tiled.BUFFERS.of(9, one), tiled.BUFFERS.of(8, one.float())]
-    thread = threading.Thread(target=lambda: found.append(tiled.BUFFERS.of(8, one)))
-    thread.start()
-    thread.join()
-    assert len({id(free) for free in found}) == 4
-    assert tiled.BUFFERS.of(8, normal(3)) is found[0]
-    assert points(3, 1).features.dtype is torch.float64

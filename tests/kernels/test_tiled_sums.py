@@ -84,24 +84,6 @@ def test_memory_is_bounded_by_the_tiles(tiles: list[tuple[int, int]]) -> None:
     assert_same(backends.evaluate(FIELD, GaussianProfile(), few, many, "dense"), [total[:3]], 1e-11)
 
 
-@pytest.mark.parametrize("formula", [FIELD, GRADIENT, HESSIAN_PRODUCT])
-def test_the_number_of_threads_changes_no_digit(formula: Formula) -> None:
-    """2100 points, of themselves and of others: enough for several threads."""
-    i, j = points(2100, 1), points(2100, 2)
-    found = []
-    for count in (1, 2, 3):
-        with torch_threads(count):
-            found.append(
-                [
-                    *Tiled().reduce(formula, GaussianProfile(), None, i),
-                    *Tiled().reduce(formula, GaussianProfile(), i, j),
-                ]
-            )
-    assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other, strict=True))
-    expected = [*Dense().reduce(formula, GaussianProfile(), None, i), *Dense().reduce(formula, GaussianProfile(), i, j)]
-    assert_same(found[0], expected, 1e-9)
-
-
 def test_buffers_of_inference_mode_serve_outside_of_it() -> None:
     i, formula = points(COLUMNS, 1), GRADIENT
     tiled.BUFFERS.of(7, i.features).clear()

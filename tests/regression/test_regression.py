@@ -166,21 +166,6 @@ def test_auto_takes_conjugate_gradients_for_large_problems() -> None:
         dc.fit(PROBLEMS["rr"], dc.GaussNewton(linear="lu"), dc.RK4(1))  # pyright: ignore[reportArgumentType]
 
 
-@every_problem
-def test_features_give_every_covariance(problem: Problem) -> None:
-    """F + sum of signed products is the posterior covariance, whichever way conditions on the data."""
-    at = deformed(problem)
-    queries = at.linearise(uniform(6, problem.x.shape[1], seed=8))
-    for conditional in (
-        choose.condition(at.linearise(), problem.noise),
-        ConjugateGradientRegression(at.linearise(), problem.noise),
-        ControlPointRegression(at, problem.x, problem.noise),
-    ):
-        values, signs = conditional.features(queries)
-        found = queries.fields.gram(queries.fields) + (values.T * signs) @ values
-        torch.testing.assert_close(found, conditional.covariance_between(queries), rtol=1e-8, atol=1e-12)
-
-
 @pytest.mark.slow
 @every_problem
 def test_control_points_in_many_blocks_of_data(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -97,39 +97,35 @@ def _term(value: float, name: str, angle: str) -> str:
     return f"{'-' if value < 0.0 else '+'}{text}{{{name}}}" if value else ""
 
 
-class Seen(NamedTuple):
-    """What rows show of a robot.
-
-    Args:
-        tip: number of the tip. rows: (R,) those to use. projector: of some of ``rows`` (M,) -> (M, M).
-        angle: unit of the table. judge: what a rigid registration of joint values (N, n) leaves, as a share.
-    """
-
-    tip: int
-    rows: Tensor
-    projector: Callable[[Tensor], Tensor]
-    angle: str
-    judge: Callable[[Tensor], float]
-
-
-def conventions(robot: Tree, q: Tensor, seen: Seen) -> list[Convention]:
+def conventions(
+    robot: Tree,
+    q: Tensor,
+    left: Callable[[Tensor], float],
+    rows: Tensor,
+    projector: Callable[[Tensor], Tensor],
+    *,
+    tip: int = 0,
+    per_rad: float = 1.0,
+) -> list[Convention]:
     """The plainest conventions that explain rows which the robot does not explain as they were read.
 
     Args:
-        robot: n joints. q: (N, n) joint values as read [rad or m]. seen: what the rows show.
+        robot: n joints. q: (N, n) joint values as read [rad or m].
+        left: what a rigid registration of joint values (N, n) leaves, as a share of the spread.
+        rows: (R,) those to use. projector: of some of these (M,) -> (M, M). tip: number of the tip that they show.
+        per_rad: how many of the table's angles are one rad.
 
     Returns:
         none if nothing explains the rows far better; several if the rows do not tell them apart.
     """
-    limit = min(gates.RIGHT_READING, gates.OTHER_READING_LEFT * seen.judge(q))
-    chosen = torch.randperm(len(seen.rows), generator=seeded(0), device=HOST)[:ROWS]
+    limit = min(gates.RIGHT_READING, gates.OTHER_READING_LEFT * left(q))
+    chosen = rows[torch.randperm(len(rows), generator=seeded(0), device=HOST)[:ROWS]]
     if len(chosen) < 2 * (2 + robot.n) or limit < SMALLEST_LIMIT:
         return []
-    own, projector = q[seen.rows[chosen]], seen.projector(chosen)
-    search = _Search(robot, seen.tip, own, projector, 180 / pi if seen.angle == "deg" else 1.0)
+    search = _Search(robot, tip, q[chosen], projector(chosen), per_rad)
 
     def judged(matrix: Tensor, offset: Tensor) -> Convention:
-        return Convention(robot, matrix, offset, seen.judge(q @ matrix.mT + offset))
+        return Convention(robot, matrix, offset, left(q @ matrix.mT + offset))
 
     def rigid(starts: _Starts) -> Iterator[_Starts]:
         """Those (1,) that are good in a rigid frame too, one for each pattern of signs."""
@@ -175,11 +171,7 @@ class _Starts(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """The search over rows q (N, n), as read, of the tip with this number; see :class:`Seen` for the projector.
-
-    Args:
-        per_rad: how many of the table's angles are one rad.
-    """
+    """The search over rows q (N, n), as read, of the tip with this number; see :func:`conventions`."""
 
     robot: Tree
     tip: int
@@ -203,12 +195,14 @@ class _Search:
     def tried(self) -> Iterator[_Starts]:
         """Starts: signs and zeros; exchanged or coupled columns; other units of all joints, and of some."""
         n, turning = self.robot.n, self.turning
-        one, width, span = torch.eye(n, dtype=torch.float64, device=HOST), *self._sizes()
+        one, span = torch.eye(n, dtype=torch.float64, device=HOST), self.q.amax(0) - self.q.amin(0)
+        width = self.room[:, 1] - self.room[:, 0]
         large = turning & (span > MOST_PART * width)
         small = turning & (span < LEAST_PART * width)
         if not bool(large.any()):
             yield self.starts(one, self.zeros(ZEROS))
-        mixed = [self.starts(one[self._exchanged(a, b)], self.zeros(2), 0) for a, b in combinations(range(n), 2)]
+        exchanged = ([b if k == a else a if k == b else k for k in range(n)] for a, b in combinations(range(n), 2))
+        mixed = [self.starts(one[order], self.zeros(2), 0) for order in exchanged]
         for k in (k for k in range(n - 1) if bool(turning[k] & turning[k + 1])):
             for sign in (1.0, -1.0):
                 coupled = one.clone()
@@ -231,16 +225,9 @@ class _Search:
                 size = torch.where(odd, 0.08 * 12.0**grid * width / span.clamp(min=1e-9), 1.0)
                 yield own._replace(matrix=own.matrix * size[..., None], scaled=odd.expand_as(own.offset))
 
-    def _sizes(self) -> tuple[Tensor, Tensor]:
-        """Width of the limits, and range of the values as read, (n,) each."""
-        return self.room[:, 1] - self.room[:, 0], self.q.amax(0) - self.q.amin(0)
-
-    def _exchanged(self, a: int, b: int) -> list[int]:
-        return [b if k == a else a if k == b else k for k in range(self.robot.n)]
-
     def factors(self) -> list[Tensor]:
         """-100..100 and 0..100 of the limits, degrees, radians and ticks as factors (n,) of the values as read."""
-        width = self._sizes()[0]
+        width = self.room[:, 1] - self.room[:, 0]
         ticks = [2 * pi / 2**k * self.per_rad for k in range(8, 25)]
         plain = [value * torch.ones_like(width) for value in (pi / 180, 180 / pi, *ticks)]
         return [width / 200.0 * self.per_rad, width / 100.0 * self.per_rad, *plain]
@@ -289,9 +276,9 @@ class _Search:
 
     def plainer(self, found: _Starts) -> tuple[Tensor, Tensor]:
         """M and b of one of the starts (1,), with known factors and the plainest zeros that explain as much."""
-        limit, (width, _) = max(NICE, KEEPS * float(found.share)), self._sizes()
+        limit, factors = max(NICE, KEEPS * float(found.share)), self.factors()
         identity = torch.eye(self.robot.n, dtype=torch.bool, device=HOST)
-        known = torch.stack([*self.factors(), *(torch.ones_like(width) / ratio for ratio in (1, *RATIOS))])
+        known = torch.stack([*factors, *(torch.ones_like(factors[0]) / ratio for ratio in (1, *RATIOS))])
         for k in found.scaled[0].nonzero()[:, 0].tolist():
             near = known[(known[:, k] / found.matrix[0, k].abs().max() - 1.0).abs() < 0.05, k]
             tried = _joined([found] * max(len(near), 1))

@@ -29,7 +29,7 @@ from diffeo_calib.common.errors import sentence, warn_user, with_deviation
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.process.process import Process
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.regression.factor import Factor
+from diffeo_calib.regression.cholesky import Factor
 from diffeo_calib.sensors.devices import MILLIMETRE, Hypothesis
 
 RELATIVE_RIDGE = 1e-9

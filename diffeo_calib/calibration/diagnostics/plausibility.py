@@ -9,6 +9,7 @@ from math import inf
 from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.likely_mistakes import (
@@ -26,10 +27,11 @@ from diffeo_calib.calibration.identification.registration import (
     spread,
     with_large_offsets,
 )
+from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, RobotError, few, sentence, shown, warn_user
-from diffeo_calib.common.quantiles import known
+from diffeo_calib.common.quantiles import chi2_median, known
 from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.table import Measurements
@@ -40,7 +42,20 @@ from diffeo_calib.sensors.coordinates import joint_name_fix
 
 def check_joints(robot: Tree, data: Any) -> None:
     """Refuse joints that are not the robot's; warn of joints that never or hardly move."""
-    _check_names(robot, data)
+    if data.n != robot.n:
+        raise MeasurementError.of(
+            f"the measurements do not fit robot '{robot.name}'",
+            expected=f"{robot.n} joints ({few(robot.joint_names, MOST_NAMES)})",
+            got=data.n,
+            fix="check the base and tip links, and the joint columns",
+        )
+    if data.joint_names is not None and tuple(data.joint_names) != tuple(robot.joint_names):
+        raise RobotError.of(
+            f"the measurements' joints are not those of robot '{robot.name}'",
+            expected=few(robot.joint_names, MOST_NAMES),
+            got=few(data.joint_names, MOST_NAMES),
+            fix=joint_name_fix(robot, data.joint_names),
+        )
     if len(data) == 1:
         return  # the registration refuses a single row
     low, high = robot.limits.to(data.q.device).unbind(1)
@@ -56,24 +71,6 @@ def check_joints(robot: Tree, data: Any) -> None:
             names = ", ".join(name for name, flag in zip(robot.joint_names, flags, strict=True) if flag)
             fix = "the model is valid only near this joint position; measure poses in which every joint moves"
             warn_user(sentence(f"{names}: {words} in these measurements", fix=fix))
-
-
-def _check_names(robot: Tree, data: Any) -> None:
-    """Refuse another number of joints, or other names."""
-    if data.n != robot.n:
-        raise MeasurementError.of(
-            f"the measurements do not fit robot '{robot.name}'",
-            expected=f"{robot.n} joints ({few(robot.joint_names, MOST_NAMES)})",
-            got=data.n,
-            fix="check the base and tip links, and the joint columns",
-        )
-    if data.joint_names is not None and tuple(data.joint_names) != tuple(robot.joint_names):
-        raise RobotError.of(
-            f"the measurements' joints are not those of robot '{robot.name}'",
-            expected=few(robot.joint_names, MOST_NAMES),
-            got=few(data.joint_names, MOST_NAMES),
-            fix=joint_name_fix(robot, data.joint_names),
-        )
 
 
 def check_limits(robot: Tree, data: Any) -> None:
@@ -98,6 +95,55 @@ def check_limits(robot: Tree, data: Any) -> None:
             fix = f"check the joint's offset, sign and unit (not in {other}?)"
             text = sentence(f"{which}: far beyond the robot's limits", expected=expected, got=got, fix=fix)
             warn_user(text)
+
+
+def quantum(values: Tensor, *, turning: bool) -> tuple[float, str] | None:
+    """The step in which a joint's values (N,) were written, rad or m, and the step in words; None if they were not.
+
+    Steps are powers of ten, whole or half, in rad, deg, m or mm.
+    """
+    units = (("rad", 1.0), ("degrees", math.pi / 180)) if turning else (("m", 1.0), ("mm", 1e-3))
+    steps = [
+        (step * size, f"{step:g} {unit}")
+        for unit, size in units
+        for digits in range(gates.DIGITS + 1)
+        for step in (10.0**-digits, 5 * 10.0 ** -(digits + 1))
+    ]
+    for size, words in sorted(steps, reverse=True):
+        multiples = values / size
+        few = len(multiples.round().unique()) < gates.DIGIT_VALUES  # near the same multiple of any large step
+        if not few and float((multiples - multiples.round()).abs().max()) < gates.DIGIT_REMAINDER:
+            return size, words
+    return None
+
+
+def warn_of_rounding(robot: Tree, data: Any, tangent: TangentData, left_out: LeaveOneOut) -> None:
+    """Warn if the joint values have so few digits that their rounding explains much of the remaining error.
+
+    Args:
+        robot: n joints. data: N rows. tangent: the same around the geometric calibration.
+        left_out: leave-one-out errors.
+    """
+    each = [quantum(own, turning=turns) for own, turns in zip(data.q.unbind(1), robot.periodic, strict=True)]
+    steps = {name: own for name, own in zip(robot.joint_names, each, strict=True) if own is not None}
+    if not steps or len(data) < gates.DIGIT_ROWS:
+        return
+    variances = tangent.x.new_tensor([0.0 if own is None else own[0] ** 2 / 12 for own in each])  # uniform
+    points = tangent.noise_model.bodies if tangent.noise_model.modes is None else tangent.y.shape[1] // 3
+    caused = float((tangent.jacobian.square() @ variances).unflatten(1, (points, -1)).sum(-1).mean().sqrt())
+    seen = left_out.errors.unflatten(1, (points, -1))
+    squares, size = seen.square().nansum(-1)[~seen.isnan().all(-1)], seen.shape[2]
+    remaining = float((size * squares.median() / chi2_median(size)).sqrt())
+    if gates.ROUNDING_LEAST * remaining < caused < gates.ROUNDING_MOST * remaining:
+        words = " and ".join(sorted({words for _, words in steps.values()}))
+        text = sentence(
+            f"the values of {few([*steps], MOST_NAMES)} are rounded to {words}",
+            expected="readings with more digits",
+            got=f"{1e3 * caused:.2g} mm RMS of position error from this rounding, {1e3 * remaining:.2g} mm remain in "
+            "all",
+            fix="write more digits of the joint values, unless the robot was commanded to exactly these",
+        )
+        warn_user(text)
 
 
 def registered(robot: Tree, data: Measurements) -> Identification:
@@ -136,7 +182,7 @@ def check_identification(data: Measurements, identification: Identification) -> 
         column, words = shown(several[0]), several[1]
         fix = f"name the column: --marker {column} (in Python `marker`)"
         raise MeasurementError.of(f"column '{column}' takes {words}: which marker does a row show", fix=fix)
-    size, typical = spread(data.points), _typical(identification, data)
+    size, typical = spread(data.points), float(distances(identification.geometry, data).nanmedian())
     angles = known(data.bodies.errors(data, identification.geometry.points(data.q))[..., 3:].norm(dim=-1))
     if len(angles) and float((angles > gates.ORIENTATION_RAD).double().mean()) > gates.ORIENTATION_SHARE:
         what = "measured orientations"
@@ -183,11 +229,6 @@ def marker_column(geometry: Geometry, data: Measurements) -> tuple[str, str] | N
     return None
 
 
-def _typical(identification: Identification, data: Measurements) -> float:
-    """Median residual, m."""
-    return float(distances(identification.geometry, data).nanmedian())
-
-
 def _check_motion(robot: Tree, data: Measurements) -> None:
     """Refuse markers that never move, although the robot's tip does: they determine nothing."""
     measured, tips = spread(data.points), spread(robot.tip_poses(data.q)[..., :3, 3])
@@ -204,7 +245,7 @@ def _check_motion(robot: Tree, data: Measurements) -> None:
 def _check_registration(robot: Tree, data: Measurements, registration: Identification) -> None:
     """Refuse measurements that no base and markers explain, but another reading does."""
     measured, nominal = spread(data.points), spread(registration.geometry.points(data.q))
-    typical = _typical(registration, data)
+    typical = float(distances(registration.geometry, data).nanmedian())
     if typical > gates.REGISTERED_RESIDUAL * max(measured, nominal):
         refuse_or_warn(
             "the measurements do not fit this robot: no base frame and markers explain them",
@@ -267,21 +308,17 @@ def unmeasured_markers(robot: Tree, data: Measurements) -> Iterator[Unmeasured]:
     tips = data.bodies.tips(data.on or robot.tips[:1] * data.points.shape[1])
     if robot.n < gates.NOMINAL_JOINTS or len(set(tips)) == len(tips):
         return
-    own = [_residual(robot, data, k, tip) for k, tip in enumerate(tips)]
+    own = [inf] * len(tips)  # median residuals of the nominal robot, m, of each by itself
+    for k, seen in enumerate(data.seen_bodies.unbind(1)):
+        if int(seen.sum()) >= gates.STUCK_ROWS:
+            alone = Measurements.of_points(data.q[seen], data.origins[seen][:, [k]], (tips[k],), None)
+            own[k] = residual_of(robot, alone)
     for k, typical in enumerate(own):
         far = max(other for other, tip in zip(own, tips, strict=True) if tip == tips[k])
         explained = gates.DIGITS_SHARE * size < far < gates.RIGHT_READING * size
         if explained and typical < min(gates.FOLLOWED * far, gates.NOMINAL_SHARE * size):
             words = f"marker {k} follows the nominal robot to {1e3 * typical:.4f} mm, another one to {1e3 * far:.3g} mm"
             yield Unmeasured(k, f"{words}: wished places", typical < gates.DIGITS_SHARE * size)
-
-
-def _residual(robot: Tree, data: Measurements, marker: int, tip: str) -> float:
-    """Median residual of the nominal robot for one marker, m; infinite where few rows show it."""
-    seen = data.seen_bodies[:, marker]
-    if int(seen.sum()) < gates.STUCK_ROWS:
-        return inf
-    return residual_of(robot, Measurements.of_points(data.q[seen], data.origins[seen][:, [marker]], (tip,), None))
 
 
 def check_markers(robot: Tree, data: Measurements) -> None:

@@ -147,7 +147,8 @@ def _start(
     s, Vt = torch.linalg.svd(white, full_matrices=False)[1:]
     root = prior[:, None] * Vt.mT / s
     covariance = slopes.new_zeros(geometry.size, geometry.size)
-    covariance[torch.tensor(sought)[:, None], sought] = root @ root.mT
+    numbers = torch.tensor(sought, dtype=torch.int64, device=slopes.device)
+    covariance[numbers[:, None], numbers] = root @ root.mT
     theta, tails = slopes.new_zeros(geometry.size), Tails.none(rows, geometry.markers, device=slopes.device)
     return Identification(geometry, rms, noise, covariance, iterations, status, theta, Prior(), tails)
 

@@ -31,12 +31,12 @@ class Drift(DeviceSet):
     """Drift of N rows with K columns.
 
     Args:
-        known: what was found, or zero before a fit. values: (N, K). q: (N, n) configurations.
+        known: what was found, or zero before a fit. ramp: (N, K) from -1/2 to 1/2. q: (N, n) configurations.
         centre: (3,) about which the frame turns and lengths grow, m; by default the middle of the rows.
     """
 
     known: KnownDrift
-    values: Tensor
+    ramp: Tensor
     q: Tensor
     centre: Tensor | None = None
 
@@ -49,7 +49,8 @@ class Drift(DeviceSet):
         joints = tuple(zip(chain.joint_names, chain.periodic, strict=True))
         nothing = values.new_zeros(values.shape[1], OFFSETS + len(joints))
         ends = values.amin(0), values.amax(0), values.new_zeros(3)
-        return [cls(KnownDrift(data.covariate_names, joints, *ends, nothing, nothing), values, data.q)]
+        known = KnownDrift(data.covariate_names, joints, *ends, nothing, nothing)
+        return [cls(known, known.ramp(data), data.q)]
 
     @property
     def size(self) -> int:
@@ -63,8 +64,7 @@ class Drift(DeviceSet):
         offsets = OFFSET_RAD_M * data.nominal.jacobian(self.q, data.y.new_zeros(data.nominal.parameters))
         whole = torch.cat([frame, GROWTH * away, offsets], 2)
         whole = whole if data.slopes is None else data.slopes @ whole
-        ramp = (self.values - self.known.lowest) / (self.known.highest - self.known.lowest) - 0.5  # from -1/2 to 1/2
-        return (whole[:, :, None] * ramp[:, None, :, None]).flatten(2)
+        return (whole[:, :, None] * self.ramp[:, None, :, None]).flatten(2)
 
     def settled(self, found: Settled) -> Drift:
         own = found.shifts.new_tensor([FRAME_M_RAD] * 6 + [GROWTH] + [OFFSET_RAD_M] * len(self.known.joints))
@@ -75,11 +75,7 @@ class Drift(DeviceSet):
         return replace(self, known=known, centre=found.centre)
 
     def with_rows(self, other: OtherRows) -> Drift:
-        """Rows that do not tell the columns are those of the middle."""
-        q, values = other.data.q, other.data.covariates
-        middle = (0.5 * (self.known.lowest + self.known.highest)).expand(len(q), -1)
-        values = values if other.data.covariate_names == self.known.names else middle
-        return replace(self, values=values, q=q, centre=other.centre)
+        return replace(self, ramp=self.known.ramp(other.data), q=other.data.q, centre=other.centre)
 
     def placed(self) -> PlacedDevices:
         return self.known.placed()

@@ -9,17 +9,15 @@ columns Z are the effects of shifts c ~ N(0, I). After the fit their posterior i
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
-from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import few, sentence
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -257,21 +255,3 @@ class OtherLabel(NamedTuple):
     name: str
     applies: Tensor
     errors: Tensor
-
-
-def label_text(errors: Tensor, wrong: Tensor, lines: Tensor, labels: Sequence[OtherLabel]) -> str | None:
-    """A sentence about the label that most wrong rows fit.
-
-    Args:
-        errors: (M,) of the rows as they are labelled, m. wrong: (M,) boolean. lines: (M,). labels: others.
-    """
-    found = [(wrong & one.applies & (one.errors < gates.REMAINING_UNDER_LABEL * errors), one) for one in labels]
-    rows, label = max(found, key=lambda each: int(each[0].sum()), default=(wrong & ~wrong, None))
-    if label is None or int(rows.sum()) < gates.LABEL_ROWS:
-        return None
-    before, after = (1e3 * float(each[rows].median()) for each in (errors, label.errors))
-    what = (
-        f"{int(rows.sum())} rows look wrong and fit {label.name}: lines {few(lines[rows.to(lines.device)].tolist(), 5)}"
-    )
-    got = f"median errors of {before:.3g} mm, and of {after:.3g} mm so"
-    return sentence(what, expected="rows that fit under their own label", got=got, fix="correct these labels")

@@ -35,7 +35,6 @@ from diffeo_calib.sensors.set_ups import (
     MountedMarkers,
     SetUps,
     View,
-    frame_slopes,
     sessions_of,
     set_up_kind,
 )
@@ -124,8 +123,7 @@ class Sessions(DeviceSet):
         if len(device.table.present_sessions) < 2:
             return [], own
         found = Sessions.around(device.table, set_up_kind(device.table), geometry, seen)
-        found = found.of_rows(device.rows, len(own.table))
-        return [found.of_rows(own.rows, count)], own._replace(table=found.aligned(own.table))
+        return [found.of_rows(own.rows[device.rows], count)], own._replace(table=found.aligned(own.table))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -150,20 +148,16 @@ class Sessions(DeviceSet):
         """Numbers of the sessions but the reference."""
         return [number for number in range(len(self.names)) if number != self.reference]
 
-    def of_each(self, effects: Tensor, session: Tensor) -> Tensor:
-        """Effects (N, R, c) on rows of sessions (N,) as those of each but the reference: (N, R, c (S - 1))."""
-        session = session.to(effects.device)
-        return torch.cat([effects * (session == number)[:, None, None] for number in self.others], dim=2)
-
-    def own_places(self, data: Measurements, by_tool: Tensor, rows: Tensor) -> Tensor:
-        """Derivatives (M, 3 P, c) of points by the places of sessions, of each but one.
+    def increments(
+        self, points: Tensor, by_tool: Tensor, centre: Tensor, rows: Tensor | slice, slopes: Tensor | None = None
+    ) -> Tensor:
+        """What the sessions but the reference leave open, (N, R, k (S - 1)): see :meth:`SetUps.increments`.
 
         Args:
-            data: M rows. by_tool: (M, 3 P, 3 P) their derivatives by points on the tool. rows: their numbers.
+            rows: numbers of the N rows.
         """
-        framed = self.set_ups.kind == SESSION
-        slopes = frame_slopes(data.points, data.points.mean((0, 1))) if framed else by_tool
-        return self.of_each(slopes, self.session[rows.to(self.session.device)])
+        session, own = self.session[rows].to(points.device), self.set_ups.increments(points, slopes, by_tool, centre)
+        return torch.cat([own * (session == number)[:, None, None] for number in self.others], dim=2)
 
     @property
     def size(self) -> int:
@@ -174,7 +168,7 @@ class Sessions(DeviceSet):
         tool, places = data.nominal.geometry.slices["tool"], data.points.unflatten(1, (-1, 3))
         by_tool = data.sensitivities[..., tool.start : tool.start + 3 * self.markers]
         centre = places.mean((0, 1)) if self.centre is None else self.centre
-        return self.of_each(self.set_ups.increments(places, data.slopes, by_tool, centre), self.session)
+        return self.increments(places, by_tool, centre, slice(None), data.slopes)
 
     def settled(self, found: Settled) -> Sessions:
         steps, k = found.shifts.view(len(self.others), -1), self.set_ups.deviations.shape[1]

@@ -18,12 +18,12 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
+from diffeo_calib.calibration.diagnostics.open_directions import warn_of_flat_places
 from diffeo_calib.calibration.diagnostics.outliers import Outlier, excluded, found_outliers
 from diffeo_calib.calibration.diagnostics.plausibility import check_identification, registered
 from diffeo_calib.calibration.diagnostics.socket_plausibility import (
     check_registration,
     check_sockets,
-    warn_of_flat_places,
     warn_of_other_robot,
     warn_of_wrong_sockets,
 )
@@ -37,13 +37,12 @@ from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, See
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.re_registration.new_rows import LinearRows
 from diffeo_calib.measurements.checks import numbers_of
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.sockets import SEPARATOR, Sockets
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails
-from diffeo_calib.regression.conditional import diagonal_blocks
-from diffeo_calib.regression.factor import Factor
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
@@ -372,10 +371,8 @@ def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> 
     """Rows whose ball the model excludes from the middle of their socket, the worst first.
 
     Each is judged as the model and the other rows of its socket predict it: where the socket is, is an error with a
-    wide prior that its rows share. With K the covariance of all errors, the model's posterior and noise included, and
-    mu = K^-1 y, the error of row i is [(K^-1)_ii]^-1 mu_i, with the covariance [(K^-1)_ii]^-1.
-    The median distance says in which unit the model's deviations are to be taken: they hold for errors elsewhere, and
-    the rows of a socket share most of these.
+    wide prior that its rows share. The median distance says in which unit the model's deviations are to be taken: they
+    hold for errors elsewhere, and the rows of a socket share most of these.
 
     Args:
         model: of rows in sockets. data: rows in sockets that took no part in its fit; rows of other kinds are left out.
@@ -383,24 +380,22 @@ def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> 
     if not bool((data.places >= 0).any()):
         return []
     resting = data.socket_rows().with_sockets_of_rows()
-    seen, socket = model.map, resting.socket_numbers.to(resting.q.device)
+    seen, socket, N = model.map, resting.socket_numbers.to(resting.q.device), len(resting)
     predicted = seen(resting.q).detach()[:, -3:]
-    middles = socket_means(predicted, socket)[socket]
-    at = seen.geodesic.linearise(resting.q)
-    last = torch.eye(seen.m, dtype=predicted.dtype, device=predicted.device)[-3:].expand(len(resting), -1, -1)
-    own = seen.covariance_between(at.projected(last))
-    rests = torch.nn.functional.one_hot(socket).to(own)
-    places = torch.kron(PLACES.found_m_rad * rests, torch.eye(3, dtype=own.dtype, device=own.device))
-    factor = Factor.of(own + torch.block_diag(*seen.new_noise[-3:, -3:].expand(len(resting), -1, -1)), places)
-    mu = factor.solve((middles - predicted).view(-1, 1)).view(-1, 3)
-    errors = torch.linalg.solve(diagonal_blocks(factor.inverse, len(resting)), mu[..., None])[..., 0]
-    squares = (mu * errors).sum(1)
+    middles, eye = socket_means(predicted, socket)[socket], torch.eye(3, dtype=predicted.dtype, device=predicted.device)
+    rests = torch.nn.functional.one_hot(socket).to(predicted)
     judged = rests.sum(0)[socket] > FEWEST_BESIDE
     if not bool(judged.any()):
         return []
-    bad = torch.zeros(len(resting), model.markers, dtype=torch.bool, device=own.device)
-    squares = squares.masked_fill(~judged, torch.nan)
+    last = torch.nn.functional.pad(eye, (seen.m - 3, 0)).expand(N, -1, -1)
+    own = seen.covariance_between(seen.geodesic.linearise(resting.q).projected(last))
+    places = torch.kron(PLACES.found_m_rad * rests, eye).view(N, 3, -1)
+    wide = torch.eye(places.shape[2], dtype=places.dtype, device=places.device)
+    noise, every = seen.new_noise[-3:, -3:].expand(N, -1, -1), torch.ones_like(predicted, dtype=torch.bool)
+    rows = LinearRows(middles - predicted, places, own, noise, every, wide, wide[0] * 0.0, wide * 0.0)
+    squares = (rows.solved * rows.left_out).sum(1).masked_fill(~judged, torch.nan)
+    bad = torch.zeros(N, model.markers, dtype=torch.bool, device=own.device)
     bad[:, -1] = excluded(squares, torch.full_like(squares, 3.0), least=0.0)
-    distances = errors.norm(dim=1)[:, None].expand(-1, model.markers)
+    distances = rows.left_out.norm(dim=1)[:, None].expand(-1, model.markers)
     placed = with_attributes(resting, points=middles[:, None])
     return found_outliers(model, placed.with_markers(model.markers), bad, distances)

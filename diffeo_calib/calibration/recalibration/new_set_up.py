@@ -39,7 +39,6 @@ from diffeo_calib.sensors.set_ups import mounted_of
 from diffeo_calib.sensors.tables import (
     Coordinates,
     OtherReadings,
-    Shown,
     ball_tip,
     check_markers,
     divided,
@@ -164,7 +163,7 @@ def _check_robot(model: CalibratedKinematics, new: Any, own: Coordinates | None,
     other = "measure the same kind again, calibrate again with all rows, or register the model (`model.registered`)"
     if model.registration is not None:  # at other markers than those of the calibration
         other = "measure the markers of the calibration itself, or calibrate again with all rows"
-    check_markers(Shown(model.nominal.geometry.markers, model.lever, model.ball, other), own, readings)
+    check_markers(model, own, readings, other)
 
 
 def _place_of_device(

@@ -15,6 +15,16 @@ predicted best,
     min over b   sum_i w_i |t_i + R_i b - (t^_i + R^_i b)|^2 + |b|^2 s^2 / PRIOR^2,
 
 (R_i, t_i) measured and (R^_i, t^_i) predicted poses of the board in the camera, s^2 the mean square at b = 0.
+
+A 95 % region of new measurements shall hold 95 % although their noise differs from configuration to configuration: a
+camera errs most across its line of sight, and joint noise moves a marker by its lever arms. A new measurement has the
+mean covariance M of the rows, but its errors are a mixture of Gaussians, with heavier tails than one. Of a marker whose
+errors e have the covariance C_i,
+
+    d^2 = e^T M^-1 e,    a sum of independent chi-squares times the eigenvalues of M^-1 C_i,
+
+is gamma-distributed to a good approximation, with mean tr(M^-1 C_i) and variance 2 tr((M^-1 C_i)^2) (F. Satterthwaite,
+"An approximate distribution of estimates of variance components", 1946), exactly if C_i is a multiple of M.
 """
 
 from __future__ import annotations
@@ -29,6 +39,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.maps.noise import mean_block, without_hidden
 from diffeo_calib.measurements.bodies import seen_board
 from diffeo_calib.measurements.poses import block_diagonal, inverse_poses, own_blocks, poses_from_marks
@@ -36,6 +47,7 @@ from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import Tails
+from diffeo_calib.regression.regions import CONFIDENCE, region_factor
 
 SMALLEST_NOISE_M = 1e-7
 """Independent noise that is always present: with less, exact data would make G + R singular in float64."""
@@ -184,6 +196,12 @@ class NoiseModel:
             mean = mean - own.mean(0) + mean_block(own, seen)
         return mean if self.known is None else mean + mean_block(self.known, seen)
 
+    def typical(self, scales: Hyperparameters, jacobian: Tensor, freedom: float) -> Tensor:
+        """The same (R, R), inflated so that its 95 % region holds 95 %: by heavy tails, and where the rows differ."""
+        mean, seen = self.mean_covariance(scales, jacobian), self.coordinates(jacobian[..., 0])
+        between_rows = differing_factor(self.covariance(scales, jacobian), mean, seen)
+        return mean * between_rows * region_factor(freedom, self.largest_freedom)
+
     def _of_all(self, scales: Hyperparameters, jacobian: Tensor) -> Tensor:
         """R_i without what is known, as if everything were visible."""
         levels = scales.sensor_noise.reshape(1)
@@ -232,6 +250,31 @@ class NoiseModel:
             blocks = [torch.where(both, eye, blocks[0]), blocks[1].masked_fill(both, 0.0)]
         found = torch.linalg.solve(*blocks).diagonal(dim1=-2, dim2=-1).sum(-1)
         return found if seen is None else found.masked_fill(~seen, nan)
+
+
+HALVINGS = 50
+"""Of the interval in which the quantile lies: to the last digit."""
+
+
+def differing_factor(covariance: Tensor, mean: Tensor, seen: Tensor) -> float:
+    """Factor, one or more, on the mean covariance with which 95 % regions of markers hold 95 % of all rows' errors.
+
+    Args:
+        covariance: (N, 3 P, 3 P) of every row, m^2. mean: (3 P, 3 P) over the rows, m^2.
+        seen: (N, 3 P) boolean: the coordinates that were measured.
+    """
+    markers = len(mean) // 3
+    visible = seen.unflatten(1, (markers, 3)).all(2)
+    relative = torch.linalg.solve(own_blocks(mean[None], markers), own_blocks(covariance, markers))[visible]
+    first = relative.diagonal(dim1=-2, dim2=-1).sum(-1)
+    second = (relative * relative.mT).sum((-2, -1))
+    gaussian = chi2_above(1.0 - CONFIDENCE, 3)
+    low, high = gaussian, gaussian * max(float(first.max()), 1.0)  # more than any single row needs
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        inside = torch.special.gammainc(first.square() / (2.0 * second), middle * first / (2.0 * second)).mean()
+        low, high = (low, middle) if float(inside) >= CONFIDENCE else (middle, high)
+    return low / gaussian
 
 
 LOG = logging.getLogger(__name__)

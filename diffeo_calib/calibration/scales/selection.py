@@ -22,7 +22,6 @@ from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.process.scales import SENSOR_SHARE, Hyperparameters
-from diffeo_calib.regression.factor import Factor
 from diffeo_calib.robots.cartesian import is_cartesian
 
 MESHING_LENGTHSCALE_RAD = 0.22
@@ -32,8 +31,6 @@ TRANSMISSION_STARTS_RAD = (MESHING_LENGTHSCALE_RAD, 0.7)
 (tens of periods per turn) and eccentricity (one)."""
 OBJECTIVE_OF_FAILURE = 1e12
 """Objective where G + R cannot be factorised: the line search then shortens its step."""
-LARGEST_GAIN = 1e5
-"""Variance by an unknown, relative to that of the fields and the noise, up to which it costs no digits among them."""
 
 
 @dataclass(frozen=True)
@@ -166,31 +163,21 @@ def log_posterior(
     Returns:
         None where G + R is not positive definite in float64.
     """
-    told, numbers, point = data.told, data.numbers, logarithms.detach().clone().requires_grad_()
-    with torch.enable_grad():
-        scales = centre.from_logarithms(point)
-        noise = numbers.blocks_of_table(told.weighted_noise(scales))
-        variance, values = data.unknowns_variance(scales), data.pairs.values(scales)
-    F = numbers.add_blocks(data.pairs.matrix(values), [block.detach() for block in noise])
-    gain = variance.detach() * numbers.S.square().amax(0)
-    wide = gain > LARGEST_GAIN * F.diagonal().min()
-    narrow, S = numbers.S[:, ~wide], numbers.S[:, wide]
-    F, root = F.addmm_(narrow * variance.detach()[~wide], narrow.T), variance.detach()[wide].sqrt()
+    point = logarithms.detach().clone().requires_grad_()
     try:
-        factor = Factor.of(F, S * root)
+        process = data.process(centre.from_logarithms(logarithms.detach()))
     except NumericalError:
         return None
-    mu = factor.solve(numbers.target[:, None])[:, 0]
-    slope = factor.inverse.addr_(mu, mu, beta=-0.5, alpha=0.5)  # of the likelihood by F + R, in closed form
+    numbers, slope = process.numbers, process.slope
     with torch.enable_grad():
+        scales = centre.from_logarithms(point)
+        noise = numbers.blocks_of_table(data.told.weighted_noise(scales))
         by_noise = sum((own * block).sum() for own, block in zip(numbers.diagonal_blocks(slope), noise, strict=True))
-        by_wide = factor.by_variance(root * (S.T @ mu)) @ variance[wide].log()
-        by_narrow = ((slope @ narrow) * narrow).sum(0) @ variance[~wide]
+        by_unknowns = process.by_log_variance @ data.unknowns_variance(scales).log()
         density = _log_prior(point - centre.logarithms(), centre.amplitudes(), prior)
-        (data.pairs.inner(values, slope) + by_noise + by_wide + by_narrow + density).backward()
-    likelihood = factor.log_density(numbers.target, mu)
+        (data.pairs.inner(data.pairs.values(scales), slope) + by_noise + by_unknowns + density).backward()
     gradient = torch.zeros_like(point) if point.grad is None else point.grad
-    return LogPosterior(likelihood, float(density.detach()), gradient)
+    return LogPosterior(process.evidence, float(density.detach()), gradient)
 
 
 def _log_prior(away: Tensor, amplitudes: Tensor, prior: ScalePrior) -> Tensor:

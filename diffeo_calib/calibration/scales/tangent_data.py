@@ -22,11 +22,13 @@ from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.kinematics.nominal import GeometryMap, rigid_motions
 from diffeo_calib.maps.deformation import ModelSpec
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
+from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.maps.observation import LinearFunctionals, Observation
 from diffeo_calib.process.numbers import Covariance, Numbers
 from diffeo_calib.process.process import Expected, Process
 from diffeo_calib.process.scales import GearLine, Hyperparameters
 from diffeo_calib.process.tails import Tails
+from diffeo_calib.regression.regions import region_factor
 from diffeo_calib.robots.gear_waves import GearWaves
 from diffeo_calib.robots.placement import PLACES
 
@@ -279,6 +281,32 @@ class TangentData:
         """R_i with the weights of the tails: (N, m, m), m^2."""
         return self.noise_model.weighted(self.noise(scales), self.tails)
 
+    def noise_of_any_row(self, scales: Hyperparameters) -> Tensor:
+        """Covariance (m, m) of a new measurement of all coordinates, m^2, see :meth:`NoiseModel.typical`.
+
+        Points of which only functionals were measured have the noise of these in each coordinate.
+        """
+        freedom = self.tails.freedom
+        if self.observe is None:
+            return self.noise_model.typical(scales, self.jacobian, freedom)
+        whole = self.nominal.jacobian(self.x, self.theta)
+        if self.beside is None:
+            return NoiseModel(whole.shape[1] // 3).typical(scales, whole, freedom)
+        # tails of the rows beside are those of the geometric calibration
+        known = replace(self.beside, tails=self.tails).noise_of_any_row(scales)
+        ball = NoiseModel(1).typical(scales, whole[:, -3:], freedom)
+        return known if len(known) == whole.shape[1] else torch.block_diag(known, ball)
+
+    def noise_of_new_rows(self, scales: Hyperparameters) -> Tensor:
+        """(N, m, m) covariance of new measurements like these rows, m^2, as predictions have it.
+
+        Rows with known deviations keep their own: the mean over images, say, is the noise of none of them.
+        """
+        own = self.noise(scales)
+        if self.observe is not None or self.noise_model.known is not None:
+            return own * region_factor(self.tails.freedom, self.noise_model.largest_freedom)
+        return without_hidden(self.noise_of_any_row(scales).expand_as(own), self.visible)
+
     @cached_property
     def numbers(self) -> Numbers:
         """All that the rows tell; the shifts that they share are the last unknowns."""
@@ -304,16 +332,17 @@ class TangentData:
         """What is known before these rows."""
         return Process.prior(scales, self.space, self.unknowns_variance(scales), self.numbers)
 
-    def expected(self, scales: Hyperparameters) -> Expected:
-        """The numbers as they are expected before the rows."""
-        return self._kept("_expected", scales, lambda: self.prior(scales).expected(self.numbers))
+    def expected(self, scales: Hyperparameters) -> tuple[Process, Expected]:
+        """What is known before these rows, and their numbers as they are expected then: the same for all weights."""
+        prior = self.prior(scales)
+        return self._kept("_expected", scales, lambda: (prior, prior.expected(self.numbers)))
 
     def process(self, scales: Hyperparameters) -> Process:
         """What is known by these rows with their weights."""
 
         def given() -> Process:
-            noise = self.numbers.blocks_of_table(self.told.weighted_noise(scales))
-            return self.prior(scales).given(self.numbers, noise, self.expected(scales))
+            prior, expected = self.expected(scales)
+            return prior.given(self.numbers, self.numbers.blocks_of_table(self.told.weighted_noise(scales)), expected)
 
         return self._kept("_process", scales, given)
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from diffeo_calib.cameras.board import BoardPrior
 from diffeo_calib.cameras.detection import Board
 from diffeo_calib.cameras.files import camera_text
-from diffeo_calib.cameras.folder import page, read_folders
 from diffeo_calib.cli.console import progress_bar, say
 from diffeo_calib.cli.declarations import ImagesOptions, RecordOptions
 from diffeo_calib.cli.record import record
@@ -17,6 +16,7 @@ from diffeo_calib.common.files import write_together, write_whole
 from diffeo_calib.measurements.bags import read_bag, read_images
 from diffeo_calib.measurements.csv.sensors import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.csv.writing import csv_text
+from diffeo_calib.measurements.image_folders import page, read_folders
 from diffeo_calib.measurements.stops import PLACE, TURN, StopLimits, pictured, rows_of, stops
 from diffeo_calib.measurements.table_format import TableFormat, options_of
 

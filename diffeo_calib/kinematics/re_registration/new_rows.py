@@ -36,8 +36,8 @@ from diffeo_calib.maps.noise import Noise, mean_block
 from diffeo_calib.maps.observation import Observation
 from diffeo_calib.measurements.poses import block_diagonal, own_blocks
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.regression.cholesky import Factor
 from diffeo_calib.regression.conditional import diagonal_blocks
-from diffeo_calib.regression.factor import Factor
 from diffeo_calib.regression.regions import OTHER_DATE, region_scale
 from diffeo_calib.robots.se3 import rotation, transforms
 

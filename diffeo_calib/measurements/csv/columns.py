@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -39,6 +40,10 @@ Values = dict[Any, Tensor]
 """Numbers of the rows of a table in SI by the keys of :attr:`Columns.groups`."""
 
 
+PER_SI = {**UNITS_PER_METRE, "rad": 1.0, "deg": 180.0 / math.pi, None: 1.0}
+"""Units per rad or m; numbers without a unit are as they are."""
+
+
 class Check(NamedTuple):
     """What numbers are expected to be; whether they may be zero; what to do about others."""
 
@@ -66,16 +71,16 @@ class Group(NamedTuple):
 
     def to_si(self, values: Tensor) -> Tensor:
         """Numbers in the unit of the file -> rad, m, or as they are."""
-        return values.deg2rad() if self.unit == "deg" else values / self._per_si
+        return values / self.per_si
 
     def from_si(self, values: Tensor) -> Tensor:
         """The inverse of :meth:`to_si`, on the host, one row for each of the values (N, ...)."""
-        rows = values.cpu().flatten(1) if values.ndim > 1 else values.cpu()[:, None]
-        return rows.rad2deg() if self.unit == "deg" else rows * self._per_si
+        return values.cpu().reshape(len(values), -1) * self.per_si
 
     @property
-    def _per_si(self) -> float:
-        return self.unit if isinstance(self.unit, (int, float)) else UNITS_PER_METRE.get(self.unit or "", 1.0)
+    def per_si(self) -> float:
+        """Units per rad or m."""
+        return self.unit if isinstance(self.unit, (int, float)) else PER_SI[self.unit]
 
 
 class Hideable(NamedTuple):
@@ -163,12 +168,10 @@ class Columns:
 
     def to_si(self, raw: Tensor) -> Values:
         """Rows (N, c) in the units of the file as those of each group (N, columns), or (N,) beside joints."""
-        found, table = self.parts(raw), self.table
-        q = self.joints.values(found["q"])
-        turns = q.deg2rad() if table.angle == "deg" else q
+        found = self.parts(raw)
         values = {name: group.to_si(found[name]) for name, group in self.groups.items()}
-        values["q"] = torch.where(self.prismatic, q / table.joints_per_metre, turns)
-        return values | {name: values[name][:, 0] for name in table.beside}
+        values["q"] = self.joints.values(found["q"]) / self._per_joint
+        return values | {name: values[name][:, 0] for name in self.table.beside}
 
     def from_si(self, values: Mapping[Any, Tensor | None]) -> dict[str, list[float]]:
         """The cells of columns by name, of values in SI by what they are."""
@@ -180,9 +183,13 @@ class Columns:
 
     def joints_from_si(self, q: Tensor) -> Tensor:
         """Joint values (N, n) in rad and m as the cells (N, c) of their columns, in the file's units."""
-        q, table = q.cpu(), self.table
-        turns = q.rad2deg() if table.angle == "deg" else q
-        return self.joints.cells(torch.where(self.prismatic, q * table.joints_per_metre, turns))
+        return self.joints.cells(q.cpu() * self._per_joint)
+
+    @property
+    def _per_joint(self) -> Tensor:
+        """(n,) units per rad or m."""
+        units = [self.table.joints_per_metre if slides else PER_SI[self.table.angle] for slides in self.prismatic]
+        return torch.tensor(units, dtype=torch.float64, device=HOST)
 
     def unlikely_units(self, raw: Tensor) -> list[str]:
         """Sentences about values (N, c), in the file's units, that look as if they were in another unit."""

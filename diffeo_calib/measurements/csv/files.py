@@ -66,8 +66,8 @@ def read_observations(
     rows, alone = read_table(file, numbers, text_columns(table), zeros=not growing), len(sensors) == 1
     tables = []
     for sensor, here in _divided(rows, sensors):
-        own = sensor.own_lines(here)
-        found = sensor.table(here).with_line_numbers(own.lines).with_payload(own.values.get("payload"))
+        found, own = sensor.table(here)
+        found = found.with_line_numbers(own.lines).with_payload(own.values.get("payload"))
         tables.append(found.with_covariates(**{name: own.values.get(name) for name in ("time", "temperature")}))
     data, sha256 = tables[0] if alone else joined_tables(tables), file_sha256(file)
     data = (data if alone else data.rows(data.line_numbers.argsort(stable=True))).with_columns(file_sha256=sha256)

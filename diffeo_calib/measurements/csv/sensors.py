@@ -61,13 +61,9 @@ class SensorColumns:
     filled: Any
     """Lines -> (N,) boolean, which of them hold such a row."""
     table: Any
-    """Lines, all of which hold one -> their rows."""
+    """Lines, all of which hold one -> their rows, and the first line of each."""
     written: Any
     """The inverse of ``table``; joints, payloads and covariates are those of the rows."""
-
-    def own_lines(self, rows: FileRows) -> FileRows:
-        """The line of every row."""
-        return rows
 
 
 class OfBody(NamedTuple):
@@ -135,11 +131,7 @@ class PositionColumns(SensorColumns):
     def filled(self, rows: FileRows) -> Tensor:
         return torch.stack([~rows.values[own.place].isnan().all(1) for own in self.each]).any(0)
 
-    def own_lines(self, rows: FileRows) -> FileRows:
-        """The first line of every row."""
-        return rows if self.form.marker is None else rows.of(self._markers(rows, self.form.marker)[0])
-
-    def table(self, rows: FileRows) -> Measurements:
+    def table(self, rows: FileRows) -> tuple[Measurements, FileRows]:
         """MeasurementError for numbers that do not form a rotation."""
         form, names, joints = self.form, None, rows.columns.joints.texts
         points = torch.stack([rows.values[own.place] for own in self.each], 1)
@@ -161,7 +153,7 @@ class PositionColumns(SensorColumns):
             how = {"lever": form.lever, "position_std": known[0], "rotation_std": known[1]}
             data = Measurements.from_poses(q, poses, joints, **how, camera_on_tool=form.camera_on_tool, doubt=False)
         set_ups = rows.devices(form.session, "a name")
-        return data.with_tips(form.on).with_sessions(set_ups, remounted=form.remounted)
+        return data.with_tips(form.on).with_sessions(set_ups, remounted=form.remounted), rows
 
     def _markers(self, rows: FileRows, marker: str) -> tuple[Tensor, tuple[Tensor, Tensor], Sequence[str]]:
         """The first line (N,) of every row; row and marker of each line; names of the markers, which a column holds.
@@ -243,13 +235,13 @@ class SocketColumns(SensorColumns):
     def filled(self, rows: FileRows) -> Tensor:
         return torch.stack([rows.filled(name) for name in self.names]).any(0)
 
-    def table(self, rows: FileRows) -> Measurements:
+    def table(self, rows: FileRows) -> tuple[Measurements, FileRows]:
         fix = "fill it in; lines without a socket hold a measured position, whose columns must be named (`position`)"
         parts = [rows.named(name, "the name of a place or socket", fix) for name in self.names]
         names = [SEPARATOR.join(row) for row in zip(*parts, strict=True)]
         known = {"distances": self.distances, "distance_std": self.distance_std}
         data = Measurements.from_sockets(rows.values["q"], names, rows.columns.joints.texts, **known, doubt=False)
-        return data.with_tips(None if self.on is None else [self.on])
+        return data.with_tips(None if self.on is None else [self.on]), rows
 
     def written(self, part: Any, table: TableFormat) -> Written:
         return {}, {self.names[0]: part.row_sockets}, *part.index
@@ -300,7 +292,7 @@ class ReadingColumns(SensorColumns):
             raise MeasurementError.of(f"one {self.kind} for all rows beside rows of other kinds", fix=fix)
         return rows.filled(self.device)
 
-    def table(self, rows: FileRows) -> Readings:
+    def table(self, rows: FileRows) -> tuple[Readings, FileRows]:
         q, joints, table = rows.values["q"], rows.columns.joints.texts, rows.columns.table
         own, own_std = self.groups(table)
         if isinstance(self.values, tuple):
@@ -318,7 +310,7 @@ class ReadingColumns(SensorColumns):
             data = Readings.distances(*given, offset_std=self.offset_std, **known)
         else:
             data = Readings.of(self.kind, *given, unit=self.unit, numbers=seen.shape[1], **known)
-        return data.with_tips(None if self.on is None else [self.on])
+        return data.with_tips(None if self.on is None else [self.on]), rows
 
     def written(self, part: Any, table: TableFormat) -> Written:
         own, std = self.groups(table)
@@ -360,13 +352,20 @@ class ImageColumns(SensorColumns):
     def filled(self, rows: FileRows) -> Tensor:
         return rows.filled(IMAGE)
 
-    def own_lines(self, rows: FileRows) -> FileRows:
-        """The first line of every image."""
-        return rows.of(torch.tensor([own[0] for own in self._images(rows).values()], dtype=torch.int64, device=HOST))
-
-    def table(self, rows: FileRows) -> Measurements:
-        images = self._images(rows)
-        _check_joints(rows, images)
+    def table(self, rows: FileRows) -> tuple[Measurements, FileRows]:
+        names = rows.named(IMAGE, "the name of the image")
+        if CAMERA in rows.texts:
+            names = [f"{camera}/{image}" for camera, image in zip(rows.texts[CAMERA], names, strict=True)]
+        images: dict[str, list[int]] = {}
+        for row, name in enumerate(names):
+            images.setdefault(name, []).append(row)
+        for name, own in images.items():
+            other = (rows.values["q"][own] != rows.values["q"][own[0]]).any(1).nonzero()[:, 0].tolist()
+            if other:
+                what = f"file '{rows.path}', image '{name}'"
+                got = f"other ones in line {few([rows.lines[own[row]] for row in other])}"
+                fix = "give every image a name of its own, and its joint values in all of its lines"
+                raise MeasurementError.of(what, expected="the joint values of its first line", got=got, fix=fix)
         points, pixels = (rows.values[one] for one in self.groups(rows.columns.table))
         flat = torch.cat([points, torch.zeros_like(points[:, :1]), pixels], 1)
         empty = flat[:, [0, 1, 3, 4]].isnan().nonzero().tolist()
@@ -376,13 +375,13 @@ class ImageColumns(SensorColumns):
         corners = flat.new_full((len(images), max(map(len, images.values())), 5), torch.nan)
         for number, own in enumerate(images.values()):
             corners[number, : len(own)] = flat[own]
-        first = self.own_lines(rows)
+        first = rows.of(torch.tensor([own[0] for own in images.values()], dtype=torch.int64, device=HOST))
         known: dict[str, Any] = {"camera_on_tool": self.camera_on_tool, "doubt": False}
         if CAMERA in rows.texts:
             known["seen_by"] = first.named(CAMERA, "the name of the camera")
         data = Measurements.from_images(first.values["q"], corners, self.camera, rows.columns.joints.texts, **known)
         set_ups = first.devices(self.device, "a name")
-        return data if set_ups is None else data.with_sessions(set_ups)
+        return (data if set_ups is None else data.with_sessions(set_ups)), first
 
     def written(self, part: Any, table: TableFormat) -> Written:
         """A line for each corner."""
@@ -394,27 +393,6 @@ class ImageColumns(SensorColumns):
         texts |= {name: [column[k] for k in whose] for name, column in named.items()}
         points, pixels = self.groups(table)
         return {points: seen[:, :2], pixels: seen[:, 3:]}, texts, number
-
-    def _images(self, rows: FileRows) -> dict[str, list[int]]:
-        """The lines of each image, by its name with that of its camera."""
-        images = rows.named(IMAGE, "the name of the image")
-        if CAMERA in rows.texts:
-            images = [f"{camera}/{image}" for camera, image in zip(rows.texts[CAMERA], images, strict=True)]
-        found: dict[str, list[int]] = {}
-        for row, name in enumerate(images):
-            found.setdefault(name, []).append(row)
-        return found
-
-
-def _check_joints(rows: FileRows, groups: dict[str, list[int]]) -> None:
-    """Raise MeasurementError for an image whose lines differ in their joint values."""
-    for name, own in groups.items():
-        other = (rows.values["q"][own] != rows.values["q"][own[0]]).any(1).nonzero()[:, 0].tolist()
-        if other:
-            what = f"file '{rows.path}', image '{name}'"
-            got = f"other ones in line {few([rows.lines[own[row]] for row in other])}"
-            fix = "give every image a name of its own, and its joint values in all of its lines"
-            raise MeasurementError.of(what, expected="the joint values of its first line", got=got, fix=fix)
 
 
 def sensors_of(table: TableFormat) -> list[SensorColumns]:

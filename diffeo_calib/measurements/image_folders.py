@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import csv
 import html
 import re
 from collections import Counter
@@ -19,8 +18,9 @@ from diffeo_calib.cameras.detection import BENT, Board, opencv, other_dictionary
 from diffeo_calib.cameras.images import Camera, Images, first_guess
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few
+from diffeo_calib.measurements.csv.lines import read_cells
+from diffeo_calib.measurements.csv.sensors import CAMERA, IMAGE
 
-IMAGE, CAMERA = "image", "camera"
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 FLIPPED, KALIBR = ("right-up", "left-down"), " (numbers run upwards, as in grids of Kalibr)"
 """Orders of grids of markers in which numbers run to the right and upwards, and what is said of them."""
@@ -117,22 +117,20 @@ def read_folders(
     if len(set(names)) < len(names):
         fix = "name the folder of each camera after it"
         raise MeasurementError.of("the folders of images", expected="different names", got=few(names), fix=fix)
-    header, rows = _table(joints, sep)
+    table = read_cells(joints, sep)
+    header, rows = table.header, [cells for _, cells in table.rows]
     if CAMERA in header and len(folders) > 1:
         fix = "leave it out: the folders name the cameras"
         raise MeasurementError.of(f"file '{joints}'", expected=f"no column `{CAMERA}`", got="one", fix=fix)
     place = _column_of_images(header, rows)
-    if place is None:
-        files = _ordered(folders, joints, len(rows))
-    else:
-        files = _named(folders, [row[place].strip() for row in rows])
-    kept = [k for k in range(len(header)) if k != place]
-    header, rows = [header[k] for k in kept], [[row[k] for k in kept] for row in rows]
+    files = _ordered(folders, joints, len(rows)) if place is None else _named(folders, [row[place] for row in rows])
+    table = table.without([] if place is None else [header[place]])
+    rows = [cells for _, cells in table.rows]
     found = []
     for folder, name, own in zip(folders, names, files, strict=True):
         whole = [(file, cells) for file, cells in zip(own, rows, strict=True) if file is not None]
         paired = f"row 1 is {own[0]}, row {len(own)} is {own[-1]}: by the numbers in the names" * (place is None)
-        found.append(_folder(folder, Folder(name, board, header, [], (0, 0), paired), whole, progress))
+        found.append(_folder(folder, Folder(name, board, table.header, [], (0, 0), paired), whole, progress))
     return found
 
 
@@ -165,18 +163,6 @@ def _folder(folder: Path, empty: Folder, known: Sequence[tuple[str, list[str]]],
     return found
 
 
-def _table(joints: Path, sep: str) -> tuple[list[str], list[list[str]]]:
-    """Header and cells."""
-    try:
-        with joints.open(newline="", encoding="utf-8-sig") as file:
-            lines = [line for line in csv.reader(file, delimiter=sep) if any(cell.strip() for cell in line)]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise MeasurementError.of(f"file '{joints}'", expected="a CSV file", got=str(error)) from None
-    if len(lines) < 2 or len({len(line) for line in lines}) > 1:
-        raise MeasurementError.of(f"file '{joints}'", expected="a header and rows with as many cells")
-    return [cell.strip() for cell in lines[0]], lines[1:]
-
-
 def _named(folders: Sequence[Path], names: Sequence[str]) -> list[list[str | None]]:
     """The file of each row in every folder, by its name."""
     files = [[name if (folder / name).is_file() else None for name in names] for folder in folders]
@@ -207,7 +193,7 @@ def _by_numbers(name: str) -> list[tuple[str, int]]:
 
 def _column_of_images(header: list[str], rows: list[list[str]]) -> int | None:
     """The column `image`, else the first one whose cells all have the suffix of an image."""
-    named = [k for k in range(len(header)) if all(Path(row[k].strip()).suffix.lower() in SUFFIXES for row in rows)]
+    named = [k for k in range(len(header)) if all(Path(row[k]).suffix.lower() in SUFFIXES for row in rows)]
     return header.index(IMAGE) if IMAGE in header else next(iter(named), None)
 
 

@@ -1,0 +1,196 @@
+"""What rows leave open: places that they do not determine, paths in a plane, joints that they do not show.
+
+The calibration goes on, and its predictions carry the deviations that follow. The warnings say what to measure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import inf
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.identification.identification import Identification
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.common.errors import few, sentence, warn_user
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.re_registration.registered_map import undetermined
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.regression.conditional import diagonal_blocks
+from diffeo_calib.robots.placement import PLACES
+from diffeo_calib.robots.se3 import skew
+from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.devices import Devices
+
+TILT = "tilt the tool by 20 degrees or more, to several sides"
+STEPS, REACHED_M, LARGEST_STEP_RAD = 30, 1e-4, 0.3
+"""Of the search for joint values that bring the ball to a place."""
+
+
+def warn_of_open_directions(robot: Tree, data: Measurements, registration: Identification) -> None:
+    """Warn of what the measurements leave open: places, a path that the robot could leave, joints one at a time.
+
+    Args:
+        robot: the nominal chain. data: the measurements. registration: base and markers.
+    """
+    for text in undetermined_places(robot, data, registration):
+        warn_user(f"{text}.")
+    measured = data.q[data.places.to(data.q.device) < 0]  # sockets on one table need not leave anything open
+    if len(measured) >= gates.PATH_POSES:  # three points always lie in a plane
+        geometry, reached = registration.geometry, _reached(robot, data, registration)
+        middles = geometry.points(measured).mean(1)
+        _, s, axes = torch.linalg.svd(middles - middles.mean(0), full_matrices=False)
+        spreads, speeds = s / len(measured) ** 0.5, geometry.jacobian(measured).mean(1)  # (N, 3, n)
+        leaving = torch.einsum("ac,ncl->nal", axes, speeds).square().mean(0).sqrt().amax(1)  # along each axis
+        flat = (spreads < gates.FLAT * reached) & (leaving > gates.LEAVES * reached)
+        if count := int(flat.sum()):
+            away = 1e3 * float(spreads[flat].square().sum().sqrt())
+            what = f"the measured positions lie near {('a plane', 'a line', 'one point')[count - 1]}"
+            fix = "predictions elsewhere are extrapolated; spread the poses over the workspace that you will use"
+            warn_user(sentence(what, got=f"{away:.2g} mm RMS away from it", fix=fix))
+    moved = (data.q - data.q.median(0).values).abs() > gates.MOVED_RAD_M
+    single, joints = int((moved.sum(1) <= 1).sum()), moved.any(0)
+    if single >= gates.SINGLE_SHARE * len(data) and int(joints.sum()) >= gates.SINGLE_JOINTS:
+        names = few([name for name, own in zip(robot.joint_names, joints, strict=True) if bool(own)], 12)
+        what = f"{names} moved one at a time in {single} of {len(data)} rows"
+        fix = "what depends on several joints, such as sag, is extrapolated; measure poses in which all joints differ"
+        warn_user(sentence(what, fix=fix))
+
+
+def undetermined_places(robot: Tree, data: Measurements, registration: Identification) -> tuple[str, ...]:
+    """Sentences about the directions of base and markers that the measurements hardly determine; arguments as above."""
+    geometry, reached, q = registration.geometry, _reached(robot, data, registration), data.q
+    every, parts = torch.arange(geometry.size, device=HOST), geometry.slices
+    places = torch.cat([every[parts["base"]], every[parts["tool"]]])
+    # Whatever a SCARA robot does, the height of its marker and that of its base cannot be told apart, and need not be.
+    slopes = geometry.sensitivities(sampled_configurations(geometry.chain))[..., places].flatten(0, 2)
+    unit = slopes.new_ones(len(places))
+    unit[3:6] = 1 / reached  # a turn as the motion at the reach, m
+    _, s, Vt = torch.linalg.svd(slopes * unit, full_matrices=False)
+    some_poses = Vt[s > gates.SEEN * gates.SAMPLES**0.5]
+    # The frame about the middle of the rows and along its own axes.
+    R, middle = geometry.base[:3, :3], geometry.points(q).mean((0, 1))
+    arm = R.mT @ (middle - geometry.base[:3, 3])  # of the middle, in the robot's base
+    to = torch.eye(len(places), dtype=q.dtype, device=q.device)
+    to[:3, :3], to[3:6, 3:6], to[:3, 3:6] = R, R, -R @ skew(arm)
+    to = to @ (unit[:, None] * (some_poses.mT @ some_poses) / unit)
+    covariance = to @ registration.covariance[places[:, None], places] @ to.mT
+    rigid = data.lever is not None
+    return undetermined(covariance, geometry.tool, reached, registration.noise, geometry.on, rigid=rigid)
+
+
+def _reached(robot: Tree, data: Measurements, registration: Identification) -> float:
+    """Largest distance of the tip from the base, m."""
+    return max(float(robot.tip_poses(data.q)[..., :3, 3].norm(dim=-1).max()), registration.noise)
+
+
+def sampled_configurations(chain: Tree) -> Tensor:
+    """Joint values (200, n) all over the range of the robot, at most half a turn to either side, rad or m."""
+    low, high = chain.limits.unbind(1)
+    low, high = low.clamp(min=-gates.SAMPLED_RAD_M), high.clamp(max=gates.SAMPLED_RAD_M)
+    draws = torch.rand(gates.SAMPLES, chain.n, dtype=low.dtype, generator=seeded(0), device=HOST)
+    return low + (high - low) * draws
+
+
+# --- the ball on a tool ---------------------------------------------------------------------------------------------
+
+
+def warn_of_what_is_open(data: TangentData, devices: Sequence[Devices]) -> None:
+    """Warn of directions of the ball and joints that rows which tell no coordinates do not show.
+
+    Args:
+        data: the rows around the geometric calibration. devices: where readings were found to come from.
+    """
+    if data.shared is None:
+        return
+    whole = data.nominal.jacobian(data.x, data.theta)
+    seen = data.jacobian.square().mean((0, 1)).sqrt() / whole.square().mean((0, 1)).sqrt().clamp(min=1e-9)
+    by_ball = data.sensitivities[..., data.nominal.geometry.slices["tool"]].flatten(0, 1)
+    shared = data.shared.flatten(0, 1)
+    shared = shared / shared.norm(dim=0).clamp(min=1e-12)
+    known = torch.linalg.lstsq(shared, by_ball, rcond=1e-6, driver="gelsd").solution  # moved devices do as well
+    tilt = torch.linalg.svdvals(by_ball - shared @ known) / data.coordinates**0.5
+    for own in devices:
+        for what, fix in own.open_sentences():
+            warn_user(sentence(what, fix=fix))
+    if float(tilt.min()) < gates.TILTED:
+        what = "the tool is hardly tilted: where the ball is on it, along one direction, is not determined"
+        warn_user(sentence(what, fix=TILT))
+    names = data.nominal.geometry.chain.joint_names
+    unseen = [name for name, share in zip(names, seen.tolist(), strict=True) if share < gates.UNSEEN]
+    if unseen:
+        what = f"the readings hardly change with {few(unseen)}: errors of such joints are not determined"
+        warn_user(sentence(what, fix="add devices that see these joints turn"))
+
+
+def warn_of_size(fix: str, size: float, share: float, expected: float) -> None:
+    """Warn where most of the error that the model expects is the robot's size.
+
+    Args:
+        fix: what to do. size: relative deviation of the size. share: of the expected error. expected: this, m.
+    """
+    if share >= gates.SIZE_SHARE:
+        what = (
+            f"the readings hold too little length: the robot's size is known to {100 * size:.2f} % (one standard "
+            f"deviation), which is {100 * share:.0f} % of the expected error of {1e3 * expected:.2f} mm and rests on "
+            "the robot's description"
+        )
+        warn_user(sentence(what, fix=fix))
+
+
+def warn_of_flat_places(fitted: FittedMap, positions: Tensor, socket: Tensor, place: Tensor, now: float) -> None:
+    """Warn of sockets near a plane if one place away from it would make the expected error smaller.
+
+    All sockets on one table need not leave anything open: a tool that tilts shows errors of all joints, and the rows
+    reach as many joint values as with a raised block. So the place is raised in the model.
+
+    Args:
+        fitted: the map, without rigid motions. positions: (S, 3) of the sockets, m.
+        socket: (N,) number of the socket of each row of the map, -1 for none. place: (S,) the place of each socket.
+        now: the expected error, m.
+    """
+    _, s, axes = torch.linalg.svd(positions - positions.mean(0), full_matrices=False)
+    reach = float(positions.norm(dim=1).max())
+    if len(s) < 3 or float(s[2]) > gates.FLAT * reach * len(positions) ** 0.5:
+        return
+    rows = (socket >= 0).nonzero()[:, 0]
+    rows = rows[place[socket[rows]] == place[socket[rows]].mode().values]
+    raised = gates.RAISED * reach * axes[2]
+    goals = (positions[socket[rows]] + sign * raised for sign in (1.0, -1.0))
+    least = min(_error_with_place(fitted, fitted.x[rows], goal, socket[rows]) for goal in goals)
+    if least < gates.WORTHWHILE_PLACE * now:
+        expected = (
+            f"about {1e3 * least:.2g} mm of error with one place {1e3 * gates.RAISED * reach:.0f} mm away from it"
+        )
+        fix = "raise or tilt the block at one place, and tilt the tool"
+        warn_user(sentence("the sockets lie near a plane", expected=expected, got=f"{1e3 * now:.2g} mm", fix=fix))
+
+
+def _error_with_place(fitted: FittedMap, q: Tensor, goal: Tensor, socket: Tensor) -> float:
+    """RMS error, m, of the ball that the model expects over its workspace with rows at one more place.
+
+    Args:
+        q: (M, n) near which joint values bring the ball to points ``goal`` (M, 3) m, in sockets of these numbers (M,).
+
+    Returns:
+        infinite if the robot reaches less than half of them.
+    """
+    for _ in range(STEPS):
+        miss = goal - fitted(q).detach()[:, -3:]
+        step = (torch.linalg.pinv(fitted.jacobian(q).detach()[:, -3:]) @ miss[..., None])[..., 0]
+        q = q + step * (LARGEST_STEP_RAD / step.abs().amax(1, keepdim=True).clamp(min=LARGEST_STEP_RAD))
+    there = (goal - fitted(q).detach()[:, -3:]).norm(dim=1) < REACHED_M
+    if int(there.sum()) < len(there) / 2:
+        return inf
+    socket = socket[there]
+    at, new = fitted.geodesic.linearise(fitted.everywhere), fitted.geodesic.linearise(q[there])
+    own, between, m = fitted.covariance_between(new), fitted.covariance_between(at, new), fitted.m
+    same = (socket[:, None] == socket).to(own) * PLACES.found_m_rad**2
+    noise = torch.block_diag(*fitted.new_noise.expand(len(socket), -1, -1))
+    K = own + noise + torch.kron(same, torch.eye(m, dtype=own.dtype, device=own.device))
+    gain = between @ torch.linalg.solve(K, between.mT)
+    after = fitted.covariance_at(at) - diagonal_blocks(gain, len(fitted.everywhere))
+    return float(after.diagonal(dim1=1, dim2=2).sum(1).mean().clamp(min=0).sqrt())
