@@ -150,8 +150,8 @@ def _of_robot(csv: Path, robot: Path, folder: Path, sheet: Sheet) -> Source:
     if others := best.other_units():
         remark = f"{few(others)}: the names say another unit than the robot finds in the numbers: check it"
         best = best.saying(Choice("", "", remark))
-    if best.rows.sockets:
-        best = with_distances(best)
+    for column in best.rows.sockets[-1:]:
+        best = with_distances(best, column)
     if best.rows.markers and best.table.rotation is None:
         best = with_deviations(with_rotation(best))
     about = "a URDF" if is_urdf(robot) else f"a DH table, {DHFile.read(robot).units}"
