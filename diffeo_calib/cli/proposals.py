@@ -426,10 +426,10 @@ def with_deviations(source: Source) -> Source:
     return source.saying(Choice("std", ",".join(names), why))
 
 
-def with_distances(source: Source, column: str) -> Source:
-    """With options about known distances between the sockets that a column names, for the user to complete: no table holds them."""
+def with_distances(source: Source, sockets: str) -> Source:
+    """With known distances between the sockets that a column names, for the user to complete: no table holds them."""
     header, rows = read_cells(source.csv, source.sheet.sep)
-    place, unit = header.index(column), source.table.length
+    place, unit = header.index(sockets), source.table.length
     names = list(dict.fromkeys(cells[place].strip() for _, cells in rows if cells[place].strip()))
     if len(names) < 2:
         remark = "there is one socket alone, and no distance to know: the URDF gives the robot's size"
