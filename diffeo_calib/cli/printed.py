@@ -21,7 +21,7 @@ from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
-from diffeo_calib.measurements.poses import POINTS, middles, rotation_numbers
+from diffeo_calib.measurements.poses import POINTS, rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.errors import SIZES, Evaluation, shown_unit
 from diffeo_calib.sensors.kinds import known_kinds
@@ -117,7 +117,7 @@ def _marker_lines(
     points: Tensor, tips: Sequence[str], *, poses: bool, ball: bool = False, known: Tensor | None = None
 ) -> Iterator[str]:
     """Places (P, 3) of markers, m, or of the frames that they represent; ``known``: standard deviations (P, 3)."""
-    places, tips = (middles(points[None])[0], tips[::POINTS]) if poses else (points, tips)
+    places, tips = (points.unflatten(0, (-1, POINTS)).mean(1), tips[::POINTS]) if poses else (points, tips)
     for k, (place, tip) in enumerate(zip(places, tips, strict=True)):
         what = "measured frame" if poses else "marker" + f" {k}" * (len(places) > 1 + ball)
         what = "ball" if ball and k == len(places) - 1 > 0 else what
