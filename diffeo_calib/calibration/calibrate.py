@@ -14,7 +14,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 from diffeo_calib.calibration.choose_scales import LIMITS as SCALE_LIMITS
 from diffeo_calib.calibration.choose_scales import (
@@ -29,7 +29,6 @@ from diffeo_calib.calibration.diagnostics.hypotheses import lengths, warn_of_len
 from diffeo_calib.calibration.diagnostics.moved_devices import change_during
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.outliers import (
-    Outlier,
     outliers,
     stuck_columns,
     warn_of_outliers,
@@ -43,7 +42,7 @@ from diffeo_calib.calibration.diagnostics.plausibility import (
 )
 from diffeo_calib.calibration.diagnostics.row_order import warn_of_contradictions
 from diffeo_calib.calibration.expected_errors import with_open_directions
-from diffeo_calib.calibration.findings import Part, parts
+from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.result import CalibrationResult
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -52,7 +51,6 @@ from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import InputError, as_written, few, kept_warnings, warn_user
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fit import fit
-from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kernels.reductions.backends import Backend
@@ -213,18 +211,14 @@ def _count(controls: Controls, data: TangentData) -> int | None:
     return controls
 
 
-def _covariances(fitted: FittedMap, placed: Placed) -> FittedMap:
-    """The map with covariances that hold where rows leave something open, or say nothing about where the robot is."""
-    if placed.coordinates is not None:
-        fitted = with_open_directions(fitted, placed.coordinates.table, placed.registration)
-    return fitted.without_rigid_motions() if placed.free else fitted
-
-
 def _result(
     robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, *, note: str, warned: list[str]
 ) -> CalibrationResult:
     """Findings about model and rows, and everything together."""
-    data, scales, fitted_map = chosen.data, chosen.selection.scales, _covariances(fitted.model, placed)
+    data, scales, fitted_map = chosen.data, chosen.selection.scales, fitted.model
+    if placed.coordinates is not None:
+        fitted_map = with_open_directions(fitted_map, placed.coordinates.table, placed.registration)
+    fitted_map = fitted_map.without_rigid_motions() if placed.free else fitted_map
     placed = placed.settled(fitted, fitted_map, chosen)
     model = CalibratedKinematics(robot, fitted_map, lever=placed.lever, ball=placed.ball)
     for devices in placed.placement:
@@ -240,13 +234,30 @@ def _result(
     warn_of_contradictions(model, placed.coordinates, found, changed)
     warn_of_rounding(robot, placed.data, data, chosen.left_out)
     found_lengths = lengths(data, scales, placed.placement.hypotheses(data, VALUE))
-    doubt = warn_of_lengths(found_lengths)
-    rms = [*placed.stage_rms(model), placed.by_kind(chosen.left_out.errors).positions_rms]
+    registration, geometry, calibrated = placed.stage_rms(model)
+    summary = Summary(
+        registration_rms=registration,
+        geometry_rms=geometry,
+        diffeomorphic_rms=calibrated,
+        leave_one_out_rms=placed.by_kind(chosen.left_out.errors).positions_rms,
+        outliers=len(found),
+        noise_degrees_of_freedom=data.tails.freedom,
+        coupling_residual=fitted.coupling_residual,
+        end_residual=fitted.end_residual,
+        energy=fitted.energy,
+        status=fitted.status,
+        scales=chosen.selection.status,
+        rows=len(data.x),
+        parts={part.name: part.displacement for part in explained},
+        effective_parameters=chosen.left_out.effective,
+        length_in_doubt=warn_of_lengths(found_lengths),
+        warnings="\n".join(warned) or None,
+    )
     return CalibrationResult(
         model=CalibratedKinematics(
             robot,
             fitted_map,
-            _summary(rms, chosen, fitted, explained, found, length_in_doubt=doubt, warnings="\n".join(warned) or None),
+            summary,
             lever=placed.lever,
             ball=placed.ball,
             placement=placed.placement.placed(),
@@ -256,39 +267,10 @@ def _result(
         ),
         placed=placed,
         selection=chosen.selection,
-        tails=chosen.data.tails,
+        tails=data.tails,
         leave_one_out=chosen.left_out,
         parts=explained,
         outliers=found,
         fit=fitted,
         lengths=found_lengths,
-    )
-
-
-def _summary(
-    rms: list[float | None],
-    chosen: ChosenScales,
-    fitted: Fit,
-    explained: list[Part],
-    found: list[Outlier],
-    **warned: Any,
-) -> Summary:
-    """Numbers and sentences that travel with the model; ``rms`` of registration, geometry, model and left out, m."""
-    registration, geometry, calibrated, left_out = rms
-    return Summary(
-        registration_rms=registration,
-        geometry_rms=geometry,
-        diffeomorphic_rms=calibrated,
-        leave_one_out_rms=left_out,
-        outliers=len(found),
-        noise_degrees_of_freedom=chosen.data.tails.freedom,
-        coupling_residual=fitted.coupling_residual,
-        end_residual=fitted.end_residual,
-        energy=fitted.energy,
-        status=fitted.status,
-        scales=chosen.selection.status,
-        rows=len(chosen.data.x),
-        parts={part.name: part.displacement for part in explained},
-        effective_parameters=chosen.left_out.effective,
-        **warned,
     )

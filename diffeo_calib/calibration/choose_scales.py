@@ -31,9 +31,9 @@ from diffeo_calib.calibration.scales.gear_lines import find_gear_lines
 from diffeo_calib.calibration.scales.leave_one_out import (
     LeaveOneOut,
     cross_validated_inflation,
-    estimate_tails,
     inflation_by_places,
     leave_one_out,
+    weighed,
 )
 from diffeo_calib.calibration.scales.selection import Selection, defaults, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -121,19 +121,22 @@ def choose_scales(
     if len(rows) < len(data.x):
         stages, how = (registration, identification), {"given": given, "models": models}
         chosen = choose_scales(some, measurements[rows], *stages, **how, seed=seed, progress=progress)
-        data = data.with_gear_lines(chosen.selection.scales.lines)
-        data = data.with_tails(estimate_tails(data, chosen.selection.scales, seed))
-        return replace(chosen, data=data, left_out=leave_one_out(data, chosen.selection.scales, seed))
+        scales = chosen.selection.scales
+        data = weighed(data.with_gear_lines(scales.lines), scales, seed)
+        return replace(chosen, data=data, left_out=leave_one_out(data, scales, seed))
     if given is not None:
-        data = data.with_gear_lines(given.lines)
-        data = data.with_tails(estimate_tails(data, given, seed))
+        data = weighed(data.with_gear_lines(given.lines), given, seed)
         left_out = leave_one_out(data, given, seed)
         _warn_of_wrong_scales(data, left_out)
         return ChosenScales(Selection(given, "given"), data, left_out)
     poses = int(measurements.groups().max()) + 1  # repeats determine the noise only
     centre = defaults(data, noise_of_few(data, poses, registration, identification), identification.prior)
     if models:
-        found, data = _of_models(models, centre, data, seed)
+        scales = scales_of_models(models, centre)
+        data = data.with_gear_lines(scales.lines)
+        scales = with_payload_factor(data, scales, seed)
+        found = Selection(scales, f"those of {len(models)} other model{'s' * (len(models) > 1)}")
+        data = weighed(data, scales, seed)
         return _inflated(found, None, data, measurements, seed=seed, progress=progress)
     if poses < LIMITS.fewest_poses:
         count = f"{poses} poses" if poses == len(measurements) else f"{poses} different poses"
@@ -148,17 +151,6 @@ def choose_scales(
             centre = replace(centre, lines=found.scales.lines)
         centre = replace(centre, payload=found.scales.payload)
     return _inflated(found, centre, data, measurements, seed=seed, progress=progress)
-
-
-def _of_models(
-    models: Sequence[CalibratedKinematics], centre: Hyperparameters, data: TangentData, seed: int
-) -> tuple[Selection, TangentData]:
-    """The scales of models of the same type of robot, and the measurements with the weights that follow."""
-    scales = scales_of_models(models, centre)
-    data = data.with_gear_lines(scales.lines)
-    scales = with_payload_factor(data, scales, seed)
-    status = f"those of {len(models)} other model{'s' * (len(models) > 1)}"
-    return Selection(scales, status), data.with_tails(estimate_tails(data, scales, seed))
 
 
 def _inflated(
@@ -205,7 +197,7 @@ def _selected(
 ) -> tuple[Selection, TangentData]:
     """Scales by marginal likelihood, and the measurements with the weights that follow."""
     first = select(centre, data, seed=seed, progress=progress)
-    data = data.with_tails(estimate_tails(data, first.scales, seed))
+    data = weighed(data, first.scales, seed)
     if first.interrupted:
         return first, data
     start = None if data.tails.gross else first.scales  # which let the fields explain gross errors
@@ -216,7 +208,7 @@ def _selected(
 def _supported(found: Selection, data: TangentData, seed: int) -> tuple[Selection, TangentData]:
     """The same without amplitudes that the data do not support, and with the weights that follow."""
     scales = found.scales.supported(data.jacobian, data.new_noise(found.scales))
-    return replace(found, scales=scales), data.with_tails(estimate_tails(data, scales, seed))
+    return replace(found, scales=scales), weighed(data, scales, seed)
 
 
 def _with_gear_lines(

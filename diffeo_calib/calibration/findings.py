@@ -11,7 +11,6 @@ from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.transmission import gear_lines
-from diffeo_calib.maps.deformation import Deformation
 
 MOST_CONFIGURATIONS = 8000
 """Configurations on which the parts of a model are measured."""
@@ -58,7 +57,9 @@ def parts(model: CalibratedKinematics) -> list[Part]:
         effects = nominal.sensitivities(x, theta)[..., nominal.sag] * coefficients
         found += [Part(name, _rms(effects[..., own].sum(-1))) for name, own in nominal.elasticity.parts.items()]
     joints += [Part(f"gear line {line.frequency:.1f} of {line.joint}", line.displacement) for line in gear_lines(model)]
-    return [*found, *joints, Part("task space", _task_part(deformation, x))]
+    points = deformation.spec.nominal(x, theta).reshape(-1, deformation.spec.task_dim)
+    bent = deformation.spec.task_kernel.field(points, deformation.task_controls, deformation.momenta.task)
+    return [*found, *joints, Part("task space", _rms(bent))]
 
 
 def _joint_parts(model: CalibratedKinematics, x: Tensor, jacobian: Tensor) -> tuple[list[Part], Tensor]:
@@ -76,13 +77,6 @@ def _joint_parts(model: CalibratedKinematics, x: Tensor, jacobian: Tensor) -> tu
         else:
             coupled = coupled + (jacobian @ v[:, :, None])[..., 0]
     return [*found, Part("coupled joint errors", _rms(coupled))], means
-
-
-def _task_part(deformation: Deformation, x: Tensor) -> float:
-    """RMS displacement of the markers by the task-space field, m."""
-    points = deformation.spec.nominal(x, deformation.momenta.theta).reshape(-1, deformation.spec.task_dim)
-    start = deformation.task_controls
-    return _rms(deformation.spec.task_kernel.field(points, start, deformation.momenta.task))
 
 
 def _rms(displacements: Tensor) -> float:

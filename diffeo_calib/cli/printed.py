@@ -21,7 +21,7 @@ from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
-from diffeo_calib.measurements.poses import POINTS, middles, rotation_numbers
+from diffeo_calib.measurements.poses import POINTS, rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.errors import SIZES, Evaluation, shown_unit
 from diffeo_calib.sensors.kinds import known_kinds
@@ -41,40 +41,36 @@ class ErrorTable:
 
     Args:
         errors: of the kind to show. of: whose they are, the end of the title. columns: names of the leading columns.
-        expected: whether there is a column of expected errors.
     """
 
-    def __init__(self, errors: Evaluation, of: str, *columns: str, expected: bool = False) -> None:
+    def __init__(self, errors: Evaluation, of: str, *columns: str) -> None:
         self.title, self.of, self.columns = f"{errors.title} in {errors.shown[0]}", of, columns
-        self.expected, self.angles = expected, errors.angles is not None
-        self.rows: list[tuple[tuple[str, ...], list[float], list[float], list[float]]] = []
+        self.rows: list[tuple[tuple[str, ...], tuple[list[float], ...]]] = []
 
     def add(self, errors: Evaluation, *labels: str, expected: float | None = None) -> None:
         """Add a row: its errors, what it is called, and the expected RMS."""
         last = [] if expected is None else [errors.shown[1] * expected]
-        self.rows.append((labels, errors.sizes, errors.angle_sizes, last))
+        self.rows.append((labels, (errors.sizes, errors.angle_sizes, last)))
 
-    def _table(self, title: str, groups: Sequence[int]) -> Table:
-        """A table of some groups of numbers: 1 errors, 2 those of orientations, 3 expected errors."""
-        names = {1: SIZES, 2: [f"{size} deg" for size in SIZES], 3: ["expected RMS"]}
-        header = [*self.columns, *(name for group in groups for name in names[group])]
+    def _table(self, title: str, *groups: int) -> Table:
+        """A table of some groups of numbers: 0 errors, 1 those of orientations, 2 expected errors."""
+        names, own = (SIZES, [f"{size} deg" for size in SIZES], ["expected RMS"]), self.rows[0][1]
+        header = [*self.columns, *(name for group in groups for name in names[group][: len(own[group])])]
         rows = [
-            [*labels, *("-" if isnan(value) else f"{value:.4f}" for group in groups for value in numbers[group - 1])]
-            for labels, *numbers in self.rows
+            [*labels, *("-" if isnan(value) else f"{value:.4f}" for group in groups for value in numbers[group])]
+            for labels, numbers in self.rows
         ]
-        return text_table(f"{title} {self.of}", header, rows, len(self.columns))
+        return text_table(title, header, rows, len(self.columns))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:
-        last = [3] * self.expected
-        whole = self._table(self.title, [1, *[2] * self.angles, *last])
-        if self.angles:
-            whole.title = f"{whole.title}, orientation errors in deg"
+        angles = bool(self.rows[0][1][1])
+        whole = self._table(f"{self.title} {self.of}" + ", orientation errors in deg" * angles, 0, 1, 2)
         wide = options.update(max_width=WIDEST)
-        if not self.angles or console.measure(whole, options=wide).maximum <= options.max_width:
+        if not angles or console.measure(whole, options=wide).maximum <= options.max_width:
             yield whole
-            return
-        yield self._table(self.title, [1, *last])
-        yield self._table("Orientation errors in deg", [2])
+        else:
+            yield self._table(f"{self.title} {self.of}", 0, 2)
+            yield self._table(f"Orientation errors in deg {self.of}", 1)
 
 
 def parts_table(parts: Sequence[Part]) -> Table:
@@ -121,7 +117,7 @@ def _marker_lines(
     points: Tensor, tips: Sequence[str], *, poses: bool, ball: bool = False, known: Tensor | None = None
 ) -> Iterator[str]:
     """Places (P, 3) of markers, m, or of the frames that they represent; ``known``: standard deviations (P, 3)."""
-    places, tips = (middles(points[None])[0], tips[::POINTS]) if poses else (points, tips)
+    places, tips = (points.unflatten(0, (-1, POINTS)).mean(1), tips[::POINTS]) if poses else (points, tips)
     for k, (place, tip) in enumerate(zip(places, tips, strict=True)):
         what = "measured frame" if poses else "marker" + f" {k}" * (len(places) > 1 + ball)
         what = "ball" if ball and k == len(places) - 1 > 0 else what
@@ -158,10 +154,8 @@ def motion_lines(found: Registration, tips: Sequence[str], *, doubt: str = "") -
     if found.free != "marker":
         yield from frame_lines(found)
     if found.free != "base":
-        tips, rigid = (
-            tips if len(tips) == len(found.markers) else [tips[0]] * len(found.markers),
-            found.lever is not None,
-        )
+        tips = tips if len(tips) == len(found.markers) else [tips[0]] * len(found.markers)
+        rigid = found.lever is not None
         yield from _marker_lines(found.markers, tips, poses=rigid, known=None if rigid else found.marker_deviations)
         if found.shift is not None:
             largest = 1e3 * float(found.shift.norm(dim=1).max())

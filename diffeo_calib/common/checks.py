@@ -46,7 +46,11 @@ def as_tensor(
     tensor = real_tensor(value, name)
     shapes = [shape, *also]
     expected = " or ".join(_words(pattern) for pattern in shapes)
-    if not any(_fits(tensor, pattern) for pattern in shapes):
+    if not any(
+        tensor.ndim == len(pattern)
+        and all(isinstance(want, str) or want == size for want, size in zip(pattern, tensor.shape, strict=True))
+        for pattern in shapes
+    ):
         raise InputError.of(f"`{name}` has the wrong shape", expected=expected, got=_words(tensor.shape), fix=fix)
     if not empty and tensor.numel() == 0:
         got = _words(tensor.shape)
@@ -175,19 +179,10 @@ def wrapped(*tensors: Tensor) -> bool:
     does not check its input.
     """
     recorded = torch.compiler.is_compiling() or torch.jit.is_tracing()  # pyright: ignore[reportPrivateImportUsage]
-    return recorded or any(map(is_functorch_wrapped_tensor, tensors)) or _has_tangent(tensors)
-
-
-def _has_tangent(tensors: Sequence[Tensor]) -> bool:
-    """Whether forward-mode derivatives follow a tensor; looking takes a microsecond where there are some."""
-    level = forward_ad._current_level  # pyright: ignore[reportPrivateUsage]
+    if recorded or any(map(is_functorch_wrapped_tensor, tensors)):
+        return True
+    level = forward_ad._current_level  # pyright: ignore[reportPrivateUsage]  # looking for tangents takes a microsecond
     return level >= 0 and any(forward_ad.unpack_dual(t).tangent is not None for t in tensors)
-
-
-def _fits(tensor: Tensor, shape: Shape) -> bool:
-    return tensor.ndim == len(shape) and all(
-        isinstance(want, str) or want == size for want, size in zip(shape, tensor.shape, strict=True)
-    )
 
 
 def _words(shape: Sequence[int | str]) -> str:

@@ -154,9 +154,6 @@ def _openblas(loaded: str) -> Any:
 
     found = ThreadpoolController()
     openblas = [library for library in found.info() if library["internal_api"] == "openblas"]
-    return found.select(filepath=[library["filepath"] for library in openblas if not belongs_to_torch(library)])
-
-
-def belongs_to_torch(library: dict[str, str]) -> bool:
-    """Whether a library belongs to torch: some builds have an OpenBLAS of their own in torch/lib or torch.libs."""
-    return any(part.startswith("torch") for part in Path(library["filepath"]).parts[-3:-1])
+    # some builds of torch have an OpenBLAS of their own in torch/lib or torch.libs
+    paths = [library["filepath"] for library in openblas]
+    return found.select(filepath=[p for p in paths if not any(d.startswith("torch") for d in Path(p).parts[-3:-1])])

@@ -31,8 +31,7 @@ OPEN_TURN_RAD = 1.0
 changed robot widens by up to ten, and that of an open one, 2."""
 NEGLIGIBLE_TURN_RAD = 0.01
 """Standard deviation of the turn of all points below which errors of second order are left out, if nothing is open."""
-
-
+TENSORS = "data", "new_noise", "workspace", "slopes", "y"  # of a map, or None
 T = TypeVar("T")
 
 
@@ -89,15 +88,15 @@ class FittedMap:
 
     def without_rigid_motions(self) -> FittedMap:
         """The same map whose covariances leave out rigid motions over the joint ranges of its rows."""
-        return self._with(self.deformation, self.everywhere)
+        return self._changed(workspace=self.everywhere)
 
     def with_deformation(self, deformation: Deformation) -> FittedMap:
         """The same map with another deformation at the same rows."""
-        return self._with(deformation, self.workspace)
+        return self._changed(deformation=deformation)
 
-    def _with(self, deformation: Deformation, workspace: Tensor | None) -> FittedMap:
-        parts = self.noise, self.data, self.new_noise, workspace
-        return FittedMap(deformation, *parts, slopes=self.slopes, y=self.y)
+    def _changed(self, **changes: Any) -> FittedMap:
+        parts = {name: getattr(self, name) for name in ("deformation", "noise", *TENSORS)}
+        return FittedMap(**parts | changes)
 
     @property
     def unregistered(self) -> FittedMap:
@@ -139,9 +138,8 @@ class FittedMap:
         device = usable(device)
         if device == self.x.device:
             return self  # with what it has computed for its covariances
-        parts = (None if part is None else part.to(device) for part in (self.data, self.new_noise, self.workspace))
-        slopes, y = (None if part is None else part.to(device) for part in (self.slopes, self.y))
-        return FittedMap(self.deformation.to(device), self.noise.to(device), *parts, slopes=slopes, y=y)
+        moved = {name: part.to(device) for name in TENSORS if (part := getattr(self, name)) is not None}
+        return self._changed(deformation=self.deformation.to(device), noise=self.noise.to(device), **moved)
 
     def __call__(self, x: object) -> Tensor:
         """Calibrated task coordinates.
@@ -321,9 +319,8 @@ class FittedMap:
         momenta = Momenta(b / factor, p / factor, theta)
         spec = replace(spec, **kernels, prior_variance=factor * spec.prior_variance)
         noise = Noise(factor * self.noise.covariance, factor**0.5 * self.noise.shared)
-        parts = self.data, factor * self.new_noise, self.workspace
         deformation = GeodesicDeformation(spec, old.x, momenta, old.integrator)
-        return FittedMap(deformation, noise, *parts, slopes=self.slopes, y=self.y)
+        return self._changed(deformation=deformation, noise=noise, new_noise=factor * self.new_noise)
 
     def parameter_covariance(self, which: Tensor) -> Tensor:
         """Posterior covariance of the parameters theta with these numbers: (k,) -> (k, k) in m^2, m rad or rad^2."""

@@ -85,7 +85,9 @@ class LBFGS:
             if renewal is not None:
                 run.renew(preconditioned=renewal)
             before = run.best_energy
-            run.burst()
+            run.optimizer.step(run.closure)  # pyright: ignore[reportArgumentType]
+            run.history.append(run.best_energy)
+            run.iterations = run.renewed + int(run.optimizer.state[run.variables]["n_iter"])
             settled = before - run.best_energy <= self.tolerance * abs(run.best_energy)
             if settled and run.factor is None:
                 return run.solution(Stop.ENERGY)
@@ -112,7 +114,7 @@ class Descent:
     @property
     def age(self) -> int:
         """Iterations since the variables were renewed."""
-        return self.iterations - self._before
+        return self.iterations - self.renewed
 
     @property
     def gradient(self) -> Tensor:
@@ -126,7 +128,7 @@ class Descent:
 
     def renew(self, preconditioned: bool = False) -> None:
         """Choose new variables around the best momenta."""
-        self.origin, self._before = self.best.flatten().detach(), self.iterations
+        self.origin, self.renewed = self.best.flatten().detach(), self.iterations
         self.factor: CholeskyRegression | None = None
         self.variables = self.origin.clone().requires_grad_()
         if preconditioned:
@@ -141,12 +143,6 @@ class Descent:
             history_size=self.history_size,
             line_search_fn="strong_wolfe",
         )
-
-    def burst(self) -> None:
-        """Run a few iterations."""
-        self.optimizer.step(self.closure)  # pyright: ignore[reportArgumentType]
-        self.history.append(self.best_energy)
-        self.iterations = self._before + int(self.optimizer.state[self.variables]["n_iter"])
 
     def momenta(self) -> Momenta:
         """The optimiser's variables as momenta."""

@@ -94,7 +94,7 @@ class Bodies:
 
     def origins(self, points: Tensor) -> Tensor:
         """Origins (N, B, 3) of bodies with points (N, P, 3), m."""
-        return points if self.lever is None else pose_math.middles(points)
+        return points.unflatten(1, (-1, self.points)).mean(2)
 
     def averaging(self, like: Tensor) -> Tensor:
         """The origins (3 B,) as linear functions of all coordinates (m,) of points: (3 B, m), m that of ``like``."""

@@ -122,7 +122,8 @@ def read_folders(
     if CAMERA in header and len(folders) > 1:
         fix = "leave it out: the folders name the cameras"
         raise MeasurementError.of(f"file '{joints}'", expected=f"no column `{CAMERA}`", got="one", fix=fix)
-    place = _column_of_images(header, rows)
+    named = [k for k in range(len(header)) if all(Path(row[k]).suffix.lower() in SUFFIXES for row in rows)]
+    place = header.index(IMAGE) if IMAGE in header else next(iter(named), None)
     files = _ordered(folders, joints, len(rows)) if place is None else _named(folders, [row[place] for row in rows])
     table = table.without([] if place is None else [header[place]])
     rows = [cells for _, cells in table.rows]
@@ -175,26 +176,19 @@ def _named(folders: Sequence[Path], names: Sequence[str]) -> list[list[str | Non
 
 def _ordered(folders: Sequence[Path], joints: Path, count: int) -> list[list[str]]:
     """The file of each row in every folder, in the order of the numbers in their names: 2.png before 10.png."""
+
+    def by_numbers(name: str) -> list[tuple[str, int]]:
+        parts = re.findall(r"(\D*)(\d*)", name.lower())
+        return [*((text, int(number or -1)) for text, number in parts), (name, 0)]
+
     names = ([own.name for own in folder.iterdir() if own.suffix.lower() in SUFFIXES] for folder in folders)
-    files = [sorted(own, key=_by_numbers) for own in names]
+    files = [sorted(own, key=by_numbers) for own in names]
     others = [f"{len(own)} in '{folder}'" for folder, own in zip(folders, files, strict=True) if len(own) != count]
     if others:
         expected, got = f"{count} images, one for each row of '{joints}'", few(others)
         fix = "add a column `image` with the name of each row's file"
         raise MeasurementError.of("images without names in the table", expected=expected, got=got, fix=fix)
     return files
-
-
-def _by_numbers(name: str) -> list[tuple[str, int]]:
-    """Texts of a name, each with the number behind it, and the name."""
-    parts = re.findall(r"(\D*)(\d*)", name.lower())
-    return [*((text, int(number or -1)) for text, number in parts), (name, 0)]
-
-
-def _column_of_images(header: list[str], rows: list[list[str]]) -> int | None:
-    """The column `image`, else the first one whose cells all have the suffix of an image."""
-    named = [k for k in range(len(header)) if all(Path(row[k]).suffix.lower() in SUFFIXES for row in rows)]
-    return header.index(IMAGE) if IMAGE in header else next(iter(named), None)
 
 
 def _seen(name: str, cells: list[str], grey: np.ndarray | None, board: Board, usual: tuple[int, ...]) -> Seen:

@@ -236,10 +236,19 @@ def _sights(corners: Sequence[Tensor], known: Mapping[str, Known], board: BoardP
     """What each camera saw, of its corners (N_i, K, 5); a warning or an error about one that saw it otherwise."""
     images = []
     for (name, own), rows in zip(known.items(), corners, strict=True):
-        images.append(
-            Images(rows[..., :3], rows[..., 3:], *((own.width, own.height) if isinstance(own, Camera) else own))
-        )
-        _check_size(images[-1], f" of camera '{name}'" * (len(known) > 1))
+        whose, size = f" of camera '{name}'" * (len(known) > 1), own
+        if isinstance(own, Camera):
+            size = own.width, own.height
+        shown = Images(rows[..., :3], rows[..., 3:], *size)
+        if not bool(shown.seen.any()):
+            raise MeasurementError.of(f"`corners`{whose}", expected="some corners", got="NaN alone")
+        low, high = (torch.stack(list(shown.pixels[shown.seen].aminmax(dim=0)))).tolist()
+        if min(low) < -1.0 or high[0] > shown.width or high[1] > shown.height:
+            got = f"from ({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f})"
+            expected = f"pixels within images of {shown.width} x {shown.height}"
+            fix = "pass the size of the images in which the corners were found, or a camera calibrated at that size"
+            raise MeasurementError.of(f"the corners{whose}", expected=expected, got=got, fix=fix)
+        images.append(shown)
     cameras = [own if isinstance(own, Camera) else None for own in known.values()]
     found = sighted_by_several(images, cameras, board)
     for name, camera, seen, shown in zip(known, cameras, found, images, strict=True):
@@ -253,19 +262,6 @@ def errors_of_poses(poses: Tensor, covariance: Tensor, shared: Tensor, *, camera
     sign = -1.0 if camera_on_tool else 1.0  # of inverse poses, see poses.py
     larger = torch.cat([poses[:, :3, 3], torch.zeros_like(poses[:, :3, 3])], 1)[..., None]
     return dict(zip(OF_POSES, (covariance, sign * shared, sign * larger), strict=True))
-
-
-def _check_size(images: Images, whose: str) -> None:
-    """Raise MeasurementError for corners outside of the images."""
-    size = images.width, images.height
-    fix = "pass the size of the images in which the corners were found, or a camera calibrated at that size"
-    if not bool(images.seen.any()):
-        raise MeasurementError.of(f"`corners`{whose}", expected="some corners", got="NaN alone")
-    low, high = (torch.stack(list(images.pixels[images.seen].aminmax(dim=0)))).tolist()
-    if min(low) < -1.0 or high[0] > size[0] or high[1] > size[1]:
-        got = f"from ({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f})"
-        expected = f"pixels within images of {size[0]} x {size[1]}"
-        raise MeasurementError.of(f"the corners{whose}", expected=expected, got=got, fix=fix)
 
 
 def _check_camera(found: Sights, free: Sights, name: str) -> None:

@@ -315,11 +315,6 @@ def frames_of_points(points: Tensor, lever: float) -> Tensor:
     return found
 
 
-def middles(points: Tensor) -> Tensor:
-    """The origins (N, T, 3) of frames that 3 T points (N, 3 T, 3) represent, m."""
-    return points.unflatten(1, (-1, POINTS)).mean(2)
-
-
 def transforms_of_frames(rotations: Tensor, places: Tensor) -> Tensor:
     """Poses (N, T, 4, 4) of rotations (N, T, 3, 3) and places (N, T, 3), m; NaN as a whole where either is."""
     frames = transforms(rotations, places)

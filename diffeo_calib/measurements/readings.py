@@ -44,12 +44,8 @@ class Readings(RowTable):
         device: (N,) int64, number of the device of each row. names: of the devices.
         offset_std: standard deviation of the unknown zero of a distance, m; 0 if lengths are absolute.
         intrinsics: focal lengths fx, fy and principal point cx, cy of images, in pixels.
-        joint_names: n names in the order of the columns of ``q``, or None.
-        line_numbers: (N,) int64, lines of the rows in their file; by default their numbers.
-        file_sha256: SHA-256 of that file. origin: that file and how it was read.
         std: (N, r) known standard deviations in the unit of ``values``; None where they are not known.
-        payload: (N,) known masses that the robot carried, in any unit; None where they are not known.
-        payload_at: name of the link that carried them; None for the robot's tip.
+        joint_names, line_numbers, file_sha256, origin, payload, payload_at: as of :class:`Measurements`.
         on: name of the tip that carries the ball, for a robot with several tips.
         unit: name of the unit in which readings are shown, and how many of it are one of ``values``.
     """
@@ -208,9 +204,7 @@ class Readings(RowTable):
         shapes = [(N,), (N, 1)] if numbers == 1 else [(N, numbers)]
         fix = f"pass {numbers} per row" + ", in m" * (unit == MILLIMETRES and numbers == 1)
         read = checks.copied(given, name, *shapes, fix=fix).reshape(N, numbers).to(angles.device)
-        if devices is None:
-            devices = [ONE_DEVICE] * N
-        whose, names = checks.numbered(devices, N)
+        whose, names = checks.numbered([ONE_DEVICE] * N if devices is None else devices, N)
         known = checks.deviations(std, "std", read)
         found = cls(kind, angles, read, whose.to(HOST), names, joint_names=joints, std=known, unit=unit)
         return found.doubted(doubt)

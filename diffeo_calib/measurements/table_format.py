@@ -96,8 +96,7 @@ class TableFormat:
     def __post_init__(self) -> None:
         check_choice("length", self.length, tuple(UNITS_PER_METRE))
         check_choice("angle", self.angle, ANGLE_UNITS)
-        if self.joint_length is not None:
-            check_choice("joint_length", self.joint_length, tuple(UNITS_PER_METRE))
+        check_choice("joint_length", self.joint_unit, tuple(UNITS_PER_METRE))
         check_choice("decimal", self.decimal, (".", ","))
         sep = self.sep
         if not isinstance(sep, str) or len(sep) != 1 or sep in '"\r\n':

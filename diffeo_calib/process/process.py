@@ -152,7 +152,8 @@ class Process:
     @property
     def by_log_variance(self) -> Tensor:
         """Derivative (K,) of the evidence by the logarithms of the unknowns' prior variances."""
-        return self.factor.by_variance(self.variance.sqrt() * (self.numbers.S.T @ self.mu))
+        explained = self.variance * (self.numbers.S.T @ self.mu).square()
+        return 0.5 * (explained - 1.0 + torch.cholesky_inverse(self.factor.B).diagonal())
 
     @property
     def evidence(self) -> float:

@@ -96,10 +96,6 @@ class Factor:
         log_det = float(self.L.diagonal().log().sum() + self.B.diagonal().log().sum())
         return -0.5 * float(values @ solved) - log_det - 0.5 * len(values) * log(2.0 * pi)
 
-    def by_variance(self, features_mu: Tensor) -> Tensor:
-        """Derivative of the log density by the logarithm of each feature's variance, with H^T K^-1 values: (K,)."""
-        return 0.5 * (features_mu.square() - 1.0 + torch.cholesky_inverse(self.B).diagonal())
-
 
 class CholeskyRegression(DataConditional):
     """Conditioning by a :class:`Factor` of G + R. Coordinates that were not measured take no part.

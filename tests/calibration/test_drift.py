@@ -61,10 +61,16 @@ def drifts(result: Any) -> list[Drift]:
     return [own for own in result.placement if isinstance(own, Drift)]
 
 
-def test_a_joint_offset_that_drifts_is_part_of_the_model() -> None:
+@pytest.fixture(scope="module")
+def drifted() -> tuple[dc.Measurements, dc.Measurements, Any]:
+    """Rows of a fit, others of the same drift, and the calibration."""
     data = drifting_rows()
-    train, other = data[:ROWS], data[ROWS:]
-    plain, result = calibrated(train.with_covariates()), calibrated(train)
+    return data[:ROWS], data[ROWS:], calibrated(data[:ROWS])
+
+
+def test_a_joint_offset_that_drifts_is_part_of_the_model(drifted: Any) -> None:
+    train, other, result = drifted
+    plain = calibrated(train.with_covariates())
     (drift,) = drifts(result)
     (line,) = drift.sentences()
     found = re.search(f"the offset of {ARM.nominal.joint_names[1]} by ([^ ]+)", line)
@@ -116,9 +122,8 @@ def test_rows_are_brought_to_the_middle_of_the_column() -> None:
     assert_close(found.points(lambda q: nominal(q, zero).view(-1, 2, 3), data), moved, rtol=0, atol=1e-5)
 
 
-def test_a_model_keeps_its_drift(tmp_path: Path) -> None:
-    data = drifting_rows()
-    result, other = calibrated(data[:ROWS]), data[ROWS:]
+def test_a_model_keeps_its_drift(drifted: Any, tmp_path: Path) -> None:
+    _, other, result = drifted
     dc.save(result.model, tmp_path / "m.safetensors")
     model = dc.load(tmp_path / "m.safetensors")
     assert isinstance(model, dc.CalibratedKinematics)
@@ -133,11 +138,10 @@ def test_a_model_keeps_its_drift(tmp_path: Path) -> None:
     assert KnownDrift.of(ARM) is None
 
 
-def test_beyond_its_rows_a_drift_stays_as_at_the_end() -> None:
-    data = drifting_rows()
-    model = calibrated(data[:ROWS]).model
+def test_beyond_its_rows_a_drift_stays_as_at_the_end(drifted: Any) -> None:
+    model = drifted[2].model
     known: Any = KnownDrift.of(model)
-    late, last = (data[ROWS:].with_covariates(time=torch.full((60,), t, dtype=torch.float64)) for t in (900.0, 7.0))
+    late, last = (drifted[1].with_covariates(time=torch.full((60,), t, dtype=torch.float64)) for t in (900.0, 7.0))
     assert_close(known.points(model, late), known.points(model, last), rtol=0, atol=1e-6)
     (line,) = [line for line in known.in_rows(late) if "outside" in line]
     assert re.search(r"\b60\b", line)

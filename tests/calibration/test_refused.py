@@ -17,9 +17,7 @@ from table_bank import refused
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.plausibility import check_identification, check_joints, check_limits
-from diffeo_calib.calibration.identification.identification import identify
-from diffeo_calib.calibration.identification.registration import register_inliers
+from diffeo_calib.calibration.diagnostics.plausibility import check_joints, check_limits
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.robots import Joint
 
@@ -99,16 +97,6 @@ def test_a_slide_moves_relative_to_its_stroke() -> None:
     check_joints(robot, moved)  # a warning fails this test
     with pytest.warns(DiffeoCalibWarning, match="^j1: hardly moved"):
         check_joints(robot, hardly)
-
-
-@pytest.mark.slow
-def test_rows_that_no_reading_explains_are_warned_about() -> None:
-    """A tip before the joint that carries the marker."""
-    short = dc.Chain("short", "base_link", "wrist_link", ROBOT.joints[:-2])
-    data = dc.Measurements(Q[:, :5], POINTS)
-    start = register_inliers(short, data)[0].geometry
-    with pytest.warns(DiffeoCalibWarning, match=r"do not fit this robot, even with .* the tip link or DH convention"):
-        check_identification(data, identify(start, data.q, data.points))
 
 
 @pytest.mark.slow

@@ -7,14 +7,12 @@ import re
 import warnings
 from dataclasses import replace
 from math import pi, radians
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from campaigns import CAMPAIGNS, box
 from degenerate import arm_of, measured, record
-from product_bank import ur10_measurements
 from robots_bank import draw
 from torch import Tensor
 from torch.testing import assert_close
@@ -104,10 +102,10 @@ def test_joints_that_never_move_leave_directions_undetermined() -> None:
     assert identify(stuck.geometry, q, truth.points(q)).rms < 1e-6
 
 
-SLIDE = (0, pi / 2, 0, pi / 2, "prismatic")
+SLIDE, DOWN = (0, pi / 2, 0, pi / 2, "prismatic"), (0, 0, 0, 0, "prismatic")
 OPEN = [
     ([(0.5, 0, 0), (0.4, 0, 0), (0.2, 0, 0)], [[0.03, -0.02, 0.0]], "1 of 9 directions"),  # in a plane
-    ([SLIDE, SLIDE, (0, 0, 0, 0, "prismatic")], [[0.0, 0.0, 0.0]], "3 of 9 directions"),  # never turns
+    ([SLIDE, SLIDE, DOWN], [[0.0, 0.0, 0.0]], "3 of 9 directions"),  # never turns
 ]
 
 
@@ -122,14 +120,6 @@ def test_directions_that_no_row_can_show_belong_to_the_base(rows: Any, tool: Any
     assert words in found.status
 
 
-def test_a_ur10(ur10_folder: Path) -> None:
-    robot, data = ur10_measurements(ur10_folder)
-    assert 1e3 * register(robot, data.q, data.points).rms < 0.774
-    train, test = data.split(0.7, seed=0)
-    geometry = register(robot, train.q, train.points).geometry
-    assert 1e3 * dc.evaluate(geometry.points, test).rms < 0.82
-
-
 # --- joint offsets far from the description ---------------------------------------------------------------------------
 
 OTHER = SimulatedArm(seed=3)
@@ -137,22 +127,15 @@ OTHER = SimulatedArm(seed=3)
 
 @pytest.mark.parametrize(("joint", "degrees"), [(1, 10.0), (2, -25.0), (3, 12.0), (4, 45.0)])
 def test_one_joint_is_found_among_geometric_errors(joint: int, degrees: float) -> None:
-    q, points = OTHER.measure(50, seed=1)
-    wrong = q.clone()
-    wrong[:, joint] -= math.radians(degrees)
-    offsets = find_joint_offsets(register(OTHER.nominal, wrong, points).geometry, wrong, points)
+    q, points = OTHER.measure(56, seed=1)
+    q[:, joint] -= math.radians(degrees)
+    points[:6, 0] += torch.randn(
+        6, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )  # gross outliers
+    offsets = find_joint_offsets(register(OTHER.nominal, q[6:], points[6:]).geometry, q, points)
     expected = torch.zeros(6, dtype=torch.float64)
     expected[joint] = math.radians(degrees)
     assert_close(offsets[1:5], expected[1:5], rtol=0, atol=0.01)  # base and marker may carry the first and the last
-
-
-def test_gross_outliers_do_not_decide() -> None:
-    q, points = OTHER.measure(60, seed=1)
-    wrong, points = q.clone(), points.clone()
-    wrong[:, 2] -= 0.3
-    points[:6, 0] += torch.randn(6, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    offsets = find_joint_offsets(register(OTHER.nominal, wrong[6:], points[6:]).geometry, wrong, points)
-    assert float(offsets[2]) == pytest.approx(0.3, abs=0.02)
 
 
 def test_absorbed_offsets_are_exactly_other_joint_values() -> None:
@@ -295,13 +278,9 @@ def test_honest_campaigns_are_not_warned_about(kind: str, rows: int) -> None:
         assert sentences(arm.nominal, data) == []
 
 
-@pytest.mark.parametrize("rows", ["scara", "gantry"])
-def test_robots_that_cannot_turn_their_tools_are_not_asked_to(rows: str) -> None:
-    if rows == "scara":
-        robot = dc.from_dh([(0.4, 0, 0), (0.3, 0, 0), (0, 0, 0, 0, "prismatic")], name=rows)
-    else:
-        slide = (0, pi / 2, 0, pi / 2, "prismatic")
-        robot = dc.from_dh([slide, slide, (0, 0, 0, 0, "prismatic")], name=rows)
+@pytest.mark.parametrize("rows", [[(0.4, 0, 0), (0.3, 0, 0), DOWN], [SLIDE, SLIDE, DOWN]], ids=["scara", "gantry"])
+def test_robots_that_cannot_turn_their_tools_are_not_asked_to(rows: Any) -> None:
+    robot = dc.from_dh(rows, name="machine")
     q = torch.rand(30, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - 0.5
     points = robot(q)[:, None, :3, 3]
     noise = torch.randn(points.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))

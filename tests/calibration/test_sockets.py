@@ -19,7 +19,7 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_registration, check_sockets
 from diffeo_calib.calibration.identification.identification import Prior, identify
 from diffeo_calib.calibration.identification.registration import register_sockets
-from diffeo_calib.calibration.placing.place import place
+from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.placing.readings import held_parameters
 from diffeo_calib.calibration.placing.sockets import SocketDevices, stages_by_sockets
 from diffeo_calib.common.errors import InputError, MeasurementError
@@ -116,13 +116,17 @@ def test_covariances_do_not_depend_on_what_is_held(result: Any) -> None:
     assert float((measured.posterior(fitted.x[:5], noise=False)[1] - held).diagonal(dim1=1, dim2=2).amin()) > 1e-8
 
 
-def test_places_left_out_by_leaving_them_out(data: dc.Measurements, arm: SimulatedArm) -> None:
+@pytest.fixture(scope="module")
+def placed(arm: SimulatedArm, data: dc.Measurements) -> Placed:
+    return place(arm.nominal, data, silent)
+
+
+def test_places_left_out_by_leaving_them_out(data: dc.Measurements, placed: Placed) -> None:
     """Closed form against a regression without the rows of the place."""
     from diffeo_calib.calibration.choose_scales import ChosenScales
     from diffeo_calib.calibration.scales.leave_one_out import leave_one_out
     from diffeo_calib.calibration.scales.selection import Selection, defaults
 
-    placed = place(arm.nominal, data, silent)
     tangent, devices = placed.tangent_data(), placed.placement.one(SocketDevices)
     scales = defaults(tangent, placed.identification.noise, placed.identification.prior)
     chosen = ChosenScales(Selection(scales, "defaults"), tangent, leave_one_out(tangent, scales))
@@ -139,7 +143,7 @@ def test_places_left_out_by_leaving_them_out(data: dc.Measurements, arm: Simulat
     assert found.distance_errors[0] == pytest.approx(float((first - second).norm()) - 0.05, abs=1e-9)
 
 
-def test_deviations_grow_where_places_contradict_each_other(data: dc.Measurements, arm: SimulatedArm) -> None:
+def test_deviations_grow_where_places_contradict_each_other(data: dc.Measurements, placed: Placed) -> None:
     """The ratio of squared errors of left-out places, by conditioning on the rows of the others."""
     from tangent_bank import covariance
 
@@ -147,7 +151,6 @@ def test_deviations_grow_where_places_contradict_each_other(data: dc.Measurement
     from diffeo_calib.calibration.scales.selection import defaults
     from diffeo_calib.regression.regions import region_factor
 
-    placed = place(arm.nominal, data, silent)
     tangent, found = placed.tangent_data(), placed.identification
     scales = defaults(tangent, 0.3 * found.noise, found.prior)
     K, r, total = covariance(tangent, scales), tangent.target.flatten(), 0.0
@@ -284,11 +287,6 @@ def test_names_that_say_nothing_are_warned_about(plain: SimulatedArm, some: Sock
         stages_by_sockets(plain.nominal, table(some, names))
 
 
-def turned(some: SocketRows, plain: SimulatedArm, change: Callable[[torch.Tensor], torch.Tensor]) -> dc.Measurements:
-    """Rows that differ in the last joints alone: how the tool turns is then known."""
-    return dc.Measurements.from_sockets(change(some.q[:1].repeat(12, 1)), ["a"] * 12)
-
-
 def test_a_tool_that_never_turns_or_tilts(plain: SimulatedArm, some: SocketRows) -> None:
     def still(q: torch.Tensor) -> torch.Tensor:
         return q + 1e-4 * torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype)
@@ -299,7 +297,7 @@ def test_a_tool_that_never_turns_or_tilts(plain: SimulatedArm, some: SocketRows)
 
     for change, expect in ((still, pytest.raises(MeasurementError, match="the tool hardly turns")),
                            (upright, pytest.warns(dc.DiffeoCalibWarning, match="never tilted"))):  # fmt: skip
-        data = turned(some, plain, change)
+        data = dc.Measurements.from_sockets(change(some.q[:1].repeat(12, 1)), ["a"] * 12)
         with expect:
             check_registration(plain.nominal, data, register_sockets(plain.nominal, data.q, data.socket))
 

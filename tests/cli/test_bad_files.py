@@ -13,22 +13,18 @@ import diffeo_calib as dc
 pytestmark = pytest.mark.slow  # calibrations by the dozen
 
 
-@pytest.mark.parametrize("action", ["evaluate", "predict"])
-def test_bad_models(action: str, small_site: Site, sound: bytes, command: Command, tmp_path: Path) -> None:
-    path = tmp_path / "model.safetensors"
-    table = TABLE if action == "evaluate" else [*TABLE[2:], "-o", str(tmp_path / "p.csv")]
+def test_bad_models(small_site: Site, sound: bytes, command: Command, tmp_path: Path) -> None:
+    """tests/interop damages files in every way."""
+    path, table = tmp_path / "model.safetensors", [*TABLE[2:], "-o", str(tmp_path / "p.csv")]
     for content, message in (
         (None, "there is no model file"),
-        (sound[:-100], "damaged or cut short"),
-        (sound[:-1] + bytes([sound[-1] ^ 1]), "checksum does not match"),
         (sound.replace(b'\\"rows\\": 10', b'\\"rows\\": 99'), "checksum does not match"),
         (small_site.csv.read_bytes(), "cannot be read as a model file"),
-        (b"", "cannot be read as a model file"),
     ):
         if content is not None:
             assert content != sound
             path.write_bytes(content)
-        done = command(action, path, small_site.csv, *table)
+        done = command("predict", path, small_site.csv, *table)
         assert done.code == 1
         assert message in done.error
         assert not (tmp_path / "p.csv").exists()

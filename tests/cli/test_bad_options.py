@@ -4,38 +4,11 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 from command_bank import ROTATION, TABLE, Command, Site, edited
 
-from diffeo_calib.measurements.csv.files import write_measurements
-from diffeo_calib.measurements.table_format import TableFormat
-
 pytestmark = pytest.mark.slow  # calibrations by the dozen
-
-
-@pytest.mark.parametrize(
-    "units",
-    [
-        (("mm", "deg"), ("mm", "rad"), "look like degrees", "angle unit"),
-        (("mm", "rad"), ("mm", "deg"), "look like radians", "angle unit"),
-        (("mm", "deg"), ("m", "deg"), "look like millimetres", "1000 times too large"),
-        (("m", "deg"), ("mm", "deg"), "look like metres", "1000 times too small"),
-    ],
-)
-def test_wrong_units(units: tuple[Any, ...], small_site: Site, command: Command, tmp_path: Path) -> None:
-    (length, angle), options, warning, message = units
-    table = TableFormat(length, angle, ";", ",")
-    write_measurements(tmp_path / "t.csv", small_site.data, table, position=["mx", "my", "mz"])
-    done = command(
-        *small_site.fit(tmp_path / "t.csv", tmp_path / "model", "--length", options[0], "--angle", options[1])
-    )
-    assert done.code == 1
-    assert len(done.warnings) == 1
-    assert warning in done.warnings[0]
-    assert message in done.error
-    assert not (tmp_path / "model").exists()
 
 
 @pytest.mark.parametrize(

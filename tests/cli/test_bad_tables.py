@@ -77,17 +77,6 @@ def test_a_tip_before_the_last_joint(small_site: Site, command: Command, tmp_pat
     assert "as the tip" in done.error
 
 
-@pytest.mark.parametrize(("by", "words"), [(1, "one row too late"), (-1, "one row too early")])
-def test_points_shifted_by_one_row(by: int, words: str, small_site: Site, command: Command, tmp_path: Path) -> None:
-    def shift(cells: list[list[str]]) -> list[list[str]]:
-        rows = cells[1:]
-        return [cells[0], *(row[:6] + rows[(k - by) % len(rows)][6:] for k, row in enumerate(rows))]
-
-    done = command(*small_site.fit(edited(small_site, tmp_path / "bad.csv", shift), tmp_path / "model", "--holdout", 0))
-    assert done.code == 1
-    assert f"the points seem to be {words}: pair every configuration with its own" in done.error
-
-
 @pytest.mark.parametrize("column_order", ["1,0,2,3,4,5", "0,1,2,3,5,4", "0,2,1,3,4,5"])
 def test_joint_columns_in_another_order(column_order: str, small_site: Site, command: Command, tmp_path: Path) -> None:
     names = small_site.arm.nominal.joint_names
@@ -95,16 +84,6 @@ def test_joint_columns_in_another_order(column_order: str, small_site: Site, com
     done = command(*small_site.fit(small_site.csv, tmp_path / "model", "--joints", wrong))
     assert done.code == 1
     assert "names the robot's joints in another order than the robot's" in done.error
-
-
-@pytest.mark.parametrize(
-    "content", ["", "<robot", "<sdf></sdf>", "not xml", '<robot name="r"><link name="a"/></robot>']
-)
-def test_bad_urdf(content: str, small_site: Site, command: Command, tmp_path: Path) -> None:
-    (tmp_path / "bad.urdf").write_text(content)
-    done = command(*small_site.fit(small_site.csv, tmp_path / "model", "--robot", tmp_path / "bad.urdf"))
-    assert done.code == 1
-    assert "bad.urdf" in done.error
 
 
 def test_missing_table(small_site: Site, command: Command, tmp_path: Path) -> None:

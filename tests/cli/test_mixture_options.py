@@ -90,24 +90,6 @@ def test_lines_of_one_kind(
         read("wrong.csv")
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--rotation", "a,b,c", "--convention", "rotvec"], "--rotation-angle is missing"),
-        (["--payload", "kg"], "no column ['kg']"),
-    ],
-)  # fmt: skip
-def test_refused_options(
-    options: list[str], message: str, folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(folder)
-    done = command("fit", "t.csv", *ROBOT, *POSITION, *SOCKETS, *options, "-o", "none.safetensors")
-    assert done.code == 1
-    assert message in " ".join(done.err.split())
-    done = command("fit", "t.csv", *ROBOT, *POSITION, *SOCKETS[:-2], "-o", "none.safetensors")
-    assert "--distance without --distance-std" in done.err
-
-
 def test_set_ups_are_evaluated_each_in_its_place(
     folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:

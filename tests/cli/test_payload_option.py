@@ -10,7 +10,6 @@ from command_bank import Command
 from product_bank import with_usual_scales
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
@@ -101,16 +100,3 @@ def test_masses_that_cannot_be(folder: Path, command: Command, tmp_path: Path) -
     refused = command("recalibrate", folder / "m.safetensors", folder / "t.csv", *POSITION, "-o", tmp_path / "n.st")
     assert refused.code == 1
     assert "with payloads" in refused.err
-
-
-@pytest.mark.usefixtures("given_scales")
-def test_one_payload_throughout(tmp_path: Path, command: Command) -> None:
-    arm = SimulatedArm(seed=2)
-    arm.write_urdf(tmp_path / "arm.urdf")
-    data = dc.Measurements(*arm.measure(12, seed=1), arm.nominal.joint_names).with_payload(6.0)
-    write_measurements(tmp_path / "t.csv", data, TableFormat("mm", "deg"))
-    robot = ("--robot", tmp_path / "arm.urdf", "--base", "base_link", "--tip", "flange")
-    rest = (*POSITION, "-o", tmp_path / "m.safetensors", "--payload", "payload", "--holdout", "0")
-    done = command("fit", tmp_path / "t.csv", *robot, *rest)
-    assert "all rows carry the same payload (6)" in done.err
-    assert DiffeoCalibWarning.__name__ not in done.err

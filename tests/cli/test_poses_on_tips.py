@@ -121,9 +121,3 @@ def test_other_tips_and_other_kinds_are_refused(case: Case) -> None:
         dc.evaluate(case.model, dc.Measurements(case.new.q, points))
     with pytest.raises(MeasurementError, match=says("has 2 tips", "from_poses(..., on=[...])")):
         dc.calibrate(case.arms.nominal, case.new.with_tips(None))
-
-
-def test_a_rotation_for_each_position(case: Case, command: Command) -> None:
-    words = [*TABLE[:4], "--rotation", "left_rx,left_ry,left_rz", *TABLE[8:]]
-    done = command("evaluate", case.path, case.folder / "new.csv", *words)
-    assert "expected one triple of columns for each, got 2 triples and 1 list" in done.error

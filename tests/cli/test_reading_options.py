@@ -8,7 +8,6 @@ import pytest
 from command_bank import Command
 from trackerless_bank import write_wire_table
 
-import diffeo_calib as dc
 from diffeo_calib.cli.options import Rows, Units
 from diffeo_calib.cli.tables import measured_table
 from diffeo_calib.measurements.csv.sensors import ReadingColumns
@@ -85,25 +84,3 @@ def test_refused(
     assert done.code in (1, 2)
     assert message in " ".join(done.err.split())
     assert not Path("none.safetensors").exists()
-
-
-@pytest.mark.usefixtures("given_scales")
-def test_readings_that_no_place_explains_are_warned_of(
-    folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(folder)
-    done = command("fit", "t.csv", *ROBOT, *UNITS, *WIRE, "--reading", "height=signed", "-o", "warned.safetensors")
-    assert done.code == 0
-    assert "no place of ball and devices explains the readings" in " ".join(done.err.split())
-
-
-def test_several_kinds_are_one_table(tmp_path: Path) -> None:
-    """Commands take one kind of reading so far; the table that options describe holds any."""
-    (tmp_path / "t.csv").write_text("a,b,x,y,z,C,place,who\n10,20,100,200,300,,,\n20,30,,,,400,,A\n30,40,,,,,s0,\n")
-    csv, units = tmp_path / "t.csv", Units(length="mm", angle="deg")
-    rows = Rows(position=["x,y,z"], reading=["distance=C"], socket="place")
-    arm = dc.from_dh([dc.DHRow(0.1, 0.2, 0.3, 0.4)] * 2, names=["a", "b"])
-    data = measured_table(csv, rows, units).read(arm)
-    assert (data.kinds, data.device_names) == (("position", "distance", "socket"), ["", "device", ""])
-    named = measured_table(csv, Rows(reading=["distance=C"], session="who"), units)
-    assert named.table.readings[0].device == "who"

@@ -92,10 +92,9 @@ def test_options_of_the_registration(fitted: Outcome, site: Site, command: Comma
     done = command("evaluate", model, path, *TABLE, "--free", "base")
     assert done.code == 0
     assert "in the frame of 'flange'" not in done.out
-    for options in (["--free", "base"], ["-o", tmp_path / "m"]):
-        refused = command("evaluate", model, path, *TABLE, *options)
-        assert refused.code == 1
-        assert refused.error.startswith(f"error: {options[0]} without --register; ")
+    refused = command("evaluate", model, path, *TABLE, "-o", tmp_path / "m")
+    assert refused.code == 1
+    assert refused.error.startswith("error: -o without --free; ")
     onto = command("evaluate", model, path, *TABLE, "--free", "both", "-o", model)
     assert onto.error == f"error: -o {model} is the file of MODEL; name another file."
     few = command("evaluate", model, table(site, tmp_path / "two.csv", MOVE, 2), *TABLE, "--free", "both")

@@ -101,7 +101,6 @@ WRONG_TENSORS: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
     "new noise of another size": ("new_noise", lambda t: t[:2, :2]),
     "new noise of one number": ("new_noise", lambda t: t[0, 0]),
     "new noise in single precision": ("new_noise", lambda t: t.float()),
-    "one elastic coefficient less": ("theta", lambda t: t[:-1]),
     "one elastic prior less": ("prior_variance", lambda t: t[:-1]),
     "one elastic prior nothing": ("prior_variance", lambda t: t * (torch.arange(len(t)) < len(t) - 1)),
     "one row less in x": ("x", lambda t: t[:-1]),

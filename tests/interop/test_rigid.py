@@ -92,17 +92,14 @@ def replace_errors(model: dc.CalibratedKinematics, errors: Tensor | None) -> dc.
     return dc.CalibratedKinematics(model.robot, model.map, model.summary, lever=model.lever, rigid_errors=errors)
 
 
-def test_models_of_poses(posed: Case) -> None:
-    found = rigid_kinematics(posed.model)
-    assert found.geometry.markers == 3
-    assert found.rms < nominal_kinematics(posed.model).rms / 2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["pair", "slider"])
-def test_several_markers_and_slides(name: str, request: pytest.FixtureRequest) -> None:
+@pytest.mark.parametrize(
+    "name", ["posed", *(pytest.param(name, marks=pytest.mark.slow) for name in ("pair", "slider"))]
+)
+def test_poses_several_markers_and_slides(name: str, request: pytest.FixtureRequest) -> None:
     model: dc.CalibratedKinematics = request.getfixturevalue(name).model
-    assert rigid_kinematics(model).rms < nominal_kinematics(model).rms / 2
+    found = rigid_kinematics(model)
+    assert found.geometry.markers == model.markers
+    assert found.rms < nominal_kinematics(model).rms / 2
 
 
 @pytest.mark.parametrize("size", [1e-3, 0.2])

@@ -183,7 +183,7 @@ def test_implausible_errors_have_a_sentence(arm: Case) -> None:
     assert not impossible(arm.model, errors.median)
     far = dc.Measurements(arm.test.q, arm.test.points + 0.5)
     assert impossible(arm.model, dc.evaluate(arm.model.__call__, far).median)
-    with pytest.raises(MeasurementError, match=r"moving the measuring device by 866 mm .*--register"):
+    with pytest.raises(MeasurementError, match=r"moving the measuring device by 866 mm .*--free both"):
         dc.evaluate(arm.model, far)
 
 

@@ -80,7 +80,7 @@ class Reading:
 
 Judge = Callable[[Reading], tuple[float, float]]
 """What the median residual of a reading is, m, and how far its points are spread, m."""
-Group = Callable[[Tree, Measurements, Judge], Iterator[Reading]]
+Group = Callable[[Tree, Measurements], Iterator[Reading]]
 
 
 def registered(reading: Reading) -> tuple[float, float]:
@@ -129,7 +129,7 @@ def likely_mistake(
     limit = min(gates.OTHER_READING_LEFT * now, gates.RIGHT_READING)
     decisive = gates.DECISIVE_READING * min(now, 1.0)
     for group in groups or EVERY_GROUP:
-        for reading in group(robot, data, judge):
+        for reading in group(robot, data):
             residual, size = judge(reading)
             share = residual / max(size, 1e-12)
             if share < limit:
@@ -161,7 +161,7 @@ def refuse_or_warn(what: str, *, expected: str, got: str, mistake: str, otherwis
 # --- other readings ---------------------------------------------------------------------------------------------------
 
 
-def other_points(robot: Tree, data: Measurements, _: Judge = registered) -> Iterator[Reading]:
+def other_points(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Points in another unit, of the row before or after, in a frame of the other hand, or of exchanged tips."""
     own, bodies = Reading.of(robot, data), data.points.unflatten(1, (data.origins.shape[1], -1))
     for factor in sorted({one / other for one, other in permutations(UNITS_PER_METRE.values(), 2)}):
@@ -181,12 +181,12 @@ def other_points(robot: Tree, data: Measurements, _: Judge = registered) -> Iter
         yield replace(own, words=words, on=tuple(exchanged.get(tip, tip) for tip in own.on))
 
 
-def other_rotations(robot: Tree, data: Measurements, _: Judge = registered) -> Iterator[Reading]:
+def other_rotations(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Measured poses whose rotations are read in other ways, or whose poses are inverted."""
     return (replace(Reading.of(robot, data), **one._asdict()) for one in rotations.other_rotations(data))
 
 
-def other_units(robot: Tree, data: Measurements, _: Judge = registered) -> Iterator[Reading]:
+def other_units(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Joint values in other units of angles and lengths."""
     own, turning = Reading.of(robot, data), torch.tensor(robot.periodic, dtype=torch.bool, device=data.q.device)
     for factor, words in ANGLE_MISTAKES if any(robot.periodic) else ():
@@ -196,7 +196,7 @@ def other_units(robot: Tree, data: Measurements, _: Judge = registered) -> Itera
         yield replace(own, q=torch.where(turning, data.q, factor * data.q), words=text)
 
 
-def longer_chains(robot: Tree, data: Measurements, _: Judge = registered) -> Iterator[Reading]:
+def longer_chains(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """The same with joints below the given tip, for which the table has columns whose values vary."""
     columns, table = rotations.numeric_table(data)
     if columns is None or robot.source is None or len(robot.tips) > 1:
@@ -221,7 +221,7 @@ def longer_chains(robot: Tree, data: Measurements, _: Judge = registered) -> Ite
             yield Reading(longer, torch.cat([data.q, more], dim=1), data.points, words)
 
 
-def other_columns(robot: Tree, data: Measurements, _: Judge = registered) -> Iterator[Reading]:
+def other_columns(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """One column of the joints or of the position replaced by one of similar name that was not read."""
     columns, table = rotations.numeric_table(data)
     if columns is None:

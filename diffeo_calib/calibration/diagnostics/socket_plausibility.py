@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -93,13 +94,14 @@ def check_registration(
     """
     median, socket = float(found.distances.median()), data.socket_numbers
     far = median > gates.SOCKET_FAR * robot.reach
-    tried = (other_units, other_conventions) if far and around is None else (other_units,)
 
     def left(reading: Reading) -> tuple[float, float]:
         again = register_sockets(robot if around is None else around, reading.q, socket)
         return float(again.distances.median()), max(spread(robot.tip_poses(reading.q)[..., :3, 3]), 1e-9)
 
-    motion = left(Reading.of(robot, data))[1]
+    motion, tried = left(Reading.of(robot, data))[1], [other_units]
+    if far and around is None:
+        tried.append(partial(other_conventions, judge=left))
     fix = "check the unit and the order of the joints, and that rows carry the names of their own sockets: of the "
     refuse_or_warn(
         "these rows do not fit the robot" + ": the ball is in no socket" * far,

@@ -166,7 +166,7 @@ def identify(
     rows = Rows(geometry, (MeasuredPoints.of(q, points, shared),))
     if noise is None:
         return estimated(rows, held, prior)
-    sigma, used = torch.full(points.shape[:2], noise, dtype=torch.float64), prior or Prior()
+    sigma, used = rows.parts[0].q.new_full(points.shape[:2], noise), prior or Prior()
     fit = solve(rows, sigma, used.root(geometry, held), **PRECISE)
     return _identification(rows, fit, noise, "given", prior=used, tails=Tails.none(*points.shape[:2]))
 
@@ -411,7 +411,7 @@ def solve(
         at = torch.from_numpy(u).clone()
         each = zip(weights, rows.slopes(root @ at[:f], at[f:], root), hidden, strict=True)
         slopes = [(w[..., None] * own).masked_fill(h[..., None], 0.0).flatten(0, 2) for w, own, h in each]
-        return torch.cat([*slopes, torch.eye(len(u), dtype=at.dtype)]).numpy()
+        return torch.cat([*slopes, torch.eye(len(u), dtype=at.dtype, device=at.device)]).numpy()
 
     derivatives: Any = jacobian  # scipy's stubs know its names of difference schemes only
     with torch_alone():

@@ -78,7 +78,7 @@ class LensAndBoard(CameraErrors):
         on_tool: whether the camera is on the tool, else the board. lever: of the poses, m.
         apart: (M, 9, c) the same effects apart from the places of the robot and of what is on the tool.
         explained: at the tool, by the rows of each camera; what the fit says is zero before it.
-        larger: see :func:`relative_size`.
+        larger: how much longer lengths in the images are than those of the robot, as a share.
     """
 
     on_tool: bool
@@ -108,25 +108,20 @@ class LensAndBoard(CameraErrors):
                 own = shared.seen_by == number
                 nominal = registration.rms if len(shared.cameras) == 1 else float(away[own].square().mean().sqrt())
                 explained.append(Explained(nominal, 0.0, 0.0, 0.0, 0.0, _corners(shared, number)))
-            places = _places(data, rows, registration, sessions)
-            apart, places = shared.slopes.flatten(0, 1), places.flatten(0, 1)
+            free = _places(data, rows, registration, sessions)
+            apart, places = shared.slopes.flatten(0, 1), free.flatten(0, 1)
             apart = apart - places @ torch.linalg.lstsq(places, apart, driver="gelsd").solution
-            on_tool = data.board is not None
-            larger = relative_size(data, rows, registration, sessions)
+            larger = _relative_size(data, registration, free)
             own = data.bodies.pose_lever(), apart.view_as(shared.slopes), tuple(explained), larger
-            found.append(cls(shared, rows, on_tool, *own))
-            found[-1].check_size()
+            found.append(cls(shared, rows, data.board is not None, *own))
+            if abs(larger) >= SIZE_WARNED:
+                what = "the size of the board does not fit that of the robot"
+                got = f"lengths in the images {100 * abs(larger):.1f} % {'larger' if larger > 0 else 'smaller'}"
+                fix = (
+                    "measure the printed squares with a caliper (printers scale to fit the page), and check their unit"
+                )
+                warn_user(sentence(f"{what}: {got}", fix=fix))
         return found
-
-    def check_size(self) -> None:
-        """Warn of a board whose lengths are not those of the robot as described."""
-        larger = self.larger
-        if abs(larger) < SIZE_WARNED:
-            return
-        what = "the size of the board does not fit that of the robot"
-        got = f"lengths in the images {100 * abs(larger):.1f} % {'larger' if larger > 0 else 'smaller'}"
-        fix = "measure the printed squares with a caliper (printers scale to fit the page), and check their unit"
-        warn_user(sentence(f"{what}: {got}", fix=fix))
 
     def settled(self, found: Settled) -> LensAndBoard:
         spread, cameras, explained = torch.linalg.cholesky(found.covariance), {}, []
@@ -231,16 +226,13 @@ def _at_tool(effects: Tensor, errors: Tensor, part: slice) -> float:
     return _rms_distance((effects[..., part] @ errors[part]).view(*effects.shape[:2], -1).norm(dim=2))
 
 
-def relative_size(
-    data: Measurements, rows: Tensor, registration: Identification, sessions: Sequence[Sessions] = ()
-) -> float:
+def _relative_size(data: Measurements, registration: Identification, places: Tensor) -> float:
     """How much longer the distances of a board from its camera are than a robot as described says, as a share.
 
-    Errors of base, markers, places of other sessions and scale that explain the residuals of the registration, by
-    reweighted least squares. Arguments as of :meth:`LensAndBoard.of_table`.
+    Errors of places, see :func:`_places`, and scale that explain the residuals of the registration, by reweighted least
+    squares.
     """
-    geometry = registration.geometry
-    slopes = torch.cat([_places(data, rows, registration, sessions), data.by_board_size()], 2)
+    geometry, slopes = registration.geometry, torch.cat([places, data.by_board_size()], 2)
     errors, weights = (data.points - geometry.points(data.q)).flatten(1), torch.ones_like(slopes[:, :1, :1])
     found = slopes.new_zeros(slopes.shape[2])
     for _ in range(ROUNDS):

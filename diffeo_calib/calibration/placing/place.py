@@ -42,7 +42,6 @@ from diffeo_calib.fitting.result import Fit, Progress
 from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.observation import Part, Stacked
-from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.cartesian import is_cartesian
@@ -300,10 +299,8 @@ class Placed:
         centre = like.points.unflatten(1, (-1, 3)).mean((0, 1))
         other = OtherRows(data, coordinates, aligned, readings, centre)
         placement = Placement(one.with_rows(other) for one in self.placement)
-        tails = Tails.none(
-            len(data if coordinates is None else coordinates.rows), self.identification.tails.weights.shape[1]
-        )
-        found = replace(self.identification, tails=tails)
+        found, count = self.identification, len(data if coordinates is None else coordinates.rows)
+        found = replace(found, tails=Tails.none(count, found.tails.weights.shape[1]))
         own = replace(self, data=data, coordinates=aligned, placement=placement, identification=found)
         rows = own._rows(like.nominal.under(data.payload), like.theta)
         rows = replace(rows, held=like.held, adrift=like.adrift)
@@ -311,30 +308,28 @@ class Placed:
 
     def _rows(self, nominal: GeometryMap, theta: Tensor) -> TangentData:
         """Rows of several kinds, or of readings: the numbers of every row, those of its first body first."""
-        own, told, dim = None, None, 3 * nominal.geometry.markers
+        own, told, found = None, None, self.identification
+        weights, weighed = found.tails.weights, [one.rows for one in self.readings]
         if self.coordinates is not None:
-            table, own_rows = self.coordinates
-            geometry, markers = nominal.geometry, table.markers
-            on_markers = nominal.with_geometry(geometry.with_tool(geometry.tool[:markers], geometry.on[:markers]))
-            tool = theta[: on_markers.geometry.size], theta[geometry.size :]
-            own = self._coordinates(on_markers.rows(own_rows), torch.cat(tool), table)
-            if len(table) == len(self.data):
+            own = self._coordinates(nominal, theta, self.coordinates)
+            if len(own.x) == len(self.data):
                 return own
-            told = Told(own_rows, own.y, own.noise_model)
-        rows = stacked(self.data.q, told, self.readings, dim)
-        weights = self.data.q.new_ones(len(self.data), rows.noise_model.bodies)
-        if own is not None and told is not None:
-            weights[told.rows] = own.tails.weights
-        else:
-            weights[torch.cat([one.rows for one in self.readings])] = self.identification.tails.weights
-        tails = replace(self.identification.tails, weights=weights)
-        at = nominal, theta, self.data.q
+            weights, weighed = own.tails.weights, [self.coordinates.rows]
+            told = Told(self.coordinates.rows, own.y, own.noise_model)
+        rows = stacked(self.data.q, told, self.readings, 3 * nominal.geometry.markers)
+        every = self.data.q.new_ones(len(self.data), rows.noise_model.bodies)
+        every[torch.cat(weighed)] = weights
+        at, tails = (nominal, theta, self.data.q), replace(found.tails, weights=every)
         return TangentData(*at, rows.y, rows.noise_model, tails, observe=rows.observe, beside=own)
 
-    def _coordinates(self, nominal: GeometryMap, theta: Tensor, table: Measurements) -> TangentData:
-        """Rows that tell the coordinates of all markers."""
-        found = self.identification
-        noise = NoiseModel.of(with_best_seen_point(table, found), found.noise)
+    def _coordinates(self, nominal: GeometryMap, theta: Tensor, own: Coordinates) -> TangentData:
+        """Rows that tell coordinates, of the markers that they show."""
+        (table, rows), geometry, found = own, nominal.geometry, self.identification
+        on_markers = nominal.with_geometry(
+            geometry.with_tool(geometry.tool[: table.markers], geometry.on[: table.markers])
+        )
+        theta = torch.cat([theta[: on_markers.geometry.size], theta[geometry.size :]])
+        nominal, noise = on_markers.rows(rows), NoiseModel.of(with_best_seen_point(table, found), found.noise)
         seen, predicted = table.points.flatten(1), nominal(table.q, theta)
         y = torch.where(seen.isnan(), predicted, seen)  # hidden markers: any value would do
         worst = found.tails.weights.unflatten(1, (noise.bodies, -1)).amin(2)  # a pose is as wrong as its worst point

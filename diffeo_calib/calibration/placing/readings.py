@@ -56,7 +56,7 @@ class ReadingDevices(DeviceSet):
 
     Args:
         data: the readings. devices: where their devices are.
-        rows: (M,) numbers of the rows among those of the calibration. numbers: (r,) where their r numbers stand there.
+        rows: (M,) numbers of the rows among those of the calibration.
         frame: the frame of their places, in words.
         known: (D, k) standard deviations of the devices' increments after a fit, m or rad; None before.
     """
@@ -64,13 +64,17 @@ class ReadingDevices(DeviceSet):
     data: Readings
     devices: Devices
     rows: Tensor
-    numbers: Tensor
     frame: str = "the robot's base"
     known: Tensor | None = None
 
     @property
     def size(self) -> int:
         return self.devices.freedom
+
+    @property
+    def numbers(self) -> Tensor:
+        """(r,) where their r numbers stand in these rows."""
+        return torch.arange(self.data.values.shape[1], device=self.rows.device)
 
     @property
     def device(self) -> Tensor:
@@ -211,10 +215,7 @@ def reading_sets(
 ) -> tuple[ReadingDevices, ...]:
     """Sets of devices and the rows that they measured; ``beside``: rows of the same robot that tell coordinates."""
     frame = "the robot's base" if beside is None or beside.without_device else "the measuring frame"
-    return tuple(
-        ReadingDevices(table, own, rows, torch.arange(table.values.shape[1], device=rows.device), frame)
-        for (table, rows), own in zip(readings, devices, strict=True)
-    )
+    return tuple(ReadingDevices(table, own, rows, frame) for (table, rows), own in zip(readings, devices, strict=True))
 
 
 def stages_beside(stages: Stages, readings: Sequence[OtherReadings], table: Measurements) -> Stages:

@@ -123,8 +123,7 @@ class Sessions(DeviceSet):
         if len(device.table.present_sessions) < 2:
             return [], own
         found = Sessions.around(device.table, set_up_kind(device.table), geometry, seen)
-        found = found.of_rows(device.rows, len(own.table))
-        return [found.of_rows(own.rows, count)], own._replace(table=found.aligned(own.table))
+        return [found.of_rows(own.rows[device.rows], count)], own._replace(table=found.aligned(own.table))
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 1 place       where the measuring device stands and the markers sit now (kinematics/re_registration)
 2 rows        weights of the new rows, seen by the old model; whether the markers moved, by their evidence
 3 changes     what else has changed: named parts may drift (changes.py), and everything a little
-4 fit         the exact model of old and new rows, with the old scales (both_dates.py)
+4 fit         the exact model of old and new rows, with the old scales (kinematics/re_registration)
 """
 
 from __future__ import annotations
@@ -40,8 +40,7 @@ from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.provenance import Provenance, check_note
-from diffeo_calib.kinematics.re_registration.both_dates import both_dates
-from diffeo_calib.kinematics.re_registration.register_again import carried_devices, devices_beside
+from diffeo_calib.kinematics.re_registration.register_again import both_dates, carried_devices, devices_beside
 from diffeo_calib.kinematics.re_registration.registered_map import Registration, moved
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.sensors.errors import Evaluations

@@ -113,6 +113,11 @@ def estimate_tails(
     return _among_gross(data, scales, tails, seed)
 
 
+def weighed(data: TangentData, scales: Hyperparameters, seed: int) -> TangentData:
+    """The measurements with the weights that outliers get with these scales."""
+    return data.with_tails(estimate_tails(data, scales, seed))
+
+
 def _among_gross(data: TangentData, scales: Hyperparameters, tails: Tails, seed: int) -> Tails:
     """The weights beside gross rows, if left-out errors show any."""
     for _ in range(ROUNDS):

@@ -9,24 +9,9 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge
+from diffeo_calib.cli import models, printed
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.declarations import EvaluateOptions
-from diffeo_calib.cli.models import (
-    another_date_lines,
-    check_payload_column,
-    load_kinematics,
-    provenance_lines,
-    table_of,
-)
-from diffeo_calib.cli.printed import (
-    ErrorTable,
-    accept,
-    expectation_lines,
-    outlier_lines,
-    parsed_limit,
-    registration_lines,
-    socket_lines,
-)
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.device import HOST
@@ -55,11 +40,11 @@ COLUMNS = ("line", "used_in_fit", "kind", "device", "marker", "dx", "dy", "dz", 
 
 def run(options: EvaluateOptions) -> None:
     """Run the command."""
-    model = load_kinematics(options.model)
-    source = table_of(model, options.csv, options.rows, options.units)
-    limit = parsed_limit(options.tolerance)
-    check_payload_column(model, source.table.payload)
-    say(*provenance_lines(model))
+    model = models.load_kinematics(options.model)
+    source = models.table_of(model, options.csv, options.rows, options.units)
+    limit = printed.parsed_limit(options.tolerance)
+    models.check_payload_column(model, source.table.payload)
+    say(*models.provenance_lines(model))
     data = source.read(model.robot)
     if options.free is not None:
         return _registered(model, data, options)
@@ -77,20 +62,20 @@ def run(options: EvaluateOptions) -> None:
     if places.numbers:
         record.add(found_from_rows={"numbers": places.numbers, "sentences": list(places.found)})
     say(*map(plain, places.found))
-    say(*(line for errors in found.values() for line in socket_lines(errors, "all rows")))
-    say(*expectation_lines(model, data))
+    say(*(line for errors in found.values() for line in printed.socket_lines(errors, "all rows")))
+    say(*printed.expectation_lines(model, data))
     warn_outside_range(model, data.q)
     source.warn_of_other_frames(rows_of_other_frames(model, data.q))
     if judged.refusal is not None:
         raise MeasurementError(judged.refusal)
     positions = 0 if found.positions is None else len(found.positions.errors)
     which = "rows" if judged.rows == positions else f"rows, evenly chosen of {positions},"
-    say(*outlier_lines(judged.outliers, judged.rows, which))
+    say(*printed.outlier_lines(judged.outliers, judged.rows, which))
     for text in judged.causes:
         warn_user(text)
     if limit is not None:
         new, which = (found, "") if bool(used.all()) else (found.rows(~used), " not used in the fit")
-        accept(accuracy(model, new.values(), limit.unit, which=which), limit)
+        printed.accept(accuracy(model, new.values(), limit.unit, which=which), limit)
 
 
 def _show(model: CalibratedKinematics, found: Evaluations, used: Tensor, seen: Measurements | None, name: str) -> None:
@@ -103,7 +88,7 @@ def _show(model: CalibratedKinematics, found: Evaluations, used: Tensor, seen: M
             of_rows |= {"used in the fit": errors.rows(own), "not used in the fit": errors.rows(~own)}
         of_devices, what = _by_device(errors), "session" if positions else "device"
         expected = expected_rms(model, seen, errors.errors.shape[1]) if positions and seen is not None else None
-        table = ErrorTable(errors, f"of {plain(name)}", "rows", expected=positions and seen is not None)
+        table = printed.ErrorTable(errors, f"of {plain(name)}", "rows")
         for label, some in of_rows.items():
             table.add(some, f"{some.count} {label}", expected=expected)
         for device, some in of_devices.items():
@@ -136,7 +121,7 @@ def _registered(model: CalibratedKinematics, data: Any, options: EvaluateOptions
     """Find device and markers anew; print what was found and the errors before and after, and write the model."""
     output = options.output
     warn_outside_range(model, data.q)
-    say(*another_date_lines(model))
+    say(*models.another_date_lines(model))
     found = model.registered(data, free=options.free or "both", learn=False)
     if output is not None:
         save(found, output)  # before anything is printed: output may be cut off
@@ -147,11 +132,11 @@ def _registered(model: CalibratedKinematics, data: Any, options: EvaluateOptions
     known = found.registration is not None and found.registration.rms_before is not None
     before = residuals(model, place(model, data), data) if known else None
     for kind, after in kinds.items():
-        table = ErrorTable(after, f"of {plain(options.model.name)}", "rows")
+        table = printed.ErrorTable(after, f"of {plain(options.model.name)}", "rows")
         if before is not None:
             table.add(before[kind], f"{after.count} with the places of the fit")
         table.add(after, f"{after.count} with places found anew")
         out.print(table)
-    say(*map(plain, (*registration_lines(found), *placement_sentences(found))))
+    say(*map(plain, (*printed.registration_lines(found), *placement_sentences(found))))
     if output is not None:
         say(f"registered model: {output}")

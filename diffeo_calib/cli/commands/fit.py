@@ -11,24 +11,15 @@ from typing import Any
 import typer
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
-from diffeo_calib.calibration.diagnostics.outliers import Outlier, contradicted
+from diffeo_calib.calibration.diagnostics.outliers import contradicted
 from diffeo_calib.calibration.judgement import check_errors
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, KindErrors, errors_by_kind
+from diffeo_calib.cli import printed
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, out, progress_bar, say
 from diffeo_calib.cli.declarations import DemoOptions, FitOptions, ReportOptions
 from diffeo_calib.cli.main import app
 from diffeo_calib.cli.models import load_kinematics, made_by_command, provenance_lines, robot_of, table_of
-from diffeo_calib.cli.printed import (
-    ErrorTable,
-    expectation_lines,
-    outlier_lines,
-    parsed_length,
-    parts_table,
-    placement_lines,
-    socket_lines,
-    stage_line,
-)
 from diffeo_calib.cli.record import entries_by_kind, kind_entry, make_folder, record
 from diffeo_calib.cli.tables import measured_table
 from diffeo_calib.common.errors import PACKAGE, InputError, printable
@@ -77,8 +68,11 @@ def run(given: FitOptions) -> None:
     say(*_verdict(result, judged))
     _show_errors(result, in_train, None if test is None else held_out)
     _show_findings(result, len(train))
-    wrong = sorted(_contradicted(result, held_out), key=lambda outlier: -outlier.distance)
-    say(*outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"))
+    wrong = [outlier for one in held_out.values() for outlier in contradicted_in_sockets(result.model, one.rows)]
+    for one in held_out.values():
+        wrong += contradicted(result.model, one.rows) if one.one.what == ERRORS else ()
+    wrong.sort(key=lambda outlier: -outlier.distance)
+    say(*printed.outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"))
     say(*_lines_about_places(result, data, held_out, hand_eye))
     say(*_advice(judged, wrong=bool(wrong)), f"model: {given.output}")
     shown, rows = (train, "training") if test is None else (test, "held-out")
@@ -90,11 +84,10 @@ def _verdict(result: CalibrationResult, judged: list[Any]) -> Iterator[str]:
     """How accurate the robot is now, first of all: by measured positions, or by what the model expects."""
     for stage in judged:
         geometry, model = stage[GEOMETRIC], stage[CALIBRATED]
-        unit, per_unit = model.shown
-        rms, most, before = (f"{per_unit * value:.3f}" for value in (model.rms, model.p95, geometry.rms))
-        yield f"held out: {rms} {unit} RMS, 95 % below {most} ({model.count} rows; geometry alone {before} {unit} RMS)"
+        rms, most, before = (f"{1e3 * value:.3f}" for value in (model.rms, model.p95, geometry.rms))
+        yield f"held out: {rms} mm RMS, 95 % below {most} ({model.count} rows; geometry alone {before} mm RMS)"
     if not judged:
-        yield stage_line(result.model, result.stages, result.expected)
+        yield printed.stage_line(result.model, result.stages, result.expected)
 
 
 def _end(result: CalibrationResult, in_train: Errors, judged: Errors) -> None:
@@ -108,30 +101,23 @@ def _end(result: CalibrationResult, in_train: Errors, judged: Errors) -> None:
         raise typer.Exit(EXIT_UNCONVERGED)
 
 
-def _contradicted(result: CalibrationResult, errors: Errors) -> Iterator[Outlier]:
-    """Rows of any kind that took no part in the fit and that look wrong."""
-    for one in errors.values():
-        yield from contradicted(result.model, one.rows) if one.one.what == ERRORS else ()
-        yield from contradicted_in_sockets(result.model, one.rows)
-
-
 def _lines_about_places(
     result: CalibrationResult, data: Any, held_out: Errors, hand_eye: dict[str, HandEye]
 ) -> Iterator[str]:
     """Hidden markers, and where devices, base and markers, or camera and board, were found."""
     placed = result.placed
     placement = list(hand_eye_sentences(hand_eye)) or list(
-        placement_lines(result.model.geometry, poses=placed.lever is not None, ball=placed.ball)
+        printed.placement_lines(result.model.geometry, poses=placed.lever is not None, ball=placed.ball)
     )
     for one in held_out.values():
-        yield from socket_lines(one.one, "held out")
+        yield from printed.socket_lines(one.one, "held out")
     own, _ = divided(data)
     if own is not None and not placed.free:
         yield from own.table.device_rows().hidden_lines()
     yield from (*result.placement.sentences(), *map(str, result.lengths[:1]))
     if any(one.one.what == ERRORS for one in held_out.values()):  # else they are the verdict
-        yield stage_line(result.model, result.stages, result.expected)
-    yield from expectation_lines(result.model, data, result.expected)
+        yield printed.stage_line(result.model, result.stages, result.expected)
+    yield from printed.expectation_lines(result.model, data, result.expected)
     advice = next(filter(None, (one.size_advice() for one in result.placement)), None)
     share, whole = result.expected.size_share, 1e3 * result.expected.workspace
     if advice is not None and share > LARGE_SHARE:
@@ -182,19 +168,18 @@ def _record(result: CalibrationResult, in_train: Errors, held_out: Errors, given
 
 def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors | None) -> None:
     """Print the errors of every stage on the training rows and on the held-out rows, if any, kind by kind."""
-    for place, (kind, one) in enumerate(in_train.items()):
-        table = ErrorTable(one.one, "by stage", "stage", "rows")
+    fitted = "was held out: these are errors on rows that were fitted"
+    none = [f"no row {fitted}, those of new rows are larger (leave-one-out RMS: {result.left_out.rms_text})"]
+    for kind, one in in_train.items():
+        table = printed.ErrorTable(one.one, "by stage", "stage", "rows")
         other = (held_out or {}).get(kind)
         for name, errors in one.stages.items():
             table.add(errors, name, f"{errors.count} training")
             if other is not None:
                 table.add(other.stages[name], name, f"{other.stages[name].count} held out")
         out.print(table)
-        if held_out is not None and other is None:
-            say("no row of this kind was held out: these are errors on rows that were fitted")
-        if held_out is None and place == 0:
-            what = "these are errors on rows that were fitted, those of new rows are larger"
-            say(f"no row was held out: {what} (leave-one-out RMS: {result.left_out.rms_text})")
+        say(*none if held_out is None else [f"no row of this kind {fitted}"] * (other is None))
+        none = []
 
 
 def _advice(judged: list[Any], *, wrong: bool) -> Iterator[str]:
@@ -212,8 +197,8 @@ def _show_findings(result: CalibrationResult, rows: int) -> None:
     """Print the rows that look wrong and how the fit ended; with --verbose also what each part explains."""
     detailed = logging.getLogger(PACKAGE).isEnabledFor(logging.INFO)
     if detailed:
-        out.print(parts_table(result.parts))
-    say(*(wave.sentence for wave in result.gear_lines), *outlier_lines(result.outliers, rows), result.status)
+        out.print(printed.parts_table(result.parts))
+    say(*(wave.sentence for wave in result.gear_lines), *printed.outlier_lines(result.outliers, rows), result.status)
     if detailed:
         left_out, fitted = result.leave_one_out, result.fit
         if left_out.effective is not None:
@@ -229,7 +214,7 @@ def run_report(wanted: ReportOptions) -> None:
     model, data = load_kinematics(wanted.model), None
     if wanted.csv is not None:
         data = table_of(model, wanted.csv, wanted.rows, wanted.units).read(model.robot)
-    tolerance = parsed_length(wanted.tolerance)
+    tolerance = printed.parsed_length(wanted.tolerance)
     if tolerance is not None and data is not None and not bool(unseen(model, data.q).any()):
         expected, fix = "rows that took no part in fit and registration", "measure more rows, or leave the table out"
         raise InputError.of("rows to hold against --tolerance", expected=expected, got=f"{len(data)} that did", fix=fix)
@@ -238,14 +223,15 @@ def run_report(wanted: ReportOptions) -> None:
         found = write_report(model, wanted.output, data, **how, progress=progress)
     say(*provenance_lines(model))
     words, stages = verdict(found, tolerance), dict(found.expected)
-    record.add(**entries_by_kind(found.kinds), expected_error_by_stage_m=stages, left_out=not found.shown.new)
+    kinds = {kind: one.stages for kind, one in found.kinds.items()}
+    record.add(**entries_by_kind(kinds), expected_error_by_stage_m=stages, left_out=not found.shown.new)
     record.add(verdict=words, advice=list(advice(found)), files={"report": wanted.output})
     if found.shown.predictions is not None:
         record.add(coverage_95=found.shown.predictions.coverage())
     if data is not None and not found.shown.new:
         each = "as fitted" if not found.errors else "each predicted by all others"
         say(f"all rows of the table were used before: the rows of the fit are shown, {each}")
-    say(words, *expectation_lines(model, None, found.deviations.error), f"report: {wanted.output}")
+    say(words, *printed.expectation_lines(model, None, found.deviations.error), f"report: {wanted.output}")
 
 
 POSITION = ("measurement_x", "measurement_y", "measurement_z")

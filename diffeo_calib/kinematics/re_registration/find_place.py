@@ -12,7 +12,6 @@ pairs, which may hide each other.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from math import exp, log
 from typing import NamedTuple
 
@@ -190,51 +189,49 @@ class SetUp:
         return self.free * self.old.new_tensor(own)
 
     def starts(self, widest: float) -> list[NewRows]:
-        """With the markers at their old places, if they are known; with markers anywhere, if they may be."""
+        """The rows around each of the places where a search may begin, with the widest prior of the markers, m."""
+        places, fitted = self._places(widest), self.model.unregistered
+        rough = places[0][0]
+        noise, there = self._noise(rough), self.data.in_frames(torch.linalg.inv(rough).expand(len(self.data), -1, -1))
+        centre, nothing = self._seen(rough).flatten(0, 1).nanmean(0), noise.new_zeros(*noise.shape[:2], 0)
+        return [
+            NewRows(
+                fitted=fitted,
+                points=FlangePoints(self.nominal, markers, same=self.same),
+                transform=T,
+                q=self.data.q,
+                y=self._seen(T).flatten(1).nan_to_num(0.0),
+                noise=noise,
+                visible=measured_coordinates(noise),
+                shared=torch.cat([nothing, *(errors.slopes for errors in there.shared_errors())], 2),
+                deviations=self.deviations(widest),
+                away=torch.cat([centre.new_zeros(6), (self.old - markers).flatten()]),
+                known=self._earlier(centre),
+                by_fit=self._by_fit(),
+                centre=centre,
+                observe=None,
+                drifts=nothing.flatten(0, 1),
+            )
+            for T, markers in places
+        ]
+
+    def _places(self, widest: float) -> list[tuple[Tensor, Tensor]]:
+        """Frames (4, 4) and markers (P, 3), m: these at their old places, if known; and anywhere, if they may be."""
         framed, points = bool(self.free[0]), self.data.points
-        starts = [self.at_old_places()] if self.known or not framed else []
+        if framed and not self.known:
+            return [self.anywhere()]
         may = self.free[6:].view(points.shape[1], -1).any(1)
         shown = (~points.isnan()).any(2).any(0) | ~may  # else some marker could be anywhere
         # as many coordinates as unknowns would fit any place
-        if framed and bool(may.any()) and bool(shown.all()) and widest >= OTHER_MARKER:
-            starts += [self.anywhere()] if len(known(points)) > len(self.free) else []
-        return [self.rows(widest, *start) for start in starts]
-
-    def rows(self, metres: float, T: Tensor, markers: Tensor) -> NewRows:
-        """The rows around a frame (4, 4) and markers (P, 3), m."""
-        centre, noise = self._seen(self.rough).flatten(0, 1).nanmean(0), self.noise
-        there = self.data.in_frames(torch.linalg.inv(self.rough).expand(len(self.data), -1, -1))
-        nothing = noise.new_zeros(*noise.shape[:2], 0)
-        return NewRows(
-            fitted=self.model.unregistered,
-            points=FlangePoints(self.nominal, markers, same=self.same),
-            transform=T,
-            q=self.data.q,
-            y=self._seen(T).flatten(1).nan_to_num(0.0),
-            noise=noise,
-            visible=measured_coordinates(noise),
-            shared=torch.cat([nothing, *(errors.slopes for errors in there.shared_errors())], 2),
-            deviations=self.deviations(metres),
-            away=torch.cat([centre.new_zeros(6), (self.old - markers).flatten()]),
-            known=self._earlier(centre),
-            by_fit=self._by_fit(),
-            centre=centre,
-            observe=None,
-            drifts=nothing.flatten(0, 1),
-        )
+        open_ = framed and bool(may.any()) and bool(shown.all()) and len(known(points)) > len(self.free)
+        return [self.at_old_places(), *([self.anywhere()] if open_ and widest >= OTHER_MARKER else [])]
 
     def _seen(self, T: Tensor) -> Tensor:
         """The measured points in the frame of the map, T^-1 y, m; NaN where hidden."""
         return (self.data.points - T[:3, 3]) @ T[:3, :3]
 
-    @cached_property
-    def rough(self) -> Tensor:
-        """(4, 4) from the frame of the map to the measuring frame, in closed form, m."""
-        return (self.at_old_places() if self.known else self.anywhere())[0]
-
-    @cached_property
-    def noise(self) -> Tensor:
-        """(M, 3 P, 3 P) covariance of the rows, m^2, without information where hidden.
+    def _noise(self, rough: Tensor) -> Tensor:
+        """(M, 3 P, 3 P) covariance of the rows, m^2, without information where hidden; ``rough``: where the device is.
 
         For another number of markers each has the mean covariance of the fitted ones.
         """
@@ -242,7 +239,7 @@ class SetUp:
         factor = float(block.trace() / fit.new_noise.trace()) if self.known else None
         if len(block) != size:
             block = torch.block_diag(*[own_blocks(block[None], len(block) // 3)[0].mean(0)] * self.data.markers)
-        total = noise_of_rows(fit, self.data, self.rough, block, factor)
+        total = noise_of_rows(fit, self.data, rough, block, factor)
         return without_hidden(total, self.data.visible.repeat_interleave(3, 1))
 
     def _earlier(self, centre: Tensor) -> Tensor:

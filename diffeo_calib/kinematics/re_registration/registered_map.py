@@ -48,7 +48,7 @@ from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.measurements.poses import POINTS, own_blocks
 from diffeo_calib.regression.conditional import Conditional
-from diffeo_calib.robots.se3 import nearest_rotations, skew, transforms
+from diffeo_calib.robots.se3 import nearest_rotations, transforms
 from diffeo_calib.sensors.set_ups import frame_slopes
 
 LARGE_EXCESS = 3.0
@@ -336,40 +336,23 @@ def undetermined(
     limit = max(HARDLY * usual, WELL_KNOWN_M)
     together = covariance[:6, 6:]
     frame = covariance[:6, :6] - together @ torch.linalg.pinv(covariance[6:, 6:], hermitian=True) @ together.mT
-    found = [
-        _sentence("the place of the measuring frame", frame[:3, :3], limit, "mm", SPREAD),
-        _sentence("the turn of the measuring frame", frame[3:, 3:], limit / max(arm, usual), "degrees", SPREAD),
-        *(_frame_on_tip if rigid else _markers_on_tip)(covariance[6:, 6:], markers, limit, tips),
+    parts = [
+        ("the place of the measuring frame", frame[:3, :3], limit, "mm", SPREAD),
+        ("the turn of the measuring frame", frame[3:, 3:], limit / max(arm, usual), "degrees", SPREAD),
     ]
-    return tuple(text for text in found if text)
-
-
-def _markers_on_tip(covariance: Tensor, markers: Tensor, limit: float, tips: Sequence[str]) -> list[str]:
-    """About each of the markers."""
-    places = covariance.unflatten(0, (-1, 3)).unflatten(2, (-1, 3)).diagonal(dim1=0, dim2=2).movedim(-1, 0)  # (P, 3, 3)
-    names = [f"marker {k}" for k in range(len(markers))] if len(markers) > 1 else ["the marker"]
-    named = zip(names, tips, places, strict=True)
-    return [_sentence(f"the place of {name} on '{tip}'", place, limit, "mm", TURN) for name, tip, place in named]
-
-
-def _frame_on_tip(covariance: Tensor, markers: Tensor, limit: float, tips: Sequence[str]) -> list[str]:
-    """About each of the frames that three points represent."""
-    blocks = own_blocks(covariance[None], len(markers) // POINTS)[0]
-    each = zip(blocks, markers.split(POINTS), tips[::POINTS], strict=True)
-    return [text for one in each for text in _about_frame(*one, limit)]
-
-
-def _about_frame(covariance: Tensor, markers: Tensor, tip: str, limit: float) -> list[str]:
-    """About one frame, covariance (9, 9) and points (3, 3)."""
-    arms = markers - markers.mean(0)
-    eye = torch.eye(3, dtype=markers.dtype, device=markers.device).expand(len(arms), 3, 3)
-    motion = torch.linalg.pinv(torch.cat([eye, -skew(arms)], 2).flatten(0, 1))  # (6, 3 P)
-    frame = motion @ covariance @ motion.mT
-    lever = float(arms.square().sum(1).mean().sqrt())
-    return [
-        _sentence(f"the place of the measured frame on '{tip}'", frame[:3, :3], limit, "mm", TURN),
-        _sentence(f"the turn of the measured frame on '{tip}'", frame[3:, 3:], limit / lever, "degrees", TURN),
-    ]
+    each = POINTS if rigid else 1
+    blocks = own_blocks(covariance[None, 6:, 6:], len(markers) // each)[0]
+    for k, (own, points, tip) in enumerate(zip(blocks, markers.split(each), tips[::each], strict=True)):
+        if not rigid:
+            name = f"marker {k}" if len(markers) > 1 else "the marker"
+            parts.append((f"the place of {name} on '{tip}'", own, limit, "mm", TURN))
+            continue
+        arms = points - points.mean(0)
+        motion = torch.linalg.pinv(frame_slopes(points[None], points.mean(0))[0])  # (6, 9)
+        moved, lever = motion @ own @ motion.mT, float(arms.square().sum(1).mean().sqrt())
+        parts.append((f"the place of the measured frame on '{tip}'", moved[:3, :3], limit, "mm", TURN))
+        parts.append((f"the turn of the measured frame on '{tip}'", moved[3:, 3:], limit / lever, "degrees", TURN))
+    return tuple(text for part in parts if (text := _sentence(*part)))
 
 
 def _sentence(what: str, covariance: Tensor, limit: float, unit: str, fix: str) -> str:

@@ -138,10 +138,19 @@ def read_table(
     cells = [[row[place] for row in rows] for place in places]
     words = [["" if text.lower() == "nan" else text for text in own] for own in cells[len(columns.names) :]]
     numbers, notes = _numbers(path, columns, lines, cells[: len(columns.names)])
-    _check_values(path, columns, numbers, lines)
+    for group, values in zip(columns.groups.values(), columns.parts(numbers).values(), strict=True):
+        check = group.check
+        wrong = [] if check is None else (values < 0 if check.zero else values <= 0).nonzero().tolist()
+        if check is not None and wrong:
+            bad = [(lines[row], group.names[k], f"{float(values[row, k]):g}") for row, k in wrong]
+            raise bad_cells(path, bad, check.expected, check.fix)
     for text in ["; ".join(file.notes + notes)] * bool(file.notes + notes) + columns.unlikely_units(numbers):
         warn_user(f"file '{path}': {text}")
-    _check_filled(path, columns, numbers)
+    for own in columns.hideable:
+        if bool(numbers[:, own.values].isnan().all()):
+            names = few([columns.names[place] for place in own.values])
+            what, fix = f"file '{path}', columns {names}: empty in all {len(numbers)} lines", "leave them out"
+            raise MeasurementError.of(what, expected=f"some line that {own.word}", fix=fix)
     markers = columns.hideable[: len(columns.table.triples)]
     for own in markers if zeros else ():
         _hide_zeros(path, columns, numbers, lines, own)
@@ -169,13 +178,14 @@ def _numbers(
         raise bad_cells(path, bad, "a number", number_hint(bad[0][2], decimal))
     numbers = torch.tensor(found, dtype=torch.float64, device=HOST).T
     empty, large = numbers.isnan(), numbers.abs() >= LARGEST_NUMBER
-    excused, shows = torch.zeros_like(empty), torch.zeros_like(empty[:, 0])
-    seen = [~(empty[:, own.values].all(1) | large[:, own.values].all(1)) for own in hideable]
-    for own, here in zip(hideable, seen, strict=True):
-        excused[:, [*own.values, *own.deviations]] |= ~here[:, None]
+    needed, shows = torch.zeros_like(empty), torch.zeros_like(empty[:, 0])
+    theirs = torch.zeros_like(empty[:1])
+    for own in hideable:
+        here, every = ~(empty[:, own.values].all(1) | large[:, own.values].all(1)), [*own.values, *own.deviations]
+        needed[:, every] |= here[:, None]
+        theirs[:, every] = True
         shows |= here
-    for own, here in zip(hideable, seen, strict=True):
-        excused[:, own.deviations] &= ~here[:, None]
+    excused = theirs & ~needed
     if hideable and not columns.all_hidden:
         excused[:, len(columns.joints.columns) :] |= ~shows[:, None]  # the row is left out
     gaps = empty | large
@@ -195,25 +205,6 @@ def _numbers(
     at = few(sorted({line for own in words.values() for line in own}))
     notes = [f"cells that hold {said} are taken as empty (line {at})"] * bool(words)
     return numbers.masked_fill(gaps, math.nan), notes
-
-
-def _check_values(path: Path, columns: Columns, numbers: Tensor, lines: Sequence[int]) -> None:
-    """MeasurementError for numbers (N, c) of a wrong sign."""
-    for group, values in zip(columns.groups.values(), columns.parts(numbers).values(), strict=True):
-        check = group.check
-        wrong = [] if check is None else (values < 0 if check.zero else values <= 0).nonzero().tolist()
-        if check is not None and wrong:
-            bad = [(lines[row], group.names[k], f"{float(values[row, k]):g}") for row, k in wrong]
-            raise bad_cells(path, bad, check.expected, check.fix)
-
-
-def _check_filled(path: Path, columns: Columns, numbers: Tensor) -> None:
-    """MeasurementError for a marker, frame or reading that no row shows."""
-    for own in columns.hideable:
-        if bool(numbers[:, own.values].isnan().all()):
-            names = few([columns.names[place] for place in own.values])
-            what, fix = f"file '{path}', columns {names}: empty in all {len(numbers)} lines", "leave them out"
-            raise MeasurementError.of(what, expected=f"some line that {own.word}", fix=fix)
 
 
 def _hide_zeros(path: Path, columns: Columns, numbers: Tensor, lines: Sequence[int], own: Hideable) -> None:

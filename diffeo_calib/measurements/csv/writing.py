@@ -206,7 +206,15 @@ def _sheet(whole: Observations, table: TableFormat) -> tuple[TableFormat, list[A
     if device is not None:
         position = table.position or [[f"{prefix}{axis}" for axis in "xyz"] for prefix in device.prefixes]
         on = device.on and list(device.bodies.tips(device.on))
-        table = _with_names(device, replace(table, position=position, remounted=device.remounted, on=on))
+        table = replace(table, position=position, remounted=device.remounted, on=on)
+        bodies, triples = device.seen_bodies.shape[1], table.triples
+        check_count("position triples", triples, bodies, "marker" if device.poses is None else "frame")
+        if device.poses is not None:
+            table = table.for_writing(rotation_std=device.rotation_std is not None, prefixes=device.prefixes)
+        if device.std is not None:
+            std = table.std or [f"std_{name}" for triple in triples for name in triple]
+            check_count("columns of standard deviations", flat_names(std), 3 * len(triples), "coordinate")
+            table = replace(table, std=std)
     known = [*whole.covariate_names, *["payload"] * (whole.payload is not None)]
     beside = {name: getattr(table, name) or name for name in known}
     own = session if device is not None and device.session is not None else None
@@ -215,19 +223,6 @@ def _sheet(whole: Observations, table: TableFormat) -> tuple[TableFormat, list[A
     readings = tuple(one for one in others if one not in (None, sockets))
     table = replace(table, **beside, sockets=sockets, readings=readings, session=own)
     return table, [one or PositionColumns(table.for_reading()) for one in others]
-
-
-def _with_names(data: Any, table: TableFormat) -> TableFormat:
-    """The format with the columns of rotations and deviations."""
-    bodies, triples = data.seen_bodies.shape[1], table.triples
-    check_count("position triples", triples, bodies, "marker" if data.poses is None else "frame")
-    if data.poses is not None:
-        table = table.for_writing(rotation_std=data.rotation_std is not None, prefixes=data.prefixes)
-    if data.std is None:
-        return table
-    std = [f"std_{name}" for triple in triples for name in triple] if table.std is None else table.std
-    check_count("columns of standard deviations", flat_names(std), 3 * len(triples), "coordinate")
-    return replace(table, std=std)
 
 
 def _others(whole: Observations, session: str | None) -> list[Any]:

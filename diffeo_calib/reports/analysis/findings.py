@@ -23,6 +23,7 @@ from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
     check_rows,
+    motions,
     place,
     placement_sentences,
     positions_of,
@@ -31,7 +32,6 @@ from diffeo_calib.kinematics.evaluation import (
     some_rows,
 )
 from diffeo_calib.kinematics.joint_ranges import SAME_CONFIGURATION
-from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
@@ -74,12 +74,17 @@ class Shown(NamedTuple):
     devices: Sequence[str] = ()
 
 
-class OwnErrors(NamedTuple):
-    """Errors of the model on N rows of one kind, joint values (N, n) and lines (N,) of these rows."""
+class RowsOfKind(NamedTuple):
+    """N rows of one kind: their errors by stage, the model last, joint values (N, n) and lines (N,)."""
 
-    errors: Evaluation
+    stages: Mapping[str, Evaluation]
     q: Tensor
     lines: Tensor
+
+    @property
+    def errors(self) -> Evaluation:
+        """Those of the model."""
+        return list(self.stages.values())[-1]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -110,24 +115,18 @@ class Findings:
     devices: Sequence[str]
 
     @cached_property
-    def kinds(self) -> Mapping[str, Mapping[str, Evaluation]]:
-        """Kind -> stage -> errors of the rows shown; empty without rows."""
-        found = self.shown.errors
-        kinds = next(iter(found.values()), ())
-        return {kind: {name: errors[kind] for name, errors in found.items()} for kind in kinds}
-
-    @property
-    def own(self) -> list[OwnErrors]:
-        """Errors of the model, kind by kind."""
-        last = list(self.shown.errors.values())[-1:]
-        each = [(one, found.index[kind].cpu()) for found in last for kind, one in found.items()]
-        return [OwnErrors(one, self.shown.q[rows], self.shown.lines[rows]) for one, rows in each]
+    def kinds(self) -> Mapping[str, RowsOfKind]:
+        """The rows shown, by kind; empty without rows."""
+        found, q, lines = self.shown.errors, self.shown.q, self.shown.lines
+        index = next((errors.index for errors in found.values()), {})
+        stages = {kind: {name: errors[kind] for name, errors in found.items()} for kind in index}
+        return {kind: RowsOfKind(stages[kind], q[rows.cpu()], lines[rows.cpu()]) for kind, rows in index.items()}
 
     @property
     def errors(self) -> Mapping[str, Evaluation]:
         """Errors of measured positions by stage, of a model that has not seen them; empty without any."""
         kinds = [] if self.shown.predictions is None else self.kinds.values()
-        return next((stages for stages in kinds if next(iter(stages.values())).what == ERRORS), {})
+        return next((one.stages for one in kinds if one.errors.what == ERRORS), {})
 
     @property
     def calibrated(self) -> Evaluation | None:
@@ -147,13 +146,13 @@ class Findings:
     @property
     def count(self) -> int:
         """Number of rows shown."""
-        return sum(len(one.lines) for one in self.own)
+        return sum(len(one.lines) for one in self.kinds.values())
 
     @property
     def judged(self) -> Accuracy:
         """The RMS error that is compared with a tolerance."""
         fitted = not self.shown.new and self.shown.predictions is None
-        own = [] if fitted else [one.errors for one in self.own]
+        own = [] if fitted else [one.errors for one in self.kinds.values()]
         return accuracy(self.model, own, "m", self.deviations.error)
 
     @property

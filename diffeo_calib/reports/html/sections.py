@@ -18,7 +18,7 @@ from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_sentences
 from diffeo_calib.kinematics.provenance import Provenance
 from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.measurements.bodies import matrix_lines
-from diffeo_calib.reports.analysis.findings import Findings, OwnErrors
+from diffeo_calib.reports.analysis.findings import Findings, RowsOfKind
 from diffeo_calib.reports.analysis.predictions import FitRows, Predictions
 from diffeo_calib.reports.analysis.repeats import STANDARD_REPEATS
 from diffeo_calib.reports.analysis.stages import Kinematics
@@ -33,7 +33,13 @@ from diffeo_calib.reports.html.document import (
     panel,
     rough_millimetres,
 )
-from diffeo_calib.reports.plots.errors import draw_before_after, draw_distributions
+from diffeo_calib.reports.plots.errors import (
+    draw_before_after,
+    draw_coverage,
+    draw_distributions,
+    draw_learning_curve,
+    draw_residuals,
+)
 from diffeo_calib.reports.plots.joints import (
     PART_WIDTH,
     draw_expected,
@@ -45,7 +51,6 @@ from diffeo_calib.reports.plots.joints import (
     short,
 )
 from diffeo_calib.reports.plots.style import PANEL, Frame
-from diffeo_calib.reports.plots.trust import draw_coverage, draw_learning_curve, draw_residuals
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.payload import payload_sentence
 from diffeo_calib.sensors.errors import ERRORS, SIZES, Evaluation
@@ -106,9 +111,8 @@ def how_good(found: Findings) -> Section:
     """Errors of every kind of rows by stage."""
     limit = None if found.repeats is None else found.repeats.deviation
     pictures = list[Picture]()
-    for number, stages in enumerate(found.kinds.values()):
-        own = limit if next(iter(stages.values())).what == ERRORS else None
-        pictures += stage_pictures(stages, f"-{number}", own)
+    for number, one in enumerate(found.kinds.values()):
+        pictures += stage_pictures(one.stages, f"-{number}", limit if one.errors.what == ERRORS else None)
     see = f"Errors on {sentences.rows_of(found)}: each stage should lie well to the left of the one before it."
     see += " Each kind has its own unit; units are never mixed." * (len(found.kinds) > 1)
     see = see if found.kinds else "No rows were passed: pass some to see errors of each kind in its own unit."
@@ -116,14 +120,15 @@ def how_good(found: Findings) -> Section:
         "Nominal: the robot's description, placed where it fits best. Geometric: joint axes and links corrected, the "
         "classical calibration. Calibrated: gravity sag, transmission errors and remaining errors as well."
     ]
-    present = {next(iter(stages.values())).what for stages in found.kinds.values()}
+    present = {one.errors.what for one in found.kinds.values()}
     notes += [text for what, text in FLATTERING.items() if what in present]
     if found.kinds and not found.shown.new:
         notes.append(
             "Nominal and geometric kinematics were fitted to these poses too, with so few parameters that it hardly "
             "matters. Measurements of new poses are the stronger proof."
         )
-    return Section("errors", "How good", see, [stage_table(own) for own in found.kinds.values()], None, pictures, notes)
+    tables = [stage_table(one.stages) for one in found.kinds.values()]
+    return Section("errors", "How good", see, tables, None, pictures, notes)
 
 
 def where(found: Findings) -> Section:
@@ -229,7 +234,7 @@ def trust(found: Findings) -> Section:
     """Claimed against found errors, residuals, outliers, learning curve."""
     shown, registered = found.shown, found.model.registration
     tables = [_outliers(shown.outliers, found.model.on)] if shown.outliers else []
-    tables += [_largest(found, own) for own in found.own]
+    tables += [_largest(found, own) for own in found.kinds.values()]
     notes = list(shown.moved)
     if registered is not None:
         each = f"each predicted by the others {millimetres(registered.left_out_rms)} mm"
@@ -255,9 +260,10 @@ def trust(found: Findings) -> Section:
 def _residuals(found: Findings) -> Iterator[Picture]:
     """Errors of every kind against the row, time and temperature, and every joint."""
     robot = found.model.robot
-    for place, (errors, q, lines) in enumerate(found.own):
-        what = errors.title if len(found.own) > 1 else "Errors"
-        columns = {"row": lines.double(), **(found.columns if errors.what == ERRORS else {})}
+    for place, one in enumerate(found.kinds.values()):
+        errors, q = one.errors, one.q
+        what = errors.title if len(found.kinds) > 1 else "Errors"
+        columns = {"row": one.lines.double(), **(found.columns if errors.what == ERRORS else {})}
         for number, (name, values) in enumerate(columns.items()):
             label = f"{what} against {printable(name)}, their RMS dashed: a trend is a drift."
             missing = int((~values.isfinite()).sum())
@@ -270,13 +276,13 @@ def _residuals(found: Findings) -> Iterator[Picture]:
             yield panel(f"residuals-{place}-joint-{joint}", label, draw_residuals, *given, key=False)
 
 
-def _largest(found: Findings, own: OwnErrors) -> Table:
+def _largest(found: Findings, own: RowsOfKind) -> Table:
     """The rows of one kind with the largest errors, of positions beside what the model expects there."""
     (unit, per_unit), seen = own.errors.shown, found.shown.predictions
     errors, body = own.errors.errors.nan_to_num(0.0).max(1)  # hidden markers have no error
     order = errors.argsort(descending=True)[:LISTED_ROWS].tolist()
     lines = [[f"error [{unit}]", *(f"{per_unit * float(errors[row]):.3f}" for row in order)]]
-    what = f"Largest: {own.errors.label}" if len(found.own) > 1 else "Largest errors"
+    what = f"Largest: {own.errors.label}" if len(found.kinds) > 1 else "Largest errors"
     if seen is not None and own.errors.what == ERRORS and len(seen) == len(own.lines):
         what += ", and what the model expects of a measurement there"
         lines.append(["expected RMS [mm]", *(millimetres(float(seen.claimed[row, body[row]])) for row in order)])

@@ -62,7 +62,7 @@ def verdict(found: Findings, tolerance: float | None = None) -> str:
 
 def _others(found: Findings) -> Iterator[tuple[str, str]]:
     """Errors of the model in rows of other kinds than measured positions: what they are, and their RMS."""
-    for own, _, _ in found.own:
+    for own in (one.errors for one in found.kinds.values()):
         if not found.errors or own.what != ERRORS:
             unit, per_unit = own.shown
             yield own.title, f"{per_unit * own.rms:.3f} {unit}"
@@ -104,8 +104,8 @@ def advice(found: Findings) -> Iterator[str]:
     yield from still_joints(found)
     if shown.moved:
         return
-    for stages in found.kinds.values():
-        *others, (_, own) = stages.items()
+    for one in found.kinds.values():
+        *others, (_, own) = one.stages.items()
         before, rival = min(others, key=lambda stage: stage[1].rms)
         if own.rms >= rival.rms:
             of = f"{own.title}: the" if len(found.kinds) > 1 else "The"
