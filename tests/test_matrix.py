@@ -145,7 +145,7 @@ FORMS = (
 )
 """Kinds whose models differ in form: in their markers, tips, poses, payload and tool."""
 PROPOSED = ("several tips", "distances", "images", "camera on the tool", "two cameras")
-"""Kinds of tables of which tests/cli/test_campaign.py and tests/calibration/test_two_cameras.py test the `init`, which
+"""Kinds of tables of which tests/cli/test_init.py and tests/calibration/test_two_cameras.py test the `init`, which
 takes a quarter of a minute for some of them."""
 Verb = Callable[[Bench], None]
 VERBS: dict[str, tuple[Verb, tuple[str, ...]]] = {}

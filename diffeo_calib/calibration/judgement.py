@@ -20,10 +20,10 @@ from diffeo_calib.kinematics.evaluation import (
     expected,
     impossible,
     impossible_errors,
+    motions,
     positions_of,
     some_rows,
 )
-from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
 from diffeo_calib.sensors.places import Places

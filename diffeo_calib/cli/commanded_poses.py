@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
+from itertools import product
 from math import ceil, inf, nan
 from pathlib import Path
 
@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.cli import proposals
-from diffeo_calib.cli.column_names import WORDS, column, whole
-from diffeo_calib.cli.guesses import ROTATIONS, Choice, RowColumns, Sheet, entries, matrix_in, rows_in
-from diffeo_calib.cli.proposals import Source
+from diffeo_calib.cli.column_names import WORDS, Group, column, whole
+from diffeo_calib.cli.guesses import Body, Choice, RowColumns, Sheet, bodies_in, entries, matrices_in, rows_in
+from diffeo_calib.cli.proposals import LARGEST_RESIDUAL, Source, percent, ranked
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.checks import quiet
@@ -36,8 +35,6 @@ UNUSUAL_LENGTHS = ("", ""), ("cm", ""), ("inch", ""), ("", "cm"), ("", "inch")
 """Units of the machine's places and of those measured, tried until one explains the rows; empty: by their size."""
 MOST_ROWS, STEPS = 40, (1, 3)
 """Rows whose motions are compared, and how many rows each of these spans."""
-JOINTS = "q0", "q1"
-"""First names of four numbers before a place that are joint values rather than a quaternion."""
 MOST_WAYS, FEW_WAYS = 60, 6
 """Ways to read the rows that are tried with a registration; if half of so many are right, no rotation is sure."""
 TURNED = "robot-pose", "angle", "convention", "rotation-angle", "camera-on-tool"
@@ -48,19 +45,6 @@ ALIKE, EXACT = 6.0, 1e-6
 
 
 @dataclass(frozen=True)
-class Body:
-    """Columns of a place, and of the rotation beside it, if any."""
-
-    place: list[str]
-    turn: list[str]
-
-    @property
-    def words(self) -> set[str]:
-        """Of the names."""
-        return {word for name in self.place for word in column(name).words}
-
-
-@dataclass(frozen=True)
 class Reading:
     """One way to read the machine's rotation, or the measured one: convention, and unit of its angles."""
 
@@ -68,37 +52,23 @@ class Reading:
     angle: str = "rad"
 
 
-def bodies_in(csv: Path, sheet: Sheet) -> list[Body]:
-    """Places with the rotations behind or before them, and poses as 6, 7, 12 or 16 numbers, in the order of columns."""
-    at = {name: number for number, name in enumerate(sheet.header)}
-    triples = [group for group in whole(sheet.numbers, "xyz") if not group.says("rate", "deviation", "turn")]
-    places = sorted((list(group.names.values()) for group in triples), key=lambda own: at[own[0]])
-    ends = [0, *(at[own[0]] for own in places), len(sheet.header)]
-    located = {name for own in places for name in own}
-
-    def turn(start: int, end: int) -> list[str]:
-        between = [name for name in sheet.header[start:end] if name in sheet.numbers and name not in located]
-        turns = [group for labels, _ in ROTATIONS for group in whole(between, labels)]
-        turns = [list(group.names.values()) for group in turns if not group.says("rate", "deviation")]
-        return turns[0] if turns else []
-
-    behind, before = ([turn(*own) for own in pairwise(part)] for part in (ends[1:], ends[:-1]))
-    first = bool(places) and bool(before[0]) and not behind[-1] and before[0][0] not in JOINTS
-    found = [Body(own, turns) for own, turns in zip(places, before if first else behind, strict=True)]
+def poses_in(csv: Path, sheet: Sheet) -> list[Body]:
+    """Places with their rotations, and poses as 6, 7, 12 or 16 numbers, in the order of columns."""
+    found = bodies_in(sheet.numbers)
     used = {name for own in found for name in (*own.place, *own.turn)}
-    while matrix := matrix_in(csv, sheet, [name for name in sheet.numbers if name not in used]):
-        found.append(Body(*(list(names) for names in matrix)))
-        used |= {*found[-1].place, *found[-1].turn}
-    for group in whole([name for name in sheet.numbers if name not in used], "xy"):
-        if group.wished and not group.says("rate", "deviation", "turn"):
-            found.append(Body(list(group.names.values()), []))
+    others = [name for name in sheet.numbers if name not in used]
+    found += matrices_in(csv, sheet, others)
+    found += [Body(list(own.names.values()), []) for own in whole(others, "xy") if own.wished and _is_place(own)]
     for labels in NUMBERED:
-        for group in whole([name for name in sheet.numbers if name not in used], labels):
+        taken = {name for own in found for name in (*own.place, *own.turn)}
+        for group in whole([name for name in others if name not in taken], labels):
             names = list(group.names.values())
-            if group.says("tool") and not group.says("rate", "deviation"):
-                found.append(Body(names[:3], names[3:]))
-                used |= {*names}
-    return sorted(found, key=lambda own: at[own.place[0]])
+            found += [Body(names[:3], names[3:])] if group.says("tool") and _is_place(group) else []
+    return sorted(found, key=lambda own: sheet.header.index(own.place[0]))
+
+
+def _is_place(group: Group) -> bool:
+    return not group.says("rate", "deviation")
 
 
 def machine_of(bodies: Sequence[Body]) -> Body:
@@ -119,13 +89,13 @@ def machine_of(bodies: Sequence[Body]) -> Body:
     return max(bodies, key=rank)
 
 
-def choices(csv: Path, sheet: Sheet) -> tuple[Source, list[Choice], list[Choice]]:
-    """The table read as poses of a machine; entries about its columns, and about units and conventions.
+def source_of(csv: Path, sheet: Sheet) -> Source:
+    """The table read as poses of a machine.
 
     Raises:
-        InputError: no poses, nothing that was measured, or no reading of the rows that is clear.
+        InputError: no poses, nothing that was measured, or no way to read the rows that is clear.
     """
-    bodies = bodies_in(csv, sheet)
+    bodies = poses_in(csv, sheet)
     if not bodies:
         expected = "a ROBOT whose joints the table has columns of, or columns of the poses of a machine"
         raise InputError.of(f"'{csv}' without a robot's description", expected=expected, got=few(sheet.header, 20))
@@ -136,39 +106,38 @@ def choices(csv: Path, sheet: Sheet) -> tuple[Source, list[Choice], list[Choice]
         what = f"what was measured of the machine in '{csv}'"
         raise InputError.of(what, expected="columns beside its poses", got=f"{few(used, 16)} alone")
     rows = rows_in(csv, replace(sheet, numbers=others), used)
-    body = next((own for own in bodies if rows.markers and own.place == rows.markers[0]), None)
-    if body is not None and body.turn and len(rows.markers) > 1:  # poses of one frame
-        left = [f"{few(names)}: beside the pose of {few(body.place)}" for names in rows.markers[1:]]
-        rows = replace(rows, markers=rows.markers[:1], left=[*rows.left, *left])
-    tried = list[list[tuple[float, Source]]]()
+    body = rows.bodies[0] if rows.bodies else Body([], [])
+    if body.turn:  # poses of one frame
+        left = [f"{few(own.place)}: beside the pose of {few(body.place)}" for own in rows.bodies[1:]]
+        rows = replace(rows, bodies=[body], left=[*rows.left, *left])
+    tried = list[list[Source]]()
     for lengths in UNUSUAL_LENGTHS:
-        tried.append(sorted(_read(csv, sheet, machine, rows, body, lengths=lengths), key=lambda entry: entry[0]))
-        if tried[-1] and tried[-1][0][0] <= proposals.LARGEST_RESIDUAL:
+        tried.append(ranked(_ways(csv, sheet, machine, rows, body, lengths=lengths)))
+        if tried[-1] and tried[-1][0].left <= LARGEST_RESIDUAL:
             break
-    found = min(tried, key=lambda own: own[0][0] if own else inf)
-    if found and found[0][0] == inf:
-        found[0][1].read_residual(found[0][1].table)  # says why
-    if not found or found[0][0] > proposals.LARGEST_RESIDUAL:
-        got = "no way to read them" if not found else f"{100 * found[0][0]:.3g} % of what the rows vary unexplained"
+    found = min(tried, key=lambda own: own[0].left if own else inf)
+    if found and found[0].left == inf:
+        found[0].share()  # says why
+    if not found or found[0].left > LARGEST_RESIDUAL:
+        got = f"{percent(found[0].left)} of what the rows vary unexplained" if found else "no way to read them"
         what = f"poses of the machine in {few(used, 16)}"
         fix = "check that the rows belong together, or write the campaign file yourself; for joints name the robot"
         raise InputError.of(what, expected="a convention and units that explain the rows", got=got, fix=fix)
-    size, limit = found[0][0], gates.READINGS_TOLD_APART * found[0][0]
-    alike, worse = [one for left, one in found if left < limit], [left for left, _ in found if left >= limit]
-    why = f"the machine's poses explain the rows but for {100 * size:.2g} % of what they vary"
-    why += f", read in any other way {100 * min(worse):.3g} %" if worse else ""
-    first = f"{why}; by their names, commanded poses in place of joint values"
-    texts = dict.fromkeys(one.joints.text for one in alike)
-    columns = [Choice("robot-pose", text, first, sure=len(texts) == 1) for text in texts]
-    units = [*_units(alike, _lengths(machine.place, _numbers(csv, sheet, machine.place)), why)]
+    limit = gates.READINGS_TOLD_APART * found[0].left
+    alike, worse = [one for one in found if one.left < limit], [one.left for one in found if one.left >= limit]
+    why = f"the machine's poses explain the rows but for {percent(found[0].left, 2)} of what they vary"
+    why += f", read in any other way {percent(worse[0])}" if worse else ""
+    said = [*_entries(alike, _lengths(machine.place, _numbers(csv, sheet, machine.place)), why)]
     if 2 * len(alike) >= len(found) >= MOST_WAYS:
-        both = [[one._replace(sure=one.sure and one.name not in TURNED) for one in own] for own in (columns, units)]
-        columns, units = both
-    return alike[0], columns, units
+        said = [one._replace(sure=one.sure and one.name not in TURNED) for one in said]
+    return alike[0].saying(*said)
 
 
-def _units(alike: Sequence[Source], lengths: Sequence[str], why: str) -> Iterator[Choice]:
-    """Units and conventions of the ways to read a table that explain it as well as each other."""
+def _entries(alike: Sequence[Source], lengths: Sequence[str], why: str) -> Iterator[Choice]:
+    """Columns, units and conventions of the ways to read a table that explain it as well as each other."""
+    texts = dict.fromkeys(one.joints.text for one in alike)
+    named = f"{why}; by their names, commanded poses in place of joint values"
+    yield from (Choice("robot-pose", text, named, sure=len(texts) == 1) for text in texts)
     tables = [one.table for one in alike]
     size, several = "the size of the numbers", len(lengths) > 1 and tables[0].joint_length is None
     size += "; which machine it is, they do not tell" * several
@@ -181,14 +150,14 @@ def _units(alike: Sequence[Source], lengths: Sequence[str], why: str) -> Iterato
     yield from entries(tables, camera_on_tool="what stands is seen from the flange")
 
 
-def _read(
-    csv: Path, sheet: Sheet, machine: Body, rows: RowColumns, body: Body | None, *, lengths: tuple[str, str]
-) -> Iterator[tuple[float, Source]]:
-    """The likeliest ways to read the table, and the share of what the rows vary that each leaves unexplained.
+def _ways(
+    csv: Path, sheet: Sheet, machine: Body, rows: RowColumns, body: Body, *, lengths: tuple[str, str]
+) -> Iterator[Source]:
+    """The likeliest ways to read the table.
 
     ``lengths``: units of the machine's places and of those measured; empty for the likeliest.
     """
-    turn, place = ([], []) if body is None else (body.turn, body.place)
+    place, turn, *_ = body
     groups = machine.place, machine.turn, place, turn
     numbers = _numbers(csv, sheet, [name for names in groups for name in names])
     if not len(numbers):
@@ -211,8 +180,7 @@ def _read(
             table = replace(table, rotation=turn, convention=measured.convention, rotation_angle=unit)
         with quiet(), suppress(DiffeoCalibError):
             robot = cartesian(read_poses(csv, pose, table))
-            source = Source(csv, robot, replace(pose, robot=robot), rows, table, sheet.numbers)
-            yield source.residual(table), source
+            yield Source(csv, sheet, robot, replace(pose, robot=robot), rows, table)
 
 
 def _numbers(csv: Path, sheet: Sheet, names: Sequence[str]) -> Tensor:

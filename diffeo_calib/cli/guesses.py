@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import product
 from os.path import relpath
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,6 +41,8 @@ NAMED = {
     "temperature": ("temperature temp temperaturec tempc", DRIFT),
 }
 """Option -> names by which a column besides the joints and what was measured is known, and what it holds."""
+JOINTS = "q0", "q1"
+"""First names of four numbers that are joint values, rather than a quaternion, where they stand before a place."""
 PENDANTS = ("base", "shoulder", "elbow", "wrist1", "wrist2", "wrist3"), tuple("slurbt"), tuple("slerubt")
 """Names of joints on the pendants of Universal Robots and Yaskawa, from the base on."""
 ROTATIONS = (
@@ -199,20 +202,64 @@ def _goes_on(columns: Sequence[str], group: Group) -> set[str]:
     return {name for name in columns if column(name).words in around}
 
 
-def guess_positions(columns: Sequence[str]) -> tuple[list[list[str]], list[tuple[list[str], str]]]:
-    """Triples of columns whose names differ by x, y and z alone; and those of no measured places, with the reason."""
-    found = [group for group in whole(columns, "xyz") if not group.says("rate", "deviation", "turn")]
-    kept, left = list[list[str]](), list[tuple[list[str], str]]()
-    for group in found:
-        names = list(group.names.values())
-        better = [one for one in found if one.stem == group.stem and one.rank < group.rank]
-        if group.wished:
-            left.append((names, "wished places"))
-        elif better:
-            left.append((names, f"places beside the measured ones of {better[0].names['x']}"))
-        else:
-            kept.append(names)
-    return kept, left
+class Body(NamedTuple):
+    """Columns of a place, and of the rotation beside it, if any.
+
+    Args:
+        place, turn: columns. usual: what such names of a rotation usually mean. left: what the place is, if no device
+            measured it.
+    """
+
+    place: list[str]
+    turn: list[str]
+    usual: str = ""
+    left: str = ""
+
+    @property
+    def words(self) -> set[str]:
+        """Of the names of the place."""
+        return {word for name in self.place for word in column(name).words}
+
+
+def bodies_in(columns: Sequence[str]) -> list[Body]:
+    """Places, columns whose names differ by x, y and z alone, each with the rotation whose names are the most alike.
+
+    Of several that are as much alike the nearest one. A rotation is four columns of a quaternion, nine of a matrix or
+    three angles.
+    """
+    at = {name: place for place, name in enumerate(columns)}
+    places = [group for group in whole(columns, "xyz") if not group.says("rate", "deviation", "turn")]
+    turns = [(group, usual) for labels, usual in ROTATIONS for group in _rotations(columns, labels)]
+    pairs = list[tuple[tuple[int, ...], str, list[str], str]]()
+    for own, (rank, (group, usual)) in product(places, enumerate(turns)):
+        first, turn = own.names["x"], list(group.names.values())
+        unlike = (group.shared - group.says("turn", "place")) ^ ({*column(first).words} - {"x", *WORDS["place"]})
+        start = min(at[name] for name in turn)
+        series = turn[0] in JOINTS and start < at[first]  # of joints, rather than a quaternion
+        if own.wished == group.wished and not series:
+            pairs.append(((len(unlike), abs(start - at[first]), at[first], start, rank), first, turn, usual))
+    found = dict[str, tuple[list[str], str]]()
+    for _, first, turn, usual in sorted(pairs):
+        if first not in found and not any(set(turn) & set(other) for other, _ in found.values()):
+            found[first] = turn, usual
+    bodies = list[Body]()
+    for own in sorted(places, key=lambda own: at[own.names["x"]]):
+        better = [one.names["x"] for one in places if one.stem == own.stem and one.rank < own.rank]
+        left = f"places beside the measured ones of {better[0]}" if better else ""
+        names, left = list(own.names.values()), "wished places" if own.wished else left
+        bodies.append(Body(names, *found.get(names[0], ([], "")), left=left))
+    return bodies
+
+
+def _rotations(columns: Sequence[str], labels: Sequence[str]) -> Iterator[Group]:
+    """Columns that differ by the labels of a rotation and hold one: no series of joints, no place, no speed."""
+    following = [f"q{len(labels) + int(labels[0][1])}"] if labels[0] in JOINTS else []
+    marks = {"r", "m", "t"} if labels[0] in ("00", "11") else {"r"}
+    for group in whole(columns, labels):
+        longer = any(one[:2] == group[:2] for one in groups(columns, following))
+        plain = labels[0] in ("x", "00", "11") and not (group.says("turn") or group.shared & marks)
+        if not (longer or plain or group.says("rate", "deviation")):
+            yield group
 
 
 def guess_matrix(columns: Sequence[str]) -> tuple[list[str], bool] | None:
@@ -241,26 +288,6 @@ def guess_readings(columns: Sequence[str]) -> dict[str, list[str]]:
     if pixels is not None:
         found[f"image={','.join(pixels)},{LENS}"] = pixels
     return found
-
-
-def guess_rotation(columns: Sequence[str], position: Sequence[str]) -> tuple[list[str], str] | None:
-    """Columns of a rotation by their names, and what such names usually mean; None without any.
-
-    Four of a quaternion, nine of a matrix or three angles; of several the measured ones, and those whose names have
-    most in common with the position's.
-    """
-    own, found = {*column(position[0]).words} - {"x", *WORDS["place"]}, list[tuple[bool, int, list[str], str]]()
-    for labels, usual in ROTATIONS:
-        following = [f"q{len(labels) + int(labels[0][1])}"] if labels[0] in ("q0", "q1") else []
-        for group in whole(columns, labels):
-            longer = any(one[:2] == group[:2] for one in groups(columns, following))  # a series of joints
-            marks = {"r", "m", "t"} if labels[0] in ("00", "11") else {"r"}
-            plain = labels[0] in ("x", "00", "11") and not (group.says("turn") or group.shared & marks)
-            if not (longer or plain or group.says("rate", "deviation")):
-                other = (group.shared - group.says("turn", "place")) ^ own
-                found.append((group.wished, len(other), list(group.names.values()), usual))
-    best = min(found, key=lambda entry: entry[:2], default=None)
-    return None if best is None else best[2:]
 
 
 def guess_deviations(columns: Sequence[str], triples: Sequence[Sequence[str]]) -> list[str] | None:
@@ -315,17 +342,20 @@ class RowColumns:
     """Columns of what was measured, by their names.
 
     Args:
-        markers: of positions. sockets: of place and socket. readings: texts of `fit --reading`. named: option -> column
-            of the device or its set-up, the payload, time, temperature.
-        matrix: the nine of the rotation, by rows, where poses are written as matrices. left: what is not used, and why.
+        bodies: of positions or poses. sockets: of place and socket. readings: texts of `fit --reading`.
+        named: option -> column of the device or its set-up, the payload, time, temperature. left: not used, and why.
     """
 
-    markers: list[list[str]]
+    bodies: list[Body]
     sockets: list[str]
     readings: list[str]
     named: dict[str, str]
-    matrix: Sequence[str] = ()
     left: Sequence[str] = ()
+
+    @property
+    def markers(self) -> list[list[str]]:
+        """Those of positions."""
+        return [own.place for own in self.bodies]
 
     @property
     def without_length(self) -> bool:
@@ -369,14 +399,14 @@ def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
     known = {name.lower(): name for name in sheet.header}
     sockets = [known[name] for name in ("place", "socket") if name in known and "socket" in known]
     with_gaps = sheet.header if sockets else sheet.numbers  # rows in sockets have no positions
-    markers, unmeasured = guess_positions([name for name in with_gaps if name not in joints])
-    left = [f"{few(names)}: {why}" for names, why in unmeasured]
+    found = bodies_in([name for name in with_gaps if name not in joints])
+    left = [f"{few(own.place)}: {own.left}" for own in found if own.left]
     others = [name for name in sheet.numbers if name not in joints]
     nameless = all(name.isdecimal() for name in sheet.header) and len(others) > 2
-    matrix = () if markers or nameless else matrix_in(csv, sheet, others)
-    markers = [others[:3]] if nameless else markers or [list(own) for own in matrix[:1]]
-    readings = _readings_in(csv, sheet, others, alone=not markers and not sockets)
-    if not markers and not sockets and not readings:
+    bodies = [Body(others[:3], [])] if nameless else [own for own in found if not own.left]
+    bodies = bodies or matrices_in(csv, sheet, others)[:1]
+    readings = _readings_in(csv, sheet, others, alone=not bodies and not sockets)
+    if not bodies and not sockets and not readings:
         expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
         common = next((name for name in sheet.header if name not in joints), "COLUMN")
         fix = f"if they are in another file: --places FILE --by {common}; "
@@ -384,28 +414,27 @@ def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
         fix += "column such as `distance`, `wire` or `height`; `fit --help` lists all options, see --reading"
         got = "; ".join(left) or few(sheet.numbers, 20)
         raise InputError.of(f"positions in '{csv}'", expected=expected, got=got, fix=fix)
-    named = [name for name in sheet.header if name not in joints]
-    columns = {"session": [] if sockets and not readings else named}
+    columns = {"session": [] if sockets and not readings else [name for name in sheet.header if name not in joints]}
     guessed = {
         option: [name for name in columns.get(option, others) if column(name).plain in known.split()]
         for option, (known, _) in NAMED.items()
     }
-    found = {option: names[0] for option, names in guessed.items() if names}
-    return RowColumns(markers, sockets, readings, found, [name for own in matrix[1:] for name in own], left)
+    named = {option: names[0] for option, names in guessed.items() if names}
+    return RowColumns(bodies, sockets, readings, named, left)
 
 
-def matrix_in(csv: Path, sheet: Sheet, columns: Sequence[str]) -> tuple[list[str], ...]:
-    """Position and rotation, by rows, of poses that are written as 16 numbers by rows or columns; none without them."""
-    found = guess_matrix(columns)
-    if found is None:
-        return ()
-    names, named = found
-    header, rows = read_cells(csv, sheet.sep)
-    by_rows = named or all(
-        number(cells[header.index(names[k])], sheet.decimal) == 0 for _, cells in rows for k in BELOW
-    )
-    entries = [names[4 * row : 4 * row + 4] if by_rows else names[row::4] for row in range(3)]
-    return [row[3] for row in entries], [name for row in entries for name in row[:3]]
+def matrices_in(csv: Path, sheet: Sheet, columns: Sequence[str]) -> list[Body]:
+    """Poses that are written as 16 numbers by rows or columns."""
+    found, (header, rows) = list[Body](), read_cells(csv, sheet.sep)
+    while (guessed := guess_matrix(columns)) is not None:
+        names, named = guessed
+        below = [header.index(names[k]) for k in BELOW if not named]
+        by_rows = all(number(cells[place], sheet.decimal) == 0 for _, cells in rows for place in below)
+        entries = [names[4 * row : 4 * row + 4] if by_rows else names[row::4] for row in range(3)]
+        turn = [name for row in entries for name in row[:3]]
+        found.append(Body([row[3] for row in entries], turn, "a matrix"))
+        columns = [name for name in columns if name not in names]
+    return found
 
 
 def _readings_in(csv: Path, sheet: Sheet, columns: Sequence[str], *, alone: bool) -> list[str]:

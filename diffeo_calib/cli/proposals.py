@@ -1,10 +1,15 @@
-"""Proposals of `diffeo-calib init` beyond joints and positions: rotations and standard deviations, if they fit."""
+"""Ways to read a table, each with what it leaves unexplained: `diffeo-calib init` proposes the best, if it is clear.
+
+A search of `init` makes ways (columns, units, conventions, meanings of joints), puts the one that leaves the least
+first, and takes it where all others leave far more; else it asks the user, or says why the table tells nothing.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 from math import inf, log
 from pathlib import Path
@@ -27,14 +32,13 @@ from diffeo_calib.cli.guesses import (
     Sheet,
     entries,
     guess_deviations,
-    guess_rotation,
 )
 from diffeo_calib.cli.options import Rows
 from diffeo_calib.cli.tables import readings_columns
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import DiffeoCalibError, MeasurementError, few
+from diffeo_calib.common.errors import DiffeoCalibError, InputError, MeasurementError, few
 from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD, quiet
-from diffeo_calib.measurements.csv.files import read_observations
+from diffeo_calib.measurements.csv.files import read_joints, read_observations
 from diffeo_calib.measurements.csv.joints import JointExpressions
 from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.sensors import SocketColumns
@@ -46,13 +50,18 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.tables import check_poses, divided, measured_positions
 
+CLEAR_RATIO = 5.0
+"""A way is clear if every other one leaves more by this factor."""
+LARGEST_RESIDUAL = 0.1
+"""Median residual, as a share of the spread, above which no way is right."""
+DOUBTFUL = 0.01
+"""Share of what the rows vary, left by the best units, above which other meanings of the joints are sought."""
+SMALLEST_PART = 0.1
+"""Of a joint's limits that a table passes through, in the right unit."""
 BALL_SEARCH = {"maxfev": 150, "initial_simplex": [[0.0] * 3, [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]]}
 """Of the ball on the tool by images, m."""
 FEWEST_IMAGES = 8
 """Rows of a camera from which a projection, 11 numbers, can be contradicted."""
-LARGEST_RESIDUAL = 0.1
-"""Median residual, as a share of the spread, above which no reading is right."""
-UNITS = (*UNITS_PER_METRE,), ("rad", "deg")
 MOST_LENGTHS = 2
 """Units of length, by the size of the robot, with which meanings of the joints are sought."""
 SMALLEST_SPREAD_M = 1e-9
@@ -61,85 +70,81 @@ LARGEST_DEVIATION = 0.01
 """Median standard deviation of a measured position, m, above which a column holds something else."""
 
 
-def beside(source: Source, sheet: Sheet) -> Iterator[Choice]:
-    """Rotations, standard deviations and distances of sockets."""
-    if source.rows.sockets:
-        yield from distances(source.csv, sheet, source.rows.sockets[-1], source.table.length)
-    if source.rows.markers:
-        yield from rotation(source)
-        yield from deviations(source)
-
-
-def marker(source: Source) -> Choice | None:
-    """The column that names the marker of each row, if the nominal robot explains the rows by several alone."""
-    alone = len(source.rows.markers) == 1 and not (source.rows.sockets or source.rows.readings)
-    for _, _, data in source.in_units() if alone else ():
-        with quiet(), suppress(DiffeoCalibError):
-            found = marker_column(register(source.robot, data.q, data.points).geometry, data)
-            if found is not None:
-                return Choice("marker", found[0], f"names the marker of each row: {found[1]}")
-    return None
-
-
 @dataclass(frozen=True)
 class Source:
-    """A table whose joints, positions and units are known."""
+    """One way to read a table.
+
+    Args:
+        csv, sheet: the table, and how it is written. robot: whose ``joints`` columns it has, or a machine with its
+            poses. rows: what was measured. table: the format; joints and rows are entered when it is read.
+        tips: of the markers, where several are. said: entries of the campaign that were decided so far.
+    """
 
     csv: Path
+    sheet: Sheet
     robot: Tree
     joints: Any
     rows: RowColumns
     table: TableFormat
-    numbers: tuple[str, ...]
     tips: Sequence[str] = ()
-    marker: Choice | None = None
+    said: tuple[Choice, ...] = ()
 
-    def read(self, table: TableFormat) -> Any:
-        """The rows in another format, of any kinds."""
+    def into(self, **formats: Any) -> Source:
+        """The same in another format."""
+        return replace(self, table=replace(self.table, **formats))
+
+    def saying(self, *choices: Choice) -> Source:
+        """The same with more entries, in place of those of the same names."""
+        names = {choice.name for choice in choices if choice.name}
+        return replace(self, said=(*(one for one in self.said if one.name not in names), *choices))
+
+    def value(self, name: str) -> Any:
+        """The value of an entry; None where there is none that is sure."""
+        return next((choice.value for choice in self.said if choice.name == name and choice.sure), None)
+
+    @cached_property
+    def data(self) -> Any:
+        """The rows, of any kinds."""
         rows, session = self.rows, self.rows.named.get("session")
-        options = Rows(session=session, camera_on_tool=table.camera_on_tool)
+        options = Rows(session=session, camera_on_tool=self.table.camera_on_tool)
         table = replace(
-            table,
+            self.table,
             joints=self.joints,
             kinds=self.robot.kinds,
             position=rows.markers or None,
             sockets=SocketColumns(tuple(rows.sockets)) if rows.sockets else None,
             readings=readings_columns([text.replace(LENS, SOME_LENS) for text in rows.readings], options),
             session=session if rows.markers else None,
-            marker=None if self.marker is None else str(self.marker.value),
-            camera_on_tool=table.camera_on_tool and not rows.of_boards,  # it is said of the corners
+            marker=self.value("marker"),
+            camera_on_tool=self.table.camera_on_tool and not rows.of_boards,  # it is said of the corners
         )
         data: Any = read_observations(self.csv, table, duplicates="keep")
         data = data.with_joint_names(self.robot.joint_names)
         return data.with_tips(self.tips) if self.tips else data
 
-    def residual(self, table: TableFormat) -> float:
-        """Median residual of the nominal robot in another format, as a share of the spread over all rows.
-
-        Of positions of the largest set-up, else of the ball in its socket, of readings or of a camera's image. In a
-        wrong unit the residual alone may be small too. Infinite if the table cannot be read so.
-        """
+    @cached_property
+    def left(self) -> float:
+        """Median residual of the nominal robot, as a share of the spread over all rows; infinite if unreadable."""
         with quiet(), suppress(DiffeoCalibError):
-            return self.read_residual(table)
+            return self.share()
         return inf
 
-    def residuals(self, formats: Iterable[TableFormat]) -> list[tuple[float, TableFormat]]:
-        """In every format; the smallest first."""
-        return sorted(((self.residual(table), table) for table in formats), key=lambda found: found[0])
+    def share(self) -> float:
+        """The same; DiffeoCalibError says why the table cannot be read so, or calibrates nothing.
 
-    def read_residual(self, table: TableFormat) -> float:
-        """The same; DiffeoCalibError says why a table cannot be read so, or calibrates nothing."""
-        data = self.read(table)
-        positions = measured_positions(data)
-        if positions is None or table.rotation is not None:
-            check_poses(data)
+        Of positions of the largest set-up, else of the ball in its socket, of readings or of a camera's image. In a
+        wrong unit the residual alone may be small too.
+        """
+        positions = measured_positions(self.data)
+        if positions is None or self.table.rotation is not None:
+            check_poses(self.data)
         if positions is not None:
             own = positions.largest_session()
             if (left := likely_mistakes.residual_of(self.robot, own)) == inf:
                 what, expected = f"{len(own)} row(s) of '{self.csv}'", "enough for base and markers, at several places"
                 raise MeasurementError.of(what, expected=expected, fix="measure more rows")
             return left / max(spread(own.points), SMALLEST_SPREAD_M)
-        own, readings = divided(data)
+        own, readings = divided(self.data)
         if own is not None:
             return _in_sockets(self.robot, own.table)
         tables = [one.table for one in readings]
@@ -150,54 +155,52 @@ class Source:
         rms = identify_readings(Geometry.nominal(self.robot), lengths, rigid=True)[0].rms
         return rms / max(size, SMALLEST_SPREAD_M)
 
-    def conventions(self, best: float) -> Iterator[Choice]:
-        """Units and `joints` with which the robot explains positions; nothing if there are none.
-
-        Args:
-            best: share that the best units leave with the columns as they are.
-        """
-        if self.rows.sockets or self.rows.readings:
-            return
-        turning = torch.tensor(self.robot.periodic, dtype=torch.bool, device=HOST)
-        likely = list[tuple[float, str, str, Measurements]]()
-        for length, angle, own in self.in_units():
-            if length in (entry[1] for entry in likely):
-                continue
-            small = float(own.q[:, turning].abs().max()) < LARGEST_JOINT_ANGLE_RAD
-            moved = spread(self.robot.tip_poses(own.q)[:, :1, :3, 3]), spread(own.points)
-            if (angle == "deg" or small) and min(moved) > 0.0:
-                likely.append((abs(log(moved[0] / moved[1])), length, angle, own))
-        for _, length, angle, data in sorted(likely, key=lambda entry: entry[0])[:MOST_LENGTHS]:
-            found = likely_mistakes.conventions_of(self.robot, data, angle)
-            joints, units = JointExpressions.of(self.joints), (angle, UNITS_PER_METRE[length])
-            for one in found:
-                own = one.of_columns(joints.matrix, joints.offset, *units)
-                text = ",".join(own.texts(joints.columns, *units))
-                why = f"the nominal robot then leaves {100 * one.left:.2g} % of what the rows vary, with the columns "
-                why += f"as they are {100 * best:.3g} %"
-                why += "; these rows do not tell which: uncomment one" * (len(found) > 1)
-                yield Choice("joints", text, why, sure=len(found) == 1)
-            if found:
-                table = replace(self.table, length=length, angle=angle)
-                yield from entries([table], length="with these joints", angle="the same")
-                return
-
-    def in_units(self) -> Iterator[tuple[str, str, Measurements]]:
-        """Units of length and angle, and the positions of the largest set-up in these, unless the file says others."""
-        for length, angle in product(*UNITS):
-            found = None
+    def positions(self) -> Iterator[tuple[Source, Measurements]]:
+        """Ways in all units that can be read, with the positions of the largest set-up; none where there are none."""
+        for one in self.in_units() if self.rows.markers else ():
             with quiet(), suppress(DiffeoCalibError):
-                found = measured_positions(self.read(replace(self.table, length=length, angle=angle)))
-            if found is not None:
-                yield length, angle, found.largest_session()
+                if (found := measured_positions(one.data)) is not None:
+                    yield one, found.largest_session()
 
-    def words(self, best: float, others: float) -> str:
-        """Residuals with the best units, and the smallest with other units."""
-        what = "the nominal robot spreads the ball in a socket, relative to all rows, by"
-        what = "images of the nominal robot differ, relative to all rows, by" if self.rows.readings else what
-        what = what if self.rows.without_length else "the nominal robot leaves, of what the rows vary,"
-        than = f"in other units at least {100 * others:.3g} %" if others < inf else "the table contradicts other units"
-        return f"{what} {100 * best:.2g} %, {than}"
+    def in_units(self, *, slides: bool = False) -> Iterator[Source]:
+        """Ways in units of length and angle, and with a camera on the tool; ``slides`` in another unit than lengths."""
+        no_length = self.rows.without_length and all(self.robot.periodic)
+        lengths = ["mm"] if no_length else list(UNITS_PER_METRE)
+        angles = ("rad", "deg") if any(self.robot.periodic) else ("rad",)
+        cameras = (False, True) if self.rows.of_boards else (False,)
+        for length, angle, slide, camera in product(lengths, angles, lengths if slides else [None], cameras):
+            if slide != length:
+                yield self.into(length=length, angle=angle, joint_length=slide, camera_on_tool=camera)
+
+    def other_units(self) -> list[str]:
+        """Columns of joints and positions whose names say other units."""
+        turning = [name for name, turns in zip(self.joints, self.robot.periodic, strict=True) if turns]
+        places = [name for triple in self.rows.markers for name in triple]
+        pairs = *product(turning, (self.table.angle,)), *product(places, (self.table.length,))
+        return [name for name, unit in pairs if column(name).unit not in ("", unit)]
+
+    def within_limits(self) -> bool:
+        """Whether the values of the joints lie within the limits, in more than a small part of these."""
+        low, high = self.robot.limits.unbind(1)
+        q = read_joints(self.csv, self.joints, self.table, kinds=self.robot.kinds)
+        part = (q.amax(0) - q.amin(0)) / (high - low)
+        return bool(((q >= low) & (q <= high)).all()) and float(part.max()) > SMALLEST_PART
+
+
+def ranked(ways: Iterable[Source]) -> list[Source]:
+    """Ways to read a table, the one that leaves the least first."""
+    return sorted(ways, key=lambda one: one.left)
+
+
+def is_clear(found: Sequence[Source], ratio: float = CLEAR_RATIO) -> bool:
+    """Whether the first way leaves little, and every other one more by this factor."""
+    best, *others = found
+    return best.left < LARGEST_RESIDUAL and all(one.left >= ratio * best.left for one in others)
+
+
+def percent(share: float, digits: int = 3) -> str:
+    """A share in words."""
+    return f"{100 * share:.{digits}g} %"
 
 
 def _in_sockets(robot: Tree, data: Measurements) -> float:
@@ -239,128 +242,200 @@ def _projection_error(points: Tensor, image: Tensor) -> float:
     return float((shown[:, :2] / shown[:, 2:] - seen).norm(dim=1).median() / seen.norm(dim=1).median())
 
 
-def joint_columns(source: Source, found: Sequence[JointColumns]) -> tuple[Source, list[Choice]]:
-    """The columns of the joints, and why: of those that names do not tell apart those that the nominal robot explains.
+# --- what one search each decides -------------------------------------------------------------------------------------
+
+
+def with_joint_columns(source: Source, found: Sequence[JointColumns]) -> Source:
+    """The columns of the joints: of those that names do not tell apart those that the nominal robot explains.
 
     Where it does not tell them apart either, a remark for each asks the user.
     """
-    best, equal, clear = found[0], [one for one in found if one.rank == found[0].rank], [(1.0, found[0])]
-    for length in UNITS_PER_METRE if len(equal) > 1 else ():
-        tables = [replace(source.table, length=length, angle=angle) for angle in ("rad", "deg")]
-        tried = [(replace(source, joints=one.names).residuals(tables)[0][0], one) for one in equal]
-        (least, own), (second, _), *_ = sorted(tried, key=lambda entry: entry[0])
-        clear.append((second / least if 0 < least < LARGEST_RESIDUAL else 1.0, own))
-    ratio, taken = max(clear, key=lambda entry: entry[0])
-    if len(equal) > 1 and ratio < gates.READINGS_TOLD_APART:
-        why = "uncomment the right line"
-        lines = [Choice("joints", ",".join(one.names), f"{why}: {one.how}", sure=False) for one in equal]
-        return replace(source, joints=best.names), lines
-    why = taken.how + f"; the nominal robot explains them {ratio:.3g} times better" * (len(equal) > 1)
+    equal, taken, why = [one for one in found if one.rank == found[0].rank], found[0], ""
+    if len(equal) > 1:
+        ways = [min(own.left for own in replace(source, joints=one.names).in_units()) for one in equal]
+        (least, best), (second, _), *_ = sorted(zip(ways, range(len(ways)), strict=True))
+        if not 0 < least < LARGEST_RESIDUAL or second < gates.READINGS_TOLD_APART * least:
+            why = "uncomment the right line"
+            lines = (Choice("joints", ",".join(one.names), f"{why}: {one.how}", sure=False) for one in equal)
+            return replace(source, joints=taken.names).saying(*lines)
+        taken, why = equal[best], f"; the nominal robot explains them {second / least:.3g} times better"
     for one in (one for one in found[:4] if one is not taken):
         why += f"; not {one.names[0]} to {one.names[-1]}" + " (commanded)" * bool(one.rank and one.rank[0])
-    return replace(source, joints=taken.names), [Choice("joints", ",".join(taken.names), why)]
+    return replace(source, joints=taken.names).saying(Choice("joints", ",".join(taken.names), taken.how + why))
 
 
-def measured(source: Source) -> Source:
-    """The same with the column of its markers, if any.
+def with_measured(source: Source) -> Source:
+    """Without markers that are copies, or that the nominal robot explains in some units and others not.
 
-    Without markers that are copies, or that the nominal robot explains in some units and others not.
+    With the column that names the marker of each row, if the nominal robot explains the rows by several alone.
     """
-    found, several = dict[int, str](), len(source.rows.markers) > 1
-    for _, _, positions in source.in_units() if several else ():
-        every = unmeasured_markers(source.robot, positions)
+    rows, found = source.rows, dict[int, str]()
+    for _, data in source.positions() if len(rows.bodies) > 1 else ():
+        every = unmeasured_markers(source.robot, data)
         found = found or {marker: words for marker, words, proved in every if proved}
-    rows, kept = source.rows, [k for k in range(len(source.rows.markers)) if k not in found]
+    kept = [k for k in range(len(rows.bodies)) if k not in found]
     left = [f"{few(rows.markers[k])}: {words} (counted from 0)" for k, words in found.items()]
-    rows = replace(rows, markers=[rows.markers[k] for k in kept], left=[*rows.left, *left])
-    seen = replace(source, rows=rows, tips=[source.tips[k] for k in kept] if source.tips else source.tips)
-    return replace(seen, marker=seen.marker or marker(seen))
+    rows = replace(rows, bodies=[rows.bodies[k] for k in kept], left=[*rows.left, *left])
+    source = replace(source, rows=rows, tips=[source.tips[k] for k in kept] if source.tips else source.tips)
+    alone = len(rows.bodies) == 1 and not (rows.sockets or rows.readings or source.value("marker"))
+    for _, data in source.positions() if alone else ():
+        with quiet(), suppress(DiffeoCalibError):
+            several = marker_column(register(source.robot, data.q, data.points).geometry, data)
+            if several is not None:
+                why = f"names the marker of each row: {several[1]}"
+                return source.saying(Choice("marker", several[0], why))
+    return source
 
 
-def other_units(source: Source, table: TableFormat) -> list[str]:
-    """Columns of joints and positions whose names say other units."""
-    turning = [name for name, turns in zip(source.joints, source.robot.periodic, strict=True) if turns]
-    places = [name for triple in source.rows.markers for name in triple]
-    pairs = *product(turning, (table.angle,)), *product(places, (table.length,))
-    return [name for name, unit in pairs if column(name).unit not in ("", unit)]
+def with_units(source: Source) -> Source:
+    """In units, and with a meaning of the joints' columns, with which the nominal robot explains the rows.
 
-
-def is_clear(found: Sequence[tuple[float, Any]], ratio: float) -> bool:
-    """Whether the first of some residuals is small, and every other one larger by this ratio."""
-    (best, _), *others = found
-    return best < LARGEST_RESIDUAL and all(value >= ratio * best for value, _ in others)
-
-
-def rotations(source: Source) -> list[tuple[Sequence[str], str]]:
-    """The columns of a rotation of each marker, by their names, and what these usually mean."""
-    if source.rows.matrix:
-        return [(source.rows.matrix, "a matrix")]
-    used = {*source.joints, *(name for triple in source.rows.markers for name in triple)}
-    others = [name for name in source.numbers if name not in used]
-    guessed = [guess_rotation(others, marker) for marker in source.rows.markers]
-    return [one for one in guessed if one is not None]
-
-
-def rotation(source: Source, *, camera: bool = False) -> Iterator[Choice]:
-    """A rotation: the convention with which the nominal robot explains the poses clearly better than with all others.
-
-    With ``camera`` in any units too, as poses of a fixed board in the frame of a camera on the tool. Nothing if there
-    are no columns of a rotation; a remark, but for a camera, if no convention is clearly better.
+    Raises:
+        InputError: none of them, or several. MeasurementError: rows that calibrate nothing.
     """
-    found, table = rotations(source), source.table
-    if not found or source.marker is not None:
-        return
-    each, names = [list(own) for own, _ in found], list(dict.fromkeys(name for own, _ in found for name in own))
-    own_body = len(source.rows.markers) == max(len(source.tips), 1) == len(each) and len(names) == sum(map(len, each))
+    periodic, why = source.robot.periodic, ""
+    found = ranked(source.in_units())
+    if not all(periodic) and (found[0].left > DOUBTFUL or not is_clear(found)):
+        others = ranked([*found, *source.in_units(slides=True)])
+        found = others if is_clear(others) else found
+    if not any(periodic) and (chosen := [one for one in found if one.left < inf and one.within_limits()]):
+        # all lengths in another unit are another size, which the rows do not show
+        found, why = chosen, ", by the limits of the joints: the numbers leave it open"
+    excluded, named = found[-1].left == inf, [one for one in found if not one.other_units()]
+    if not is_clear(found) and 0 < len(named) < len(found) and named[0].left < CLEAR_RATIO * found[0].left:
+        found, why = named, ", by the names of the columns: the numbers leave it open" + why
+    best, clear = found[0], is_clear(found)
+    if not clear and (seen := with_rotation(source, camera=True)) is not source:
+        return seen
+    if best.left == inf:
+        best.share()  # says why
+    if best.left >= DOUBTFUL and any(periodic) and (meant := _with_meanings(best)) is not best:
+        return meant
+    if not clear:
+        raise _unclear(found, excluded=excluded)
+    why = _units_words(best, found[1].left if len(found) > 1 else inf) + why
+    no_length = source.rows.without_length and all(periodic)
+    length, angle = ("of lengths that you add: the table holds none", why) if no_length else (why, "the same")
+    camera, slides = "the same; else the board is on the tool", "the same: the slides are in another unit"
+    return best.saying(*entries([best.table], length=length, angle=angle, joint_length=slides, camera_on_tool=camera))
+
+
+def _units_words(best: Source, others: float) -> str:
+    """What the best units leave, and the least of other units."""
+    what = "the nominal robot spreads the ball in a socket, relative to all rows, by"
+    what = "images of the nominal robot differ, relative to all rows, by" if best.rows.readings else what
+    what = what if best.rows.without_length else "the nominal robot leaves, of what the rows vary,"
+    than = f"in other units at least {percent(others)}" if others < inf else "the table contradicts other units"
+    return f"{what} {percent(best.left, 2)}, {than}"
+
+
+def _unclear(found: Sequence[Source], *, excluded: bool) -> InputError:
+    parts = [(one.left, one.table) for one in found if one.left < inf]
+    units = [(t.length, t.angle, t.joint_length, "camera on the tool" * t.camera_on_tool) for _, t in parts]
+    each = zip(units, parts, strict=True)
+    got = "; ".join(f"{' and '.join(filter(None, words))}: {percent(left)}" for words, (left, _) in each)
+    got += "; the units that the file states exclude others" * excluded
+    rows, fix = found[0].rows, ""
+    if rows.markers and not (rows.sockets or rows.readings):
+        fix = "no signs, zeros, coupling or units of the joints do either: "
+    fix += "check the table's joints against the robot's, or write the file yourself; of a robot with several tips "
+    fix += "the columns of each are to be named after it, such as left_x"
+    what = "units with which the robot explains what the rows vary"
+    return InputError.of(what, expected="one clear reading", got=f"left unexplained {got}", fix=fix)
+
+
+def _with_meanings(best: Source) -> Source:
+    """With the units and the `joints` with which the robot explains positions; the same if there are none.
+
+    Args:
+        best: in the best units with the columns as they are.
+    """
+    if best.rows.sockets or best.rows.readings:
+        return best
+    turning = torch.tensor(best.robot.periodic, dtype=torch.bool, device=HOST)
+    likely = dict[str, tuple[float, Source, Measurements]]()
+    for one, own in best.positions():
+        small = float(own.q[:, turning].abs().max()) < LARGEST_JOINT_ANGLE_RAD
+        moved = spread(best.robot.tip_poses(own.q)[:, :1, :3, 3]), spread(own.points)
+        if (one.table.angle == "deg" or small) and min(moved) > 0.0:
+            likely.setdefault(one.table.length, (abs(log(moved[0] / moved[1])), one, own))
+    for _, one, data in sorted(likely.values(), key=lambda entry: entry[0])[:MOST_LENGTHS]:
+        units = one.table.angle, UNITS_PER_METRE[one.table.length]
+        found, joints = likely_mistakes.conventions_of(best.robot, data, units[0]), JointExpressions.of(best.joints)
+        if not found:
+            continue
+        said, more = list[Choice](), "; these rows do not tell which: uncomment one" * (len(found) > 1)
+        for meaning in found:
+            own = meaning.of_columns(joints.matrix, joints.offset, *units)
+            why = f"the nominal robot then leaves {percent(meaning.left, 2)} of what the rows vary, with the columns "
+            why += f"as they are {percent(best.left)}{more}"
+            said.append(Choice("joints", ",".join(own.texts(joints.columns, *units)), why, sure=len(found) == 1))
+        said += entries([one.table], length="with these joints", angle="the same")
+        names = str(said[0].value).split(",") if said[0].sure else best.joints
+        return with_measured(replace(one, joints=names).saying(*said))  # the robot explains the rows only now
+    return best
+
+
+def with_rotation(source: Source, *, camera: bool = False) -> Source:
+    """In the convention with which the nominal robot explains the poses clearly better than with all others.
+
+    With ``camera`` in any units too, as poses of a fixed board in the frame of a camera on the tool. The same if there
+    are no columns of a rotation; with a remark, but for a camera, if no convention is clearly better.
+    """
+    bodies = source.rows.bodies
+    found = [own for own in bodies if own.turn]
+    if not found or source.value("marker") is not None:
+        return source
+    each = [own.turn for own in found]
+    own_body = len(bodies) == max(len(source.tips), 1) == len(each)
     conventions = [name for name in ALL_CONVENTIONS if numbers_of(name) == len(each[0])] if own_body else []
-    turns = product(conventions, ("deg", "rad") if len(each[0]) == 3 else (None,))
-    units = product(UNITS_PER_METRE, ("rad", "deg")) if camera else [(table.length, table.angle)]
-    known = replace(table, rotation=each[0] if len(each) == 1 else each, camera_on_tool=camera)
-    ways = [(*unit, *turn) for unit, turn in product(units, turns)]
-    clear = source.residuals(replace(known, length=a, angle=b, convention=c, rotation_angle=d) for a, b, c, d in ways)
-    if not clear or not is_clear(clear, gates.READINGS_TOLD_APART):
+    turns = list(product(conventions, ("deg", "rad") if len(each[0]) == 3 else (None,)))
+    units = source.in_units() if camera else [source]
+    known = {"rotation": each[0] if len(each) == 1 else each, "camera_on_tool": camera}
+    ways = ranked(one.into(**known, convention=c, rotation_angle=d) for one in units for c, d in turns)
+    if not ways or not is_clear(ways, gates.READINGS_TOLD_APART):
         what = "rotations of no convention that is clearly better than others"
         what = what if own_body else "rotations, but not one for each marker"
-        usual = " or ".join(dict.fromkeys(words for _, words in found))
-        if not camera:
-            yield Choice("", "", f"{few(names, 9)}: {what}; not used; such names usually mean {usual}")
-        return
-    (best, table), *worse = clear
-    why = f"the nominal robot leaves, of what the rows vary, {100 * best:.2g} %"
-    why += f", read in any other way at least {100 * worse[0][0]:.3g} %" if worse and worse[0][0] < inf else ""
+        usual, names = " or ".join(dict.fromkeys(own.usual for own in found)), [name for own in each for name in own]
+        remark = Choice("", "", f"{few(names, 9)}: {what}; not used; such names usually mean {usual}")
+        return source if camera else source.saying(remark)
+    best, *worse = ways
+    why = f"the nominal robot leaves, of what the rows vary, {percent(best.left, 2)}"
+    why += f", read in any other way at least {percent(worse[0].left)}" if worse and worse[0].left < inf else ""
     written = [",".join(own) for own in each]
-    if camera:
-        seen = "the nominal robot explains poses of a fixed board alone, seen from the tool"
-        yield from entries([table], length=why, angle="the same", camera_on_tool=seen)
-    without = "without these three lines positions alone are calibrated"
-    yield Choice("rotation", written[0] if len(written) == 1 else written, f"by their names; {without}")
-    yield from entries([table], convention=why, rotation_angle="the same")
+    units = {"length": why, "angle": "the same"} if camera else {}
+    units |= {"camera_on_tool": "the nominal robot explains poses of a fixed board alone, seen from the tool"}
+    alone = "by their names; without these three lines positions alone are calibrated"
+    turned = Choice("rotation", written[0] if len(written) == 1 else written, alone)
+    turn = entries([best.table], convention=why, rotation_angle="the same")
+    return best.saying(*entries([best.table], **units), turned, *turn)
 
 
-def deviations(source: Source) -> Iterator[Choice]:
-    """Standard deviations of the positions, or a remark why there are none."""
-    names = guess_deviations(source.numbers, source.rows.markers)
+def with_deviations(source: Source) -> Source:
+    """With standard deviations of the positions, or a remark why there are none."""
+    names = guess_deviations(source.sheet.numbers, source.rows.markers)
     if names is None:
-        return
+        return source
     found = None
     with quiet(), suppress(DiffeoCalibError):
-        found = measured_positions(source.read(replace(source.table, std=names)))
+        found = measured_positions(source.into(std=names).data)
     if found is None or found.std is None or (typical := float(found.std.nanmedian())) > LARGEST_DEVIATION:
-        yield Choice("", "", f"{few(names)}: no standard deviations of positions, or not all positive; not used")
-        return
+        remark = f"{few(names)}: no standard deviations of positions, or not all positive; not used"
+        return source.saying(Choice("", "", remark))
     why = f"by their names; median {1e3 * typical:.2g} mm, noise beyond these is estimated"
-    yield Choice("std", ",".join(names), why)
+    return source.saying(Choice("std", ",".join(names), why))
 
 
-def distances(csv: Path, sheet: Sheet, column: str, unit: str) -> Iterator[Choice]:
-    """Options about known distances between sockets, for the user to complete: no table holds them."""
-    header, rows = read_cells(csv, sheet.sep)
-    place = header.index(column)
+def with_distances(source: Source, sockets: str) -> Source:
+    """With known distances between the sockets that a column names, for the user to complete: no table holds them."""
+    header, rows = read_cells(source.csv, source.sheet.sep)
+    place, unit = header.index(sockets), source.table.length
     names = list(dict.fromkeys(cells[place].strip() for _, cells in rows if cells[place].strip()))
     if len(names) < 2:
-        yield Choice("", "", "there is one socket alone, and no distance to know: the URDF gives the robot's size")
-        return
+        remark = "there is one socket alone, and no distance to know: the URDF gives the robot's size"
+        return source.saying(Choice("", "", remark))
     length, deviation = (f"{metres * UNITS_PER_METRE[unit]:g}" for metres in (0.05, 3e-5))
     why = f"measure it, in {unit}, and uncomment: it gives the robot its size"
-    yield Choice("distance", [f"{names[0]},{names[1]}={length}"], why, sure=False)
-    yield Choice("", "", f"distance-std = {deviation}  # how well it is known, in {unit}: so well with a caliper")
+    remark = f"distance-std = {deviation}  # how well it is known, in {unit}: so well with a caliper"
+    asked = Choice("distance", [f"{names[0]},{names[1]}={length}"], why, sure=False)
+    return source.saying(asked, Choice("", "", remark))

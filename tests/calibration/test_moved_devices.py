@@ -14,7 +14,7 @@ import pytest
 import torch
 from golden_bank import sockets
 from math_bank import normal
-from product_bank import Case, simulated, simulated_poses, ur10_measurements, ur10_scales
+from product_bank import simulated, simulated_poses, ur10_measurements, ur10_scales
 from reading_bank import readings, scales
 from tangent_bank import Setting, built, covariance
 from torch import Tensor
@@ -92,10 +92,7 @@ def test_sockets_without_a_known_distance_show_no_size() -> None:
 
 def test_the_scale_of_a_wire_is_checked_in_the_same_way() -> None:
     data = readings(ARM, "distance", ROWS, zero=0.02)
-    wrong = dc.Readings.distances(
-        data.q, 1.01 * data.values[:, 0], [data.names[k] for k in data.device.tolist()], offset_std=0.1
-    )
-    _, (text,) = warned(wrong)
+    _, (text,) = warned(with_attributes(data, values=1.01 * data.values))
     found = re.match(r"the size of the robot seems to differ by \+([\d.]+) %", text)
     assert found is not None, text
     assert float(found[1]) == pytest.approx(1.0, rel=0.2)
@@ -158,21 +155,6 @@ def from_row(points: Tensor, row: int, change: Tensor) -> Tensor:
     changed = points.clone()
     changed[row:] += change
     return changed
-
-
-@pytest.mark.slow
-def test_a_tracker_that_was_knocked_is_noticed(arm: Case) -> None:
-    """0.5 mm from one of 60 rows on, in the order of their numbers; the error of the calibration is 0.04 mm."""
-    change = torch.tensor([3e-4, 0.0, 4e-4], dtype=torch.float64)
-    data = dc.Measurements(arm.train.q, from_row(arm.train.points, 25, change))
-    mixed = data[torch.from_numpy(np.random.default_rng(0).permutation(len(data)))]
-    with pytest.warns(DiffeoCalibWarning, match="moved by") as caught:
-        dc.calibrate(arm.robot, mixed)
-    assert {w.filename for w in caught} == {__file__}  # it points at the caller
-    (found,) = (re.match(r"the measuring device.* about ([\d.]+) mm near row (\d+)", str(w.message)) for w in caught)
-    assert found is not None
-    assert float(found[1]) == pytest.approx(0.5, rel=0.3)
-    assert abs(int(found[2]) - 25) <= 1
 
 
 def test_the_gain_is_that_of_the_definition() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import socket
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from http.client import HTTPConnection, HTTPResponse
@@ -132,33 +131,3 @@ def test_rows_under_an_id_of_others(tmp_path: Path, run: Callable[..., tuple[Out
         assert all("whose values are others" in one["error"] for one in answers[6:9])
         assert all("leave it out" in one["error"] for one in answers[9:])
     assert len((tmp_path / "run.csv").read_text().splitlines()) == 4
-
-
-def test_a_row_that_is_none_ends_nothing(run: Callable[..., tuple[Outcome, Answers]]) -> None:
-    bad = [row(1).replace(b'"x": ', b'"x": %s, "y": ' % value) for value in (b"1e999", b"NaN", b"true", b"[1]")]
-    bad += [row(1).replace(b'"id": 1', b'"id": %s' % value) for value in (b"1e999", b"-Infinity", b"false", b"[]")]
-    done, (*refused, taken, _) = run([*bad, row(0)])
-    assert done.code == 0
-    for one, name in zip(refused, 4 * ["x"] + 4 * ["id"], strict=True):
-        assert f"'{name}' of a row: expected a finite number" in one["error"]
-    assert taken["line"] == 2
-
-
-def test_a_table_that_another_program_edits(tmp_path: Path, run: Callable[..., tuple[Outcome, Answers]]) -> None:
-    """The next row lost its first characters, and was accepted."""
-    path = tmp_path / "run.csv"
-
-    def lines() -> Iterator[bytes]:
-        yield from map(row, range(3))
-        journal = tmp_path / "run.csv.journal"
-        while not journal.exists() or journal.read_text().count('"line": ') < 3:
-            time.sleep(0.05)
-        whole = path.read_text()
-        path.write_text(whole[:-20] + whole[-17:])
-        yield row(3)
-
-    done, answers = run(lines())
-    assert done.code == 1
-    assert "was changed" in done.error
-    assert [one["line"] for one in answers if "error" not in one] == [2, 3, 4]
-    assert path.read_text().count("\n") == 4

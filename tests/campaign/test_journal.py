@@ -209,8 +209,9 @@ def test_lines_that_are_no_rows() -> None:
             parsed(bad)
     assert parsed(b'{"a": 1.5, "b": null, "c": "x"}\n') == {"a": 1.5, "b": None, "c": "x"}
     for value in ("NaN", "1e999", "-Infinity", "true", "[1]", "{}", '"x\\n"', f'"{999 * "x"}"', 400 * "9"):
-        with pytest.raises(InputError, match=r"'a' of a row: expected a finite number"):
-            check_cells(parsed(f'{{"a": {value}}}\n'.encode()))
+        for name in ("a", "id"):
+            with pytest.raises(InputError, match=rf"'{name}' of a row: expected a finite number"):
+                check_cells(parsed(f'{{"{name}": {value}}}\n'.encode()))
     for value in (None, "", " "):
         with pytest.raises(InputError, match="leave it out"):
             check_cells({"id": value})

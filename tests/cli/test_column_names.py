@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from diffeo_calib.cli.column_names import column
-from diffeo_calib.cli.guesses import guess_joints, guess_matrix, guess_positions, guess_rotation, joints_without_column
+from diffeo_calib.cli.guesses import Body, bodies_in, guess_joints, guess_matrix, joints_without_column
 
 SIX = [f"joint_{k}" for k in range(1, 7)]
 SO_100 = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"]
@@ -111,10 +111,8 @@ def test_headers_of_devices(device: str) -> None:
     joints, first, second, (wanted, position, rotation), third = HEADERS[device]
     header = list(dict.fromkeys([*first, *second, *third]))
     assert guess_joints(header, joints)[0].names == wanted
-    others = [name for name in header if name not in wanted]
-    assert guess_positions(others)[0] == [position]
-    found = guess_rotation(others, position)
-    assert (found and found[0]) == rotation
+    (found,) = [own for own in bodies_in([name for name in header if name not in wanted]) if not own.left]
+    assert (found.place, found.turn) == (position, rotation or [])
 
 
 @pytest.mark.parametrize(
@@ -134,21 +132,23 @@ def test_headers_of_devices(device: str) -> None:
 )
 def test_wished_places_are_no_markers(measured: str, wished: str) -> None:
     for axes in ("xyz", "XYZ"):
-        kept, left = guess_positions([*triple(wished, axes), *triple(measured, axes)])
-        assert kept == [triple(measured, axes)]
-        assert left == [(triple(wished, axes), "wished places")]
+        found = bodies_in([*triple(wished, axes), *triple(measured, axes)])
+        assert [(own.place, own.left) for own in found] == [
+            (triple(wished, axes), "wished places"),
+            (triple(measured, axes), ""),
+        ]
 
 
 def test_two_markers_stay_two() -> None:
-    assert guess_positions([*triple("{}"), *triple("{}", "XYZ")])[0] == [triple("{}"), triple("{}", "XYZ")]
-    for names in ("left_{}", "{}1", "target 1 {}", "m{}"):
-        both = [triple("b_{}"), triple(names)]
-        assert guess_positions([*both[0], *both[1]]) == (both, [])
+    for one, other in (("{}", "{}"), *(("b_{}", name) for name in ("left_{}", "{}1", "target 1 {}", "m{}"))):
+        both = [triple(one), triple(other, "XYZ")]
+        assert bodies_in([*both[0], *both[1]]) == [Body(names, []) for names in both]
 
 
 @pytest.mark.parametrize("other", ["v{}", "gyro_{}", "rot_{}", "d{}", "force {} [N]", "sigma_{}", "q_{}"])
 def test_other_triples_are_no_places(other: str) -> None:
-    assert guess_positions([*triple(other), *triple("p{}")]) == ([triple("p{}")], [])
+    assert bodies_in([*triple(other), *triple("p{}")])[-1].place == triple("p{}")
+    assert len(bodies_in([*triple(other), *triple("p{}")])) == 1
 
 
 @pytest.mark.parametrize("other", ["qd_{}", "tau_{}", "J{} [deg/s]", "joint_velocity_{}", "joint_current_{}", "tcp_{}"])
@@ -208,8 +208,11 @@ def test_words_and_units(name: str, words: tuple[str, ...], unit: str) -> None:
 
 
 def test_places_are_no_rotations() -> None:
-    assert guess_rotation(triple("m1_{}"), triple("m2_{}")) is None
-    assert guess_rotation(triple("tip_{}"), triple("m2_{}")) is None
-    found = guess_rotation([*triple("a rot {}"), *triple("b rot {}")], triple("b_{}"))
-    assert found is not None
-    assert found[0] == triple("b rot {}")
+    assert bodies_in([*triple("m1_{}"), *triple("m2_{}")])[1].turn == []
+    assert bodies_in([*triple("tip_{}"), *triple("m2_{}")])[1].turn == []
+    assert bodies_in(["x", "y", "z", "rx", "ry"]) == [Body(["x", "y", "z"], [])]
+    for names in ("{} rot {}", "{}_r{} [deg]"):
+        each = [[names.format(body, axis) for axis in "xyz"] for body in "ab"]
+        places = [[f"{body}_{axis}" for axis in "xyz"] for body in "ba"]
+        found = bodies_in(["Goal roll", "Goal pitch", "Goal yaw", *each[0], *each[1], *places[0], *places[1]])
+        assert [own.turn for own in found] == each[::-1]

@@ -84,7 +84,7 @@ def test_whose_columns_are_the_machine_s(names: str, machine: str, tmp_path: Pat
     pose = transforms(turned(drawn(4, 3, seed=2)), drawn(4, 3, seed=3)).mT.flatten(1)  # by columns
     values = torch.cat([pose if "O_T_EE" in names else drawn(4, 0, seed=1), drawn(4, 30, seed=1)], 1)
     table = write_columns(tmp_path / "t.csv", **{"|".join(names.split()): values[:, : len(names.split())]})
-    found = commanded_poses.bodies_in(table, guess_sheet(table))
+    found = commanded_poses.poses_in(table, guess_sheet(table))
     assert commanded_poses.machine_of(found).place[0] == machine
 
 

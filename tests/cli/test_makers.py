@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from diffeo_calib.cli.guesses import guess_joints, guess_positions
+from diffeo_calib.cli.guesses import bodies_in, guess_joints
 
 PAGE = Path(__file__).parents[2] / "scripts/docs/pages/howto/makers.md"
 ROBOTS = PAGE.read_text(encoding="utf-8").split("\n## ")[1]
@@ -22,7 +22,7 @@ def test_joints_of_a_maker_are_found_beside_their_speeds(maker: str) -> None:
     joints = ["q1", "q2"] if maker.startswith("ROS") else joints
     columns = [*SERIES[maker], *(f"d{name}" for name in own), *PLACES]
     assert guess_joints(columns, joints)[0].names == own
-    assert guess_positions(columns)[0] == [PLACES]
+    assert [own.place for own in bodies_in(columns)] == [PLACES]
 
 
 def test_every_maker_is_tested() -> None:

@@ -288,8 +288,7 @@ def size_ratio(predicted: Tensor, measured: Tensor) -> float:
 
 def warn_of_scale(rows: NewRows) -> None:
     """Warn if distances between points that a device measured differ by a factor that no robot has."""
-    measured = rows.y.masked_fill(~rows.visible, nan)
-    ratio = size_ratio(*(each.unflatten(1, (-1, 3)) for each in (rows.seen[0], measured)))
+    ratio = size_ratio(*(each.unflatten(1, (-1, 3)) for each in (rows.seen[0], rows.given.shown(rows.y))))
     if abs(ratio - 1.0) > USUAL_RATIO:
         what = f"distances between the new rows are {ratio:.4f} times those that the model predicts"
         warn_user(sentence(what, fix="check the scale of the measuring device"))

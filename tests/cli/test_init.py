@@ -1,0 +1,606 @@
+"""`init`: which robot, link, columns, units and conventions it proposes, and what `fit` says of the same."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import shutil
+from collections.abc import Callable, Sequence
+from math import degrees, pi
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from command_bank import Command
+from commanded_bank import write_columns
+from kind_bank import kind_named
+from product_bank import simulated_poses
+from torch import Tensor
+from trackerless_bank import write_socket_table, write_wire_table
+from typer.main import get_command
+
+import diffeo_calib as dc
+from diffeo_calib.cameras.files import camera_text
+from diffeo_calib.cli.guesses import guess_deviations, guess_sheet
+from diffeo_calib.cli.main import app, expanded
+from diffeo_calib.measurements.csv.files import write_measurements
+from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots.simulated_arm import SimulatedArm
+
+ARM, ROWS = SimulatedArm(seed=3), 40
+NAMES, XYZ = list(ARM.nominal.joint_names), ["x", "y", "z"]
+SERIES = [f"j{k}" for k in range(1, 7)]
+Proposed = Callable[..., tuple[dict[str, Any], str]]
+
+
+def rows() -> tuple[Tensor, Tensor]:
+    """Joint values, deg, and places, mm."""
+    q, points = ARM.measure(ROWS, seed=0)
+    return q.rad2deg(), 1e3 * points[:, 0]
+
+
+def noise(*shape: int, size: float) -> Tensor:
+    return size * torch.randn(shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+
+@pytest.fixture
+def proposed(tmp_path: Path, init: Proposed) -> Proposed:
+    """What `init` proposes for columns of some names and numbers, and a robot: its entries, and its text."""
+
+    def propose(*columns: tuple[Sequence[str], Tensor], robot: str = "arm.urdf") -> tuple[dict[str, Any], str]:
+        if not (tmp_path / robot).exists():
+            ARM.write_urdf(tmp_path / robot)
+        table = write_columns(tmp_path / "t.csv", **{"|".join(names): values for names, values in columns})
+        return init(table, tmp_path / robot)
+
+    return propose
+
+
+@pytest.fixture
+def frame(tmp_path: Path) -> Any:
+    """A table of the arm as a data frame, m and rad, beside its URDF."""
+    ARM.write_urdf(tmp_path / "arm.urdf")
+    return dc.Measurements(*ARM.measure(ROWS, seed=0), NAMES).to_frame()
+
+
+def reasons(text: str) -> dict[str, str]:
+    """What stands beside each entry."""
+    lines = [line.partition("  # ") for line in text.splitlines() if not line.startswith("#")]
+    return {line.partition(" = ")[0]: why for line, _, why in lines}
+
+
+# --- the robot and its links ---
+
+JOINT = (
+    '<link name="{2}"/><joint name="{0}" type="{3}"><parent link="{1}"/><child link="{2}"/>'
+    '<origin xyz="0 0 .06"/><axis xyz="0 1 0"/><limit lower="0" upper=".8"/>{4}</joint>'
+)
+GRIPPER = (
+    ("mount", "flange", "hand", "fixed", ""),
+    ("slide", "hand", "left_jaw", "prismatic", ""),
+    ("follower", "hand", "right_jaw", "prismatic", '<mimic joint="slide"/>'),
+)
+OPENING = torch.linspace(0.0, 50.0, ROWS, dtype=torch.float64)[
+    torch.randperm(ROWS, generator=torch.Generator().manual_seed(1))
+][:, None]
+"""Of the gripper, mm."""
+
+
+def write_arm(folder: Path, *joints: tuple[str, ...]) -> None:
+    """The arm with more joints."""
+    ARM.write_urdf(folder / "arm.urdf")
+    text = (folder / "arm.urdf").read_text()
+    text = text.replace("</robot>", "".join(JOINT.format(*joint) for joint in joints) + "</robot>")
+    (folder / "arm.urdf").write_text(text)
+
+
+@pytest.mark.parametrize(
+    ("slide", "why"),
+    [
+        (OPENING[:, :0], ""),
+        (20.0 + 0.0 * OPENING, "slide hardly moves in the table"),
+        (OPENING, "with slide the nominal robot leaves"),
+    ],
+)
+def test_the_tip_is_before_a_gripper(slide: Tensor, why: str, tmp_path: Path, proposed: Proposed) -> None:
+    write_arm(tmp_path, *GRIPPER)
+    q, points = rows()
+    entries, text = proposed((NAMES, q), (XYZ, points), *[(["slide"], slide)] * slide.shape[1])
+    assert (entries["base"], entries["tip"], entries["joints"]) == ("base_link", "flange", ",".join(NAMES))
+    assert f"behind {NAMES[-1]}" in reasons(text)["tip"]
+    assert why in reasons(text)["tip"]
+    assert ("slide" in text.splitlines()[-1]) == bool(slide.numel()), "it is not used"
+
+
+@pytest.mark.parametrize("tip", ["left_jaw", "flange"])
+def test_the_tip_is_what_carries_the_marker(tip: str, tmp_path: Path, proposed: Proposed) -> None:
+    """On the last axis a marker tells nothing of its joint, but this is one of the arm's."""
+    write_arm(tmp_path, *GRIPPER[: 3 * (tip == "left_jaw")])
+    robot = dc.load_urdf(tmp_path / "arm.urdf", "base_link", tip)
+    q, slide = ARM.measure(ROWS, seed=0)[0], OPENING if tip == "left_jaw" else OPENING[:, :0]
+    points = 1e3 * robot(torch.cat([q, slide / 1e3], 1))[:, :3, 3] + noise(ROWS, 3, size=1.0)
+    entries, _ = proposed((robot.joint_names, torch.cat([q.rad2deg(), slide], 1)), (XYZ, points))
+    assert entries["tip"] == tip
+
+
+def test_links_without_usual_names_and_joints_that_follow(tmp_path: Path, proposed: Proposed) -> None:
+    """The tip is the link of the last joint, behind a wrist that follows the arm's own joints."""
+    follows = f'<mimic joint="{NAMES[1]}" multiplier="0"/>'
+    write_arm(tmp_path, ("level", "flange", "plate", "revolute", follows), ("screws", "plate", "probe", "fixed", ""))
+    q, points = rows()
+    assert proposed((NAMES, q), (XYZ, points))[0]["tip"] == "plate"
+
+
+def test_two_arms_that_explain_the_rows_alike_are_not_guessed(tmp_path: Path, proposed: Proposed) -> None:
+    """Numbered columns may be of either arm; named after its joints they are of one."""
+    write_arm(tmp_path)
+    body = (tmp_path / "arm.urdf").read_text().partition('<robot name="simulated_arm">')[2].partition("</robot>")[0]
+    arms = [re.sub(r'(<link name|<joint name|link)="', rf'\1="{side}_', body) for side in ("left", "right")]
+    mount = '<joint name="{0}" type="fixed"><parent link="torso"/><child link="{0}_base_link"/></joint>'
+    parts = ['<robot name="two"><link name="torso"/>', *(mount.format(side) for side in ("left", "right")), *arms]
+    (tmp_path / "two.urdf").write_text("".join([*parts, "</robot>"]))
+    q, points = rows()
+    _, text = proposed(([f"q{k}" for k in range(6)], q), (XYZ, points), robot="two.urdf")
+    assert "expected some that explain the rows far better, got left_waist_joint" in text
+    entries, _ = proposed(([f"right_{name}" for name in NAMES], q), (XYZ, points), robot="two.urdf")
+    assert entries["tip"] == "right_flange"
+
+
+def test_a_robot_in_macros_and_a_folder_of_images_are_told_what_to_do(
+    tmp_path: Path, command: Command, frame: Any
+) -> None:
+    frame.to_csv(tmp_path / "t.csv", index=False)
+    name_space = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
+    (tmp_path / "arm.xacro").write_text(f'<robot name="a" {name_space}><xacro:arm prefix="left"/></robot>')
+    (tmp_path / "images").mkdir()
+    units = ["--length", "m", "--angle", "rad", "--position", "x,y,z", "-o", tmp_path / "m.safetensors"]
+    for table, robot, message in (
+        ("t.csv", "arm.xacro", "expand the xacro file first (`xacro FILE > robot.urdf`)"),
+        ("images", "arm.urdf", "is a folder: expected a table; of images of a board run `diffeo-calib images"),
+    ):
+        asked = command("init", tmp_path / table, tmp_path / robot, "-o", tmp_path / "c.toml")
+        fitted = command("fit", tmp_path / table, "--robot", tmp_path / robot, *units)
+        assert asked.error == fitted.error
+        assert message in asked.error
+
+
+DH = [(0.07, -pi / 2, 0.41, 0.0), (0.5, 0.0, 0.0, -pi / 2), (0.04, -pi / 2, 0.0, 0.0)]
+DH += [(0.0, pi / 2, 0.45, 0.0), (0.0, -pi / 2, 0.0, 0.0), (0.0, 0.0, 0.09, pi)]
+
+
+def write_dh_arm(folder: Path, convention: str, scale: float, joints: str) -> tuple[Tensor, Tensor]:
+    """A DH file, and rows, deg and mm, of a robot that differs from it by a millimetre and a milliradian."""
+    lines = [f"{degrees(theta)},{scale * d},{scale * a},{degrees(alpha)}" for a, alpha, d, theta in DH]
+    (folder / "arm.csv").write_text("\n".join(["theta,d,a,alpha", *lines]))
+    found = (torch.tensor(DH, dtype=torch.float64) + noise(6, 4, size=1e-3)).tolist()
+    robot = dc.from_dh(found, convention, [joints.format(k + 1) for k in range(6)])
+    q = 3.0 * torch.rand(ROWS, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(4)) - 1.5
+    return q.rad2deg(), 1e3 * (robot(q) @ torch.tensor([0.08, 0.04, 0.1, 1.0], dtype=torch.float64))[:, :3]
+
+
+@pytest.mark.parametrize(("convention", "scale"), [("standard", 1.0), ("craig", 1e3)])
+def test_the_convention_that_explains_the_rows(
+    convention: str, scale: float, tmp_path: Path, command: Command, proposed: Proposed
+) -> None:
+    q, points = write_dh_arm(tmp_path, convention, scale, "J{}")
+    columns = [f"J{k}" for k in range(1, 7)]
+    entries, text = proposed((columns, q), (XYZ, points), robot="arm.csv")
+    assert [entries[name] for name in ("robot", "dh-convention", "joints")] == [
+        "arm.csv",
+        convention,
+        ",".join(columns),
+    ]
+    assert not {"base", "tip"} & set(entries)
+    assert f"lengths in {'m' if scale == 1 else 'mm'}, angles in deg" in reasons(text)["robot"]
+    given = ["--length", "mm", "--angle", "deg", "--position", "x,y,z", "-o", tmp_path / "m.safetensors"]
+    fitted = command("fit", tmp_path / "t.csv", "--robot", tmp_path / "arm.csv", *given)
+    assert "--dh-convention; `init` finds the one that fits" in fitted.error
+
+
+def test_a_last_row_without_a_joint_and_options_that_do_not_belong(
+    tmp_path: Path, command: Command, proposed: Proposed
+) -> None:
+    """The row of a flange has no column; the tip is before it."""
+    q, points = write_dh_arm(tmp_path, "standard", 1.0, "joint_{}")
+    with (tmp_path / "arm.csv").open("a") as file:
+        file.write("\n0,0.05,0,0\n# standard")
+    entries, _ = proposed(([f"joint_{k}" for k in range(1, 7)], q), (XYZ, points), robot="arm.csv")
+    assert (entries["tip"], "dh-convention" in entries) == ("joint_6", False)
+    words = ["fit", tmp_path / "t.csv", "--length", "mm", "--angle", "deg", "--position", "x,y,z", "-o", tmp_path / "m"]
+    ARM.write_urdf(tmp_path / "arm.urdf")
+    for robot, option, message in (
+        ("arm.csv", ["--base", "link"], "--base or --load of a DH table"),
+        ("arm.csv", ["--tip", "flange"], "expected one of joint_1, joint_2"),
+        ("arm.urdf", ["--dh-convention", "craig"], "--dh-convention of a URDF"),
+    ):
+        assert message in command(*words, "--robot", tmp_path / robot, *option).error
+
+
+# --- columns whose names leave something open ---
+
+
+def test_of_equal_series_the_robot_decides(proposed: Proposed, tmp_path: Path, command: Command) -> None:
+    """Where it does not tell them apart the user is asked."""
+    (q, points), other = rows(), [f"A{k}" for k in range(1, 7)]
+    written, text = proposed((other, noise(ROWS, 6, size=40.0)), (SERIES, q), (XYZ, points))
+    assert written["joints"] == ",".join(SERIES)
+    assert "times better; not A1 to A6" in text
+    written, text = proposed((other, q + noise(ROWS, 6, size=1e-4)), (SERIES, q), (XYZ, points))
+    assert "joints" not in written
+    for names in (other, SERIES):
+        assert f'# joints = "{",".join(names)}"  # uncomment the right line' in text
+    assert command("fit", tmp_path / "c.toml").code == 1
+
+
+def test_wished_places_are_known_by_their_numbers_or_names(proposed: Proposed) -> None:
+    q, points = rows()
+    nominal = 1e3 * ARM.nominal(q.deg2rad())[:, :3, 3]
+    names = [f"m{k}_{axis}" for k in (1, 2) for axis in "xyz"]
+    written, text = proposed((SERIES, q), (names, torch.cat([nominal, points], 1)))
+    assert written.get("position") == ["m2_x,m2_y,m2_z"], text
+    assert "m1_x, m1_y, m1_z: marker 0 follows the nominal robot to 0.00" in text
+    written, text = proposed((SERIES, q), (names, torch.cat([points, points], 1)))
+    assert written["position"] == ["m1_x,m1_y,m1_z"]
+    assert "m2_x, m2_y, m2_z: marker 1 is a copy of marker 0 (counted from 0); not used" in text
+    _, text = proposed((SERIES, q), (["goal_x", "goal_y", "goal_z"], nominal))
+    assert "got goal_x, goal_y, goal_z: wished places" in text
+
+
+@pytest.mark.parametrize("by_rows", [True, False])
+def test_poses_as_sixteen_numbers(by_rows: bool, proposed: Proposed) -> None:
+    q = rows()[0]
+    poses = ARM.nominal(q.deg2rad())
+    poses[:, :3, 3] = 1e3 * poses[:, :3, 3] + noise(ROWS, 3, size=0.5)
+    names = [f"O_T_EE[{k}]" for k in range(16)]
+    written, _ = proposed((SERIES, q), (names, (poses if by_rows else poses.mT).flatten(1)))
+    order = torch.arange(16).view(4, 4) if by_rows else torch.arange(16).view(4, 4).mT
+    assert written["position"] == [",".join(names[int(k)] for k in order[:3, 3])]
+    assert written["rotation"] == ",".join(names[int(k)] for k in order[:3, :3].flatten())
+    assert written["convention"] == "matrix"
+
+
+def test_a_pose_keeps_the_last_joint_though_its_place_does_not_move(proposed: Proposed) -> None:
+    q = rows()[0]
+    q[:, 5] *= 0.1
+    poses = ARM.nominal(q.deg2rad())
+    poses[:, :3, 3] = 1e3 * poses[:, :3, 3] + noise(ROWS, 3, size=0.5)
+    written, _ = proposed((SERIES, q), ([f"T{row}{k}" for row in range(3) for k in range(4)], poses[:, :3].flatten(1)))
+    assert (written["joints"], written["convention"]) == (",".join(SERIES), "matrix")
+
+
+def test_names_that_contradict_the_numbers_or_lack_a_joint(proposed: Proposed) -> None:
+    q, points = rows()
+    _, text = proposed(([f"{name} [rad]" for name in SERIES], q), (["x [mm]", "y [mm]", "z [mm]"], points))
+    assert "the units that the file states exclude others" in text
+    some = [f"{name}.pos" for k, name in enumerate(NAMES) if k != 3]
+    _, text = proposed((some, q[:, :5]), (XYZ, points))
+    assert f"No column is named after {NAMES[3]}" in text
+
+
+# --- units, and what the columns of joints mean ---
+
+LIFT = """<robot name="lift"><link name="floor"/>
+<joint name="up" type="prismatic"><parent link="floor"/><child link="a"/><axis xyz="0 0 1"/>
+<limit lower="0" upper="1.5" effort="1" velocity="1"/></joint><link name="a"/>
+<joint name="one" type="revolute"><parent link="a"/><child link="b"/><origin xyz=".1 0 .2"/><axis xyz="0 0 1"/>
+<limit lower="-3" upper="3" effort="1" velocity="1"/></joint><link name="b"/>
+<joint name="two" type="revolute"><parent link="b"/><child link="c"/><origin xyz=".5 0 0"/><axis xyz="0 1 0"/>
+<limit lower="-3" upper="3" effort="1" velocity="1"/></joint><link name="c"/>
+<joint name="end" type="fixed"><parent link="c"/><child link="hand"/><origin xyz=".4 .05 0"/></joint><link name="hand"/>
+</robot>"""
+UNIT = torch.rand(30, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+
+
+def lift(folder: Path, travel: float = 1.2) -> tuple[Tensor, Tensor]:
+    """A URDF, joint values (30, 3) and places of the hand (30, 3), rad and m."""
+    (folder / "arm.urdf").write_text(LIFT)
+    q = UNIT * torch.tensor([travel, 3.0, 2.0], dtype=torch.float64) - torch.tensor([0.0, 1.5, 1.0])
+    away = torch.randn(30, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    return q, dc.load_urdf(folder / "arm.urdf")(q)[:, :3, 3] + 0.3 + 2e-3 * away
+
+
+@pytest.mark.parametrize(
+    ("factors", "written"),
+    [
+        ((1.0, 1.0, 1.0), {"length": "m", "angle": "rad"}),
+        ((100.0, 180 / math.pi, 100.0), {"length": "cm", "angle": "deg"}),
+        ((1 / 0.0254, 1.0, 1 / 0.0254), {"length": "inch", "angle": "rad"}),
+        ((1.0, 180 / math.pi, 1e3), {"length": "mm", "angle": "deg", "joint-length": "m"}),
+    ],
+)
+def test_units(
+    factors: tuple[float, float, float], written: dict[str, str], tmp_path: Path, proposed: Proposed
+) -> None:
+    slide, angle, length = factors
+    q, points = lift(tmp_path)
+    cells = torch.cat([q[:, :1] * slide, q[:, 1:] * angle], 1)
+    found, text = proposed((["up", "one", "two"], cells), (XYZ, points * length))
+    assert {name: found[name] for name in ("length", "angle", "joint-length") if name in found} == written
+    assert found["joints"] == "up,one,two"
+    assert "all columns are used" in text
+
+
+def test_a_short_slide_and_a_sign_where_the_file_states_its_units(tmp_path: Path, proposed: Proposed) -> None:
+    """Read in mm a short slide seems to stand still, and the rest explains the rows nearly as well."""
+    q, points = lift(tmp_path, travel=0.096)
+    found, _ = proposed((["up", "one", "two"], q), (XYZ, 1e3 * points))
+    assert [found[name] for name in ("length", "angle", "joint-length")] == ["mm", "rad", "m"]
+    q, points = lift(tmp_path)
+    q[:, 2] *= -1
+    found, _ = proposed((["up", "one [rad]", "two [rad]"], q), (XYZ, points))
+    assert found["joints"] == "up,one [rad],-{two [rad]}"
+
+
+@pytest.mark.parametrize(("length", "per_metre"), [("m", 1.0), ("mm", 1e3)])
+def test_the_size_of_a_gantry_follows_from_its_limits(
+    length: str, per_metre: float, tmp_path: Path, proposed: Proposed
+) -> None:
+    link = '<joint name="{0}" type="prismatic"><parent link="{1}"/><child link="{2}"/><axis xyz="{3}"/>'
+    link += '<limit lower="0" upper="1" effort="1" velocity="1"/></joint><link name="{2}"/>'
+    axes = ("x1", "a", "b", "1 0 0"), ("y1", "b", "c", "0 1 0"), ("z1", "c", "d", "0 0 1")
+    text = f'<robot name="g"><link name="a"/>{"".join(link.format(*axis) for axis in axes)}</robot>'
+    (tmp_path / "arm.urdf").write_text(text)
+    found, text = proposed((["x1", "y1", "z1"], per_metre * UNIT), (XYZ, per_metre * (0.999 * UNIT + 0.3)))
+    assert found["length"] == length
+    assert "limits of the joints" in text
+
+
+@pytest.mark.slow
+def test_signs_and_a_zero_are_proposed_and_read(tmp_path: Path, command: Command, proposed: Proposed) -> None:
+    read, points = rows()
+    read[:, 1] *= -1
+    read[:, 2] += 90
+    found, text = proposed((NAMES, read), (XYZ, points))
+    expected = f"{NAMES[0]},-{{{NAMES[1]}}},{{{NAMES[2]}}}-90,{','.join(NAMES[3:])}"
+    assert found["joints"] == expected
+    assert "with the columns as they are" in text
+    given = ["--robot", tmp_path / "arm.urdf", "--base", "base_link", "--tip", "flange", "--position", "x,y,z"]
+    done = command("fit", tmp_path / "t.csv", *given, "--length", "mm", "--angle", "deg", "-o", tmp_path / "m")
+    assert done.code == 1
+    assert f"the rows fit with --joints '{expected}'" in done.error
+
+
+@pytest.mark.slow
+def test_meanings_that_nothing_tells_apart_are_for_the_user(proposed: Proposed) -> None:
+    q, points = rows()
+    q[:, 4] *= -1
+    found, text = proposed((NAMES, q), (XYZ, points))
+    assert "joints" not in found
+    lines = [line for line in text.splitlines() if line.startswith("# joints = ")]
+    assert len(lines) == 2
+    assert all("uncomment one" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    "written", [(",", ".", "mm", "deg"), (";", ",", "m", "rad"), ("\t", ".", "mm", "rad"), ("|", ",", "m", "deg")]
+)
+def test_a_proposal_is_that_of_the_table(written: tuple[str, str, str, str], tmp_path: Path, command: Command) -> None:
+    sep, decimal, length, angle = written
+    arm = SimulatedArm(seed=3, markers=2)
+    arm.write_urdf(tmp_path / "arm.urdf")
+    data = dc.Measurements(*arm.measure(60, seed=0), NAMES)
+    positions = [("left x", "left y", "left z"), ("right x", "right y", "right z")]
+    write_measurements(tmp_path / "t.csv", data, TableFormat(length, angle, sep, decimal), position=positions)
+    out = tmp_path / "sub"
+    out.mkdir()
+    done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", out / "cell.toml")
+    assert (done.code, done.err) == (0, "")
+    assert "the nominal robot leaves, of what the rows vary" in done.out
+    words = expanded(["fit", str(out / "cell.toml")])
+    options = dict(zip(words[2::2], words[3::2], strict=True))
+    assert os.path.realpath(words[1]) == os.path.realpath(tmp_path / "t.csv")
+    assert (options["--length"], options["--angle"], options["--decimal"]) == (length, angle, decimal)
+    assert options["--sep"] == ("tab" if sep == "\t" else sep)
+    assert [words[k + 1] for k, word in enumerate(words) if word == "--position"] == [",".join(p) for p in positions]
+    assert (options["--joints"], options["--base"], options["--tip"]) == (",".join(NAMES), "base_link", "flange")
+
+
+@pytest.mark.parametrize(("count", "message"), [(ROWS, "one clear reading"), (3, "3 row(s)")])
+def test_a_robot_that_explains_nothing_is_refused(count: int, message: str, tmp_path: Path, proposed: Proposed) -> None:
+    points = 1e3 * SimulatedArm(seed=4).measure(count, seed=9)[1][:, 0]
+    entries, text = proposed((NAMES, rows()[0][:count]), (XYZ, points))
+    assert message in text
+    assert not entries
+    assert not (tmp_path / "c.toml").exists()
+
+
+# --- what else a table holds ---
+
+
+def test_sockets_are_proposed(tmp_path: Path, proposed: Proposed, init: Proposed) -> None:
+    """Angles in degrees, known by the ball; distances are for the user to fill in. Beside positions in their unit."""
+    arm = SimulatedArm(seed=1)
+    arm.write_urdf(tmp_path / "arm.urdf")
+    write_socket_table(tmp_path / "t.csv", arm, "ab", 1)
+    written, text = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
+    assert (written["socket"], written["angle"], written["length"]) == (["place", "socket"], "deg", "mm")
+    assert not {"position", "distance", "distance-std"} & set(written)
+    assert "# all columns are used" in text
+    (tmp_path / "cell.toml").write_text(text.replace("# distance", "distance"))
+    words = expanded(["fit", str(tmp_path / "cell.toml")])
+    assert words[words.index("--socket") + 1] == "place,socket"
+    assert words[words.index("--distance") + 1] == "a,b=50"
+    header, *lines = (tmp_path / "t.csv").read_text().split("\n")
+    q, points = arm.measure(20, seed=2)
+    seen = [["", "", *map(repr, [*a, *p])] for a, p in zip(q.rad2deg().tolist(), points[:, 0].tolist(), strict=True)]
+    (tmp_path / "t.csv").write_text(
+        "\n".join([f"{header},x,y,z", *map(",".join, seen), *(f"{line},,," for line in lines)])
+    )
+    written, text = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
+    assert (written["position"], written["socket"]) == (["x,y,z"], ["place", "socket"])
+    assert (written["angle"], written["length"]) == ("deg", "m")
+    assert '# distance = ["a,b=0.05"]' in text
+    assert "# distance-std = 3e-05" in text
+
+
+def test_sockets_of_a_panda(ur10_folder: Path, init: Proposed) -> None:
+    """Read as degrees all angles are near zero, and the ball hardly leaves its place: 4.9 mm beside the right 2.6."""
+    data = ur10_folder.parent / "mukca"
+    assert init(data / "panda_3.csv", data / "panda.urdf")[0]["angle"] == "rad"
+
+
+def test_the_ur10(ur10_folder: Path, init: Proposed) -> None:
+    assert guess_sheet(ur10_folder / "measurements_iso_cubes.csv").decimal == ","
+    _, text = init(ur10_folder / "measurements_iso_cubes.csv", ur10_folder / "ur10_robot.urdf")
+    for line in (
+        *('length = "mm"', 'angle = "rad"', 'decimal = ","', 'sep = ";"', "measurement_x,measurement_y"),
+        *('rotation = "measurement_rx,measurement_ry,measurement_rz"', 'convention = "XYZ"', 'rotation-angle = "deg"'),
+        'std = "measurement_std_x,measurement_std_y,measurement_std_z"',
+    ):
+        assert line in text
+    assert "time = " not in text, "numbers that `fit` refuses"
+    assert "Timestamp, Goal x" in text.splitlines()[-1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("convention", "unit", "names"),
+    [
+        ("zyx", "deg", ["roll", "pitch", "yaw"]),
+        ("ZXZ", "rad", ["m_rx", "m_ry", "m_rz"]),
+        ("rotvec", "deg", ["rx", "ry", "rz"]),
+        ("quat_xyzw", None, ["qx", "qy", "qz", "qw"]),
+        ("matrix", None, [f"R{i}{j}" for i in "012" for j in "012"]),
+    ],
+)
+def test_rotations_are_proposed_in_the_convention_that_fits(
+    convention: str, unit: str | None, names: list[str], tmp_path: Path, init: Proposed
+) -> None:
+    arm, data, _ = simulated_poses(ROWS)
+    arm.write_urdf(tmp_path / "arm.urdf")
+    table = TableFormat("mm", "deg", rotation=names, convention=convention, rotation_angle=unit)
+    position = ("m_x", "m_y", "m_z") if names[0].startswith("m_") else ("x", "y", "z")
+    write_measurements(tmp_path / "t.csv", data, table, position=position)
+    written, _ = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
+    assert (written["rotation"], written["convention"]) == (",".join(names), convention)
+    assert written.get("rotation-angle") == unit
+    known = [option for one in get_command(app).commands["fit"].params for option in one.opts]  # pyright: ignore[reportAttributeAccessIssue]
+    assert {f"--{name}" for name in written} - {"--csv"} <= set(known)
+
+
+def test_rotations_that_no_convention_explains_are_named_and_not_used(tmp_path: Path, init: Proposed) -> None:
+    arm, data, _ = simulated_poses(ROWS)
+    arm.write_urdf(tmp_path / "arm.urdf")
+    turned = data.rows([*range(1, ROWS), 0])
+    mixed = dc.Measurements(data.q, data.points[:, 0], data.joint_names).to_frame()
+    mixed[["rx", "ry", "rz"]] = turned.to_frame()[["rx", "ry", "rz"]].to_numpy()
+    mixed.to_csv(tmp_path / "t.csv", index=False)
+    written, text = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
+    assert "rotation" not in written
+    assert "# rx, ry, rz: rotations of no convention that is clearly better than others; not used" in text
+    assert "such names usually mean a rotation vector, or angles about x, y and z" in text
+
+
+def test_deviations_are_proposed_if_they_can_be_some(tmp_path: Path, frame: Any, init: Proposed) -> None:
+    for std, proposed in ((2e-5, True), (0.0, False), (0.5, False)):
+        frame[["std_x", "std_y", "std_z"]] = std
+        frame.to_csv(tmp_path / "t.csv", index=False)
+        _, text = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
+        assert ('std = "std_x,std_y,std_z"' in text) is proposed
+        assert ("# std_x, std_y, std_z: no standard deviations" in text) is not proposed
+    triples = [["m_x", "m_y", "m_z"]]
+    assert guess_deviations(["m_std_x", "m_std_z", "m_std_y", "m_x"], triples) == ["m_std_x", "m_std_y", "m_std_z"]
+    assert guess_deviations(["m_std_x", "m_std_y", "m_x"], triples) is None
+
+
+def test_an_edited_file_is_kept(tmp_path: Path, command: Command, frame: Any) -> None:
+    frame.rename(columns={axis: f"t{axis}" for axis in XYZ}).to_csv(tmp_path / "t.csv", index=False)
+    words = "init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml"
+    assert command(*words).code == 0
+    assert 'position = ["tx,ty,tz"]' in (tmp_path / "c.toml").read_text()
+    assert command(*words).code == 0  # the same again
+    with (tmp_path / "c.toml").open("a") as file:
+        file.write("holdout = 0\n")
+    done = command(*words)
+    assert done.code == 1
+    assert "exists and holds other options" in done.err
+    assert (tmp_path / "c.toml").read_text().endswith("holdout = 0\n")
+    assert command(*words, "--force").code == 0
+    assert "holdout" not in (tmp_path / "c.toml").read_text()
+
+
+@pytest.mark.slow
+def test_a_wire_its_anchors_and_a_payload(tmp_path: Path, frame: Any, init: Proposed) -> None:
+    write_wire_table(tmp_path / "wire.csv", ARM, seed=1)
+    written, _ = init(tmp_path / "wire.csv", tmp_path / "arm.urdf")
+    expected = {"reading": "displacement=wire", "session": "anchor", "length": "mm", "angle": "deg"}
+    assert {name: written[name] for name in expected} == expected
+    frame["payload_kg"], frame["time_s"], frame["Temperature"] = [0.0, 2.0] * 20, range(ROWS), [21.5] * ROWS
+    frame.to_csv(tmp_path / "t.csv", index=False)
+    written, _ = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
+    expected = {"payload": "payload_kg", "time": "time_s", "temperature": "Temperature"}
+    assert {name: written[name] for name in expected} == expected
+    frame["time_s"] += 20_210_313_000_000  # a date: `fit` refuses it
+    frame.to_csv(tmp_path / "t.csv", index=False)
+    assert "time" not in init(tmp_path / "t.csv", tmp_path / "arm.urdf")[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["several tips", "camera on the tool"])
+def test_tips_and_cameras_are_proposed(name: str, init: Proposed) -> None:
+    """The options that `init` writes read the table as those that wrote it."""
+    kind = kind_named(name)
+    table, options = kind.table()
+    written, _ = init(table, kind.urdf)
+    given: dict[str, list[str]] = {}
+    for word, value in zip(options, [*options[1:], ""], strict=True):
+        if word.startswith("--"):
+            given.setdefault(word.removeprefix("--"), []).append(value)
+    for option, values in given.items():
+        expected = [True] if option == "camera-on-tool" else values
+        assert written[option] == (expected if len(expected) > 1 or option == "position" else expected[0]), option
+    assert written["tip"] == (list(kind.robot.tips) if name == "several tips" else kind.robot.tip)
+
+
+@pytest.mark.slow
+def test_the_camera_beside_the_table(tmp_path: Path, command: Command) -> None:
+    """Another YAML file is none; its place is relative to the campaign, which runs from anywhere."""
+    kind = kind_named("images of a board")
+    table, _ = kind.table()
+    (tmp_path / "sub").mkdir()
+    shutil.copy(table, tmp_path / "corners.csv")
+    (tmp_path / "launch.yaml").write_text("camera: none\n")
+    (tmp_path / "wrist.yaml").write_text(camera_text(next(iter(kind.data.cameras.values()))))
+    done = command("init", tmp_path / "corners.csv", kind.urdf, "-o", tmp_path / "sub" / "c.toml")
+    assert done.code == 0, done.err
+    text = (tmp_path / "sub" / "c.toml").read_text()
+    assert 'reading = "corners=../wrist.yaml"' in text
+    assert "the file beside the table" in reasons(text)["reading"]
+
+
+def test_lenses_that_no_table_holds_are_to_be_filled_in(tmp_path: Path, command: Command, init: Proposed) -> None:
+    """Angles follow from the images all the same; `fit` refuses the file until the lens is there."""
+    kind = kind_named("images")
+    table, _ = kind.table()
+    written, _ = init(table, kind.urdf)
+    assert (written["reading"], written["session"], written["angle"]) == ("image=u,v,FX,FY,CX,CY", "session", "deg")
+    refused = command("fit", tmp_path / "c.toml")
+    assert refused.code == 1
+    assert "--reading image=u,v,FX,FY,CX,CY" in refused.err
+
+
+def test_a_full_column_beside_positions_is_no_reading(tmp_path: Path, frame: Any, init: Proposed) -> None:
+    """Rows of several kinds leave the cells of the other kinds empty."""
+    frame["distance"], frame["session"] = 1.0, ["monday", "tuesday"] * 20
+    frame.to_csv(tmp_path / "t.csv", index=False)
+    written, text = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
+    assert "reading" not in written
+    assert written["session"] == "session"
+    assert "not used: distance" in text
+
+
+@pytest.mark.slow
+def test_a_kind_from_outside_alone(tmp_path: Path, init: Proposed) -> None:
+    """Beams need nothing beside them; readings of a frame need poses, and what refuses them says so."""
+    said = {}
+    for name in ("laser beams", "inclinations"):
+        kind = kind_named(name)
+        table = tmp_path / f"{name[:3]}.csv"
+        rows = kind.source.golden.rows.parts[1].with_joint_names(kind.robot.joint_names)
+        write_measurements(table, rows, TableFormat("mm", "deg"))
+        said[name] = init(table, kind.urdf)
+    assert "line distance=line distance" in said["laser beams"][0]["reading"]
+    assert not said["inclinations"][0]
+    assert "measured poses" in said["inclinations"][1]
