@@ -86,8 +86,7 @@ class CampaignOptions(Command):
     the best poses to measure next. A journal beside the table keeps what was decided: after a crash the same
     command goes on where it stopped. Ends with exit code 0 when --tolerance is reached, 4 if the rows end before.
 
-    A campaign file (`diffeo-calib campaign campaign.toml`, see `init`) may take the place of CSV: it can hold all
-    options, the required ones too; those that are typed as well win.
+    A campaign file (`diffeo-calib campaign campaign.toml`, see `init`) may take the place of CSV, as of `fit`.
     """
 
     csv: Path = argument(CSV, "CSV", kind="later")

@@ -33,7 +33,13 @@ from diffeo_calib.reports.html.document import (
     panel,
     rough_millimetres,
 )
-from diffeo_calib.reports.plots.errors import draw_before_after, draw_distributions
+from diffeo_calib.reports.plots.errors import (
+    draw_before_after,
+    draw_coverage,
+    draw_distributions,
+    draw_learning_curve,
+    draw_residuals,
+)
 from diffeo_calib.reports.plots.joints import (
     PART_WIDTH,
     draw_expected,
@@ -45,7 +51,6 @@ from diffeo_calib.reports.plots.joints import (
     short,
 )
 from diffeo_calib.reports.plots.style import PANEL, Frame
-from diffeo_calib.reports.plots.trust import draw_coverage, draw_learning_curve, draw_residuals
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.payload import payload_sentence
 from diffeo_calib.sensors.errors import ERRORS, SIZES, Evaluation
