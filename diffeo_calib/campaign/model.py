@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import combinations
 from math import inf, isinf, pi
 from typing import Any, NamedTuple
 
@@ -22,7 +23,7 @@ from diffeo_calib.calibration.planning.candidates import candidates, ranges_arou
 from diffeo_calib.calibration.planning.knowledge import factor, greedy
 from diffeo_calib.calibration.scales.selection import SCALE_PRIOR, defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.campaign.verdicts import Seen, Verdict, exchanged, find_change, measure
+from diffeo_calib.campaign.verdicts import Seen, Verdict, find_change, measure
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning, InputError, MeasurementError, few
 from diffeo_calib.common.quantiles import chi2_above
@@ -312,21 +313,13 @@ class CampaignModel:
 
     def _cause(self, table: Any, data: TangentData, seen: Seen, known: Tensor) -> str:
         """Why the last row is wrong, in words; empty if nothing that is undone makes it fit."""
-        row, last, freedom = self.window[-1], len(known) - 1, _freedom(data, len(known) - 1)
+        last, bodies, freedom = len(known) - 1, data.noise_model.bodies, _freedom(data, len(known) - 1)
         numbers, mine = seen.numbers, seen.numbers.owner == last
 
         def fits(other: Seen, some: Tensor | None = None, freedom: int = freedom) -> bool:
             return measure(other, last, known, freedom, some).fits(self.typical, gates.UNDONE_CHANCE)
 
-        y = data.y[last : last + 1]
-        bodies = data.noise_model.bodies
-        units = [(f"its values seem to be {words}", factor * y) for factor, words in UNITS]
-        for words, other in [*units, *exchanged(y, bodies)]:
-            undone = torch.zeros_like(data.y)
-            undone[last:] = other - y
-            if fits(seen._replace(error=seen.error + numbers.of_table(data.in_numbers(undone)))):
-                return words
-        for words, other in self._other_joints(table, row, data):
+        for words, other in self._undone(table, data, seen):
             if fits(other):
                 return words
         size = numbers.shape[1] // bodies
@@ -334,8 +327,17 @@ class CampaignModel:
         good = [b for b in range(bodies) if fits(seen, mine & (body != b), freedom * (bodies - 1) // bodies)]
         return f"marker {good[0]} seems to be wrong" if len(good) == 1 < bodies else ""
 
-    def _other_joints(self, table: Any, row: int, data: TangentData) -> Iterator[tuple[str, Seen]]:
-        """The last rows with other joint values of the last one, in words."""
+    def _undone(self, table: Any, data: TangentData, seen: Seen) -> Iterator[tuple[str, Seen]]:
+        """The last rows with a mistake of the last one undone, in words: in its values, and in its joint values."""
+        row, y, each = self.window[-1], data.y[-1:], data.y[-1].unflatten(0, (data.noise_model.bodies, -1))
+        values = [(f"its values seem to be {words}", factor * y) for factor, words in UNITS]
+        for a, b in combinations(range(len(each)), 2):
+            other = each.index_copy(0, torch.tensor([a, b], device=each.device), each[[b, a]])
+            values.append((f"markers {a} and {b} seem to be exchanged", other.flatten()[None]))
+        for words, other in values:
+            undone = torch.zeros_like(data.y)
+            undone[-1:] = other - y
+            yield words, seen._replace(error=seen.error + seen.numbers.of_table(data.in_numbers(undone)))
         turning = torch.tensor(self.placed.registration.geometry.chain.periodic, dtype=torch.bool, device=HOST)
         q = table.q[row]
         joints = {
@@ -344,9 +346,9 @@ class CampaignModel:
             "it seems to have been measured at the joint values of the row before": table.q[row - 1],
         }
         before, noise = self._told(data.rows(torch.arange(len(data.x) - 1, device=HOST)))
-        each = self.around(with_joints(table.rows([row] * len(joints)), torch.stack([*joints.values()]))).data
+        others = self.around(with_joints(table.rows([row] * len(joints)), torch.stack([*joints.values()]))).data
         for number, text in enumerate(joints):
-            own, own_noise = self._told(each.rows(torch.tensor([number], dtype=torch.int64, device=HOST)))
+            own, own_noise = self._told(others.rows(torch.tensor([number], dtype=torch.int64, device=HOST)))
             yield text, self._seen(before.joined(own), [*noise, *own_noise])
 
     def _told(self, data: TangentData) -> tuple[Numbers, list[Tensor]]:

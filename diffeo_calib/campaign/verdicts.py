@@ -12,9 +12,8 @@ A row is judged by d^2 = e^T S^-1 e, chi-squared if it is right. Two kinds of ca
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from itertools import combinations
 from math import log
 from typing import Any, NamedTuple
 
@@ -144,15 +143,6 @@ def measure(seen: Seen, row: int, known: Tensor, freedom: int, some: Tensor | No
     square = float(error @ torch.linalg.solve(covariance, error))
     expected = float(covariance.diagonal().mean().clamp(min=0).sqrt())
     return Measure(square, freedom, float(error.square().mean().sqrt()), expected)
-
-
-def exchanged(y: Tensor, bodies: int) -> Iterator[tuple[str, Tensor]]:
-    """Values (1, m) of a row with two bodies exchanged, in words and numbers."""
-    each = y.unflatten(1, (bodies, -1))
-    for a, b in combinations(range(bodies), 2):
-        order = list(range(bodies))
-        order[a], order[b] = b, a
-        yield f"markers {a} and {b} seem to be exchanged", each[:, order].flatten(1)
 
 
 def find_change(

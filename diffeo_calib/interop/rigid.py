@@ -24,13 +24,12 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import (
-    PRECISE,
     SMALLEST_NOISE_M,
     Identification,
     Prior,
     identify,
 )
-from diffeo_calib.calibration.identification.registration import fit_joint_offsets, register, with_joint_offsets
+from diffeo_calib.calibration.identification.registration import find_joint_offsets, register, with_joint_offsets
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.robots.geometry import Geometry
@@ -134,7 +133,7 @@ def best_joint_offsets(model: CalibratedKinematics) -> JointOffsets:
     offsets = on.x.new_zeros(on.x.shape[1])
     for std in (LOOSE_STD, LOOSE_STD, LOOSE_STD, OFFSET_STD):  # large offsets first: they look like noise
         noise = _noise(float((geometry.points(on.x) - on.y).square().sum(-1).mean().sqrt()))
-        offsets = fit_joint_offsets(start, on.x, on.y, std, noise, **PRECISE)
+        offsets = find_joint_offsets(start, on.x, on.y, std, noise)
         geometry = _placed(model, with_joint_offsets(start, offsets).joint_errors, on)
     return JointOffsets(offsets, on.compared(geometry, "joint offsets", {}))
 

@@ -35,11 +35,10 @@ class Observation(ABC):
 
     constants: tuple[str, ...]
     """Names of attributes, each a tensor with one row per configuration."""
-
-    @property
-    @abstractmethod
-    def size(self) -> int:
-        """Numbers per row, r."""
+    size: int
+    """Numbers per row, r."""
+    dim: int
+    """Coordinates m of the points that it sees."""
 
     @abstractmethod
     def value(self, points: Tensor) -> Tensor:
@@ -48,11 +47,6 @@ class Observation(ABC):
     @abstractmethod
     def slope(self, points: Tensor) -> Tensor:
         """A = Dh: points (N, m) -> (N, r, m)."""
-
-    @property
-    def dim(self) -> int:
-        """Coordinates m of the points that it sees."""
-        return getattr(self, self.constants[0]).shape[-1]
 
     def __len__(self) -> int:
         return len(getattr(self, self.constants[0]))
@@ -81,7 +75,6 @@ class ReadPoints(Observation):
     """
 
     constants = ("own",)
-    dim, size = 0, 0
 
     def __init__(
         self, read: Read, own: Tensor, dim: int, size: int = 1, check: Check = lambda own, points: None
@@ -108,13 +101,10 @@ class LinearFunctionals(Observation):
 
     def __init__(self, axes: object, offsets: object = None) -> None:
         self.axes = as_tensor(axes, "axes", ("N", "r", "m"), fix="pass r axes for every row").detach()
+        self.size, self.dim = self.axes.shape[1:]
         shape = self.axes.shape[:2]
         offsets = self.axes.new_zeros(shape) if offsets is None else offsets
         self.offsets = as_tensor(offsets, "offsets", tuple(shape), fix="pass one offset per axis, in m").detach()
-
-    @property
-    def size(self) -> int:
-        return self.axes.shape[1]
 
     def value(self, points: Tensor) -> Tensor:
         return (self.axes @ points[:, :, None])[:, :, 0] - self.offsets
@@ -176,15 +166,7 @@ class Stacked(Observation):
     constants = ()
 
     def __init__(self, count: int, size: int, dim: int, parts: Sequence[Part]) -> None:
-        self.count, self._size, self._dim, self.parts = count, size, dim, tuple(parts)
-
-    @property
-    def size(self) -> int:
-        return self._size
-
-    @property
-    def dim(self) -> int:
-        return self._dim
+        self.count, self.size, self.dim, self.parts = count, size, dim, tuple(parts)
 
     def __len__(self) -> int:
         return self.count

@@ -24,7 +24,7 @@ from diffeo_calib.measurements.poses import POINTS, of_frames, poses_of_triangle
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 from diffeo_calib.measurements.rows import FEWEST_PER_DEVICE
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.robots.se3 import transforms, twist_transform
+from diffeo_calib.robots.se3 import skew
 
 SMALLEST_M = 1e-12
 """Of a column of a linear system, against division by zero."""
@@ -144,13 +144,10 @@ class Devices(ABC):
 
     def by_increments(self, points: Tensor, device: Tensor) -> Tensor:
         """Derivatives (N, r, k) of what rows of these devices (N,) observe at points (N, 3 k), m, by increments."""
-
-        def read(own: Tensor, at: Tensor, step: Tensor) -> Tensor:
-            return self._read_metres(self.changed(own, step), at)
-
-        own = self.constants[device]
+        own, none = self.constants[device], self.constants.new_zeros(len(self.names), len(self.deviations))
         self.check_seen(own, points)
-        return vmap(jacrev(read, argnums=2))(own, points, own.new_zeros(len(own), len(self.deviations)))
+        by_own = vmap(jacrev(self._read_metres))(own, points)  # (N, r, c)
+        return by_own @ vmap(jacrev(self.changed, argnums=1))(self.constants, none)[device]
 
     def moved(self, increments: Tensor) -> Devices:
         """The devices after increments (D, k)."""
@@ -350,8 +347,8 @@ def unit_least_squares(matrix: Tensor, target: Tensor) -> Tensor:
 
 def moved_pose(rows: Tensor, twist: Tensor) -> Tensor:
     """The rows (..., 12) of a transform after a shift and a turn (..., 6) in the frame that it leads to, m and rad."""
-    T = rows.unflatten(-1, (3, 4))
-    return (twist_transform(twist) @ transforms(T[..., :3], T[..., 3]))[..., :3, :].flatten(-2)
+    turn, shift = torch.linalg.matrix_exp(skew(twist[..., 3:])), torch.nn.functional.pad(twist[..., :3, None], (3, 0))
+    return (turn @ rows.unflatten(-1, (3, 4)) + shift).flatten(-2)
 
 
 def numbers_text(values: list[float]) -> str:

@@ -107,6 +107,20 @@ def test_weights_account_for_the_uncertainty_of_the_parameters() -> None:
     torch.testing.assert_close(found.tails.weights, expected, rtol=0.05, atol=0)  # the level still moves a little
 
 
+def test_left_out_points_are_predicted_by_the_others() -> None:
+    """In closed form as by leaving every row out."""
+    arm = SimulatedArm(seed=2, transmission=0, gravity=0, noise=5e-5)
+    q, points = arm.measure(25)
+    start, squares = register(arm.nominal, q, points).geometry, []
+    found = identify(start, q, points)
+    for row in range(25):
+        others = torch.arange(25) != row
+        alone = identify(start, q[others], points[others], found.noise, found.prior).geometry
+        squares.append(float((alone.points(q[row : row + 1]) - points[row]).square().sum()))
+    assert found.left_out == pytest.approx((sum(squares) / 25) ** 0.5, rel=0.1)
+    assert found.left_out > 1.5 * found.rms
+
+
 def test_scales_of_the_joint_errors_are_found() -> None:
     """Translations and rotations apart: one arm of each kind."""
     arm = SimulatedArm(seed=3, transmission=0, gravity=0, noise=1e-5)

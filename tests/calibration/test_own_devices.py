@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -185,9 +184,9 @@ def holding(arms: two_arms_bank.TwoArms, X: Tensor, home: Tensor, rows: int, see
     return q[(away(arms, q, X).abs().amax(1) < 1e-9) & (q.abs().amax(1) < 2.5)]
 
 
-@cache
-def case(folder: Path) -> Any:
-    path = folder / "arms.urdf"
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    path = tmp_path_factory.mktemp("arms") / "arms.urdf"
     path.write_text(urdf())
     robot = dc.load_urdf(path, "base", list(two_arms_bank.HANDS))
     arms = two_arms_bank.TwoArms(robot)
@@ -206,11 +205,6 @@ def case(folder: Path) -> Any:
     turned[..., :3, 3] += 2e-5 * normal(16, 2, 3, seed=7)
     tracked = dc.Measurements.from_poses(free, turned, robot.joint_names, on=two_arms_bank.HANDS)
     return robot, arms, X, tracked, held, kept
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    return case(tmp_path_factory.mktemp("arms"))
 
 
 def relative_errors(model: Any, arms: Any, q: Tensor) -> float:

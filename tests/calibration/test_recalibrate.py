@@ -14,7 +14,7 @@ import pytest
 import reading_bank
 import torch
 from again_bank import ELSEWHERE, NEW, arm, model, positions
-from product_bank import Case, simulated, simulated_poses, ur10_measurements, ur10_scales
+from product_bank import Case, covered, simulated, simulated_poses, ur10_measurements, ur10_scales
 from recorded_bank import made
 from table_bank import refused
 
@@ -61,18 +61,11 @@ def rms(model: Any, robot: SimulatedArm | None = None) -> float:
     return dc.evaluate(model, measured(robot, 100, 6)).rms
 
 
-def within_region(model: dc.CalibratedKinematics, test: dc.Measurements) -> float:
-    """Share of rows in their 95 % regions."""
-    mean, covariance = model.predict(test.q)
-    error = (test.points - mean)[:, 0, :, None]
-    return float(((error.mT @ torch.linalg.solve(covariance[:, 0], error)).flatten() < 7.81).double().mean())
-
-
 def test_new_rows_add_to_what_the_old_model_knew() -> None:
     found, error = again(), rms(again().model)
     assert error < 0.9 * rms(old().registered(measured(), learn=False))
     assert error < 0.7 * rms(fitted(measured()))
-    assert 0.9 < within_region(found.model, measured(rows=100, seed=6)) <= 1.0
+    assert 0.9 < covered(found.model, measured(rows=100, seed=6)) <= 1.0
     assert found.marker == "same"
     assert found.outliers == ()
     assert 1.0 <= found.inflation < 1.5
@@ -115,7 +108,7 @@ def test_a_worn_joint_is_named_and_followed(arm: Case) -> None:
     with pytest.warns(DiffeoCalibWarning, match="times as large as the model leads to expect"):
         still = dc.recalibrate(arm.model, new, drift="none")
     assert dc.evaluate(found.model, test).rms < 0.5 * dc.evaluate(still.model, test).rms
-    assert 0.88 < within_region(found.model, test) <= 1.0
+    assert 0.88 < covered(found.model, test) <= 1.0
 
 
 def test_outliers_hardly_count() -> None:
@@ -134,7 +127,7 @@ def test_another_marker() -> None:
     found = dc.recalibrate(old(), measured(robot), drift="none")
     assert found.marker == "other"
     assert rms(found.model, robot) < 1.02 * rms(old().registered(measured(robot), learn=False), robot)
-    assert 0.9 < within_region(found.model, measured(robot, 100, 6)) <= 1.0
+    assert 0.9 < covered(found.model, measured(robot, 100, 6)) <= 1.0
 
 
 def test_rows_outside_of_the_old_range_say_nothing_about_change() -> None:
@@ -180,7 +173,7 @@ def test_rows_of_which_half_contradict_the_model_are_warned_about() -> None:
 def test_known_noise_of_the_new_rows_counts() -> None:
     found = dc.recalibrate(old(), noisy(1e-3, std=1e-3), drift="none")
     assert found.outliers == ()
-    assert within_region(found.model, measured(rows=200, seed=6)) > 0.9
+    assert covered(found.model, measured(rows=200, seed=6)) > 0.9
 
 
 def test_markers_that_moved_although_they_are_said_to_be_the_same() -> None:
@@ -220,7 +213,7 @@ def test_a_ur10_measured_again(ur10_folder: Path) -> None:
     new, test = data.split(30 / len(data), seed=0)
     found = dc.recalibrate(first, new)
     assert dc.evaluate(found.model, test).rms < 0.9 * dc.evaluate(first.registered(new, learn=False), test).rms
-    assert within_region(found.model, test) > 0.83
+    assert covered(found.model, test) > 0.83
 
 
 def test_what_is_refused() -> None:

@@ -100,11 +100,8 @@ def worth_it(before: Tensor, after: Tensor) -> bool:
 
 def left_out_rms(process: Process) -> float:
     """RMS of the errors of rows, m, as all other rows predict them."""
-    total, numbers = 0.0, process.numbers
-    for part, block in zip(numbers.parts, numbers.diagonal_blocks(process.inverse), strict=True):
-        mu = process.mu[part.numbers].view(*part.cells.shape, 1)
-        total += float(torch.linalg.solve(block, mu).square().sum())
-    return (total / len(numbers.q)) ** 0.5
+    errors, _ = process.left_out(process.numbers.owner)
+    return float((errors.square().sum() / len(process.numbers.q)).sqrt())
 
 
 # --- lengths against what they are said to be -------------------------------------------------------------------------

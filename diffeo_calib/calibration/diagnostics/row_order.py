@@ -30,8 +30,7 @@ from diffeo_calib.calibration.identification.registration import (
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
 from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.evaluation import expected_error
-from diffeo_calib.kinematics.re_registration.motions import motions
+from diffeo_calib.kinematics.evaluation import expected_error, motions
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree

@@ -27,6 +27,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import (
+    PRECISE,
     SMALLEST_NOISE_M,
     Identification,
     MeasuredPoints,
@@ -239,29 +240,23 @@ INLIER_ERROR = 0.1
 MAX_EVALUATIONS = 100
 
 
-def find_joint_offsets(geometry: Geometry, q: Tensor, points: Tensor) -> Tensor:
-    """Offsets to add to the joint values so that base and markers explain the points best.
+def find_joint_offsets(
+    geometry: Geometry, q: Tensor, points: Tensor, deviation: float = OFFSET_STD, noise: float | None = None
+) -> Tensor:
+    """Offsets to add to the joint values so that base and markers explain the points best, by least squares.
 
     Args:
         geometry: a registered robot. q: (N, n) joint values [rad or m]. points: (N, P, 3) [m]; NaN where hidden.
+        deviation: of the offsets' prior [rad or m]. noise: of a coordinate [m]; by default it is not known, and a few
+            gross outliers have little influence.
 
     Returns:
         (n,) [rad or m]; zero where base or markers could explain the same change.
     """
-    typical = (geometry.points(q) - points).norm(dim=-1).nanmedian()
-    # Huber's loss on every coordinate: a few gross outliers have little influence.
-    options = {"loss": "huber", "f_scale": INLIER_ERROR, "x_scale": "jac", "max_nfev": MAX_EVALUATIONS}
-    return fit_joint_offsets(geometry, q, points, OFFSET_STD, typical, **options)
-
-
-def fit_joint_offsets(
-    geometry: Geometry, q: Tensor, points: Tensor, deviation: float, noise: float | Tensor, **options: Any
-) -> Tensor:
-    """Offsets (n,) by least squares with a prior deviation, rad or m, together with base and markers; scipy's options.
-
-    Args:
-        geometry: a registered robot. q: (N, n). points: (N, P, 3) m; NaN where hidden. noise: of a coordinate, m.
-    """
+    options: dict[str, Any] = PRECISE
+    if noise is None:  # Huber's loss on every coordinate
+        noise = float((geometry.points(q) - points).norm(dim=-1).nanmedian())
+        options = {"loss": "huber", "f_scale": INLIER_ERROR, "x_scale": "jac", "max_nfev": MAX_EVALUATIONS}
     twists, parts = offset_twists(geometry), geometry.slices
     places = torch.eye(geometry.size, dtype=twists.dtype, device=twists.device)
     root = torch.cat([deviation * twists, FREE_STD * places[:, parts["base"]], FREE_STD * places[:, parts["tool"]]], 1)

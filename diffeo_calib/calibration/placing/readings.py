@@ -57,15 +57,15 @@ class ReadingDevices(DeviceSet):
     Args:
         data: the readings. devices: where their devices are.
         rows: (M,) numbers of the rows among those of the calibration.
+        known: (D, k) standard deviations of the devices' increments, before a fit those of the prior, m or rad.
         frame: the frame of their places, in words.
-        known: (D, k) standard deviations of the devices' increments after a fit, m or rad; None before.
     """
 
     data: Readings
     devices: Devices
     rows: Tensor
-    frame: str = "the robot's base"
-    known: Tensor | None = None
+    known: Tensor
+    frame: str
 
     @property
     def size(self) -> int:
@@ -116,21 +116,16 @@ class ReadingDevices(DeviceSet):
             warn_of_size(self.devices.size_fix, expected.size, expected.size_share, expected.workspace)
 
     def sentences(self) -> list[str]:
-        known = torch.zeros_like(self.devices.constants) if self.known is None else self.known
-        return [self.devices.sentence(number, own, self.frame) for number, own in enumerate(known)]
+        return [self.devices.sentence(number, own, self.frame) for number, own in enumerate(self.known)]
 
     def placed(self) -> PlacedDevices:
-        prior = self.devices.deviations.expand(len(self.devices.names), -1)
-        deviations = prior if self.known is None else self.known
-        own = self.devices.names, self.devices.constants, deviations, self.rows, self.device
+        own = self.devices.names, self.devices.constants, self.known, self.rows, self.device
         return PlacedDevices(self.devices.kind, *own, self.data.shown)
 
     def entry(self) -> dict[str, object]:
-        constants = dict(zip(self.devices.names, self.devices.constants.tolist(), strict=True))
-        found: dict[str, object] = {"constants": constants}
-        if self.known is not None:
-            found["deviations"] = dict(zip(self.devices.names, self.known.tolist(), strict=True))
-        return {"devices": found}
+        values = {"constants": self.devices.constants, "deviations": self.known}
+        own = {what: dict(zip(self.devices.names, each.tolist(), strict=True)) for what, each in values.items()}
+        return {"devices": own}
 
 
 Stages = tuple[Identification, Identification]
@@ -215,7 +210,11 @@ def reading_sets(
 ) -> tuple[ReadingDevices, ...]:
     """Sets of devices and the rows that they measured; ``beside``: rows of the same robot that tell coordinates."""
     frame = "the robot's base" if beside is None or beside.without_device else "the measuring frame"
-    return tuple(ReadingDevices(table, own, rows, frame) for (table, rows), own in zip(readings, devices, strict=True))
+    each = zip(readings, devices, strict=True)
+    return tuple(
+        ReadingDevices(table, own, rows, own.deviations.expand(len(own.names), -1), frame)
+        for (table, rows), own in each
+    )
 
 
 def stages_beside(stages: Stages, readings: Sequence[OtherReadings], table: Measurements) -> Stages:

@@ -90,8 +90,7 @@ class SocketDevices(DeviceSet):
             fit, m.
         socket: (N,) number of the socket of each row of the calibration, -1 for rows of none.
         by_device: whether a device measured other rows.
-        covariance: (3 S, 3 S) of the positions, m^2; without a device without rigid motions of all of them. None before
-            the fit.
+        covariance: (3 S, 3 S) of the positions, m^2; after a fit without a device without rigid motions of all of them.
         left_out: every place, predicted by all other rows.
         workspace_deviation: root mean square distance, m, that the model expects between its positions of the ball and
             the true ones over the joint ranges of the rows; without a device after the best rigid motion.
@@ -101,8 +100,8 @@ class SocketDevices(DeviceSet):
     positions: Tensor
     root: Tensor
     socket: Tensor
-    by_device: bool = False
-    covariance: Tensor | None = None
+    by_device: bool
+    covariance: Tensor
     left_out: tuple[PlaceErrors, ...] = ()
     workspace_deviation: float = 0.0
 
@@ -123,7 +122,7 @@ class SocketDevices(DeviceSet):
         factor = torch.linalg.cholesky(precision)
         root = torch.linalg.solve_triangular(factor, eye, upper=False).mT
         places = positions + (root @ (root.mT @ push)).view(-1, 3)
-        return cls(sockets, places, root, data.socket_numbers, not data.without_device)
+        return cls(sockets, places, root, data.socket_numbers, not data.without_device, root @ root.mT)
 
     @classmethod
     def around_model(cls, table: Measurements, rows: Tensor, seen: Tensor) -> tuple[list[DeviceSet], Measurements]:
@@ -259,8 +258,7 @@ class SocketDevices(DeviceSet):
     @property
     def deviations(self) -> Tensor:
         """(S, 3) standard deviations of the coordinates, m."""
-        known = torch.zeros_like(self.root) if self.covariance is None else self.covariance
-        return known.diagonal().clamp(min=0).sqrt().view(-1, 3)
+        return self.covariance.diagonal().clamp(min=0).sqrt().view(-1, 3)
 
     @property
     def left_out_spread(self) -> float:

@@ -23,6 +23,7 @@ from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
     check_rows,
+    motions,
     place,
     placement_sentences,
     positions_of,
@@ -31,7 +32,6 @@ from diffeo_calib.kinematics.evaluation import (
     some_rows,
 )
 from diffeo_calib.kinematics.joint_ranges import SAME_CONFIGURATION
-from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
