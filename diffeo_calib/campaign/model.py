@@ -131,9 +131,9 @@ class CampaignModel:
             fix = "measure more rows, then the model is made"
             raise MeasurementError.of("the first rows do not fit together yet", expected=expected, got=got, fix=fix)
         found, data = chosen.selection.scales, chosen.data
-        later: Any = None
+        later: Any = [None] * 10  # what follows from the accepted rows
         counts = 0 if scales is None and first else len(numbers), inf, len(numbers), len(table)
-        made = cls(placed, data, found, *counts, asked, later, [], *[later] * 6, [], later).rebuilt(table, verdicts)
+        made = replace(cls(placed, data, found, *counts, asked, *later), ratios=[]).rebuilt(table, verdicts)
         if certain and known is None:
             made.deviation = made.scales_deviation()
         return made
