@@ -332,7 +332,7 @@ class CampaignModel:
         row, y, each = self.window[-1], data.y[-1:], data.y[-1].unflatten(0, (data.noise_model.bodies, -1))
         values = [(f"its values seem to be {words}", factor * y) for factor, words in UNITS]
         for a, b in combinations(range(len(each)), 2):
-            other = each.index_copy(0, torch.tensor([a, b], device=each.device), each[[b, a]])
+            other = each.index_copy(0, torch.tensor([a, b], dtype=torch.int64, device=each.device), each[[b, a]])
             values.append((f"markers {a} and {b} seem to be exchanged", other.flatten()[None]))
         for words, other in values:
             undone = torch.zeros_like(data.y)
