@@ -24,7 +24,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.open_directions import sampled_configurations, undetermined_places
+from diffeo_calib.calibration.diagnostics.open_directions import (
+    sampled_configurations,
+    undetermined_places,
+    without_shared,
+)
 from diffeo_calib.calibration.identification.identification import Identification, Prior
 from diffeo_calib.common.errors import printable
 from diffeo_calib.fitting.fitted_map import FittedMap
@@ -245,10 +249,7 @@ def _places(model_map: FittedMap) -> tuple[Tensor, Tensor, Tensor]:
     rows, shared = (
         (each * fitted.noise.visible[some, :, None]).flatten(0, 1) for each in (rows, fitted.noise.shared[some])
     )
-    if shared.shape[1]:  # without what devices that the rows share would take up
-        shared = shared / shared.norm(dim=0).clamp(min=1e-12)
-        rows = rows - shared @ torch.linalg.lstsq(shared, rows, rcond=1e-6, driver="gelsd").solution
-    return root, anywhere, rows
+    return root, anywhere, without_shared(rows, shared)
 
 
 def _root(covariance: Tensor) -> Tensor:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from diffeo_calib.calibration.diagnostics import gates
@@ -105,8 +104,7 @@ def expected_rms(model: CalibratedKinematics, data: Measurements, bodies: int) -
     return float(covariance.diagonal(dim1=-2, dim2=-1).sum(-1).mean().sqrt())
 
 
-@dataclass(frozen=True)
-class Accuracy:
+class Accuracy(NamedTuple):
     """What is compared with a limit.
 
     Args:

@@ -7,7 +7,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
 from math import ceil, inf, nan
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -22,7 +21,6 @@ from diffeo_calib.measurements.checks import quiet
 from diffeo_calib.measurements.csv.cells import numbers_in
 from diffeo_calib.measurements.csv.files import read_poses
 from diffeo_calib.measurements.csv.joints import PoseColumns
-from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.poses import ALL_CONVENTIONS, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat
 from diffeo_calib.robots.cartesian import cartesian
@@ -52,12 +50,12 @@ class Reading:
     angle: str = "rad"
 
 
-def poses_in(csv: Path, sheet: Sheet) -> list[Body]:
+def poses_in(sheet: Sheet) -> list[Body]:
     """Places with their rotations, and poses as 6, 7, 12 or 16 numbers, in the order of columns."""
     found = bodies_in(sheet.numbers)
     used = {name for own in found for name in (*own.place, *own.turn)}
     others = [name for name in sheet.numbers if name not in used]
-    found += matrices_in(csv, sheet, others)
+    found += matrices_in(sheet, others)
     found += [Body(list(own.names.values()), []) for own in whole(others, "xy") if own.wished and _is_place(own)]
     for labels in NUMBERED:
         taken = {name for own in found for name in (*own.place, *own.turn)}
@@ -89,30 +87,32 @@ def machine_of(bodies: Sequence[Body]) -> Body:
     return max(bodies, key=rank)
 
 
-def source_of(csv: Path, sheet: Sheet) -> Source:
+def source_of(sheet: Sheet) -> Source:
     """The table read as poses of a machine.
 
     Raises:
         InputError: no poses, nothing that was measured, or no way to read the rows that is clear.
     """
-    bodies = poses_in(csv, sheet)
+    bodies = poses_in(sheet)
     if not bodies:
         expected = "a ROBOT whose joints the table has columns of, or columns of the poses of a machine"
-        raise InputError.of(f"'{csv}' without a robot's description", expected=expected, got=few(sheet.header, 20))
+        raise InputError.of(
+            f"'{sheet.path}' without a robot's description", expected=expected, got=few(sheet.header, 20)
+        )
     machine = machine_of(bodies)
     used = [*machine.place, *machine.turn]
     others = tuple(name for name in sheet.numbers if name not in used)
     if not others:
-        what = f"what was measured of the machine in '{csv}'"
+        what = f"what was measured of the machine in '{sheet.path}'"
         raise InputError.of(what, expected="columns beside its poses", got=f"{few(used, 16)} alone")
-    rows = rows_in(csv, replace(sheet, numbers=others), used)
+    rows = rows_in(replace(sheet, numbers=others), used)
     body = rows.bodies[0] if rows.bodies else Body([], [])
     if body.turn:  # poses of one frame
         left = [f"{few(own.place)}: beside the pose of {few(body.place)}" for own in rows.bodies[1:]]
         rows = replace(rows, bodies=[body], left=[*rows.left, *left])
     tried = list[list[Source]]()
     for lengths in UNUSUAL_LENGTHS:
-        tried.append(ranked(_ways(csv, sheet, machine, rows, body, lengths=lengths)))
+        tried.append(ranked(_ways(sheet, machine, rows, body, lengths=lengths)))
         if tried[-1] and tried[-1][0].left <= LARGEST_RESIDUAL:
             break
     found = min(tried, key=lambda own: own[0].left if own else inf)
@@ -127,7 +127,7 @@ def source_of(csv: Path, sheet: Sheet) -> Source:
     alike, worse = [one for one in found if one.left < limit], [one.left for one in found if one.left >= limit]
     why = f"the machine's poses explain the rows but for {percent(found[0].left, 2)} of what they vary"
     why += f", read in any other way {percent(worse[0])}" if worse else ""
-    said = [*_entries(alike, _lengths(machine.place, _numbers(csv, sheet, machine.place)), why)]
+    said = [*_entries(alike, _lengths(machine.place, _numbers(sheet, machine.place)), why)]
     if 2 * len(alike) >= len(found) >= MOST_WAYS:
         said = [one._replace(sure=one.sure and one.name not in TURNED) for one in said]
     return alike[0].saying(*said)
@@ -150,16 +150,14 @@ def _entries(alike: Sequence[Source], lengths: Sequence[str], why: str) -> Itera
     yield from entries(tables, camera_on_tool="what stands is seen from the flange")
 
 
-def _ways(
-    csv: Path, sheet: Sheet, machine: Body, rows: RowColumns, body: Body, *, lengths: tuple[str, str]
-) -> Iterator[Source]:
+def _ways(sheet: Sheet, machine: Body, rows: RowColumns, body: Body, *, lengths: tuple[str, str]) -> Iterator[Source]:
     """The likeliest ways to read the table.
 
     ``lengths``: units of the machine's places and of those measured; empty for the likeliest.
     """
     place, turn, *_ = body
     groups = machine.place, machine.turn, place, turn
-    numbers = _numbers(csv, sheet, [name for names in groups for name in names])
+    numbers = _numbers(sheet, [name for names in groups for name in names])
     if not len(numbers):
         return
     commanded_at, commanded_turn, seen_at, seen_turn = numbers.split([len(names) for names in groups], 1)
@@ -179,17 +177,15 @@ def _ways(
             unit = measured.angle if len(turn) == 3 else None
             table = replace(table, rotation=turn, convention=measured.convention, rotation_angle=unit)
         with quiet(), suppress(DiffeoCalibError):
-            robot = cartesian(read_poses(csv, pose, table))
-            yield Source(csv, sheet, robot, replace(pose, robot=robot), rows, table)
+            robot = cartesian(read_poses(sheet.path, pose, table))
+            yield Source(sheet, robot, replace(pose, robot=robot), rows, table)
 
 
-def _numbers(csv: Path, sheet: Sheet, names: Sequence[str]) -> Tensor:
+def _numbers(sheet: Sheet, names: Sequence[str]) -> Tensor:
     """Columns as they are (N, c), of the rows without an empty cell among them."""
-    header, lines = read_cells(csv, sheet.sep, names)
-    columns = [numbers_in([cells[header.index(name)] for _, cells in lines], sheet.decimal) for name in names]
-    found = torch.tensor(
-        [[nan if value is None else value for value in own] for own in columns], dtype=torch.float64, device=HOST
-    )
+    columns = [numbers_in(sheet.cells[name], sheet.decimal) for name in names]
+    values = [[nan if value is None else value for value in own] for own in columns]
+    found = torch.tensor(values, dtype=torch.float64, device=HOST)
     return found[:, found.isfinite().all(0)].T
 
 

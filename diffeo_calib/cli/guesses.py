@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from os.path import relpath
 from pathlib import Path
@@ -72,16 +73,24 @@ class Sheet:
     """A table as it seems to be written.
 
     Args:
-        sep, decimal: between cells, and in numbers. header: all columns. numbers: those that hold numbers alone.
+        path: of the file. sep, decimal: between cells, and in numbers. header: all columns. numbers: those that hold
+            numbers alone.
         notes: what the reader decided. odd: which cells are no numbers in columns that seem to hold some; or empty.
     """
 
+    path: Path
     sep: str
     decimal: str
     header: tuple[str, ...]
     numbers: tuple[str, ...]
     notes: tuple[str, ...] = ()
     odd: str = ""
+
+    @cached_property
+    def cells(self) -> dict[str, list[str]]:
+        """Column -> texts of all rows."""
+        header, rows = read_cells(self.path, self.sep)
+        return {name: [cells[k].strip() for _, cells in rows] for k, name in enumerate(header)}
 
 
 def guess_sheet(path: Path) -> Sheet:
@@ -103,7 +112,7 @@ def guess_sheet(path: Path) -> Sheet:
                 cell for name in columns if name not in numbers for cell in _odd(name, lines, columns[name], decimal)
             ]
             why = str(bad_cells(path, odd, "a number", number_hint(odd[0][2], decimal))) if odd else ""
-            found.append(Sheet(sep, decimal, tuple(columns), numbers, tuple(file.notes), why))
+            found.append(Sheet(path, sep, decimal, tuple(columns), numbers, tuple(file.notes), why))
     best = max(found, key=lambda sheet: len(sheet.numbers), default=None)
     width, reason = max(reasons, key=lambda one: one[0], default=(0, None))
     if reason is not None and (best is None or not best.numbers or width > 2 * len(best.numbers)):
@@ -394,7 +403,7 @@ class RowColumns:
             yield Choice(option, name, why)
 
 
-def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
+def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
     """The probable contents of a table beside its joints."""
     known = {name.lower(): name for name in sheet.header}
     sockets = [known[name] for name in ("place", "socket") if name in known and "socket" in known]
@@ -404,8 +413,8 @@ def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
     others = [name for name in sheet.numbers if name not in joints]
     nameless = all(name.isdecimal() for name in sheet.header) and len(others) > 2
     bodies = [Body(others[:3], [])] if nameless else [own for own in found if not own.left]
-    bodies = bodies or matrices_in(csv, sheet, others)[:1]
-    readings = _readings_in(csv, sheet, others, alone=not bodies and not sockets)
+    bodies = bodies or matrices_in(sheet, others)[:1]
+    readings = _readings_in(sheet, others, alone=not bodies and not sockets)
     if not bodies and not sockets and not readings:
         expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
         common = next((name for name in sheet.header if name not in joints), "COLUMN")
@@ -413,7 +422,7 @@ def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
         fix += "without a tracker: a ball in sockets has columns `place` and `socket`, which `init` knows, a device a "
         fix += "column such as `distance`, `wire` or `height`; `fit --help` lists all options, see --reading"
         got = "; ".join(left) or few(sheet.numbers, 20)
-        raise InputError.of(f"positions in '{csv}'", expected=expected, got=got, fix=fix)
+        raise InputError.of(f"positions in '{sheet.path}'", expected=expected, got=got, fix=fix)
     columns = {"session": [] if sockets and not readings else [name for name in sheet.header if name not in joints]}
     guessed = {
         option: [name for name in columns.get(option, others) if column(name).plain in known.split()]
@@ -423,13 +432,13 @@ def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
     return RowColumns(bodies, sockets, readings, named, left)
 
 
-def matrices_in(csv: Path, sheet: Sheet, columns: Sequence[str]) -> list[Body]:
+def matrices_in(sheet: Sheet, columns: Sequence[str]) -> list[Body]:
     """Poses that are written as 16 numbers by rows or columns."""
-    found, (header, rows) = list[Body](), read_cells(csv, sheet.sep)
+    found = list[Body]()
     while (guessed := guess_matrix(columns)) is not None:
         names, named = guessed
-        below = [header.index(names[k]) for k in BELOW if not named]
-        by_rows = all(number(cells[place], sheet.decimal) == 0 for _, cells in rows for place in below)
+        below = [cell for k in BELOW if not named for cell in sheet.cells[names[k]]]
+        by_rows = all(number(cell, sheet.decimal) == 0 for cell in below)
         entries = [names[4 * row : 4 * row + 4] if by_rows else names[row::4] for row in range(3)]
         turn = [name for row in entries for name in row[:3]]
         found.append(Body([row[3] for row in entries], turn, "a matrix"))
@@ -437,24 +446,21 @@ def matrices_in(csv: Path, sheet: Sheet, columns: Sequence[str]) -> list[Body]:
     return found
 
 
-def _readings_in(csv: Path, sheet: Sheet, columns: Sequence[str], *, alone: bool) -> list[str]:
+def _readings_in(sheet: Sheet, columns: Sequence[str], *, alone: bool) -> list[str]:
     """Texts of `fit --reading`; beside other kinds of rows, or one another, columns that some rows leave empty."""
-    header, rows = read_cells(csv, sheet.sep)
-    corners = _corners_in(csv, sheet) if {IMAGE, *POINT, *PIXEL} <= set(header) else []
+    corners = _corners_in(sheet) if {IMAGE, *POINT, *PIXEL} <= {*sheet.cells} else []
     found = guess_readings([name for name in columns if not corners or name not in (*POINT, *PIXEL)])
     if alone and len(found) == 1 and not corners:
         return list(found)
-    empty = {name for k, name in enumerate(header) if any(not cells[k].strip() for _, cells in rows)}
-    return [*corners, *(text for text, own in found.items() if set(own) <= empty)]
+    return [*corners, *(text for text, own in found.items() if all("" in sheet.cells[name] for name in own))]
 
 
-def _corners_in(csv: Path, sheet: Sheet) -> list[str]:
+def _corners_in(sheet: Sheet) -> list[str]:
     """The files of the cameras beside the table, as `images` writes them, else a usual size that holds all corners."""
-    header, rows = read_cells(csv, sheet.sep)
-    names = dict.fromkeys(cells[header.index(CAMERA)].strip() for _, cells in rows) if CAMERA in header else {}
-    files = [f"{name}.yaml" for name in names if name]
-    if len(files) > 1 and all((csv.parent / file).is_file() for file in files):
-        return [f"{CORNERS}{csv.parent / file}" for file in files]
+    csv = sheet.path
+    files = [csv.with_name(f"{name}.yaml") for name in dict.fromkeys(sheet.cells.get(CAMERA, ())) if name]
+    if len(files) > 1 and all(file.is_file() for file in files):
+        return [f"{CORNERS}{file}" for file in files]
     own, cameras = csv.with_suffix(".yaml"), list[Path]()
     for file in [own] if own.is_file() else csv.parent.glob("*.yaml"):
         with suppress(InputError):  # no camera
@@ -462,8 +468,7 @@ def _corners_in(csv: Path, sheet: Sheet) -> list[str]:
             cameras.append(file)
     if len(files) < 2 and len(cameras) == 1:
         return [f"{CORNERS}{cameras[0]}"]
-    places = [header.index(name) for name in PIXEL]
-    width, height = (max(number(cells[k], sheet.decimal) or 0.0 for _, cells in rows) for k in places)
+    width, height = (max(number(cell, sheet.decimal) or 0.0 for cell in sheet.cells[name]) for name in PIXEL)
     size = next((size for size in USUAL_SIZES if width < size[0] and height < size[1]), USUAL_SIZES[-1])
     return [f"{CORNERS}{','.join(map(str, size))}"]
 
@@ -480,10 +485,8 @@ def with_places(csv: Path, given: Places, folder: Path) -> tuple[Path, list[Choi
     """The table, joined with that of the measured places if there is one, and the entries of a campaign in a folder."""
     if given.places is None:
         return csv, []
-    joints, places = sheets = guess_sheet(csv), guess_sheet(given.places)
-    tables = [read_cells(path, sheet.sep) for path, sheet in zip((csv, given.places), sheets, strict=True)]
-    texts = [{name: {cells[k] for _, cells in rows} for k, name in enumerate(header)} for header, rows in tables]
-    common = {name: len(own & texts[1][name]) for name, own in texts[0].items() if name in texts[1]}
+    joints, places = guess_sheet(csv), guess_sheet(given.places)
+    common = {name: len({*own} & {*places.cells[name]}) for name, own in joints.cells.items() if name in places.cells}
     if given.by is None and not common:
         expected, got = "a column that both files have", " and ".join(few(own.header, 12) for own in (joints, places))
         fix = "add one, such as the number of the pose, or name two: --by COLUMN=OTHER"

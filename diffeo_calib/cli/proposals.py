@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from math import inf, log
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -40,7 +39,6 @@ from diffeo_calib.common.errors import DiffeoCalibError, InputError, Measurement
 from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD, quiet
 from diffeo_calib.measurements.csv.files import read_joints, read_observations
 from diffeo_calib.measurements.csv.joints import JointExpressions
-from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.sensors import SocketColumns
 from diffeo_calib.measurements.poses import ALL_CONVENTIONS, numbers_of
 from diffeo_calib.measurements.readings import Readings
@@ -75,12 +73,11 @@ class Source:
     """One way to read a table.
 
     Args:
-        csv, sheet: the table, and how it is written. robot: whose ``joints`` columns it has, or a machine with its
+        sheet: the table. robot: whose ``joints`` columns it has, or a machine with its
             poses. rows: what was measured. table: the format; joints and rows are entered when it is read.
         tips: of the markers, where several are. said: entries of the campaign that were decided so far.
     """
 
-    csv: Path
     sheet: Sheet
     robot: Tree
     joints: Any
@@ -118,7 +115,7 @@ class Source:
             marker=self.value("marker"),
             camera_on_tool=self.table.camera_on_tool and not rows.of_boards,  # it is said of the corners
         )
-        data: Any = read_observations(self.csv, table, duplicates="keep")
+        data: Any = read_observations(self.sheet.path, table, duplicates="keep")
         data = data.with_joint_names(self.robot.joint_names)
         return data.with_tips(self.tips) if self.tips else data
 
@@ -141,7 +138,10 @@ class Source:
         if positions is not None:
             own = positions.largest_session()
             if (left := likely_mistakes.residual_of(self.robot, own)) == inf:
-                what, expected = f"{len(own)} row(s) of '{self.csv}'", "enough for base and markers, at several places"
+                what, expected = (
+                    f"{len(own)} row(s) of '{self.sheet.path}'",
+                    "enough for base and markers, at several places",
+                )
                 raise MeasurementError.of(what, expected=expected, fix="measure more rows")
             return left / max(spread(own.points), SMALLEST_SPREAD_M)
         own, readings = divided(self.data)
@@ -182,7 +182,7 @@ class Source:
     def within_limits(self) -> bool:
         """Whether the values of the joints lie within the limits, in more than a small part of these."""
         low, high = self.robot.limits.unbind(1)
-        q = read_joints(self.csv, self.joints, self.table, kinds=self.robot.kinds)
+        q = read_joints(self.sheet.path, self.joints, self.table, kinds=self.robot.kinds)
         part = (q.amax(0) - q.amin(0)) / (high - low)
         return bool(((q >= low) & (q <= high)).all()) and float(part.max()) > SMALLEST_PART
 
@@ -428,9 +428,7 @@ def with_deviations(source: Source) -> Source:
 
 def with_distances(source: Source, sockets: str) -> Source:
     """With known distances between the sockets that a column names, for the user to complete: no table holds them."""
-    header, rows = read_cells(source.csv, source.sheet.sep)
-    place, unit = header.index(sockets), source.table.length
-    names = list(dict.fromkeys(cells[place].strip() for _, cells in rows if cells[place].strip()))
+    names, unit = list(dict.fromkeys(filter(None, source.sheet.cells[sockets]))), source.table.length
     if len(names) < 2:
         remark = "there is one socket alone, and no distance to know: the URDF gives the robot's size"
         return source.saying(Choice("", "", remark))

@@ -131,7 +131,7 @@ def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[Pre
     seen = [_seen(fitted, q, slice(first, first + PREDICT_ROWS)) for first in range(0, len(q), PREDICT_ROWS)]
     found = mounted
     for own, devices in sets:
-        unit, scale, zero = own.shown_as
+        unit, scale, zero = own.shown or ("", (1.0,), (0.0,))  # files of old versions: as reported, lengths in m
         for number, name in enumerate(own.names):
             device = FittedDevice.of(fitted, own, number)
             means, blocks = zip(*(device.readings(fitted, rows, noise=noise) for rows in seen), strict=True)

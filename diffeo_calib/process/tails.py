@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
+from diffeo_calib.regression.regions import student_likelihood
 
 FREEDOM_CENTRE, FREEDOM_EFOLDS = 4.0, 2.0
 """Log-normal prior of nu: the most probable one, safe for clean data and for data with outliers, and the standard
@@ -31,8 +32,6 @@ SMALLEST_FREEDOM, GAUSSIAN_FREEDOM = 2.0, 100.0
 """Bound below which the variance would be infinite, and nu from which noise counts as Gaussian."""
 FREEDOM_GRID_POINTS = 400
 """Points of the logarithmic grid of nu: steps of one percent."""
-BLOCK = 1 << 16
-"""Numbers of the likelihood that are added at once."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,7 @@ def reweight(squares: Tensor, dim: int | Tensor) -> Tails:
     low, high = log(SMALLEST_FREEDOM), log(1.01 * GAUSSIAN_FREEDOM)
     grid = torch.logspace(low, high, FREEDOM_GRID_POINTS, base=torch.e, dtype=squares.dtype, device=squares.device)
     prior = -0.5 * ((grid / FREEDOM_CENTRE).log() / FREEDOM_EFOLDS).square()
-    freedom = float(grid[int((prior + _student(*_seen(squares, dim), grid)).argmax())])
+    freedom = float(grid[int((prior + student_likelihood(*_seen(squares, dim), grid)).argmax())])
     if freedom >= GAUSSIAN_FREEDOM:
         return Tails(inf, torch.ones_like(squares))
     return Tails(freedom, ((freedom + dim) / (freedom + squares)).nan_to_num(1.0))
@@ -83,18 +82,6 @@ def _seen(squares: Tensor, dim: int | Tensor) -> tuple[Tensor, Tensor]:
     """Squares and numbers of coordinates of the errors that are not hidden: (n,) each."""
     seen = ~squares.isnan()
     return squares[seen], torch.as_tensor(dim, dtype=squares.dtype, device=squares.device).expand_as(squares)[seen]
-
-
-def _student(squares: Tensor, dim: Tensor, freedoms: Tensor) -> Tensor:
-    """Log likelihood (F,) of n errors under Student's t of each nu (F,), relative to (2 pi)^(-k/2) of each error."""
-    value = torch.zeros_like(freedoms)
-    for k in dim.unique().tolist():
-        own, half = squares[dim == k], 0.5 * (freedoms + k)
-        parts = freedoms[:, None].split(max(1, BLOCK // len(own)))
-        distances = torch.cat([(own / nu).log1p().sum(1) for nu in parts])
-        density = torch.lgamma(half) - torch.lgamma(0.5 * freedoms) - 0.5 * k * (0.5 * freedoms).log()
-        value = value + len(own) * density - half * distances
-    return value
 
 
 FACTORS = tuple(25.0 * 4e4 ** (i / 34) for i in range(35))
@@ -116,7 +103,7 @@ def gross_weights(squares: Tensor, dim: int | Tensor) -> Tensor | None:
     freedoms, best, found, student = squares.new_tensor(FREEDOMS), -inf, (0.0, 1.0, 1.0), -inf
     for s in VARIANCES:
         scale = 0.5 * float(k.sum()) * log(s)
-        student = max(student, float(_student(d2 / s, k, freedoms).max()) - scale)
+        student = max(student, float(student_likelihood(d2 / s, k, freedoms).max()) - scale)
         good, gross = -0.5 * d2 / s, -0.5 * (d2 / (factors * s) + k * factors.log())
         value = torch.logaddexp((1.0 - shares).log() + good, shares.log() + gross).sum(2) - scale
         if float(value.max()) > best:

@@ -15,8 +15,9 @@ eleven kinds and three real series.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from math import inf
+from math import exp, inf, log
 
 import numpy as np
 import torch
@@ -27,7 +28,8 @@ from diffeo_calib.common.quantiles import chi2_above, f_below
 CONFIDENCE = 0.95
 SCALES = np.exp(np.linspace(np.log(0.05), np.log(200.0), 120))
 FREEDOMS = np.exp(np.linspace(np.log(2.0), np.log(200.0), 30))
-HALVINGS = 40
+HALVINGS = 70  # of an interval in which a value is sought: to the last digit
+BLOCK = 1 << 16  # numbers of a likelihood that are added at once
 FACTORS = 0.01, 1e4  # between which the factor is sought
 
 
@@ -72,16 +74,21 @@ def region_scale(
         return 1.0
     values = squares[seen].numpy(force=True)
     dims = np.full(len(values), dim) if isinstance(dim, int) else dim[seen].numpy(force=True)
-    shares = np.ones(len(values)) if weights is None else weights[seen].numpy(force=True)
+    shares = np.ones(len(values)) if weights is None else weights[seen].double().numpy(force=True)
     density = _posterior(values, dims, shares, prior)
     counts = {int(k): float(shares[dims == k].sum() / shares.sum()) for k in np.unique(dims)}
-    low, high = np.log(FACTORS)
-    for _ in range(HALVINGS):
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if _held(float(np.exp(middle)), counts, density) >= CONFIDENCE else (middle, high)
+    high = smallest(lambda at: _held(exp(at), counts, density) >= CONFIDENCE, *map(log, FACTORS))
     number = float(shares.sum())
     own = _log_quantile(values / np.array([chi2_above(1.0 - CONFIDENCE, k) for k in dims]), shares)
     return float(np.exp((number * own + prior.rows * high) / (number + prior.rows)))
+
+
+def smallest(holds: Callable[[float], bool], low: float, high: float) -> float:
+    """The smallest number from which on a condition holds, between two bounds."""
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if holds(middle) else (middle, high)
+    return high
 
 
 def region_factor(freedom: float, dim: int) -> float:
@@ -104,16 +111,29 @@ def _log_quantile(ratios: np.ndarray, shares: np.ndarray) -> float:
     return float(np.interp(CONFIDENCE, below, np.log(ratios[order].clip(min=np.finfo(float).tiny))))
 
 
+def student_likelihood(squares: Tensor, dim: Tensor, freedoms: Tensor, shares: Tensor | None = None) -> Tensor:
+    """Log likelihood (F,) of n errors under Student's t of each nu (F,), relative to (2 pi)^(-k/2) of each error.
+
+    They have squares d^2 (n,) and k = dim (n,) coordinates, and count by their shares (n,), one by default.
+    """
+    value, shares = torch.zeros_like(freedoms), torch.ones_like(squares) if shares is None else shares
+    for k in dim.unique().tolist():
+        own, count, half = squares[dim == k], shares[dim == k], 0.5 * (freedoms + k)
+        parts = freedoms[:, None].split(max(1, BLOCK // len(own)))
+        distances = torch.cat([(own / nu).log1p() @ count for nu in parts])
+        density = torch.lgamma(half) - torch.lgamma(0.5 * freedoms) - 0.5 * k * (0.5 * freedoms).log()
+        value = value + count.sum() * density - half * distances
+    return value
+
+
 def _posterior(values: np.ndarray, dims: np.ndarray, shares: np.ndarray, prior: RegionPrior) -> np.ndarray:
     """Probability of every pair of nu and s: (len(FREEDOMS), len(SCALES))."""
     nu, s = FREEDOMS[:, None], SCALES
-    log = -0.5 * (np.log(nu / prior.freedom) / prior.freedom_efolds) ** 2 - 0.5 * (np.log(s) / prior.scale_efolds) ** 2
-    for k in np.unique(dims):
-        own, weight = values[dims == k], shares[dims == k]
-        distances = np.stack([np.log1p(own / (each * s[:, None])) @ weight for each in FREEDOMS])
-        gamma = torch.lgamma(torch.from_numpy((nu + k) / 2)) - torch.lgamma(torch.from_numpy(nu / 2))
-        log = log + weight.sum() * (gamma.numpy() - 0.5 * k * np.log(nu * s)) - 0.5 * (nu + k) * distances
-    density = np.exp(log - log.max())
+    logs = -0.5 * (np.log(nu / prior.freedom) / prior.freedom_efolds) ** 2 - 0.5 * (np.log(s) / prior.scale_efolds) ** 2
+    d2, k, count, freedoms = map(torch.from_numpy, (values, dims, shares, FREEDOMS))
+    likelihood = torch.stack([student_likelihood(d2 / each, k, freedoms, count) for each in s.tolist()], 1).numpy()
+    logs = logs + likelihood - 0.5 * (dims @ shares) * np.log(s)
+    density = np.exp(logs - logs.max())
     return density / density.sum()
 
 

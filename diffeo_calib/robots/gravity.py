@@ -26,7 +26,6 @@ compliance; along the axis for a slide) and about the two axes perpendicular to 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cached_property
 from types import SimpleNamespace
 
 import torch
@@ -47,7 +46,10 @@ class GravitySag:
 
     Attributes:
         compliances: all compliances, those under the payload last; their features follow each other in the coefficients
-            w (K,).
+            w (K,). size: K.
+        joints: (K,) the moving joint of every coefficient.
+        own: (K,) True for a compliance along the joint's own motion, False for a lateral one.
+        loaded: (K,) True for the coefficients of the payload, the last ones.
 
     Raises InputError: a payload at another link.
     """
@@ -57,31 +59,10 @@ class GravitySag:
         self.compliances = (*chain.arrays.compliances, *(_under_payload(chain, payload.link) if payload else ()))
         self._masses = Masses(*map(torch.from_numpy, Masses.of(self.compliances, chain.arrays)))
         self._numbers = self._masses.own.mT.nonzero()[:, 1]  # of the compliance of each mass
-
-    @property
-    def size(self) -> int:
-        """Number of coefficients K."""
-        return sum(compliance.size for compliance in self.compliances)
-
-    @cached_property
-    def joints(self) -> Tensor:
-        """(K,) the moving joint of every coefficient."""
-        return self._each("joint", torch.int64)
-
-    @cached_property
-    def own(self) -> Tensor:
-        """(K,) True for a compliance along the joint's own motion, False for a lateral one."""
-        return self._each("own", torch.bool)
-
-    @cached_property
-    def loaded(self) -> Tensor:
-        """(K,) True for the coefficients of the payload, the last ones."""
-        return self._each("loaded", torch.bool)
-
-    def _each(self, name: str, dtype: torch.dtype) -> Tensor:
-        """A property of the compliance of every coefficient."""
-        values = [getattr(one, name) for one in self.compliances for _ in range(one.size)]
-        return torch.tensor(values, dtype=dtype, device="cpu")
+        each = [(one.joint, one.own, one.loaded) for one in self.compliances for _ in range(one.size)]
+        columns = torch.tensor(each, dtype=torch.int64, device="cpu").view(-1, 3)
+        self.size, self.joints = len(each), columns[:, 0]
+        self.own, self.loaded = columns[:, 1:].bool().unbind(1)
 
     @property
     def components(self) -> Tensor:

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few, listed
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake, rare_names
-from diffeo_calib.measurements.poses import angle_between, frames_of_points, rotation_numbers
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.sockets import Sockets
@@ -170,14 +169,9 @@ class Poses(Positions):
     options, fix = ", `convention` and `rotation_angle`", "leave the rotation out"
 
     def _errors(self, whole: Evaluation, data: Measurements, points: Tensor) -> Evaluation:
-        if data.frames is None:
-            raise InputError.of("measured poses", got=f"{data.kind}s")
-        measured = data.frames
-        frames = frames_of_points(points, data.bodies.pose_lever())
-        away = measured[..., :3, 3] - frames[..., :3, 3]
-        angles = angle_between(frames[..., :3, :3], measured[..., :3, :3])
+        away, turns = data.bodies.errors(data, points).split(3, dim=-1)
+        angles = turns.norm(dim=-1)
         angles = angles[:, 0] if angles.shape[1] == 1 else angles
-        turns = rotation_numbers(measured[..., :3, :3] @ frames[..., :3, :3].mT, "rotvec").to(away)
         return replace(whole, errors=away.norm(dim=-1), angles=angles, away=away, turns=turns)
 
 

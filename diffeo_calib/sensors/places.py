@@ -234,11 +234,6 @@ class PlacedDevices:
             for name, place in zip(self.names, self.constants[:, :3], strict=True)
         ]
 
-    @property
-    def shown_as(self) -> Shown:
-        """How readings are shown, for files of old versions as the devices report them, lengths in m."""
-        return self.shown or ("", (1.0,), (0.0,))
-
     def entry(self) -> dict[str, Any]:
         """For a file, in m and rad."""
         found = {name: getattr(self, name) for name in ENTRIES} | ({} if self.shown is None else {"shown": self.shown})

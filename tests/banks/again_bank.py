@@ -94,37 +94,34 @@ def mixture(arm: SimulatedArm, rows: int, seed: int) -> dc.Measurements:
     return dc.Measurements.joined([positions(arm, rows // 2, seed), sockets(arm, rows // 2, seed)])
 
 
-def several(arm: SimulatedArm, rows: int, seed: int) -> Any:
-    return dc.Observations.joined([positions(arm, rows // 2, seed), height(arm, rows - rows // 2, seed)])
-
-
 class Again(NamedTuple):
-    """How the arm is measured at first, and how again."""
+    """How the arm is measured at first, and how again, and whether the new rows are compared after wear, too.
+
+    Rows are seen by an old model as those of other cases are, where they are not; and 60 rows in sockets leave 0.5 mm:
+    distances show a change, but not of which joint.
+    """
 
     old: Rows
     new: Rows
     markers: int = 1
     count: int = NEW
+    wears: bool = True
 
 
 CASES = {
     "positions": Again(positions, positions),
-    "two sessions": Again(positions, sessions),
+    "two sessions": Again(positions, sessions, wears=False),
     "hidden markers": Again(hidden, hidden, 2),
     "payloads": Again(payloads, payloads),
     "sockets": Again(sockets, sockets),
     "heights": Again(height, height),
-    "distances": Again(distance, distance),
     "images": Again(image, image),
     "mixture": Again(mixture, mixture),
-    "mixture, then a tracker": Again(mixture, positions),
-    "mixture, then sockets": Again(mixture, sockets),
-    "several kinds": Again(several, several, count=60),
+    "mixture, then a tracker": Again(mixture, positions, wears=False),
     "positions, then sockets": Again(positions, sockets),
     "positions, then heights": Again(positions, height, count=60),
-    "positions, then a mixture": Again(positions, mixture),
-    "heights, then a tracker": Again(height, positions),
-    "sockets, then distances": Again(sockets, distance, count=60),
+    "heights, then a tracker": Again(height, positions, wears=False),
+    "sockets, then distances": Again(sockets, distance, count=60, wears=False),
 }
 
 

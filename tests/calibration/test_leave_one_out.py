@@ -148,16 +148,6 @@ def test_effective_number_of_parameters(name: str, request: pytest.FixtureReques
     assert leave_one_out(data, case.scales).effective == pytest.approx(float(expected), rel=1e-6)
 
 
-@pytest.mark.parametrize(("coordinates", "count"), [(180, 1), (179, 2), (26, 7), (3, 60)])
-def test_blocks_cover_every_row_once(coordinates: int, count: int, clean: Chosen) -> None:
-    blocks = random_blocks(clean.data, 0, coordinates)
-    assert len(blocks) == count
-    assert sorted(torch.cat(blocks).tolist()) == list(range(60))
-    sizes = [len(rows) for rows in blocks]
-    assert max(sizes) - min(sizes) <= 1
-    assert not torch.equal(torch.cat(blocks), torch.cat(random_blocks(clean.data, 1, coordinates)))
-
-
 def test_several_blocks_are_predicted_one_by_one(pair: Chosen) -> None:
     whole, data = leave_one_out(pair.data, pair.scales), weighted(pair.data)
     found = leave_one_out(data, pair.scales, seed=3, block_coordinates=130)

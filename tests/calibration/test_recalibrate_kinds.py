@@ -22,12 +22,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # few row
 ARM = again_bank.arm()
 OTHERWISE = [name for name, case in CASES.items() if case.old is not case.new]
 """Measured in one way and then in another; tests/test_matrix.py recalibrates with rows of the same kind."""
-TOO_LITTLE = {"sockets, then distances"}
-"""60 rows in sockets leave 0.5 mm: distances show a change, but not of which joint."""
-ALIKE = {"mixture, then sockets", "positions, then a mixture"}
-"""Cases of which other cases hold every part."""
-SEEN_ALIKE = {"two sessions", "distances", "several kinds", "mixture, then a tracker", "heights, then a tracker"}
-"""Further cases whose new rows are compared with the model as those of other cases are."""
 
 
 def quietly(work: Any, *given: Any) -> Any:
@@ -44,7 +38,7 @@ def recalibrated(name: str) -> dc.Recalibration:
     return quietly(dc.recalibrate, again_bank.model(case.old, case.markers), new)
 
 
-@pytest.mark.parametrize("name", [name for name in OTHERWISE if name not in ALIKE])
+@pytest.mark.parametrize("name", OTHERWISE)
 def test_new_rows_make_the_model_better(name: str) -> None:
     case: Again = CASES[name]
     model, arm = again_bank.model(case.old, case.markers), again_bank.arm(case.markers)
@@ -56,7 +50,7 @@ def test_new_rows_make_the_model_better(name: str) -> None:
     assert found.rms_after <= found.rms_before
 
 
-@pytest.mark.parametrize("name", [name for name in CASES if name not in TOO_LITTLE | ALIKE | SEEN_ALIKE])
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.wears])
 def test_a_worn_joint_is_found(name: str) -> None:
     case: Again = CASES[name]
     worn = again_bank.arm(case.markers).worn(again_bank.WORN, again_bank.FACTOR)

@@ -42,16 +42,6 @@ def problem_of(observe: Observation, noise: object = 1e-3) -> Problem:
     return Problem(elastic_rr.nominal, x, y, joint_kernel=K_V, task_kernel=K_W, noise=noise, observe=observe)
 
 
-@pytest.mark.parametrize("name", ["distance", "plane"])
-def test_slopes_are_derivatives(name: str) -> None:
-    """A against differences, along random directions."""
-    observe = observations()[name]
-    points, direction = 0.5 * normal(ROWS, observe.dim, seed=8), normal(ROWS, observe.dim, seed=9)
-    eps = 1e-6
-    change = (observe.value(points + eps * direction) - observe.value(points - eps * direction)) / (2 * eps)
-    torch.testing.assert_close((observe.slope(points) @ direction[:, :, None])[:, :, 0], change, rtol=1e-7, atol=1e-8)
-
-
 def test_the_identity_as_a_functional_is_a_measured_position(tmp_path: Path) -> None:
     x, blocks = configurations(), noise_blocks(ROWS, 2)
     y = elastic_rr.real(x)

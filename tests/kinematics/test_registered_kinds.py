@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from typing import Any
 
+import again_bank
 import pytest
 import torch
+from again_bank import positions
 from kind_bank import ELSEWHERE, Kind, kind_named
 from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.rows import with_attributes
-from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
 
 
@@ -129,26 +129,18 @@ def test_the_middle_of_a_socket_with_one_row_is_known_as_well_as_a_row() -> None
 # --- markers of new rows in another order than in the fit -----------------------------------------------------------
 
 
-@cache
-def fitted() -> tuple[SimulatedArm, dc.CalibratedKinematics, dc.Measurements]:
-    arm = SimulatedArm(seed=1, markers=3)
-    names = arm.nominal.joint_names
-    data = dc.Measurements(*arm.measure(50, seed=2), names)
-    model = dc.calibrate(arm.nominal, data, hyperparameters=kind_named("positions").scales).model
-    return arm, model, dc.Measurements(*arm.measure(24, seed=7), names)
-
-
 @pytest.mark.parametrize("verb", [dc.CalibratedKinematics.registered, dc.recalibrate, dc.compare])
 def test_exchanged_markers_are_named(verb: Callable[[Any, Any], Any]) -> None:
-    _, model, new = fitted()
+    model, new = again_bank.model(positions, 3), positions(again_bank.arm(3), 24, 7)
     for order, named in (([1, 0, 2], "0, 1"), ([1, 2, 0], "0, 1, 2")):
         with pytest.warns(DiffeoCalibWarning, match=f"markers {named}, or.* seem to be exchanged"):
             verb(model, with_attributes(new, points=new.points[:, order]))
 
 
 def test_markers_that_moved_are_not_exchanged() -> None:
-    arm, model, new = fitted()
-    turns = arm.truth.marker_poses(new.q)[..., :3, :3]
+    arm, model = again_bank.arm(3), again_bank.model(positions, 3)
+    new = positions(arm, 24, 7)
+    turns = again_bank.ELSEWHERE[:3, :3] @ arm.truth.marker_poses(new.q)[..., :3, :3]
     shifts = torch.tensor([[2e-3, 1e-3, 0.0], [-1e-3, 3e-3, 2e-3], [3e-2, -4e-2, 1e-2]], dtype=torch.float64)
     moved = with_attributes(new, points=new.points + (turns @ shifts[None, ..., None])[..., 0])
     assert model.registered(moved).registration.exchanged == ()

@@ -185,27 +185,6 @@ def test_tangent_limit(arm: Arm) -> None:
     torch.testing.assert_close(derivative, first, rtol=1e-8, atol=1e-8)
 
 
-@every_arm
-def test_gram_of_the_tangent_model(arm: Arm) -> None:
-    """G(x, x') = Dk0 K_V Dk0'^T + K_W(k0, k0') + S Lambda^-1 S'^T, at two different sets of points."""
-    tangent = arm.deform(0.0, steps=1)
-    theta = tangent.momenta.theta
-    x, y = arm.points(4, 7), arm.points(3, 8)
-
-    def blocks(at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        dk0, s = arm.spec.nominal.jacobian(at, theta), arm.spec.nominal.sensitivities(at, theta)
-        return torch.block_diag(*dk0), arm.spec.nominal(at, theta).reshape(-1, arm.spec.task_dim), s.flatten(0, 1)
-
-    (d1, z1, s1), (d2, z2, s2) = blocks(x), blocks(y)
-    expected = (
-        d1 @ arm.spec.joint_kernel.matrix(x, y) @ d2.T
-        + arm.spec.task_kernel.matrix(z1, z2)
-        + s1 @ torch.diag(arm.spec.prior_variance) @ s2.T
-    )
-    actual = tangent.linearise(x).gram(tangent.linearise(y))
-    torch.testing.assert_close(actual, expected, rtol=1e-12, atol=1e-12)
-
-
 def perturbed(arm: Arm, x: Tensor, steps: int, eps: float, where: str) -> Tensor:
     """k1(x) along the flows of an :class:`Arm` when one field is changed to v + eps u, u fixed in time."""
     start = arm.deform(0.1, steps)

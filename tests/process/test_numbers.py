@@ -7,7 +7,6 @@ import torch
 from process_bank import Case
 from tangent_bank import normal
 from torch import Tensor
-from torch.testing import assert_close
 
 from diffeo_calib.process.numbers import Numbers
 
@@ -59,55 +58,18 @@ def test_a_point_that_any_row_depends_on_is_there() -> None:
     assert torch.equal(numbers.parts[0].A[:, 0, 0], torch.eye(3, dtype=torch.float64)[[0, 2]])
 
 
-def test_values_and_blocks_there_and_back() -> None:
-    numbers = table(SHOWN)
-    values, blocks = normal(6, 6, 2, seed=8), normal(6, 6, 6, seed=9)
-    back = numbers.in_table(numbers.of_table(values))
-    assert_close(back[SHOWN], values[SHOWN], rtol=0, atol=0)
-    assert not bool(back[~SHOWN].any())
-    whole = numbers.blocks_in_table(numbers.blocks_of_table(blocks))
-    both = SHOWN[:, :, None] & SHOWN[:, None]
-    assert torch.equal(whole, torch.where(both, blocks, 0.0))
-    for own, again in zip(numbers.blocks_of_table(whole), numbers.blocks_of_table(blocks), strict=True):
-        assert torch.equal(own, again)
-
-
-def test_blocks_are_those_of_the_rows() -> None:
-    """In a matrix of all numbers, and added to it."""
-    numbers, matrix = table(SHOWN), normal(20, 20, seed=10)
-    expected = torch.where(numbers.owner[:, None] == numbers.owner, matrix, 0.0)
-    blocks = numbers.diagonal_blocks(matrix)
-    assert_close(numbers.add_blocks(torch.zeros_like(matrix), blocks), expected, rtol=0, atol=0)
-    assert_close(numbers.add_blocks(matrix.clone(), blocks), matrix + expected, rtol=0, atol=0)
-    for part, own in zip(numbers.parts, blocks, strict=True):
-        for cells, block in zip(part.cells, own, strict=True):
-            at = torch.cat([(numbers.cells == cell).nonzero()[0] for cell in cells])
-            assert torch.equal(block, matrix[at][:, at])
-
-
 @pytest.mark.parametrize("cut", [1, 3])
 def test_joined_numbers_are_those_of_the_joined_table(cut: int) -> None:
-    N, whole = len(SHOWN), {}
+    N = len(SHOWN)
     q, points, target = normal(N, 3, seed=0), normal(N, 6, seed=1), normal(N, 6, seed=2)
     S, J, A = normal(N, 6, 4, seed=3), normal(N, 6, 3, seed=4), normal(N, 6, 6, seed=5)
 
     def of(rows: slice) -> Numbers:
-        arrays = {"target": target[rows], "S": S[rows], "J": J[rows], "A": A[rows]}
-        return Numbers.of(q[rows], points[rows], SHOWN[rows], **arrays)
+        return Numbers.of(q[rows], points[rows], SHOWN[rows], target=target[rows], S=S[rows], J=J[rows], A=A[rows])
 
     together, apart = of(slice(0, N)), of(slice(0, cut)).joined(of(slice(cut, N)))
     assert apart.shape == together.shape
     for numbers in (together, apart):
-        order = numbers.cells.argsort()
-        found = [numbers.cells, numbers.target, numbers.S, numbers.J, numbers.owner, numbers.q[numbers.row]]
-        whole[numbers] = [values[order] for values in found]
-    for first, second in zip(whole[together], whole[apart], strict=True):
-        assert torch.equal(first, second)
-    blocks = normal(N, 6, 6, seed=11)
-    found = apart.blocks_in_table(apart.blocks_of_table(blocks))
-    assert torch.equal(found, together.blocks_in_table(together.blocks_of_table(blocks)))
-
-
-def test_none_of_them() -> None:
-    none = table(SHOWN).none
-    assert (len(none.target), none.S.shape[1], none.J.shape[1], none.shape) == (0, 4, 3, (0, 6))
+        assert torch.equal(numbers.in_table(numbers.target), torch.where(SHOWN, target, 0.0))
+        assert torch.equal(numbers.S, S.flatten(0, 1)[numbers.cells])
+        assert torch.equal(numbers.q[numbers.row], q[numbers.owner])

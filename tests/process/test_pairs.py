@@ -11,7 +11,7 @@ from tangent_bank import normal
 from torch import Tensor
 from torch.testing import assert_close
 
-from diffeo_calib.process.numbers import Covariance, Numbers, joint_weights
+from diffeo_calib.process.numbers import Covariance, Numbers
 from diffeo_calib.process.scales import Hyperparameters
 
 
@@ -44,16 +44,6 @@ def test_both_fields_count(case: Case) -> None:
         assert_close(matrix(case.data.pairs, alone), expected, rtol=0, atol=1e-13 * float(expected.abs().max()))
 
 
-def test_some_rows_with_others(case: Case) -> None:
-    a, b = two(case)
-    count, R = len(case.data.x), case.data.told.y.shape[1]
-    rows, columns = torch.arange(0, count, 3)[a.owner], torch.arange(1, count)[b.owner]
-    at, to = rows * R + a.cells % R, columns * R + b.cells % R
-    expected = case.fields[at][:, to]
-    found = matrix(Covariance(a, b, case.data.space), case.scales)
-    assert_close(found, expected, rtol=0, atol=1e-13 * float(expected.abs().max()))
-
-
 def test_inner_is_the_sum_with_the_matrix_and_so_is_its_slope(case: Case) -> None:
     """Of each kind of scale, by central differences."""
     a, b = two(case)
@@ -73,14 +63,3 @@ def test_inner_is_the_sum_with_the_matrix_and_so_is_its_slope(case: Case) -> Non
 
         expected = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / 12e-3
         assert float(of_scale) == pytest.approx(expected, rel=1e-6, abs=1e-9 * size)
-
-
-def test_weights_of_the_joints(case: Case) -> None:
-    """J^T W J of every pair of rows and every joint."""
-    a, b = two(case)
-    weights = normal(len(a.target), len(b.target), seed=5)
-    found = joint_weights(a, b, weights)
-    expected = torch.zeros_like(found)
-    for i in range(len(a.target)):
-        expected[a.row[i]].index_add_(1, b.row, (a.J[i][:, None] * weights[i] * b.J.T))
-    assert_close(found, expected, rtol=1e-10, atol=1e-10 * float(expected.abs().max()))

@@ -109,10 +109,7 @@ def warn_of_what_is_open(data: TangentData, devices: Sequence[Devices]) -> None:
     whole = data.nominal.jacobian(data.x, data.theta)
     seen = data.jacobian.square().mean((0, 1)).sqrt() / whole.square().mean((0, 1)).sqrt().clamp(min=1e-9)
     by_ball = data.sensitivities[..., data.nominal.geometry.slices["tool"]].flatten(0, 1)
-    shared = data.shared.flatten(0, 1)
-    shared = shared / shared.norm(dim=0).clamp(min=1e-12)
-    known = torch.linalg.lstsq(shared, by_ball, rcond=1e-6, driver="gelsd").solution  # moved devices do as well
-    tilt = torch.linalg.svdvals(by_ball - shared @ known) / data.coordinates**0.5
+    tilt = torch.linalg.svdvals(without_shared(by_ball, data.shared.flatten(0, 1))) / data.coordinates**0.5
     for own in devices:
         for what, fix in own.open_sentences():
             warn_user(sentence(what, fix=fix))
@@ -124,6 +121,14 @@ def warn_of_what_is_open(data: TangentData, devices: Sequence[Devices]) -> None:
     if unseen:
         what = f"the readings hardly change with {few(unseen)}: errors of such joints are not determined"
         warn_user(sentence(what, fix="add devices that see these joints turn"))
+
+
+def without_shared(effects: Tensor, shared: Tensor) -> Tensor:
+    """Effects (M, k) on numbers less what unknowns that rows share, with effects (M, c), do as well."""
+    if not shared.shape[1]:
+        return effects
+    shared = shared / shared.norm(dim=0).clamp(min=1e-12)
+    return effects - shared @ torch.linalg.lstsq(shared, effects, rcond=1e-6, driver="gelsd").solution
 
 
 def warn_of_size(fix: str, size: float, share: float, expected: float) -> None:

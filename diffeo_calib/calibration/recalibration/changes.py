@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import degrees, inf
 from typing import NamedTuple
 
@@ -89,17 +89,12 @@ class Changes:
         smallest: of every joint, the smallest change of its offset that the rows would show; empty once one was found.
     """
 
-    found: tuple[Change, ...]
-    probabilities: dict[str, float]
-    noise: float
-    rows: int
-    level: float | None
+    found: tuple[Change, ...] = ()
+    probabilities: dict[str, float] = field(default_factory=dict)
+    noise: float = 1.0
+    rows: int = 0
+    level: float | None = None
     smallest: tuple[SmallestOffset, ...] = ()
-
-    @classmethod
-    def untested(cls) -> Changes:
-        """No test was wanted."""
-        return cls((), {}, 1.0, 0, None)
 
     @property
     def tested(self) -> bool:

@@ -130,7 +130,10 @@ def compare(
     changes, _ = find_changes(rows, level=level, seed=seed)
     if measured:
         warn_of_places(rows.before, marker, outliers=not changes.found, excess=not changes.found)
-    usual = (_usual_deviation(model) ** 2 + rows.noise.diagonal(dim1=1, dim2=2)).sqrt()
+    q = model.configurations  # what is usual is expected at the rows of its fit
+    _, covariance = model.predict(q[:: -(-len(q) // MOST_USUAL)], noise=False)
+    variance = float(covariance.diagonal(dim1=-2, dim2=-1).mean().clamp(min=0))
+    usual = (variance + rows.noise.diagonal(dim1=1, dim2=2)).sqrt()
     usual = usual.masked_fill(~rows.visible, nan)
     return Comparison(
         moved=rows.before.registration if measured else None,
@@ -141,13 +144,6 @@ def compare(
         hidden=hidden_offsets(model.robot, rows.before.place, changes) if measured else (),
         payload=payload,
     )
-
-
-def _usual_deviation(model: CalibratedKinematics) -> float:
-    """Standard deviation of a model per coordinate at the rows of its fit, m, noise left out."""
-    q = model.configurations
-    _, covariance = model.predict(q[:: -(-len(q) // MOST_USUAL)], noise=False)
-    return float(covariance.diagonal(dim1=-2, dim2=-1).mean().clamp(min=0).sqrt())
 
 
 def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) -> WeighedRows:

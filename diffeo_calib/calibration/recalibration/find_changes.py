@@ -167,9 +167,11 @@ def groups_of(rows: WeighedRows) -> dict[str, tuple[Tensor, bool]]:
 
 def _changes_of(rows: WeighedRows, *, level: float, seed: int) -> tuple[Changes, list[Drift]]:
     """Test rows together; arguments as of :func:`find_changes`."""
-    rows = rows.kept(within_old_range(rows))
+    low, high = rows.fitted.x.amin(0), rows.fitted.x.amax(0)
+    margin = RANGE_MARGIN * (high - low)
+    rows = rows.kept(((rows.q >= low - margin) & (rows.q <= high + margin)).all(1).nonzero()[:, 0])
     if len(rows) < FEWEST_ROWS:
-        return Changes((), {}, 1.0, len(rows), level), []
+        return Changes(rows=len(rows), level=level), []
     parts = {part.name: part for part in (*parts_of(rows.fitted), *offsets_of(rows.fitted))}
     roots = {name: part.root(rows.at) for name, part in parts.items()}
     rows = rows.changed(tails=rows.drifting(list(roots.values())).with_weights().tails)
@@ -209,13 +211,6 @@ def _smallest(rows: WeighedRows) -> tuple[SmallestOffset, ...]:
         size = size if size < LARGEST_OFFSET_RAD_M else inf
         found.append(SmallestOffset(chain.joint_names[joint], size, chain.kinds[joint] != "prismatic"))
     return tuple(found)
-
-
-def within_old_range(rows: WeighedRows) -> Tensor:
-    """(k,) numbers of the rows within the ranges of the joints in the old rows."""
-    low, high = rows.fitted.x.amin(0), rows.fitted.x.amax(0)
-    margin = RANGE_MARGIN * (high - low)
-    return ((rows.q >= low - margin) & (rows.q <= high + margin)).all(1).nonzero()[:, 0]
 
 
 def _change(rows: WeighedRows, drift: Drift, probability: float, others: tuple[str, ...]) -> Change:

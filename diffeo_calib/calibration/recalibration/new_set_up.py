@@ -24,7 +24,6 @@ from diffeo_calib.kinematics.evaluation import rows_used_in_fit
 from diffeo_calib.kinematics.joint_ranges import check_same_robot
 from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
 from diffeo_calib.kinematics.re_registration.find_place import MARKER_DEVIATIONS, FoundPlace, find_place, warn_about
-from diffeo_calib.kinematics.re_registration.new_rows import NewRows
 from diffeo_calib.kinematics.re_registration.registered_map import Registration, robot_map
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
@@ -177,7 +176,11 @@ def _place_of_device(
     largest = device.largest_session()
     check_size(predicted(largest), largest.points)
     place = find_place(old, nominal, lever, largest, marker_std=marker_std)
-    warn_of_scale(place.rows)
+    rows = place.rows
+    ratio = size_ratio(*(each.unflatten(1, (-1, 3)) for each in (rows.seen[0], rows.given.shown(rows.y))))
+    if abs(ratio - 1.0) > USUAL_RATIO:
+        what = f"distances between the new rows are {ratio:.4f} times those that the model predicts"
+        warn_user(sentence(what, fix="check the scale of the measuring device"))
     turn, T = float(place.registration.frame_deviations[3:].max()), place.registration.transform
     if turn > LARGEST_TURN_RAD:
         raise MeasurementError.of(
@@ -284,14 +287,6 @@ def size_ratio(predicted: Tensor, measured: Tensor) -> float:
     )
     far = expected >= expected.quantile(FARTHEST_PAIRS) if len(expected) else expected.bool()
     return float((found[far] / expected[far]).median()) if bool((expected[far] > 0).all()) and len(expected) else 1.0
-
-
-def warn_of_scale(rows: NewRows) -> None:
-    """Warn if distances between points that a device measured differ by a factor that no robot has."""
-    ratio = size_ratio(*(each.unflatten(1, (-1, 3)) for each in (rows.seen[0], rows.given.shown(rows.y))))
-    if abs(ratio - 1.0) > USUAL_RATIO:
-        what = f"distances between the new rows are {ratio:.4f} times those that the model predicts"
-        warn_user(sentence(what, fix="check the scale of the measuring device"))
 
 
 def warn_of_places(before: Before, marker: str, *, outliers: bool, excess: bool) -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
-from math import nan
 from typing import Any, Literal
 
 import torch
@@ -158,7 +157,7 @@ def recalibrate(
     rows = weighed(before, marker)
     LOG.info("registration: RMS %s of %d new rows", rows.by_kind(rows.placed_residual).rms_text, len(new))
     progress("changes", 0, 1)
-    changes, drifts = find_changes(rows, seed=seed) if drift == "tested" else (Changes.untested(), [])
+    changes, drifts = find_changes(rows, seed=seed) if drift == "tested" else (Changes(), [])
     LOG.info("changes: %s", changes)
     warn_of_groups(changes)
     warn_of_places(before, marker, outliers=False, excess=not drifts)
@@ -185,12 +184,17 @@ def _result(
         fitted_map = fitted_map.without_rigid_motions()
     if found is not None:
         fitted_map = moved(fitted_map, found.transform)
-    ball = place.new_ball or (knows_ball(model) and not _ball_measured(place))
+    own, shared = place.coordinates, fitted.problem.noise.shared[-len(rows) :]
+    # a ball that a device measured is none in an unknown place any more
+    measured = place.ball is None and own is not None and not bool(own.table.points[:, -1].isnan().all())
+    ball = place.new_ball or (knows_ball(model) and not measured)
     again = model.with_fit(fitted_map, Provenance.now(new, note), ball=ball)
     small = (rows.tails.weights < OUTLIER_WEIGHT).any(1)
     again.placement = carried_devices(model, again, place.transform)
     again.placement = _with_settled(devices_beside(again, new), model, place, rows, fitted)
-    before, after, left_out = map(rows.by_kind, (rows.placed_residual, _left_over(fitted, rows), rows.given.left_out))
+    left = (fitted.residual[-len(rows) :] - shared @ fitted.shifts)[:, : rows.y.shape[1]]  # devices where it puts them
+    left = rows.given.shown(left)
+    before, after, left_out = map(rows.by_kind, (rows.placed_residual, left, rows.given.left_out))
     if model.summary is not None:
         known = {"diffeomorphic_rms": after.positions_rms, "leave_one_out_rms": left_out.positions_rms}
         certificates = {name: getattr(fitted, name) for name in CERTIFICATES}
@@ -233,19 +237,6 @@ def _with_settled(
                 device = torch.cat([other.device, number[own.device]])
                 found[k] = replace(other, rows=torch.cat([other.rows, own.rows]), device=device)
     return tuple(found)
-
-
-def _ball_measured(before: Before) -> bool:
-    """Whether a device measured the last marker: it is no ball in an unknown place any more."""
-    own = before.coordinates
-    return before.ball is None and own is not None and not bool(own.table.points[:, -1].isnan().all())
-
-
-def _left_over(fitted: Fit, rows: WeighedRows) -> Tensor:
-    """(M, R) residuals of the new rows after the fit, their devices where it puts them, m; NaN where hidden."""
-    shared = fitted.problem.noise.shared[-len(rows) :]
-    left = (fitted.residual[-len(rows) :] - shared @ fitted.shifts)[:, : rows.y.shape[1]]
-    return left.masked_fill(~rows.visible, nan)
 
 
 LARGEST_OUTLIER_PART = 0.5

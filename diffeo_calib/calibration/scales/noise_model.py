@@ -47,7 +47,7 @@ from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import Tails
-from diffeo_calib.regression.regions import CONFIDENCE, region_factor
+from diffeo_calib.regression.regions import CONFIDENCE, region_factor, smallest
 
 SMALLEST_NOISE_M = 1e-7
 """Independent noise that is always present: with less, exact data would make G + R singular in float64."""
@@ -252,10 +252,6 @@ class NoiseModel:
         return found if seen is None else found.masked_fill(~seen, nan)
 
 
-HALVINGS = 50
-"""Of the interval in which the quantile lies: to the last digit."""
-
-
 def differing_factor(covariance: Tensor, mean: Tensor, seen: Tensor) -> float:
     """Factor, one or more, on the mean covariance with which 95 % regions of markers hold 95 % of all rows' errors.
 
@@ -269,12 +265,13 @@ def differing_factor(covariance: Tensor, mean: Tensor, seen: Tensor) -> float:
     first = relative.diagonal(dim1=-2, dim2=-1).sum(-1)
     second = (relative * relative.mT).sum((-2, -1))
     gaussian = chi2_above(1.0 - CONFIDENCE, 3)
-    low, high = gaussian, gaussian * max(float(first.max()), 1.0)  # more than any single row needs
-    for _ in range(HALVINGS):
-        middle = 0.5 * (low + high)
-        inside = torch.special.gammainc(first.square() / (2.0 * second), middle * first / (2.0 * second)).mean()
-        low, high = (low, middle) if float(inside) >= CONFIDENCE else (middle, high)
-    return low / gaussian
+
+    def holds(bound: float) -> bool:
+        inside = torch.special.gammainc(first.square() / (2.0 * second), bound * first / (2.0 * second)).mean()
+        return float(inside) >= CONFIDENCE
+
+    most = gaussian * max(float(first.max()), 1.0)  # more than any single row needs
+    return smallest(holds, gaussian, most) / gaussian
 
 
 LOG = logging.getLogger(__name__)

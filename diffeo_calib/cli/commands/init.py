@@ -69,7 +69,7 @@ def run(given: InitOptions) -> None:
     csv, joined = with_places(given.csv, given.places, output.parent)
     sheet = guess_sheet(csv)
     try:
-        source = _commanded(csv, given.robot, sheet) or _of_robot(csv, given.robot or Path(), output.parent, sheet)
+        source = _commanded(given.robot, sheet) or _of_robot(given.robot or Path(), output.parent, sheet)
     except InputError as error:
         raise type(error)(f"{error} {sheet.odd}".strip()) from error
     choices = [
@@ -107,22 +107,22 @@ def _used(choices: list[Choice]) -> set[str]:
     return corners | {name for each in names for name in re.findall(r"\{([^{}]+)\}", each) or [each]}
 
 
-def _commanded(csv: Path, robot: Path | None, sheet: Sheet) -> Source | None:
+def _commanded(robot: Path | None, sheet: Sheet) -> Source | None:
     """The table as poses of the machine; None where a robot is named whose joints the table has."""
     if robot is None:
-        return commanded_poses.source_of(csv, sheet)
+        return commanded_poses.source_of(sheet)
     try:
         _arms(robot, sheet)
     except InputError as error:
         try:
-            source = commanded_poses.source_of(csv, sheet)
+            source = commanded_poses.source_of(sheet)
         except DiffeoCalibError:
             raise error from None
         return source.saying(Choice("", "", f"{robot}: not used, no column is named after its joints"))
     return None
 
 
-def _of_robot(csv: Path, robot: Path, folder: Path, sheet: Sheet) -> Source:
+def _of_robot(robot: Path, folder: Path, sheet: Sheet) -> Source:
     """The table as joint values of a robot: of the joints, or in the convention, that explain the rows.
 
     Raises:
@@ -132,7 +132,7 @@ def _of_robot(csv: Path, robot: Path, folder: Path, sheet: Sheet) -> Source:
     for arm in (arms := _arms(robot, sheet)):
         try:
             with quiet():  # `fit` warns of the right reading
-                one = _read(csv, robot, sheet, arm)
+                one = _read(robot, sheet, arm)
                 found.setdefault((arm.links.dh_convention, *one.robot.joint_names), one)
         except InputError as error:
             refused.append(error)
@@ -158,15 +158,13 @@ def _of_robot(csv: Path, robot: Path, folder: Path, sheet: Sheet) -> Source:
     return replace(best, said=(Choice("robot", relpath(robot, folder), about), *best.said))
 
 
-def _read(csv: Path, robot: Path, sheet: Sheet, arm: Arm) -> Source:
+def _read(robot: Path, sheet: Sheet, arm: Arm) -> Source:
     """The table as values of these joints; InputError if the robot does not explain the rows."""
     leaves = [path[-1].child for path in chains_in(robot)] if is_urdf(robot) else []
-    rows = rows_in(csv, sheet, arm.columns.names)
+    rows = rows_in(sheet, arm.columns.names)
     tips = tips_of(rows.markers, leaves)
     chain = load_robot(robot, replace(arm.links, tip=tips or arm.links.tip))
-    source = Source(
-        csv, sheet, chain, arm.columns.names, rows, TableFormat("mm", "deg", sheet.sep, sheet.decimal), tips
-    )
+    source = Source(sheet, chain, arm.columns.names, rows, TableFormat("mm", "deg", sheet.sep, sheet.decimal), tips)
     guessed = guess_joints(sheet.numbers, chain.joint_names) or [arm.columns]
     source = with_units(with_measured(with_joint_columns(source, guessed)))
     about = [Choice("base", arm.links.base or "", "root of the URDF")] if is_urdf(robot) else []
@@ -180,7 +178,7 @@ def _read(csv: Path, robot: Path, sheet: Sheet, arm: Arm) -> Source:
 def _with_tip(robot: Path, source: Source, arm: Arm) -> Source:
     """The same without joints at the end that no marker follows, and why the tip is there."""
     left_out = list[str]()
-    q = read_joints(source.csv, source.joints, source.table, kinds=source.robot.kinds)
+    q = read_joints(source.sheet.path, source.joints, source.table, kinds=source.robot.kinds)
     moved = (q.amax(0) - q.amin(0)).tolist()
     while len(arm.joints) > 1 and source.value("joints"):
         count = len(arm.joints) - 1
