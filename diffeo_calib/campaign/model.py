@@ -131,9 +131,9 @@ class CampaignModel:
             fix = "measure more rows, then the model is made"
             raise MeasurementError.of("the first rows do not fit together yet", expected=expected, got=got, fix=fix)
         found, data = chosen.selection.scales, chosen.data
-        later: Any = None
+        later: Any = [None] * 10  # what follows from the accepted rows
         counts = 0 if scales is None and first else len(numbers), inf, len(numbers), len(table)
-        made = cls(placed, data, found, *counts, asked, later, [], *[later] * 6, [], later).rebuilt(table, verdicts)
+        made = replace(cls(placed, data, found, *counts, asked, *later), ratios=[]).rebuilt(table, verdicts)
         if certain and known is None:
             made.deviation = made.scales_deviation()
         return made
@@ -332,7 +332,7 @@ class CampaignModel:
         row, y, each = self.window[-1], data.y[-1:], data.y[-1].unflatten(0, (data.noise_model.bodies, -1))
         values = [(f"its values seem to be {words}", factor * y) for factor, words in UNITS]
         for a, b in combinations(range(len(each)), 2):
-            other = each.index_copy(0, torch.tensor([a, b], device=each.device), each[[b, a]])
+            other = each.index_copy(0, torch.tensor([a, b], dtype=torch.int64, device=each.device), each[[b, a]])
             values.append((f"markers {a} and {b} seem to be exchanged", other.flatten()[None]))
         for words, other in values:
             undone = torch.zeros_like(data.y)

@@ -44,7 +44,8 @@ def write_report(
         model: the calibrated model.
         path: the file.
         data: rows of any kinds; rows of the fit, and of a registration, are left out. By default, and if no others are
-            left, the rows of the fit are shown: measured positions each predicted by all others in closed form.
+            left, the rows of the fit are shown: measured positions each predicted by all others in closed form, rows of
+            other kinds as fitted. A model with control points does not know its rows: pass them in their order.
         title: of the page, by default the robot's.
         stages: name -> kinematics (N, n) -> (N, P, 3) in m to compare, the model last; by default the nominal robot and
             the geometric calibration, base and markers where they fit best.
@@ -61,6 +62,7 @@ def write_report(
     Raises:
         InputError: arguments of another kind, measurements that do not belong to the model, a column that the table
             does not have, or a file that cannot be written.
+        MeasurementError: rows that another reading explains far better, or too few rows of a set-up.
     """
     check_writable(path)  # before the work
     if tolerance is not None:

@@ -1,4 +1,4 @@
-"""`diffeo-calib fit`: what it prints and writes."""
+"""`diffeo-calib fit`: what it prints and writes; `demo`."""
 
 from __future__ import annotations
 
@@ -168,3 +168,20 @@ def test_a_device_that_moved_half_way_fails_the_fit(tmp_path: Path, command: Com
     assert any("near row 57" in line for line in done.warnings)
     assert "from the model" in done.error
     assert "session" in done.error
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("given_scales")
+def test_demo(command: Command, tmp_path: Path) -> None:
+    done = command("demo", "--output", tmp_path / "demo", "--count", 30)
+    assert (done.code, done.err.strip()) == (0, "")
+    names = {path.name for path in (tmp_path / "demo").iterdir()}
+    assert names == {"arm.urdf", "measurements.csv", "model.safetensors", "calibration.png", "report.html"}
+    assert done.numbers("calibrated", "held out")[0] < done.numbers("geometric", "held out")[0]
+    # the command that it shows is one that works
+    shown = re.search(r"  diffeo-calib (fit .*?)\n\n", done.out, re.DOTALL)
+    assert shown is not None
+    arguments = shown.group(1).replace("\\\n", " ").replace("'", "").split()
+    again = command(*arguments[: arguments.index("--figure")])  # figure and report are those of the demo
+    assert again.code == 0
+    assert again.numbers("calibrated", "held out") == done.numbers("calibrated", "held out")

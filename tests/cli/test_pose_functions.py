@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import runpy
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,11 +11,6 @@ from command_bank import Command
 from commanded_bank import cells, without_frames, write_columns
 from documentation_bank import write_commanded_tables
 from torch.testing import assert_close
-
-if sys.version_info >= (3, 11):
-    pass
-else:
-    pass  # pyright: ignore[reportMissingImports]
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from process_bank import Case
 from tangent_bank import normal
@@ -55,3 +56,20 @@ def test_a_point_that_any_row_depends_on_is_there() -> None:
     numbers = Numbers.of(one[..., 0], points, torch.ones(2, 1).bool(), target=one[..., 0], S=one, J=one, A=A)
     assert torch.equal(numbers.z, points[:, 3:])
     assert torch.equal(numbers.parts[0].A[:, 0, 0], torch.eye(3, dtype=torch.float64)[[0, 2]])
+
+
+@pytest.mark.parametrize("cut", [1, 3])
+def test_joined_numbers_are_those_of_the_joined_table(cut: int) -> None:
+    N = len(SHOWN)
+    q, points, target = normal(N, 3, seed=0), normal(N, 6, seed=1), normal(N, 6, seed=2)
+    S, J, A = normal(N, 6, 4, seed=3), normal(N, 6, 3, seed=4), normal(N, 6, 6, seed=5)
+
+    def of(rows: slice) -> Numbers:
+        return Numbers.of(q[rows], points[rows], SHOWN[rows], target=target[rows], S=S[rows], J=J[rows], A=A[rows])
+
+    together, apart = of(slice(0, N)), of(slice(0, cut)).joined(of(slice(cut, N)))
+    assert apart.shape == together.shape
+    for numbers in (together, apart):
+        assert torch.equal(numbers.in_table(numbers.target), torch.where(SHOWN, target, 0.0))
+        assert torch.equal(numbers.S, S.flatten(0, 1)[numbers.cells])
+        assert torch.equal(numbers.q[numbers.row], q[numbers.owner])

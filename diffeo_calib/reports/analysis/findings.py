@@ -193,23 +193,12 @@ def find(
     against: Sequence[str] = (),
     progress: Progress = silent,
 ) -> Findings:
-    """Compute everything that a report shows.
-
-    Args:
-        model: a calibrated model. data: rows of any kinds; rows of the fit, and of a registration, are left out. By
-            default, and if no others are left, the rows of the fit are shown: measured positions each predicted by all
-            others, rows of other kinds as fitted. A model with control points does not know its rows: pass them in
-            their order.
-        stages: kinematics to compare, the model last; found anew by default.
-        places: of the devices beside each stage, by its name; by default they are placed on the rows.
-        against: further columns of the table of ``data``.
-        progress: called as ``progress(task, done, total)``.
-
-    Raises:
-        InputError: arguments of another kind, joints in another order, or a column that the table does not have.
-        MeasurementError: rows that another reading explains far better, or too few rows of a set-up.
-    """
-    check_arguments(model, data)
+    """Compute everything that a report shows; arguments and errors as of :func:`write_report`."""
+    if not isinstance(model, CalibratedKinematics):
+        raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
+    if not (data is None or isinstance(data, RowGroups)):
+        expected = "dc.Measurements, dc.Readings or Observations"
+        raise InputError.of("`data`", expected=expected, got=type(data).__name__)
     if data is not None:
         check_rows(model, data)
     own = Places() if data is None else place(model, data) if places is None else list(places.values())[-1]
@@ -245,15 +234,6 @@ def find(
     return Findings(model, kinematics, rows, *found)
 
 
-def check_arguments(model: object, data: object) -> None:
-    """Raise InputError for arguments of another kind."""
-    if not isinstance(model, CalibratedKinematics):
-        raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
-    if not (data is None or isinstance(data, RowGroups)):
-        expected = "dc.Measurements, dc.Readings or Observations"
-        raise InputError.of("`data`", expected=expected, got=type(data).__name__)
-
-
 def unseen(model: CalibratedKinematics, q: Tensor) -> Tensor:
     """(N,) which configurations took no part in the fit, nor in a registration."""
     new = ~rows_used_in_fit(model, q)
@@ -269,11 +249,9 @@ def _errors(
     own: Places,
     places: Mapping[str, Places] | None,
 ) -> dict[str, Evaluations]:
-    """Errors of all rows by stage.
+    """Errors of all rows by stage, devices in their ``own`` places beside the model, in ``places`` beside every stage.
 
-    Args:
-        data: the rows. aligned: the same in the frame of the model, without its drift, if all are measured positions.
-        own: places of the devices beside the model. places: beside every stage, if they are known.
+    ``aligned``: the rows in the frame of the model, without its drift, if all are measured positions.
     """
     *before, last = stages
     found = dict[str, Evaluations]()
@@ -310,11 +288,9 @@ def _of_table(
     *,
     every: Mapping[str, Evaluations],
 ) -> Shown:
-    """Rows that the model has not seen; if there are none, all as fitted.
+    """Rows that the model has not seen, of a ``mask`` (N,); if there are none, all as fitted.
 
-    Args:
-        mask: (N,) which rows are new. measured: positions of all in the frame of the model.
-        own: places of the devices. every: errors of all by stage.
+    ``measured``: positions of all in the frame of the model. ``every``: errors of all by stage.
     """
     new = bool(mask.any())
     LOG.info("judged by %d rows it has not seen, %d were used before", int(mask.sum()), int((~mask).sum()))
