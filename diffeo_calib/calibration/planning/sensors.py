@@ -305,7 +305,7 @@ class DeviceReadings(Sensor):
             shared = self._new(scene, self.devices.shared(points[rows], device))
         else:
             shared = slopes.new_zeros(*slopes.shape[:2], scene.shifts)
-            shared[..., columns] = self.fitted.shared(points[rows])
+            shared[..., columns] = self.fitted.by_increments(points[rows]) @ self.fitted.root
         return Options(rows, slopes, shared, self._noise(scene, rows, slopes), device, self.devices.names)
 
     def _noise(self, scene: Scene, rows: Tensor, slopes: Tensor) -> Tensor:
