@@ -14,7 +14,7 @@ import pytest
 import torch
 from golden_bank import sockets
 from math_bank import normal
-from product_bank import simulated, simulated_poses, ur10_measurements, ur10_scales
+from product_bank import Case, simulated, simulated_poses, ur10_measurements, ur10_scales
 from reading_bank import readings, scales
 from tangent_bank import Setting, built, covariance
 from torch import Tensor
@@ -277,3 +277,18 @@ def test_three_set_ups_are_no_drift() -> None:
 def test_the_chance_of_a_jump_is_a_little_more_than_the_tabulated_one(gain: float, unknowns: int, level: float) -> None:
     """By table I of Andrews, Econometrica 71 (2003), without 15 % of the rows at both ends."""
     assert 1.05 < chance_of_jump(gain, unknowns, 0.15) / level < 1.15
+
+
+@pytest.mark.slow
+def test_a_tracker_that_was_knocked_is_noticed(arm: Case) -> None:
+    """0.5 mm from one of 60 rows on, in the order of their numbers; the error of the calibration is 0.04 mm."""
+    change = torch.tensor([3e-4, 0.0, 4e-4], dtype=torch.float64)
+    data = dc.Measurements(arm.train.q, from_row(arm.train.points, 25, change))
+    mixed = data[torch.from_numpy(np.random.default_rng(0).permutation(len(data)))]
+    with pytest.warns(DiffeoCalibWarning, match="moved by") as caught:
+        dc.calibrate(arm.robot, mixed)
+    assert {w.filename for w in caught} == {__file__}  # it points at the caller
+    (found,) = (re.match(r"the measuring device.* about ([\d.]+) mm near row (\d+)", str(w.message)) for w in caught)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(0.5, rel=0.3)
+    assert abs(int(found[2]) - 25) <= 1

@@ -17,9 +17,11 @@ from table_bank import refused
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.plausibility import check_joints, check_limits
+from diffeo_calib.calibration.diagnostics.plausibility import check_identification, check_joints, check_limits
+from diffeo_calib.calibration.identification.identification import identify
+from diffeo_calib.calibration.identification.registration import register_inliers
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
-from diffeo_calib.robots import Joint
+from diffeo_calib.robots import Joint, SimulatedArm
 
 NOT_THIS_ROBOT = "the measurements do not fit this robot"
 ARM, ROWS, _ = simulated(30)
@@ -195,3 +197,24 @@ def test_warnings_point_at_the_caller(spoil: Callable[[Case], dc.Measurements], 
     messages = [str(w.message) for w in caught]
     assert all(any(word in message for message in messages) for word in words), messages
     assert [(str(w.message), w.filename) for w in caught if w.filename != __file__] == []
+
+
+def test_poses_commanded_in_whole_degrees_are_calibrated() -> None:
+    """An elastic arm that errs by a millimetre, which steps of 1 degree would explain if they were reported so."""
+    arm = SimulatedArm(seed=1, gravity=2.0)
+    q = arm.sample(40, 3).rad2deg().round().deg2rad()
+    points = (arm.true_points(q) + arm.noise * normal(40, 1, 3)).round(decimals=6)
+    result = with_usual_scales(arm.nominal, dc.Measurements(q, points))
+    assert 5e-4 < result.registration.rms < 5e-3
+    assert result.left_out_rms < 0.3 * result.registration.rms
+    assert math.isfinite(result.expected.workspace)
+
+
+@pytest.mark.slow
+def test_rows_that_no_reading_explains_are_warned_about() -> None:
+    """A tip before the joint that carries the marker."""
+    short = dc.Chain("short", "base_link", "wrist_link", ROBOT.joints[:-2])
+    data = dc.Measurements(Q[:, :5], POINTS)
+    start = register_inliers(short, data)[0].geometry
+    with pytest.warns(DiffeoCalibWarning, match=r"do not fit this robot, even with .* the tip link or DH convention"):
+        check_identification(data, identify(start, data.q, data.points))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import socket
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from http.client import HTTPConnection, HTTPResponse
@@ -131,3 +132,23 @@ def test_rows_under_an_id_of_others(tmp_path: Path, run: Callable[..., tuple[Out
         assert all("whose values are others" in one["error"] for one in answers[6:9])
         assert all("leave it out" in one["error"] for one in answers[9:])
     assert len((tmp_path / "run.csv").read_text().splitlines()) == 4
+
+
+def test_a_table_that_another_program_edits(tmp_path: Path, run: Callable[..., tuple[Outcome, Answers]]) -> None:
+    """The next row lost its first characters, and was accepted."""
+    path = tmp_path / "run.csv"
+
+    def lines() -> Iterator[bytes]:
+        yield from map(row, range(3))
+        journal = tmp_path / "run.csv.journal"
+        while not journal.exists() or journal.read_text().count('"line": ') < 3:
+            time.sleep(0.05)
+        whole = path.read_text()
+        path.write_text(whole[:-20] + whole[-17:])
+        yield row(3)
+
+    done, answers = run(lines())
+    assert done.code == 1
+    assert "was changed" in done.error
+    assert [one["line"] for one in answers if "error" not in one] == [2, 3, 4]
+    assert path.read_text().count("\n") == 4

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import errno
+import http.client
 import io
+import json
 import os
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
-from command_bank import Command
+from command_bank import PROGRAM, Command
 
 import diffeo_calib as dc
 from diffeo_calib.campaign.feeds import as_line, check_cells, parsed
@@ -285,3 +289,31 @@ def test_a_campaign_goes_on_as_it_was_begun(tmp_path: Path, lines: list[str], co
     old = journal.split(b"\n", 1)[1]  # of versions that did not say it
     (tmp_path / "run.csv.journal").write_bytes(old)
     assert command(*words).code == 0
+
+
+@pytest.mark.slow
+def test_a_row_rejected_on_the_page_is_rejected_in_the_journal(tmp_path: Path, lines: list[str]) -> None:
+    (tmp_path / "run.csv").write_text("".join(lines[:17]))
+    words = ["campaign", "campaign.toml", "--stdin", "--page", "0"]
+    process = subprocess.Popen(
+        [sys.executable, "-u", "-c", PROGRAM, *words],
+        cwd=tmp_path,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    address = urlsplit(process.stdout.readline().split()[-1])
+    assert any("row 17" in line for line in process.stdout)
+    connection = http.client.HTTPConnection(address.hostname or "", address.port, timeout=60)
+    connection.request("POST", "/reject?line=7", headers={"X-Campaign": "1"})
+    assert connection.getresponse().status == 200
+    connection.close()
+    journal = tmp_path / "run.csv.journal"
+    for _ in range(600):
+        if '"row": 5' in journal.read_text():
+            break
+        time.sleep(0.1)
+    out = process.communicate(timeout=120)[0]
+    assert "15 of 16 rows accepted" in out
+    assert json.loads(journal.read_text().splitlines()[-1])["decided"] is True

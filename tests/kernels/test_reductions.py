@@ -142,3 +142,9 @@ def test_unknown_backends_are_refused(name: Any) -> None:
     ):
         backends.check_backend(name)
     assert [backends.check_backend(known) for known in ("auto", "dense", "tiled", "keops")]
+
+
+def test_small_sums_do_not_import_keops(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(backends.BACKENDS["keops"], "usable", lambda: pytest.fail("pykeops was imported"))
+    backends.evaluate(FIELD, GaussianProfile(), *apart())
+    assert backends.choose("auto", 1000, 1000, torch.device("cpu")) in {"fused", "tiled"}
