@@ -234,11 +234,8 @@ def _result(
     warn_of_contradictions(model, placed.coordinates, found, changed)
     warn_of_rounding(robot, placed.data, data, chosen.left_out)
     found_lengths = lengths(data, scales, placed.placement.hypotheses(data, VALUE))
-    registration, geometry, calibrated = placed.stage_rms(model)
     summary = Summary(
-        registration_rms=registration,
-        geometry_rms=geometry,
-        diffeomorphic_rms=calibrated,
+        *placed.stage_rms(model),
         leave_one_out_rms=placed.by_kind(chosen.left_out.errors).positions_rms,
         outliers=len(found),
         noise_degrees_of_freedom=data.tails.freedom,

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 from command_bank import Command, Outcome, Site, make_site, run_process
+from commanded_bank import write_columns
+from init_bank import ARM, Proposed
 from server_bank import Server
+from torch import Tensor
 
 import diffeo_calib as dc
 
@@ -81,3 +84,16 @@ def init(command: Command, tmp_path: Path) -> Callable[..., tuple[dict[str, Any]
         return {} if done.code else tomllib.loads(text), text
 
     return proposed
+
+
+@pytest.fixture
+def proposed(tmp_path: Path, init: Proposed) -> Proposed:
+    """What `init` proposes for columns of some names and numbers, and a robot: its entries, and its text."""
+
+    def propose(*columns: tuple[Sequence[str], Tensor], robot: str = "arm.urdf") -> tuple[dict[str, Any], str]:
+        if not (tmp_path / robot).exists():
+            ARM.write_urdf(tmp_path / robot)
+        table = write_columns(tmp_path / "t.csv", **{"|".join(names): values for names, values in columns})
+        return init(table, tmp_path / robot)
+
+    return propose

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 import os
 import re
-import shutil
-from collections.abc import Callable, Sequence
 from math import degrees, pi
 from pathlib import Path
 from typing import Any
@@ -14,48 +12,14 @@ from typing import Any
 import pytest
 import torch
 from command_bank import Command
-from commanded_bank import write_columns
-from kind_bank import kind_named
-from product_bank import simulated_poses
+from init_bank import ARM, NAMES, ROWS, SERIES, XYZ, Proposed, noise, reasons, rows
 from torch import Tensor
-from trackerless_bank import write_socket_table, write_wire_table
-from typer.main import get_command
 
 import diffeo_calib as dc
-from diffeo_calib.cameras.files import camera_text
-from diffeo_calib.cli.guesses import guess_deviations, guess_sheet
-from diffeo_calib.cli.main import app, expanded
+from diffeo_calib.cli.main import expanded
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
-
-ARM, ROWS = SimulatedArm(seed=3), 40
-NAMES, XYZ = list(ARM.nominal.joint_names), ["x", "y", "z"]
-SERIES = [f"j{k}" for k in range(1, 7)]
-Proposed = Callable[..., tuple[dict[str, Any], str]]
-
-
-def rows() -> tuple[Tensor, Tensor]:
-    """Joint values, deg, and places, mm."""
-    q, points = ARM.measure(ROWS, seed=0)
-    return q.rad2deg(), 1e3 * points[:, 0]
-
-
-def noise(*shape: int, size: float) -> Tensor:
-    return size * torch.randn(shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-
-
-@pytest.fixture
-def proposed(tmp_path: Path, init: Proposed) -> Proposed:
-    """What `init` proposes for columns of some names and numbers, and a robot: its entries, and its text."""
-
-    def propose(*columns: tuple[Sequence[str], Tensor], robot: str = "arm.urdf") -> tuple[dict[str, Any], str]:
-        if not (tmp_path / robot).exists():
-            ARM.write_urdf(tmp_path / robot)
-        table = write_columns(tmp_path / "t.csv", **{"|".join(names): values for names, values in columns})
-        return init(table, tmp_path / robot)
-
-    return propose
 
 
 @pytest.fixture
@@ -63,12 +27,6 @@ def frame(tmp_path: Path) -> Any:
     """A table of the arm as a data frame, m and rad, beside its URDF."""
     ARM.write_urdf(tmp_path / "arm.urdf")
     return dc.Measurements(*ARM.measure(ROWS, seed=0), NAMES).to_frame()
-
-
-def reasons(text: str) -> dict[str, str]:
-    """What stands beside each entry."""
-    lines = [line.partition("  # ") for line in text.splitlines() if not line.startswith("#")]
-    return {line.partition(" = ")[0]: why for line, _, why in lines}
 
 
 # --- the robot and its links ---
@@ -404,203 +362,3 @@ def test_a_robot_that_explains_nothing_is_refused(count: int, message: str, tmp_
     assert message in text
     assert not entries
     assert not (tmp_path / "c.toml").exists()
-
-
-# --- what else a table holds ---
-
-
-def test_sockets_are_proposed(tmp_path: Path, proposed: Proposed, init: Proposed) -> None:
-    """Angles in degrees, known by the ball; distances are for the user to fill in. Beside positions in their unit."""
-    arm = SimulatedArm(seed=1)
-    arm.write_urdf(tmp_path / "arm.urdf")
-    write_socket_table(tmp_path / "t.csv", arm, "ab", 1)
-    written, text = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
-    assert (written["socket"], written["angle"], written["length"]) == (["place", "socket"], "deg", "mm")
-    assert not {"position", "distance", "distance-std"} & set(written)
-    assert "# all columns are used" in text
-    (tmp_path / "cell.toml").write_text(text.replace("# distance", "distance"))
-    words = expanded(["fit", str(tmp_path / "cell.toml")])
-    assert words[words.index("--socket") + 1] == "place,socket"
-    assert words[words.index("--distance") + 1] == "a,b=50"
-    header, *lines = (tmp_path / "t.csv").read_text().split("\n")
-    q, points = arm.measure(20, seed=2)
-    seen = [["", "", *map(repr, [*a, *p])] for a, p in zip(q.rad2deg().tolist(), points[:, 0].tolist(), strict=True)]
-    (tmp_path / "t.csv").write_text(
-        "\n".join([f"{header},x,y,z", *map(",".join, seen), *(f"{line},,," for line in lines)])
-    )
-    written, text = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
-    assert (written["position"], written["socket"]) == (["x,y,z"], ["place", "socket"])
-    assert (written["angle"], written["length"]) == ("deg", "m")
-    assert '# distance = ["a,b=0.05"]' in text
-    assert "# distance-std = 3e-05" in text
-
-
-def test_sockets_of_a_panda(ur10_folder: Path, init: Proposed) -> None:
-    """Read as degrees all angles are near zero, and the ball hardly leaves its place: 4.9 mm beside the right 2.6."""
-    data = ur10_folder.parent / "mukca"
-    assert init(data / "panda_3.csv", data / "panda.urdf")[0]["angle"] == "rad"
-
-
-def test_the_ur10(ur10_folder: Path, init: Proposed) -> None:
-    assert guess_sheet(ur10_folder / "measurements_iso_cubes.csv").decimal == ","
-    _, text = init(ur10_folder / "measurements_iso_cubes.csv", ur10_folder / "ur10_robot.urdf")
-    for line in (
-        *('length = "mm"', 'angle = "rad"', 'decimal = ","', 'sep = ";"', "measurement_x,measurement_y"),
-        *('rotation = "measurement_rx,measurement_ry,measurement_rz"', 'convention = "XYZ"', 'rotation-angle = "deg"'),
-        'std = "measurement_std_x,measurement_std_y,measurement_std_z"',
-    ):
-        assert line in text
-    assert "time = " not in text, "numbers that `fit` refuses"
-    assert "Timestamp, Goal x" in text.splitlines()[-1]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("convention", "unit", "names"),
-    [
-        ("zyx", "deg", ["roll", "pitch", "yaw"]),
-        ("ZXZ", "rad", ["m_rx", "m_ry", "m_rz"]),
-        ("rotvec", "deg", ["rx", "ry", "rz"]),
-        ("quat_xyzw", None, ["qx", "qy", "qz", "qw"]),
-        ("matrix", None, [f"R{i}{j}" for i in "012" for j in "012"]),
-    ],
-)
-def test_rotations_are_proposed_in_the_convention_that_fits(
-    convention: str, unit: str | None, names: list[str], tmp_path: Path, init: Proposed
-) -> None:
-    arm, data, _ = simulated_poses(ROWS)
-    arm.write_urdf(tmp_path / "arm.urdf")
-    table = TableFormat("mm", "deg", rotation=names, convention=convention, rotation_angle=unit)
-    position = ("m_x", "m_y", "m_z") if names[0].startswith("m_") else ("x", "y", "z")
-    write_measurements(tmp_path / "t.csv", data, table, position=position)
-    written, _ = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
-    assert (written["rotation"], written["convention"]) == (",".join(names), convention)
-    assert written.get("rotation-angle") == unit
-    known = [option for one in get_command(app).commands["fit"].params for option in one.opts]  # pyright: ignore[reportAttributeAccessIssue]
-    assert {f"--{name}" for name in written} - {"--csv"} <= set(known)
-
-
-def test_rotations_that_no_convention_explains_are_named_and_not_used(tmp_path: Path, init: Proposed) -> None:
-    arm, data, _ = simulated_poses(ROWS)
-    arm.write_urdf(tmp_path / "arm.urdf")
-    turned = data.rows([*range(1, ROWS), 0])
-    mixed = dc.Measurements(data.q, data.points[:, 0], data.joint_names).to_frame()
-    mixed[["rx", "ry", "rz"]] = turned.to_frame()[["rx", "ry", "rz"]].to_numpy()
-    mixed.to_csv(tmp_path / "t.csv", index=False)
-    written, text = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
-    assert "rotation" not in written
-    assert "# rx, ry, rz: rotations of no convention that is clearly better than others; not used" in text
-    assert "such names usually mean a rotation vector, or angles about x, y and z" in text
-
-
-def test_deviations_are_proposed_if_they_can_be_some(tmp_path: Path, frame: Any, init: Proposed) -> None:
-    for std, proposed in ((2e-5, True), (0.0, False), (0.5, False)):
-        frame[["std_x", "std_y", "std_z"]] = std
-        frame.to_csv(tmp_path / "t.csv", index=False)
-        _, text = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
-        assert ('std = "std_x,std_y,std_z"' in text) is proposed
-        assert ("# std_x, std_y, std_z: no standard deviations" in text) is not proposed
-    triples = [["m_x", "m_y", "m_z"]]
-    assert guess_deviations(["m_std_x", "m_std_z", "m_std_y", "m_x"], triples) == ["m_std_x", "m_std_y", "m_std_z"]
-    assert guess_deviations(["m_std_x", "m_std_y", "m_x"], triples) is None
-
-
-def test_an_edited_file_is_kept(tmp_path: Path, command: Command, frame: Any) -> None:
-    frame.rename(columns={axis: f"t{axis}" for axis in XYZ}).to_csv(tmp_path / "t.csv", index=False)
-    words = "init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml"
-    assert command(*words).code == 0
-    assert 'position = ["tx,ty,tz"]' in (tmp_path / "c.toml").read_text()
-    assert command(*words).code == 0  # the same again
-    with (tmp_path / "c.toml").open("a") as file:
-        file.write("holdout = 0\n")
-    done = command(*words)
-    assert done.code == 1
-    assert "exists and holds other options" in done.err
-    assert (tmp_path / "c.toml").read_text().endswith("holdout = 0\n")
-    assert command(*words, "--force").code == 0
-    assert "holdout" not in (tmp_path / "c.toml").read_text()
-
-
-@pytest.mark.slow
-def test_a_wire_its_anchors_and_a_payload(tmp_path: Path, frame: Any, init: Proposed) -> None:
-    write_wire_table(tmp_path / "wire.csv", ARM, seed=1)
-    written, _ = init(tmp_path / "wire.csv", tmp_path / "arm.urdf")
-    expected = {"reading": "displacement=wire", "session": "anchor", "length": "mm", "angle": "deg"}
-    assert {name: written[name] for name in expected} == expected
-    frame["payload_kg"], frame["time_s"], frame["Temperature"] = [0.0, 2.0] * 20, range(ROWS), [21.5] * ROWS
-    frame.to_csv(tmp_path / "t.csv", index=False)
-    written, _ = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
-    expected = {"payload": "payload_kg", "time": "time_s", "temperature": "Temperature"}
-    assert {name: written[name] for name in expected} == expected
-    frame["time_s"] += 20_210_313_000_000  # a date: `fit` refuses it
-    frame.to_csv(tmp_path / "t.csv", index=False)
-    assert "time" not in init(tmp_path / "t.csv", tmp_path / "arm.urdf")[0]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["several tips", "camera on the tool"])
-def test_tips_and_cameras_are_proposed(name: str, init: Proposed) -> None:
-    """The options that `init` writes read the table as those that wrote it."""
-    kind = kind_named(name)
-    table, options = kind.table()
-    written, _ = init(table, kind.urdf)
-    given: dict[str, list[str]] = {}
-    for word, value in zip(options, [*options[1:], ""], strict=True):
-        if word.startswith("--"):
-            given.setdefault(word.removeprefix("--"), []).append(value)
-    for option, values in given.items():
-        expected = [True] if option == "camera-on-tool" else values
-        assert written[option] == (expected if len(expected) > 1 or option == "position" else expected[0]), option
-    assert written["tip"] == (list(kind.robot.tips) if name == "several tips" else kind.robot.tip)
-
-
-@pytest.mark.slow
-def test_the_camera_beside_the_table(tmp_path: Path, command: Command) -> None:
-    """Another YAML file is none; its place is relative to the campaign, which runs from anywhere."""
-    kind = kind_named("images of a board")
-    table, _ = kind.table()
-    (tmp_path / "sub").mkdir()
-    shutil.copy(table, tmp_path / "corners.csv")
-    (tmp_path / "launch.yaml").write_text("camera: none\n")
-    (tmp_path / "wrist.yaml").write_text(camera_text(next(iter(kind.data.cameras.values()))))
-    done = command("init", tmp_path / "corners.csv", kind.urdf, "-o", tmp_path / "sub" / "c.toml")
-    assert done.code == 0, done.err
-    text = (tmp_path / "sub" / "c.toml").read_text()
-    assert 'reading = "corners=../wrist.yaml"' in text
-    assert "the file beside the table" in reasons(text)["reading"]
-
-
-def test_lenses_that_no_table_holds_are_to_be_filled_in(tmp_path: Path, command: Command, init: Proposed) -> None:
-    """Angles follow from the images all the same; `fit` refuses the file until the lens is there."""
-    kind = kind_named("images")
-    table, _ = kind.table()
-    written, _ = init(table, kind.urdf)
-    assert (written["reading"], written["session"], written["angle"]) == ("image=u,v,FX,FY,CX,CY", "session", "deg")
-    refused = command("fit", tmp_path / "c.toml")
-    assert refused.code == 1
-    assert "--reading image=u,v,FX,FY,CX,CY" in refused.err
-
-
-def test_a_full_column_beside_positions_is_no_reading(tmp_path: Path, frame: Any, init: Proposed) -> None:
-    """Rows of several kinds leave the cells of the other kinds empty."""
-    frame["distance"], frame["session"] = 1.0, ["monday", "tuesday"] * 20
-    frame.to_csv(tmp_path / "t.csv", index=False)
-    written, text = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
-    assert "reading" not in written
-    assert written["session"] == "session"
-    assert "not used: distance" in text
-
-
-@pytest.mark.slow
-def test_a_kind_from_outside_alone(tmp_path: Path, init: Proposed) -> None:
-    """Beams need nothing beside them; readings of a frame need poses, and what refuses them says so."""
-    said = {}
-    for name in ("laser beams", "inclinations"):
-        kind = kind_named(name)
-        table = tmp_path / f"{name[:3]}.csv"
-        rows = kind.source.golden.rows.parts[1].with_joint_names(kind.robot.joint_names)
-        write_measurements(table, rows, TableFormat("mm", "deg"))
-        said[name] = init(table, kind.urdf)
-    assert "line distance=line distance" in said["laser beams"][0]["reading"]
-    assert not said["inclinations"][0]
-    assert "measured poses" in said["inclinations"][1]
