@@ -14,9 +14,6 @@ from diffeo_calib.kinematics.transmission import gear_lines
 
 MOST_CONFIGURATIONS = 8000
 """Configurations on which the parts of a model are measured."""
-FAR = "far from where the other rows predict it"
-MAX_MARKERS_FOR_EXCHANGE = 12
-"""Number of markers up to which exchanged pairs are looked for."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.placing.readings import Stages, identify_readings
+from diffeo_calib.calibration.placing.placement import Placement
+from diffeo_calib.calibration.placing.readings import Stages, identify_readings, reading_sets
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -29,11 +30,25 @@ from diffeo_calib.process.scales import SCALES
 from diffeo_calib.robots import Geometry, SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.places import fitting_devices
 from diffeo_calib.sensors.range import FixedPoints
+from diffeo_calib.sensors.tables import OtherReadings
 
 
 def identified(robot: Tree, data: dc.Readings) -> Stages:
     return identify_readings(Geometry.nominal(robot, 1), [data])
+
+
+def test_devices_of_several_kinds_are_all_written() -> None:
+    arm, every = SimulatedArm(0), torch.arange(30)
+    tables = [readings(arm, kind, 30) for kind in ("distance", "height")]
+    tables[1] = replace(tables[1], names=("x", "y", "z"))
+    devices = [fitting_devices(one, in_base(arm, one.q)[:, None]) for one in tables]
+    sets = reading_sets([OtherReadings(one, every) for one in tables], devices)
+    found = Placement(sets).entry()["devices"]
+    for what, values in found.items():
+        assert values == {**sets[0].entry()["devices"][what], **sets[1].entry()["devices"][what]}
+        assert len(values) == 6
 
 
 @pytest.mark.parametrize(

@@ -174,7 +174,7 @@ class DeviceSet(ABC):
         """Where the devices are."""
         return []
 
-    def entry(self) -> dict[str, object]:
+    def entry(self) -> dict[str, Any]:
         """Where the devices are, for programs, in m and rad."""
         return {}
 
@@ -234,10 +234,11 @@ class Placement(tuple[DeviceSet, ...]):
     def sentences(self) -> list[str]:
         return [line for own in self for line in own.sentences()]
 
-    def entry(self) -> dict[str, object]:
-        found: dict[str, object] = {}
-        for own in self:
-            found |= own.entry()
+    def entry(self) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for name, own in (item for one in self for item in one.entry().items()):
+            before = found.get(name, {})  # of devices of another kind
+            found[name] = own | {key: before[key] | own[key] for key in before}
         return found
 
     def placed(self) -> tuple[PlacedDevices, ...]:
