@@ -31,6 +31,7 @@ from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.placement import PLACES
 
 # --- rows that a model contradicts ------------------------------------------------------------------------------------
 
@@ -210,6 +211,21 @@ def test_rows_that_took_no_part_are_named(result: Any) -> None:
     assert wrong[0].distance == pytest.approx(SHIFT_M, rel=0.4)
     two = moved(new, [7]).rows([0, 7])
     assert contradicted_in_sockets(result.model, two) == [], "two rows cannot tell which of them is wrong"
+
+
+def test_a_row_in_a_socket_is_judged_as_all_others_predict_it(result: Any) -> None:
+    """By the conditional mean and covariance of its error given theirs, with dense matrices."""
+    new, model = moved(in_their_sockets(7, 1), [7]), result.model.map
+    (found,) = contradicted_in_sockets(result.model, new)
+    rests = new.socket_numbers[:, None] == new.socket_numbers
+    eye, seen = torch.eye(3, dtype=torch.float64), model(new.q).detach()
+    middles = rests.double() @ seen / rests.sum(1, keepdim=True)
+    K = model.joint_covariance(new.q) + PLACES.found_m_rad**2 * torch.kron(rests.double(), eye)
+    K, error = K + torch.kron(torch.eye(len(new)), model.new_noise), (middles - seen).flatten()
+    own = torch.arange(3 * len(new)) // 3 == 7
+    gain = torch.linalg.solve(K[~own][:, ~own], K[~own][:, own]).mT
+    away = error[own] - gain @ error[~own]
+    assert found.distance == pytest.approx(float(away.norm()), rel=1e-4)
 
 
 def test_a_plane_is_named_where_it_matters(result: Any) -> None:
