@@ -8,7 +8,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, NumericalError
 
 HIDDEN_VARIANCE = 1e8  # variance, m^2, of a coordinate that was not measured: it carries no information
 
@@ -112,18 +112,17 @@ class Noise:
     def add_to(self, gram: Tensor) -> Tensor:
         """G + R: (N m, N m)."""
         n, m, _ = self.covariance.shape
-        out = gram.clone()
-        blocks = out.view(n, m, n, m)
+        out, flat = gram.clone(), self.shared.flatten(0, 1)
         index = torch.arange(n, device=gram.device)
-        blocks[index, :, index, :] = blocks[index, :, index, :] + self.covariance
-        if self.shared.shape[2]:
-            flat = self.shared.flatten(0, 1)
-            out.addmm_(flat, flat.T)
-        return out
+        out.view(n, m, n, m)[index, :, index, :] += self.covariance
+        return out.addmm_(flat, flat.T) if flat.shape[1] else out
 
     @cached_property
     def _core(self) -> Tensor:
         """Cholesky factor of 1 + Z^T blockdiag(R_i)^-1 Z."""
         white = self.whiten(self.shared).flatten(0, 1)
         eye = torch.eye(white.shape[1], dtype=white.dtype, device=white.device)
-        return torch.linalg.cholesky(eye + white.T @ white)
+        factor, info = torch.linalg.cholesky_ex(eye + white.T @ white)
+        if int(info):
+            raise NumericalError.of("what rows share is too large beside their noise", fix="raise `noise`")
+        return factor

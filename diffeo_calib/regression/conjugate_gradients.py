@@ -21,6 +21,7 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
+from diffeo_calib.regression.cholesky import lower_root
 from diffeo_calib.regression.conditional import DataConditional
 
 BLOCK_CONFIGURATIONS = 64  # number of configurations that are drawn together
@@ -128,15 +129,14 @@ class ConjugateGradientRegression(DataConditional):
         Woodbury's identity is a small difference of large numbers. In coordinates in which the noise is white, with
         [P; 1] = [Q1; Q2] C, |c - Q1 Q1^T c|^2 + |Q2 Q1^T c|^2 is the same without cancellation.
         """
-        upper, lower = self._orthogonal
-        white = self._whiten(values)
+        (upper, lower), white = self._orthogonal, self._whiten(values)
         inside = upper.T @ white
         return torch.cat([white - upper @ inside, lower @ inside])
 
     @cached_property
     def apart(self) -> tuple[Tensor, Tensor]:
         W = self.white(self.slopes)
-        return W, torch.linalg.cholesky(torch.eye(W.shape[1], dtype=W.dtype, device=W.device) + W.T @ W)
+        return W, lower_root(torch.eye(W.shape[1], dtype=W.dtype, device=W.device) + W.T @ W)
 
     @cached_property
     def _orthogonal(self) -> tuple[Tensor, Tensor]:

@@ -333,6 +333,10 @@ def test_conjugate_gradients_that_cannot_converge_say_so() -> None:
     at = deformed(problem)
     with pytest.raises(NumericalError, match="conjugate gradients did not converge"):
         ConjugateGradientRegression(at.linearise(), problem.noise, rank=2).solve(normal(25, 2, 1, seed=1))
+    model = replace(problem.spec, prior_variance=torch.ones(2, dtype=torch.float64))
+    alike = replace(at.linearise(), spec=model, sensitivity=torch.ones(25, 2, 2, dtype=torch.float64))
+    with pytest.raises(NumericalError, match="too large beside their noise"):
+        ConjugateGradientRegression(alike, problem.noise).solve(normal(25, 2, 1, seed=1))
 
 
 def test_unknown_free_memory_refuses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
