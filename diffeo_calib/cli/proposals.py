@@ -152,7 +152,7 @@ class Source:
         if not lengths:
             return max(_in_images(self.robot, one) for one in tables)
         size = float(torch.cat([one.reported.flatten() for one in lengths]).square().mean().sqrt())
-        rms = identify_readings(Geometry.nominal(self.robot), lengths, rigid=True)[0].rms
+        rms = identify_readings(Geometry.nominal(self.robot), lengths, rigid=True)[0].noise  # of a number
         return rms / max(size, SMALLEST_SPREAD_M)
 
     def positions(self) -> Iterator[tuple[Source, Measurements]]:
