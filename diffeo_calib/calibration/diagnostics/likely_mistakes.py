@@ -186,12 +186,12 @@ def other_rotations(robot: Tree, data: Measurements) -> Iterator[Reading]:
     return (replace(Reading.of(robot, data), **one._asdict()) for one in rotations.other_rotations(data))
 
 
-def other_units(robot: Tree, data: Measurements) -> Iterator[Reading]:
-    """Joint values in other units of angles and lengths."""
+def other_units(robot: Tree, data: Measurements, *, slides: bool = True) -> Iterator[Reading]:
+    """Joint values in other units of angles, and of lengths if ``slides``."""
     own, turning = Reading.of(robot, data), torch.tensor(robot.periodic, dtype=torch.bool, device=data.q.device)
     for factor, words in ANGLE_MISTAKES if any(robot.periodic) else ():
         yield replace(own, q=torch.where(turning, factor * data.q, data.q), words=angle_mistake(words))
-    for factor, words in ((1e-3, "large"), (1e3, "small")) if not all(robot.periodic) else ():
+    for factor, words in ((1e-3, "large"), (1e3, "small")) if slides and not all(robot.periodic) else ():
         text = f"the values of prismatic joints seem to be 1000 times too {words}: check their unit (`joint_length`)"
         yield replace(own, q=torch.where(turning, data.q, factor * data.q), words=text)
 

@@ -99,7 +99,7 @@ def check_registration(
         again = register_sockets(robot if around is None else around, reading.q, socket)
         return float(again.distances.median()), max(spread(robot.tip_poses(reading.q)[..., :3, 3]), 1e-9)
 
-    motion, tried = left(Reading.of(robot, data))[1], [other_units]
+    motion, tried = left(Reading.of(robot, data))[1], [partial(other_units, slides=far)]
     if far and around is None:
         tried.append(partial(other_conventions, judge=left))
     fix = "check the unit and the order of the joints, and that rows carry the names of their own sockets: of the "
