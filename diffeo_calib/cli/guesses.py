@@ -458,7 +458,7 @@ def _readings_in(sheet: Sheet, columns: Sequence[str], *, alone: bool) -> list[s
 def _corners_in(sheet: Sheet) -> list[str]:
     """The files of the cameras beside the table, as `images` writes them, else a usual size that holds all corners."""
     csv = sheet.path
-    files = [csv.with_name(f"{name}.yaml") for name in dict.fromkeys(sheet.cells.get(CAMERA, ())) if name]
+    files = [csv.parent / f"{name}.yaml" for name in dict.fromkeys(sheet.cells.get(CAMERA, ())) if name]
     if len(files) > 1 and all(file.is_file() for file in files):
         return [f"{CORNERS}{file}" for file in files]
     own, cameras = csv.with_suffix(".yaml"), list[Path]()

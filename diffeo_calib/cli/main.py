@@ -32,6 +32,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import MISSING
 from importlib import import_module
 from importlib.metadata import version
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, TextIO
 
@@ -207,17 +208,20 @@ def _place_of_command(words: Sequence[str]) -> int:
 def renamed(words: Sequence[str]) -> list[str]:
     """The same command line without former names of commands and options."""
     at = _place_of_command(words)
-    command, rest, first = [FORMER.get(word, word) for word in words[at : at + 1]], list[str](), list[str]()
-    for word in words[at + 1 :]:
+    command, following = [FORMER.get(word, word) for word in words[at : at + 1]], iter(words[at + 1 :])
+    first, rest, last = list[str](), list[str](), list[str]()
+    for word in following:
         name, equal, value = word.partition("=")
         now = RENAMED.get(name[2:]) if name.startswith("--") else None
         if now is None:
             rest.append(word)
         elif "=" in now:
             first.append(f"--{now}")  # before what was typed as well
-        elif now or value:
-            rest.append(f"--{now}{equal}{value}" if now else value)
-    return [*words[:at], *command, *first, *rest]
+        elif now:
+            rest.append(f"--{now}{equal}{value}")
+        else:
+            last += [value] if equal else islice(following, 1)  # the last argument
+    return [*words[:at], *command, *first, *rest, *last]
 
 
 def expanded(arguments: Sequence[str]) -> list[str]:

@@ -56,7 +56,7 @@ class TableFormat:
         joints: names of the joint columns in the robot's order, or the robot, or expressions of columns. kinds: of each
             joint; by default those of the robot, or all revolute.
         position: names of the x, y and z columns of the marker, or one such triple per marker; None without positions.
-        sockets: columns of a ball in sockets. readings: of each kind of reading, and of images (csv/images.py).
+        sockets: columns of a ball in sockets. readings: of each kind of reading, and of images (csv/sensors.py).
         session: name of a column whose texts tell the set-ups of the device apart that measures positions or poses, see
             :meth:`Measurements.with_sessions`.
         on: names of the tips that carry the markers or frames, one for each, for a robot with several tips.

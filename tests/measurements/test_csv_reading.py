@@ -137,6 +137,7 @@ def test_wrong_file_is_one_clear_error(name: str, read: Reader) -> None:
         ({"duplicates": "ignore"}, ("`duplicates`", "'error' or 'keep' or 'drop'")),
         ({"joints": "q1"}, ("`joints`", "'q1'")),
         ({"joints": ["q1", "x"]}, ("distinct columns", "x")),
+        ({"position": [["x", "y", "z"]] * 2}, ("`joints` and `position`", "distinct columns", "x")),
         ({"position": "xyz"}, ("`position`", "three names")),
         ({"position": [["x", "y", "z"], ["x", "y"]]}, ("`position`",)),
         (

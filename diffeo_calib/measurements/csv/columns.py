@@ -145,10 +145,11 @@ class Columns:
         for name, column in table.beside.items():
             every[name] = Group((column.strip(),), check=MASS if name == "payload" else None)
         columns = cls(table, read, prismatic, kinds_known, every, bodies, all_hidden)
-        twice = repeated(columns.names) or repeated(names)
+        alike = [name for place, group in enumerate(groups) if group in groups[:place] for name in group.names]
+        twice = repeated([*columns.names, *alike]) or repeated(names)
         if twice:
             markers = len(table.triples)
-            plain = len(columns.names) == len(names) + 3 * markers
+            plain = len(columns.names) + len(alike) == len(names) + 3 * markers
             what = "`joints`" + " and `position`" * bool(markers) if plain else "the named columns"
             fix = "name every column once"
             deviations = {*twice} & {*flat_names(table.std), *flat_names(table.rotation_std)}
