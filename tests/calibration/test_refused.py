@@ -102,10 +102,18 @@ def test_a_slide_moves_relative_to_its_stroke() -> None:
 
 
 @pytest.mark.slow
-def test_doubtful_rows_are_calibrated() -> None:
-    points = POINTS[torch.randperm(30, generator=torch.Generator().manual_seed(0))]
-    with pytest.warns(DiffeoCalibWarning, match=f"{NOT_THIS_ROBOT}, even with geo"):
-        assert math.isfinite(with_usual_scales(ROBOT, dc.Measurements(Q, points)).left_out_rms)
+@pytest.mark.parametrize(
+    ("points", "words"),
+    [
+        (POINTS[torch.randperm(30, generator=torch.Generator().manual_seed(0))], f"{NOT_THIS_ROBOT}, even with geo"),
+        (ROBOT(Q)[:, None, :3, 3].contiguous(), "show no errors of the robot"),
+    ],
+)
+def test_doubtful_rows_are_calibrated(points: Tensor, words: str) -> None:
+    with pytest.warns(DiffeoCalibWarning) as caught:
+        result = with_usual_scales(ROBOT, dc.Measurements(Q, points))
+    assert math.isfinite(result.left_out_rms)
+    assert any(words in str(one.message) for one in caught)
 
 
 @pytest.mark.slow
