@@ -243,3 +243,10 @@ def test_everything_has_a_table(name: str, request: pytest.FixtureRequest) -> No
         for text in expected:
             assert text in page.text_content()
     assert ("orientation" in errors._repr_html_()) == (name == "posed")
+
+
+def test_the_script_of_versions_names_files_that_are_there() -> None:
+    text = (PACKAGE.parent / "scripts" / "versions.sh").read_text(encoding="utf-8")
+    names = re.findall(r"tests/[\w/.]+", text)
+    assert len(names) > 10
+    assert [name for name in names if not (PACKAGE.parent / name).exists()] == []
