@@ -145,17 +145,6 @@ class Process:
         return self.factor.inverse
 
     @property
-    def slope(self) -> Tensor:
-        """Derivative (M, M) of the evidence by K."""
-        return self.inverse.addr(self.mu, self.mu, beta=-0.5, alpha=0.5)
-
-    @property
-    def by_log_variance(self) -> Tensor:
-        """Derivative (K,) of the evidence by the logarithms of the unknowns' prior variances."""
-        explained = self.variance * (self.numbers.S.T @ self.mu).square()
-        return 0.5 * (explained - 1.0 + torch.cholesky_inverse(self.factor.B).diagonal())
-
-    @property
     def evidence(self) -> float:
         """log N(target; 0, K) of all numbers; that of later ones given the others is a difference."""
         return self.factor.log_density(self.numbers.target, self.mu)

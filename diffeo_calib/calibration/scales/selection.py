@@ -22,6 +22,7 @@ from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.process.scales import SENSOR_SHARE, Hyperparameters
+from diffeo_calib.regression.cholesky import Factor
 from diffeo_calib.robots.cartesian import is_cartesian
 
 MESHING_LENGTHSCALE_RAD = 0.22
@@ -31,6 +32,9 @@ TRANSMISSION_STARTS_RAD = (MESHING_LENGTHSCALE_RAD, 0.7)
 (tens of periods per turn) and eccentricity (one)."""
 OBJECTIVE_OF_FAILURE = 1e12
 """Objective where G + R cannot be factorised: the line search then shortens its step."""
+LARGEST_GAIN = 1e5
+"""Variance by an unknown, relative to that of the fields and the noise, up to which it costs no digits among them; a
+factor of its own for all unknowns would take half as long again."""
 
 
 @dataclass(frozen=True)
@@ -163,21 +167,29 @@ def log_posterior(
     Returns:
         None where G + R is not positive definite in float64.
     """
-    point = logarithms.detach().clone().requires_grad_()
-    try:
-        process = data.process(centre.from_logarithms(logarithms.detach()))
-    except NumericalError:
-        return None
-    numbers, slope = process.numbers, process.slope
+    told, numbers, point = data.told, data.numbers, logarithms.detach().clone().requires_grad_()
     with torch.enable_grad():
         scales = centre.from_logarithms(point)
-        noise = numbers.blocks_of_table(data.told.weighted_noise(scales))
+        noise = numbers.blocks_of_table(told.weighted_noise(scales))
+        variance, values = data.unknowns_variance(scales), data.pairs.values(scales)
+    F = numbers.add_blocks(data.pairs.matrix(values), [block.detach() for block in noise])
+    wide = variance.detach() * numbers.S.square().amax(0) > LARGEST_GAIN * F.diagonal().min()
+    narrow, S = numbers.S[:, ~wide], numbers.S[:, wide]
+    F, root = F.addmm_(narrow * variance.detach()[~wide], narrow.T), variance.detach()[wide].sqrt()
+    try:
+        factor = Factor.of(F, S * root)
+    except NumericalError:
+        return None
+    mu = factor.solve(numbers.target[:, None])[:, 0]
+    slope = factor.inverse.addr_(mu, mu, beta=-0.5, alpha=0.5)  # of the likelihood by F + R, in closed form
+    with torch.enable_grad():
         by_noise = sum((own * block).sum() for own, block in zip(numbers.diagonal_blocks(slope), noise, strict=True))
-        by_unknowns = process.by_log_variance @ data.unknowns_variance(scales).log()
+        explained = (root * (S.T @ mu)).square() - 1.0 + torch.cholesky_inverse(factor.B).diagonal()
+        by_unknowns = 0.5 * explained @ variance[wide].log() + ((slope @ narrow) * narrow).sum(0) @ variance[~wide]
         density = _log_prior(point - centre.logarithms(), centre.amplitudes(), prior)
-        (data.pairs.inner(data.pairs.values(scales), slope) + by_noise + by_unknowns + density).backward()
+        (data.pairs.inner(values, slope) + by_noise + by_unknowns + density).backward()
     gradient = torch.zeros_like(point) if point.grad is None else point.grad
-    return LogPosterior(process.evidence, float(density.detach()), gradient)
+    return LogPosterior(factor.log_density(numbers.target, mu), float(density.detach()), gradient)
 
 
 def _log_prior(away: Tensor, amplitudes: Tensor, prior: ScalePrior) -> Tensor:
