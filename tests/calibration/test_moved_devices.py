@@ -71,7 +71,9 @@ def test_the_result_tells_which_scales_pass_without_a_warning(share: float, noti
     assert bool(texts) == noticed
     moved = (y - y.mean((0, 1))).square().sum(-1).mean().sqrt() * found.unnoticed
     assert found.unnoticed * found.motion == pytest.approx(float(moved), rel=0.15)
-    assert "may be wrong without a warning" in str(wrong.lengths[0])
+    said, size = str(wrong.lengths[0]), wrong.lengths[0]
+    assert f"moves points by {1e3 * abs(size.value) * size.motion:.2g} mm" in said
+    assert "may be wrong without a warning" in said
 
 
 def test_sockets_without_a_known_distance_show_no_size() -> None:

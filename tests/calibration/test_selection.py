@@ -25,6 +25,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.scales import selection
 from diffeo_calib.calibration.scales.selection import (
     LARGEST_AMPLITUDE_RATIO,
     SEARCH_LIMITS,
@@ -205,6 +206,19 @@ def test_a_singular_covariance_has_no_posterior() -> None:
         task_lengthscale=scales.task_lengthscale * 1e4,
     )
     assert log_posterior(mute.logarithms(), scales, setting.tangent_data) is None
+
+
+def test_unknowns_beside_the_covariance_or_in_it_agree(setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
+    data, point = weighted(setting), shaken(setting.scales, 2).logarithms()
+    found = []
+    for gain in (0.0, 1e300):
+        monkeypatch.setattr(selection, "LARGEST_GAIN", gain)
+        found.append(log_posterior(point, setting.scales, data))
+    beside, inside = found
+    assert beside is not None
+    assert inside is not None
+    assert beside.likelihood == pytest.approx(inside.likelihood, rel=1e-6)
+    torch.testing.assert_close(beside.gradient, inside.gradient, rtol=1e-3, atol=1e-3)
 
 
 def test_a_wide_prior_costs_no_digits(setting: Setting) -> None:

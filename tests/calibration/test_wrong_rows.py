@@ -364,3 +364,20 @@ def test_a_gross_error_is_named_and_hidden_markers_are_not() -> None:
     squares[4, 1], squares[7, 0] = 100.0, torch.nan
     found = excluded(squares, torch.full_like(squares, 3.0))
     assert found.nonzero().tolist() == [[4, 1]]
+
+
+@pytest.mark.parametrize("by_others", [True, False])
+def test_a_factor_on_errors_is_one_on_their_squares(by_others: bool) -> None:
+    squares = normal(30, 3, seed=5).square().sum(1, keepdim=True)
+
+    def limit(factor: float) -> float:
+        """The smallest square of the first row that is excluded."""
+        low, high = 0.0, 1e4
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            squares[0] = middle
+            bad = excluded(squares, torch.full_like(squares, 3.0), factor=factor, by_others=by_others)
+            low, high = (low, middle) if bool(bad[0]) else (middle, high)
+        return high
+
+    assert limit(3.0) == pytest.approx(9.0 * limit(1.0), rel=1e-6)

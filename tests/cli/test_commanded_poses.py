@@ -346,6 +346,16 @@ def test_a_table_with_two_slides_is_corrected_where_it_can_move(tmp_path: Path, 
     assert {row[header.index("status")] for row in rows} == {"reached"}
     sent = torch.tensor([[*map(float, row[:2]), 0.0] for row in rows], dtype=torch.float64) / 1e3
     assert without_frames(bent(sent), places) < 0.15 * without_frames(bent(places), places)
+    model: Any = dc.load(tmp_path / "t.safetensors")
+    at, *ends = torch.zeros(3, 1, 2, dtype=torch.float64) + torch.eye(3, 2, dtype=torch.float64).roll(1, 0)[:, None]
+    here, x, y = (model.tool_poses(one, frame="measuring")[0, :3, 3] for one in (at, *ends))
+    above = torch.nn.functional.normalize(torch.linalg.cross(x - here, y - here), dim=0)
+    wanted = here + 0.05 * (x - here) + 0.1 * above
+    stopped = dc.compensate(model, wanted[None], at, bound=1e-3, frame="measuring")
+    left = wanted - model.tool_poses(stopped.q, frame="measuring")[0, :3, 3]
+    assert float(left.norm()) > 0.1
+    assert float(stopped.miss) == pytest.approx(float((left - (left @ above) * above).norm()), rel=0.01)
+    assert float(stopped.miss) > 0.02  # what lies above counts nothing, what lies aside does
 
 
 def test_nothing_is_sure_where_the_machine_never_turns(tmp_path: Path, init: Any) -> None:

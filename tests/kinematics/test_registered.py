@@ -408,3 +408,15 @@ def test_places_are_those_of_the_noise_alone_and_their_covariance_is_that_of_all
     assert_close(one.covariance, posterior + one.gain @ one.C @ one.gain.T)
     left = one.residual.flatten() - one.slopes @ one.step
     assert_close(one.after_placing @ one.target, left)
+
+
+def test_markers_that_the_fit_knows_poorly_follow_the_rows() -> None:
+    """Their errors B widen what the rows may move, not what is known before them."""
+    shapes, one = normal(K, K + 2), rows()
+    one = replace(one, by_fit=shapes @ shapes.T)
+    S, wide = one.slopes, one.prior + one.by_fit
+    gain = wide @ S.T @ torch.linalg.inv(S @ wide @ S.T + torch.block_diag(*one.noise))
+    assert_close(one.gain, gain)
+    cross = gain @ S @ one.prior
+    total = S @ one.prior @ S.T + one.C + torch.block_diag(*one.noise)
+    assert_close(one.covariance, one.prior - cross - cross.T + gain @ total @ gain.T)

@@ -86,8 +86,8 @@ Group = Callable[[Tree, Measurements], Iterator[Reading]]
 def registered(reading: Reading) -> tuple[float, float]:
     """Median distance after registration of a random subset of the rows, m, infinite if that cannot be done; spread.
 
-    Gross rows are left out of the registration, a few rounds long those that are the farthest off (P. Rousseeuw,
-    K. Van Driessen, "Computing LTS regression for large data sets", 2006).
+    Two rounds at most register again without the quarter of the rows that is farthest off, as long as a row is gross
+    (P. Rousseeuw, K. Van Driessen, "Computing LTS regression for large data sets", 2006).
     """
     q, points = reading.q, reading.points
     rows = torch.randperm(len(q), generator=seeded(0), device=HOST)[: gates.REGISTERED_ROWS]
