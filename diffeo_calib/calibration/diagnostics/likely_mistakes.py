@@ -34,17 +34,9 @@ from diffeo_calib.common.quantiles import known
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
-from diffeo_calib.measurements.csv.tables import TableOrigin
-from diffeo_calib.measurements.poses import (
-    EULER,
-    POINTS,
-    inverse_poses,
-    points_of_frames,
-    rotation_matrices,
-    transforms_of_frames,
-)
+from diffeo_calib.measurements.csv.tables import numeric_table, rereadings, with_coordinate
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_format import UNITS_PER_METRE, flat_names
+from diffeo_calib.measurements.table_format import UNITS_PER_METRE
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import moving_joints_below, read_urdf
@@ -54,14 +46,6 @@ GROSS_MEDIANS, KEPT_ROWS, TRIMMINGS = 3.0, 0.75, 2
 the share of rows that are closest, at most so often."""
 MOST_COLUMNS = 4
 """Most columns that are tried in the place of another one: every try is a registration."""
-INVERTED = (
-    "the poses seem to be those of the measuring frame, seen from the tool: if a camera on the tool sees a board, "
-    "pass camera_on_tool=True (--camera-on-tool), else give the poses of the tool in the measuring frame"
-)
-NOT_INVERTED = (
-    "the poses seem to be those of the camera in the board's frame already, or those of a board on the tool that a "
-    "fixed camera sees: leave camera_on_tool (--camera-on-tool) out"
-)
 NO_MISTAKE_FOUND = (
     "check the angle unit, the order of the joints, the tip link or DH convention, "
     "and that rows pair joints with their own points"
@@ -198,51 +182,8 @@ def other_points(robot: Tree, data: Measurements) -> Iterator[Reading]:
 
 
 def other_rotations(robot: Tree, data: Measurements) -> Iterator[Reading]:
-    """Measured poses whose rotations are read in other ways, or whose poses are inverted; none without poses."""
-    if data.frames is None or data.lever is None:
-        return
-    own, lever, seen_from_tool = Reading.of(robot, data), data.lever, data.board is not None
-    written = inverse_poses(data.frames) if seen_from_tool else data.frames
-
-    def reread(frames: Tensor, words: str, option: str = "") -> Reading:
-        points = points_of_frames(inverse_poses(frames) if seen_from_tool else frames, lever)
-        return replace(own, points=points, words=words, option=option)
-
-    turns, places = written[..., :3, :3], written[..., :3, 3]
-    yield reread(inverse_poses(written), NOT_INVERTED if seen_from_tool else INVERTED)
-    words = "the rotations alone seem to be inverted (transposed): give those that belong to the positions"
-    yield reread(transforms_of_frames(turns.mT, places), words)
-    for rotations, words, option in _rewritten(data):
-        yield reread(transforms_of_frames(rotations.to(places.device), places), words, option)
-    if not seen_from_tool:  # else the place of the camera follows from its rotation
-        words = "the positions alone fit: check the convention and the unit of the rotation columns"
-        yield replace(own, points=places, words=words, on=own.on[::POINTS], partial=True)
-
-
-def _rewritten(data: Measurements) -> Iterator[tuple[Tensor, str, str]]:
-    """Rotations (N, T, 3, 3) read in other ways, with words, and the option that reads them so."""
-    columns, table = _numeric_table(data)
-    names = () if columns is None else flat_names(columns.table.rotation)
-    if columns is None or columns.table.convention is None or not all(name in table for name in names):
-        return
-    convention, unit = columns.table.convention, columns.table.rotation_angle or "rad"
-    frames = len(columns.table.triples)
-    numbers = torch.stack([table[name] for name in names], dim=1).unflatten(1, (frames, -1))
-    count, flat = numbers.shape[2], numbers.flatten(0, 1)
-
-    def read(values: Tensor, convention: str, angle: str) -> Tensor:
-        return rotation_matrices(values, convention, angle=angle).unflatten(0, (-1, frames))
-
-    families = {3: (*EULER, "rotvec"), 4: ("quat_xyzw", "quat_wxyz"), 9: ("matrix",)}
-    for other in families[count]:
-        if other != convention:
-            yield read(flat, other, unit), "", f"convention='{other}'"
-    if count == 3:
-        other = "deg" if unit == "rad" else "rad"
-        yield read(flat, convention, other), "", f"rotation_angle='{other}'"
-        for order in list(permutations(range(3)))[1:-1]:  # the last, reversed Euler angles, is a convention by itself
-            words = f"the rotation columns seem to be in the order {shown(','.join(names[k] for k in order))}"
-            yield read(flat[:, list(order)], convention, unit), words, ""
+    """Measured poses whose rotations are read in other ways, or whose poses are inverted."""
+    return (replace(Reading.of(robot, data), **one) for one in rereadings(data))
 
 
 def other_units(robot: Tree, data: Measurements, *, slides: bool = True) -> Iterator[Reading]:
@@ -257,7 +198,7 @@ def other_units(robot: Tree, data: Measurements, *, slides: bool = True) -> Iter
 
 def longer_chains(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """The same with joints below the given tip, for which the table has columns whose values vary."""
-    columns, table = _numeric_table(data)
+    columns, table = numeric_table(data)
     if columns is None or robot.source is None or len(robot.tips) > 1:
         return
     spare, content = _spare(columns, table), robot.source.encode("utf-8", "surrogateescape")
@@ -282,7 +223,7 @@ def longer_chains(robot: Tree, data: Measurements) -> Iterator[Reading]:
 
 def other_columns(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """One column of the joints or of the position replaced by one of similar name that was not read."""
-    columns, table = _numeric_table(data)
+    columns, table = numeric_table(data)
     if columns is None:
         return
     spare, as_read = _spare(columns, table), Reading.of(robot, data)
@@ -295,31 +236,9 @@ def other_columns(robot: Tree, data: Measurements) -> Iterator[Reading]:
     for marker, triple in enumerate(columns.table.triples):
         for axis, own in enumerate(triple):
             for name in _similar([own], spare):
-                points = _with_coordinate(data, marker, axis, spare[name] / columns.table.per_metre)
+                points = with_coordinate(data, marker, axis, spare[name] / columns.table.per_metre)
                 words = f"column '{shown(name)}' fits in place of '{shown(own)}': check the position columns"
                 yield replace(as_read, points=points, words=words)
-
-
-def _with_coordinate(data: Measurements, marker: int, axis: int, values: Tensor) -> Tensor:
-    """The points (N, P, 3) with other values (N,) of one coordinate of a marker, or of a pose's origin, m."""
-    points, values = data.points.clone(), values.to(data.points.device)
-    if data.frames is None:
-        points[:, marker, axis] = values.where(~points[:, marker, axis].isnan(), torch.nan)
-    elif data.board is not None and data.lever is not None:
-        written = inverse_poses(data.frames)
-        written[:, 0, axis, 3] = values
-        return points_of_frames(inverse_poses(written), data.lever)
-    else:
-        points[:, POINTS * marker : POINTS * (marker + 1), axis] += (values - data.frames[:, marker, axis, 3])[:, None]
-    return points
-
-
-def _numeric_table(data: Measurements) -> tuple[Columns | None, Mapping[str, Tensor]]:
-    """How measurements were read, and all numeric columns of their file; None without it, or of rows of many lines."""
-    if not isinstance(data.origin, TableOrigin) or data.origin.columns.table.marker is not None:
-        return None, {}
-    table = data.origin.numeric_columns(data.line_numbers)
-    return (data.origin.columns, table) if table else (None, {})
 
 
 def _spare(columns: Columns, table: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -344,7 +263,7 @@ def _joint_values(columns: Columns, values: Tensor, *, slides: bool) -> Tensor:
 
 def other_conventions(robot: Tree, data: Measurements, judge: Judge = registered) -> Iterator[Reading]:
     """Joint values, or commanded poses, in another convention."""
-    (columns, table), own = _numeric_table(data), Reading.of(robot, data)
+    (columns, table), own = numeric_table(data), Reading.of(robot, data)
     pose = None if columns is None else columns.joints
     if is_cartesian(robot):
         if columns is not None and isinstance(pose, PoseColumns):
