@@ -13,6 +13,7 @@ from difflib import SequenceMatcher
 from itertools import combinations, permutations
 from math import degrees, inf
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -113,6 +114,25 @@ def residual_of(robot: Tree, data: Measurements) -> float:
     return registered(Reading.of(robot, data))[0]
 
 
+def check_fit(
+    robot: Tree,
+    data: Measurements,
+    typical: float,
+    what: str,
+    *,
+    expected: str,
+    got: str,
+    otherwise: str | None = None,
+    **search: Any,
+) -> None:
+    """Refuse measurements that a mistake explains, see :func:`likely_mistake`; else warn and advise ``otherwise``."""
+    mistake = likely_mistake(robot, data, typical, **search)
+    if mistake:
+        raise MeasurementError.of(what, expected=expected, got=got, fix=mistake)
+    if otherwise is not None:
+        warn_user(sentence(what, expected=expected, got=got, fix=otherwise))
+
+
 def likely_mistake(
     robot: Tree, data: Measurements, typical: float, groups: Sequence[Group] = (), judge: Judge = registered
 ) -> str:
@@ -148,14 +168,6 @@ def likely_mistake(
         words = f"the rotations seem to be written with {' or '.join(options)}"
         words += ", which these rows do not tell apart" * (len(options) > 1)
     return f"{words} (the median residual falls from {1e3 * typical:.3g} to {1e3 * best:.3g} mm)"
-
-
-def refuse_or_warn(what: str, *, expected: str, got: str, mistake: str, otherwise: str | None = None) -> None:
-    """Refuse measurements that a mistake explains; else warn of them and advise ``otherwise``, if that is given."""
-    if mistake:
-        raise MeasurementError.of(what, expected=expected, got=got, fix=mistake)
-    if otherwise is not None:
-        warn_user(sentence(what, expected=expected, got=got, fix=otherwise))
 
 
 # --- other readings ---------------------------------------------------------------------------------------------------
