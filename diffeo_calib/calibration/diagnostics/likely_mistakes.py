@@ -33,9 +33,9 @@ from diffeo_calib.common.errors import (
 )
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake
-from diffeo_calib.measurements.csv import rotations
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
+from diffeo_calib.measurements.csv.tables import numeric_table, rereadings, with_coordinate
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import UNITS_PER_METRE
 from diffeo_calib.robots.cartesian import is_cartesian
@@ -195,7 +195,7 @@ def other_points(robot: Tree, data: Measurements) -> Iterator[Reading]:
 
 def other_rotations(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Measured poses whose rotations are read in other ways, or whose poses are inverted."""
-    return (replace(Reading.of(robot, data), **one._asdict()) for one in rotations.other_rotations(data))
+    return (replace(Reading.of(robot, data), **one) for one in rereadings(data))
 
 
 def other_units(robot: Tree, data: Measurements, *, slides: bool = True) -> Iterator[Reading]:
@@ -210,7 +210,7 @@ def other_units(robot: Tree, data: Measurements, *, slides: bool = True) -> Iter
 
 def longer_chains(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """The same with joints below the given tip, for which the table has columns whose values vary."""
-    columns, table = rotations.numeric_table(data)
+    columns, table = numeric_table(data)
     if columns is None or robot.source is None or len(robot.tips) > 1:
         return
     spare, content = _spare(columns, table), robot.source.encode("utf-8", "surrogateescape")
@@ -235,7 +235,7 @@ def longer_chains(robot: Tree, data: Measurements) -> Iterator[Reading]:
 
 def other_columns(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """One column of the joints or of the position replaced by one of similar name that was not read."""
-    columns, table = rotations.numeric_table(data)
+    columns, table = numeric_table(data)
     if columns is None:
         return
     spare, as_read = _spare(columns, table), Reading.of(robot, data)
@@ -248,7 +248,7 @@ def other_columns(robot: Tree, data: Measurements) -> Iterator[Reading]:
     for marker, triple in enumerate(columns.table.triples):
         for axis, own in enumerate(triple):
             for name in _similar([own], spare):
-                points = rotations.with_coordinate(data, marker, axis, spare[name] / columns.table.per_metre)
+                points = with_coordinate(data, marker, axis, spare[name] / columns.table.per_metre)
                 words = f"column '{shown(name)}' fits in place of '{shown(own)}': check the position columns"
                 yield replace(as_read, points=points, words=words)
 
@@ -275,7 +275,7 @@ def _joint_values(columns: Columns, values: Tensor, *, slides: bool) -> Tensor:
 
 def other_conventions(robot: Tree, data: Measurements, judge: Judge = registered) -> Iterator[Reading]:
     """Joint values, or commanded poses, in another convention."""
-    (columns, table), own = rotations.numeric_table(data), Reading.of(robot, data)
+    (columns, table), own = numeric_table(data), Reading.of(robot, data)
     pose = None if columns is None else columns.joints
     if is_cartesian(robot):
         if columns is not None and isinstance(pose, PoseColumns):
