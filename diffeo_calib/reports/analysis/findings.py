@@ -17,18 +17,16 @@ from diffeo_calib.calibration.expected_errors import expected_errors
 from diffeo_calib.calibration.findings import Part, parts
 from diffeo_calib.calibration.judgement import Accuracy, accuracy, judge
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
     check_rows,
-    motions,
     place,
     placement_sentences,
     positions_of,
     residuals,
     rows_used_in_fit,
-    some_rows,
 )
 from diffeo_calib.kinematics.joint_ranges import SAME_CONFIGURATION
 from diffeo_calib.measurements.csv.tables import TableOrigin
@@ -293,25 +291,10 @@ def _of_table(
     raw = measured_positions(data)  # as read: those of `measured` are moved by a drift that the model knows
     if measured is None or raw is None or not new or not bool((seen := unseen(model, raw.q)).any()):
         return shown
-    moved = _causes(model, own, data.rows(mask), list(errors.values())[-1])
+    judged = judge(model, own, data.rows(mask), list(errors.values())[-1])
+    moved = judged.causes if judged.refusal is None else [judged.refusal]
     predictions = Predictions.of(model, measured.rows(seen))
     return shown | {"predictions": predictions, "outliers": predictions.outliers(model), "moved": moved}
-
-
-def _causes(model: CalibratedKinematics, own: Places, data: Any, found: Evaluations) -> Sequence[str]:
-    """What happened to new rows.
-
-    Raises:
-        MeasurementError: another reading explains impossible errors. Something that moved is told, not raised.
-    """
-    try:
-        judged = judge(model, own, data, found)
-    except MeasurementError as error:
-        seen = positions_of(model, own, data)
-        if seen is None or not motions(model, some_rows(seen)):
-            raise
-        return [str(error)]
-    return judged.causes if judged.refusal is None else [judged.refusal]
 
 
 def _left_out(model: CalibratedKinematics, rows: FitRows, stages: Mapping[str, Kinematics]) -> dict[str, Any]:
