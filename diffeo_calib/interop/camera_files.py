@@ -6,7 +6,7 @@ from xml.sax.saxutils import quoteattr
 
 from diffeo_calib.cameras.files import camera_text, matrix_lines
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.interop.files import origin_numbers
+from diffeo_calib.interop.tables import origin_numbers
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.hand_eye import HandEye
 from diffeo_calib.measurements.poses import rotation_numbers

@@ -216,7 +216,7 @@ class Measurements(ImageTable):
         return joined_tables(parts)
 
     def beside_images(self) -> list[tuple[Any, Tensor]]:
-        """See :class:`RowTable`; poses stay."""
+        """See :class:`RowGroups`; poses stay."""
         return super().beside_images() if self.lever is not None else as_readings(self)
 
     @property
@@ -309,7 +309,7 @@ class Measurements(ImageTable):
 
     @property
     def compared(self) -> Tensor:
-        """See :class:`RowTable`."""
+        """See :class:`RowGroups`."""
         return torch.cat([self.q, self.points.flatten(1)], dim=1)
 
     def __repr__(self) -> str:
@@ -354,7 +354,7 @@ class Measurements(ImageTable):
 
     @property
     def ranges(self) -> list[list[str]]:
-        """See :attr:`RowTable.ranges`; of the places, none for a ball in sockets."""
+        """See :attr:`RowGroups.ranges`; of the places, none for a ball in sockets."""
         places = self.origins.flatten(0, 1)
         measured = places[~places.isnan().any(1)]
         return [value_range(axis, values, "m") for axis, values in zip("xyz", measured.T, strict=True) if len(measured)]
@@ -387,7 +387,7 @@ class Measurements(ImageTable):
         return with_attributes(self, session=numbers, session_names=known, remounted=remounted and numbers is not None)
 
     def doubted(self, doubt: bool = True) -> Measurements:
-        """See :class:`RowTable`; MeasurementError for a marker, or frame, that no row shows."""
+        """See :class:`RowGroups`; MeasurementError for a marker, or frame, that no row shows."""
         if doubt:
             self.check_every_marker_seen()
         return super().doubted(doubt)

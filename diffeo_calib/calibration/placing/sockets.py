@@ -20,10 +20,11 @@ from torch import Tensor
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_flat_places
 from diffeo_calib.calibration.diagnostics.outliers import Outlier, excluded, found_outliers
-from diffeo_calib.calibration.diagnostics.plausibility import check_identification, registered
-from diffeo_calib.calibration.diagnostics.socket_plausibility import (
-    check_registration,
+from diffeo_calib.calibration.diagnostics.plausibility import (
+    check_identification,
+    check_socket_registration,
     check_sockets,
+    registered,
     warn_of_other_robot,
     warn_of_wrong_sockets,
 )
@@ -335,7 +336,7 @@ def stages_by_sockets(
     start = None if device is None else registered(robot, device)
     resting = data.socket_rows()
     found = register_sockets(robot if start is None else start.geometry, resting.q, resting.socket_numbers)
-    check_registration(robot, resting, found, None if start is None else start.geometry)
+    check_socket_registration(robot, resting, found, None if start is None else start.geometry)
     registration = found.identification
     if start is not None:  # all rows with the weight 1
         registration = start.with_ball(registration)

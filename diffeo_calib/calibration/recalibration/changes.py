@@ -64,16 +64,27 @@ class Change:
         return f"{part} has changed by {size}{by} (by chance with a probability of at most {self.probability:.2g})"
 
 
-class SmallestOffset(NamedTuple):
-    """The smallest change of an offset, rad or m, shown in nine cases of ten; infinite if places hide it."""
+class Offset(NamedTuple):
+    """A change of a joint's offset: the smallest that rows show in nine cases of ten, or one that they cannot exclude.
+
+    Args:
+        joint: its name. angle: whether the others are in rad, else in m.
+        size: is added to a reading as that of a :class:`Change`; infinite if places hide any.
+        deviation: of the size; zero of the smallest one. instead: what has moved otherwise, in words; empty for those.
+    """
 
     joint: str
-    size: float
     angle: bool
+    size: float
+    deviation: float = 0.0
+    instead: str = ""
 
     def __str__(self) -> str:
-        size = "none" if self.size == inf else f"{1e3 * self.size:.2g} {'mrad' if self.angle else 'mm'}"
-        return f"{self.joint} {size}"
+        unit = "mrad" if self.angle else "mm"
+        if not self.instead:
+            return f"{self.joint} none" if self.size == inf else f"{self.joint} {1e3 * self.size:.2g} {unit}"
+        size = f"{with_deviation(1e3 * self.size, 1e3 * self.deviation)} {unit}"
+        return f"{self.instead}, or the offset of {self.joint} has changed by {size}: these rows cannot tell which"
 
 
 @dataclass(frozen=True)
@@ -94,7 +105,7 @@ class Changes:
     noise: float = 1.0
     rows: int = 0
     level: float | None = None
-    smallest: tuple[SmallestOffset, ...] = ()
+    smallest: tuple[Offset, ...] = ()
 
     @property
     def tested(self) -> bool:
@@ -118,28 +129,7 @@ class Changes:
         return "; ".join(map(str, self.found))
 
 
-class HiddenOffset(NamedTuple):
-    """An offset that explains a new place as well.
-
-    Args:
-        joint: its name. size, deviation: of the offset, rad or m, which is added to a reading as that of a
-            :class:`Change`. angle: whether it is in rad.
-        instead: what has moved otherwise, in words.
-    """
-
-    joint: str
-    size: float
-    deviation: float
-    angle: bool
-    instead: str
-
-    def __str__(self) -> str:
-        unit = "mrad" if self.angle else "mm"
-        size = f"{with_deviation(1e3 * self.size, 1e3 * self.deviation)} {unit}"
-        return f"{self.instead}, or the offset of {self.joint} has changed by {size}: these rows cannot tell which"
-
-
-def hidden_offsets(robot: Tree, place: FoundPlace | None, changes: Changes) -> tuple[HiddenOffset, ...]:
+def hidden_offsets(robot: Tree, place: FoundPlace | None, changes: Changes) -> tuple[Offset, ...]:
     """Offsets that explain where a registration found device or markers; none where a change of the robot is named.
 
     Args:
@@ -169,7 +159,7 @@ def hidden_offsets(robot: Tree, place: FoundPlace | None, changes: Changes) -> t
             unseen = abs(size) * float((J[:, joint, None] - S[:, own] @ d).square().mean().sqrt())
             left = total - float(evidence.gain)
             if unseen < gates.HIDDEN_SHARE * noise and left < chi2_above(LEVEL, max(count - 1, 1)):
-                hidden.append(HiddenOffset(name, size, deviation, robot.kinds[joint] != "prismatic", instead))
+                hidden.append(Offset(name, robot.kinds[joint] != "prismatic", size, deviation, instead))
     return tuple(hidden)
 
 

@@ -26,7 +26,7 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
 from diffeo_calib.calibration.diagnostics.row_order import find_block
-from diffeo_calib.calibration.recalibration.changes import LEVEL, Change, Changes, SmallestOffset
+from diffeo_calib.calibration.recalibration.changes import LEVEL, Change, Changes, Offset
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, WeighedRows
 from diffeo_calib.calibration.recalibration.parts import (
     OFFSET_DEVIATION_RAD_M,
@@ -202,14 +202,14 @@ LARGEST_OFFSET_RAD_M = 5e-3
 """The largest one that is tested, see SIZES."""
 
 
-def _smallest(rows: WeighedRows) -> tuple[SmallestOffset, ...]:
+def _smallest(rows: WeighedRows) -> tuple[Offset, ...]:
     """See :class:`Changes`."""
     chain, found = rows.points.fitted.geometry.chain, []
     for joint, part in enumerate(offsets_of(rows.fitted)):
         evidence = rows.evidence(part.root(rows.at))
         size = SHOWN * OFFSET_DEVIATION_RAD_M / float(evidence.H.sqrt())
         size = size if size < LARGEST_OFFSET_RAD_M else inf
-        found.append(SmallestOffset(chain.joint_names[joint], size, chain.kinds[joint] != "prismatic"))
+        found.append(Offset(chain.joint_names[joint], chain.kinds[joint] != "prismatic", size))
     return tuple(found)
 
 
