@@ -141,20 +141,17 @@ def place(kinematics: Callable[[Tensor], Tensor], data: Any, *, every_session: b
 
 def devices_of(model: object) -> dict[str, Devices]:
     """The devices of readings whose places a model knows, by kind; none for other kinematics."""
-    sets = getattr(model, "placement", None) or ()
-    known = [own if isinstance(own, Devices) else getattr(own, "devices", None) for own in sets]
     found = dict[str, Devices]()
-    for own in known:
-        if isinstance(own, Devices):
-            found[own.kind] = found[own.kind].beside(own) if own.kind in found else own
+    for own in [own.devices for own in getattr(model, "placement", None) or () if own.devices.reads]:
+        found[own.kind] = found[own.kind].beside(own) if own.kind in found else own
     return found
 
 
 def placement_sentences(model: object) -> list[str]:
     """Where the devices are that a model knows, with deviations; none for other kinematics."""
     drift = KnownDrift.of(model)
-    lines = [line for own in getattr(model, "placement", None) or () for line in own.sentences()]
-    return lines if drift is None else [*lines, *drift.sentences()]
+    lines = [line for own in getattr(model, "placement", None) or () for line in own.devices.sentences()]
+    return lines if drift is None else [*lines, *drift.of_joints()]
 
 
 def at_payloads(kinematics: Callable[[Tensor], Tensor], data: Any) -> Callable[[Tensor], Tensor]:
