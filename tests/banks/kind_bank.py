@@ -33,9 +33,9 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.recalibration.new_set_up import Before, place_again
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.csv.sensors import ImageColumns
-from diffeo_calib.measurements.poses import LEVER, mark_points
+from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.measurements.rows import with_attributes
-from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.measurements.table_format import LEVER, TableFormat
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
 

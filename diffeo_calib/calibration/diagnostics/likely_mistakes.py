@@ -13,12 +13,13 @@ from difflib import SequenceMatcher
 from itertools import combinations, permutations
 from math import degrees, inf
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.conventions import Convention, conventions, frame_projector, socket_projector
+from diffeo_calib.calibration.diagnostics.conventions import Convention, conventions, without
 from diffeo_calib.calibration.identification.registration import can_register, register, spread
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import (
@@ -113,6 +114,25 @@ def residual_of(robot: Tree, data: Measurements) -> float:
     return registered(Reading.of(robot, data))[0]
 
 
+def check_fit(
+    robot: Tree,
+    data: Measurements,
+    typical: float,
+    what: str,
+    *,
+    expected: str,
+    got: str,
+    otherwise: str | None = None,
+    **search: Any,
+) -> None:
+    """Refuse measurements that a mistake explains, see :func:`likely_mistake`; else warn and advise ``otherwise``."""
+    mistake = likely_mistake(robot, data, typical, **search)
+    if mistake:
+        raise MeasurementError.of(what, expected=expected, got=got, fix=mistake)
+    if otherwise is not None:
+        warn_user(sentence(what, expected=expected, got=got, fix=otherwise))
+
+
 def likely_mistake(
     robot: Tree, data: Measurements, typical: float, groups: Sequence[Group] = (), judge: Judge = registered
 ) -> str:
@@ -148,14 +168,6 @@ def likely_mistake(
         words = f"the rotations seem to be written with {' or '.join(options)}"
         words += ", which these rows do not tell apart" * (len(options) > 1)
     return f"{words} (the median residual falls from {1e3 * typical:.3g} to {1e3 * best:.3g} mm)"
-
-
-def refuse_or_warn(what: str, *, expected: str, got: str, mistake: str, otherwise: str | None = None) -> None:
-    """Refuse measurements that a mistake explains; else warn of them and advise ``otherwise``, if that is given."""
-    if mistake:
-        raise MeasurementError.of(what, expected=expected, got=got, fix=mistake)
-    if otherwise is not None:
-        warn_user(sentence(what, expected=expected, got=got, fix=otherwise))
 
 
 # --- other readings ---------------------------------------------------------------------------------------------------
@@ -289,7 +301,9 @@ def conventions_of(robot: Tree, data: Measurements, angle: str, judge: Judge = r
         return residual / size
 
     def projector(chosen: Tensor) -> Tensor:
-        return socket_projector(socket[chosen]) if free else frame_projector(places[chosen])
+        own, at = socket[chosen], places[chosen]
+        affine = torch.cat([torch.ones_like(at[:, :1]), at - at.mean(0)], 1)
+        return without((own[:, None] == own.unique()).to(at) if free else affine)
 
     tip = robot.tips.index(data.on[marker]) if data.on else 0
     per_rad = degrees(1.0) if angle == "deg" else 1.0

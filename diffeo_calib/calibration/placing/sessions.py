@@ -188,8 +188,8 @@ class Sessions(DeviceSet):
             yield OtherLabel(f"session '{name}'", applies, away.norm(dim=-1).nanmean(1))
 
     def placed(self) -> PlacedDevices:
-        rows, own = (self.session != NO_SOCKET).nonzero()[:, 0], self.set_ups
-        return PlacedDevices(own.kind, own.names, own.constants, own.deviations, rows, self.session[rows])
+        rows = (self.session != NO_SOCKET).nonzero()[:, 0]
+        return PlacedDevices(self.set_ups, rows, self.session[rows])
 
     def entry(self) -> dict[str, object]:
         return {self.set_ups.key: self.set_ups.entry()}
