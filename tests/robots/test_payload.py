@@ -48,6 +48,15 @@ def test_one_payload_on_a_branch_is_one_of_the_unknown_masses() -> None:
     assert moved.tolist() == own.tolist()  # its torso and its arm, not the other one
 
 
+def test_masses_are_counted_in_units() -> None:
+    """Coefficients are sags under one unit, whatever the unit of mass is."""
+    robot, q = SimulatedArm().nominal, draw(len(MASSES), 6)
+    w = draw(laden(robot).size, seed=2)
+    in_grams = GravitySag(robot, Payload(robot.tips[0], 1e3 * MASSES, 1e3 * UNIT))
+    torch.testing.assert_close(in_grams.twists(q, w), laden(robot).twists(q, w))
+    assert Payload(robot.tips[0], MASSES, UNIT).amounts(q)[:, 0].tolist() == [0.0, 0.4, 1.0, 1.0, 0.3]
+
+
 def test_wrong_payloads() -> None:
     arm = SimulatedArm().nominal
     with pytest.raises(InputError, match="the link of the payload: expected flange, got wrist"):
