@@ -25,8 +25,8 @@ from diffeo_calib.cameras.images import UNKNOWNS
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.csv.files import read_observations, write_measurements
-from diffeo_calib.measurements.poses import LEVER, mark_points, poses_from_marks
-from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.measurements.poses import mark_points, poses_from_marks
+from diffeo_calib.measurements.table_format import LEVER, TableFormat
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation, transforms
 from diffeo_calib.sensors.tool_frames import Contacts, Trackers

@@ -24,7 +24,8 @@ from diffeo_calib.calibration.planning.candidates import candidates
 from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
 from diffeo_calib.cameras.images import Images, sees, shown, sighted
 from diffeo_calib.cameras.images import expected as expected_errors
-from diffeo_calib.measurements.poses import LEVER, inverse_poses, poses_from_marks
+from diffeo_calib.measurements.poses import inverse_poses, poses_from_marks
+from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.regression.conditional import WithoutRigidMotions
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
