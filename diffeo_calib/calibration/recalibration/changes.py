@@ -16,10 +16,13 @@ from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kinematics.re_registration.find_place import FoundPlace
 from diffeo_calib.kinematics.re_registration.new_rows import NewRows
 from diffeo_calib.measurements.poses import rotation_numbers
+from diffeo_calib.regression.conditional import roots
 from diffeo_calib.robots.tree import Tree
 
 LEVEL = 0.01
 """Probability that anything is named although nothing has changed."""
+
+
 RANK_TOLERANCE = 1e-9
 """Smallest eigenvalue of correlations, relative to the largest, that is not rounding."""
 
@@ -155,7 +158,8 @@ def hidden_offsets(robot: Tree, place: FoundPlace | None, changes: Changes) -> t
         places["the markers have moved"] = (slice(6, S.shape[1]), found.shift.flatten())
     hidden = []
     for instead, (own, shift) in places.items():
-        white = _whitening(covariance[own, own])
+        white = roots(covariance[own, own], RANK_TOLERANCE)[1]
+        white = white[white.any(1)]  # markers that moved together leave it singular
         away = white @ shift
         count, total = len(away), float(away @ away)
         if total < chi2_above(LEVEL, count):
@@ -171,14 +175,6 @@ def hidden_offsets(robot: Tree, place: FoundPlace | None, changes: Changes) -> t
             if unseen < gates.HIDDEN_SHARE * noise and left < chi2_above(LEVEL, max(count - 1, 1)):
                 hidden.append(HiddenOffset(name, size, deviation, robot.kinds[joint] != "prismatic", instead))
     return tuple(hidden)
-
-
-def _whitening(K: Tensor) -> Tensor:
-    """(k, K) root of the pseudo-inverse of a covariance of rank k: markers that moved together leave it singular."""
-    scale = K.diagonal().sqrt()
-    values, Q = torch.linalg.eigh(K / scale / scale[:, None])
-    kept = values > RANK_TOLERANCE * values[-1]
-    return (Q[:, kept] / scale[:, None] / values[kept].sqrt()).mT
 
 
 def _motion(rows: NewRows) -> Tensor:
