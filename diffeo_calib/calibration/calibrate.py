@@ -55,7 +55,7 @@ from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.provenance import Provenance, Summary, check_note
+from diffeo_calib.kinematics.provenance import OF_POSITIONS, Provenance, Summary, check_note
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
@@ -235,7 +235,7 @@ def _result(
     warn_of_rounding(robot, placed.data, data, chosen.left_out)
     found_lengths = lengths(data, scales, placed.placement.hypotheses(data, VALUE))
     summary = Summary(
-        *placed.stage_rms(model),
+        **dict(zip(OF_POSITIONS, placed.stage_rms(model), strict=False)),
         leave_one_out_rms=placed.by_kind(chosen.left_out.errors).positions_rms,
         outliers=len(found),
         noise_degrees_of_freedom=data.tails.freedom,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from diffeo_calib.calibration.diagnostics import gates
@@ -15,11 +16,9 @@ from diffeo_calib.common.quantiles import known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
     LARGEST_ERROR_PER_REACH,
-    causes_of,
+    Judgement,
     expected,
-    impossible,
-    impossible_errors,
-    motions,
+    judged,
     positions_of,
     some_rows,
 )
@@ -48,50 +47,43 @@ def check_errors(model: CalibratedKinematics, found: Evaluation, usual: float) -
         )
 
 
-class Judgement(NamedTuple):
-    """What errors mean.
+@dataclass(frozen=True)
+class JudgedRows(Judgement):
+    """The same, and the positions that look wrong among ``rows`` evenly chosen ones."""
 
-    Args:
-        refusal: why they are not those of this robot. causes: sentences about likely causes of large errors.
-        outliers: positions that look wrong among ``rows`` evenly chosen ones.
-    """
-
-    refusal: str | None = None
-    causes: Sequence[str] = ()
     outliers: Sequence[Outlier] = ()
     rows: int = 0
 
 
-def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> Judgement:
+def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> JudgedRows:
     """Name rows that look wrong, and likely causes of large errors.
 
     Args:
         model: a calibrated model. places, data, found: see :func:`~diffeo_calib.kinematics.evaluation.residuals`.
 
     Raises:
-        MeasurementError: another reading of the table, or something that moved, explains impossible errors.
+        MeasurementError: another reading of the table explains impossible errors.
     """
     seen = positions_of(model, places, data)
     if seen is None or found.positions is None:
-        return Judgement(impossible_errors(model, places, data, found))
+        return JudgedRows(judged(model, places, data, found).refusal)
     some = some_rows(seen)
     for step in steps_of(model, some):
-        return Judgement(step.sentence())
-    if impossible(model, found.positions.median) and not motions(model, some):
+        return JudgedRows(step.sentence())
+    known, errors = judged(model, places, data, found), found.positions
+    if known.refusal is not None and not known.moved:
         refuse_mistakes(model.robot, some)
-    refusal = impossible_errors(model, places, data, found)
-    causes = causes_of(model, some, found.positions)
-    if refusal is not None or causes:
-        return Judgement(refusal, causes)
+    if known.refusal is not None or known.causes:
+        return JudgedRows(known.refusal, known.causes, known.moved)
     wrong = contradicted(model, some)
-    block, errors = block_text(model, some, wrong), found.positions
-    causes, usual = [block] if block is not None else [], expected_rms(model, seen, errors.errors.shape[1])
+    block, usual = block_text(model, some, wrong), expected_rms(model, seen, errors.errors.shape[1])
+    causes = [block] if block is not None else []
     if not causes and not wrong and errors.rms >= gates.LARGE_PER_EXPECTED * usual:
         what = f"the errors are {errors.rms / usual:.1f} times as large as the model expects: "
         fix = "something has changed since the fit, or these poses are unlike those of the fit: compare, or recalibrate"
         size = f"RMS {1e3 * errors.rms:.3f} mm"
         causes = [sentence(what + size, expected=f"about {1e3 * usual:.3f} mm", fix=fix)]
-    return Judgement(None, causes, wrong, len(some))
+    return JudgedRows(None, causes, outliers=wrong, rows=len(some))
 
 
 def expected_rms(model: CalibratedKinematics, data: Measurements, bodies: int) -> float:

@@ -15,10 +15,6 @@ if TYPE_CHECKING:
     from diffeo_calib.interop.dh import DHTable as DHTable
     from diffeo_calib.interop.dh import dh_table as dh_table
     from diffeo_calib.interop.dh import write_dh as write_dh
-    from diffeo_calib.interop.joint_tables import CorrectionTable as CorrectionTable
-    from diffeo_calib.interop.joint_tables import correction_tables as correction_tables
-    from diffeo_calib.interop.joint_tables import write_correction_tables as write_correction_tables
-    from diffeo_calib.interop.joint_tables import write_joint_offsets as write_joint_offsets
     from diffeo_calib.interop.mjcf import write_mjcf as write_mjcf
     from diffeo_calib.interop.numpy_model import NumpyKinematics as NumpyKinematics
     from diffeo_calib.interop.numpy_model import load_numpy as load_numpy
@@ -27,6 +23,10 @@ if TYPE_CHECKING:
     from diffeo_calib.interop.rigid import best_joint_offsets as best_joint_offsets
     from diffeo_calib.interop.rigid import rigid_kinematics as rigid_kinematics
     from diffeo_calib.interop.sklearn import DiffeoRegressor as DiffeoRegressor
+    from diffeo_calib.interop.tables import CorrectionTable as CorrectionTable
+    from diffeo_calib.interop.tables import correction_tables as correction_tables
+    from diffeo_calib.interop.tables import write_correction_tables as write_correction_tables
+    from diffeo_calib.interop.tables import write_joint_offsets as write_joint_offsets
     from diffeo_calib.interop.torch_program import TorchProgram as TorchProgram
     from diffeo_calib.interop.torch_program import export_onnx as export_onnx
     from diffeo_calib.interop.torch_program import export_torch as export_torch

@@ -22,8 +22,8 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.files import write_whole
-from diffeo_calib.interop.files import check_units, in_unit, origin_numbers, table_text
 from diffeo_calib.interop.rigid import geometry_of
+from diffeo_calib.interop.tables import check_units, in_unit, origin_numbers, table_text
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.tool import checked_tip
 from diffeo_calib.robots.dh import CONVENTIONS, DHRow, from_dh, row_transform

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from math import inf
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import torch
 from torch import Tensor
@@ -29,7 +29,7 @@ from diffeo_calib.kernels.profiles import PROBED_R2, Profile, probe
 from diffeo_calib.kernels.radial import PROBE, RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
-from diffeo_calib.kinematics.provenance import Provenance, Summary
+from diffeo_calib.kinematics.provenance import Provenance, Summary, entries_of, record_of
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
@@ -45,11 +45,12 @@ from diffeo_calib.sensors.places import PlacedDevices
 UNITS = {"length": "m", "angle": "rad"}
 LARGEST_PARAMETER = 1e6
 """Of a robot, m or rad: beyond it results have no correct digits."""
-MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance", "new_noise")
+ENTRIES = {"format", "units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report", "lever"}
 OPTIONAL = {"tool", "tool_tip", "urdf", "provenance", "registration", "ball", "placement"}
-"""Entries that a header may have or not."""
+"""Entries of every header, and those that it may have or not."""
 PROBE_CONFIGURATIONS = 8
 """Number of configurations at which a nominal function passed to `load` is compared with that of the fit."""
+MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance", "new_noise")
 GEOMETRY = ("base", "joint_errors", "tool")
 MAP_TENSORS = {
     "data": "data",  # measured configurations of a coarse model; in others the control points x are these
@@ -60,9 +61,6 @@ MAP_TENSORS = {
 """Tensors that only some models have -> attributes of the map."""
 ROBOT_TENSORS = ("rigid_errors", "scales")
 """The same of a robot's model: joint errors of the geometric calibration alone, scales of kernels, priors and noise."""
-
-Tensors = dict[str, Tensor]
-KernelClasses = Mapping[str, type[Kernel] | type[Profile] | Profile]
 PAYLOADS = ("payloads", "task_controls", "unladen_theta")
 """Tensors of a model with payloads: mass of every control; then, for readers without the formulas of a payload, the
 places of the controls' markers before the task-space flow, and theta of a robot for which the payload of the model is
@@ -73,14 +71,13 @@ SESSIONS = (SHARED, "session", "session_tools")
 one calibration had several sessions, whose markers are those of the model."""
 PREFIX = "registration_"
 ARRAYS = ("transform", "markers", "covariance", "centre", "q", "gain", "noise")
-REGISTRATION = tuple(PREFIX + name for name in ARRAYS)
-NUMBERS = ("lever", "rms_before", "rms_after", "left_out_rms", "excess", "same_place")
-UNKNOWN_IN_REGISTRATIONS = ("lever", "rms_before", "same_place")
-ENTRIES = (*NUMBERS, "same", "free", "outliers", "undetermined", "shift")
-LEARNT, TABLE = "learnt", "table_sha256"
-"""Entries of a registration that the map learnt from, no map around another one; the first files had no table."""
+LEARNT = "learnt"
+"""Entry of a registration that the map learnt from, no map around another one."""
 PROBE_TOLERANCE = 1e-9
 """Largest relative difference between values of a profile passed to `load` and of that of the fit."""
+
+Tensors = dict[str, Tensor]
+KernelClasses = Mapping[str, type[Kernel] | type[Profile] | Profile]
 
 
 class MissingArgumentError(InputError):
@@ -122,17 +119,16 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
             "tool": model.tool.tolist() if model.has_tool else None,
             "tool_tip": model.tool_tip,
             "urdf": model.robot.source,
-            "provenance": None if model.provenance is None else model.provenance.to_dict(),
+            "provenance": None if model.provenance is None else entries_of(model.provenance),
             "ball": True if model.ball and model.map.workspace is None else None,
             "placement": [own.entry() for own in model.placement] or None,
         }
         header |= {name: entry for name, entry in known.items() if entry is not None}
         header |= {"report": model.report, "lever": model.lever}
     if (found := model.registration) is not None:
-        entry = {name: getattr(found, name) for name in ENTRIES}
-        entry["shift"] = None if found.shift is None else found.shift.tolist()
-        entry |= {TABLE: found.table_sha256} if found.table_sha256 else {}
-        header["registration"] = entry | ({LEARNT: True} if seen.registration is None else {})
+        shift = None if found.shift is None else found.shift.tolist()
+        learnt = {LEARNT: True} if seen.registration is None else {}
+        header["registration"] = entries_of(found, *ARRAYS, "shift") | {"shift": shift} | learnt
         tensors |= {PREFIX + name: getattr(found, name) for name in ARRAYS}
     return header, {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items() if t is not None}
 
@@ -196,10 +192,9 @@ def rebuild(
     Raises MissingArgumentError: ``nominal`` or an entry of ``kernels`` is missing, or is another one than that of the
     fit. ModelFileError, InputError, KeyError, TypeError, ValueError: contents that do not fit together.
     """
-    known = {"format", "units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report", "lever"}
-    if set(header) - OPTIONAL != known or header["units"] != UNITS:
+    if set(header) - OPTIONAL != ENTRIES or header["units"] != UNITS:
         what = "the header of the model file is not understood"
-        raise ModelFileError.of(what, expected=sorted(known), got=sorted(header))
+        raise ModelFileError.of(what, expected=sorted(ENTRIES), got=sorted(header))
     x, b, p, theta, noise, prior, new_noise = (tensors[name] for name in MOMENTA)
     k0 = _rebuild_nominal(header["nominal"], tensors, nominal, header.get("urdf"))
     _check(header, tensors, k0)
@@ -225,7 +220,8 @@ def rebuild(
     given |= {name: tensors.get(name) for name in ROBOT_TENSORS} | {"learnt": learnt}
     given["ball"] = header.get("ball", False) is True
     given["placement"] = tuple(PlacedDevices.from_entry(own, len(fitted.x)) for own in header.get("placement", ()))
-    given["provenance"] = Provenance.from_dict(header["provenance"]) if "provenance" in header else None
+    made = header.get("provenance")
+    given["provenance"] = None if made is None else record_of(Provenance, made, "provenance")
     return CalibratedKinematics(k0.geometry.chain, fitted, summary, **given)
 
 
@@ -233,7 +229,7 @@ def _check(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
     """Raise InputError unless all tensors that belong to the header are there, finite float64 of shapes that agree."""
     robot = nominal if isinstance(nominal, GeometryMap) else None
     expected = {*MOMENTA, *(("probe",) if robot is None else GEOMETRY)}
-    expected |= set(REGISTRATION) if "registration" in header else set()
+    expected |= {PREFIX + name for name in ARRAYS} if "registration" in header else set()
     expected |= set(PAYLOADS) if robot is not None and robot.payload is not None else set()
     if SHARED in tensors:
         expected |= set(SESSIONS) if SESSIONS[1] in tensors else {SHARED}
@@ -363,27 +359,20 @@ def _rebuild_rows(nominal: NominalMap, tensors: Tensors) -> GeometryMap | Sessio
 
 def rebuild_registration(entry: Any, tensors: Tensors, n: int) -> Registration:
     """A registration of a robot with n joints."""
-    if not isinstance(entry, dict) or set(entry) - {LEARNT, TABLE} != set(ENTRIES):
-        got = sorted(entry) if isinstance(entry, dict) else entry
-        raise InputError.of("the entry registration", expected=sorted(ENTRIES), got=got)
-    for name in NUMBERS:
-        if not (entry[name] is None and name in UNKNOWN_IN_REGISTRATIONS):
-            check_number(entry[name], f"the entry {name} of the registration", above=-1e-300, below=inf)
-    if not isinstance(entry["same"], bool) or entry["free"] not in ("both", "base", "marker"):
-        expected = "a boolean `same`, and `free` of both, base or marker"
-        raise InputError.of("the entry registration", expected=expected, got=(entry["same"], entry["free"]))
     arrays = {name: tensors[PREFIX + name] for name in ARRAYS}
     m, rows = 3 * len(arrays["markers"]), len(arrays["q"])
     shapes = {"markers": (m // 3, 3), "centre": (3,), "q": (rows, n), "gain": (m + 6, m * rows)}
     for name, shape in (shapes | {"noise": (m, m), "covariance": (m + 6, m + 6)}).items():
         as_tensor(arrays[name], PREFIX + name, shape)
     rigid(arrays["transform"], PREFIX + "transform")
-    shift = None if entry["shift"] is None else as_tensor(entry["shift"], "shift", (m // 3, 3))
-    words: dict[str, Any] = {
-        "outliers": tuple(map(int, entry["outliers"])),
-        "undetermined": tuple(map(str, entry["undetermined"])),
-    }
-    named: dict[str, Any] = {name: entry[name] for name in (*NUMBERS, "same", "free")} | {
-        TABLE: str(entry.get(TABLE, ""))
-    }
-    return Registration(**arrays, **words, **named, shift=shift)
+    plain = dict(entry)
+    plain.pop(LEARNT, None)
+    moved = plain.pop("shift", None)
+    shift = None if moved is None else as_tensor(moved, "shift", (m // 3, 3))
+    found = record_of(Registration, plain, "registration", **arrays, shift=shift)
+    for name, hint in get_type_hints(Registration).items():
+        if float in (hint, *get_args(hint)) and getattr(found, name) is not None:
+            check_number(getattr(found, name), f"the entry {name} of the registration", above=-1e-300, below=inf)
+    if found.free not in ("both", "base", "marker"):
+        raise InputError.of("the entry free of the registration", expected="both, base or marker", got=found.free)
+    return found

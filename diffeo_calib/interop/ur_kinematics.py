@@ -25,8 +25,8 @@ from torch import Tensor
 from diffeo_calib.common.errors import InputError, RobotError, as_written
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.interop.dh import links, on_axis, zero_frames
-from diffeo_calib.interop.files import origin_numbers
 from diffeo_calib.interop.rigid import geometry_of
+from diffeo_calib.interop.tables import origin_numbers
 from diffeo_calib.interop.urdf import urdf_of
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.robots.dh import DHRow, row_transform

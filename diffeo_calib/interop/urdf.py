@@ -24,8 +24,8 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, NumericalError, RobotError
 from diffeo_calib.common.files import read_regular, write_whole
-from diffeo_calib.interop.files import origin_numbers
 from diffeo_calib.interop.rigid import geometry_of
+from diffeo_calib.interop.tables import origin_numbers
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree

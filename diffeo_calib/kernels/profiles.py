@@ -12,6 +12,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from math import gamma, pi
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -20,8 +21,11 @@ from torch import Tensor
 from diffeo_calib.common.checks import wrapped
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.runtime.profiles import FORMULAS
 
 MAX_ORDER = 3  # highest derivative that every profile provides
+METHODS = SimpleNamespace(exp=lambda a: a.exp(), sqrt=lambda a: a.sqrt(), relu=lambda a: a.relu())
+"""Functions of the formulas in runtime/profiles.py for tensors, symbols and lazy matrices."""
 
 
 class Profile(ABC):
@@ -109,55 +113,53 @@ def _derivative(r2: Tensor, profile: Profile, order: int) -> Tensor:
     return kind.apply(r2, profile, order)  # pyright: ignore[reportReturnType]
 
 
+class _Shipped(Profile):
+    """A profile of the package, by the formula of its name."""
+
+    def derivative(self, r2: Any, order: int) -> Any:
+        return next(FORMULAS[self.name](r2, (order,), METHODS))
+
+    def derivatives(self, r2: Any, order: int) -> list[Any]:
+        """[kappa, kappa', ...] from one root and one exponential, differentiable by autograd when r2 is a tensor."""
+        if isinstance(r2, Tensor) and (r2.requires_grad or wrapped(r2)):
+            return super().derivatives(r2, order)
+        return self._direct(r2, order)
+
+    def _direct(self, r2: Any, order: int) -> list[Any]:
+        return list(FORMULAS[self.name](r2, range(order + 1), METHODS))
+
+
 @dataclass(frozen=True)
-class GaussianProfile(Profile):
+class GaussianProfile(_Shipped):
     """kappa = exp(-r2 / 2); on circles the von Mises kernel."""
 
     name = "gaussian"
 
     def spectral_density(self, w2: Tensor, dim: int) -> Tensor:
         """(2 pi)^(-dim / 2) exp(-w2 / 2)."""
-        return (-0.5 * w2).exp() * (2.0 * pi) ** (-0.5 * dim)
+        return (w2 * -0.5).exp() * (2.0 * pi) ** (-0.5 * dim)
 
     def derivatives(self, r2: Any, order: int) -> list[Any]:
-        """[kappa, -kappa/2, kappa/4, ...] from one exponential."""
-        kappa = (r2 * -0.5).exp()
-        return [kappa * (-0.5) ** k if k else kappa for k in range(order + 1)]
-
-    def derivative(self, r2: Any, order: int) -> Any:
-        """(-1/2)^order exp(-r2 / 2)."""
-        return self.derivatives(r2, order)[order]
+        """[kappa, -kappa/2, kappa/4, ...] from one exponential, which autograd follows as often as it likes."""
+        return self._direct(r2, order)
 
 
 @dataclass(frozen=True)
-class CauchyProfile(Profile):
+class CauchyProfile(_Shipped):
     """kappa = 1 / (1 + r2), a heavy-tailed mixture of Gaussians (rational quadratic, alpha = 1)."""
 
     name = "cauchy"
 
-    def derivative(self, r2: Any, order: int) -> Any:
-        """(-1)^k k! (1 + r2)^-(k + 1)."""
-        inverse = 1.0 / (1.0 + r2)
-        factor = (1.0, -1.0, 2.0, -6.0)[order]
-        out = inverse
-        for _ in range(order):
-            out = out * inverse
-        return out * factor
-
 
 @dataclass(frozen=True)
-class ConstantProfile(Profile):
+class ConstantProfile(_Shipped):
     """kappa = 1: a rigid translation of all points."""
 
     name = "constant"
 
-    def derivative(self, r2: Any, order: int) -> Any:
-        """1, then 0."""
-        return r2 * 0.0 + (1.0 if order == 0 else 0.0)
-
 
 @dataclass(frozen=True)
-class MaternProfile(Profile):
+class MaternProfile(_Shipped):
     """Matern with nu = 3/2, 5/2 or 7/2: fields that are once, twice, three times differentiable.
 
     With r = sqrt(2 nu r2):  nu = 3/2: (1 + r) e^-r;  5/2: (1 + r + r^2/3) e^-r;
@@ -180,50 +182,6 @@ class MaternProfile(Profile):
         power = self.nu + 0.5 * dim
         scale = gamma(power) / gamma(self.nu) * pi ** (-0.5 * dim) * (2.0 * self.nu) ** self.nu
         return scale * (2.0 * self.nu + w2) ** -power
-
-    def derivatives(self, r2: Any, order: int) -> list[Any]:
-        """[kappa, kappa', ...] from one root and one exponential, differentiable by autograd when r2 is a tensor."""
-        if isinstance(r2, Tensor) and (r2.requires_grad or wrapped(r2)):
-            return super().derivatives(r2, order)
-        r = self._distance(r2)
-        decay = (-r).exp()
-        return [self._derivative(r, decay, k) for k in range(order + 1)]
-
-    def derivative(self, r2: Any, order: int) -> Any:
-        """d^k kappa / d r2^k through the recursion nu -> nu - 1."""
-        r = self._distance(r2)
-        return self._derivative(r, (-r).exp(), order)
-
-    def _distance(self, r2: Any) -> Any:
-        """r; rounding leaves r2 = -1e-16 at coinciding points."""
-        return (r2.relu() * (2.0 * self.nu)).sqrt()
-
-    def _derivative(self, r: Any, decay: Any, order: int) -> Any:
-        """d^k kappa / d r2^k from r and e^-r."""
-        p = round(self.nu - 0.5)  # 1, 2, 3
-        # kappa_p' = -nu / (2 p - 1) kappa_(p - 1) in the variable r2 at fixed nu, down to kappa_0 = e^-r;
-        # below it the polynomials are continued with the factor -nu.
-        factor = 1.0
-        for _ in range(order):
-            factor *= -self.nu / max(2 * p - 1, 1)
-            p -= 1
-        if p == 0:
-            return decay * factor
-        return _matern_polynomial(r, p) * decay * factor
-
-
-def _matern_polynomial(r: Any, p: int) -> Any:
-    """kappa_p(r) e^r for p = 3, 2, 1 and its continuation p = -1, -2 (singular at r = 0)."""
-    if p == 3:
-        return 1.0 + r * (1.0 + r * (0.4 + r / 15.0))
-    if p == 2:
-        return 1.0 + r * (1.0 + r / 3.0)
-    if p == 1:
-        return 1.0 + r
-    # Below p = 0 the derivative is infinite at r = 0, but every formula multiplies it by |F - F'|^2 or a higher power,
-    # so that the product vanishes. The floor keeps rounding of coinciding points (r2 = 1e-16, not 0) from blowing up.
-    safe = (r * r + 1e-14).sqrt()
-    return 1.0 / safe if p == -1 else (1.0 + safe) / (safe * safe * safe)
 
 
 PROFILES: dict[str, Profile] = {

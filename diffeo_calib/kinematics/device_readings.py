@@ -22,9 +22,9 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import block_diagonal
-from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.devices import Devices, Extrinsics
 from diffeo_calib.sensors.places import PlacedDevices
-from diffeo_calib.sensors.set_ups import MOUNTING, seen_mounted
+from diffeo_calib.sensors.set_ups import MountedMarkers, seen_mounted
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +69,8 @@ class FittedDevice(NamedTuple):
     @classmethod
     def of(cls, fitted: FittedMap, own: PlacedDevices, number: int) -> FittedDevice:
         """A device of a set of those of readings."""
-        kind: Any = type(own.devices)
-        deviations = own.deviations[number]
-        devices: Devices = kind(own.names[number : number + 1], own.constants[number, None], deviations)
+        devices: Any = own.devices.only(own.names[number : number + 1])
+        deviations = devices.deviations[0]
         placed, rows = cls(devices, torch.diag(deviations)), own.rows[own.device == number]
         if not len(rows):
             return placed
@@ -113,9 +112,10 @@ def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[Pre
     """
     fitted: FittedMap = model.map
     for own in model.placement:
-        own.warn_if_unknown()
-    sets = [(own, own.devices) for own in model.placement if own.devices is not None and len(q)]
-    mounted = [one for own in model.placement if own.kind == MOUNTING for one in _mounted(model, own, q, noise=noise)]
+        own.devices.warn_if_unknown()
+    sets = [(own, own.devices) for own in model.placement if own.devices.reads and len(q)]
+    markers = [own.devices for own in model.placement if own.kind == MountedMarkers.kind]
+    mounted = [one for own in markers for one in _mounted(model, own, q, noise=noise)]
     if not sets:
         return mounted
     each = (slice(first, first + PREDICT_ROWS) for first in range(0, len(q), PREDICT_ROWS))
@@ -133,7 +133,7 @@ def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[Pre
     return found
 
 
-def _mounted(model: Any, own: PlacedDevices, q: Tensor, *, noise: bool) -> Iterator[PredictedReadings]:
+def _mounted(model: Any, own: Extrinsics, q: Tensor, *, noise: bool) -> Iterator[PredictedReadings]:
     """Positions of the markers as they were mounted in other sessions than that of the model."""
     mean, covariance = model.predict(q, noise=noise)
     shifts, deviations = (each.unflatten(1, (-1, 3)) for each in (own.constants, own.deviations))

@@ -6,8 +6,8 @@ whether errors are too large to be those of a calibrated robot, or those of a mo
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from math import degrees, inf, radians
 from typing import Any, NamedTuple
@@ -76,9 +76,11 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Any) -> Evaluation | 
     places = place(kinematics, data)
     found = residuals(kinematics, places, data)
     if isinstance(kinematics, CalibratedKinematics):
-        doubt = impossible_errors(kinematics, places, data, found)
-        if doubt is not None:
-            warn_user(doubt)
+        doubt = judged(kinematics, places, data, found, usual=False)
+        if doubt.moved:
+            raise MeasurementError(doubt.refusal)
+        if doubt.refusal is not None:
+            warn_user(doubt.refusal)
     return replace(found.main, placed=found.placed, numbers=found.numbers) if len(found) == 1 else found
 
 
@@ -139,20 +141,17 @@ def place(kinematics: Callable[[Tensor], Tensor], data: Any, *, every_session: b
 
 def devices_of(model: object) -> dict[str, Devices]:
     """The devices of readings whose places a model knows, by kind; none for other kinematics."""
-    sets = getattr(model, "placement", None) or ()
-    known = [own if isinstance(own, Devices) else getattr(own, "devices", None) for own in sets]
     found = dict[str, Devices]()
-    for own in known:
-        if isinstance(own, Devices):
-            found[own.kind] = found[own.kind].beside(own) if own.kind in found else own
+    for own in [own.devices for own in getattr(model, "placement", None) or () if own.devices.reads]:
+        found[own.kind] = found[own.kind].beside(own) if own.kind in found else own
     return found
 
 
 def placement_sentences(model: object) -> list[str]:
     """Where the devices are that a model knows, with deviations; none for other kinematics."""
     drift = KnownDrift.of(model)
-    lines = [line for own in getattr(model, "placement", None) or () for line in own.sentences()]
-    return lines if drift is None else [*lines, *drift.sentences()]
+    lines = [line for own in getattr(model, "placement", None) or () for line in own.devices.sentences()]
+    return lines if drift is None else [*lines, *drift.of_joints()]
 
 
 def at_payloads(kinematics: Callable[[Tensor], Tensor], data: Any) -> Callable[[Tensor], Tensor]:
@@ -195,47 +194,52 @@ def rows_of_other_frames(model: CalibratedKinematics, q: Tensor) -> int:
     return int((torch.cdist(q.to(elsewhere), elsewhere, p=torch.inf) < SAME_CONFIGURATION).any(1).sum())
 
 
-def impossible(model: CalibratedKinematics, median: float) -> bool:
-    """Whether a median error, m, is too large to describe the robot: above a tenth of its reach."""
-    return median > LARGEST_ERROR_PER_REACH * model.robot.reach
+@dataclass(frozen=True)
+class Judgement:
+    """What errors of a model mean.
+
+    Args:
+        refusal: why they say nothing about the robot; None if they do. causes: likely causes of large errors.
+        moved: whether something that moved explains errors that say nothing.
+    """
+
+    refusal: str | None = None
+    causes: Sequence[str] = ()
+    moved: bool = False
 
 
-def impossible_errors(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> str | None:
-    """A sentence about errors that say nothing about the robot; None for others.
+def judged(
+    model: CalibratedKinematics, places: Places, data: Any, found: Evaluations, *, usual: bool = True
+) -> Judgement:
+    """Whether errors are those of a calibrated robot: something may have moved, or a unit is wrong.
 
     Args:
         model: a calibrated model. places, data, found: see :func:`residuals`.
-
-    Raises:
-        MeasurementError: something has moved, which explains them.
+        usual: whether to look at errors below a tenth of the robot's reach too.
     """
+    impossible = LARGEST_ERROR_PER_REACH * model.robot.reach
     for table, _ in divided(data)[1]:
         devices = places.devices[table.column_kind]
         away = devices.errors(table, devices.points_of(_predicted(model, table))).norm(dim=1)
-        if impossible(model, float(away.median())):
+        if (median := float(away.median())) > impossible:
             fix = "check the unit of the readings (--length), their columns (--reading), and the device of every row"
             fix += " (`device`, --session)"
-            got = f"a median of {1e3 * float(away.median()):.4g} mm at the ball"
-            return sentence("these errors are not those of a calibrated robot", got=got, fix=fix)
+            got = f"a median of {1e3 * median:.4g} mm at the ball"
+            return Judgement(sentence("these errors are not those of a calibrated robot", got=got, fix=fix))
     seen = positions_of(model, places, data)
-    if seen is None or found.positions is None or not impossible(model, found.positions.median):
-        return None
-    some = some_rows(seen)
-    if motions(model, some):
-        raise MeasurementError(" ".join(causes_of(model, some, found.positions)))
-    return implausible(model, some, found.positions)
+    if seen is None or found.positions is None or not (usual or found.positions.median > impossible):
+        return Judgement()
+    some, fix = some_rows(seen), "register the model first: `model.registered`, evaluate --free both"
+    moved = [sentence(motion.sentence, fix=fix) for motion in motions(model, some)]
+    causes = moved or [text for text in [implausible(model, some, found.positions)] if text is not None]
+    if found.positions.median > impossible:
+        return Judgement(" ".join(causes) or None, (), bool(moved))
+    return Judgement(None, causes)
 
 
 def some_rows(data: Measurements) -> Measurements:
     """Evenly chosen rows, so many as tell what moved."""
     return data.rows(slice(None, None, -(-len(data) // MOST_ROWS)))
-
-
-def causes_of(model: CalibratedKinematics, some: Measurements, errors: Evaluation) -> list[str]:
-    """What moved, or that these are no errors of a calibrated robot."""
-    fix = "register the model first: `model.registered`, evaluate --free both"
-    causes = [sentence(motion.sentence, fix=fix) for motion in motions(model, some)]
-    return causes or [text for text in [implausible(model, some, errors)] if text is not None]
 
 
 def positions_of(model: CalibratedKinematics, places: Places, data: Any) -> Measurements | None:

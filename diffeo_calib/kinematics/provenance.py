@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, dataclass, field, fields, replace
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from math import inf
-from typing import Any
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from diffeo_calib.common.errors import PACKAGE, InputError, as_written, printable
 
@@ -50,28 +50,6 @@ class Provenance:
         table = "" if measurements.origin is None else measurements.origin.options
         return cls(date, package_version(), measurements.sha256, note, table=table)
 
-    @classmethod
-    def from_dict(cls, entries: Mapping[str, Any]) -> Provenance:
-        """The inverse of :meth:`to_dict`.
-
-        Raises:
-            InputError: an entry is missing or unknown, or is no text.
-        """
-        names = [field.name for field in fields(cls)]
-        if isinstance(entries, Mapping):
-            entries = {"command": "", "table": "", **entries}  # the first files did not have them
-        if not isinstance(entries, Mapping) or set(entries) != set(names):
-            got = sorted(map(str, entries)) if isinstance(entries, Mapping) else entries
-            raise InputError.of("the entry provenance", expected=names, got=got)
-        for name, value in entries.items():
-            if not isinstance(value, str):
-                raise InputError.of(f"the entry {name!r} of the provenance", expected="text", got=as_written(value))
-        return cls(**entries)
-
-    def to_dict(self) -> dict[str, str]:
-        """The fields by name, as model files hold them."""
-        return asdict(self)
-
     def sentence(self, robot: str, rows: int) -> str:
         """One line: ``fitted 2026-11-22 with diffeo_calib 0.1.0 to robot 'ur10', 442 rows, table sha256 ab12...``."""
         made = f"fitted {self.date[:10]} with {PACKAGE} {self.version} to robot '{robot}', {rows} rows"
@@ -96,34 +74,18 @@ def package_version() -> str:
         return "unknown"
 
 
-ENTRIES: dict[str, tuple[str, type]] = {
-    "registration_rms": ("registration rms [m]", float),
-    "geometry_rms": ("geometry rms [m]", float),
-    "diffeomorphic_rms": ("diffeomorphic rms [m]", float),
-    "leave_one_out_rms": ("leave-one-out rms [m]", float),
-    "outliers": ("outliers", int),
-    "noise_degrees_of_freedom": ("noise degrees of freedom", float),
-    "coupling_residual": ("coupling residual", float),
-    "end_residual": ("end residual", float),
-    "energy": ("energy", float),
-    "status": ("status", str),
-    "scales": ("scales", str),
-    "rows": ("rows", int),
-    "effective_parameters": ("effective parameters", float),
-    "length_in_doubt": ("length in doubt [m]", float),
-    "warnings": ("warnings", str),
-}
-"""Field of a summary -> its name in dictionaries and model files, and its type."""
-OF_POSITIONS = ("registration_rms", "geometry_rms", "diffeomorphic_rms", "leave_one_out_rms")
-OPTIONAL = (*OF_POSITIONS, "noise_degrees_of_freedom", "effective_parameters", "length_in_doubt", "warnings")
-"""Fields that may be None: they have no entry then. Old model files do not have the last four."""
 LENGTH_UNIT = " [m]"
 """Ends the names of the parts' entries."""
 INFINITE = "infinite"
-"""An infinite number in a dictionary: JSON has none."""
+"""An infinite number among entries: JSON has none."""
 
 
-@dataclass(frozen=True)
+def _entry(name: str, default: Any = MISSING) -> Any:
+    """A field of another name in model files, which need not hold it if it has a default."""
+    return field(default=default, metadata={"name": name})
+
+
+@dataclass(frozen=True, kw_only=True)
 class Summary:
     """Results of a calibration, in SI units. Errors are those of measured positions: None where none was measured.
 
@@ -133,47 +95,41 @@ class Summary:
         diffeomorphic_rms: the same of the calibrated model, m.
         leave_one_out_rms: RMS distance of every marker from its prediction by all other rows, m.
         outliers: number of measurements flagged as outliers.
+        noise_degrees_of_freedom: of Student's t; infinite for Gaussian noise, None if unknown.
         coupling_residual: certificate of the fit, see :class:`Fit`; dimensionless.
         end_residual: certificate of the fit, see :class:`Fit`; dimensionless.
         energy: value of the minimised energy; dimensionless.
         status: why the fit stopped, in one sentence.
         scales: how the scales of kernels, priors and noise were chosen, in one sentence.
         rows: number of training rows.
-        parts: name of each part of the model -> RMS displacement of the markers that it explains, m.
-        noise_degrees_of_freedom: of Student's t; infinite for Gaussian noise, None if unknown.
         effective_parameters: effective number of parameters of the fit; None if it was not computed.
         length_in_doubt: RMS distance by which points move with a length of robot or device that is improbable, m; None
             without one.
         warnings: what the calibration warned of, one line each; None if it did not.
+        parts: name of each part of the model -> RMS displacement of the markers that it explains, m.
     """
 
-    registration_rms: float | None
-    geometry_rms: float | None
-    diffeomorphic_rms: float | None
-    leave_one_out_rms: float | None
+    registration_rms: float | None = _entry("registration rms [m]", None)
+    geometry_rms: float | None = _entry("geometry rms [m]", None)
+    diffeomorphic_rms: float | None = _entry("diffeomorphic rms [m]", None)
+    leave_one_out_rms: float | None = _entry("leave-one-out rms [m]", None)
     outliers: int
-    coupling_residual: float
-    end_residual: float
+    noise_degrees_of_freedom: float | None = _entry("noise degrees of freedom", None)
+    coupling_residual: float = _entry("coupling residual")
+    end_residual: float = _entry("end residual")
     energy: float
     status: str
     scales: str
     rows: int
-    parts: Mapping[str, float]
-    noise_degrees_of_freedom: float | None = None
-    effective_parameters: float | None = None
-    length_in_doubt: float | None = None
+    effective_parameters: float | None = _entry("effective parameters", None)
+    length_in_doubt: float | None = _entry("length in doubt [m]", None)
     warnings: str | None = None
+    parts: Mapping[str, float]
 
-    def to_dict(self) -> dict[str, float | int | str]:
-        """Entries named with their units, as model files hold them; "infinite" stands for an infinite number."""
-        values: dict[str, float | int | str] = {}
-        for field, (name, _) in ENTRIES.items():
-            value = getattr(self, field)
-            if field == "effective_parameters":  # the parts stand before it
-                values |= {f"{part}{LENGTH_UNIT}": displacement for part, displacement in self.parts.items()}
-            if value is not None:
-                values[name] = INFINITE if value == inf else value
-        return values
+    def to_dict(self) -> dict[str, Any]:
+        """Entries named with their units, as model files hold them, of what is known; the parts are the last ones."""
+        known = {name: value for name, value in entries_of(self, "parts").items() if value is not None}
+        return known | {f"{part}{LENGTH_UNIT}": displacement for part, displacement in self.parts.items()}
 
     @classmethod
     def from_dict(cls, entries: Mapping[str, Any], *, positions: bool = True) -> Summary:
@@ -185,34 +141,59 @@ class Summary:
         Raises:
             InputError: an entry is missing or unknown, or its value has another type.
         """
-        known = {name for name, _ in ENTRIES.values()}
-        values = {field: _value(entries, field) for field in ENTRIES}
-        values |= {} if positions else dict.fromkeys(OF_POSITIONS)
-        parts = {}
-        for name, value in entries.items():
-            if name not in known:
-                if not name.endswith(LENGTH_UNIT):
-                    expected = f"{', '.join(sorted(known))}, or a part with its unit{LENGTH_UNIT}"
-                    raise InputError.of("an entry of the summary", expected=expected, got=as_written(name))
-                parts[name.removesuffix(LENGTH_UNIT)] = _read(value, name, float)
-        return cls(parts=parts, **values)
+        own = {one.metadata.get("name", one.name) for one in fields(cls)}
+        others = [name for name in entries if name not in own and name.endswith(LENGTH_UNIT)]
+        parts = {name.removesuffix(LENGTH_UNIT): read(entries[name], float, name, "summary") for name in others}
+        found = record_of(cls, {k: v for k, v in entries.items() if k not in others}, "summary", parts=parts)
+        return found if positions else replace(found, **dict.fromkeys(OF_POSITIONS))
 
 
-def _value(entries: Mapping[str, Any], field: str) -> Any:
-    """The value of one field of a summary."""
-    name, kind = ENTRIES[field]
-    if name in entries:
-        return _read(entries[name], name, kind)
-    if field in OPTIONAL:
+OF_POSITIONS = ("registration_rms", "geometry_rms", "diffeomorphic_rms", "leave_one_out_rms")
+
+
+# --- dataclasses of plain values as entries of a file ----------------------------------------------------------------
+
+WORDS = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
+Record = TypeVar("Record")
+
+
+def entries_of(record: Any, *without: str) -> dict[str, Any]:
+    """The fields of a dataclass, or some of them, under their names in files."""
+    named = {one.metadata.get("name", one.name): getattr(record, one.name) for one in fields(record)}
+    plain = {name: INFINITE if value == inf else value for name, value in named.items() if name not in without}
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in plain.items()}
+
+
+def record_of(kind: type[Record], entries: object, what: str, **given: Any) -> Record:
+    """A dataclass of the entries of a file, ``what`` in messages, and of other fields that are ``given``.
+
+    Raises:
+        InputError: an entry is missing or unknown, or its value has another type than the field.
+    """
+    known: dict[str, Any] = {one.metadata.get("name", one.name): one for one in fields(kind)}  # pyright: ignore[reportArgumentType]
+    known = {name: one for name, one in known.items() if one.name not in given}
+    needed = {name for name, one in known.items() if one.default is MISSING}
+    if not isinstance(entries, Mapping) or not needed <= set(entries) <= set(known):
+        got = sorted(map(str, entries)) if isinstance(entries, Mapping) else entries
+        raise InputError.of(f"the entry {what}", expected=sorted(known), got=got)
+    hints = get_type_hints(kind)
+    values = {known[name].name: read(value, hints[known[name].name], name, what) for name, value in entries.items()}
+    return kind(**values, **given)
+
+
+def read(value: Any, hint: Any, name: str, what: str) -> Any:
+    """A value of a file as a float, an int, text, true or false, a tuple of these, or None where its type says so."""
+    if get_origin(hint) is tuple and isinstance(value, list):
+        return tuple(read(one, get_args(hint)[0], name, what) for one in value)
+    kinds = get_args(hint) or (hint,)
+    if value is None and type(None) in kinds:
         return None
-    raise InputError.of(f"the summary has no entry {name!r}")
-
-
-def _read(value: Any, name: str, kind: type) -> Any:
-    """An entry as a float, an int or a str; a whole number may stand for a float."""
+    kind = kinds[0]
     if kind is float and value == INFINITE:
         return inf
-    if isinstance(value, bool) or not isinstance(value, (int, float) if kind is float else kind):
-        words = {float: "a number", int: "a whole number", str: "text"}
-        raise InputError.of(f"the entry {name!r} of the summary", expected=words[kind], got=as_written(value))
+    accepted = (int, float) if kind is float else kind  # a whole number may stand for a float
+    if isinstance(value, bool) is not (kind is bool) or not isinstance(value, accepted):
+        raise InputError.of(
+            f"the entry {name!r} of the {what}", expected=WORDS.get(kind, "a list"), got=as_written(value)
+        )
     return kind(value)

@@ -15,7 +15,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.measurements.checks import arrays_sha256, chosen_rows, numbers_of
-from diffeo_calib.measurements.rows import NO_SOCKET, RowGroups, RowTable, check_alike, common, set_attributes
+from diffeo_calib.measurements.rows import NO_SOCKET, RowGroups, check_alike, common, set_attributes
 
 WITH_POSITION = ("position", "pose", "mixture")
 """Kinds of rows of which a device measures positions."""
@@ -36,6 +36,9 @@ class Observations(RowGroups):
     Other attributes are those that all parts have, see :class:`Measurements`; q, line_numbers, payload and covariates
     hold the values of all rows. A line of a file that holds observations of several kinds is several rows.
     """
+
+    parts: Any = ()
+    index: Any = ()
 
     def __init__(self, parts: Sequence[Any], index: Sequence[Tensor]) -> None:
         order = sorted(range(len(index)), key=lambda k: int(index[k].min()))
@@ -108,7 +111,7 @@ class Observations(RowGroups):
         return f"Observations({', '.join(words)}: {', '.join(map(repr, self.parts))})"
 
     def to_frame(self) -> Any:
-        """See :meth:`RowTable.to_frame`; the first column is kind, and cells of other kinds are NaN."""
+        """See :meth:`RowGroups.to_frame`; the first column is kind, and cells of other kinds are NaN."""
         frames = [part.to_frame() for part in self.parts]
         import pandas  # noqa: PLC0415  # optional; the line before has found it
 
@@ -157,7 +160,7 @@ def _pieces(tables: Sequence[Any]) -> list[Rows]:
     if not given:
         raise MeasurementError.of("tables to join", expected="at least one", got="none")
     for table in given:
-        if not isinstance(table, (RowTable, Observations)):
+        if not isinstance(table, RowGroups):
             expected, got = "dc.Measurements, dc.Readings or Observations", type(table).__name__
             raise MeasurementError.of("tables to join", expected=expected, got=got)
     found, start = [], 0

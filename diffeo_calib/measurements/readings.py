@@ -19,7 +19,7 @@ from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.measurements import checks
 from diffeo_calib.measurements.observations import joined_tables
-from diffeo_calib.measurements.rows import RowTable, set_attributes, value_range, with_attributes
+from diffeo_calib.measurements.rows import RowGroups, set_attributes, value_range, with_attributes
 
 MILLIMETRES = "mm", 1e3
 """Unit in which lengths are shown, and how many of it are a metre."""
@@ -33,7 +33,7 @@ ONE_DEVICE = "device"
 
 @methods_outside_inference_mode
 @dataclass(frozen=True, eq=False, repr=False)
-class Readings(RowTable):
+class Readings(RowGroups):
     """N joint configurations and what a device reported in each of one ball, or another mark, on the tool.
 
     Made by :meth:`distances`, :meth:`heights` and :meth:`images`, and by :meth:`of` for devices of your own.
@@ -272,7 +272,7 @@ class Readings(RowTable):
 
     @property
     def ranges(self) -> list[list[str]]:
-        """See :attr:`RowTable.ranges`."""
+        """See :attr:`RowGroups.ranges`."""
         unit = {"px": "px", "mm": "m"}.get(self.unit[0], "rad")
         return [value_range(*one, unit) for one in zip(self.value_names, self.reported.T, strict=True)]
 
@@ -289,7 +289,7 @@ class Readings(RowTable):
 
     @property
     def compared(self) -> Tensor:
-        """See :class:`RowTable`."""
+        """See :class:`RowGroups`."""
         return torch.cat([self.q, self.values, self.device[:, None].to(self.q)], 1)
 
 

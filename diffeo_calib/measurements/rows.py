@@ -52,12 +52,22 @@ CONFIGURATIONS, PLACES = "distinct configurations", "places with sockets"
 
 @methods_outside_inference_mode
 class RowGroups:
-    """Rows that are divided, with repeated configurations kept together, and the sockets of a place.
+    """N rows of one kind with a value per column and row, its columns are the attributes ``BY_ROW`` that are not None.
+
+    Rows of several kinds are :class:`Observations`, whose ``parts`` are tables of one kind each.
 
     Attributes:
-        parts: tables of one kind each. index: (N_i,) int64 for each part, its row numbers here.
         covariates: (N, K) values with which something may drift, such as times and temperatures, in any unit.
     """
+
+    BY_ROW: ClassVar[tuple[str, ...]] = ()
+    """Attributes with a value for each row, all of them tensors (N, ...)."""
+    ALIKE: ClassVar[tuple[str, ...]] = ()
+    """Other attributes in which tables agree that are joined."""
+    NUMBERED: ClassVar[tuple[str, str]]
+    """The column of numbers of set-ups or devices, -1 for none, and the attribute with their names."""
+    flattery: ClassVar[str] = ""
+    """What errors of these rows do not show where no device measured a position."""
 
     q: Tensor
     line_numbers: Tensor
@@ -68,11 +78,106 @@ class RowGroups:
     origin: object | None = None
     covariates: Tensor | None = None
     covariate_names: tuple[str, ...] = ()
-    parts: tuple[Any, ...]
-    index: tuple[Tensor, ...]
-    device_names: Sequence[str]
     without_device: bool = True
     """Whether neither a position nor a pose was measured."""
+    kind: Any
+    compared: Any
+    """(N, c) numbers in which a row that repeats another one equals it."""
+    measured: Any
+    """() -> name -> values (N,) of every column but joints, payloads and covariates, in SI units and pixels."""
+    ranges: Any
+    """Column, smallest and largest value and their unit, of what was measured."""
+
+    @property
+    def parts(self) -> tuple[Self, ...]:
+        """This table alone, so that it can be treated like :class:`Observations`."""
+        return (self,)
+
+    @property
+    def index(self) -> tuple[Tensor]:
+        """(N,) int64 row numbers of this one part."""
+        return (torch.arange(len(self), device=HOST),)
+
+    @property
+    def columns(self) -> dict[str, Tensor]:
+        """The columns that this table has, by name."""
+        return {name: values for name in self.BY_ROW if (values := getattr(self, name)) is not None}
+
+    @property
+    def column_kind(self) -> object:
+        """Key that is equal for tables that can be joined into one."""
+        return self.kind
+
+    @property
+    def device_names(self) -> list[str]:
+        """(N,) name of the device, or of its set-up, of each row; "" without one."""
+        column, names = self.NUMBERED
+        return checks.texts_of(getattr(self, column), getattr(self, names), len(self))
+
+    def beside_images(self) -> list[tuple[Any, Tensor]]:
+        """These rows as they stand beside images of a board with the same tool: tables, and row numbers (M,) here."""
+        return [(self, *self.index)]
+
+    def rows(self, index: object) -> Self:
+        """The rows chosen by an integer, slice, list of integers or boolean mask, in that order.
+
+        Raises:
+            IndexError: an index out of range, or a mask of the wrong length.
+            MeasurementError: the selection is empty, or nothing that chooses rows.
+        """
+        chosen = checks.chosen_rows(index, len(self))
+        return with_attributes(self, **{name: t[chosen.to(t.device)] for name, t in self.columns.items()})
+
+    def of_each(self, change: Callable[[Any, Tensor], Any]) -> Self:
+        """The same rows after a change of each part, given with its row numbers (N_i,)."""
+        return change(self, *self.index)
+
+    def to_frame(self) -> Any:
+        """A pandas.DataFrame of the rows, in SI units and pixels, whose index are the line numbers.
+
+        Its columns are the joints (q1, q2, ... without names), those of :meth:`measured`, known masses as payload, and
+        covariates. ImportError if pandas is not installed.
+        """
+        names = self.joint_names or [f"q{joint + 1}" for joint in range(self.n)]
+        payload = {} if self.payload is None else {"payload": self.payload}
+        columns = dict(zip(names, self.q.T, strict=True)) | self.measured() | payload | self.drifting
+        return data_frame(columns, self.line_numbers.numpy())
+
+    def doubted(self, doubt: bool = True) -> Self:
+        """The same table, after warnings about exact copies of rows and joint values that look like degrees."""
+        pairs = self.copies() if doubt else []
+        if pairs:
+            where = f"first row {pairs[0][1]}, of row {pairs[0][0]}"
+            text = f"{len(pairs)} of {len(self)} rows repeat an earlier row exactly: {where}"
+            warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
+        largest, joint = (float(value) for value in self.q.abs().amax(dim=0).max(dim=0))
+        if doubt and largest > checks.LARGEST_JOINT_ANGLE_RAD:  # the kinds of the joints are not known
+            name = f" ('{self.joint_names[int(joint)]}')" if self.joint_names else ""
+            text = f"`q`, column {int(joint)}{name} reaches {largest:g}: values look like degrees, or like millimetres"
+            warn_user(f"{text} of a prismatic joint; convert them to rad or m if they are.")
+        return self
+
+    @classmethod
+    def in_one(cls, tables: Sequence[Self]) -> Self:
+        """Tables that one table can hold, in order; MeasurementError if they differ in their columns."""
+        if len(tables) == 1:
+            return tables[0]
+        tables = cls.of_one_layout(tables)
+        check_alike(tables, cls.BY_ROW, cls.ALIKE)
+        whole = {name: torch.cat([table.columns[name] for table in tables]) for name in tables[0].columns}
+        same = {name: common([getattr(table, name) for table in tables]) for name in ("file_sha256", "origin")}
+        return with_attributes(tables[0], **whole, **same)
+
+    @classmethod
+    def of_one_layout(cls, tables: Sequence[Self]) -> Sequence[Self]:
+        """The same tables with the same columns, those of a few being empty, and set-ups or devices numbered alike."""
+        column, texts = cls.NUMBERED
+        names = tuple(dict.fromkeys(name for table in tables for name in getattr(table, texts)))
+        found = []
+        for table in tables:
+            new, numbers = checks.numbers_of([*getattr(table, texts), ""], names), getattr(table, column)
+            found.append(table if numbers is None else with_attributes(table, **{column: new[numbers], texts: names}))
+        return found
 
     @property
     def n(self) -> int:
@@ -87,19 +192,6 @@ class RowGroups:
 
     def __iter__(self) -> Iterator[Self]:
         return (self.rows(i) for i in range(len(self)))
-
-    def rows(self, index: object) -> Self:
-        """The rows chosen by an integer, slice, list of integers or boolean mask, in that order.
-
-        Raises:
-            IndexError: an index out of range, or a mask of the wrong length.
-            MeasurementError: the selection is empty, or nothing that chooses rows.
-        """
-        raise NotImplementedError
-
-    def of_each(self, change: Callable[[Any, Tensor], Any]) -> Self:
-        """The same rows after a change of each part, given with its row numbers (N_i,)."""
-        raise NotImplementedError
 
     def with_columns(self, **columns: object) -> Self:
         """The same rows with other attributes; tensors (N, ...) have a value for each row."""
@@ -279,114 +371,6 @@ class RowGroups:
         alone = int(self.places.max()) + 1 + torch.arange(len(self), device=HOST)
         labels = connected(torch.where(resting, self.places, alone)[rows], self.rows(rows).groups())
         return rows.numpy(), labels, PLACES if bool(resting.all()) else CONFIGURATIONS
-
-
-@methods_outside_inference_mode
-class RowTable(RowGroups):
-    """N rows with one value per column and row; its columns are the attributes ``BY_ROW`` that are not None."""
-
-    BY_ROW: ClassVar[tuple[str, ...]] = ()
-    """Attributes with a value for each row, all of them tensors (N, ...)."""
-    ALIKE: ClassVar[tuple[str, ...]] = ()
-    """Other attributes in which tables agree that are joined."""
-    NUMBERED: ClassVar[tuple[str, str]]
-    """The column of numbers of set-ups or devices, -1 for none, and the attribute with their names."""
-    flattery: ClassVar[str] = ""
-    """What errors of these rows do not show where no device measured a position."""
-
-    kind: Any
-    compared: Any
-    """(N, c) numbers in which a row that repeats another one equals it."""
-    measured: Any
-    """() -> name -> values (N,) of every column but joints, payloads and covariates, in SI units and pixels."""
-    ranges: Any
-    """Column, smallest and largest value and their unit, of what was measured."""
-
-    @property
-    def parts(self) -> tuple[Self, ...]:
-        """This table alone, so that it can be treated like :class:`Observations`."""
-        return (self,)
-
-    @property
-    def index(self) -> tuple[Tensor]:
-        """(N,) int64 row numbers of this one part."""
-        return (torch.arange(len(self), device=HOST),)
-
-    @property
-    def columns(self) -> dict[str, Tensor]:
-        """The columns that this table has, by name."""
-        return {name: values for name in self.BY_ROW if (values := getattr(self, name)) is not None}
-
-    @property
-    def column_kind(self) -> object:
-        """Key that is equal for tables that can be joined into one."""
-        return self.kind
-
-    @property
-    def device_names(self) -> list[str]:
-        """(N,) name of the device, or of its set-up, of each row; "" without one."""
-        column, names = self.NUMBERED
-        return checks.texts_of(getattr(self, column), getattr(self, names), len(self))
-
-    def beside_images(self) -> list[tuple[Any, Tensor]]:
-        """These rows as they stand beside images of a board with the same tool: tables, and row numbers (M,) here."""
-        return [(self, *self.index)]
-
-    def rows(self, index: object) -> Self:
-        """See :class:`RowGroups`."""
-        chosen = checks.chosen_rows(index, len(self))
-        return with_attributes(self, **{name: t[chosen.to(t.device)] for name, t in self.columns.items()})
-
-    def of_each(self, change: Callable[[Any, Tensor], Any]) -> Self:
-        """See :class:`RowGroups`."""
-        return change(self, *self.index)
-
-    def to_frame(self) -> Any:
-        """A pandas.DataFrame of the rows, in SI units and pixels, whose index are the line numbers.
-
-        Its columns are the joints (q1, q2, ... without names), those of :meth:`measured`, known masses as payload, and
-        covariates. ImportError if pandas is not installed.
-        """
-        names = self.joint_names or [f"q{joint + 1}" for joint in range(self.n)]
-        payload = {} if self.payload is None else {"payload": self.payload}
-        columns = dict(zip(names, self.q.T, strict=True)) | self.measured() | payload | self.drifting
-        return data_frame(columns, self.line_numbers.numpy())
-
-    def doubted(self, doubt: bool = True) -> Self:
-        """The same table, after warnings about exact copies of rows and joint values that look like degrees."""
-        pairs = self.copies() if doubt else []
-        if pairs:
-            where = f"first row {pairs[0][1]}, of row {pairs[0][0]}"
-            text = f"{len(pairs)} of {len(self)} rows repeat an earlier row exactly: {where}"
-            warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
-        largest, joint = (float(value) for value in self.q.abs().amax(dim=0).max(dim=0))
-        if doubt and largest > checks.LARGEST_JOINT_ANGLE_RAD:  # the kinds of the joints are not known
-            name = f" ('{self.joint_names[int(joint)]}')" if self.joint_names else ""
-            text = f"`q`, column {int(joint)}{name} reaches {largest:g}: values look like degrees, or like millimetres"
-            warn_user(f"{text} of a prismatic joint; convert them to rad or m if they are.")
-        return self
-
-    @classmethod
-    def in_one(cls, tables: Sequence[Self]) -> Self:
-        """Tables that one table can hold, in order; MeasurementError if they differ in their columns."""
-        if len(tables) == 1:
-            return tables[0]
-        tables = cls.of_one_layout(tables)
-        check_alike(tables, cls.BY_ROW, cls.ALIKE)
-        whole = {name: torch.cat([table.columns[name] for table in tables]) for name in tables[0].columns}
-        same = {name: common([getattr(table, name) for table in tables]) for name in ("file_sha256", "origin")}
-        return with_attributes(tables[0], **whole, **same)
-
-    @classmethod
-    def of_one_layout(cls, tables: Sequence[Self]) -> Sequence[Self]:
-        """The same tables with the same columns, those of a few being empty, and set-ups or devices numbered alike."""
-        column, texts = cls.NUMBERED
-        names = tuple(dict.fromkeys(name for table in tables for name in getattr(table, texts)))
-        found = []
-        for table in tables:
-            new, numbers = checks.numbers_of([*getattr(table, texts), ""], names), getattr(table, column)
-            found.append(table if numbers is None else with_attributes(table, **{column: new[numbers], texts: names}))
-        return found
 
 
 def value_range(name: str, values: Tensor, unit: str) -> list[str]:

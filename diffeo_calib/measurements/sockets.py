@@ -18,7 +18,7 @@ from diffeo_calib.common.checks import number_of
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written, few, listed
 from diffeo_calib.measurements.checks import numbers_of, texts_of
-from diffeo_calib.measurements.rows import NO_SOCKET, RowTable, with_attributes
+from diffeo_calib.measurements.rows import NO_SOCKET, RowGroups, with_attributes
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -101,7 +101,7 @@ class Sockets:
         return numbers_of([_place(name) for name in self.names], self.place_names)
 
 
-class SocketTable(RowTable):
+class SocketTable(RowGroups):
     """Rows of markers whose last one may be a ball that rested in sockets.
 
     In a table of both kinds of rows the ball is hidden where a device measured, and the other markers where it rested.

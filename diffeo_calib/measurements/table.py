@@ -24,6 +24,7 @@ from diffeo_calib.measurements.observations import Observations, joined_tables
 from diffeo_calib.measurements.readings import Readings, as_readings
 from diffeo_calib.measurements.rows import NO_SOCKET, set_attributes, value_range, with_attributes
 from diffeo_calib.measurements.sockets import ONE_SESSION, Distances, Sockets
+from diffeo_calib.measurements.table_format import LEVER
 
 XYZ, TURNS = ("x", "y", "z"), ("rx", "ry", "rz")
 
@@ -110,7 +111,7 @@ class Measurements(ImageTable):
         joint_names: Sequence[str] | None = None,
         *,
         on: Sequence[str] | None = None,
-        lever: float = pose_math.LEVER,
+        lever: float = LEVER,
         position_std: object = None,
         rotation_std: object = None,
         camera_on_tool: bool = False,
@@ -216,7 +217,7 @@ class Measurements(ImageTable):
         return joined_tables(parts)
 
     def beside_images(self) -> list[tuple[Any, Tensor]]:
-        """See :class:`RowTable`; poses stay."""
+        """See :class:`RowGroups`; poses stay."""
         return super().beside_images() if self.lever is not None else as_readings(self)
 
     @property
@@ -309,7 +310,7 @@ class Measurements(ImageTable):
 
     @property
     def compared(self) -> Tensor:
-        """See :class:`RowTable`."""
+        """See :class:`RowGroups`."""
         return torch.cat([self.q, self.points.flatten(1)], dim=1)
 
     def __repr__(self) -> str:
@@ -354,7 +355,7 @@ class Measurements(ImageTable):
 
     @property
     def ranges(self) -> list[list[str]]:
-        """See :attr:`RowTable.ranges`; of the places, none for a ball in sockets."""
+        """See :attr:`RowGroups.ranges`; of the places, none for a ball in sockets."""
         places = self.origins.flatten(0, 1)
         measured = places[~places.isnan().any(1)]
         return [value_range(axis, values, "m") for axis, values in zip("xyz", measured.T, strict=True) if len(measured)]
@@ -387,7 +388,7 @@ class Measurements(ImageTable):
         return with_attributes(self, session=numbers, session_names=known, remounted=remounted and numbers is not None)
 
     def doubted(self, doubt: bool = True) -> Measurements:
-        """See :class:`RowTable`; MeasurementError for a marker, or frame, that no row shows."""
+        """See :class:`RowGroups`; MeasurementError for a marker, or frame, that no row shows."""
         if doubt:
             self.check_every_marker_seen()
         return super().doubted(doubt)

@@ -37,7 +37,6 @@ from diffeo_calib.common.errors import InputError, NumericalError, as_written
 from diffeo_calib.fitting.problem import Problem, tangent
 from diffeo_calib.flows.geodesic import energy
 from diffeo_calib.flows.integrators import RK4, Integrator, Run
-from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, finite
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.regression.cholesky import CholeskyRegression
@@ -98,60 +97,67 @@ class Kinematics(NamedTuple):
     curvature: Tensor | None
 
 
-class EulerianFlow:
-    """The solution of (17) with (19) from t = 0 to 1, and of (20) at any other point.
+class EulerianDeformation(Deformation):
+    """k1 for given P0: (17) and (19) solved once from t = 0 to 1, then (20) at any configuration.
 
     Args:
+        spec: nominal map, kernels, prior.
+        x: (N, n) configurations of the data, the fixed points.
+        momenta: P0 (and theta); the joint-space momenta are empty.
+        integrator: time stepping.
         equations: the errata to keep.
-        kernels: K_V on joint space, K_W on R^d.
-        x: (N, n) fixed points.
-        start: k0 at these points.
-        momenta: (N, m) P0.
-        integrator: time stepping. task_dim: d, a divisor of m.
 
     Attributes:
-        nodes: the states (N, 2 m + m n) at the nodes of the time grid: k, P and Dk, concatenated.
+        nodes: the states (N, 2 m + m n) at the nodes of the time grid: k, P and Dk, concatenated. z1: (N, m) k1(x).
+
+    Raises:
+        NumericalError: the flow overflows.
     """
 
-    def __init__(
-        self,
-        equations: Eulerian,
-        kernels: tuple[Kernel, Kernel],
-        x: Tensor,
-        start: Kinematics,
-        momenta: Tensor,
-        *,
-        integrator: Integrator,
-        task_dim: int,
-    ) -> None:
-        self.equations, self.x, self.task_dim = equations, x, task_dim
-        self.joint_kernel, self.task_kernel = kernels
-        self._curvature = start.curvature
-        self._run = Run(integrator, self.rates, torch.cat([start.value, momenta, start.jacobian.flatten(1)], 1))
-        self.nodes = self._run.nodes
+    formulation = "eulerian"
 
-    def __call__(self, start: Kinematics, x: Tensor) -> tuple[Tensor, Tensor]:
-        """(20): k1 (M, m) and the transported Dk1 (M, m, n) at points x (M, n), from k0 there (``start``)."""
-        m = start.value.shape[1]
+    def __init__(
+        self, spec: ModelSpec, x: Tensor, momenta: Momenta, integrator: Integrator, equations: Eulerian
+    ) -> None:
+        self.spec, self.x, self.momenta, self.integrator = spec, x, momenta, integrator
+        self.equations = equations
+        value, jacobian, self._curvature = self._start(x)
+        p = momenta.task.reshape(value.shape)
+        self._run = Run(integrator, self.rates, torch.cat([value, p, jacobian.flatten(1)], 1))
+        self.nodes = self._run.nodes
+        self.z1 = self.unpack(finite(self.nodes[-1], "the flow at fixed points (17) overflows"))[0]
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """k1(x) by (20), (21): (M, n) -> (M, m), differentiable by autograd; for derivatives in x, see `jacobian`."""
+        return self._passive(x)[0]
+
+    def jacobian(self, x: Tensor) -> Tensor:
+        """Dk1(x), transported by (20): (M, m, n). It is NOT the derivative of :meth:`__call__`.
+
+        (18), (19) hold along points that move with v. Used at fixed points, their Jacobian is about 6 % off on the
+        paper's RR test bed (erratum 2; 0.4 % with ``printed_jacobian=False``). The derivative of the call is given by
+        central differences, or by autograd with the equations as printed and without torchdiffeq's adjoint. In the
+        exact model both Jacobians are equal.
+        """
+        return self._passive(x)[1]
+
+    def _passive(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(20): k1 (M, m) and the transported Dk1 (M, m, n) at points x (M, n)."""
+        value, jacobian, bend = self._start(x)
+        m, shape = value.shape[1], jacobian.shape[1:]
 
         def field(state: Tensor, controls: Tensor) -> Tensor:
-            k, jacobian = state[:, :m], state[:, m:].unflatten(1, start.jacobian.shape[1:])
-            return torch.cat(self._transport(Kinematics(k, jacobian, start.curvature), x, controls)[:2], 1)
+            at = Kinematics(state[:, :m], state[:, m:].unflatten(1, shape), bend)
+            return torch.cat(self._transport(at, x, controls)[:2], 1)
 
-        packed = torch.cat([start.value, start.jacobian.flatten(1)], 1)
-        end = self._run.alongside(field, packed, self.rates)[-1]
-        return end[:, :m], end[:, m:].unflatten(1, start.jacobian.shape[1:])
+        end = self._run.alongside(field, torch.cat([value, jacobian.flatten(1)], 1), self.rates)[-1]
+        return end[:, :m], end[:, m:].unflatten(1, shape)
 
     def unpack(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """k (N, m), P (N, m) and Dk (N, m, n) of a state."""
         n = self.x.shape[1]
         m = state.shape[1] // (n + 2)
         return state[:, :m], state[:, m : 2 * m], state[:, 2 * m :].unflatten(1, (m, n))
-
-    def joint_momenta(self, state: Tensor) -> Tensor:
-        """L_V v at the points, with the corrected sign -Dk^T P: (N, n)."""
-        _, momenta, jacobian = self.unpack(state)
-        return self.equations.sign * torch.einsum("imn,im->in", jacobian, momenta)
 
     def rates(self, state: Tensor) -> Tensor:
         """Right-hand side of (17) and (19) for a state: (N, 2 m + m n)."""
@@ -172,70 +178,30 @@ class EulerianFlow:
             controls: the state of the controls.
         """
         (k, jacobian, curvature), (values, momenta, _) = at, self.unpack(controls)
-        z, q, p = (t.reshape(-1, self.task_dim) for t in (k, values, momenta))
-        v, dv = self.joint_kernel.field_and_jacobian(x, self.x, self.joint_momenta(controls))
-        w, dw = self.task_kernel.field_and_jacobian(None if x is None else z, q, p)
-        by_task_field = (dw @ jacobian.reshape(len(dw), self.task_dim, jacobian.shape[-1])).reshape(jacobian.shape)
+        z, q, p = (t.reshape(-1, self.spec.task_dim) for t in (k, values, momenta))
+        v, dv = self.spec.joint_kernel.field_and_jacobian(x, self.x, self._joint_momenta(controls))
+        w, dw = self.spec.task_kernel.field_and_jacobian(None if x is None else z, q, p)
+        by_task_field = (dw @ jacobian.reshape(len(dw), self.spec.task_dim, jacobian.shape[-1])).reshape(jacobian.shape)
         dj = by_task_field - jacobian @ dv
         if curvature is not None:
             dj = dj - torch.einsum("imab,ib->ima", curvature, v)
         return w.reshape(k.shape) - (jacobian @ v[:, :, None])[:, :, 0], dj.flatten(1), dv, dw
 
-
-class EulerianDeformation(Deformation):
-    """k1 for given P0: (17) and (19) solved once, then (20) at any configuration.
-
-    Args:
-        spec: nominal map, kernels, prior.
-        x: (N, n) configurations of the data.
-        momenta: P0 (and theta); the joint-space momenta are empty.
-        integrator: time stepping.
-        equations: the errata to keep.
-
-    Attributes:
-        flow: the solution of (17), (19). z1: (N, m) k1(x).
-
-    Raises:
-        NumericalError: the flow overflows.
-    """
-
-    formulation = "eulerian"
-
-    def __init__(
-        self, spec: ModelSpec, x: Tensor, momenta: Momenta, integrator: Integrator, equations: Eulerian
-    ) -> None:
-        self.spec, self.x, self.momenta, self.integrator = spec, x, momenta, integrator
-        self.equations = equations
-        start = self._start(x)
-        kernels = spec.joint_kernel, spec.task_kernel
-        p = momenta.task.reshape(start.value.shape)
-        self.flow = EulerianFlow(equations, kernels, x, start, p, integrator=integrator, task_dim=spec.task_dim)
-        self.z1 = self.flow.unpack(finite(self.flow.nodes[-1], "the flow at fixed points (17) overflows"))[0]
-
-    def __call__(self, x: Tensor) -> Tensor:
-        """k1(x) by (20), (21): (M, n) -> (M, m), differentiable by autograd; for derivatives in x, see `jacobian`."""
-        return self.flow(self._start(x), x)[0]
-
-    def jacobian(self, x: Tensor) -> Tensor:
-        """Dk1(x), transported by (20): (M, m, n). It is NOT the derivative of :meth:`__call__`.
-
-        (18), (19) hold along points that move with v. Used at fixed points, their Jacobian is about 6 % off on the
-        paper's RR test bed (erratum 2; 0.4 % with ``printed_jacobian=False``). The derivative of the call is given by
-        central differences, or by autograd with the equations as printed and without torchdiffeq's adjoint. In the
-        exact model both Jacobians are equal.
-        """
-        return self.flow(self._start(x), x)[1]
+    def _joint_momenta(self, state: Tensor) -> Tensor:
+        """L_V v at the points, with the corrected sign -Dk^T P: (N, n)."""
+        _, momenta, jacobian = self.unpack(state)
+        return self.equations.sign * torch.einsum("imn,im->in", jacobian, momenta)
 
     def field_energies(self) -> tuple[Tensor, Tensor]:
-        return self._energies(self.flow.nodes[0])
+        return self._energies(self.nodes[0])
 
     @property
     def task_controls(self) -> Tensor:
-        return self.flow.unpack(self.flow.nodes[0])[0].reshape(self.momenta.task.shape)
+        return self.unpack(self.nodes[0])[0].reshape(self.momenta.task.shape)
 
     @property
     def end_momenta(self) -> Tensor:
-        return self.flow.unpack(self.flow.nodes[-1])[1].reshape(self.momenta.task.shape)
+        return self.unpack(self.nodes[-1])[1].reshape(self.momenta.task.shape)
 
     def coupling_residual(self) -> float:
         """NaN: (17) computes v from L_V v = -Dk^T P, so that the coupling holds by construction."""
@@ -243,7 +209,7 @@ class EulerianDeformation(Deformation):
 
     def energy_drift(self) -> float:
         """Relative drift of 1/2 |v|^2 + 1/2 |w|^2, an error of this formulation that small time steps do not remove."""
-        start, end = (float(sum(self._energies(node))) for node in (self.flow.nodes[0], self.flow.nodes[-1]))
+        start, end = (float(sum(self._energies(node))) for node in (self.nodes[0], self.nodes[-1]))
         return abs(end - start) / start if start > 0 else 0.0
 
     def to(self, device: torch.device | str) -> EulerianDeformation:
@@ -251,10 +217,10 @@ class EulerianDeformation(Deformation):
         return EulerianDeformation(*moved, self.integrator, self.equations)
 
     def _energies(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        k, p, _ = self.flow.unpack(state)
+        k, p, _ = self.unpack(state)
         points, momenta = (t.reshape(self.momenta.task.shape) for t in (k, p))
         return (
-            energy(self.spec.joint_kernel, self.x, self.flow.joint_momenta(state)),
+            energy(self.spec.joint_kernel, self.x, self._joint_momenta(state)),
             energy(self.spec.task_kernel, points, momenta),
         )
 

@@ -74,7 +74,7 @@ def write_report(
     fit, rows = f"{robot.n} joints, {len(model.configurations)} rows in the fit{date}{note}", sentences.rows_of(found)
     if warnings is None:
         warnings = (summary.warnings or "").splitlines() if summary else []
-    sha256 = None if data is None or not found.shown.new else data.sha256
+    sha256 = None if data is None or not found.new else data.sha256
     text = page(
         title=printable(title or f"Robot {robot.name}, {robot.base} to {robot.tip}"),
         subtitle=f"{fit}. Errors: {rows}.",

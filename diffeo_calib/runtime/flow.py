@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import islice
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from diffeo_calib.runtime.arrays import Array, transforms
-from diffeo_calib.runtime.tables import PROFILES, JointTables, cells_around, tabulated, within_turn
+from diffeo_calib.runtime.profiles import FORMULAS
+from diffeo_calib.runtime.tables import JointTables, cells_around, tabulated, within_turn
 
 BLOCK = 1 << 16
 """Largest number of kernel values that are held at once: they stay in the cache of the processor."""
@@ -57,7 +57,7 @@ class RadialTerm:
         """
         F, r2 = squared_distances(self, stage, x, NUMPY)
         (N, n), D = x.shape, F.shape[1]
-        kappa, derivative = islice(PROFILES[self.profile](r2), 2)
+        kappa, derivative = FORMULAS[self.profile](r2, range(2))
         both = derivative @ self._products[stage]
         slope = 2.0 * (both[:, :n, None] * F[:, None, :] - both[:, n:].reshape(N, n, D))
         out, L = np.zeros((N, n, n)), len(self.centre)
@@ -143,7 +143,7 @@ NUMPY = SimpleNamespace(
     ones_like=np.ones_like,
     broadcast_to=np.broadcast_to,
     at_least=lambda values, floor: np.maximum(values, floor, out=values),
-    profile=lambda name, r2: next(PROFILES[name](r2)),
+    profile=lambda name, r2: next(FORMULAS[name](r2, (0,))),
     cells_around=cells_around,
     combined=combined,
     transforms=transforms,

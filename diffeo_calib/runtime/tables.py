@@ -7,82 +7,18 @@ A term of the joint kernel that acts on one revolute joint alone makes the field
 a function of that joint's value. Quintic Hermite interpolation of (f, f', f'') replaces the sum. Matern kernels have
 kinks in a higher derivative at the controls: these are knots, so that the function is smooth within every cell. Cells
 are halved until the error at their middle is below :data:`TOLERANCE`.
-
-Radial profiles kappa(r2) and their derivatives in NumPy; kernels/profiles.py has the formulas for torch.
-
-Matern profiles use r = sqrt(2 nu r2). Their second derivative in r2 may be infinite at r = 0, where every formula
-multiplies it by a higher power of r: a floor under r keeps the product finite.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from diffeo_calib.runtime.arrays import Array, as_index
-
-SMALLEST_RADIUS = 1e-7
-"""Floor under r where a formula divides by it."""
-
-
-def gaussian(r2: Array) -> Iterator[Array]:
-    """exp(-r2 / 2)."""
-    kappa = r2 * -0.5
-    np.exp(kappa, out=kappa)
-    yield kappa
-    yield -0.5 * kappa
-    yield 0.25 * kappa
-
-
-def cauchy(r2: Array) -> Iterator[Array]:
-    """1 / (1 + r2)."""
-    kappa = 1.0 / (1.0 + r2)
-    yield kappa
-    yield -(kappa**2)
-    yield 2.0 * kappa**3
-
-
-def constant(r2: Array) -> Iterator[Array]:
-    """1: the same motion everywhere."""
-    yield from (np.ones_like(r2), np.zeros_like(r2), np.zeros_like(r2))
-
-
-def matern(r2: Array, *, order: int) -> Iterator[Array]:
-    """p_k(r) exp(-r) with r = sqrt(2 nu r2), nu = k + 1/2, for the orders k = 1, 2, 3.
-
-    d kappa_k / d r2 = -c / (2 (2 k - 1)) kappa_(k-1) at fixed c = 2 nu, with kappa_0 = exp(-r) and
-    d kappa_0 / d r2 = -c / (2 r) exp(-r).
-    """
-    c, factor = 2.0 * order + 1.0, 1.0
-    r = np.sqrt(np.maximum(r2, 0.0) * c)
-    decay = np.exp(-r)
-    for k in range(order, order - 3, -1):
-        yield factor * MATERN[k](r) * decay
-        factor *= -0.5 * c / max(2 * k - 1, 1)
-
-
-MATERN: dict[int, Callable[[Array], Array]] = {
-    3: lambda r: 1.0 + r * (1.0 + r * (0.4 + r / 15.0)),
-    2: lambda r: 1.0 + r * (1.0 + r / 3.0),
-    1: lambda r: 1.0 + r,
-    0: np.ones_like,
-    -1: lambda r: 1.0 / np.maximum(r, SMALLEST_RADIUS),
-}
-"""kappa_k exp(r)."""
-
-PROFILES: dict[str, Callable[[Array], Iterator[Array]]] = {
-    "gaussian": gaussian,
-    "cauchy": cauchy,
-    "constant": constant,
-    "matern32": partial(matern, order=1),
-    "matern52": partial(matern, order=2),
-    "matern72": partial(matern, order=3),
-}
-"""All profiles by their names in model files: kappa at r2, and on request its first two derivatives in r2."""
+from diffeo_calib.runtime.profiles import FORMULAS
 
 TOLERANCE = 1e-13
 """Largest error of a table, rad; for fields above 1 rad relative to the largest."""
@@ -117,7 +53,7 @@ class PeriodicSum:
         for rows in (slice(first, first + size) for first in range(0, len(x), size)):
             around = np.stack([np.cos(x[rows]), np.sin(x[rows])], axis=1)
             along, across = around @ np.stack([cosine, sine]), around @ np.stack([-sine, cosine])  # cos, sin of x - q
-            kappa, slope, curvature = PROFILES[self.profile](scale * (1.0 - along))
+            kappa, slope, curvature = FORMULAS[self.profile](scale * (1.0 - along), range(3))
             first, second = scale * across, scale * along  # derivatives of the squared distance
             sums = (kappa, slope * first, curvature * first**2 + slope * second)
             out[rows] = np.stack([s @ self.weights for s in sums], axis=1)

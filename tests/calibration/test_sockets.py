@@ -16,7 +16,7 @@ from table_bank import refused
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.socket_plausibility import check_registration, check_sockets
+from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration, check_sockets
 from diffeo_calib.calibration.identification.identification import Prior, identify
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import Placed, place
@@ -300,7 +300,7 @@ def test_a_tool_that_never_turns_or_tilts(plain: SimulatedArm, some: SocketRows)
                            (upright, pytest.warns(dc.DiffeoCalibWarning, match="never tilted"))):  # fmt: skip
         data = dc.Measurements.from_sockets(change(some.q[:1].repeat(12, 1)), ["a"] * 12)
         with expect:
-            check_registration(plain.nominal, data, register_sockets(plain.nominal, data.q, data.socket))
+            check_socket_registration(plain.nominal, data, register_sockets(plain.nominal, data.q, data.socket))
 
 
 def test_tables_that_cannot_be_made(some: SocketRows) -> None:

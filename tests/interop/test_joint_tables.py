@@ -13,7 +13,6 @@ from product_bank import Case, simulated
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.interop.joint_tables import correction_tables, write_correction_tables, write_joint_offsets
 from diffeo_calib.interop.rigid import (
     applied_with_tables,
     best_joint_offsets,
@@ -21,6 +20,7 @@ from diffeo_calib.interop.rigid import (
     nominal_kinematics,
     rigid_kinematics,
 )
+from diffeo_calib.interop.tables import correction_tables, write_correction_tables, write_joint_offsets
 
 
 def read(path: Path) -> list[dict[str, str]]:

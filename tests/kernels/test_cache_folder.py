@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from diffeo_calib.common.errors import DiffeoCalibWarning
-from diffeo_calib.kernels.reductions import keops
+from diffeo_calib.kernels.reductions import cache_folder
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "getuid"), reason="home folders are private here")
 as_root = pytest.mark.skipif(hasattr(os, "getuid") and os.getuid() != 0, reason="needs files of another user")
@@ -27,7 +27,7 @@ def _new(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
 
 
 def _forget() -> None:
-    for function in (keops._kept_folder, keops._passing_folder, keops._warned):
+    for function in (cache_folder._kept_folder, cache_folder._passing_folder):
         function.cache_clear()
 
 
@@ -42,18 +42,18 @@ def kept(folder: Path) -> Path:
 def passing(place: Path | str) -> None:
     """Assert that this process has a folder of its own, and says so once."""
     with pytest.warns(DiffeoCalibWarning, match="for this run only: '[^']*diffeo_calib' is no folder") as caught:
-        found = keops.cache_folder(NAME)
+        found = cache_folder.cache_folder(NAME)
     assert len(caught) == 1
     assert str(place) in str(caught[0].message)
     assert not list(found.iterdir())
     assert stat.S_IMODE(found.stat().st_mode) == 0o700
-    assert keops.cache_folder(NAME) == found  # without a warning
+    assert cache_folder.cache_folder(NAME) == found  # without a warning
 
 
 def test_the_users_folder_is_used_and_closed_to_others(tmp_path: Path) -> None:
     own = kept(tmp_path / "cache")
     own.chmod(0o755)
-    assert keops.cache_folder(NAME) == own
+    assert cache_folder.cache_folder(NAME) == own
     assert stat.S_IMODE(own.stat().st_mode) == 0o700
 
 
@@ -61,7 +61,7 @@ def test_what_is_made_is_closed_to_others_whatever_the_umask(tmp_path: Path) -> 
     before = os.umask(0)
     try:
         (tmp_path / "cache").mkdir(mode=0o755)
-        folder = keops.cache_folder(NAME)
+        folder = cache_folder.cache_folder(NAME)
     finally:
         os.umask(before)
     assert folder == tmp_path / "cache" / "diffeo_calib" / NAME
@@ -111,13 +111,13 @@ def test_a_shared_folder_that_keeps_files_of_their_owners_is_used(tmp_path: Path
     """As /tmp does."""
     own = kept(tmp_path / "cache")
     (tmp_path / "cache").chmod(0o1777)
-    assert keops.cache_folder(NAME) == own
+    assert cache_folder.cache_folder(NAME) == own
 
 
 def test_a_link_to_a_folder_of_the_user_is_followed(tmp_path: Path) -> None:
     own = kept(tmp_path / "elsewhere")
     (tmp_path / "cache").symlink_to(tmp_path / "elsewhere")
-    assert keops.cache_folder(NAME) == own
+    assert cache_folder.cache_folder(NAME) == own
 
 
 @pytest.mark.parametrize("home", ["", "relative"])

@@ -24,7 +24,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile, Profile
-from diffeo_calib.kernels.reductions import backends, keops
+from diffeo_calib.kernels.reductions import backends, formulas
 from diffeo_calib.kernels.reductions import fused as sums
 from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Dense, Formula, Points
 from diffeo_calib.kernels.reductions.fused import Fused
@@ -182,8 +182,8 @@ def test_a_folder_that_cannot_be_written_does_not_matter(tmp_path: Path, monkeyp
 def test_without_llvmlite_tiles_do_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "llvmlite", None)
     monkeypatch.setattr(sums, "machine", sums.Machine)
-    sums._reason.cache_clear()
-    keops._warned.cache_clear()
+    sums._missing.cache_clear()
+    formulas._warn.cache_clear()
     q, a = normal(200, 3, seed=1), normal(200, 3, seed=2)
     expected = dc.Gaussian(0.5).using("tiled").field(None, q, a)
     try:
@@ -192,7 +192,7 @@ def test_without_llvmlite_tiles_do_the_work(monkeypatch: pytest.MonkeyPatch) -> 
         with pytest.warns(DiffeoCalibWarning, match=r"llvmlite.*diffeo_calib\[fused\].*tiled"):
             assert torch.equal(dc.Gaussian(0.5).using("fused").field(None, q, a), expected)
     finally:
-        sums._reason.cache_clear()
+        sums._missing.cache_clear()
 
 
 def test_what_cannot_be_written_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -240,10 +240,10 @@ def test_a_process_forked_while_a_thread_compiles_can_compile() -> None:
 def test_a_failure_of_llvm_is_not_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
     backend = Fused()
     monkeypatch.setattr(Program, "code", lambda self: ("nonsense", [1.0]))
-    keops._warned.cache_clear()
+    formulas._warn.cache_clear()
     with pytest.warns(DiffeoCalibWarning, match="LLVM could not compile"):
         assert backend.reduce(FIELD, GaussianProfile(), None, points(30, 2)) is None
-    assert not backend.available()
+    assert not backend.usable()
     assert backend.reduce(FIELD, GaussianProfile(), None, points(30, 2)) is None
 
 

@@ -121,7 +121,7 @@ def test_auto_chooses_by_size_and_device(
     monkeypatch: pytest.MonkeyPatch, device: str, usable: bool, compiled: bool
 ) -> None:
     monkeypatch.setattr(backends.BACKENDS["keops"], "usable", lambda: usable)
-    monkeypatch.setattr(backends.FUSED, "available", lambda: compiled)
+    monkeypatch.setattr(backends.FUSED, "trouble", lambda: "" if compiled else "not here")
     here, most, fewest = torch.device(device), backends.DENSE_PAIRS[device], backends.KEOPS_PAIRS
     least = backends.FUSED_PAIRS
     large = "keops" if usable else "tiled"

@@ -19,10 +19,9 @@ from two_arms_bank import HANDS, robot
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.kinematics.compensation.box_search import _Search, box_minimum, joint_limits
-from diffeo_calib.kinematics.compensation.chord import Box
-from diffeo_calib.kinematics.compensation.kinematics import ToolFunctions, tool_functions
-from diffeo_calib.kinematics.compensation.targets import Targets
+from diffeo_calib.kinematics.compensation.problem import joint_limits
+from diffeo_calib.kinematics.compensation.search import Box, _Search, box_minimum
+from diffeo_calib.kinematics.compensation.targets import Targets, ToolFunctions, tool_functions
 from diffeo_calib.measurements.poses import angle_between
 from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.se3 import twist_transform

@@ -16,11 +16,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.kinematics.evaluation import (
-    implausible,
-    impossible,
-    rows_used_in_fit,
-)
+from diffeo_calib.kinematics.evaluation import implausible, rows_used_in_fit
 from diffeo_calib.kinematics.joint_ranges import joints_outside_range, refuse_other_angles, warn_outside_range
 from diffeo_calib.measurements.poses import mark_points, rotation_matrices, transforms
 from diffeo_calib.measurements.rows import with_attributes
@@ -180,9 +176,7 @@ def test_implausible_errors_have_a_sentence(arm: Case) -> None:
     text = implausible(arm.model, moved, errors) or ""
     assert text.startswith("these errors are not those of a calibrated robot: expected a median of about ")
     assert f"got {1e3 * errors.median:.3g} mm; check `length` and `angle`, the order of the columns, and that" in text
-    assert not impossible(arm.model, errors.median)
     far = dc.Measurements(arm.test.q, arm.test.points + 0.5)
-    assert impossible(arm.model, dc.evaluate(arm.model.__call__, far).median)
     with pytest.raises(MeasurementError, match=r"moving the measuring device by 866 mm .*--free both"):
         dc.evaluate(arm.model, far)
 

@@ -59,7 +59,7 @@ def test_a_flow_ends_with_its_last_reference() -> None:
     gc.collect()
     gc.disable()
     try:
-        flow = ref(deformed(P0).flow)
+        flow = ref(deformed(P0))
         assert flow() is None
     finally:
         gc.enable()

@@ -18,8 +18,7 @@ from diffeo_calib.common.files import write_figure
 from diffeo_calib.reports.analysis import predictions
 from diffeo_calib.reports.analysis.findings import find
 from diffeo_calib.reports.analysis.predictions import SHARES, FitRows, Predictions, forecast
-from diffeo_calib.reports.analysis.repeats import repeats_of
-from diffeo_calib.reports.analysis.stages import Deviations, stages_of
+from diffeo_calib.reports.analysis.stages import Deviations, repeats_of, stages_of
 from diffeo_calib.reports.html.sentences import advice
 from diffeo_calib.sensors.errors import Evaluation
 
@@ -178,22 +177,22 @@ def test_outliers_and_moved_markers_are_named(arm: Case) -> None:
     points = test.points.clone()
     points[17] += 0.005
     found = find(arm.model, dc.Measurements(test.q, points))
-    assert [one.row for one in found.shown.outliers] == [17]
-    assert found.shown.moved == []
+    assert [one.row for one in found.outliers] == [17]
+    assert found.moved == []
     turned = find(arm.model, dc.Measurements(test.q, test.points + torch.tensor([0.003, 0.0, 0.0])))
-    assert any("measuring device" in text for text in turned.shown.moved)
+    assert any("measuring device" in text for text in turned.moved)
 
 
 def test_rows_of_the_fit_are_left_out_of_new_rows(arm: Case) -> None:
     test = arm.test[:60]
     both = dc.Measurements.joined([arm.train, test])
     found = find(arm.model, both)
-    assert not found.shown.predictions.left_out
-    assert len(found.shown.predictions) == len(test)
+    assert not found.predictions.left_out
+    assert len(found.predictions) == len(test)
     assert found.errors["calibrated"].rms == pytest.approx(dc.evaluate(arm.model, test).rms)
     same = find(arm.model, arm.train)
-    assert same.shown.predictions.left_out
-    assert len(same.shown.predictions) == len(arm.train)
+    assert same.predictions.left_out
+    assert len(same.predictions) == len(arm.train)
 
 
 @pytest.mark.slow
@@ -208,10 +207,10 @@ def test_models_with_control_points_and_with_outliers() -> None:
         find(model)
     assert find(model, test).errors["calibrated"].rms == pytest.approx(dc.evaluate(model, test).rms)
     found = find(model, data)
-    assert {3, 40} <= {one.row for one in found.shown.outliers}
+    assert {3, 40} <= {one.row for one in found.outliers}
     good = torch.ones(80, dtype=torch.bool)
     good[[3, 40]] = False
-    rms = float(found.shown.predictions.errors.rows(good).rms)
+    rms = float(found.predictions.errors.rows(good).rms)
     assert rms == pytest.approx(dc.evaluate(model, test).rms, rel=0.3)
 
 
@@ -230,7 +229,7 @@ def test_errors_that_no_calibrated_robot_has_are_not_praised(arm: Case) -> None:
         find(arm.model, dc.Measurements(test.q, test.points[..., [1, 0, 2]]))
     noise = 0.01 * torch.randn(60, 1, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     found = find(arm.model, dc.Measurements(test.q, test.points + noise))
-    assert any("not those of a calibrated robot" in text for text in found.shown.moved)
+    assert any("not those of a calibrated robot" in text for text in found.moved)
     assert not any("Twice as many" in text for text in advice(found))
 
 
@@ -239,8 +238,8 @@ def test_rows_that_placed_a_model_are_not_new(arm: Case) -> None:
     test = arm.test[:60]
     shifted = dc.Measurements(test.q, test.points + torch.tensor([0.3, 0.1, -0.2]))
     registered = arm.model.registered(shifted[:12])
-    assert len(find(registered, shifted).shown.predictions) == len(shifted) - 12
-    assert find(registered, shifted[:12]).shown.predictions.left_out
+    assert len(find(registered, shifted).predictions) == len(shifted) - 12
+    assert find(registered, shifted[:12]).predictions.left_out
 
 
 def test_neighbours_and_copies_are_no_repeats(arm: Case) -> None:

@@ -106,7 +106,7 @@ def test_rows_of_the_fit_are_seen_from_its_own_frame(arm: Case, tmp_path: Path) 
     result = dc.calibrate(arm.robot, table, hyperparameters=usual_scales(arm.robot))
     found = made(tmp_path / "report.html", result.model, table)
     assert found.errors["calibrated"].rms < 2.0 * result.left_out_rms
-    assert found.shown.predictions.data.line_numbers[0] == 2
+    assert found.predictions.data.line_numbers[0] == 2
     unseen = arm.test[:SHOWN]
     new = dc.Measurements(unseen.q, unseen.points + torch.tensor([0.3, -0.1, 0.2]), arm.robot.joint_names)
     new = new.with_sessions(["tuesday"] * len(new))
@@ -227,8 +227,8 @@ def test_measured_positions_decide_about_a_tolerance() -> None:
     assert found.deviations.error.whole < 1e-3 < found.judged.value
     assert verdict(found, 1e-3).startswith("Above")
     new = find(kind.model, kind.new)
-    assert new.shown.predictions is not None
-    assert len(new.shown.predictions) == len(tracked) < new.count
+    assert new.predictions is not None
+    assert len(new.predictions) == len(tracked) < new.count
     assert list(new.kinds) == ["position", "socket"]
     assert f"on {len(tracked)} rows that the model has not seen" in verdict(new)
     assert "Spread within sockets: " in verdict(new)

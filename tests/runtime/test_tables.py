@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from diffeo_calib.runtime.tables import PROFILES, JointTables, PeriodicSum, tabulate
+from diffeo_calib.runtime.profiles import FORMULAS
+from diffeo_calib.runtime.tables import JointTables, PeriodicSum, tabulate
 
-SMOOTH = [name for name in PROFILES if name != "matern32"]
+SMOOTH = [name for name in FORMULAS if name != "matern32"]
 
 
 def periodic_sum(profile: str, lengthscale: float = 0.3, count: int = 40) -> PeriodicSum:
@@ -31,7 +32,7 @@ def test_interpolation_error(profile: str) -> None:
     assert not values[:, 0].any()
 
 
-@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("profile", FORMULAS)
 def test_derivatives_against_differences(profile: str) -> None:
     exact, x, h = periodic_sum(profile), np.linspace(0.013, 6.0, 50), 1e-5
     _, slope, curvature = exact.derivatives(x).T

@@ -13,12 +13,13 @@ from difflib import SequenceMatcher
 from itertools import combinations, permutations
 from math import degrees, inf
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.conventions import Convention, conventions, frame_projector, socket_projector
+from diffeo_calib.calibration.diagnostics.conventions import Convention, conventions, without
 from diffeo_calib.calibration.identification.registration import can_register, register, spread
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import (
@@ -32,9 +33,9 @@ from diffeo_calib.common.errors import (
 )
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake
-from diffeo_calib.measurements.csv import rotations
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
+from diffeo_calib.measurements.csv.tables import numeric_table, rereadings, with_coordinate
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import UNITS_PER_METRE
 from diffeo_calib.robots.cartesian import is_cartesian
@@ -113,6 +114,25 @@ def residual_of(robot: Tree, data: Measurements) -> float:
     return registered(Reading.of(robot, data))[0]
 
 
+def check_fit(
+    robot: Tree,
+    data: Measurements,
+    typical: float,
+    what: str,
+    *,
+    expected: str,
+    got: str,
+    otherwise: str | None = None,
+    **search: Any,
+) -> None:
+    """Refuse measurements that a mistake explains, see :func:`likely_mistake`; else warn and advise ``otherwise``."""
+    mistake = likely_mistake(robot, data, typical, **search)
+    if mistake:
+        raise MeasurementError.of(what, expected=expected, got=got, fix=mistake)
+    if otherwise is not None:
+        warn_user(sentence(what, expected=expected, got=got, fix=otherwise))
+
+
 def likely_mistake(
     robot: Tree, data: Measurements, typical: float, groups: Sequence[Group] = (), judge: Judge = registered
 ) -> str:
@@ -150,14 +170,6 @@ def likely_mistake(
     return f"{words} (the median residual falls from {1e3 * typical:.3g} to {1e3 * best:.3g} mm)"
 
 
-def refuse_or_warn(what: str, *, expected: str, got: str, mistake: str, otherwise: str | None = None) -> None:
-    """Refuse measurements that a mistake explains; else warn of them and advise ``otherwise``, if that is given."""
-    if mistake:
-        raise MeasurementError.of(what, expected=expected, got=got, fix=mistake)
-    if otherwise is not None:
-        warn_user(sentence(what, expected=expected, got=got, fix=otherwise))
-
-
 # --- other readings ---------------------------------------------------------------------------------------------------
 
 
@@ -183,7 +195,7 @@ def other_points(robot: Tree, data: Measurements) -> Iterator[Reading]:
 
 def other_rotations(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Measured poses whose rotations are read in other ways, or whose poses are inverted."""
-    return (replace(Reading.of(robot, data), **one._asdict()) for one in rotations.other_rotations(data))
+    return (replace(Reading.of(robot, data), **one) for one in rereadings(data))
 
 
 def other_units(robot: Tree, data: Measurements, *, slides: bool = True) -> Iterator[Reading]:
@@ -198,7 +210,7 @@ def other_units(robot: Tree, data: Measurements, *, slides: bool = True) -> Iter
 
 def longer_chains(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """The same with joints below the given tip, for which the table has columns whose values vary."""
-    columns, table = rotations.numeric_table(data)
+    columns, table = numeric_table(data)
     if columns is None or robot.source is None or len(robot.tips) > 1:
         return
     spare, content = _spare(columns, table), robot.source.encode("utf-8", "surrogateescape")
@@ -223,7 +235,7 @@ def longer_chains(robot: Tree, data: Measurements) -> Iterator[Reading]:
 
 def other_columns(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """One column of the joints or of the position replaced by one of similar name that was not read."""
-    columns, table = rotations.numeric_table(data)
+    columns, table = numeric_table(data)
     if columns is None:
         return
     spare, as_read = _spare(columns, table), Reading.of(robot, data)
@@ -236,7 +248,7 @@ def other_columns(robot: Tree, data: Measurements) -> Iterator[Reading]:
     for marker, triple in enumerate(columns.table.triples):
         for axis, own in enumerate(triple):
             for name in _similar([own], spare):
-                points = rotations.with_coordinate(data, marker, axis, spare[name] / columns.table.per_metre)
+                points = with_coordinate(data, marker, axis, spare[name] / columns.table.per_metre)
                 words = f"column '{shown(name)}' fits in place of '{shown(own)}': check the position columns"
                 yield replace(as_read, points=points, words=words)
 
@@ -263,7 +275,7 @@ def _joint_values(columns: Columns, values: Tensor, *, slides: bool) -> Tensor:
 
 def other_conventions(robot: Tree, data: Measurements, judge: Judge = registered) -> Iterator[Reading]:
     """Joint values, or commanded poses, in another convention."""
-    (columns, table), own = rotations.numeric_table(data), Reading.of(robot, data)
+    (columns, table), own = numeric_table(data), Reading.of(robot, data)
     pose = None if columns is None else columns.joints
     if is_cartesian(robot):
         if columns is not None and isinstance(pose, PoseColumns):
@@ -289,7 +301,9 @@ def conventions_of(robot: Tree, data: Measurements, angle: str, judge: Judge = r
         return residual / size
 
     def projector(chosen: Tensor) -> Tensor:
-        return socket_projector(socket[chosen]) if free else frame_projector(places[chosen])
+        own, at = socket[chosen], places[chosen]
+        affine = torch.cat([torch.ones_like(at[:, :1]), at - at.mean(0)], 1)
+        return without((own[:, None] == own.unique()).to(at) if free else affine)
 
     tip = robot.tips.index(data.on[marker]) if data.on else 0
     per_rad = degrees(1.0) if angle == "deg" else 1.0

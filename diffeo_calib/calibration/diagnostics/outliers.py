@@ -177,7 +177,7 @@ def _reason(row: int, body: int, data: Measurements, predicted: Tensor, bad: Ten
 
 
 class DeviceRows(NamedTuple):
-    """Rows of one kind that one device, or a device in one set-up, measured: its name, and their numbers (M,)."""
+    """Rows of one kind that one device, or a device in one set-up, measured: its name, their numbers (M,), and they."""
 
     words: str
     rows: Tensor
@@ -193,33 +193,26 @@ def _device_rows(data: Any) -> Iterator[DeviceRows]:
             yield DeviceRows(f"{part.kind}s" + f" of '{name}'" * bool(name), numbers[own], part.rows(own))
 
 
-class Stuck(NamedTuple):
-    """A column in which a device reports one value, in words, and the numbers (M,) of the rows in which it does."""
-
-    words: str
-    rows: Tensor
-
-
-def stuck_columns(data: Any) -> list[Stuck]:
-    """Columns of any table in which a device reports one value in all rows where it reports any."""
-    found = []
+def stuck_columns(data: Any) -> list[DeviceRows]:
+    """Columns of any table in which a device reports one value in all rows where it reports any, and these rows."""
+    found = list[DeviceRows]()
     for words, rows, table in _device_rows(data):
         for name, values in table.measured().items():
             if not isinstance(values, Tensor) or name.startswith(OF_DEVIATIONS):
                 continue
             seen = ~values.isnan()
             if int(seen.sum()) >= gates.STUCK_ROWS and bool((values[seen] == values[seen][0]).all()):
-                found.append(Stuck(f"'{name}' of the {words}", rows[seen.to(rows.device)]))
+                found.append(DeviceRows(f"'{name}' of the {words}", rows[seen.to(rows.device)], table))
     return found
 
 
-def _stuck_words(stuck: Sequence[Stuck]) -> str:
+def _stuck_words(stuck: Sequence[DeviceRows]) -> str:
     several = len(stuck) > 1
     names = few([one.words for one in stuck], MOST_NAMES)
     return f"{names} hold{'s' * (not several)} one value in all of {'their' if several else 'its'} rows"
 
 
-def warn_of_stuck(data: TangentData, stuck: Sequence[Stuck]) -> None:
+def warn_of_stuck(data: TangentData, stuck: Sequence[DeviceRows]) -> None:
     """Warn of columns of one value although the robot moves what they tell, by the geometric calibration."""
     size, bad = spread(data.points.unflatten(1, (-1, 3))), []
     for one in stuck:

@@ -20,7 +20,7 @@ from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_
 from diffeo_calib.calibration.diagnostics.moved_devices import Variation, variation
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_open_directions
 from diffeo_calib.calibration.diagnostics.outliers import Outlier
-from diffeo_calib.calibration.diagnostics.socket_plausibility import check_readings
+from diffeo_calib.calibration.diagnostics.plausibility import check_readings
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters
 from diffeo_calib.calibration.placing.drift import Drift
 from diffeo_calib.calibration.placing.lens import LensAndBoard

@@ -20,10 +20,11 @@ from torch import Tensor
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_flat_places
 from diffeo_calib.calibration.diagnostics.outliers import Outlier, excluded, found_outliers
-from diffeo_calib.calibration.diagnostics.plausibility import check_identification, registered
-from diffeo_calib.calibration.diagnostics.socket_plausibility import (
-    check_registration,
+from diffeo_calib.calibration.diagnostics.plausibility import (
+    check_identification,
+    check_socket_registration,
     check_sockets,
+    registered,
     warn_of_other_robot,
     warn_of_wrong_sockets,
 )
@@ -47,9 +48,9 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import VALUE, Hypothesis
-from diffeo_calib.sensors.errors import socket_errors
-from diffeo_calib.sensors.places import SOCKET, PlacedDevices
+from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import View, frame_slopes
+from diffeo_calib.sensors.sockets import SocketPlaces, socket_errors
 from diffeo_calib.sensors.tables import Coordinates
 
 T = TypeVar("T")
@@ -268,7 +269,7 @@ class SocketDevices(DeviceSet):
 
     def placed(self) -> PlacedDevices:
         rows = (self.socket != NO_SOCKET).nonzero()[:, 0]
-        return PlacedDevices(SOCKET, self.names, self.positions, self.deviations, rows, self.socket[rows])
+        return PlacedDevices(SocketPlaces(self.names, self.positions, self.deviations), rows, self.socket[rows])
 
     def entry(self) -> dict[str, object]:
         """Positions by name, and spread of places left out, for programs; in m."""
@@ -335,7 +336,7 @@ def stages_by_sockets(
     start = None if device is None else registered(robot, device)
     resting = data.socket_rows()
     found = register_sockets(robot if start is None else start.geometry, resting.q, resting.socket_numbers)
-    check_registration(robot, resting, found, None if start is None else start.geometry)
+    check_socket_registration(robot, resting, found, None if start is None else start.geometry)
     registration = found.identification
     if start is not None:  # all rows with the weight 1
         registration = start.with_ball(registration)

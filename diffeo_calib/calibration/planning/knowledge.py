@@ -37,8 +37,9 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.registered_map import robot_map
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.bodies import Bodies
-from diffeo_calib.measurements.poses import LEVER, mark_points
+from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.conditional import (

@@ -276,7 +276,8 @@ class DeviceReadings(Sensor):
             expected = f"{own.stated_as} with a direction"
             raise InputError.of(f"devices of {kind}s", expected=expected, got=as_written(given.tolist()))
         names = tuple(f"{kind} {number}" for number in range(1, len(given) + 1))
-        return cls(std, own(names, constants, constants.new_tensor(own.prior(offset_std))))
+        prior = constants.new_tensor(own.prior(offset_std)).expand(len(names), -1)
+        return cls(std, own(names, constants, prior))
 
     def sentences(self) -> list[str]:
         """One for each."""

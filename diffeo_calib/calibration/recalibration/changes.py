@@ -7,14 +7,12 @@ from math import degrees, inf
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
 from diffeo_calib.common.errors import with_deviation
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kinematics.re_registration.find_place import FoundPlace
-from diffeo_calib.kinematics.re_registration.new_rows import NewRows
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.regression.conditional import roots
 from diffeo_calib.robots.tree import Tree
@@ -67,16 +65,27 @@ class Change:
         return f"{part} has changed by {size}{by} (by chance with a probability of at most {self.probability:.2g})"
 
 
-class SmallestOffset(NamedTuple):
-    """The smallest change of an offset, rad or m, shown in nine cases of ten; infinite if places hide it."""
+class Offset(NamedTuple):
+    """A change of a joint's offset: the smallest that rows show in nine cases of ten, or one that they cannot exclude.
+
+    Args:
+        joint: its name. angle: whether the others are in rad, else in m.
+        size: is added to a reading as that of a :class:`Change`; infinite if places hide any.
+        deviation: of the size; zero of the smallest one. instead: what has moved otherwise, in words; empty for those.
+    """
 
     joint: str
-    size: float
     angle: bool
+    size: float
+    deviation: float = 0.0
+    instead: str = ""
 
     def __str__(self) -> str:
-        size = "none" if self.size == inf else f"{1e3 * self.size:.2g} {'mrad' if self.angle else 'mm'}"
-        return f"{self.joint} {size}"
+        unit = "mrad" if self.angle else "mm"
+        if not self.instead:
+            return f"{self.joint} none" if self.size == inf else f"{self.joint} {1e3 * self.size:.2g} {unit}"
+        size = f"{with_deviation(1e3 * self.size, 1e3 * self.deviation)} {unit}"
+        return f"{self.instead}, or the offset of {self.joint} has changed by {size}: these rows cannot tell which"
 
 
 @dataclass(frozen=True)
@@ -97,7 +106,7 @@ class Changes:
     noise: float = 1.0
     rows: int = 0
     level: float | None = None
-    smallest: tuple[SmallestOffset, ...] = ()
+    smallest: tuple[Offset, ...] = ()
 
     @property
     def tested(self) -> bool:
@@ -121,28 +130,7 @@ class Changes:
         return "; ".join(map(str, self.found))
 
 
-class HiddenOffset(NamedTuple):
-    """An offset that explains a new place as well.
-
-    Args:
-        joint: its name. size, deviation: of the offset, rad or m, which is added to a reading as that of a
-            :class:`Change`. angle: whether it is in rad.
-        instead: what has moved otherwise, in words.
-    """
-
-    joint: str
-    size: float
-    deviation: float
-    angle: bool
-    instead: str
-
-    def __str__(self) -> str:
-        unit = "mrad" if self.angle else "mm"
-        size = f"{with_deviation(1e3 * self.size, 1e3 * self.deviation)} {unit}"
-        return f"{self.instead}, or the offset of {self.joint} has changed by {size}: these rows cannot tell which"
-
-
-def hidden_offsets(robot: Tree, place: FoundPlace | None, changes: Changes) -> tuple[HiddenOffset, ...]:
+def hidden_offsets(robot: Tree, place: FoundPlace | None, changes: Changes) -> tuple[Offset, ...]:
     """Offsets that explain where a registration found device or markers; none where a change of the robot is named.
 
     Args:
@@ -153,7 +141,10 @@ def hidden_offsets(robot: Tree, place: FoundPlace | None, changes: Changes) -> t
     rows, found = place.rows, place.registration
     S, J = rows.by_places.flatten(0, 1), rows.at.joint_to_start.flatten(0, 1)  # (M m, 6 + 3 P), (M m, n)
     covariance, noise = rows.inflation * rows.given.covariance, float(found.noise.diagonal().mean().sqrt())
-    places = {"the measuring device has moved": (slice(0, 6), _motion(rows))}
+    T, centre = rows.transform, rows.centre
+    turn = rotation_numbers(T[None, :3, :3], "rotvec", angle="rad")[0]
+    moved = torch.cat([T[:3, :3] @ centre + T[:3, 3] - centre, turn])  # m and rad, of the frame in that of the map
+    places = {"the measuring device has moved": (slice(0, 6), moved)}
     if found.shift is not None:
         places["the markers have moved"] = (slice(6, S.shape[1]), found.shift.flatten())
     hidden = []
@@ -173,12 +164,5 @@ def hidden_offsets(robot: Tree, place: FoundPlace | None, changes: Changes) -> t
             unseen = abs(size) * float((J[:, joint, None] - S[:, own] @ d).square().mean().sqrt())
             left = total - float(evidence.gain)
             if unseen < gates.HIDDEN_SHARE * noise and left < chi2_above(LEVEL, max(count - 1, 1)):
-                hidden.append(HiddenOffset(name, size, deviation, robot.kinds[joint] != "prismatic", instead))
+                hidden.append(Offset(name, robot.kinds[joint] != "prismatic", size, deviation, instead))
     return tuple(hidden)
-
-
-def _motion(rows: NewRows) -> Tensor:
-    """(6,) shift at the centre and small turn of the measuring frame, in the frame of the map."""
-    T, centre = rows.transform, rows.centre
-    turn = rotation_numbers(T[None, :3, :3], "rotvec", angle="rad")[0]
-    return torch.cat([T[:3, :3] @ centre + T[:3, 3] - centre, turn])

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.recalibration.changes import LEVEL, Changes, HiddenOffset, hidden_offsets
+from diffeo_calib.calibration.recalibration.changes import LEVEL, Changes, Offset, hidden_offsets
 from diffeo_calib.calibration.recalibration.find_changes import FEWEST_ROWS, find_changes
 from diffeo_calib.calibration.recalibration.new_rows import WeighedRows, weighed
 from diffeo_calib.calibration.recalibration.new_set_up import (
@@ -64,7 +64,7 @@ class Comparison:
     errors: Evaluations
     expectations: Evaluations
     usual: Evaluations
-    hidden: tuple[HiddenOffset, ...] = ()
+    hidden: tuple[Offset, ...] = ()
     payload: float | None = None
 
     rms = property(lambda self: self.errors.rms)

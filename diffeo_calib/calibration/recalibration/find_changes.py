@@ -26,7 +26,7 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
 from diffeo_calib.calibration.diagnostics.row_order import find_block
-from diffeo_calib.calibration.recalibration.changes import LEVEL, Change, Changes, SmallestOffset
+from diffeo_calib.calibration.recalibration.changes import LEVEL, Change, Changes, Offset
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, WeighedRows
 from diffeo_calib.calibration.recalibration.parts import (
     OFFSET_DEVIATION_RAD_M,
@@ -56,10 +56,6 @@ class Ratio(NamedTuple):
     value: float
     probability: float
     variance: float
-
-    def least_certain(self, other: Ratio) -> Ratio:
-        """This ratio with the larger probability, and the smaller value, of both."""
-        return Ratio(min(self.value, other.value), max(self.probability, other.probability), self.variance)
 
 
 def likelihood_ratios(rows: WeighedRows, roots: dict[str, Tensor], seed: int) -> tuple[dict[str, Ratio], float]:
@@ -180,7 +176,10 @@ def _changes_of(rows: WeighedRows, *, level: float, seed: int) -> tuple[Changes,
         ratios, factor = likelihood_ratios(rows, roots, seed)
         # A few outliers look like a change, and a change looks like outliers: it must stand out with either weights.
         strict, _ = likelihood_ratios(rows.with_weights(), roots, seed)
-        ratios = {name: each.least_certain(strict[name]) for name, each in ratios.items()}
+        both = [(name, own, strict[name]) for name, own in ratios.items()]
+        ratios = {
+            name: Ratio(min(a.value, b.value), max(a.probability, b.probability), a.variance) for name, a, b in both
+        }
         if not first:
             first, noise = {name: ratio.probability for name, ratio in ratios.items()}, factor
         name = min(ratios, key=lambda each: (ratios[each].probability, -ratios[each].value))
@@ -202,14 +201,14 @@ LARGEST_OFFSET_RAD_M = 5e-3
 """The largest one that is tested, see SIZES."""
 
 
-def _smallest(rows: WeighedRows) -> tuple[SmallestOffset, ...]:
+def _smallest(rows: WeighedRows) -> tuple[Offset, ...]:
     """See :class:`Changes`."""
     chain, found = rows.points.fitted.geometry.chain, []
     for joint, part in enumerate(offsets_of(rows.fitted)):
         evidence = rows.evidence(part.root(rows.at))
         size = SHOWN * OFFSET_DEVIATION_RAD_M / float(evidence.H.sqrt())
         size = size if size < LARGEST_OFFSET_RAD_M else inf
-        found.append(SmallestOffset(chain.joint_names[joint], size, chain.kinds[joint] != "prismatic"))
+        found.append(Offset(chain.joint_names[joint], chain.kinds[joint] != "prismatic", size))
     return tuple(found)
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE
 from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.placing.placement import Placement
-from diffeo_calib.calibration.recalibration.changes import Changes, HiddenOffset, hidden_offsets
+from diffeo_calib.calibration.recalibration.changes import Changes, Offset, hidden_offsets
 from diffeo_calib.calibration.recalibration.find_changes import find_changes, usual_drift
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, WeighedRows, weighed
 from diffeo_calib.calibration.recalibration.new_set_up import (
@@ -88,7 +88,7 @@ class Recalibration:
     inflation: float
     fit: Fit
     shift: Tensor | None = None
-    hidden: tuple[HiddenOffset, ...] = ()
+    hidden: tuple[Offset, ...] = ()
 
     rms_before = property(lambda self: self.before.rms)
     rms_after = property(lambda self: self.after.rms)
@@ -230,9 +230,11 @@ def _with_settled(
     for one in rows.placement.settled(fitted, *at, known=mounted_of(model)).placed():
         own = replace(one, rows=one.rows + first)
         for k, other in enumerate(found):
-            if own.same_set(other) and own.set_ups is not None:
+            if not own.devices.same_set(other.devices):
+                continue
+            if own.devices.fitted_again:
                 found[k] = own.beside(other)
-            elif own.same_set(other):
+            else:
                 number = torch.tensor([other.names.index(name) for name in own.names], dtype=torch.int64, device=HOST)
                 device = torch.cat([other.device, number[own.device]])
                 found[k] = replace(other, rows=torch.cat([other.rows, own.rows]), device=device)

@@ -20,9 +20,6 @@ from diffeo_calib.common.files import write_together
 from diffeo_calib.interop.c_source import CFiles, c_files
 from diffeo_calib.interop.camera_files import camera_files
 from diffeo_calib.interop.dh import DHTable, dh_table, dh_text
-from diffeo_calib.interop.error_field import field_text
-from diffeo_calib.interop.files import in_unit, origin_numbers
-from diffeo_calib.interop.joint_tables import CorrectionTable, correction_tables, offsets_text, tables_text
 from diffeo_calib.interop.mjcf import mjcf_text
 from diffeo_calib.interop.rigid import (
     Compared,
@@ -31,6 +28,15 @@ from diffeo_calib.interop.rigid import (
     best_joint_offsets,
     nominal_kinematics,
     rigid_kinematics,
+)
+from diffeo_calib.interop.tables import (
+    CorrectionTable,
+    correction_tables,
+    field_text,
+    in_unit,
+    offsets_text,
+    origin_numbers,
+    tables_text,
 )
 from diffeo_calib.interop.torch_program import export_onnx, export_torch
 from diffeo_calib.interop.ur_kinematics import ur_text, ur_transforms

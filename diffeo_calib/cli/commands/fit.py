@@ -224,11 +224,11 @@ def run_report(wanted: ReportOptions) -> None:
     say(*provenance_lines(model))
     words, stages = verdict(found, tolerance), dict(found.expected)
     kinds = {kind: one.stages for kind, one in found.kinds.items()}
-    record.add(**entries_by_kind(kinds), expected_error_by_stage_m=stages, left_out=not found.shown.new)
+    record.add(**entries_by_kind(kinds), expected_error_by_stage_m=stages, left_out=not found.new)
     record.add(verdict=words, advice=list(advice(found)), files={"report": wanted.output})
-    if found.shown.predictions is not None:
-        record.add(coverage_95=found.shown.predictions.coverage())
-    if data is not None and not found.shown.new:
+    if found.predictions is not None:
+        record.add(coverage_95=found.predictions.coverage())
+    if data is not None and not found.new:
         each = "as fitted" if not found.errors else "each predicted by all others"
         say(f"all rows of the table were used before: the rows of the fit are shown, {each}")
     say(words, *printed.expectation_lines(model, None, found.deviations.error), f"report: {wanted.output}")

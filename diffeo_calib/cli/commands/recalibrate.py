@@ -9,7 +9,7 @@ from typing import Any
 
 import typer
 
-from diffeo_calib.calibration.recalibration.changes import Changes, HiddenOffset
+from diffeo_calib.calibration.recalibration.changes import Changes, Offset
 from diffeo_calib.calibration.recalibration.compare import compare
 from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
 from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
@@ -73,7 +73,7 @@ def doubt(changes: Changes, where: str) -> str:
     return "" if changes.tested else f": a change of the robot, which was not tested, would be {where}"
 
 
-def change_entries(changes: Changes, hidden: Sequence[HiddenOffset] = ()) -> dict[str, list[dict[str, object]]]:
+def change_entries(changes: Changes, hidden: Sequence[Offset] = ()) -> dict[str, list[dict[str, object]]]:
     """For programs: changes, what offsets the rows would show (None where places hide it), and those they may hide."""
     smallest = [(one.joint, one.size if isfinite(one.size) else None) for one in changes.smallest]
     return {

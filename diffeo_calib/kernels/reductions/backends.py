@@ -23,10 +23,11 @@ from torch import Tensor
 from diffeo_calib.common.checks import number_of, wrapped
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kernels.profiles import Profile
-from diffeo_calib.kernels.reductions import fourier, keops
+from diffeo_calib.kernels.reductions import fourier
 from diffeo_calib.kernels.reductions.distributed import Distributed
 from diffeo_calib.kernels.reductions.formulas import Dense, Formula, Points, SumBackend, matrices
 from diffeo_calib.kernels.reductions.fused import FUSED
+from diffeo_calib.kernels.reductions.keops import Keops
 from diffeo_calib.kernels.reductions.tiled import Tiled
 
 Backend = Literal["auto", "dense", "fused", "tiled", "keops", "distributed"]
@@ -36,7 +37,7 @@ BACKENDS: dict[str, SumBackend] = {
     "dense": Dense(),
     "fused": FUSED,
     "tiled": Tiled(),
-    "keops": keops.Keops(),
+    "keops": Keops(),
     "distributed": Distributed(),
 }
 FINEST_ACCURACY = 1e-12  # below it rounding counts
@@ -74,7 +75,7 @@ def choose(backend: Backend, rows: int, columns: int, device: torch.device) -> s
     name: str = backend
     if backend == "auto":
         name = "dense" if pairs <= DENSE_PAIRS["cpu" if on_cpu else "cuda"] else "tiled"
-        if on_cpu and pairs >= FUSED_PAIRS and FUSED.available():
+        if on_cpu and pairs >= FUSED_PAIRS and not FUSED.trouble():
             name = "fused"
         elif not on_cpu and pairs >= KEOPS_PAIRS and BACKENDS["keops"].usable():
             name = "keops"
@@ -113,12 +114,7 @@ def evaluate(
         found = fourier.sums(formula, profile, i, j, accuracy) if bool(finite) else None
         if found is not None:
             return found
-    try:
-        found = BACKENDS[name].reduce(formula, profile, i, j)
-    except keops.KeopsUnavailableError as error:
-        keops.warn(str(error))
-        found = None
-    return found or Tiled().reduce(formula, profile, *_centred(i, j))
+    return BACKENDS[name].reduce(formula, profile, i, j) or Tiled().reduce(formula, profile, *_centred(i, j))
 
 
 def profile_matrix(profile: Profile, rows: Tensor, columns: Tensor) -> Tensor:

@@ -16,15 +16,17 @@ column points (and of the row points, where a formula needs them).
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import cache, cached_property, reduce
 from itertools import chain
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.kernels.profiles import Profile
 
 Leaf = Callable[[str], Any]  # one of the :data:`LEAVES` by its name, as a matrix or a symbol
@@ -219,13 +221,26 @@ class SumBackend:
     Attributes:
         differentiable: whether autograd can differentiate the sums. Tiled sums replace a backend that cannot where
             gradients are needed.
+        failure: why it failed once, as a sentence; it is not tried again then.
     """
 
     differentiable: ClassVar[bool] = False
+    failure = ""
+
+    def trouble(self) -> str:
+        """Why it cannot evaluate sums on this machine, as a sentence; empty where it can."""
+        return self.failure
 
     def usable(self) -> bool:
         """Whether the backend is expected to work on this machine; warns once if not."""
-        return True
+        if trouble := self.trouble():
+            _warn(trouble)
+        return not trouble
+
+    def failed(self, failure: str) -> None:
+        """Note a failure, and warn that tiled sums replace this backend from now on."""
+        self.failure = failure
+        _warn(failure)
 
     def reduce(
         self, formula: Formula, profile: Profile, rows: Points | None, columns: Points
@@ -239,6 +254,13 @@ class SumBackend:
             columns: the N points of the sum.
         """
         raise NotImplementedError
+
+
+@cache
+def _warn(reason: str) -> None:
+    """Warn, once per reason, that the fallback runs."""
+    text = f"{reason} Kernel sums run in torch instead (backend 'tiled'): slower, the same numbers."
+    warnings.warn(text, DiffeoCalibWarning, stacklevel=2)  # not warn_user: models do not record it
 
 
 class Dense(SumBackend):

@@ -26,8 +26,8 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.common.threads import in_parallel
 from diffeo_calib.kernels.profiles import SHIPPED, Profile
+from diffeo_calib.kernels.reductions.cache_folder import cache_folder
 from diffeo_calib.kernels.reductions.formulas import Formula, Points, SumBackend
-from diffeo_calib.kernels.reductions.keops import cache_folder, warn
 from diffeo_calib.kernels.reductions.loops import ARGUMENTS, Program, Vector
 from diffeo_calib.kernels.reductions.symbols import Weights, recorded
 from diffeo_calib.kernels.reductions.tiled import LARGE_PAIRS, PARTS, SHARED_PARTS, Chosen, dealt
@@ -207,31 +207,20 @@ class Compiled(NamedTuple):
 
 
 class Fused(SumBackend):
-    """Evaluates sums in compiled loops, on a CPU.
-
-    Attributes:
-        failed: whether LLVM has failed; it is not tried again then.
-    """
+    """Evaluates sums in compiled loops, on a CPU."""
 
     def __init__(self) -> None:
-        self.failed = False
         self._programs: dict[tuple[Formula, Weights, tuple[tuple[str, int], ...]], Compiled | None] = {}
         self._own = Counter[type]()
 
-    def available(self) -> bool:
-        """Whether llvmlite is installed and compiles for this machine."""
-        return not self.failed and _reason() is None
-
-    def usable(self) -> bool:
-        if not self.available():
-            warn(f"{_reason() or 'LLVM has failed'}.")
-        return self.available()
+    def trouble(self) -> str:
+        return self.failure or _missing()
 
     def program(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> Compiled | None:
         """The compiled sum; None where it is not for this backend: on a GPU, for another type, an unusual profile."""
         tensors = [t for t in (*(rows or ()), *columns) if t is not None]
         fitting = all(t.dtype == torch.float64 and t.device.type == "cpu" for t in tensors)
-        if not fitting or not self.available():
+        if not fitting or self.trouble():
             return None
         weights = recorded(formula, profile)
         if weights is None:
@@ -252,9 +241,7 @@ class Fused(SumBackend):
         try:
             return Compiled(program, factors, machine().function(text))
         except Exception as error:  # LLVM may raise anything
-            self.failed = True
-            warn(f"LLVM could not compile a kernel sum ({error}).")
-            return None
+            return self.failed(f"LLVM could not compile a kernel sum ({error}).")
 
     def reduce(
         self, formula: Formula, profile: Profile, rows: Points | None, columns: Points
@@ -270,12 +257,12 @@ FUSED = Fused()  # one for the whole program, which keeps what it has compiled
 
 
 @cache
-def _reason() -> str | None:
-    """Why sums cannot be compiled here; None if they can."""
+def _missing() -> str:
+    """Why sums cannot be compiled here; empty where they can."""
     try:
         machine()
     except ImportError:
-        return "The package llvmlite is not installed (pip install 'diffeo_calib[fused]')"
+        return "The package llvmlite is not installed (pip install 'diffeo_calib[fused]')."
     except Exception as error:  # LLVM may raise anything
-        return f"LLVM does not know this processor ({error})"
-    return None
+        return f"LLVM does not know this processor ({error})."
+    return ""

@@ -28,22 +28,19 @@ from diffeo_calib.common.data_frames import named_columns
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.compensation.box_search import (
-    box_search,
+from diffeo_calib.kinematics.compensation.problem import (
+    CODE,
+    MEMBERS,
+    CompensationProblem,
+    Solution,
+    Status,
     by_joint,
     joint_limits,
     largest_motion,
     mobilities,
 )
-from diffeo_calib.kinematics.compensation.chord import Box, reached
-from diffeo_calib.kinematics.compensation.kinematics import tool_functions
-from diffeo_calib.kinematics.compensation.problem import CODE, MEMBERS, CompensationProblem, Solution, Status
-from diffeo_calib.kinematics.compensation.targets import (
-    Array,
-    Targets,
-    checked_targets,
-    finite_rows,
-)
+from diffeo_calib.kinematics.compensation.search import Box, box_search, reached
+from diffeo_calib.kinematics.compensation.targets import Array, Targets, checked_targets, finite_rows, tool_functions
 from diffeo_calib.kinematics.tool import TOOL_LEVER, checked_tip, tool_transform
 from diffeo_calib.robots.tree import Tree
 

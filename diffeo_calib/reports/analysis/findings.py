@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from math import inf
 from typing import Any, NamedTuple
 
@@ -18,26 +17,23 @@ from diffeo_calib.calibration.expected_errors import expected_errors
 from diffeo_calib.calibration.findings import Part, parts
 from diffeo_calib.calibration.judgement import Accuracy, accuracy, judge
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
     check_rows,
-    motions,
     place,
     placement_sentences,
     positions_of,
     residuals,
     rows_used_in_fit,
-    some_rows,
 )
 from diffeo_calib.kinematics.joint_ranges import SAME_CONFIGURATION
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.predictions import FitRows, Predictions, forecast
-from diffeo_calib.reports.analysis.repeats import Repeats, repeats_of
-from diffeo_calib.reports.analysis.stages import Deviations, Kinematics, stages_of
+from diffeo_calib.reports.analysis.stages import Deviations, Kinematics, Repeats, repeats_of, stages_of
 from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
 from diffeo_calib.sensors.places import Places
 from diffeo_calib.sensors.tables import divided, measured_positions, measured_rows
@@ -51,27 +47,6 @@ FAR_RATIO = 3.0
 """Ratio of expected errors anywhere to those like the measured ones from which the reason is told."""
 COLUMN_WORDS = ("temp", "time", "stamp", "date", "hour")
 """Parts of the names of columns against which errors are shown without being asked."""
-
-
-class Shown(NamedTuple):
-    """Rows of a report and their errors.
-
-    Args:
-        errors: stage -> errors of these rows, the model last; empty without rows.
-        q: (N, n) their joint values, and ``lines``: (N,) in the file.
-        new: whether the model has not seen them. predictions: measured positions among them, predicted by a model
-            that has not seen them; None without any.
-        outliers: rows that look wrong, and ``moved``: what else happened to them. devices: what was found from them.
-    """
-
-    errors: Mapping[str, Evaluations]
-    q: Tensor
-    lines: Tensor
-    new: bool = False
-    predictions: Predictions | None = None
-    outliers: Sequence[Outlier] = ()
-    moved: Sequence[str] = ()
-    devices: Sequence[str] = ()
 
 
 class RowsOfKind(NamedTuple):
@@ -93,39 +68,41 @@ class Findings:
 
     Args:
         model: the model. stages: kinematics to compare: nominal, geometric, calibrated. rows: those of the fit.
-        shown: the rows that the report shows.
+        kinds: the rows that the report shows, by kind; empty without rows. new: whether the model has not seen them.
+        predictions: measured positions among them, predicted by a model that has not seen them; None without any.
+        outliers: rows that look wrong, and ``moved``: what else happened to them.
         repeats: what repeated configurations show; None if there are none.
         learning_curve: number of rows -> error of others, m; empty if the rows of the fit are not known.
         columns: further columns of the table that errors are shown against, by name.
         expected: stage -> RMS error of positions that the model expects over the joint ranges of its rows, m.
         deviations: what it expects at random configurations there, and at those of the fit.
-        parts: what explains how much. devices: where devices are, and what was found from the rows shown.
+        devices: where devices are, and what was found from the rows shown.
     """
 
     model: CalibratedKinematics
     stages: Mapping[str, Kinematics]
     rows: FitRows
-    shown: Shown
+    kinds: Mapping[str, RowsOfKind]
+    new: bool
+    predictions: Predictions | None
+    outliers: Sequence[Outlier]
+    moved: Sequence[str]
     repeats: Repeats | None
     learning_curve: Sequence[tuple[int, float]]
     columns: Mapping[str, Tensor]
     expected: Mapping[str, float]
     deviations: Deviations
-    parts: Sequence[Part]
     devices: Sequence[str]
 
-    @cached_property
-    def kinds(self) -> Mapping[str, RowsOfKind]:
-        """The rows shown, by kind; empty without rows."""
-        found, q, lines = self.shown.errors, self.shown.q, self.shown.lines
-        index = next((errors.index for errors in found.values()), {})
-        stages = {kind: {name: errors[kind] for name, errors in found.items()} for kind in index}
-        return {kind: RowsOfKind(stages[kind], q[rows.cpu()], lines[rows.cpu()]) for kind, rows in index.items()}
+    @property
+    def parts(self) -> Sequence[Part]:
+        """What explains how much."""
+        return parts(self.model)
 
     @property
     def errors(self) -> Mapping[str, Evaluation]:
         """Errors of measured positions by stage, of a model that has not seen them; empty without any."""
-        kinds = [] if self.shown.predictions is None else self.kinds.values()
+        kinds = [] if self.predictions is None else self.kinds.values()
         return next((one.stages for one in kinds if one.errors.what == ERRORS), {})
 
     @property
@@ -151,7 +128,7 @@ class Findings:
     @property
     def judged(self) -> Accuracy:
         """The RMS error that is compared with a tolerance."""
-        fitted = not self.shown.new and self.shown.predictions is None
+        fitted = not self.new and self.predictions is None
         own = [] if fitted else [one.errors for one in self.kinds.values()]
         return accuracy(self.model, own, "m", self.deviations.error)
 
@@ -166,7 +143,7 @@ class Findings:
         geometry = self.model.nominal.geometry
         return torch.arange(geometry.size, device=self.rows.q.device)[geometry.slices["tool"]]
 
-    @cached_property
+    @property
     def share_of_tool(self) -> float:
         """Share of the expected variance that knowing the markers would remove."""
         return self.rows.map.explained_by(self.tool, self.deviations.q[:PROBE_CONFIGURATIONS])
@@ -211,27 +188,38 @@ def find(
     kinematics = stages_of(model, rows) if stages is None else stages
     progress("analysis", 1, STEPS)
     new = None if data is None else _new_rows(model, data, rows)
-    if data is not None and new is not None and (bool(new.any()) or not rows.of_positions):
+    if new is not None and (bool(new.any()) or not rows.of_positions):
         aligned = measured if rows.of_positions and measured is not None and len(measured) == len(data) else None
-        errors = _errors(data, aligned, kinematics, own, places)
-        shown = _of_table(model, data, new, measured, own, every=errors)
-    elif rows.of_positions:
-        shown = _left_out(model, rows, kinematics)
+        errors = _by_stage(data, aligned, kinematics, own, places)
+        shown = _of_table(model, data, new, measured, own, errors=errors)
     else:
-        shown = Shown({}, rows.q, rows.q[:, 0])
+        shown = _left_out(model, rows, kinematics) if rows.of_positions else NOTHING
     progress("analysis", 2, STEPS)
     noise, curve = float(model.map.new_noise.diagonal().mean().sqrt()), rows.learning_curve() if rows.known else []
     repeats = None if measured is None else repeats_of(measured, kinematics, noise)
     if repeats is None and model.registration is None and rows.known:
         repeats = repeats_of(rows.measurements, kinematics, noise)
-    columns = _columns(None if shown.predictions is None else shown.predictions.data, against)
+    seen: Predictions | None = shown["predictions"]
+    columns = _columns(None if seen is None else seen.data, against)
     progress("analysis", 3, STEPS)
     deviations = Deviations.of(model).planned(model)
-    expected = expected_errors(model, kinematics, deviations.error)
-    devices = [*shown.devices, *placement_sentences(model)]
     progress("analysis", STEPS, STEPS)
-    found = shown, repeats, curve, columns, expected, deviations, parts(model), devices
-    return Findings(model, kinematics, rows, *found)
+    return Findings(
+        model,
+        kinematics,
+        rows,
+        repeats=repeats,
+        learning_curve=curve,
+        columns=columns,
+        expected=expected_errors(model, kinematics, deviations.error),
+        deviations=deviations,
+        devices=[*shown.pop("devices", ()), *placement_sentences(model)],
+        **shown,
+    )
+
+
+NOTHING: dict[str, Any] = {"kinds": {}, "new": False, "predictions": None, "outliers": (), "moved": ()}
+"""What a report shows of rows without any; of others with these entries."""
 
 
 def unseen(model: CalibratedKinematics, q: Tensor) -> Tensor:
@@ -240,30 +228,6 @@ def unseen(model: CalibratedKinematics, q: Tensor) -> Tensor:
     if model.registration is not None:
         new &= torch.cdist(q, model.registration.q.to(q), p=inf).amin(1) > SAME_CONFIGURATION
     return new.to(HOST)
-
-
-def _errors(
-    data: Any,
-    aligned: Measurements | None,
-    stages: Mapping[str, Kinematics],
-    own: Places,
-    places: Mapping[str, Places] | None,
-) -> dict[str, Evaluations]:
-    """Errors of all rows by stage, devices in their ``own`` places beside the model, in ``places`` beside every stage.
-
-    ``aligned``: the rows in the frame of the model, without its drift, if all are measured positions.
-    """
-    *before, last = stages
-    found = dict[str, Evaluations]()
-    for name in before:
-        kinematics = stages[name]
-        if aligned is not None:
-            found[name] = residuals(kinematics, place(kinematics, aligned), aligned)
-        else:
-            at = place(kinematics, data) if places is None else places[name]
-            at = replace(at, frames=at.frames or own.frames, ball=own.ball)
-            found[name] = residuals(kinematics, at, data)
-    return found | {last: residuals(stages[last], own, data)}
 
 
 def _new_rows(model: CalibratedKinematics, data: Any, rows: FitRows) -> Tensor:
@@ -279,6 +243,32 @@ def _new_rows(model: CalibratedKinematics, data: Any, rows: FitRows) -> Tensor:
     return new
 
 
+def _by_stage(
+    data: Any, measured: Measurements | None, stages: Mapping[str, Kinematics], own: Places, places: Any
+) -> dict[str, Evaluations]:
+    """Errors of all rows by stage, devices in their ``own`` places beside the model, in ``places`` beside every stage.
+
+    ``measured``: the rows in the frame of the model, without its drift, if all are measured positions; they are placed.
+    """
+    *before, last = stages
+    found = dict[str, Evaluations]()
+    for name in before:
+        rows = data if measured is None else measured
+        at = place(stages[name], rows) if measured is not None or places is None else places[name]
+        at = at if measured is not None else replace(at, frames=at.frames or own.frames, ball=own.ball)
+        found[name] = residuals(stages[name], at, rows)
+    return found | {last: residuals(stages[last], own, data)}
+
+
+def _by_kind(errors: Mapping[str, Evaluations], q: Tensor, lines: Tensor) -> dict[str, RowsOfKind]:
+    """Errors by stage, of rows with these joint values (N, n) and lines (N,), by kind."""
+    index = next(iter(errors.values())).index
+    return {
+        kind: RowsOfKind({name: found[kind] for name, found in errors.items()}, q[rows.cpu()], lines[rows.cpu()])
+        for kind, rows in index.items()
+    }
+
+
 def _of_table(
     model: CalibratedKinematics,
     data: Any,
@@ -286,42 +276,28 @@ def _of_table(
     measured: Measurements | None,
     own: Places,
     *,
-    every: Mapping[str, Evaluations],
-) -> Shown:
+    errors: Mapping[str, Evaluations],
+) -> dict[str, Any]:
     """Rows that the model has not seen, of a ``mask`` (N,); if there are none, all as fitted.
 
-    ``measured``: positions of all in the frame of the model. ``every``: errors of all by stage.
+    ``measured``: positions of all in the frame of the model. ``errors``: of all by stage.
     """
     new = bool(mask.any())
     LOG.info("judged by %d rows it has not seen, %d were used before", int(mask.sum()), int((~mask).sum()))
     mask = mask if new else ~mask
-    errors = {name: found.rows(mask) for name, found in every.items()}
-    shown = Shown(errors, data.q[mask], data.line_numbers[mask], new, devices=own.found)
+    errors = {name: found.rows(mask) for name, found in errors.items()}
+    shown = NOTHING | {"kinds": _by_kind(errors, data.q[mask], data.line_numbers[mask])}
+    shown |= {"new": new, "devices": own.found}
     raw = measured_positions(data)  # as read: those of `measured` are moved by a drift that the model knows
     if measured is None or raw is None or not new or not bool((seen := unseen(model, raw.q)).any()):
         return shown
-    moved = _causes(model, own, data.rows(mask), list(errors.values())[-1])
+    judged = judge(model, own, data.rows(mask), list(errors.values())[-1])
+    moved = judged.causes if judged.refusal is None else [judged.refusal]
     predictions = Predictions.of(model, measured.rows(seen))
-    return shown._replace(predictions=predictions, outliers=predictions.outliers(model), moved=moved)
+    return shown | {"predictions": predictions, "outliers": predictions.outliers(model), "moved": moved}
 
 
-def _causes(model: CalibratedKinematics, own: Places, data: Any, found: Evaluations) -> Sequence[str]:
-    """What happened to new rows.
-
-    Raises:
-        MeasurementError: another reading explains impossible errors. Something that moved is told, not raised.
-    """
-    try:
-        judged = judge(model, own, data, found)
-    except MeasurementError as error:
-        seen = positions_of(model, own, data)
-        if seen is None or not motions(model, some_rows(seen)):
-            raise
-        return [str(error)]
-    return judged.causes if judged.refusal is None else [judged.refusal]
-
-
-def _left_out(model: CalibratedKinematics, rows: FitRows, stages: Mapping[str, Kinematics]) -> Shown:
+def _left_out(model: CalibratedKinematics, rows: FitRows, stages: Mapping[str, Kinematics]) -> dict[str, Any]:
     """The rows of the fit, each predicted by all others."""
     fitted = model.nominal.geometry.markers
     if model.registration is not None and model.markers != fitted:
@@ -330,13 +306,13 @@ def _left_out(model: CalibratedKinematics, rows: FitRows, stages: Mapping[str, K
         raise InputError.of("a report of the rows of the fit", expected="the markers of the fit", got=got, fix=fix)
     found = Predictions.of_fit(rows)
     LOG.info("judged by the %d rows of the fit, each predicted by all others", len(found))
-    *before, own = stages
-    errors = {name: residuals(stages[name], place(stages[name], found.data), found.data) for name in before}
+    data, (*before, own) = found.data, stages
+    errors = {name: residuals(stages[name], place(stages[name], data), data) for name in before}
     errors[own] = Evaluations.of([(found.errors, torch.arange(len(found), device=HOST))], len(found))
-    outliers, moved = found.outliers(model), list[str]()
-    if model.registration is None:  # else the rows of its fit are in another place
-        moved = [common_cause(model, found.data, outliers) or ""]
-    return Shown(errors, found.data.q, found.data.line_numbers, False, found, outliers, list(filter(None, moved)))
+    outliers = found.outliers(model)
+    cause = common_cause(model, data, outliers) if model.registration is None else None  # else they are elsewhere
+    kinds, moved = _by_kind(errors, data.q, data.line_numbers), [cause] if cause else []
+    return {"kinds": kinds, "new": False, "predictions": found, "outliers": outliers, "moved": moved}
 
 
 def _columns(data: Measurements | None, against: Sequence[str]) -> dict[str, Tensor]:

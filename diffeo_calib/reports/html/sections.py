@@ -20,8 +20,7 @@ from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.measurements.bodies import matrix_lines
 from diffeo_calib.reports.analysis.findings import Findings, RowsOfKind
 from diffeo_calib.reports.analysis.predictions import FitRows, Predictions
-from diffeo_calib.reports.analysis.repeats import STANDARD_REPEATS
-from diffeo_calib.reports.analysis.stages import Kinematics
+from diffeo_calib.reports.analysis.stages import STANDARD_REPEATS, Kinematics
 from diffeo_calib.reports.html import sentences
 from diffeo_calib.reports.html.document import (
     Picture,
@@ -122,7 +121,7 @@ def how_good(found: Findings) -> Section:
     ]
     present = {one.errors.what for one in found.kinds.values()}
     notes += [text for what, text in FLATTERING.items() if what in present]
-    if found.kinds and not found.shown.new:
+    if found.kinds and not found.new:
         notes.append(
             "Nominal and geometric kinematics were fitted to these poses too, with so few parameters that it hardly "
             "matters. Measurements of new poses are the stronger proof."
@@ -140,7 +139,7 @@ def where(found: Findings) -> Section:
         panel(f"expected-{k}", words.format(printable(name)), *what, k, found.deviations, key=k == 0)
         for k, name in enumerate(robot.joint_names)
     ]
-    scene = None if found.shown.predictions is None else _scene(found.stages, found.shown.predictions)
+    scene = None if found.predictions is None else _scene(found.stages, found.predictions)
     arrows = "Arrows point from the predicted to the measured place, with one scale in all views. Below: "
     see = arrows * (scene is not None) + (
         "The error that the model itself expects, without the noise of a measurement: "
@@ -232,23 +231,23 @@ MOST_REPEATS = 12
 
 def trust(found: Findings) -> Section:
     """Claimed against found errors, residuals, outliers, learning curve."""
-    shown, registered = found.shown, found.model.registration
-    tables = [_outliers(shown.outliers, found.model.on)] if shown.outliers else []
+    registered, seen = found.model.registration, found.predictions
+    tables = [_outliers(found.outliers, found.model.on)] if found.outliers else []
     tables += [_largest(found, own) for own in found.kinds.values()]
-    notes = list(shown.moved)
+    notes = list(found.moved)
     if registered is not None:
         each = f"each predicted by the others {millimetres(registered.left_out_rms)} mm"
         after = f"{registered.rows} rows, RMS {millimetres(registered.rms_after)} mm"
         notes.append(f"The model was registered anew with {after}; {each}.")
-    elif not notes and shown.predictions is not None:
+    elif not notes and seen is not None:
         notes.append("No device or marker moved, and no block of rows is wrong.")
-    if not shown.outliers and not shown.moved and shown.predictions is not None:
+    if not found.outliers and not found.moved and seen is not None:
         none = "No row looks wrong: none is further from its prediction than chance allows in a table of this size"
         notes.append(f"{none} (1 %), by the model's own deviations.")
     pictures = list[Picture]()
-    if shown.predictions is not None:
+    if seen is not None:
         label = "Found against claimed shares of errors; on the diagonal the claims are true."
-        pictures.append(panel("coverage", label, draw_coverage, shown.predictions))
+        pictures.append(panel("coverage", label, draw_coverage, seen))
     if found.learning_curve:
         label = "Error of rows of the fit when a model knows fewer of them, each row left out in turn."
         what = found.learning_curve, found.forecast, found.limit if found.repeats else None
@@ -278,7 +277,7 @@ def _residuals(found: Findings) -> Iterator[Picture]:
 
 def _largest(found: Findings, own: RowsOfKind) -> Table:
     """The rows of one kind with the largest errors, of positions beside what the model expects there."""
-    (unit, per_unit), seen = own.errors.shown, found.shown.predictions
+    (unit, per_unit), seen = own.errors.shown, found.predictions
     errors, body = own.errors.errors.nan_to_num(0.0).max(1)  # hidden markers have no error
     order = errors.argsort(descending=True)[:LISTED_ROWS].tolist()
     lines = [[f"error [{unit}]", *(f"{per_unit * float(errors[row]):.3f}" for row in order)]]

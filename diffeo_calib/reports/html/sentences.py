@@ -33,7 +33,7 @@ def rows_of(found: Findings, count: int | None = None) -> str:
     count = found.count if count is None else count
     if not found.kinds:
         return "none, because no rows were passed"
-    if found.shown.new:
+    if found.new:
         return f"{count} rows that the model has not seen"
     if not found.errors:
         return f"{count} rows of its own fit"
@@ -79,8 +79,8 @@ def figures(found: Findings) -> Iterator[tuple[str, str]]:
         yield "95 % of errors below", f"{1e3 * own.p95:.3f} mm"
     for name, value in _others(found):
         yield f"{name}, RMS", value
-    if found.shown.predictions is not None:
-        inside, count = found.shown.predictions.inside()
+    if found.predictions is not None:
+        inside, count = found.predictions.inside()
         yield "inside claimed 95 % regions", f"{inside} of {count} ({100 * inside / count:.0f} %)"
     if found.unlike:
         error = found.deviations.error
@@ -92,17 +92,17 @@ def figures(found: Findings) -> Iterator[tuple[str, str]]:
 
 def advice(found: Findings) -> Iterator[str]:
     """Next steps, the most important first."""
-    shown = found.shown
-    yield from shown.moved
-    if shown.predictions is not None and shown.outliers:
-        wrong = {one.row for one in shown.outliers}
-        good = [row for row in range(len(shown.predictions)) if row not in wrong]
-        text = f"{len(wrong)} of {len(shown.predictions)} rows look wrong: check them, see below"
-        rest = shown.predictions.errors.errors[good].square().nanmean().sqrt()
-        yield f"{text}; without them {1e3 * float(rest):.3f} mm RMS." if good else f"{text}."
+    yield from found.moved
+    seen = found.predictions
+    if seen is not None and found.outliers:
+        wrong = {one.row for one in found.outliers}
+        good = [row for row in range(len(seen)) if row not in wrong]
+        rest = 1e3 * float(seen.errors.errors[good].square().nanmean().sqrt())
+        text = f"{len(wrong)} of {len(seen)} rows look wrong: check them, see below"
+        yield f"{text}; without them {rest:.3f} mm RMS." if good else f"{text}."
     yield from unlike_poses(found)
     yield from still_joints(found)
-    if shown.moved:
+    if found.moved:
         return
     for one in found.kinds.values():
         *others, (_, own) = one.stages.items()
@@ -110,7 +110,7 @@ def advice(found: Findings) -> Iterator[str]:
         if own.rms >= rival.rms:
             of = f"{own.title}: the" if len(found.kinds) > 1 else "The"
             yield f"{of} model is no better than the {before} one on these rows: measure more poses."
-    if found.kinds and not shown.new and not found.errors:
+    if found.kinds and not found.new and not found.errors:
         yield "These are rows of the fit: pass rows that the model has not seen."
     if not found.learning_curve or found.learning_curve[-1][0] < len(found.rows):
         return
@@ -167,7 +167,7 @@ def still_joints(found: Findings) -> Iterator[str]:
 
 def worst_range(found: Findings) -> Iterator[str]:
     """A sentence about the part of a joint's range with the largest errors, if they are unusual."""
-    seen, robot = found.shown.predictions, found.model.robot
+    seen, robot = found.predictions, found.model.robot
     if seen is None:
         return
     lengths, most, where = 1e3 * largest_known(seen.errors.errors), BAD_RATIO * 1e3 * seen.errors.rms, ""
@@ -183,10 +183,10 @@ def worst_range(found: Findings) -> Iterator[str]:
 
 def judged(found: Findings) -> str:
     """Whether the claimed regions can be believed, as far as the number of rows tells."""
-    if found.shown.predictions is None:
+    if found.predictions is None:
         none = "No position was measured that the model has not seen, so the regions that it claims cannot be"
         return f"{none} compared with errors."
-    inside, count = found.shown.predictions.inside()
+    inside, count = found.predictions.inside()
     low, high = binomial_band(count, 0.95, MISCALIBRATION_PROBABILITY)
     if inside < low:
         what = "these are too small: widen the model's deviations, or measure more poses like these"

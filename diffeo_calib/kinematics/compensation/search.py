@@ -1,6 +1,11 @@
-"""The careful search: the nearest point that a box of joint values allows.
+"""Two searches for the nearest point that a box of joint values allows.
 
-Minimises, for every row on its own,
+The fast one takes steps with one approximate inverse per row, improved as they go. A calibrated robot differs from its
+geometric model by about 1e-3, so that steps with the geometric Jacobian contract the error by 100 each, and a Broyden
+update of rank one improves the inverse from step to step. Rows for which this is no good (a joint leaves its box, the
+error does not shrink fast) are given up.
+
+The careful one minimises, for every row on its own,
 
     F(q) = f(q) + MOTION_COST / 2 |q - start|_W^2     over low <= q <= high,
 
@@ -8,30 +13,126 @@ f from the targets, W the inverse mobilities. The second term is worth less than
 decides between commands that are equally good. Newton steps with the exact Hessian in a trust region (Levenberg and
 Marquardt; K. Madsen, H. Nielsen, O. Tingleff, "Methods for non-linear least squares problems", 2004), each the exact
 minimum of its quadratic model in the box.
-
-Where the joints may be: their limits, and how far a correction may move them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from math import radians
 
 import numpy as np
 
-from diffeo_calib.common.checks import positive, real_tensor
-from diffeo_calib.common.errors import InputError
-from diffeo_calib.kinematics.compensation.chord import Box, chord_search, reached
-from diffeo_calib.kinematics.compensation.kinematics import ToolFunctions
-from diffeo_calib.kinematics.compensation.targets import Array, Targets
-from diffeo_calib.robots.tree import Tree
+from diffeo_calib.kinematics.compensation.targets import Array, Targets, ToolFunctions
+
+REACHED_MISS = 5e-10
+"""Miss in m and rad at which a row counts as reached: half of what is promised."""
+MOST_STEPS = 8
+SLOWEST_CONTRACTION = 0.3
+"""A step must leave less than this fraction of the error."""
+RELATIVE_RIDGE = 1e-12
+"""Part of the trace that keeps singular matrices invertible; rows where it matters are given up."""
+
+
+@dataclass(eq=False)
+class Box:
+    """Where the joints may be, and what their motion costs.
+
+    Args:
+        start: (N, n) commands before the correction, rad or m.
+        low: (N, n) and
+        high: (N, n) what the joints' limits and the bound of motion leave.
+        mobility: (N, n) motion of a joint where it costs nothing extra; 0 for a joint that must not move.
+    """
+
+    start: Array
+    low: Array
+    high: Array
+    mobility: Array
+
+    def take(self, rows: Array) -> Box:
+        """The boxes of some rows."""
+        return Box(self.start[rows], self.low[rows], self.high[rows], self.mobility[rows])
+
+    def holds(self, q: Array) -> Array:
+        """(N,) whether all joints are inside."""
+        return np.all((q >= self.low) & (q <= self.high), axis=1)
+
+
+def reached(targets: Targets, poses: Array) -> Array:
+    """(N,) whether each tool is at its target."""
+    distance, angle = targets.misses(poses)
+    return np.all((distance if angle is None else np.maximum(distance, angle)) <= REACHED_MISS, axis=1)
+
+
+def chord_search(
+    tool: ToolFunctions, targets: Targets, q: Array, box: Box, *, slopes: Array, poses: Array
+) -> tuple[Array, Array, Array]:
+    """Search targets that are near.
+
+    Args:
+        tool: the kinematics.
+        targets: N targets. q: (N, n) where to start, inside the box.
+        box: its mobility weighs the joints of redundant robots, 0 holds a joint fixed.
+        slopes: (N, k, n) of the targets' errors at ``q``, at least roughly. poses: (N, T, 4, 4) of the tools at ``q``.
+
+    Returns:
+        (N, n) joint values, (N, T, 4, 4) poses of the tools, (N,) whether they reach the targets.
+    """
+    q, poses = q.copy(), poses.copy()
+    done = reached(targets, poses)
+    todo = np.flatnonzero(~done)
+    inverse = _right_inverse(slopes[todo], box.mobility[todo])
+    goal, room = targets.take(todo), box.take(todo)
+    error = goal.errors(poses[todo])
+    for _ in range(MOST_STEPS):
+        if not len(todo):
+            break
+        step = (inverse @ error[:, :, None])[:, :, 0]
+        keep = room.holds(q[todo] + step)
+        todo, goal, room, inverse = todo[keep], goal.take(keep), room.take(keep), inverse[keep]
+        error, step = error[keep], step[keep]
+        if not len(todo):
+            break
+        at = q[todo] + step
+        seen = tool.poses(at)
+        fresh = goal.errors(seen)
+        arrived = reached(goal, seen)
+        good = arrived | (np.linalg.norm(fresh, axis=1) < SLOWEST_CONTRACTION * np.linalg.norm(error, axis=1))
+        q[todo[good]], poses[todo[good]], done[todo[arrived]] = at[good], seen[good], True
+        keep = good & ~arrived
+        inverse = _updated(inverse[keep], step[keep], (error - fresh)[keep])
+        todo, goal, room, error = todo[keep], goal.take(keep), room.take(keep), fresh[keep]
+    return q, poses, done
+
+
+def _right_inverse(slopes: Array, mobility: Array) -> Array:
+    """(N, n, k) inverse of least motion: M J^T (J M J^T)^-1 with the mobilities M."""
+    moved = mobility[:, :, None] * slopes.swapaxes(1, 2)
+    if slopes.shape[1] <= slopes.shape[2]:
+        return np.linalg.solve(_regular(slopes @ moved), moved.swapaxes(1, 2)).swapaxes(1, 2)
+    return np.linalg.solve(_regular(moved @ slopes), moved)
+
+
+def _regular(square: Array) -> Array:
+    """Symmetric matrices (N, k, k) with a small multiple of the identity added."""
+    size = square.shape[1]
+    return square + (RELATIVE_RIDGE * np.trace(square, axis1=1, axis2=2) + 1e-300)[:, None, None] * np.eye(size)
+
+
+def _updated(inverse: Array, step: Array, gain: Array) -> Array:
+    """Broyden's good update, after which the inverse takes the gain to the step that made it."""
+    guess = (inverse @ gain[:, :, None])[:, :, 0]
+    along = np.einsum("nj,njk->nk", step, inverse)
+    scale = np.einsum("nk,nk->n", along, gain)
+    safe = np.abs(scale) > 0.1 * np.einsum("nj,nj->n", step, step)
+    factor = np.where(safe, 1.0 / np.where(safe, scale, 1.0), 0.0)
+    return inverse + ((step - guess) * factor[:, None])[:, :, None] * along[:, None, :]
+
 
 MOTION_COST = 1e-10
 """m^2 per rad^2 (or per m^2 of a slide)."""
 IMMOBILE_MOBILITY = 1e-13
 """Mobility of joints that must not move: they give way by less than a microradian for a miss of 0.1 m."""
-MOST_STEPS = 100
+MOST_NEWTON_STEPS = 100
 SETTLED_STEP = 1e-12
 """No joint moves by more than this any more, rad or m."""
 NEAR_TARGET_M = 1e-4
@@ -51,7 +152,7 @@ def box_search(
         (N, n) joint values, (N, T, 4, 4) poses of the tools, (N,) whether they reach the targets.
     """
     search = _Search(tool, targets, q, box, tool.poses(q) if poses is None else poses)
-    for _ in range(MOST_STEPS):
+    for _ in range(MOST_NEWTON_STEPS):
         if not len(search.todo):
             break
         search.step()
@@ -195,113 +296,3 @@ def _face_step(H: Array, g: Array, low: Array, high: Array, *, s: Array, fixed: 
     fixed = fixed | hit
     fixed[np.flatnonzero(leave), worst[leave]] = False
     return s, fixed, blocked | leave
-
-
-TURN_BOUND = radians(1.0)
-"""Default bound of a correction of a turning joint, rad."""
-SLIDE_BOUND = 0.02
-"""Default bound of a correction of a slide, m."""
-LIMIT_SLACK = 1e-9
-"""Starts beyond a limit by less than this, rad or m, come from rounding."""
-
-
-@dataclass(frozen=True, eq=False)
-class Limits:
-    """Limits of the active joints, including those of the mimic joints that one joint drives.
-
-    Args:
-        low: (n,) rad or m. high: (n,).
-        matrix: (k, n) of mimic joints that several joints drive: least <= matrix q <= most.
-        least: (k,). most: (k,).
-    """
-
-    low: Array
-    high: Array
-    matrix: Array
-    least: Array
-    most: Array
-
-    def within(self, start: Array, q: Array) -> Array:
-        """Commands on the way from ``start`` to ``q`` (N, n) where the mimic joints of several joints stay in limits.
-
-        NaN where they are beyond their limits at the start already.
-        """
-        before, change = start @ self.matrix.T, (q - start) @ self.matrix.T  # (N, k)
-        outside = ((before < self.least - LIMIT_SLACK) | (before > self.most + LIMIT_SLACK)).any(1)
-        end = np.where(change > 0, self.most, self.least)
-        share = np.where(change != 0, (end - before) / np.where(change != 0, change, 1.0), np.inf)
-        share = np.clip(share.min(1, initial=1.0), 0.0, 1.0)
-        kept = np.where((share < 1.0)[:, None], start + share[:, None] * (q - start), q)
-        return np.where(outside[:, None], np.nan, kept)
-
-
-def joint_limits(chain: Tree, given: object) -> Limits:
-    """The limits of a chain, or those that are given for the active joints, (n, 2) in rad or m.
-
-    Raises:
-        InputError: another shape, NaN, or a lower limit above the upper one.
-    """
-    active = chain.limits.numpy() if given is None else _given_limits(chain, given)
-    low, high = active[:, 0].copy(), active[:, 1].copy()
-    coupling, constant = chain.coupling.numpy(), chain.coupling_offset.numpy()
-    moving = [joint for joint in chain.joints if joint.kind != "fixed"]
-    shared = []
-    for row, joint in enumerate(moving):
-        drivers = np.flatnonzero(coupling[row])
-        if joint.mimic is None or not len(drivers):
-            continue
-        if len(drivers) > 1:
-            shared.append(row)
-            continue
-        driver, slope = drivers[0], coupling[row, drivers[0]]
-        ends = sorted([(joint.lower - constant[row]) / slope, (joint.upper - constant[row]) / slope])
-        low[driver], high[driver] = max(low[driver], ends[0]), min(high[driver], ends[1])
-    least = np.array([moving[row].lower - constant[row] for row in shared])
-    most = np.array([moving[row].upper - constant[row] for row in shared])
-    return Limits(low, high, coupling[shared], least, most)
-
-
-def largest_motion(chain: Tree, bound: object, scale: float = 1.0) -> Array:
-    """(n,) how far a correction may move each joint, rad or m; ``scale`` multiplies the defaults.
-
-    Raises:
-        InputError: not a positive number, or one for each joint.
-    """
-    usual = scale * np.where(np.array(chain.periodic), TURN_BOUND, SLIDE_BOUND)
-    return usual if bound is None else by_joint(chain, bound, "bound", usual)
-
-
-def by_joint(chain: Tree, value: object, name: str, usual: Array) -> Array:
-    """A positive number for all turning joints, ``usual`` (n,) for the others, or one number for each joint: (n,)."""
-    if np.ndim(value) == 0:  # pyright: ignore[reportArgumentType]
-        return np.where(np.array(chain.periodic), float(positive(value, name)), usual)
-    return positive(value, name, (chain.n,)).numpy().copy()
-
-
-def mobilities(chain: Tree, weights: object, tips: Sequence[str], aimed: Array) -> Array:
-    """(N, n) inverse of the cost of each joint's motion; 0 by default for joints that move no tip with a target.
-
-    Args:
-        chain: n joints. weights: (n,) or None. tips: T names. aimed: (N, T) True where a tip has a target.
-
-    Raises:
-        InputError: not one positive number for each joint.
-    """
-    if weights is None:
-        coupling = chain.coupling.numpy()
-        moving = np.stack([(coupling[chain.path_to(tip).numpy()] != 0).any(0) for tip in tips])  # (T, n)
-        return np.any(aimed[:, :, None] & moving, axis=1).astype(np.float64)
-    return np.tile(1.0 / positive(weights, "weights", (chain.n,)).numpy(), (len(aimed), 1))
-
-
-def _given_limits(chain: Tree, given: object) -> Array:
-    fix = "pass the lower and the upper limit of every joint of `robot.joint_names`, infinite for none"
-    values = real_tensor(given, "limits").detach().cpu().numpy()
-    if values.shape != (chain.n, 2):
-        raise InputError.of("`limits` has the wrong shape", expected=f"({chain.n}, 2)", got=values.shape, fix=fix)
-    wrong = ~(values[:, 0] <= values[:, 1])
-    if wrong.any():
-        joint = int(np.flatnonzero(wrong)[0])
-        what = f"`limits` of joint '{chain.joint_names[joint]}'"
-        raise InputError.of(what, expected="lower <= upper", got=values[joint].tolist(), fix=fix)
-    return values

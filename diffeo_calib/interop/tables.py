@@ -1,4 +1,4 @@
-"""Files for controllers that correct joint by joint: joint offsets, and tables of corrections against joint value.
+"""Tables for controllers: joint offsets, corrections against joint value, the error field of a machine with places.
 
 Signs. The robot's joint is at ``reading + e(reading)`` when its encoder reads ``reading``, e the transmission error. To
 bring the joint itself to q, command c with c + e(c) = q: the correction c - q is what a controller adds to q. A joint
@@ -7,27 +7,59 @@ offset is a constant e.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import csv
+import io
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from math import ceil, radians
+from math import ceil, degrees, prod, radians
 from os import PathLike
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_number
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.files import write_whole
-from diffeo_calib.interop.files import check_units, in_unit, table_text
 from diffeo_calib.interop.rigid import JointOffsets, best_joint_offsets
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.compensation.compensate import compensate
+from diffeo_calib.measurements.table_format import UNITS_PER_METRE
+from diffeo_calib.robots.cartesian import SLIDES, is_cartesian
+from diffeo_calib.robots.se3 import roll_pitch_yaw_angles
 from diffeo_calib.robots.tree import Tree
 
+LENGTHS, ANGLES = UNITS_PER_METRE, {"rad": 1.0, "deg": degrees(1.0)}
+"""Units of tables, per metre and per radian."""
 TURN_STEP, SLIDE_STEP = radians(0.5), 5e-4
 """Distance between the rows of a table, rad and m."""
 MOST_ROWS = 100_000
 FIXED_POINT_STEPS = 20
 """Of c = q - e(c): every step makes the error smaller by the slope of e, a thousandth or so."""
+
+
+def origin_numbers(transform: Tensor) -> tuple[list[float], list[float]]:
+    """A rigid transform (4, 4) as x, y, z [m] and roll, pitch, yaw [rad], R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    xyz, rpy = transform[:3, 3].tolist(), roll_pitch_yaw_angles(transform[:3, :3])
+    return [value + 0.0 for value in xyz], [value + 0.0 for value in rpy]  # no -0.0
+
+
+def check_units(length: str, angle: str) -> None:
+    """Raise InputError for a unit that tables do not have."""
+    for name, value, known in (("length", length, LENGTHS), ("angle", angle, ANGLES)):
+        if value not in known:
+            raise InputError.of(f"`{name}`", expected=" or ".join(map(repr, known)), got=as_written(value))
+
+
+def in_unit(values: Sequence[float], unit: str) -> list[float]:
+    """Lengths in m or angles in rad -> in a unit."""
+    return [value * (LENGTHS | ANGLES)[unit] for value in values]
+
+
+def table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table as CSV; numbers are read back to the last bit."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([header, *rows])
+    return text.getvalue()
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,3 +157,42 @@ def _table(model: CalibratedKinematics, index: int, step: float, turns: bool) ->
     between = float(((rows[1:] + rows[:-1]) / 2 - middle).abs().max())
     values, errors, corrections = (t.detach().cpu() for t in (q[::2], model.transmission(joint, q[::2]), rows))
     return CorrectionTable(joint, turns, values, errors, corrections, between)
+
+
+MOST_POINTS = 100_000
+DIGITS = 7
+
+
+def field_text(model: CalibratedKinematics, grid: str, length: str) -> str:
+    """A table of places within those of the fit, what to add to commands there, and its standard deviations, as CSV.
+
+    Orientations are in the middle of those of the fit. Deviations are those of the first marker, or point of a pose,
+    along the axes of the machine.
+
+    Args:
+        model: of a machine with commanded places or poses, see :func:`diffeo_calib.cartesian`.
+        grid: numbers of points along each axis, such as "5x5x3". length: unit in the file.
+
+    Raises InputError: a model of joint values, another number of axes, or more than 100,000 points.
+    """
+    robot, counts = model.robot, [int(word) if word.isdigit() else 0 for word in grid.lower().split("x")]
+    axes = min(robot.n, len(SLIDES))
+    if not is_cartesian(robot):
+        fix = "calibrate with --robot-pose, or correct a program with `correct`"
+        raise InputError.of("an error field", expected="a machine with commanded places", got=robot.name, fix=fix)
+    if len(counts) != axes or min(counts) < 2 or prod(counts) > MOST_POINTS:
+        expected = f"{axes} numbers of 2 or more, such as {'x'.join('5' * axes)}, at most {MOST_POINTS} points"
+        raise InputError.of(f"--grid {grid}", expected=expected)
+    fitted = model.configurations
+    ends = zip(fitted.amin(0)[:axes].tolist(), fitted.amax(0)[:axes].tolist(), counts, strict=True)
+    lines = [torch.linspace(*each, dtype=fitted.dtype, device=fitted.device) for each in ends]
+    places = torch.cartesian_prod(*lines).view(-1, axes)
+    q = torch.cat([places, places.new_zeros(len(places), robot.n - axes)], 1)
+    targets = robot(q) @ model.tool
+    found = compensate(model, targets if robot.n > axes else targets[:, :3, 3], q)
+    base = model.geometry.base[:3, :3]
+    known = base.mT @ model.predict(q, noise=False)[1][:, 0] @ base
+    deviations = known.diagonal(dim1=1, dim2=2)[:, :axes].sqrt()
+    cells = LENGTHS[length] * torch.cat([places, found.correction[:, :axes], deviations], 1)
+    header = [f"{word}{axis} [{length}]" for word in ("", "add_", "std_") for axis in "xyz"[:axes]]
+    return table_text(header, cells.round(decimals=DIGITS).tolist())
