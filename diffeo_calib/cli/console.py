@@ -120,7 +120,7 @@ def _as_options(text: str) -> str:
     """Keywords of Python as options: ``sep=';'`` -> ``--sep ';'``, `rotation_angle` -> --rotation-angle."""
     given = r"\b(sep|decimal|angle|length|joint_length|convention|duplicates|position|joints|rotation_angle)=('[^']*')"
     text = re.sub(given, lambda found: f"--{found[1].replace('_', '-')} {found[2]}", text)
-    named = r"`(length|joint_length|angle|rotation|convention|rotation_angle|std|rotation_std|controls|tip|payload)`"
+    named = r"`(length|joint_length|angle|position|marker|rotation|convention|rotation_angle|std|rotation_std|controls|tip|payload)`"
     return re.sub(named, lambda found: f"--{found[1].replace('_', '-')}", text)
 
 
