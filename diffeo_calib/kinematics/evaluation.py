@@ -259,9 +259,9 @@ def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluat
     largest = model.robot.reach * LARGEST_ERROR_PER_REACH
     found, options = expected(model, data), sensor_of(data).options
     medians = [(errors.median, _typical(found.places), 1e3, "mm", largest)]
-    if errors.angle_median is not None:
+    if errors.orientation is not None:
         turns = found.covariance[..., 3:, 3:]
-        medians.append((radians(errors.angle_median), _typical(turns), degrees(1.0), "degrees", inf))
+        medians.append((radians(errors.orientation.median), _typical(turns), degrees(1.0), "degrees", inf))
     for median, usual, per_unit, unit, most in medians:
         if median > min(most, LARGEST_ERROR_PER_EXPECTED * usual):
             return sentence(

@@ -24,6 +24,7 @@ import torch
 import two_arms_bank
 from golden_bank import Golden
 from product_bank import simulated_poses
+from shared_bank import shared
 from simulated_camera import camera_arm, fixed_camera_arm, images_of_both
 from torch import Tensor
 from torch.testing import assert_close
@@ -260,9 +261,7 @@ class Kind:
 
     @cached_property
     def result(self) -> Any:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # few rows
-            return dc.calibrate(self.robot, self.data, hyperparameters=self.scales)
+        return shared(f"kind {self.name}", lambda: self._calibrated(self.data))
 
     @property
     def model(self) -> dc.CalibratedKinematics:
@@ -276,9 +275,12 @@ class Kind:
     @cached_property
     def of_part(self) -> Any:
         """The calibration of ``part``."""
+        return shared(f"part of {self.name}", lambda: self._calibrated(self.part))
+
+    def _calibrated(self, rows: Any) -> Any:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return dc.calibrate(self.robot, self.part, hyperparameters=self.scales)
+            warnings.simplefilter("ignore")  # few rows
+            return dc.calibrate(self.robot, rows, hyperparameters=self.scales)
 
     def q(self, count: int = 40) -> Tensor:
         """Configurations within the joint ranges of the fit; for the camera those in which it sees its board."""

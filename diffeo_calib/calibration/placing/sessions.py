@@ -107,7 +107,7 @@ class Sessions(DeviceSet):
         """The sessions of rows whose points (N, P, 3) are known in the frame of the largest one, m."""
         names, session = sessions_of(data)
         reference = int(torch.bincount(session[session != NO_SOCKET], minlength=len(names)).argmax())
-        found = kind.of(seen, data, lambda q: geometry.marker_poses(q)[..., :3, :3])
+        found = kind.of(seen, data, geometry.marker_turns)
         return cls(found.with_reference(reference), reference, session, data.markers)
 
     @staticmethod
