@@ -37,7 +37,6 @@ class Observations(RowGroups):
     hold the values of all rows. A line of a file that holds observations of several kinds is several rows.
     """
 
-    APART = True
     parts: Any = ()
     index: Any = ()
 
@@ -52,6 +51,16 @@ class Observations(RowGroups):
             own = [getattr(part, name) for part in tables]
             alike[name] = None if own[0] is None else self._whole(own)
         set_attributes(self, **alike)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Any]) -> Observations:
+        """The rows of several tables in order: :class:`Measurements`, :class:`Readings` or observations.
+
+        Raises:
+            MeasurementError: no table; tables that differ in joints or payloads; positions with other markers, poses
+                on other tips, other sockets, or a ball on another tip.
+        """
+        return joined_tables(parts, apart=True)
 
     @property
     def sha256(self) -> str:

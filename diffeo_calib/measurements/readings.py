@@ -18,6 +18,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.measurements import checks
+from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.rows import RowGroups, set_attributes, value_range, with_attributes
 
 MILLIMETRES = "mm", 1e3
@@ -207,6 +208,11 @@ class Readings(RowGroups):
         known = checks.deviations(std, "std", read)
         found = cls(kind, angles, read, whose.to(HOST), names, joint_names=joints, std=known, unit=unit)
         return found.doubted(doubt)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Any]) -> Any:
+        """The rows of several tables in order: :class:`Readings` of one kind, else :class:`Observations`."""
+        return joined_tables(parts)
 
     @property
     def reported(self) -> Tensor:

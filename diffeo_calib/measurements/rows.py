@@ -66,8 +66,6 @@ class RowGroups:
     """Other attributes in which tables agree that are joined."""
     NUMBERED: ClassVar[tuple[str, str]]
     """The column of numbers of set-ups or devices, -1 for none, and the attribute with their names."""
-    APART: ClassVar[bool] = False
-    """Whether joined rows stay in parts even where one table can hold them."""
     flattery: ClassVar[str] = ""
     """What errors of these rows do not show where no device measured a position."""
 
@@ -158,22 +156,6 @@ class RowGroups:
             text = f"`q`, column {int(joint)}{name} reaches {largest:g}: values look like degrees, or like millimetres"
             warn_user(f"{text} of a prismatic joint; convert them to rad or m if they are.")
         return self
-
-    @classmethod
-    def joined(cls, parts: Sequence[Any]) -> Any:
-        """The rows of several tables, in order: one table of their kind if that can hold them, else observations.
-
-        One table holds rows with the same columns, and measured positions beside rows in sockets, of one tool, whose
-        ball is then the last marker. Rows of other kinds become :class:`Observations`. Beside images of a board
-        positions and rows in sockets become readings of points of the same tool, see sensors/tool_frames.py.
-
-        Raises:
-            MeasurementError: no table; tables that differ in joints, payloads, markers, sockets, tips of the ball or
-                known deviations.
-        """
-        from diffeo_calib.measurements.observations import joined_tables  # noqa: PLC0415  # it knows all classes
-
-        return joined_tables(parts, apart=cls.APART)
 
     @classmethod
     def in_one(cls, tables: Sequence[Self]) -> Self:

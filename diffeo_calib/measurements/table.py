@@ -20,7 +20,8 @@ from diffeo_calib.measurements import checks
 from diffeo_calib.measurements import poses as pose_math
 from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.images import ImageTable
-from diffeo_calib.measurements.readings import as_readings
+from diffeo_calib.measurements.observations import Observations, joined_tables
+from diffeo_calib.measurements.readings import Readings, as_readings
 from diffeo_calib.measurements.rows import NO_SOCKET, set_attributes, value_range, with_attributes
 from diffeo_calib.measurements.sockets import ONE_SESSION, Distances, Sockets
 from diffeo_calib.measurements.table_format import LEVER
@@ -201,6 +202,19 @@ class Measurements(ImageTable):
         nowhere = torch.zeros(len(angles), 1, 3, dtype=torch.float64, device=angles.device)
         data = cls(angles, nowhere, joints, doubt=doubt)
         return with_attributes(data, points=torch.full_like(nowhere, torch.nan), socket=numbers, sockets=known)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Measurements | Readings | Observations]) -> Any:
+        """The rows of several tables, in order: :class:`Measurements` if one table can hold them.
+
+        These are rows with the same columns, and measured positions beside rows in sockets, of one tool, whose ball is
+        then the last marker. Rows of other kinds become :class:`Observations`. Beside images of a board positions
+        and rows in sockets become readings of points of the same tool, see sensors/tool_frames.py.
+
+        Raises:
+            MeasurementError: tables that differ in joints, payloads, markers or known deviations.
+        """
+        return joined_tables(parts)
 
     def beside_images(self) -> list[tuple[Any, Tensor]]:
         """See :class:`RowGroups`; poses stay."""
