@@ -253,9 +253,8 @@ class ProgramTable:
             raise InputError.of("--position", expected=f"{tools} of them", got=len(position), fix=fix)
         turned = Rows(rotation=rotation, convention=given.convention, rotation_angle=given.rotation_angle)
         table = replace(with_rows(self.table, turned) if rotation else self.table, kinds=robot.kinds)
-        table = replace(
-            table, joints=joint_columns(self.joints, robot), position=[_split_names(text) for text in position]
-        )
+        names = [_split_names(text) for text in position]
+        table = replace(table, joints=joint_columns(self.joints, robot), position=names)
         data = read_observations(self.csv, table, duplicates="keep", growing=True)  # 0, 0, 0 is a target
         lines = [line for line, _ in read_cells(self.csv, table.sep, numeric_columns(table).names)[1]]
         if len(data) < len(lines):
