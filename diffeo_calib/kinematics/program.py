@@ -35,9 +35,8 @@ def takes_program(q: Tensor) -> bool:
 def program_of(deformation: Deformation) -> Program | None:
     """The program of a robot's calibrated map, made at its first use.
 
-    Returns:
-        None for maps without constant stages: adaptive time steps, users' kernels, the Eulerian formulation, and maps
-        on another device than the CPU.
+    None for maps without constant stages: adaptive time steps, users' kernels, the Eulerian formulation, and maps on
+    another device than the CPU.
     """
     if deformation not in _PROGRAMS:
         _PROGRAMS[deformation] = _program(deformation)
@@ -47,13 +46,11 @@ def program_of(deformation: Deformation) -> Program | None:
 def _program(deformation: Deformation) -> Program | None:
     if not isinstance(deformation, GeodesicDeformation):
         return None
-    nominal, theta = deformation.spec.nominal, deformation.momenta.theta
-    points = nominal.points if isinstance(nominal, FlangePoints) else None
-    on = nominal.map.geometry.on if isinstance(nominal, FlangePoints) else None
-    nominal = nominal.fitted if isinstance(nominal, FlangePoints) else nominal
+    asked, theta = deformation.spec.nominal, deformation.momenta.theta
+    other = asked if isinstance(asked, FlangePoints) else None
+    nominal = asked if other is None else other.fitted
     if not isinstance(nominal, GeometryMap) or nominal.load.by_row:
         return None
-    own = on or nominal.geometry.on
     flows = deformation.joint_flow, deformation.task_flow
     radial = all(isinstance(term, RadialKernel) for flow in flows for term in flow.kernel.terms)
     if not radial or not isinstance(deformation.integrator, RungeKutta) or deformation.x.device.type != "cpu":
@@ -69,9 +66,9 @@ def _program(deformation: Deformation) -> Program | None:
     waves = waves_of(nominal.waves.to_config(), geometry.chain.n, _array(nominal.wave_coefficients(theta)))
     chain = replace(chain, waves=waves)
     joint, task = (_recorded(flow, deformation.integrator) for flow in flows)
-    points = geometry.absorb(errors.detach().cpu()).tool if points is None else points
-    tips = geometry.chain.tips
-    return Program(joint, chain, task, _array(points), tuple(tips.index(tip) for tip in own), tips)
+    points = geometry.absorb(errors.detach().cpu()).tool if other is None else other.points
+    tips, on = geometry.chain.tips, geometry.on if other is None else other.map.geometry.on
+    return Program(joint, chain, task, _array(points), tuple(map(tips.index, on)), tips)
 
 
 def _recorded(flow: Flow, integrator: RungeKutta) -> RecordedFlow:
