@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import cast
 from weakref import WeakKeyDictionary
 
@@ -18,7 +17,6 @@ from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.runtime.arrays import Array
 from diffeo_calib.runtime.build import calibrated_chain, recorded_flow
-from diffeo_calib.runtime.chain import waves_of
 from diffeo_calib.runtime.flow import RecordedFlow
 from diffeo_calib.runtime.program import Program
 
@@ -62,9 +60,8 @@ def _program(deformation: Deformation) -> Program | None:
         _array(geometry.joint_errors),
         _array(errors),
         None if nominal.elasticity is None else _array(nominal.elasticity.folded(coefficients)),
+        waves=(nominal.waves.to_config(), _array(nominal.wave_coefficients(theta))),
     )
-    waves = waves_of(nominal.waves.to_config(), geometry.chain.n, _array(nominal.wave_coefficients(theta)))
-    chain = replace(chain, waves=waves)
     joint, task = (_recorded(flow, deformation.integrator) for flow in flows)
     points = geometry.absorb(errors.detach().cpu()).tool if other is None else other.points
     tips, on = geometry.chain.tips, geometry.on if other is None else other.map.geometry.on
