@@ -30,34 +30,37 @@ from product_bank import (
     ur10_measurements,
     with_usual_scales,
 )
+from shared_bank import begin, shared
 
 import diffeo_calib as dc
+
+BANK = begin()  # of this run
 
 
 @pytest.fixture(scope="session")
 def arm() -> Case:
     """The simulated arm, calibrated with 60 poses of one marker."""
-    return calibrated(60)
+    return shared("arm", lambda: calibrated(60))
 
 
 @pytest.fixture(scope="session")
 def arm_200(arm: Case) -> Case:
     """The simulated arm, calibrated with 200 poses and the scales of 60."""
     robot, train, test = simulated(200)
-    scales = arm.result.selection.scales
-    return Case(robot.nominal, train, test, dc.calibrate(robot.nominal, train, hyperparameters=scales))
+    given = {"hyperparameters": arm.result.selection.scales}
+    return shared("arm 200", lambda: Case(robot.nominal, train, test, dc.calibrate(robot.nominal, train, **given)))
 
 
 @pytest.fixture(scope="session")
 def pair() -> Case:
     """The simulated arm with two markers on its tool, 40 poses."""
-    return calibrated(40, markers=2)
+    return shared("pair", lambda: calibrated(40, markers=2))
 
 
 @pytest.fixture(scope="session")
 def posed() -> Case:
     """The simulated arm, calibrated with 30 poses of a frame on its tool."""
-    return calibrated_poses(30)
+    return shared("posed", lambda: calibrated_poses(30))
 
 
 @pytest.fixture(scope="session")
@@ -65,7 +68,7 @@ def slider() -> Case:
     """A robot with a prismatic joint, 50 poses."""
     robot = sliding_robot()
     train, test = sliding_measurements(robot, 50), sliding_measurements(robot, 300, seed=1)
-    return Case(robot, train, test, dc.calibrate(robot, train))
+    return shared("slider", lambda: Case(robot, train, test, dc.calibrate(robot, train)))
 
 
 @pytest.fixture
@@ -162,4 +165,4 @@ def ur10_150(ur10_folder: Path) -> Case:
     train, test = data.split(0.7, seed=0)
     some = train.rows(np.random.default_rng(0).permutation(len(train))[:150])
     some = dc.Measurements(some.q, some.points)
-    return Case(robot, some, test, dc.calibrate(robot, some))
+    return shared("ur10 150", lambda: Case(robot, some, test, dc.calibrate(robot, some)))

@@ -12,7 +12,8 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.registration import find_joint_offsets, register, with_joint_offsets
-from diffeo_calib.measurements.poses import LEVER, inverse_poses, mark_points
+from diffeo_calib.measurements.poses import inverse_poses, mark_points
+from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import nearest_rotations, transforms
 

@@ -21,7 +21,8 @@ import diffeo_calib as dc
 from diffeo_calib.cameras.images import Camera
 from diffeo_calib.common.device import HOST
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.measurements.poses import LEVER, inverse_poses, mark_points, poses_from_marks
+from diffeo_calib.measurements.poses import inverse_poses, mark_points, poses_from_marks
+from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.gravity import GravitySag
 from diffeo_calib.robots.se3 import twist_transform

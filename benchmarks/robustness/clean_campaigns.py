@@ -38,8 +38,8 @@ from varied_arms import TWIST_DEVIATION, Kind, VariedArm
 
 import diffeo_calib as dc
 from diffeo_calib.measurements.csv.files import write_measurements
-from diffeo_calib.measurements.poses import LEVER, mark_points, poses_from_marks
-from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.measurements.poses import mark_points, poses_from_marks
+from diffeo_calib.measurements.table_format import LEVER, TableFormat
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.robots.simulated_arm import URDF_FILE

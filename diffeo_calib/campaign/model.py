@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import combinations
 from math import inf, isinf, pi
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.moved_devices import changes_of
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.planning.candidates import candidates, ranges_around
-from diffeo_calib.calibration.planning.knowledge import factor, greedy
+from diffeo_calib.calibration.planning.knowledge import greedy
 from diffeo_calib.calibration.scales.selection import SCALE_PRIOR, defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.campaign.verdicts import Seen, Verdict, find_change, measure
@@ -47,13 +47,6 @@ EXCEEDANCE_PROBABILITY = 0.05
 INFORMATION_COORDINATES, LOG_SCALE_STEP = 450, 0.2
 """Measured numbers of random rows that say how certain scales are; step of a log scale between which they change."""
 UNITS = ((1e-3, "1000 times too large: mm as m?"), (1e3, "1000 times too small: m as mm?"))
-
-
-class Around(NamedTuple):
-    """Rows around the places of a model, and what may change of robot, tool and devices."""
-
-    data: TangentData
-    changes: Callable[[], list[Hypothesis]]
 
 
 @dataclass(eq=False)
@@ -153,15 +146,15 @@ class CampaignModel:
         process = some.process(self.scales)
         later = [row for row in old if row not in place_of]
         if later:
-            process = process.given(*self._told(self.around(table.rows(later)).data))
-        own: dict[str, Any] = {"process": process, "window": window, "last": self.around(table.rows(window)).data}
+            process = process.given(*self._told(self.around(table.rows(later))[0]))
+        own: dict[str, Any] = {"process": process, "window": window, "last": self.around(table.rows(window))[0]}
         own |= {"taken": _flags([verdicts[row].accepted for row in window]), "ratios": list(self.ratios)}
         errors, own["compared"] = self._errors()
         own["target"] = process.expected(errors)
         candidates, row = self.asked[0], self.like
         rows = table.rows([int(self.placed.data.line_numbers[row])] * len(candidates))
         like = self.placed.measured_at(row, with_joints(rows, candidates), candidates)
-        options, (own["noise"],) = self._told(self.around(like).data)
+        options, (own["noise"],) = self._told(self.around(like)[0])
         own |= {"options": process.expected(options), "open": self.placed.sees(self.like, candidates)}
         return replace(self, **own, seen=len(table))
 
@@ -231,30 +224,26 @@ class CampaignModel:
     @property
     def _covariance(self) -> Tensor:
         """Covariance (T r, T r) of the errors over the target, m^2."""
-        self.target = self.process.expected(self.target.numbers, self.target)
-        return self.compared @ self.known(self.target, self.target) @ self.compared
+        return self.compared @ self._now[1].covariance @ self.compared
 
-    def known(self, a: Expected, b: Expected) -> Tensor:
-        """Covariance (Ma, Mb) of places by all accepted rows, m^2."""
-        numbers, noise = self._told(self.last)
-        last, mine = self.process.expected(numbers), self.taken[numbers.owner]
-        by_a, by_b = (self.process.between(last, one)[mine] for one in (a, b))
-        K = numbers.add_blocks(last.covariance, noise)[mine][:, mine]
-        return self.process.between(a, b) - by_a.T @ torch.linalg.solve(K, by_b)
+    @property
+    def _now(self) -> tuple[Process, Expected]:
+        """What all accepted rows say, and the target by them."""
+        self.target = self.process.expected(self.target.numbers, self.target)
+        taken = self.taken.nonzero()[:, 0]
+        now = self.process.given(*self._told(self.last.rows(taken))) if len(taken) else self.process
+        return now, now.expected(self.target.numbers, self.target)
 
     def next(self, count: int) -> tuple[list[int], list[float]]:
         """Candidates that lower the variance over the target most, and the expected error before and after each, m."""
         self.options = self.process.expected(self.options.numbers, self.options)
-        variance, cross = self._covariance.diagonal().mean(), self.compared @ self.known(self.target, self.options)
-        K, (M, r) = self.known(self.options, self.options), self.noise.shape[:2]
-        own, place = self.options.numbers.diagonal_blocks(K)[0] + self.noise, torch.arange(M, device=HOST)
+        now, target = self._now
+        options, variance = now.expected(self.options.numbers, self.options), self._covariance.diagonal().mean()
+        cross, K, (M, r) = self.compared @ now.between(target, options), options.covariance, self.noise.shape[:2]
+        own, place = options.numbers.diagonal_blocks(K)[0] + self.noise, torch.arange(M, device=HOST)
         how: Any = {"place": place, "open_": self.open, "count": min(count, int(self.open.sum()))}
-        order = greedy(cross, own, lambda row: K.view(M, r, -1)[row], **how)
-        at = torch.tensor(order, dtype=torch.int64, device=HOST)
-        numbers = (at[:, None] * r + torch.arange(r, device=HOST)).flatten()
-        low = factor(K[numbers][:, numbers] + torch.block_diag(*self.noise[at]))
-        by = torch.linalg.solve_triangular(low, cross[:, numbers].T, upper=False).reshape(len(order), r * len(cross))
-        lowered = torch.cat([variance[None], -by.square().sum(1) / len(cross)]).cumsum(0)
+        order, by = greedy(cross, own, lambda row: K.view(M, r, -1)[row], **how)
+        lowered = torch.cat([variance[None], -by.square().sum((1, 2)) / len(cross)]).cumsum(0)
         return order, (3 * lowered).clamp(min=0).sqrt().tolist()
 
     def judge(self, table: Any, verdicts: list[Verdict], lines: Sequence[int]) -> None:
@@ -269,23 +258,23 @@ class CampaignModel:
         row = len(table) - 1
         self.window.append(row)
         try:
-            around = self.around(table.rows(list(self.window)))
+            data, changes = self.around(table.rows(list(self.window)))
         except DiffeoCalibError:
             self.window.pop()
             raise
-        last, seen = len(self.window) - 1, self._seen(*self._told(around.data))
+        last, seen = len(self.window) - 1, self._seen(*self._told(data))
         known = _flags([*(verdicts[number].accepted for number in self.window[:-1]), False])
-        found, typical = measure(seen, last, known, _freedom(around.data, last)), self.typical
+        found, typical = measure(seen, last, known, _freedom(data, last)), self.typical
         fits = found.fits(typical)
         if fits:
             self.ratios.append(found.square / chi2_above(1.0 - gates.TYPICAL_SHARE, found.freedom))
-        cause = "" if fits else self._cause(table, around.data, seen, known)
+        cause = "" if fits else self._cause(table, data, seen, known)
         shown = self.placed.shown(table.rows([row]).parts[0])
         verdicts.append(Verdict(row, fits, fits, found.error, found.expected, cause, shown=shown, line=lines[row]))
         own = [verdicts[number] for number in self.window]
         flags = _flags([one.accepted for one in own]), _flags([not one.cause for one in own])
-        how: Any = {"single": found, "typical": typical, "coordinates": around.data.y.shape[1]}
-        change = None if cause else find_change(seen, self.window, around.changes(), flags, **how)
+        how: Any = {"single": found, "typical": typical, "coordinates": data.y.shape[1]}
+        change = None if cause else find_change(seen, self.window, changes(), flags, **how)
         if change is not None:
             change = replace(change, line=lines[change.row])
             for number in self.window:
@@ -293,7 +282,7 @@ class CampaignModel:
                 if own.change is not None or not (before or own.cause or own.decided):
                     accepted = before and bool(own.fits)
                     verdicts[number] = replace(own, accepted=accepted, change=None if before else change)
-        self._move_on(around.data, verdicts)
+        self._move_on(data, verdicts)
 
     @property
     def typical(self) -> float:
@@ -346,7 +335,7 @@ class CampaignModel:
             "it seems to have been measured at the joint values of the row before": table.q[row - 1],
         }
         before, noise = self._told(data.rows(torch.arange(len(data.x) - 1, device=HOST)))
-        others = self.around(with_joints(table.rows([row] * len(joints)), torch.stack([*joints.values()]))).data
+        others = self.around(with_joints(table.rows([row] * len(joints)), torch.stack([*joints.values()])))[0]
         for number, text in enumerate(joints):
             own, own_noise = self._told(others.rows(torch.tensor([number], dtype=torch.int64, device=HOST)))
             yield text, self._seen(before.joined(own), [*noise, *own_noise])
@@ -360,8 +349,11 @@ class CampaignModel:
         at = self.process.expected(numbers)
         return Seen(numbers, numbers.target - at.mean, numbers.add_blocks(at.covariance, noise))
 
-    def around(self, others: Any) -> Around:
-        """Rows of the campaign around the places of the model; MeasurementError for devices that it does not know."""
+    def around(self, others: Any) -> tuple[TangentData, Callable[[], list[Hypothesis]]]:
+        """Rows of the campaign around the places of the model, and what may change of robot, tool and devices.
+
+        MeasurementError for devices that it does not know.
+        """
         known = self.placed.data
         unknown = set(others.device_names) - set(known.device_names)
         if unknown:
@@ -373,7 +365,7 @@ class CampaignModel:
         placed, data = self.placed.beside(whole, self.data)
         index = torch.arange(len(anchors), len(whole), device=HOST)
         rows = data.rows(index)
-        return Around(rows, lambda: changes_of(rows, placed.placement.hypotheses(data, CHANGE), index))
+        return rows, lambda: changes_of(rows, placed.placement.hypotheses(data, CHANGE), index)
 
     def _errors(self) -> tuple[Numbers, Tensor]:
         """The markers, or the origins of poses, at the target, and (T r, T r) what of their errors counts.

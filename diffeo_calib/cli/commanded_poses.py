@@ -21,8 +21,8 @@ from diffeo_calib.measurements.checks import quiet
 from diffeo_calib.measurements.csv.cells import numbers_in
 from diffeo_calib.measurements.csv.files import read_poses
 from diffeo_calib.measurements.csv.joints import PoseColumns
-from diffeo_calib.measurements.poses import ALL_CONVENTIONS, numbers_of, rotation_matrices
-from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat
+from diffeo_calib.measurements.poses import rotation_matrices
+from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, UNITS_PER_METRE, TableFormat, numbers_of
 from diffeo_calib.robots.cartesian import cartesian
 
 NUMBERED = "0123456", "1234567", "012345", "123456"

@@ -7,11 +7,8 @@ from pathlib import Path
 from typing import Literal
 
 from diffeo_calib.cli.options import (
-    CONVENTION,
     MASS,
-    PAYLOAD,
     ROBOT,
-    ROTATION_ANGLE,
     SEED,
     Angle,
     Candidates,
@@ -210,9 +207,9 @@ class PredictOptions(Command):
     csv: Path = argument(CSV, "CSV")
     units: Units
     output: Path = written("Table of predictions to write.", "CSV", MISSING)
-    convention: str | None = option(CONVENTION)
-    rotation_angle: Angle | None = option(ROTATION_ANGLE)
-    payload: str | None = option(PAYLOAD, "COLUMN")
+    convention: str | None = option()
+    rotation_angle: Angle | None = option()
+    payload: str | None = option(metavar="COLUMN")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.measurements.table_format import described
 
 Kind = Literal["read", "write", "source", "later", "folder"]
 """A file must exist, is written, is written with a header beside it, may come later; or is a folder that is made."""
 Length = Literal["m", "mm", "cm", "inch"]
-"""As in measurements/table_format.py, which loads torch."""
 Angle = Literal["rad", "deg"]
 Convention = Literal["standard", "craig"]
 SHORT = {"output": "-o", "count": "-n"}
@@ -28,12 +28,19 @@ CORNERS = "corners="
 
 
 def option(
-    text: str, metavar: str | None = None, default: Any = None, kind: Kind = "read", *, named: bool = True, **how: Any
+    text: str = "",
+    metavar: str | None = None,
+    default: Any = None,
+    kind: Kind = "read",
+    *,
+    named: bool = True,
+    **how: Any,
 ) -> Any:
     """A field that is an option of its name, or, if it is not ``named``, an argument.
 
     Args:
-        text: its help. metavar: what its value is called. default: MISSING for one that is required.
+        text: its help, by default what :class:`TableFormat` says of its name. metavar: what its value is called.
+        default: MISSING for one that is required.
         kind: what happens to its file. how: limits of its value, as of :func:`typer.Option`.
     """
     how = {"help": text, "metavar": metavar, **how}
@@ -69,7 +76,8 @@ class Option(NamedTuple):
     @classmethod
     def of(cls, own: Field[Any], hint: Any) -> Option:
         """That of a field."""
-        kind, how = own.metadata["kind"], own.metadata["how"]
+        kind, how = own.metadata["kind"], dict(own.metadata["how"])
+        how["help"] = how["help"] or described().get(own.name, "")
         long = f"--{own.name.replace('_', '-')}"
         names = tuple(filter(None, (SHORT.get(own.name), long))) if own.metadata["named"] else ()
         return cls(own.name, hint, own.default, names, (*names, how["metavar"])[0], kind, how)
@@ -128,12 +136,6 @@ def has(hint: Any, part: Any) -> bool:
 
 # --- groups of several commands -----------------------------------------------------------------------------------
 
-CONVENTION = (
-    "How rotations are written: rotvec, quat_xyzw, quat_wxyz, matrix, or an order of Euler angles, extrinsic (such as "
-    "xyz) or intrinsic (such as XYZ)."
-)
-ROTATION_ANGLE = "Unit of Euler angles and rotation vectors."
-PAYLOAD = "Column with the known mass that the robot carried, in any unit."
 MASS = "Mass that the robot carries, for a model with payloads."
 ROBOT = "The robot's description: a URDF, or a table of its Denavit-Hartenberg parameters, one line per joint."
 
@@ -142,24 +144,18 @@ ROBOT = "The robot's description: a URDF, or a table of its Denavit-Hartenberg p
 class Units(Options):
     """How tables are written; a model knows that of the table of its fit."""
 
-    length: Length | None = option(
-        "Unit of positions in the table, and of prismatic joints; needed where no model knows it."
-    )
-    angle: Angle | None = option("Unit of revolute joints in the table; needed where no model knows it.")
-    joint_length: Length | None = option("Unit of prismatic joints, if not that of --length.")
-    joints: str | None = option(
-        "Joint columns in the robot's order, if not named after its joints, or expressions of columns in the units of "
-        "the table, such as -{J2}+90 or {J3}+{J2}.",
-        "A,B,...",
-    )
+    length: Length | None = option()
+    angle: Angle | None = option()
+    joint_length: Length | None = option()
+    joints: str | None = option(metavar="A,B,...")
     robot_pose: str | None = option(
         "Columns of the commanded place or pose, as the controller writes it, in place of joint values and a robot's "
         "description: X,Y,Z, or X,Y,Z,A,B,C=CONVENTION as of --convention, angles in the unit of --angle; or "
         "A,B,...=FILE.py:NAME, a function of yours that makes places or poses of these columns.",
         "X,Y,Z[,...]",
     )
-    sep: str | None = option("Column separator ('\\t' for a tab), by default that of the model, or a comma.")
-    decimal: str | None = option("Decimal mark, by default that of the model, or a point.")
+    sep: str | None = option()
+    decimal: str | None = option()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,9 +177,7 @@ class Places(Options):
 class Rows(Places):
     """Columns of the measurements in a table, of any kinds."""
 
-    position: list[str] | None = option(
-        "The three position columns of a marker; repeat for more markers. Empty cells: hidden in that row.", "X,Y,Z"
-    )
+    position: list[str] | None = option(metavar="X,Y,Z")
     socket: str | None = option(
         "Columns that name the socket in which a ball on the tool rested, in rows without a position.", "PLACE,SOCKET"
     )
@@ -199,41 +193,19 @@ class Rows(Places):
         "printed board. --session names the fixed point, plane or camera of each row.",
         "KIND=COLUMN",
     )
-    marker: str | None = option(
-        "Column that names which marker a line holds, where each has the position of one (not with --rotation or "
-        "several --position, nor for readings and images). Lines with the same joint values that follow each other are "
-        "one row. With names in order where a model has them: COLUMN=A,B,...",
-        "COLUMN",
-    )
-    session: str | None = option("Column that names the set-up of the device for every row.", "COLUMN")
-    remounted: bool = option("For each --session the markers were mounted anew; the device stayed.", default=False)
-    payload: str | None = option(PAYLOAD, "COLUMN")
-    time: str | None = option("Column of times, in any unit: device or arm may drift with it.", "COLUMN")
-    temperature: str | None = option("Column of temperatures, in any unit; likewise.", "COLUMN")
-    rotation: list[str] | None = option(
-        "Columns of the rotation, if poses were measured: 3, 4 or 9, depending on --convention; for frames on several "
-        "tips once per --position.",
-        "A,B,...",
-    )
-    convention: str | None = option(CONVENTION)
-    rotation_angle: Angle | None = option(ROTATION_ANGLE)
-    lever: float | None = option(
-        "Distance from a pose's origin to the three points that represent the pose, in the unit of --length: it weighs "
-        "orientation against position. 0.1 m by default."
-    )
-    camera_on_tool: bool = option(
-        "The poses, or corners, are those of a fixed board in the frame of a camera on the tool, as detectors of "
-        "boards give them; standard deviations are along the camera's axes.",
-        default=False,
-    )
-    std: str | None = option(
-        "Columns with standard deviations of the positions: one for all, one per marker or three per marker.", "A,B,..."
-    )
-    rotation_std: list[str] | None = option(
-        "Columns with standard deviations of the rotation about the measuring frame's axes, or one for all three, in "
-        "the unit of --rotation-angle; once per --rotation.",
-        "A,B,C",
-    )
+    marker: str | None = option(metavar="COLUMN")
+    session: str | None = option(metavar="COLUMN")
+    remounted: bool = option(default=False)
+    payload: str | None = option(metavar="COLUMN")
+    time: str | None = option(metavar="COLUMN")
+    temperature: str | None = option(metavar="COLUMN")
+    rotation: list[str] | None = option(metavar="A,B,...")
+    convention: str | None = option()
+    rotation_angle: Angle | None = option()
+    lever: float | None = option()
+    camera_on_tool: bool = option(default=False)
+    std: str | None = option(metavar="A,B,...")
+    rotation_std: list[str] | None = option(metavar="A,B,C")
     needs = (
         ("--lever", "--rotation"),
         ("--camera-on-tool", "--rotation --reading"),
@@ -286,8 +258,8 @@ class Targets(Options):
         "Columns of the target positions of the tool, if the commands' own nominal poses are not the targets.", "X,Y,Z"
     )
     rotation: list[str] | None = option("Columns of the target orientations: 3, 4 or 9, see --convention.", "A,B,...")
-    convention: str | None = option(CONVENTION)
-    rotation_angle: Angle | None = option(ROTATION_ANGLE)
+    convention: str | None = option()
+    rotation_angle: Angle | None = option()
 
 
 @dataclass(frozen=True, kw_only=True)

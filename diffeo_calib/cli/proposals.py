@@ -40,10 +40,9 @@ from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD, quiet
 from diffeo_calib.measurements.csv.files import read_joints, read_observations
 from diffeo_calib.measurements.csv.joints import JointExpressions
 from diffeo_calib.measurements.csv.sensors import SocketColumns
-from diffeo_calib.measurements.poses import ALL_CONVENTIONS, numbers_of
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat
+from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, UNITS_PER_METRE, TableFormat, numbers_of
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.tables import check_poses, divided, measured_positions

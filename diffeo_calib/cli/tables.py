@@ -30,8 +30,8 @@ from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
 from diffeo_calib.measurements.csv.sensors import ImageColumns, ReadingColumns, SocketColumns, numeric_columns
-from diffeo_calib.measurements.poses import LEVER, by_frame, numbers_of, rotation_matrices
-from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.measurements.poses import by_frame, rotation_matrices
+from diffeo_calib.measurements.table_format import LEVER, TableFormat, numbers_of
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.kinds import known_kinds

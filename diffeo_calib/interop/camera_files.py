@@ -28,11 +28,11 @@ def camera_files(
 
     Raises InputError: a model without such a camera, or one that was registered again.
     """
-    cameras = {name: own for each in model.placement for name, own in each.cameras.items()}
+    cameras = {name: own for each in model.placement for name, own in each.devices.cameras.items()}
     if not cameras and (model.lever is None or on_tool is None):
         fix = "calibrate with a table of `images`; of poses of a board say whether the camera is on the tool"
         raise InputError.of("the camera of the model", expected="one that saw a board", got="none", fix=fix)
-    on_tool = next(iter(cameras.values())).on_tool if cameras else bool(on_tool)
+    on_tool = bool(next(iter(cameras.values())).on_tool if cameras else on_tool)
     found, each = dict[str, str](), HandEye.of_each(model, camera_on_tool=on_tool, geometry=geometry)
     for name, own in each.items():
         known, files = name.replace("/", "_"), dict[str, str]()

@@ -230,7 +230,7 @@ class CalibratedKinematics:
 
     def turns(self, q: Tensor) -> Tensor:
         """(N, P, 3, 3) turns of the tips that carry the points at (N, n) joint values, by the geometry."""
-        return self.geometry.marker_poses(q)[..., :3, :3]
+        return self.geometry.marker_turns(q)
 
     @property
     def measured_frame(self) -> Tensor:

@@ -22,9 +22,9 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import block_diagonal
-from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.devices import Devices, Extrinsics
 from diffeo_calib.sensors.places import PlacedDevices
-from diffeo_calib.sensors.set_ups import MOUNTING, seen_mounted
+from diffeo_calib.sensors.set_ups import MountedMarkers, seen_mounted
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,14 +49,6 @@ class PredictedReadings:
         return self.covariance.diagonal(dim1=1, dim2=2).clamp(min=0).sqrt()
 
 
-class _Seen(NamedTuple):
-    """The points of a model at some configurations: values (N, 3 P), m, and their linearisation."""
-
-    points: Tensor
-    at: Linearisation
-    sensitivity: Tensor | None
-
-
 class FittedDevice(NamedTuple):
     """A device of readings beside a fit, where the model has it.
 
@@ -77,9 +69,8 @@ class FittedDevice(NamedTuple):
     @classmethod
     def of(cls, fitted: FittedMap, own: PlacedDevices, number: int) -> FittedDevice:
         """A device of a set of those of readings."""
-        kind: Any = type(own.devices)
-        deviations = own.deviations[number]
-        devices: Devices = kind(own.names[number : number + 1], own.constants[number, None], deviations)
+        devices: Any = own.devices.only(own.names[number : number + 1])
+        deviations = devices.deviations[0]
         placed, rows = cls(devices, torch.diag(deviations)), own.rows[own.device == number]
         if not len(rows):
             return placed
@@ -97,33 +88,32 @@ class FittedDevice(NamedTuple):
         """(N, r, k) derivatives of readings of points (N, 3 P'), which it sees, by its unknowns, m."""
         return self.devices.by_increments(points, torch.zeros(len(points), dtype=torch.int64, device=HOST))
 
-    def readings(self, fitted: FittedMap, seen: _Seen, *, noise: bool) -> tuple[Tensor, Tensor]:
-        """Mean (N, r) and covariance (N, r, r) of its readings, m."""
-        points = seen.points[:, -3 * self.devices.seen_points :]
+    def readings(self, fitted: FittedMap, seen: tuple[Tensor, Linearisation], *, noise: bool) -> tuple[Tensor, Tensor]:
+        """Mean (N, r) and covariance (N, r, r) of its readings, m, of points and their linearisation."""
+        whole, at = seen
+        points = whole[:, -3 * self.devices.seen_points :]
         observation = self.devices.observation(torch.zeros(len(points), dtype=torch.int64, device=HOST))
-        A = torch.nn.functional.pad(observation.slope(points), (seen.points.shape[1] - points.shape[1], 0))
+        A = torch.nn.functional.pad(observation.slope(points), (whole.shape[1] - points.shape[1], 0))
         B = self.by_increments(points) @ self.root
         if self.columns is None:
-            covariance = fitted.covariance_at(seen.at, A) + B @ B.mT
+            covariance = fitted.conditional.covariance(at, A) + B @ B.mT
         else:
-            covariance = fitted.with_shifts(seen.at.projected(A), B, self.columns)
-        if seen.sensitivity is not None:
-            moved = A @ (seen.sensitivity @ fitted.open_directions)
-            covariance = covariance + moved @ moved.mT
+            covariance = fitted.with_shifts(at.projected(A), B, self.columns)
         if noise:
             covariance = covariance + (A @ fitted.new_noise @ A.mT if self.noise is None else self.noise)
-        return observation.value(points), covariance
+        return observation.value(points).detach(), covariance
 
 
 def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[PredictedReadings]:
     """Predicted readings at q (N, n) of every device that a model knows, see :meth:`predict_readings`."""
     fitted: FittedMap = model.map
     for own in model.placement:
-        own.warn_if_unknown()
-    sets = [(own, own.devices) for own in model.placement if own.devices is not None and len(q)]
-    found = [one for own in model.placement if own.kind == MOUNTING for one in _mounted(model, own, q, noise=noise)]
-    blocks = range(0, len(q) if sets else 0, PREDICT_ROWS)
-    seen = [_seen(fitted, q, slice(first, first + PREDICT_ROWS)) for first in blocks]
+        own.devices.warn_if_unknown()
+    sets = [(own, own.devices) for own in model.placement if own.devices.reads and len(q)]
+    markers = [own.devices for own in model.placement if own.kind == MountedMarkers.kind]
+    found = [one for own in markers for one in _mounted(model, own, q, noise=noise)]
+    each = (slice(first, first + PREDICT_ROWS) for first in range(0, len(q) if sets else 0, PREDICT_ROWS))
+    seen = [fitted.linearised_value(q[some], fitted.geodesic.at_rows(some)) for some in each]
     for own, devices in sets:
         unit, scale, zero = own.shown or ("", (1.0,), (0.0,))  # files of old versions: as reported, lengths in m
         for number, name in enumerate(own.names):
@@ -136,7 +126,7 @@ def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[Pre
     return found
 
 
-def _mounted(model: Any, own: PlacedDevices, q: Tensor, *, noise: bool) -> Iterator[PredictedReadings]:
+def _mounted(model: Any, own: Extrinsics, q: Tensor, *, noise: bool) -> Iterator[PredictedReadings]:
     """Positions of the markers as they were mounted in other sessions than that of the model."""
     mean, covariance = model.predict(q, noise=noise)
     shifts, deviations = (each.unflatten(1, (-1, 3)) for each in (own.constants, own.deviations))
@@ -148,9 +138,3 @@ def _mounted(model: Any, own: PlacedDevices, q: Tensor, *, noise: bool) -> Itera
             places = places.masked_fill(~seen_mounted(std)[:, None], torch.nan)
             blocks = 1e6 * (covariance[:, :P] + turns @ torch.diag_embed(std.square()) @ turns.mT)
             yield PredictedReadings("position", name, "mm", places.flatten(1), block_diagonal(blocks))
-
-
-def _seen(fitted: FittedMap, q: Tensor, some: slice) -> _Seen:
-    geodesic = fitted.geodesic.at_rows(some)
-    points, at = geodesic.linearised_value(q[some])
-    return _Seen(points.detach(), at, fitted.open_sensitivity(geodesic.spec.nominal, q[some]))

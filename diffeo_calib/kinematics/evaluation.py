@@ -131,18 +131,16 @@ def place(kinematics: Callable[[Tensor], Tensor], data: Any, *, every_session: b
 def devices_of(model: object) -> dict[str, Devices]:
     """The devices of readings whose places a model knows, by kind; none for other kinematics."""
     found = dict[str, Devices]()
-    for one in getattr(model, "placement", None) or ():
-        own = one if isinstance(one, Devices) else getattr(one, "devices", None)
-        if isinstance(own, Devices):
-            found[own.kind] = found[own.kind].beside(own) if own.kind in found else own
+    for own in [own.devices for own in getattr(model, "placement", None) or () if own.devices.reads]:
+        found[own.kind] = found[own.kind].beside(own) if own.kind in found else own
     return found
 
 
 def placement_sentences(model: object) -> list[str]:
     """Where the devices are that a model knows, with deviations; none for other kinematics."""
     drift = KnownDrift.of(model)
-    lines = [line for own in getattr(model, "placement", None) or () for line in own.sentences()]
-    return lines if drift is None else [*lines, *drift.sentences()]
+    lines = [line for own in getattr(model, "placement", None) or () for line in own.devices.sentences()]
+    return lines if drift is None else [*lines, *drift.of_joints()]
 
 
 def at_payloads(kinematics: Callable[[Tensor], Tensor], data: Any) -> Callable[[Tensor], Tensor]:
@@ -244,9 +242,9 @@ def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluat
     largest = model.robot.reach * LARGEST_ERROR_PER_REACH
     found, options = expected(model, data), sensor_of(data).options
     medians = [(errors.median, _typical(found.places), 1e3, "mm", largest)]
-    if errors.angle_median is not None:
+    if errors.orientation is not None:
         turns = found.covariance[..., 3:, 3:]
-        medians.append((radians(errors.angle_median), _typical(turns), degrees(1.0), "degrees", inf))
+        medians.append((radians(errors.orientation.median), _typical(turns), degrees(1.0), "degrees", inf))
     for median, usual, per_unit, unit, most in medians:
         if median > min(most, LARGEST_ERROR_PER_EXPECTED * usual):
             return sentence(

@@ -10,7 +10,6 @@ only, orientations are off by 0.046 degrees RMS, those of its geometric calibrat
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -89,29 +88,18 @@ class ToolKinematics:
         """
         turn, poses, blocks = self._turned(), [], []
         without_base = self.frame == "base" and self.fitted.workspace is None  # there the base carries rigid motions
+        held = self.nominal.geometry.slices["base"] if without_base else slice(0)
         for rows in q.detach().split(PREDICT_ROWS):
-            points, at = self.deformation.linearised_value(rows)
+            points, at = self.fitted.linearised_value(rows, self.deformation, held)
             seen = poses_from_marks(points.unflatten(1, (3, 3)), TOOL_LEVER)
-            if without_base:
-                at = replace(at, sensitivity=self._without_base(at.sensitivity))
             poses.append(self._in_frame(seen))
-            directions = turn @ pose_directions(seen, TOOL_LEVER)
-            sensitivity = self.fitted.open_sensitivity(self.deformation.spec.nominal, rows)
-            if sensitivity is not None and without_base:
-                sensitivity = self._without_base(sensitivity)
-            covariance = self.fitted.covariance_at(at, directions)
-            blocks.append(self.fitted.with_open_directions(covariance, sensitivity, directions))
+            blocks.append(self.fitted.covariance(at, turn @ pose_directions(seen, TOOL_LEVER)))
         return torch.cat(poses), torch.cat(blocks)
 
     def _program_for(self, q: Tensor) -> Program | None:
         """The constants that answer a query; None where torch must."""
         known = program_of(self.fitted.deformation) if takes_program(q) else None
         return None if known is None else known.at(self.tip)
-
-    def _without_base(self, sensitivity: Tensor) -> Tensor:
-        kept = sensitivity.new_ones(sensitivity.shape[2])
-        kept[self.nominal.geometry.slices["base"]] = 0.0
-        return sensitivity * kept
 
     def _in_frame(self, poses: Tensor) -> Tensor:
         return poses if self.frame == "measuring" else torch.linalg.inv(self.base.to(poses.device)) @ poses
@@ -182,7 +170,7 @@ def covariance_without_placement(model: Any, q: Tensor, tool: Tensor, tip: str |
     every = torch.linspace(0, len(known) - 1, min(len(known), REFERENCE_ROWS), dtype=torch.float64, device=known.device)
     rows = torch.cat([known[every.round().long()], q.detach()])
     points, at = kinematics.deformation.linearised_value(rows)
-    covariance = fitted.covariance_between(at)  # directions that the data leave open are those of both motions
+    covariance = fitted.conditional.covariance_between(at)  # open directions are those of both motions
     points = points.unflatten(1, (3, 3))
     base, own = frame_slopes(points, points.mean((0, 1))), tool_points(tool).to(points)  # a motion of the base moves
     flange = FlangePoints(kinematics.nominal, own, on=(kinematics.tip,) * 3)  # the points, one of the tool these

@@ -14,19 +14,14 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_number, real_tensor, wrapped
-from diffeo_calib.common.errors import InputError, as_written
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.checks import quiet
+from diffeo_calib.measurements.table_format import numbers_of
 from diffeo_calib.robots import se3
 from diffeo_calib.robots.se3 import skew, transforms
 
-ANGLE_UNITS = ("rad", "deg")
-NUMBERS = {"rotvec": 3, "quat_xyzw": 4, "quat_wxyz": 4, "matrix": 9}
-"""How many numbers write a rotation in each convention; an order of Euler angles takes three."""
-CONVENTIONS = "'rotvec', 'quat_xyzw', 'quat_wxyz', 'matrix', or three letters as 'xyz' (extrinsic) or 'XYZ' (intrinsic)"
 TOLERANCE = 1e-3
 """Quaternions and matrices may be off by this, because files have few digits; the nearest rotation is used."""
-LEVER = 0.1
-"""Default distance [m] from a pose's origin to the three points that represent it: the size of usual tools."""
 MARKS = ((1.0, 0.0, 0.0), (-0.5, 0.75**0.5, 0.0), (-0.5, -(0.75**0.5), 0.0))
 """Directions u_k from the frame's origin to its three points, one per row: their sum is zero."""
 POINTS = 3
@@ -45,37 +40,6 @@ Place = Callable[[int], str]
 def marks(device: torch.device) -> Tensor:
     """The directions u_k as a tensor (3, 3)."""
     return torch.tensor(MARKS, dtype=torch.float64, device=device)
-
-
-def numbers_of(convention: object, angle: object = "rad") -> int:
-    """How many numbers one rotation takes: 3, 4 or 9; InputError for an unknown convention, or unit of angles."""
-    if angle not in ANGLE_UNITS:
-        fix = "pass the unit of the rotations"
-        raise InputError.of("`angle`", expected="'rad' or 'deg'", got=as_written(angle), fix=fix)
-    if isinstance(convention, str) and convention in NUMBERS:
-        return NUMBERS[convention]
-    if not is_euler(convention):
-        fix = "name the convention in which the rotations are written"
-        raise InputError.of("`convention`", expected=CONVENTIONS, got=as_written(convention), fix=fix)
-    return 3
-
-
-def is_euler(convention: object) -> bool:
-    """Whether this is an order of Euler angles: three axes of one case, none twice in a row."""
-    if not isinstance(convention, str) or len(convention) != 3:
-        return False
-    one_case = set(convention) <= set("xyz") or set(convention) <= set("XYZ")
-    return one_case and convention[0] != convention[1] != convention[2]
-
-
-EULER = tuple(
-    order
-    for letters in ("xyz", "XYZ")
-    for order in ("".join((a, b, c)) for a in letters for b in letters for c in letters)
-    if is_euler(order)
-)
-"""The 24 orders of Euler angles."""
-ALL_CONVENTIONS = (*NUMBERS, *EULER)
 
 
 def rotation_matrices(values: object, convention: str, *, angle: str = "rad", place: Place = "row {}".format) -> Tensor:

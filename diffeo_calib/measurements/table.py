@@ -24,6 +24,7 @@ from diffeo_calib.measurements.observations import Observations, joined_tables
 from diffeo_calib.measurements.readings import Readings, as_readings
 from diffeo_calib.measurements.rows import NO_SOCKET, set_attributes, value_range, with_attributes
 from diffeo_calib.measurements.sockets import ONE_SESSION, Distances, Sockets
+from diffeo_calib.measurements.table_format import LEVER
 
 XYZ, TURNS = ("x", "y", "z"), ("rx", "ry", "rz")
 
@@ -110,7 +111,7 @@ class Measurements(ImageTable):
         joint_names: Sequence[str] | None = None,
         *,
         on: Sequence[str] | None = None,
-        lever: float = pose_math.LEVER,
+        lever: float = LEVER,
         position_std: object = None,
         rotation_std: object = None,
         camera_on_tool: bool = False,

@@ -1,20 +1,27 @@
-"""How a table is written: units, separators, and the columns of rotations and standard deviations.
+"""How a table is written: units, separators, and its columns. Imports nothing slow: help shows what is said here.
 
 Units exist only in files. They must always be named and are never guessed.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cache
+from textwrap import dedent
 from typing import Any
 
-from diffeo_calib.common.errors import MeasurementError, as_written, listed
-from diffeo_calib.measurements.checks import of_measurements
-from diffeo_calib.measurements.poses import ANGLE_UNITS, CONVENTIONS, LEVER, numbers_of
+from diffeo_calib.common.errors import InputError, MeasurementError, as_written, listed
 
 Names = Sequence[str] | Sequence[Sequence[str]]
 """Names of columns: a list, or one for each marker or frame."""
+ANGLE_UNITS = ("rad", "deg")
+NUMBERS = {"rotvec": 3, "quat_xyzw": 4, "quat_wxyz": 4, "matrix": 9}
+"""How many numbers write a rotation in each convention; an order of Euler angles takes three."""
+CONVENTIONS = "'rotvec', 'quat_xyzw', 'quat_wxyz', 'matrix', or three letters as 'xyz' (extrinsic) or 'XYZ' (intrinsic)"
+LEVER = 0.1
+"""Default distance [m] from a pose's origin to the three points that represent it: the size of usual tools."""
 UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0, "cm": 100.0, "inch": 1 / 0.0254}
 """A length in a file is divided by this."""
 ROTATION_NAMES = {
@@ -33,36 +40,40 @@ class TableFormat:
     """What a table of measurements or predictions holds, and how it is written.
 
     Args:
-        length: unit of the positions in the file. angle: of its revolute joints.
-        sep: one character between cells. decimal: ``"."`` or ``","``.
-        rotation: names of the columns of the tool's rotation, for measured poses, or one such list for each frame on
-            several tips, whose origins are the positions. Rotation and position map from the tool's frame to the
-            measuring frame.
-        convention: how all rotations are written: ``"rotvec"``, ``"quat_xyzw"``, ``"quat_wxyz"``, ``"matrix"`` (nine
-            columns row by row) or an order of Euler angles: extrinsic as ``"xyz"``, intrinsic as ``"XYZ"``.
-        rotation_angle: unit of Euler angles, rotation vectors and ``rotation_std``, ``"rad"`` or ``"deg"``.
-        lever: see :meth:`Measurements.from_poses`; in m, whatever the unit of length in the file.
-        std: names of columns with standard deviations of the positions, in the unit of length: one for all, one
-            per marker or three per marker.
-        rotation_std: names of columns with standard deviations of the rotation about the axes of the measuring frame,
-            which are not the axes of Euler angles: one for all, or one or three for each frame.
-        joint_length: unit of the prismatic joints in the file; that of the positions by default.
-        payload: name of a column with the known mass that the robot carried at its tip, in any unit; 0 without load.
-            For another link see :meth:`Measurements.with_payload`.
-        time, temperature: names of columns with which something may drift, see :meth:`Measurements.with_covariates`.
-        camera_on_tool: the poses are those of a fixed board in the frame of a camera on the tool, and standard
-            deviations are along its axes; see :meth:`Measurements.from_poses`.
-        remounted: whether the markers were mounted anew between the set-ups, see :meth:`Measurements.with_sessions`.
-        joints: names of the joint columns in the robot's order, or the robot, or expressions of columns. kinds: of each
-            joint; by default those of the robot, or all revolute.
-        position: names of the x, y and z columns of the marker, or one such triple per marker; None without positions.
+        length: unit of positions in the table, and of prismatic joints; a model knows that of its own table.
+        angle: unit of revolute joints in the table; likewise.
+        sep: one character between cells (on the command line also: tab), by default a comma, or that of the model.
+        decimal: decimal mark, by default a point, or that of the model.
+        rotation: columns of the rotation, if poses were measured: 3, 4 or 9, depending on `convention`; for frames on
+            several tips, whose origins are the positions, a list for each. Rotation and position map from the tool's
+            frame to the measuring frame.
+        convention: how all rotations are written: rotvec, quat_xyzw, quat_wxyz, matrix (nine columns row by row), or an
+            order of Euler angles, extrinsic (such as xyz) or intrinsic (such as XYZ).
+        rotation_angle: unit of Euler angles, rotation vectors and `rotation_std`.
+        lever: distance from a pose's origin to the three points that represent the pose: it weighs orientation against
+            position. 0.1 m by default, in Python in m, on the command line in the unit of `length`.
+        std: columns with standard deviations of the positions, in the unit of `length`: one for all, one per marker or
+            three per marker.
+        rotation_std: columns with standard deviations of the rotation about the measuring frame's axes, which are not
+            the axes of Euler angles: one for all, or one or three for each frame.
+        joint_length: unit of prismatic joints, if not that of `length`.
+        payload: column with the known mass that the robot carried at its tip, in any unit; 0 without load.
+        time: column of times, in any unit: device or arm may drift with it.
+        temperature: column of temperatures, in any unit: device or arm may drift with it.
+        camera_on_tool: the poses, or corners, are those of a fixed board in the frame of a camera on the tool, as
+            detectors of boards give them; standard deviations are along the camera's axes.
+        remounted: for each `session` the markers were mounted anew; the device stayed.
+        joints: joint columns in the robot's order, if not named after its joints, or expressions of columns in the
+            units of the table, such as -{J2}+90 or {J3}+{J2}. In Python also the robot.
+        kinds: of each joint; by default those of the robot, or all revolute.
+        position: the three position columns of a marker; several of them for more markers. Empty cells: hidden in that
+            row. None in Python without positions.
         sockets: columns of a ball in sockets. readings: of each kind of reading, and of images (csv/sensors.py).
-        session: name of a column whose texts tell the set-ups of the device apart that measures positions or poses, see
-            :meth:`Measurements.with_sessions`.
+        session: column that names the set-up of the device for every row.
         on: names of the tips that carry the markers or frames, one for each, for a robot with several tips.
-        marker: name of a column that names the marker of every line, where each has the position of one. Lines with the
-            same joint values that follow each other are one row. Markers are in the order in which they appear, or, for
-            rows of a model, in the one that ``"COLUMN=A,B,C"`` gives.
+        marker: column that names which marker a line holds, where each has the position of one (not with `rotation` or
+            several markers, nor for readings and images). Lines with the same joint values that follow each other are
+            one row. Markers are in the order in which they appear, or in that of COLUMN=A,B,...
 
     Raises:
         MeasurementError: an unknown unit, a separator that is not one character, or one that is also the decimal mark.
@@ -155,8 +166,7 @@ class TableFormat:
         if self.convention is None:
             what = "`rotation` is given, but its `convention` is not"
             raise MeasurementError.of(what, expected=CONVENTIONS, fix="name it: it is never guessed")
-        with of_measurements():
-            count = numbers_of(self.convention)
+        count = numbers_of(self.convention, error=MeasurementError)
         expected = f"{count} names of columns for {self.convention!r}"
         rotation = by_frame("rotation", self.rotation, expected, count)
         std, unit = self.rotation_std, self.rotation_angle
@@ -179,8 +189,7 @@ class TableFormat:
         the columns of each frame begin with. MeasurementError for an unknown convention, unit or number of names.
         """
         convention, unit = self.convention or "rotvec", self.rotation_angle or self.angle
-        with of_measurements():
-            count = numbers_of(convention)
+        count = numbers_of(convention, error=MeasurementError)
         check_choice("rotation_angle", unit, ANGLE_UNITS)
         plain = ROTATION_NAMES.get(convention, ("euler1", "euler2", "euler3"))
         names = by_frame("rotation", self.rotation or _prefixed(prefixes, plain), f"{count} names", count)
@@ -190,6 +199,46 @@ class TableFormat:
             std = by_frame("rotation_std", given, "three names", 3)
         angle = unit if count == 3 or rotation_std else None
         return replace(self, rotation=names, convention=convention, rotation_angle=angle, rotation_std=std)
+
+
+def numbers_of(convention: object, angle: object = "rad", error: type[InputError] = InputError) -> int:
+    """How many numbers one rotation takes: 3, 4 or 9; an error for an unknown convention, or unit of angles."""
+    if angle not in ANGLE_UNITS:
+        fix = "pass the unit of the rotations"
+        raise error.of("`angle`", expected="'rad' or 'deg'", got=as_written(angle), fix=fix)
+    if isinstance(convention, str) and convention in NUMBERS:
+        return NUMBERS[convention]
+    if not is_euler(convention):
+        fix = "name the convention in which the rotations are written"
+        raise error.of("`convention`", expected=CONVENTIONS, got=as_written(convention), fix=fix)
+    return 3
+
+
+def is_euler(convention: object) -> bool:
+    """Whether this is an order of Euler angles: three axes of one case, none twice in a row."""
+    if not isinstance(convention, str) or len(convention) != 3:
+        return False
+    one_case = set(convention) <= set("xyz") or set(convention) <= set("XYZ")
+    return one_case and convention[0] != convention[1] != convention[2]
+
+
+EULER = tuple(
+    order
+    for letters in ("xyz", "XYZ")
+    for order in ("".join((a, b, c)) for a in letters for b in letters for c in letters)
+    if is_euler(order)
+)
+"""The 24 orders of Euler angles."""
+ALL_CONVENTIONS = (*NUMBERS, *EULER)
+
+
+@cache
+def described() -> dict[str, str]:
+    """What every field of a table is, by the docstring of :class:`TableFormat`, with keywords as options."""
+    text = dedent("        " + (TableFormat.__doc__ or "").partition("Args:")[2].partition("Raises:")[0].strip())
+    found = re.findall(r"^(\w+): (.*(?:\n +.*)*)", text, re.MULTILINE)
+    words = {name: re.sub(r"`(\w+)`", lambda own: f"--{own[1].replace('_', '-')}", said) for name, said in found}
+    return {name: " ".join(f"{said[0].upper()}{said[1:]}".split()) for name, said in words.items()}
 
 
 def options_of(table: TableFormat) -> list[str]:

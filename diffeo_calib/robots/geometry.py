@@ -115,6 +115,10 @@ class Geometry:
         """Poses in the measuring frame of the tips that carry the markers, see :meth:`points`: -> (N, P, 4, 4) [m]."""
         return self._walk(q, theta).tips
 
+    def marker_turns(self, q: Tensor) -> Tensor:
+        """Orientations of these tips: (N, n) -> (N, P, 3, 3)."""
+        return self.marker_poses(q)[..., :3, :3]
+
     def points(self, q: Tensor, theta: Tensor | None = None) -> Tensor:
         """Markers in the measuring frame: q (N, n), theta (K,) or per row (N, K), None for zero -> (N, P, 3) [m]."""
         return self._walk(q, theta).points

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.cameras.images import UNKNOWNS, Camera, View
+from diffeo_calib.sensors.devices import Extrinsics
 
-CAMERA = "camera"
 SIZE = len(UNKNOWNS)
 
 
@@ -83,6 +83,21 @@ class BoardCamera:
         known = View.from_numbers(view) if len(view) else None
         camera = Camera(int(width), int(height), half_size, unknowns, root.view(SIZE, SIZE), noise, known)
         return cls(camera, bool(on_tool), Explained(*explained))
+
+
+@dataclass(frozen=True, eq=False)
+class BoardCameras(Extrinsics):
+    """Cameras that saw a board, by their :attr:`BoardCamera.numbers`."""
+
+    kind = "camera"
+
+    @property
+    def cameras(self) -> dict[str, BoardCamera]:
+        each = zip(self.names, map(BoardCamera.of, self.constants), strict=True)
+        return {name: own for name, own in each if own is not None}
+
+    def sentences(self) -> list[str]:
+        return list(camera_sentences(self.cameras))
 
 
 def camera_sentences(cameras: Mapping[str, BoardCamera]) -> Iterator[str]:

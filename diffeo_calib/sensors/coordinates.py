@@ -14,19 +14,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, listed
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake, rare_names
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
-from diffeo_calib.measurements.sockets import Sockets
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices
-from diffeo_calib.sensors.errors import ERRORS, READINGS, SPREAD, Evaluation, Evaluations, socket_errors
+from diffeo_calib.sensors.errors import ERRORS, READINGS, SPREAD, Evaluation, Evaluations
 from diffeo_calib.sensors.kinds import kind_of
-from diffeo_calib.sensors.places import BALL_IS_THE_MARKER, SOCKET, PlacedDevices, Places, placed
+from diffeo_calib.sensors.places import BALL_IS_THE_MARKER, PlacedDevices, Places, placed
 from diffeo_calib.sensors.set_ups import ROWS, Turns, check_same_markers, set_up_kind
+from diffeo_calib.sensors.sockets import SocketPlaces, socket_errors, sockets_of
 from diffeo_calib.sensors.tables import Coordinates
 
 KNOWN_DEVIATION = 1e-8
@@ -124,7 +124,7 @@ class Positions(Sensor):
 
         The rows of a single unknown set-up are those of a model that knows none, unless no device shares its frame.
         """
-        known = set_up_kind(data).of_model(beside.model, beside.turns)
+        known = set_up_kind(data).known_to(beside.model, beside.turns)
         if beside.unplaced and not data.remounted:
             data = data.with_sessions([name or ROWS for name in data.device_names])
         names = dict.fromkeys(name for name in data.device_names if name)
@@ -157,10 +157,12 @@ class Positions(Sensor):
         """The frames of the set-ups that rows name, or their markers; those of the only one are those of the model."""
         names = data.present_sessions
         if len(names) < 2:
-            kept = not names or (data.remounted and data.lever is not None)  # a camera that the model knows stays
-            return () if kept else (PlacedDevices.of_model_alone(names, data.markers if data.remounted else 0),)
-        own = set_up_kind(data).of(points, data, turns)
-        return (PlacedDevices.outside(own.kind, own.names, own.constants, own.deviations),)
+            if not names or (data.remounted and data.lever is not None):  # a camera that the model knows stays
+                return ()
+            none = torch.zeros(1, 3 * data.markers * data.remounted, dtype=torch.float64, device=HOST)
+            here = none if data.remounted else torch.eye(4, dtype=none.dtype, device=HOST).view(1, 16)
+            return (PlacedDevices(set_up_kind(data)(names, here, none)),)
+        return (PlacedDevices(set_up_kind(data).of(points, data, turns)),)
 
 
 class Poses(Positions):
@@ -225,17 +227,7 @@ class Contacts(Sensor):
         return Evaluation(size, None, away[:, None], lines, distances, what=SPREAD, kind="socket", devices=names)
 
     def settled(self, data: Measurements, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
-        """The middles of the sockets, with their standard deviations; a single row deviates as those of others do."""
-        socket, known = sockets_of(data)
-        numbers = socket.unique()
-        own = [points[socket == number, -1] for number in numbers]
-        middles = torch.stack([rows.mean(0) for rows in own])
-        spreads = [rows.var(0) for rows in own if len(rows) > 1]
-        single = torch.stack(spreads).mean(0).sqrt() if spreads else torch.full_like(middles[0], PLACES.found_m_rad)
-        each = [rows.std(0) / len(rows) ** 0.5 if len(rows) > 1 else single for rows in own]
-        deviations = torch.stack(each)
-        names = tuple(known.names[number] for number in numbers.tolist())
-        return (PlacedDevices.outside(SOCKET, names, middles, deviations),)
+        return (PlacedDevices(SocketPlaces.of(points[:, -1], data)),)
 
 
 class OtherDevices(Sensor):
@@ -264,8 +256,7 @@ class OtherDevices(Sensor):
             devices = known.beside(devices)
         names = few([f"'{name}'" for name in names])
         sentence = f"the places of the devices of {data.kind}s were found from these rows: {names}"
-        numbers = free * int(new.sum())
-        return Places(devices={data.column_kind: devices}, found=(sentence,), numbers=numbers)
+        return Places(devices={data.column_kind: devices}, found=(sentence,), numbers=free)
 
     def errors(self, data: Readings, points: Tensor, places: Places) -> Evaluation:
         devices = places.devices.get(data.column_kind)
@@ -294,7 +285,7 @@ class OtherDevices(Sensor):
                 "median error of readings at the best places", expected=expected, got=got, fix=fix
             )
         deviations = found.open_deviations(data, seen)
-        return (PlacedDevices.outside(found.kind, found.names, found.constants, deviations, data.shown),)
+        return (PlacedDevices(replace(found, deviations=deviations), shown=data.shown),)
 
 
 def of_devices(data: Any, names: Collection[str]) -> Any:
@@ -414,10 +405,3 @@ def joint_name_fix(robot: Tree, names: Sequence[str]) -> str:
         "(`read_measurements(file, robot, ..., joints=[...])`), rename the columns, or name the joints of a DH table "
         "after them (`from_dh(..., names=[...])`)"
     )
-
-
-def sockets_of(data: Measurements) -> tuple[Tensor, Sockets]:
-    """(N,) numbers of the sockets of rows, and these."""
-    if data.socket is None or data.sockets is None:
-        raise InputError.of("rows in sockets", got=f"{data.kind}s")
-    return data.socket.to(data.points.device), data.sockets

@@ -8,9 +8,9 @@ new kind of device is a subclass of :class:`Devices` in a file of its own, regis
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,6 +26,10 @@ from diffeo_calib.measurements.rows import FEWEST_PER_DEVICE
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import skew
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+MODEL_FRAME = "the frame of the model"
 SMALLEST_M = 1e-12
 """Of a column of a linear system, against division by zero."""
 ROUNDS = 20
@@ -67,18 +71,87 @@ class Hypothesis(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Devices(ABC):
-    """The devices of some readings, all of one kind.
-
-    A kind says how a reading follows from constants (:meth:`read`) and how these change (:meth:`changed`); derivatives
-    are found by torch.
+class Extrinsics(ABC):
+    """What is known of devices of one kind beside a model.
 
     Args:
-        names: D names. constants: (D, c). deviations: (k,) of the prior of the increments, m or rad.
+        names: D names. constants: (D, c). deviations: (D, k) standard deviations of increments of these, m or rad: of
+            their prior before a fit, after it of what the rows leave open.
     """
 
     kind: ClassVar[str]
-    """Of the readings: :attr:`Readings.kind`."""
+    reads: ClassVar[bool] = False
+    """Whether they report readings of a model's points."""
+
+    names: tuple[str, ...]
+    constants: Tensor
+    deviations: Tensor
+
+    def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
+        """Constants beside another model of the same robot: those of readings read of its points what they read before.
+
+        Args:
+            T: (4, 4) from the old frame to the new one, m.
+            before, after: (N, P, 3) points of the old and the new model at the rows of the fit, m.
+            markers: (P, 3) old places of the markers from the new ones, in the frames of their tips, m.
+        """
+        return self.constants
+
+    def sentences(self) -> list[str]:
+        """What is known of each of them, in the frame of the model."""
+        return []
+
+    def warn_if_unknown(self) -> None:  # noqa: B027
+        """Warn of devices that cannot be used, and say what to do."""
+
+    @property
+    def elsewhere(self) -> Tensor:
+        """(D,) boolean: set-ups in another frame than the model's, or with other markers."""
+        return torch.zeros(len(self.names), dtype=torch.bool, device=self.constants.device)
+
+    @property
+    def of_model(self) -> bool:
+        """Whether this is one set-up alone, whose frame and markers are those of the model."""
+        return False
+
+    @property
+    def fitted_again(self) -> bool:
+        """Whether a fit to rows of known devices finds them anew, as it does set-ups."""
+        return False
+
+    @property
+    def cameras(self) -> dict[str, Any]:
+        """As the cameras that saw a board, by their names; none for other kinds."""
+        return {}
+
+    def same_set(self, other: Extrinsics) -> bool:
+        """Whether others are of one set with these: of the same kind."""
+        return self.kind == other.kind
+
+    def only(self, names: Collection[str]) -> Self:
+        """Those with some names."""
+        kept = [number for number, name in enumerate(self.names) if name in names]
+        own = tuple(self.names[number] for number in kept)
+        return replace(self, names=own, constants=self.constants[kept], deviations=self.deviations[kept])
+
+    def beside(self, other: Self) -> Self:
+        """These, and those of the same kind under other names."""
+        if not self.names:
+            return other
+        other = other.only({*other.names} - {*self.names})
+        values = {k: torch.cat([getattr(self, k), getattr(other, k)]) for k in ("constants", "deviations")}
+        return replace(self, names=(*self.names, *other.names), **values)
+
+
+@dataclass(frozen=True, eq=False)
+class Devices(Extrinsics):
+    """The devices of some readings, all of one kind, that of :attr:`Readings.kind`.
+
+    A kind says how a reading follows from constants (:meth:`read`) and how these change (:meth:`changed`); derivatives
+    are found by torch.
+    """
+
+    reads = True
     size_fix: ClassVar[str]
     """Advice where readings of this kind say too little about length."""
     stated_as: ClassVar[str] = ""
@@ -93,10 +166,6 @@ class Devices(ABC):
     """Metres at the tool that a unit of a reading counts as."""
     unit: ClassVar[tuple[str, float]] = MILLIMETRES
     """In which readings are shown and written, and how many of it are one; see :meth:`Readings.of`."""
-
-    names: tuple[str, ...]
-    constants: Tensor
-    deviations: Tensor
 
     @classmethod
     @abstractmethod
@@ -128,7 +197,7 @@ class Devices(ABC):
         """Constants (c,) of one device after increments (k,)."""
         return constants + increments
 
-    @classmethod  # noqa: B027
+    @classmethod
     def check_seen(cls, constants: Tensor, points: Tensor) -> None:
         """Raise InputError for points (N, 3 k) of which devices with constants (N, c) have no reading."""
 
@@ -144,7 +213,7 @@ class Devices(ABC):
 
     def by_increments(self, points: Tensor, device: Tensor) -> Tensor:
         """Derivatives (N, r, k) of what rows of these devices (N,) observe at points (N, 3 k), m, by increments."""
-        own, none = self.constants[device], self.constants.new_zeros(len(self.names), len(self.deviations))
+        own, none = self.constants[device], torch.zeros_like(self.deviations)
         self.check_seen(own, points)
         by_own = vmap(jacrev(self._read_metres))(own, points)  # (N, r, c)
         return by_own @ vmap(jacrev(self.changed, argnums=1))(self.constants, none)[device]
@@ -198,7 +267,7 @@ class Devices(ABC):
         """The same devices with what was said to be known left open, to test it; None if there is nothing."""
         return None
 
-    def check_freed(self, noise: float, free_noise: float) -> None:  # noqa: B027
+    def check_freed(self, noise: float, free_noise: float) -> None:
         """Refuse, or warn about, what :meth:`freed` left open; noise of the geometric calibrations without, with, m."""
 
     def hypotheses(self, points: Tensor, device: Tensor) -> Iterator[Hypothesis]:
@@ -218,7 +287,8 @@ class Devices(ABC):
     @classmethod
     def of(cls, data: Readings, constants: Tensor) -> Devices:
         """Devices with wide priors around constants (D, c)."""
-        return cls(data.names, constants, constants.new_tensor(cls.prior(data.offset_std)))
+        prior = constants.new_tensor(cls.prior(data.offset_std))
+        return cls(data.names, constants, prior.expand(len(constants), -1))
 
     @classmethod
     def at(cls, data: Readings, points: Tensor) -> Devices:
@@ -227,15 +297,30 @@ class Devices(ABC):
         seen = cls.bodies(points)
         return cls.of(data, torch.stack([cls.start(data.values[own], seen[own]) for own in rows]))
 
-    def beside(self, other: Devices) -> Devices:
-        """These and others of the same kind under other names, such as wires with and without a known zero."""
-        names, constants = (*self.names, *other.names), torch.cat([self.constants, other.constants])
-        return replace(self, names=names, constants=constants)
-
     @property
     def freedom(self) -> int:
         """Increments of all devices."""
-        return len(self.constants) * len(self.deviations)
+        return self.deviations.numel()
+
+    def same_set(self, other: Extrinsics) -> bool:
+        """Also under some of the same names."""
+        return super().same_set(other) and bool(set(self.names) & set(other.names))
+
+    def sentences(self) -> list[str]:
+        return [self.sentence(number, own, MODEL_FRAME) for number, own in enumerate(self.deviations)]
+
+    def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
+        return torch.stack([self.only([name])._carried(before, after) for name in self.names])
+
+    def _carried(self, before: Tensor, after: Tensor) -> Tensor:
+        """Constants (c,) of the device that reads of points (N, P, 3) what this one reads of others, m."""
+        old, new = self.points_of(before), self.points_of(after)
+        own = torch.zeros(len(old), dtype=torch.int64, device=old.device)
+        sees = self.sees(old, own)
+        old, new, own = old[sees], new[sees], own[sees]
+        values = self.observation(own).value(old) / self.metres
+        start = replace(self, constants=self.start(values, self.bodies(new))[None])
+        return start.refined(Readings(self.kind, old[:, :1], values, own, self.names), new).constants[0]
 
     @property
     def metres(self) -> Tensor:
@@ -267,7 +352,7 @@ class Devices(ABC):
 
     def shared(self, points: Tensor, device: Tensor) -> Tensor:
         """Uncertainty of the devices, as effects of unit variance that rows share: (N, r, D k)."""
-        own = self.by_increments(points, device) * self.deviations  # (N, r, k)
+        own = self.by_increments(points, device) * self.deviations[device][:, None]  # (N, r, k)
         whose = torch.nn.functional.one_hot(device, len(self.constants)).to(own)
         return (whose[:, None, :, None] * own[:, :, None]).flatten(2)
 

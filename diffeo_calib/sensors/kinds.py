@@ -7,19 +7,29 @@ inclinometer.py. The command line knows it if a package that is installed names 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
 
-from diffeo_calib.common.errors import InputError, MeasurementError, listed
+from torch import Tensor
+
+from diffeo_calib.common.errors import InputError, MeasurementError, listed, sentence, warn_user
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.board_camera import BoardCameras
+from diffeo_calib.sensors.devices import Devices, Extrinsics
 from diffeo_calib.sensors.height import Planes
 from diffeo_calib.sensors.image import Cameras
+from diffeo_calib.sensors.known_drift import KnownDrift
 from diffeo_calib.sensors.range import FixedPoints
+from diffeo_calib.sensors.set_ups import MeasuringFrames, MountedFrames, MountedMarkers
+from diffeo_calib.sensors.sockets import SocketPlaces
 from diffeo_calib.sensors.tool_frames import Contacts, HeldTools, Trackers
 
 KINDS: dict[str, type[Devices]] = {
     kind.kind: kind for kind in (FixedPoints, Planes, Cameras, HeldTools, Trackers, Contacts)
+}
+WITHOUT_READINGS: dict[str, type[Extrinsics]] = {
+    kind.kind: kind for kind in (MeasuringFrames, MountedMarkers, MountedFrames, SocketPlaces, BoardCameras, KnownDrift)
 }
 
 
@@ -55,3 +65,30 @@ def kind_of(data: Readings) -> type[Devices]:
         fix = "register its class with `diffeo_calib.sensors.kinds.register`"
         raise MeasurementError.of("the kind of readings", expected=listed(list(KINDS)), got=repr(data.kind), fix=fix)
     return KINDS[data.kind]
+
+
+@dataclass(frozen=True, eq=False)
+class Unregistered(Extrinsics):
+    """Devices of a kind that nobody registered in this session."""
+
+    read_kind: str = ""
+
+    @property
+    def kind(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """As the file says it."""
+        return self.read_kind
+
+    def warn_if_unknown(self) -> None:
+        what = f"the model has {len(self.names)} devices of the kind {self.kind!r}, which is not registered here"
+        fix = "import the module that registers it (`diffeo_calib.sensors.kinds.register`), or install its package"
+        warn_user(sentence(f"{what}: their readings are not predicted", fix=fix))
+
+    def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
+        fix = "import the module that registers it"
+        raise InputError.of(f"devices of the kind {self.kind!r} in a model", got="a kind not registered", fix=fix)
+
+
+def extrinsics(kind: str, names: tuple[str, ...], constants: Tensor, deviations: Tensor) -> Extrinsics:
+    """Devices of any kind, of one that nobody registered too; see :class:`Extrinsics`."""
+    found = {**known_kinds(), **WITHOUT_READINGS}.get(kind)
+    return Unregistered(names, constants, deviations, kind) if found is None else found(names, constants, deviations)

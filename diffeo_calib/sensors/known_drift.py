@@ -8,17 +8,16 @@ known: the drift stays as it is at the nearer end.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, with_deviation
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots.se3 import skew
-from diffeo_calib.sensors.places import DRIFT, PlacedDevices
+from diffeo_calib.sensors.devices import Extrinsics
 
 FRAME, GROWTH, OFFSETS = 6, 6, 7
 """Of the unknowns: shift and turn of the frame come first, then growth, then the joint offsets."""
@@ -28,23 +27,19 @@ SURE = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class KnownDrift:
+class KnownDrift(Extrinsics):
     """Drift with K columns of a robot with n joints.
 
     Args:
-        names: of the columns. joints: names, and whether each turns.
-        lowest, highest: (K,) range of every column in the rows of the fit.
-        centre: (3,) about which the frame turns and lengths grow, m.
-        sizes, deviations: (K, 7 + n) over the whole range: shift [m], turn [rad], growth, joint offsets [rad or m].
+        constants: (K, 12 + n) the range of every column in the rows of the fit, the point about which the frame turns
+            and lengths grow, m, and what changes over the whole range: shift [m], turn [rad], growth, joint offsets
+            [rad or m].
+        deviations: (K, 7 + n) of these changes.
+        joints: names, and whether each turns; a file does not say it.
     """
 
-    names: tuple[str, ...]
-    joints: tuple[tuple[str, bool], ...]
-    lowest: Tensor
-    highest: Tensor
-    centre: Tensor
-    sizes: Tensor
-    deviations: Tensor
+    kind = "drift"
+    joints: tuple[tuple[str, bool], ...] = ()
 
     @classmethod
     def of(cls, model: Any) -> KnownDrift | None:
@@ -53,7 +48,8 @@ class KnownDrift:
         Raises:
             InputError: numbers that do not fit the robot's joints.
         """
-        own = next((own for own in getattr(model, "placement", None) or () if own.kind == DRIFT), None)
+        sets = getattr(model, "placement", None) or ()
+        own: Any = next((own.devices for own in sets if own.kind == cls.kind), None)
         if own is None:
             return None
         joints = tuple(zip(model.robot.joint_names, model.robot.periodic, strict=True))
@@ -63,14 +59,27 @@ class KnownDrift:
             raise InputError.of(
                 "the drift of a model", expected=f"{ENDS_AND_CENTRE + size} and {size} numbers", got=got
             )
-        lowest, highest = own.constants[:, :2].T
-        return cls(own.names, joints, lowest, highest, own.constants[0, 2:5], own.constants[:, 5:], own.deviations)
+        return replace(own, joints=joints)
 
-    def placed(self) -> PlacedDevices:
-        """Entries for the model file."""
-        centre = self.centre.expand(len(self.names), 3)
-        constants = torch.cat([self.lowest[:, None], self.highest[:, None], centre, self.sizes], 1)
-        return PlacedDevices.outside(DRIFT, self.names, constants.to(HOST), self.deviations.to(HOST))
+    @property
+    def lowest(self) -> Tensor:
+        """(K,) of every column."""
+        return self.constants[:, 0]
+
+    @property
+    def highest(self) -> Tensor:
+        """(K,) of every column."""
+        return self.constants[:, 1]
+
+    @property
+    def centre(self) -> Tensor:
+        """(3,) about which the frame turns and lengths grow, m."""
+        return self.constants[0, 2:ENDS_AND_CENTRE]
+
+    @property
+    def sizes(self) -> Tensor:
+        """(K, 7 + n) changes over the whole range."""
+        return self.constants[:, ENDS_AND_CENTRE:]
 
     def ramp(self, data: Any) -> Tensor:
         """From -1/2 at the lowest value of each column to 1/2 at the highest: (N, K); 0 where rows do not tell it."""
@@ -107,7 +116,7 @@ class KnownDrift:
         """Why it is not applied to rows of another date."""
         return f"the drift with {' and '.join(self.names)} is that of the rows of the fit"
 
-    def sentences(self) -> Iterator[str]:
+    def of_joints(self) -> Iterator[str]:
         """How much drifted with each column, of what is known well, and for what the model holds."""
         for number, name in enumerate(self.names):
             low, high = float(self.lowest[number]), float(self.highest[number])

@@ -80,7 +80,7 @@ class FixedPoints(Devices):
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
         found, std = (1e3 * self.constants[number]).tolist(), (1e3 * deviations).tolist()
-        zero = f", its zero at {found[3]:.3f} +- {std[3]:.3f} mm" * bool(self.deviations[3] > FIXED_DEVIATION_M)
+        zero = f", its zero at {found[3]:.3f} +- {std[3]:.3f} mm" * bool(self.deviations[number, 3] > FIXED_DEVIATION_M)
         place = f"{numbers_text(found[:3])} +- {numbers_text(std[:3])} mm in {frame}"
         return f"fixed point '{self.names[number]}': {place}{zero}"
 
@@ -94,10 +94,10 @@ class FixedPoints(Devices):
         return found[3:6], torch.cat([found[:3], offset])
 
     def freed(self) -> FixedPoints | None:
-        if float(self.deviations[3]) > FIXED_DEVIATION_M:
+        if float(self.deviations[:, 3].max()) > FIXED_DEVIATION_M:
             return None
         free = self.deviations.clone()
-        free[3] = UNKNOWN_ZERO_M
+        free[:, 3] = UNKNOWN_ZERO_M
         return replace(self, deviations=free)
 
     def hypotheses(self, points: Tensor, device: Tensor) -> Iterator[Hypothesis]:

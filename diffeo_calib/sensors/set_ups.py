@@ -7,8 +7,8 @@ K X M (several cameras on the tool).
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -23,12 +23,8 @@ from diffeo_calib.measurements.poses import angle_between, frames_of_points, pos
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES, rigid_fit
-from diffeo_calib.robots.se3 import (
-    nearest_rotations,
-    skew,
-    transforms,
-    twist_transform,
-)
+from diffeo_calib.robots.se3 import nearest_rotations, skew, transforms, twist_transform
+from diffeo_calib.sensors.devices import Extrinsics
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -50,16 +46,14 @@ Turns = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True, eq=False)
-class SetUps(ABC):
+class SetUps(Extrinsics):
     """What differs between some set-ups and that of a model.
 
     Args:
-        names: S set-ups. constants: (S, c). deviations: (S, k) of increments of these, m and rad.
         turns: of the tips; None for kinematics that do not tell.
         increments_each: numbers of a set-up that a fit leaves open.
     """
 
-    kind: ClassVar[str]
     shape: ClassVar[tuple[int, int]] = (4, 4)
     """Of the constants of one."""
     key: ClassVar[str] = "mountings"
@@ -67,9 +61,6 @@ class SetUps(ABC):
     what: ClassVar[str]
     unit: ClassVar[float] = PLACES.session_m_rad
     """Prior deviation of an increment in a fit, m or rad."""
-    names: tuple[str, ...]
-    constants: Tensor
-    deviations: Tensor
     turns: Turns | None = None
     increments_each: int = 0
 
@@ -83,12 +74,13 @@ class SetUps(ABC):
         """
 
     @classmethod
-    def of_model(cls, model: object, turns: Turns | None) -> Self:
+    def known_to(cls, model: Any, turns: Turns | None) -> Self:
         """Those of this kind that a model knows."""
-        sets = [own for own in getattr(model, "placement", None) or () if getattr(own, "kind", None) == cls.kind]
         none = torch.zeros(0, 0, dtype=torch.float64, device=HOST)
-        constants, std = (torch.cat([getattr(own, k) for own in sets] or [none]) for k in ("constants", "deviations"))
-        return cls(tuple(name for own in sets for name in own.names), constants, std, turns)
+        found = cls((), none, none)
+        for own in getattr(model, "placement", None) or ():
+            found = found.beside(own.devices) if own.kind == cls.kind else found
+        return replace(found, turns=turns)
 
     @abstractmethod
     def aligned(self, data: Measurements) -> Measurements:
@@ -106,10 +98,6 @@ class SetUps(ABC):
     @abstractmethod
     def stepped(self, constants: Tensor, steps: Tensor, centre: Tensor, T: Tensor) -> Tensor:
         """Constants (T, c) after increments (T, k), m and rad, as of :meth:`moved`."""
-
-    @abstractmethod
-    def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
-        """Constants beside another model of the same robot; arguments as of :meth:`PlacedDevices.carried`."""
 
     @abstractmethod
     def sentence(self, number: int) -> str:
@@ -133,6 +121,14 @@ class SetUps(ABC):
         """(S,) boolean: the set-ups but the model's."""
         return (self.constants != self.same).any(1)
 
+    @property
+    def of_model(self) -> bool:
+        return len(self.names) == 1
+
+    @property
+    def fitted_again(self) -> bool:
+        return True
+
     def views(self) -> list[View]:
         """How each set-up sees poses of the model; as the model where markers were mounted anew."""
         return [lambda poses: poses for _ in self.names]
@@ -152,19 +148,6 @@ class SetUps(ABC):
         own = torch.arange(len(self.names), device=HOST)[:, None] == reference
         constants, deviations = torch.where(own, self.same, self.constants), self.deviations.masked_fill(own, 0.0)
         return replace(self, constants=constants, deviations=deviations)
-
-    def only(self, names: Collection[str]) -> Self:
-        """Those with some names."""
-        kept = [number for number, name in enumerate(self.names) if name in names]
-        own = tuple(self.names[number] for number in kept)
-        return replace(self, names=own, constants=self.constants[kept], deviations=self.deviations[kept])
-
-    def beside(self, other: Self) -> Self:
-        """These, and those of other names."""
-        if not self.names:
-            return other
-        values = {k: torch.cat([getattr(self, k), getattr(other, k)]) for k in ("constants", "deviations")}
-        return replace(self, names=(*self.names, *other.names), **values)
 
     @property
     def fitted_numbers(self) -> int:
@@ -336,7 +319,6 @@ class MountedFrames(SetUps):
         return f"'{self.names[number]}' is {away}"
 
 
-KINDS: dict[str, type[SetUps]] = {kind.kind: kind for kind in (MeasuringFrames, MountedMarkers, MountedFrames)}
 TRANSFORMS = SESSION, MOUNTED_FRAME
 """Kinds whose constants are transforms."""
 
@@ -353,7 +335,7 @@ def mounted_kind(lever: float | None) -> type[SetUps]:
 
 def mounted_of(model: Any) -> SetUps:
     """What is on the tool in every set-up that a calibrated model knows, for rows that were mounted anew."""
-    return mounted_kind(model.lever).of_model(model, model.turns)
+    return mounted_kind(model.lever).known_to(model, model.turns)
 
 
 def check_same_markers(points: Tensor, measured: Tensor) -> None:

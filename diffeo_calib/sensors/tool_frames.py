@@ -19,7 +19,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from diffeo_calib.measurements.poses import LEVER, POINTS
+from diffeo_calib.measurements.poses import POINTS
+from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.robots.placement import place
 from diffeo_calib.robots.se3 import nearest_rotations
 from diffeo_calib.sensors.devices import Devices, least_squares, moved_pose, numbers_text

@@ -19,7 +19,8 @@ from simulated_sockets import rest_in_sockets
 
 import diffeo_calib as dc
 from diffeo_calib.cameras.board import BoardPrior
-from diffeo_calib.measurements.poses import LEVER, poses_from_marks
+from diffeo_calib.measurements.poses import poses_from_marks
+from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation, transforms
 

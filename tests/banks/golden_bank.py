@@ -244,7 +244,7 @@ def devices(result: Any) -> Numbers:
     """Sockets, measuring frames, or devices of readings."""
     if result.readings:
         (own,) = result.readings
-        at = {"devices": own.devices.constants, "devices, deviations": own.known}
+        at = {"devices": own.devices.constants, "devices, deviations": own.devices.deviations}
         return {**at, "expected error": one(result.expected.workspace)}
     found: Numbers = {}
     if result.sockets is not None:

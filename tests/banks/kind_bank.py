@@ -24,6 +24,7 @@ import torch
 import two_arms_bank
 from golden_bank import Golden
 from product_bank import simulated_poses
+from shared_bank import shared
 from simulated_camera import camera_arm, fixed_camera_arm, images_of_both
 from torch import Tensor
 from torch.testing import assert_close
@@ -32,9 +33,9 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.recalibration.new_set_up import Before, place_again
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.csv.sensors import ImageColumns
-from diffeo_calib.measurements.poses import LEVER, mark_points
+from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.measurements.rows import with_attributes
-from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.measurements.table_format import LEVER, TableFormat
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
 
@@ -260,9 +261,7 @@ class Kind:
 
     @cached_property
     def result(self) -> Any:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # few rows
-            return dc.calibrate(self.robot, self.data, hyperparameters=self.scales)
+        return shared(f"kind {self.name}", lambda: self._calibrated(self.data))
 
     @property
     def model(self) -> dc.CalibratedKinematics:
@@ -276,9 +275,12 @@ class Kind:
     @cached_property
     def of_part(self) -> Any:
         """The calibration of ``part``."""
+        return shared(f"part of {self.name}", lambda: self._calibrated(self.part))
+
+    def _calibrated(self, rows: Any) -> Any:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return dc.calibrate(self.robot, self.part, hyperparameters=self.scales)
+            warnings.simplefilter("ignore")  # few rows
+            return dc.calibrate(self.robot, rows, hyperparameters=self.scales)
 
     def q(self, count: int = 40) -> Tensor:
         """Configurations within the joint ranges of the fit; for the camera those in which it sees its board."""

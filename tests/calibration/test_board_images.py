@@ -25,8 +25,8 @@ from diffeo_calib.cameras.images import UNKNOWNS
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.csv.files import read_observations, write_measurements
-from diffeo_calib.measurements.poses import LEVER, mark_points, poses_from_marks
-from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.measurements.poses import mark_points, poses_from_marks
+from diffeo_calib.measurements.table_format import LEVER, TableFormat
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation, transforms
 from diffeo_calib.sensors.tool_frames import Contacts, Trackers
@@ -71,7 +71,7 @@ def test_pixels_are_better_than_poses() -> None:
 
 
 def test_lens_and_board_are_found_with_the_robot() -> None:
-    camera = calibrated().model.placement[0].cameras["camera"].camera
+    camera = calibrated().model.placement[0].devices.cameras["camera"].camera
     truth, deviations = true_camera().unknowns, camera.deviations
     assert float(((camera.unknowns - truth) / deviations).abs().max()) < 4.5
     before = data().camera
@@ -154,7 +154,9 @@ def kind() -> Any:
 
 
 def camera() -> Any:
-    return next(iter(next(own for own in kind().model.placement if own.cameras).cameras.values())).camera
+    return next(
+        iter(next(own for own in kind().model.placement if own.devices.cameras).devices.cameras.values())
+    ).camera
 
 
 def drawn_bodies(rows: int = 12) -> Tensor:
@@ -204,7 +206,7 @@ def test_the_size_comes_from_board_and_tracker() -> None:
 
 
 def test_the_marker_is_where_it_is_on_the_tool() -> None:
-    placed = next(own for own in kind().model.placement if own.kind == "marker")
+    placed = next(own for own in kind().model.placement if own.kind == "marker").devices
     on_flange = poses_from_marks(camera_arm(60).arm.truth.tool[None], LEVER)[0]
     marker = torch.linalg.inv(on_flange) @ torch.cat([SimulatedArm(seed=1).truth.tool[0], torch.ones(1)])
     away = placed.constants[0, 12:] - marker[:3]
@@ -225,7 +227,7 @@ def test_the_tracker_makes_the_workspace_known() -> None:
 def test_sockets_are_where_they_are() -> None:
     rows = with_sockets()[1]
     found = dc.calibrate(kind().robot, rows, hyperparameters=kind().scales)
-    placed = next(own for own in found.model.placement if own.kind == "contact")
+    placed = next(own for own in found.model.placement if own.kind == "contact").devices
     assert placed.names == ("0/0", "0/1", "1/0", "1/1")
     places, std = placed.constants[:, :3], placed.deviations[:, :3].norm(dim=1)
     for first in (0, 2):  # the sockets of a block are 50 mm apart, which nobody said

@@ -115,7 +115,8 @@ def test_rows_are_brought_to_the_middle_of_the_column() -> None:
     drift: Any = Drift.of_table(data, ARM.nominal)[0]
     effects = drift.effects(SeenRows(nominal, plain, plain, None, zero))
     assert_close(effects @ unknowns, moved.flatten(1) - plain, rtol=0, atol=1e-5)
-    found = replace(drift.known, centre=centre, sizes=size[None], deviations=size[None].abs())
+    constants = torch.cat([drift.known.constants[:, :2], centre[None], size[None]], 1)
+    found = replace(drift.known, constants=constants, deviations=size[None].abs())
     back = found.aligned(data)
     assert_close(nominal(back.q, zero), back.points.flatten(1), rtol=0, atol=1e-5)
     assert back.covariates is None
@@ -131,7 +132,7 @@ def test_a_model_keeps_its_drift(drifted: Any, tmp_path: Path) -> None:
     assert told.rms == pytest.approx(dc.evaluate(result.model, other).rms, rel=1e-9)
     assert told.rms < 0.7 * untold.rms
     assert "time 5" in " ".join(untold.placed)  # from 3 to 7
-    assert list(known.sentences()) == drifts(result)[0].sentences()
+    assert list(known.of_joints()) == drifts(result)[0].sentences()
     with torch.inference_mode():
         again = model.registered(other)
     assert KnownDrift.of(again) is None

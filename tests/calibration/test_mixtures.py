@@ -324,9 +324,9 @@ def test_devices_are_where_they_are_within_their_deviations(joint: Any) -> None:
     base = PLAIN.truth.base
     ranges = joint.readings[0]
     errors = ranges.devices.constants[:, :3] - (POINTS @ base[:3, :3].mT + base[:3, 3])
-    away = errors / ranges.known[:, :3]
+    away = errors / ranges.devices.deviations[:, :3]
     assert float(away.square().mean()) < 4.0
-    assert 1e-6 < float(ranges.known[:, :3].max()) < 1e-3
+    assert 1e-6 < float(ranges.devices.deviations[:, :3].max()) < 1e-3
     assert float((joint.model.geometry.tool[1] - PLAIN.truth.tool[0]).norm()) < 1e-3
     assert joint.model.markers == 2
     assert "mm in the measuring frame" in joint.placement.sentences()[0]
@@ -349,5 +349,5 @@ def test_controls(joint: Any) -> None:
     """Fewer momenta than rows: the deviations of devices are found as well."""
     coarse = fit_of([positions(25), read("distance", 36)], controls=40)
     for one, other in zip(joint.readings, coarse.readings, strict=True):
-        torch.testing.assert_close(other.known, one.known, rtol=0.1, atol=1e-6)
+        torch.testing.assert_close(other.devices.deviations, one.devices.deviations, rtol=0.1, atol=1e-6)
     assert rms(joint.model(PLAIN.sample(50, 2)).detach() - coarse.model(PLAIN.sample(50, 2)).detach()) < 1e-4

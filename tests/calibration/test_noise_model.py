@@ -16,7 +16,8 @@ from torch import Tensor
 from diffeo_calib.calibration.choose_scales import robot_problem
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, differing_factor
 from diffeo_calib.maps.noise import HIDDEN_VARIANCE
-from diffeo_calib.measurements.poses import LEVER, mark_jacobian, mark_points, pose_jacobian
+from diffeo_calib.measurements.poses import mark_jacobian, mark_points, pose_jacobian
+from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.regression.regions import region_factor
 
 DRAWS = 20000

@@ -94,7 +94,7 @@ def test_an_inclinometer_finds_how_it_is_mounted_and_makes_the_model_better() ->
     mount = model[0, :3, :3].mT @ frames[0, :3, :3]  # the model's frame is that of the poses of the table
     assert_close(axes @ mount, inclinometer.AXES, rtol=0, atol=2e-3)
     assert_close(up, torch.nn.functional.normalize(inclinometer.UP, dim=0), rtol=0, atol=2e-3)
-    assert float(own.known.max()) < 2e-3  # pyright: ignore
+    assert float(own.devices.deviations.max()) < 2e-3  # pyright: ignore
     alone = dc.calibrate(kind.robot, kind.data.parts[0], hyperparameters=kind.scales).model
     q = kind.q(100)
     assert kind.error_mm(kind.model(q), q) < kind.error_mm(alone(q), q)

@@ -24,8 +24,8 @@ from diffeo_calib.calibration.planning.candidates import candidates
 from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
 from diffeo_calib.cameras.images import Images, sees, shown, sighted
 from diffeo_calib.cameras.images import expected as expected_errors
-from diffeo_calib.measurements.poses import LEVER, inverse_poses, poses_from_marks
-from diffeo_calib.regression.conditional import WithoutRigidMotions
+from diffeo_calib.measurements.poses import inverse_poses, poses_from_marks
+from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.sensors.set_ups import frame_slopes
@@ -49,7 +49,7 @@ def slopes_of(devices: Any, number: int, z: Tensor) -> tuple[Tensor, Tensor]:
     """Derivatives of a reading by the point and by all increments of unit prior, by central differences."""
 
     def read(point: Tensor, increments: Tensor) -> Tensor:
-        moved = devices.moved(increments.view(len(devices.names), -1) * devices.deviations)
+        moved = devices.moved(increments.view(len(devices.names), -1) * z.new_tensor(devices.prior()))
         return moved.observation(torch.tensor([number])).value(point[None])[0]
 
     none = z.new_zeros(devices.freedom)
@@ -64,8 +64,6 @@ def slopes_of(devices: Any, number: int, z: Tensor) -> tuple[Tensor, Tensor]:
 def naive_rms(result: Any, q: Tensor, taken: list[tuple[int, int]]) -> list[float]:
     """RMS error over q after 0, 1, ... readings (row, device), after a rigid fit: the whole covariance inverted."""
     fitted_map, devices = result.model.map, result.placement[0].devices
-    conditional = fitted_map.conditional
-    assert isinstance(conditional, WithoutRigidMotions)
     z, at = fitted_map.geodesic.linearised_value(q)
     data = fitted_map.geodesic.linearise(fitted_map.x).projected(fitted_map.slopes)
     shared = fitted_map.noise.shared.flatten(0, 1)
@@ -305,7 +303,7 @@ def test_candidates_that_no_camera_sees_are_refused() -> None:
 def test_images_of_the_fit_are_what_they_were(kind: str) -> None:
     """Their noise and what lens and board do to them, by the poses of the model alone."""
     model = kind_named(kind).model
-    placed = next(own for own in model.placement if own.cameras)
+    placed = next(own for own in model.placement if own.devices.cameras)
     for number, one in enumerate(cameras(kind_named(kind))):
         rows = placed.rows[placed.device == number]
         points = model(model.configurations[rows]).detach().flatten(1)

@@ -129,7 +129,7 @@ def test_a_recalibrated_model_keeps_its_devices() -> None:
 def test_sockets_of_a_registered_model_are_known_as_means_of_their_rows() -> None:
     kind = kind_named("mixture")
     found = quietly(kind.model.registered, kind.moved)
-    sockets = next(own for own in found.placement if own.kind == "socket")
+    sockets = next(own.devices for own in found.placement if own.kind == "socket")
     seen = found(kind.moved.q).detach()[:, -1].numpy()
     again = set(kind.moved.row_sockets) - {""}
     assert set(sockets.names) - again == set(kind.data.row_sockets) - {""} - again  # they stay where they were

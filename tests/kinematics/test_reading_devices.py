@@ -50,7 +50,7 @@ def readings(kind: str) -> dc.Readings:
         start = replace(start, values=start.values + 1.0)
     at = points(Q)
     devices = (
-        KINDS[kind].at(start, at[:, 0]) if kind != "image" else Cameras(start.names, constants(kind), torch.ones(6))
+        KINDS[kind].at(start, at[:, 0]) if kind != "image" else Cameras(start.names, constants(kind), torch.ones(2, 6))
     )
     there = replace(devices, constants=constants(kind))
     return replace(start, values=there.observation(start.device).value(at[:, 0]))
@@ -109,7 +109,7 @@ def test_a_unit_vector_of_least_squares(size: float) -> None:
 def test_shared_effects_are_derivatives_by_increments(kind: str) -> None:
     data = readings(kind)
     devices, at = placed(data, points(data.q)), points(Q)[:, 0]
-    step = normal(2, len(devices.deviations), seed=7)
+    step = normal(*devices.deviations.shape, seed=7)
     eps = 1e-6
 
     def seen(there: Devices) -> Tensor:
@@ -168,7 +168,7 @@ def test_readings_that_are_noise() -> None:
 
 def test_cameras_start_in_front_of_points_that_are_not_those() -> None:
     """Eight images each, points of a ball that is thought elsewhere: projection alone puts some behind the camera."""
-    truth = Cameras(("left", "right"), constants("image"), torch.ones(6).double())
+    truth = Cameras(("left", "right"), constants("image"), torch.ones(2, 6).double())
     behind = 0
     for seed in range(20):
         real = 0.7 * normal(16, 3, seed=seed).clamp(-2, 2)

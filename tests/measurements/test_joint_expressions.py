@@ -18,8 +18,8 @@ from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
 from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.csv.writing import write_columns
-from diffeo_calib.measurements.poses import ALL_CONVENTIONS, rotation_numbers
-from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat
+from diffeo_calib.measurements.poses import rotation_numbers
+from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, UNITS_PER_METRE, TableFormat
 from diffeo_calib.robots.se3 import transforms
 
 

@@ -25,7 +25,6 @@ from diffeo_calib.measurements.poses import (
     mark_jacobian,
     mark_points,
     marks,
-    numbers_of,
     pose_directions,
     poses_from_marks,
     rigid_poses,
@@ -33,7 +32,7 @@ from diffeo_calib.measurements.poses import (
     rotation_numbers,
     transforms,
 )
-from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.measurements.table_format import TableFormat, numbers_of
 from diffeo_calib.robots.se3 import rotation
 
 EYE = torch.eye(3, dtype=torch.float64)

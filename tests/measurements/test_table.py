@@ -18,10 +18,11 @@ from torch.testing import assert_close
 
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.observations import Observations
-from diffeo_calib.measurements.poses import LEVER, mark_jacobian, mark_points
+from diffeo_calib.measurements.poses import mark_jacobian, mark_points
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import FEWEST_PER_DEVICE, REPEAT_TOLERANCE
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.table_format import LEVER
 
 # --- the table ------------------------------------------------------------------------------------
 

@@ -21,7 +21,8 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.measurements.poses import LEVER, mark_points, poses_from_marks
+from diffeo_calib.measurements.poses import mark_points, poses_from_marks
+from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.robots import DHRow, Geometry, SimulatedArm, from_dh, load_urdf
 from diffeo_calib.robots.gear_waves import GearWaves
 from diffeo_calib.robots.gravity import GravitySag

@@ -144,18 +144,9 @@ def conventions(
     return [one for one in near if one.cost == least and least]
 
 
-def frame_projector(points: Tensor) -> Tensor:
-    """(M, M) that removes affine functions of points (M, 3)."""
-    return _without(torch.cat([torch.ones_like(points[:, :1]), points - points.mean(0)], 1))
-
-
-def socket_projector(socket: Tensor) -> Tensor:
-    """(M, M) that removes the mean of each socket (M,)."""
-    return _without((socket[:, None] == socket.unique()).double())
-
-
-def _without(basis: Tensor) -> Tensor:
-    own = torch.linalg.qr(basis / basis.norm(dim=0).clamp(min=1e-12)).Q
+def without(columns: Tensor) -> Tensor:
+    """(M, M) that removes what columns (M, k) explain: of a frame affine functions, of sockets a place of each."""
+    own = torch.linalg.qr(columns / columns.norm(dim=0).clamp(min=1e-12)).Q
     return torch.eye(len(own), dtype=own.dtype, device=own.device) - own @ own.mT
 
 

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.conventions import Convention, conventions, frame_projector, socket_projector
+from diffeo_calib.calibration.diagnostics.conventions import Convention, conventions, without
 from diffeo_calib.calibration.identification.registration import can_register, register, spread
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import (
@@ -301,7 +301,9 @@ def conventions_of(robot: Tree, data: Measurements, angle: str, judge: Judge = r
         return residual / size
 
     def projector(chosen: Tensor) -> Tensor:
-        return socket_projector(socket[chosen]) if free else frame_projector(places[chosen])
+        own, at = socket[chosen], places[chosen]
+        affine = torch.cat([torch.ones_like(at[:, :1]), at - at.mean(0)], 1)
+        return without((own[:, None] == own.unique()).to(at) if free else affine)
 
     tip = robot.tips.index(data.on[marker]) if data.on else 0
     per_rad = degrees(1.0) if angle == "deg" else 1.0

@@ -268,7 +268,7 @@ def changes_of(data: TangentData, devices: Iterable[Hypothesis] = (), index: Ten
         devices: with effects on more rows, of which these have the numbers ``index`` (N,).
     """
     points, geometry = data.points.unflatten(1, (-1, 3)), data.nominal.geometry
-    base, R = frame_slopes(points, points.mean((0, 1))), geometry.marker_poses(data.x)[..., :3, :3]
+    base, R = frame_slopes(points, points.mean((0, 1))), geometry.marker_turns(data.x)
     own = torch.eye(R.shape[1], dtype=R.dtype, device=R.device)
     markers = torch.einsum("npab,pk->npakb", R, own).flatten(3).flatten(1, 2)  # (N, 3 P, 3 P), in the tips' frames
     if data.basis is not None:  # nothing bends a frame

@@ -48,8 +48,8 @@ class Drift(DeviceSet):
             return []
         joints = tuple(zip(chain.joint_names, chain.periodic, strict=True))
         nothing = values.new_zeros(values.shape[1], OFFSETS + len(joints))
-        ends = values.amin(0), values.amax(0), values.new_zeros(3)
-        known = KnownDrift(data.covariate_names, joints, *ends, nothing, nothing)
+        ends = values.amin(0), values.amax(0), *values.new_zeros(3, len(nothing))
+        known = KnownDrift(data.covariate_names, torch.cat([torch.stack(ends, 1), nothing], 1), nothing, joints)
         return [cls(known, known.ramp(data), data.q)]
 
     @property
@@ -71,18 +71,19 @@ class Drift(DeviceSet):
         shifts, deviations = (
             own * each.view(len(self.known.names), -1) for each in (found.shifts, found.covariance.diagonal().sqrt())
         )
-        known = replace(self.known, centre=found.centre, sizes=shifts, deviations=deviations)
+        constants = torch.cat([self.known.constants[:, :2], found.centre.expand(len(shifts), 3), shifts], 1)
+        known = replace(self.known, constants=constants, deviations=deviations)
         return replace(self, known=known, centre=found.centre)
 
     def with_rows(self, other: OtherRows) -> Drift:
         return replace(self, ramp=self.known.ramp(other.data), q=other.data.q, centre=other.centre)
 
     def placed(self) -> PlacedDevices:
-        return self.known.placed()
+        return PlacedDevices(self.known)
 
     def sentences(self) -> list[str]:
         """How much drifted with each column, of what is known well."""
-        return list(self.known.sentences())
+        return list(self.known.of_joints())
 
     def entry(self) -> dict[str, object]:
         """Unknowns in m and rad over the range of every column."""

@@ -19,7 +19,7 @@ from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
 from diffeo_calib.measurements.images import SharedErrors
 from diffeo_calib.measurements.poses import inverse_poses, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.sensors.board_camera import CAMERA, BoardCamera, Explained, camera_sentences
+from diffeo_calib.sensors.board_camera import BoardCamera, BoardCameras, Explained, camera_sentences
 from diffeo_calib.sensors.devices import OUTLIER_MEDIANS, ROW, Hypothesis, median_weights
 from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import View
@@ -185,7 +185,8 @@ class LensAndBoard(CameraErrors):
     def placed(self) -> PlacedDevices:
         numbers = torch.stack([own.numbers for own in self._cameras])
         deviations = torch.stack([own.camera.deviations for own in self._cameras])
-        return PlacedDevices(CAMERA, tuple(self.shared.cameras), numbers, deviations, self.rows, self.shared.seen_by)
+        cameras = BoardCameras(tuple(self.shared.cameras), numbers, deviations)
+        return PlacedDevices(cameras, self.rows, self.shared.seen_by)
 
     @property
     def _cameras(self) -> list[BoardCamera]:

@@ -57,14 +57,12 @@ class ReadingDevices(DeviceSet):
     Args:
         data: the readings. devices: where their devices are.
         rows: (M,) numbers of the rows among those of the calibration.
-        known: (D, k) standard deviations of the devices' increments, before a fit those of the prior, m or rad.
         frame: the frame of their places, in words.
     """
 
     data: Readings
     devices: Devices
     rows: Tensor
-    known: Tensor
     frame: str
 
     @property
@@ -102,7 +100,7 @@ class ReadingDevices(DeviceSet):
         devices, shape = self.devices, (len(self.devices.names), -1)
         moved = devices.moved(found.shifts.view(shape) * devices.deviations)
         known = found.covariance.diagonal().clamp(min=0).sqrt().view(shape) * devices.deviations
-        return replace(self, devices=moved, known=known)
+        return replace(self, devices=replace(moved, deviations=known))
 
     def with_rows(self, other: OtherRows) -> ReadingDevices:
         own = next(one for one in other.readings if one.table.column_kind == self.data.column_kind)
@@ -116,14 +114,13 @@ class ReadingDevices(DeviceSet):
             warn_of_size(self.devices.size_fix, expected.size, expected.size_share, expected.workspace)
 
     def sentences(self) -> list[str]:
-        return [self.devices.sentence(number, own, self.frame) for number, own in enumerate(self.known)]
+        return [self.devices.sentence(number, own, self.frame) for number, own in enumerate(self.devices.deviations)]
 
     def placed(self) -> PlacedDevices:
-        own = self.devices.names, self.devices.constants, self.known, self.rows, self.device
-        return PlacedDevices(self.devices.kind, *own, self.data.shown)
+        return PlacedDevices(self.devices, self.rows, self.device, self.data.shown)
 
     def entry(self) -> dict[str, object]:
-        values = {"constants": self.devices.constants, "deviations": self.known}
+        values = {"constants": self.devices.constants, "deviations": self.devices.deviations}
         own = {what: dict(zip(self.devices.names, each.tolist(), strict=True)) for what, each in values.items()}
         return {"devices": own}
 
@@ -161,7 +158,7 @@ def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool
     devices, squares = best.rows.devices(fit.shifts), body_squares(fit.errors)
     noise = float((squares.sum() / sum(own.numel() for own in fit.errors)).sqrt())
     nothing, tails = torch.zeros_like(fit.covariance), Tails.none(len(squares), 1)
-    known = 0, "ball and devices found.", nothing[0], Prior(), tails, devices
+    known = nothing[0], Prior(), tails, devices
     registration = Identification(geometry, float(squares.mean().sqrt()), noise, nothing, *known)
     rows = Rows(geometry, tuple(map(ReadRows, tables, devices)), rigid=rigid)
     return registration, estimated(rows, _all_but_ball(bare) if rigid else held_parameters(bare, adrift=True), Prior())
@@ -210,11 +207,7 @@ def reading_sets(
 ) -> tuple[ReadingDevices, ...]:
     """Sets of devices and the rows that they measured; ``beside``: rows of the same robot that tell coordinates."""
     frame = "the robot's base" if beside is None or beside.without_device else "the measuring frame"
-    each = zip(readings, devices, strict=True)
-    return tuple(
-        ReadingDevices(table, own, rows, own.deviations.expand(len(own.names), -1), frame)
-        for (table, rows), own in each
-    )
+    return tuple(ReadingDevices(table, own, rows, frame) for (table, rows), own in zip(readings, devices, strict=True))
 
 
 def stages_beside(stages: Stages, readings: Sequence[OtherReadings], table: Measurements) -> Stages:

@@ -107,7 +107,7 @@ class Sessions(DeviceSet):
         """The sessions of rows whose points (N, P, 3) are known in the frame of the largest one, m."""
         names, session = sessions_of(data)
         reference = int(torch.bincount(session[session != NO_SOCKET], minlength=len(names)).argmax())
-        found = kind.of(seen, data, lambda q: geometry.marker_poses(q)[..., :3, :3])
+        found = kind.of(seen, data, geometry.marker_turns)
         return cls(found.with_reference(reference), reference, session, data.markers)
 
     @staticmethod
@@ -188,8 +188,8 @@ class Sessions(DeviceSet):
             yield OtherLabel(f"session '{name}'", applies, away.norm(dim=-1).nanmean(1))
 
     def placed(self) -> PlacedDevices:
-        rows, own = (self.session != NO_SOCKET).nonzero()[:, 0], self.set_ups
-        return PlacedDevices(own.kind, own.names, own.constants, own.deviations, rows, self.session[rows])
+        rows = (self.session != NO_SOCKET).nonzero()[:, 0]
+        return PlacedDevices(self.set_ups, rows, self.session[rows])
 
     def entry(self) -> dict[str, object]:
         return {self.set_ups.key: self.set_ups.entry()}

@@ -48,9 +48,9 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import VALUE, Hypothesis
-from diffeo_calib.sensors.errors import socket_errors
-from diffeo_calib.sensors.places import SOCKET, PlacedDevices
+from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import View, frame_slopes
+from diffeo_calib.sensors.sockets import SocketPlaces, socket_errors
 from diffeo_calib.sensors.tables import Coordinates
 
 T = TypeVar("T")
@@ -269,7 +269,7 @@ class SocketDevices(DeviceSet):
 
     def placed(self) -> PlacedDevices:
         rows = (self.socket != NO_SOCKET).nonzero()[:, 0]
-        return PlacedDevices(SOCKET, self.names, self.positions, self.deviations, rows, self.socket[rows])
+        return PlacedDevices(SocketPlaces(self.names, self.positions, self.deviations), rows, self.socket[rows])
 
     def entry(self) -> dict[str, object]:
         """Positions by name, and spread of places left out, for programs; in m."""
@@ -387,7 +387,7 @@ def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> 
     if not bool(judged.any()):
         return []
     last = torch.nn.functional.pad(eye, (seen.m - 3, 0)).expand(N, -1, -1)
-    own = seen.covariance_between(seen.geodesic.linearise(resting.q).projected(last))
+    own = seen.conditional.covariance_between(seen.geodesic.linearise(resting.q).projected(last))
     places = torch.kron(PLACES.found_m_rad * rests, eye).view(N, 3, -1)
     wide = torch.eye(places.shape[2], dtype=places.dtype, device=places.device)
     noise, every = seen.new_noise[-3:, -3:].expand(N, -1, -1), torch.ones_like(predicted, dtype=torch.bool)

@@ -91,7 +91,7 @@ class BoardImages(Sensor):
 
 def board_images(model: CalibratedKinematics, placed: PlacedDevices) -> list[Sensor]:
     """Those of the cameras of a fit; none of other devices."""
-    each = enumerate(placed.cameras.items())
+    each = enumerate(placed.devices.cameras.items())
     return [_of_camera(model, name, seen, placed.rows[placed.device == k]) for k, (name, seen) in each]
 
 

@@ -14,7 +14,7 @@ from diffeo_calib.cameras.images import UNKNOWNS
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.device_readings import FittedDevice
-from diffeo_calib.sensors.places import SOCKET
+from diffeo_calib.sensors.sockets import SocketPlaces
 
 
 def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
@@ -26,7 +26,7 @@ def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
     found: list[Sensor] = [] if without_positions(model) else [Positions(whole=model.lever is not None)]
     for own in model.placement:
         found += board_images(model, own)
-        if own.kind == SOCKET and len(own.rows):
+        if own.kind == SocketPlaces.kind and len(own.rows):
             found.append(_sockets(model, own.rows, own.device))
     found += _devices(model)
     if not found:
@@ -45,9 +45,9 @@ def without_positions(model: CalibratedKinematics) -> bool:
     shared = model.map.noise.shared
     other = torch.zeros(len(shared), dtype=torch.bool, device=shared.device)
     for own in model.placement:
-        if own.devices is not None or own.cameras or own.kind == SOCKET:
+        if own.devices.reads or own.devices.cameras or own.kind == SocketPlaces.kind:
             other[own.rows] = True
-        if own.cameras:
+        if own.devices.cameras:
             other |= (shared != 0).any(1).sum(1) >= len(UNKNOWNS)
     return bool(other.all())
 
@@ -63,11 +63,11 @@ def _sockets(model: CalibratedKinematics, rows: Tensor, socket: Tensor) -> InSoc
 def _devices(model: CalibratedKinematics) -> Iterator[DeviceReadings]:
     """Every device of readings of a model by itself; of one that measured no row only its rough place is known."""
     for one in model.placement:
-        for number, word in enumerate(one.names if one.devices is not None else ()):
+        for number, word in enumerate(one.names if one.devices.reads else ()):
             several = sum(word in other.names for other in model.placement) > 1
             fitted = FittedDevice.of(model.map, one, number)
-            devices, offset = fitted.devices, float(fitted.devices.deviations[-1])
+            devices, offset = fitted.devices, float(fitted.devices.deviations[0, -1])
             prior = devices.constants.new_tensor(devices.prior(offset))
-            known = devices.deviations if fitted.columns is None else prior
+            known = devices.deviations if fitted.columns is None else prior[None]
             named = replace(devices, names=(f"{one.kind} {word}" if several else word,), deviations=known)
             yield DeviceReadings(None, named, fitted)

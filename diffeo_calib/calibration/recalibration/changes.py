@@ -7,19 +7,20 @@ from math import degrees, inf
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
 from diffeo_calib.common.errors import with_deviation
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kinematics.re_registration.find_place import FoundPlace
-from diffeo_calib.kinematics.re_registration.new_rows import NewRows
 from diffeo_calib.measurements.poses import rotation_numbers
+from diffeo_calib.regression.conditional import roots
 from diffeo_calib.robots.tree import Tree
 
 LEVEL = 0.01
 """Probability that anything is named although nothing has changed."""
+
+
 RANK_TOLERANCE = 1e-9
 """Smallest eigenvalue of correlations, relative to the largest, that is not rounding."""
 
@@ -140,12 +141,16 @@ def hidden_offsets(robot: Tree, place: FoundPlace | None, changes: Changes) -> t
     rows, found = place.rows, place.registration
     S, J = rows.by_places.flatten(0, 1), rows.at.joint_to_start.flatten(0, 1)  # (M m, 6 + 3 P), (M m, n)
     covariance, noise = rows.inflation * rows.given.covariance, float(found.noise.diagonal().mean().sqrt())
-    places = {"the measuring device has moved": (slice(0, 6), _motion(rows))}
+    T, centre = rows.transform, rows.centre
+    turn = rotation_numbers(T[None, :3, :3], "rotvec", angle="rad")[0]
+    moved = torch.cat([T[:3, :3] @ centre + T[:3, 3] - centre, turn])  # m and rad, of the frame in that of the map
+    places = {"the measuring device has moved": (slice(0, 6), moved)}
     if found.shift is not None:
         places["the markers have moved"] = (slice(6, S.shape[1]), found.shift.flatten())
     hidden = []
     for instead, (own, shift) in places.items():
-        white = _whitening(covariance[own, own])
+        white = roots(covariance[own, own], RANK_TOLERANCE)[1]
+        white = white[white.any(1)]  # markers that moved together leave it singular
         away = white @ shift
         count, total = len(away), float(away @ away)
         if total < chi2_above(LEVEL, count):
@@ -161,18 +166,3 @@ def hidden_offsets(robot: Tree, place: FoundPlace | None, changes: Changes) -> t
             if unseen < gates.HIDDEN_SHARE * noise and left < chi2_above(LEVEL, max(count - 1, 1)):
                 hidden.append(Offset(name, robot.kinds[joint] != "prismatic", size, deviation, instead))
     return tuple(hidden)
-
-
-def _whitening(K: Tensor) -> Tensor:
-    """(k, K) root of the pseudo-inverse of a covariance of rank k: markers that moved together leave it singular."""
-    scale = K.diagonal().sqrt()
-    values, Q = torch.linalg.eigh(K / scale / scale[:, None])
-    kept = values > RANK_TOLERANCE * values[-1]
-    return (Q[:, kept] / scale[:, None] / values[kept].sqrt()).mT
-
-
-def _motion(rows: NewRows) -> Tensor:
-    """(6,) shift at the centre and small turn of the measuring frame, in the frame of the map."""
-    T, centre = rows.transform, rows.centre
-    turn = rotation_numbers(T[None, :3, :3], "rotvec", angle="rad")[0]
-    return torch.cat([T[:3, :3] @ centre + T[:3, 3] - centre, turn])

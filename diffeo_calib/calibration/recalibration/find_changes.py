@@ -57,10 +57,6 @@ class Ratio(NamedTuple):
     probability: float
     variance: float
 
-    def least_certain(self, other: Ratio) -> Ratio:
-        """This ratio with the larger probability, and the smaller value, of both."""
-        return Ratio(min(self.value, other.value), max(self.probability, other.probability), self.variance)
-
 
 def likelihood_ratios(rows: WeighedRows, roots: dict[str, Tensor], seed: int) -> tuple[dict[str, Ratio], float]:
     """Ratios of all parts.
@@ -180,7 +176,10 @@ def _changes_of(rows: WeighedRows, *, level: float, seed: int) -> tuple[Changes,
         ratios, factor = likelihood_ratios(rows, roots, seed)
         # A few outliers look like a change, and a change looks like outliers: it must stand out with either weights.
         strict, _ = likelihood_ratios(rows.with_weights(), roots, seed)
-        ratios = {name: each.least_certain(strict[name]) for name, each in ratios.items()}
+        both = [(name, own, strict[name]) for name, own in ratios.items()]
+        ratios = {
+            name: Ratio(min(a.value, b.value), max(a.probability, b.probability), a.variance) for name, a, b in both
+        }
         if not first:
             first, noise = {name: ratio.probability for name, ratio in ratios.items()}, factor
         name = min(ratios, key=lambda each: (ratios[each].probability, -ratios[each].value))

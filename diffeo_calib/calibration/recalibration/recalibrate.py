@@ -230,9 +230,11 @@ def _with_settled(
     for one in rows.placement.settled(fitted, *at, known=mounted_of(model)).placed():
         own = replace(one, rows=one.rows + first)
         for k, other in enumerate(found):
-            if own.same_set(other) and own.set_ups is not None:
+            if not own.devices.same_set(other.devices):
+                continue
+            if own.devices.fitted_again:
                 found[k] = own.beside(other)
-            elif own.same_set(other):
+            else:
                 number = torch.tensor([other.names.index(name) for name in own.names], dtype=torch.int64, device=HOST)
                 device = torch.cat([other.device, number[own.device]])
                 found[k] = replace(other, rows=torch.cat([other.rows, own.rows]), device=device)

@@ -43,7 +43,8 @@ from diffeo_calib.regression.choose import MAX_DENSE
 from diffeo_calib.robots.payload import joined_masses
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import sensor_of
-from diffeo_calib.sensors.places import DRIFT, PlacedDevices
+from diffeo_calib.sensors.known_drift import KnownDrift
+from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import mounted_of
 from diffeo_calib.sensors.tables import rows_of_one_kind
 
@@ -213,8 +214,9 @@ def devices_beside(model: Any, data: Any) -> tuple[PlacedDevices, ...]:
         sensor_of(part).check(part, model)
         points = model.at_payloads(part.payload).map(part.q).detach().unflatten(1, (-1, 3))
         for own in sensor_of(part).settled(part, points, model.turns):
-            same = next((number for number, old in enumerate(found) if own.same_set(old)), len(found))
-            alone = [] if own.of_model else [own]
+            alike = [number for number, old in enumerate(found) if own.devices.same_set(old.devices)]
+            same = alike[0] if alike else len(found)
+            alone = [] if own.devices.of_model else [own]
             found[same : same + 1] = [own.beside(old) for old in found[same : same + 1]] or alone
     return tuple(found)
 
@@ -235,7 +237,11 @@ def carried_devices(old: Any, new: Any, T: Tensor) -> tuple[PlacedDevices, ...]:
     P = min(before.shape[1], after.shape[1])
     away = (before @ T[:3, :3].mT + T[:3, 3])[:, :P] - after[:, :P]
     markers = (turns[:, :P].mT @ away[..., None])[..., 0].mean(0)
-    return tuple(own.carried(T, before, after, markers) for own in old.placement if own.kind != DRIFT)
+    return tuple(
+        replace(own, devices=replace(own.devices, constants=own.devices.carried(T, before, after, markers)))
+        for own in old.placement
+        if own.kind != KnownDrift.kind
+    )
 
 
 def registered_devices(old: Any, new: Any) -> tuple[PlacedDevices, ...]:
@@ -245,7 +251,7 @@ def registered_devices(old: Any, new: Any) -> tuple[PlacedDevices, ...]:
         DiffeoCalibWarning: devices that are left out.
     """
     same = new.registration.same and old.ball == new.ball
-    lost = [own for own in old.placement if own.devices is not None and not same]
+    lost = [own for own in old.placement if own.devices.reads and not same]
     if lost:
         names = few([f"'{name}'" for own in lost for name in own.names])
         what = f"the model no longer knows the devices {names}: these rows show other markers than what they read"

@@ -26,14 +26,8 @@ from diffeo_calib.common.errors import DiffeoCalibError, MeasurementError, as_wr
 from diffeo_calib.common.files import PROGRAM
 from diffeo_calib.measurements.checks import of_measurements
 from diffeo_calib.measurements.csv.cells import repeated
-from diffeo_calib.measurements.poses import (
-    ALL_CONVENTIONS,
-    ANGLE_UNITS,
-    CONVENTIONS,
-    numbers_of,
-    rotation_matrices,
-    rotation_numbers,
-)
+from diffeo_calib.measurements.poses import rotation_matrices, rotation_numbers
+from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, ANGLE_UNITS, CONVENTIONS, numbers_of
 from diffeo_calib.robots.cartesian import cartesian, pose_inputs
 from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.robots.tree import Chain

@@ -23,15 +23,13 @@ from diffeo_calib.measurements.csv.columns import Columns, Hideable, Values
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import ANGLES, CsvLines, read_cells, stated_unit
 from diffeo_calib.measurements.poses import (
-    ANGLE_UNITS,
-    EULER,
     POINTS,
     inverse_poses,
     points_of_frames,
     rotation_matrices,
     transforms_of_frames,
 )
-from diffeo_calib.measurements.table_format import UNITS_PER_METRE, flat_names, options_of
+from diffeo_calib.measurements.table_format import ANGLE_UNITS, EULER, UNITS_PER_METRE, flat_names, options_of
 
 
 @dataclass(frozen=True)

@@ -112,7 +112,7 @@ class FitRows:
     def blocks(self) -> list[tuple[Tensor, CholeskyRegression]]:
         """Row numbers (B,) of each block, and the model conditioned on them: on all rows the map is that at hand."""
         n, m, _ = self.map.noise.covariance.shape
-        known = self.map.conditional if self.map.data is None and n * m <= WHOLE_COORDINATES else None
+        known = self.map.by_data if self.map.data is None and n * m <= WHOLE_COORDINATES else None
         if isinstance(known, CholeskyRegression):
             return [(torch.arange(n, device=HOST), known)]
         order = torch.randperm(n, generator=seeded(0), device=HOST)

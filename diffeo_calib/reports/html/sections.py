@@ -56,18 +56,19 @@ def stage_pictures(stages: Mapping[str, Evaluation], suffix: str, repeatability:
     yield panel(f"distributions{suffix}", label, plots.draw_distributions, stages, **how)
     label = f"Every row: {some.label} of the calibrated model against that of the stage before it."
     yield panel(f"before-after{suffix}", label, plots.draw_before_after, stages, frame=UNDER_LEGEND)
-    if some.angles is not None:
+    turned = {name: one.orientation for name, one in stages.items() if one.orientation is not None}
+    if turned:
         label = "Share of rows whose orientation error is at most a value."
-        yield panel(f"angles{suffix}", label, plots.draw_distributions, stages, angles=True, frame=UNDER_LEGEND)
+        yield panel(f"angles{suffix}", label, plots.draw_distributions, turned, frame=UNDER_LEGEND)
 
 
 def stage_table(stages: Mapping[str, Evaluation]) -> Table:
     """Errors of one kind of rows by stage, and orientation errors in degrees if there are any."""
     some = next(iter(stages.values()))
-    units = [some.shown[0], *["deg"] * (some.angles is not None)]
+    units = [one.shown[0] for one in some.each]
     header = ["stage", *(name for unit in units for name in (f"{SIZES[0]} [{unit}]", *SIZES[1:]))]
     rows = [
-        [name, *(f"{size:.3f}" for size in own.sizes), *(f"{size:.4f}" for size in own.angle_sizes)]
+        [name, *(f"{size:.{3 + number}f}" for number, one in enumerate(own.each) for size in one.sizes)]
         for name, own in stages.items()
     ]
     return Table(f"{some.title} by stage", header, rows)

@@ -75,8 +75,8 @@ def figures(found: Findings) -> Iterator[tuple[str, str]]:
     own = found.calibrated
     for name, value in found.rms.items():
         yield f"expected error, {name}" if own is None else f"{name}, RMS", f"{1e3 * value:.3f} mm"
-    if own is not None and own.angle_rms is not None:
-        yield "orientation, RMS", f"{own.angle_rms:.4f}\u00b0"
+    if own is not None and own.orientation is not None:
+        yield "orientation, RMS", f"{own.orientation.rms:.4f}\u00b0"
     if own is not None and own.count >= ENOUGH_FOR_P95:
         yield "95 % of errors below", f"{1e3 * own.p95:.3f} mm"
     for name, value in _others(found):
