@@ -174,7 +174,7 @@ def _regions(model: dc.CalibratedKinematics, new: Tensor, truth: Tensor) -> Reco
     points = mean.flatten(0, 1)
     R, t = rigid_fit(truth.flatten(0, 1), points)
     error = truth.flatten(0, 1) @ R + t - points
-    whole = fitted.covariance_between(fitted.geodesic.linearise(new))
+    whole = fitted.conditional.covariance_between(fitted.geodesic.linearise(new))
     motions = rigid_motions(points)
     larger = mean.mean(1, keepdim=True).expand_as(mean).reshape(-1, 1)  # a larger board is farther away as a whole
     free, apart = (without(directions, whole) for directions in (motions, torch.cat([motions, larger], 1)))

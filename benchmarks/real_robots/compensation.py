@@ -105,7 +105,7 @@ class Bench:
     def held_out(self, kinematics: Callable[[Tensor], Tensor]) -> Record:
         """Errors on measurements that were not fitted."""
         found = dc.evaluate(kinematics, self.test)
-        return {"held_out_mm": 1e3 * found.rms, "held_out_deg": found.angle_rms}
+        return {"held_out_mm": 1e3 * found.rms, "held_out_deg": found.orientation.rms}
 
 
 def geometric_commands(geometry: Geometry, tool: Tensor, targets: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:

@@ -191,12 +191,10 @@ def carried_over(model: dc.CalibratedKinematics, new: dc.Measurements, test: dc.
         warnings.simplefilter("ignore", dc.DiffeoCalibWarning)
         placed = model.registered(new, free="base", learn=False)
     start = of_model(placed, torch.cat([new.q, test.q]), "base")
-    rows, size = torch.arange(len(new)), new.points.numel()
-    cross = start.known.between(rows)
-    inner = cross[:, :size] + torch.block_diag(*start.scene.noise[rows])
-    known = cross[:, size : size + test.points.numel()].T @ torch.linalg.solve(
-        inner, (new.points - placed(new.q)).flatten()
-    )
+    measured, tested = (start.at.rows(own) for own in torch.arange(len(start.at.xi)).split([len(new), len(test)]))
+    inner = start.known.covariance_between(measured) + torch.block_diag(*start.scene.noise[: len(new)])
+    residual = torch.linalg.solve(inner, (new.points - placed(new.q)).flatten())
+    known = start.known.covariance_between(tested, measured) @ residual
     errors = (placed(test.q) + known.view_as(test.points) - test.points).norm(dim=-1).flatten()
     return {"rms_mm": 1e3 * float(errors.square().mean().sqrt()), "p95_mm": 1e3 * float(errors.quantile(0.95))}
 

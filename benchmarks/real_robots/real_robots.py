@@ -81,7 +81,7 @@ def errors(fitted: Fitted, test: dc.Measurements) -> Record:
     """Errors on held-out rows."""
     found = dc.evaluate(fitted.kinematics, test)
     record: Record = {f"{name}_mm": 1e3 * getattr(found, name) for name in ("rms", "median", "p95", "max")}
-    record["rms_deg"] = None if found.angles is None else found.angle_rms
+    record["rms_deg"] = None if found.orientation is None else found.orientation.rms
     record["coverage_95"] = None if fitted.predict is None else coverage(*fitted.predict(test.q), test)
     return record
 

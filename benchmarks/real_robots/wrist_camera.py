@@ -82,7 +82,7 @@ def judged(
     record: Record = {
         "rms_mm": 1e3 * found.rms,
         "median_mm": 1e3 * found.median,
-        "rms_deg": found.angle_rms,
+        "rms_deg": found.orientation.rms,
         "board_mm": board_error(mean, test, MIDDLES[name]),
         "coverage_95": covered(test.points - mean, covariance),
         "true_mm": None,

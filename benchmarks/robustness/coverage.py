@@ -135,7 +135,7 @@ def perfect_deviation(model: dc.CalibratedKinematics, q: Tensor) -> float:
     """Standard deviation of the coverage over draws of errors from the model's own posterior, new noise added."""
     n, m = len(q), model.map.m
     _, at = model.map.geodesic.linearised_value(q)
-    values, vectors = torch.linalg.eigh(model.map.covariance_between(at))
+    values, vectors = torch.linalg.eigh(model.map.conditional.covariance_between(at))
     root, new = vectors * values.clamp(min=0).sqrt(), torch.linalg.cholesky(model.map.new_noise)
     rng = np.random.default_rng(0)
     covariance, found = model.predict(q)[1], []

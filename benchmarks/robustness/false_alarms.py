@@ -150,7 +150,7 @@ def truth(made: Campaign, model: dc.CalibratedKinematics) -> Record:
     points, true = model(q).detach().flatten(0, 1), made.truth(q).flatten(0, 1)
     T = rigid_fit(true, points)
     error = true @ T[:3, :3].mT + T[:3, 3] - points
-    whole = model.map.covariance_between(model.map.geodesic.linearise(q))
+    whole = model.map.conditional.covariance_between(model.map.geodesic.linearise(q))
     eye = torch.eye(3, dtype=q.dtype).expand(len(points), 3, 3)
     motions = torch.linalg.qr(torch.cat([eye, -skew(points - points.mean(0))], 2).flatten(0, 1)).Q
     left = whole - motions @ (motions.mT @ whole)

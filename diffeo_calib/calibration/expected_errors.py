@@ -35,7 +35,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.regression.conditional import diagonal_blocks
+from diffeo_calib.regression.conditional import diagonal_blocks, roots
 from diffeo_calib.robots.placement import PLACES, rigid_fit
 from diffeo_calib.sensors.tables import device_coordinates
 
@@ -100,7 +100,7 @@ class ExpectedError:
         away = points[:, -3:] - points[:, -3:].mean(0)
         last = torch.eye(own.m, dtype=points.dtype, device=points.device)[-3:].expand(len(points), -1, -1)
         along = (away / away.square().sum()).flatten()  # of a growth of the robot about the middle of its points
-        size = float((along @ own.covariance_between(at.projected(last)) @ along).clamp(min=0).sqrt())
+        size = float((along @ own.conditional.covariance_between(at.projected(last)) @ along).clamp(min=0).sqrt())
         whole = expected = rms(fitted.posterior(q, noise=False)[1])
         if found.motions.shape[1]:
             left = found.without(found.without(fitted.joint_covariance(q)).mT)
@@ -234,13 +234,14 @@ def _places(model_map: FittedMap) -> tuple[Tensor, Tensor, Tensor]:
     registration, fitted = model_map.registration, model_map.unregistered
     q = fitted.everywhere
     if registration is not None and not registration.same:  # it found other markers
-        slopes: Any = model_map.place_slopes  # pyright: ignore[reportAttributeAccessIssue]
-        return (_root(registration.covariance.to(fitted.x)), *(slopes(at) for at in (q, registration.q)))
+        known: Any = model_map.conditional
+        rows = registration.q.to(q)
+        return (known.root, *(known.slopes(model_map.linearised_value(at)[1]) for at in (q, rows)))
     nominal, conditional = fitted.geodesic.spec.nominal, fitted.conditional
     own = torch.tensor(nominal.places, dtype=torch.int64, device=fitted.x.device)
     opened, theta = fitted.open_directions[own], q.new_zeros(nominal.parameters)
     anywhere = conditional.compared_slopes(nominal.sensitivities(q, theta)[..., own].flatten(0, 1))
-    root = _root(conditional.inner.posterior(fitted.parameters_as_points(own))[0] + opened @ opened.mT)
+    root, _ = roots(conditional.inner.posterior(fitted.parameters_as_points(own))[0] + opened @ opened.mT)
     if registration is not None:  # its rows may show what those of the fit left open
         return root, anywhere, nominal.sensitivities(registration.q.to(q), theta)[..., own].flatten(0, 1)
     some = _some_rows(fitted.x)
@@ -250,12 +251,6 @@ def _places(model_map: FittedMap) -> tuple[Tensor, Tensor, Tensor]:
         (each * fitted.noise.visible[some, :, None]).flatten(0, 1) for each in (rows, fitted.noise.shared[some])
     )
     return root, anywhere, without_shared(rows, shared)
-
-
-def _root(covariance: Tensor) -> Tensor:
-    """A square root (k, k) of a covariance that may be singular."""
-    values, vectors = torch.linalg.eigh(covariance)
-    return vectors * values.clamp(min=0).sqrt()
 
 
 STILL_RANGE = 0.05

@@ -20,7 +20,7 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.moved_devices import changes_of
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.planning.candidates import candidates, ranges_around
-from diffeo_calib.calibration.planning.knowledge import factor, greedy
+from diffeo_calib.calibration.planning.knowledge import greedy
 from diffeo_calib.calibration.scales.selection import SCALE_PRIOR, defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.campaign.verdicts import Seen, Verdict, find_change, measure
@@ -242,12 +242,8 @@ class CampaignModel:
         cross, K, (M, r) = self.compared @ now.between(target, options), options.covariance, self.noise.shape[:2]
         own, place = options.numbers.diagonal_blocks(K)[0] + self.noise, torch.arange(M, device=HOST)
         how: Any = {"place": place, "open_": self.open, "count": min(count, int(self.open.sum()))}
-        order = greedy(cross, own, lambda row: K.view(M, r, -1)[row], **how)
-        at = torch.tensor(order, dtype=torch.int64, device=HOST)
-        numbers = (at[:, None] * r + torch.arange(r, device=HOST)).flatten()
-        low = factor(K[numbers][:, numbers] + torch.block_diag(*self.noise[at]))
-        by = torch.linalg.solve_triangular(low, cross[:, numbers].T, upper=False).reshape(len(order), r * len(cross))
-        lowered = torch.cat([variance[None], -by.square().sum(1) / len(cross)]).cumsum(0)
+        order, by = greedy(cross, own, lambda row: K.view(M, r, -1)[row], **how)
+        lowered = torch.cat([variance[None], -by.square().sum((1, 2)) / len(cross)]).cumsum(0)
         return order, (3 * lowered).clamp(min=0).sqrt().tolist()
 
     def judge(self, table: Any, verdicts: list[Verdict], lines: Sequence[int]) -> None:

@@ -50,7 +50,8 @@ class ErrorTable:
     def add(self, errors: Evaluation, *labels: str, expected: float | None = None) -> None:
         """Add a row: its errors, what it is called, and the expected RMS."""
         last = [] if expected is None else [errors.shown[1] * expected]
-        self.rows.append((labels, (errors.sizes, errors.angle_sizes, last)))
+        turned = errors.orientation
+        self.rows.append((labels, (errors.sizes, [] if turned is None else turned.sizes, last)))
 
     def _table(self, title: str, *groups: int) -> Table:
         """A table of some groups of numbers: 0 errors, 1 those of orientations, 2 expected errors."""

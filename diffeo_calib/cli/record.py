@@ -109,7 +109,7 @@ ERRORS = "errors"
 def errors_entry(errors: Evaluation) -> dict[str, object]:
     """Errors of measured positions in m, and of orientations in degrees (null without), over some rows."""
     entry = {"rows": errors.count} | {f"{name}_m": getattr(errors, name) for name in NAMES}
-    return entry | {f"angle_{name}_deg": getattr(errors, f"angle_{name}") for name in NAMES}
+    return entry | {f"angle_{name}_deg": getattr(errors.orientation, name, None) for name in NAMES}
 
 
 def kind_entry(errors: Evaluation) -> dict[str, object]:
@@ -117,7 +117,7 @@ def kind_entry(errors: Evaluation) -> dict[str, object]:
     unit, per_unit = errors.shown
     entry = {"rows": errors.count, "what": errors.what, "unit": unit}
     entry |= {name: per_unit * getattr(errors, name) for name in NAMES}
-    return entry | {f"angle_{name}_deg": getattr(errors, f"angle_{name}") for name in NAMES}
+    return entry | {f"angle_{name}_deg": getattr(errors.orientation, name, None) for name in NAMES}
 
 
 def entries_by_kind(found: Mapping[str, Any]) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.regression.choose import condition, condition_controls
-from diffeo_calib.regression.conditional import Conditional, WithoutRigidMotions, of_parameters
+from diffeo_calib.regression.conditional import Conditional, Opened, WithoutRigidMotions
 from diffeo_calib.regression.control_points import ControlPointRegression
 
 PREDICT_ROWS, WORKSPACE_ROWS = 1024, 100  # number of configurations that are linearised together for their covariances
@@ -191,30 +191,46 @@ class FittedMap:
         means, blocks = [], []
         for first in range(0, max(len(x), 1), PREDICT_ROWS):
             some = slice(first, first + PREDICT_ROWS)
-            rows, geodesic = x[some], self.geodesic.at_rows(some)
-            mean, at = geodesic.linearised_value(rows)
+            mean, at = self.linearised_value(x[some], self.geodesic.at_rows(some))
             wanted = None if directions is None else directions(mean)
             means.append(mean)
-            blocks.append(self._covariance(geodesic, rows, at, wanted))
+            blocks.append(self.covariance(at, wanted))
             if noise:
                 blocks[-1] += self.new_noise if wanted is None else wanted @ self.new_noise @ wanted.mT
         return torch.cat(means), torch.cat(blocks)
 
-    def _covariance(
-        self, geodesic: GeodesicDeformation, rows: Tensor, at: Linearisation, directions: Tensor | None
-    ) -> Tensor:
-        """Covariance of the map itself at some rows, with what is open, see :meth:`posterior`."""
-        sensitivity = self.open_sensitivity(geodesic.spec.nominal, rows)
-        return self.with_open_directions(self.covariance_at(at, directions), sensitivity, directions)
+    def linearised_value(
+        self, x: Tensor, geodesic: GeodesicDeformation | None = None, held: slice = slice(0)
+    ) -> tuple[Tensor, Linearisation]:
+        """k1 at x (M, n), m, and its linearisation with columns by all that the model does not know.
 
-    def covariance_at(self, at: Linearisation, directions: Tensor | None = None) -> Tensor:
-        """Posterior covariance of the points of a linearisation, those of k1 or others of the body: (M, m', m').
+        Args:
+            x: configurations. geodesic: k1 of other points of the body, or of rows under their payloads.
+            held: numbers of parameters that count as known.
+        """
+        around, root = geodesic or self.geodesic, self.open_directions
+        points, at = around.linearised_value(x)
+        kept = root.new_ones(len(root))
+        kept[held] = 0.0
+        at = replace(at, sensitivity=at.sensitivity * kept)
+        if root.shape[1]:
+            opened = around.spec.nominal.sensitivities(x, 0.0 * kept) @ (kept[:, None] * root)
+            at = at.with_columns(opened, self.columns - root.shape[1])
+        return points, at
+
+    @property
+    def columns(self) -> int:
+        """Parameters, shifts that rows of the fit share, and directions that they leave open."""
+        return len(self.geodesic.spec.prior_variance) + self.noise.shared.shape[2] + self.open_directions.shape[1]
+
+    def covariance(self, at: Linearisation, directions: Tensor | None = None) -> Tensor:
+        """Posterior covariance (M, m', m') of the points of :meth:`linearised_value`.
 
         Args:
             at: the linearisation.
             directions: (M, r, m') linear functions of the points whose covariance (M, r, r) is wanted instead.
         """
-        return self.conditional.covariance(at, directions)
+        return self.with_second_order(self.conditional.covariance(at, directions))
 
     def with_shifts(self, at: Linearisation, effects: Tensor, columns: Tensor) -> Tensor:
         """Posterior covariance (M, r, r) of points together with shifts that rows of the fit shared.
@@ -225,10 +241,9 @@ class FittedMap:
             at: linearisation of the points. effects: (M, r, k) of k shifts of unit prior variance on them.
             columns: (c,) boolean, which of the shifts of the fit these are.
         """
-        K = len(self.geodesic.spec.prior_variance)
-        slopes = of_parameters(at, K + len(columns)).clone()
-        slopes[..., K:][..., columns] = effects
-        return self.conditional.inner.posterior(replace(at, sensitivity=slopes))
+        shifts = effects.new_zeros(*effects.shape[:2], len(columns))
+        shifts[..., columns] = effects
+        return self.conditional.inner.posterior(at.with_columns(shifts, len(self.geodesic.spec.prior_variance)))
 
     @of_origin
     def fitted_points(self) -> Tensor:
@@ -259,30 +274,6 @@ class FittedMap:
         noise = float(self.new_noise.diagonal().mean().sqrt())
         root[places] = deviations[:, None] * Vt.mT
         return root[:, s < noise]
-
-    def open_sensitivity(self, nominal: NominalMap, x: Tensor) -> Tensor | None:
-        """Derivatives (M, m', K) of points by theta, at theta = 0; None if no direction is open.
-
-        Args:
-            nominal: nominal map of the points, with the parameters of this map's. x: (M, n) configurations.
-        """
-        root = self.open_directions
-        return nominal.sensitivities(x, root.new_zeros(len(root))) if root.shape[1] else None
-
-    def with_open_directions(
-        self, covariance: Tensor, sensitivity: Tensor | None, directions: Tensor | None = None
-    ) -> Tensor:
-        """The covariance (M, r, r) with what is open, and with errors of second order.
-
-        Args:
-            covariance: of the linear model. sensitivity: of the points, see :meth:`open_sensitivity`.
-            directions: (M, r, m') linear functions of the points that the covariance is of; None for the points.
-        """
-        if sensitivity is not None:
-            moved = sensitivity @ self.open_directions
-            moved = moved if directions is None else directions @ moved
-            covariance = covariance + moved @ moved.mT
-        return self.with_second_order(covariance)
 
     def with_second_order(self, covariance: Tensor) -> Tensor:
         """The covariance (M, r, r) of points that may be turned by many degrees, with their errors of second order.
@@ -334,10 +325,10 @@ class FittedMap:
     def explained_by(self, which: Tensor, x: Tensor) -> float:
         """Share of the posterior variance of k1 at x (M, n) that knowing these parameters would remove."""
         own, at = self.parameters_as_points(which), self.geodesic.linearise(x)
-        between = self.covariance_between(at, own)  # (M m, k)
+        between = self.conditional.covariance_between(at, own)  # (M m, k)
         known = self.conditional.posterior(own)[0]
         removed = (between * torch.linalg.solve(known, between.T).T).sum()
-        return float(removed / self.covariance_at(at).diagonal(dim1=1, dim2=2).sum())
+        return float(removed / self.conditional.covariance(at).diagonal(dim1=1, dim2=2).sum())
 
     def parameters_as_points(self, which: Tensor) -> Linearisation:
         """The parameters with these numbers as if they were the coordinates of one configuration.
@@ -349,16 +340,9 @@ class FittedMap:
         chosen = torch.eye(at.sensitivity.shape[2] + shifts, dtype=nothing.dtype, device=nothing.device)[which]
         return replace(at.projected(nothing), sensitivity=chosen[None])
 
-    def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
-        """Posterior covariance between the points of two linearisations, by default the same: (M m', M'' m'')."""
-        return self.conditional.covariance_between(at, other)
-
     def joint_covariance(self, x: Tensor) -> Tensor:
         """Posterior covariance of all coordinates of k1 at x (M, n) together: (M m, M m), m^2."""
-        points, at = self.geodesic.linearised_value(x)
-        return self.covariance_between(
-            at.projected(torch.eye(self.m, dtype=points.dtype, device=points.device).expand(len(x), -1, -1))
-        )
+        return self.conditional.covariance_between(self.linearised_value(x)[1])
 
     def measured(self) -> Tensor:
         """(N, m) the measurements that lead to this map and its posterior, m, or (N, r) with slopes.
@@ -391,9 +375,8 @@ class FittedMap:
     def weighted_residual(self) -> Tensor:
         """R^-1 (y - h(k1)) at the optimum: (N, r), zero where nothing was measured."""
         deformation = self.geodesic
-        conditional = self.conditional.inner if self.data is not None else None
-        if isinstance(conditional, ControlPointRegression):
-            return conditional.weighted_residual()
+        if isinstance(self.by_data, ControlPointRegression):
+            return self.by_data.weighted_residual()
         pull = deformation.end_momenta.reshape(deformation.z1.shape)
         return pull if self.slopes is None else (torch.linalg.pinv(self.slopes.mT) @ pull[:, :, None])[:, :, 0]
 
@@ -426,17 +409,23 @@ class FittedMap:
         return inverse_of(self.deformation, as_tensor(y, "y", (len(x), self.m), empty=True), x)
 
     @of_origin
-    def conditional(self) -> Conditional:
+    def by_data(self) -> Conditional:
         """The fields around the fitted flows, conditioned on the data."""
         around, slopes = self.geodesic, self.slopes
-        if self.data is None:
-            at = around.linearise()
-            found: Conditional = condition(at if slopes is None else at.projected(slopes), self.noise)
-        else:
-            found = condition_controls(around, self.data, self.noise, slopes)
-        if self.workspace is None:
-            return found
-        return WithoutRigidMotions(found, around.linearise(self.workspace), around.spec.nominal.places[:6])
+        if self.data is not None:
+            return condition_controls(around, self.data, self.noise, slopes)
+        at = around.linearise()
+        return condition(at if slopes is None else at.projected(slopes), self.noise)
+
+    @of_origin
+    def conditional(self) -> Conditional:
+        """The same without rigid motions where no device saw them, and with what the data leave open."""
+        found, around, root = self.by_data, self.geodesic, self.open_directions
+        if self.workspace is not None:
+            at = around.linearise(self.workspace)
+            found = WithoutRigidMotions(found, at, around.spec.nominal.places[:6])
+        first, many = self.columns - root.shape[1], root.shape[1]
+        return Opened(found, first, root.new_ones(many)) if many else found
 
     def _configurations(self, x: object) -> Tensor:
         refuse_data_frame(x, "x")

@@ -49,14 +49,6 @@ class PredictedReadings:
         return self.covariance.diagonal(dim1=1, dim2=2).clamp(min=0).sqrt()
 
 
-class _Seen(NamedTuple):
-    """The points of a model at some configurations: values (N, 3 P), m, and their linearisation."""
-
-    points: Tensor
-    at: Linearisation
-    sensitivity: Tensor | None
-
-
 class FittedDevice(NamedTuple):
     """A device of readings beside a fit, where the model has it.
 
@@ -96,40 +88,32 @@ class FittedDevice(NamedTuple):
         """(N, r, k) derivatives of readings of points (N, 3 P'), which it sees, by its unknowns, m."""
         return self.devices.by_increments(points, torch.zeros(len(points), dtype=torch.int64, device=HOST))
 
-    def readings(self, fitted: FittedMap, seen: _Seen, *, noise: bool) -> tuple[Tensor, Tensor]:
-        """Mean (N, r) and covariance (N, r, r) of its readings, m."""
-        points = seen.points[:, -3 * self.devices.seen_points :]
+    def readings(self, fitted: FittedMap, seen: tuple[Tensor, Linearisation], *, noise: bool) -> tuple[Tensor, Tensor]:
+        """Mean (N, r) and covariance (N, r, r) of its readings, m, of points and their linearisation."""
+        whole, at = seen
+        points = whole[:, -3 * self.devices.seen_points :]
         observation = self.devices.observation(torch.zeros(len(points), dtype=torch.int64, device=HOST))
-        A = torch.nn.functional.pad(observation.slope(points), (seen.points.shape[1] - points.shape[1], 0))
+        A = torch.nn.functional.pad(observation.slope(points), (whole.shape[1] - points.shape[1], 0))
         B = self.by_increments(points) @ self.root
         if self.columns is None:
-            covariance = fitted.covariance_at(seen.at, A) + B @ B.mT
+            covariance = fitted.conditional.covariance(at, A) + B @ B.mT
         else:
-            covariance = fitted.with_shifts(seen.at.projected(A), B, self.columns)
-        if seen.sensitivity is not None:
-            moved = A @ (seen.sensitivity @ fitted.open_directions)
-            covariance = covariance + moved @ moved.mT
+            covariance = fitted.with_shifts(at.projected(A), B, self.columns)
         if noise:
             covariance = covariance + (A @ fitted.new_noise @ A.mT if self.noise is None else self.noise)
-        return observation.value(points), covariance
+        return observation.value(points).detach(), covariance
 
 
 def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[PredictedReadings]:
-    """Predicted readings of every device that a model knows; empty for devices that measure coordinates.
-
-    Args:
-        model: calibrated. q: (N, n) configurations. noise: whether the covariance is that of a new reading.
-    """
+    """Predicted readings at q (N, n) of every device that a model knows, see :meth:`predict_readings`."""
     fitted: FittedMap = model.map
     for own in model.placement:
         own.devices.warn_if_unknown()
     sets = [(own, own.devices) for own in model.placement if own.devices.reads and len(q)]
     markers = [own.devices for own in model.placement if own.kind == MountedMarkers.kind]
-    mounted = [one for own in markers for one in _mounted(model, own, q, noise=noise)]
-    if not sets:
-        return mounted
-    seen = [_seen(fitted, q, slice(first, first + PREDICT_ROWS)) for first in range(0, len(q), PREDICT_ROWS)]
-    found = mounted
+    found = [one for own in markers for one in _mounted(model, own, q, noise=noise)]
+    each = (slice(first, first + PREDICT_ROWS) for first in range(0, len(q) if sets else 0, PREDICT_ROWS))
+    seen = [fitted.linearised_value(q[some], fitted.geodesic.at_rows(some)) for some in each]
     for own, devices in sets:
         unit, scale, zero = own.shown or ("", (1.0,), (0.0,))  # files of old versions: as reported, lengths in m
         for number, name in enumerate(own.names):
@@ -154,9 +138,3 @@ def _mounted(model: Any, own: Extrinsics, q: Tensor, *, noise: bool) -> Iterator
             places = places.masked_fill(~seen_mounted(std)[:, None], torch.nan)
             blocks = 1e6 * (covariance[:, :P] + turns @ torch.diag_embed(std.square()) @ turns.mT)
             yield PredictedReadings("position", name, "mm", places.flatten(1), block_diagonal(blocks))
-
-
-def _seen(fitted: FittedMap, q: Tensor, some: slice) -> _Seen:
-    geodesic = fitted.geodesic.at_rows(some)
-    points, at = geodesic.linearised_value(q[some])
-    return _Seen(points.detach(), at, fitted.open_sensitivity(geodesic.spec.nominal, q[some]))

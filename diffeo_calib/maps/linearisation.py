@@ -178,6 +178,13 @@ class Linearisation:
         joint, task = ([node.projected(directions) for node in nodes] for nodes in (self.joint, self.task))
         return Linearisation(self.spec, joint, task, directions @ self.sensitivity)
 
+    def with_columns(self, columns: Tensor, first: int) -> Linearisation:
+        """With derivatives (M, r, k) by unknowns beside those of the nominal map, numbers ``first`` to first + k."""
+        count = max(self.sensitivity.shape[2], first + columns.shape[2])
+        whole = torch.nn.functional.pad(self.sensitivity, (0, count - self.sensitivity.shape[2]))
+        whole[..., first : first + columns.shape[2]] = columns
+        return replace(self, sensitivity=whole)
+
     def product(self, mu: Tensor) -> Tensor:
         """G mu without the matrix G: (N, m, k) -> (N, m, k), by kernel sums."""
         prior = self.spec.prior_variance[:, None] * torch.einsum("imt,imk->tk", self.sensitivity, mu)

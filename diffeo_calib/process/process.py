@@ -21,7 +21,8 @@ from torch import Tensor
 from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.process.numbers import Covariance, Numbers
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.regression.cholesky import Factor, lower_root
+from diffeo_calib.regression.cholesky import Factor
+from diffeo_calib.regression.conditional import lower_root
 
 
 @dataclass(frozen=True)

@@ -14,16 +14,7 @@ from diffeo_calib.common.threads import large_work
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.conditional import NOISE_ADVICE, DataConditional, diagonal_blocks
-
-
-def lower_root(F: Tensor) -> Tensor:
-    """L with L L^T = F (M, M); NumericalError where F is not positive definite in float64."""
-    with large_work(F.numel()):
-        L, info = torch.linalg.cholesky_ex(F)
-    if int(info):
-        raise NumericalError.of("the covariance of the rows is not positive definite", fix=NOISE_ADVICE)
-    return L
+from diffeo_calib.regression.conditional import NOISE_ADVICE, DataConditional, diagonal_blocks, lower_root
 
 
 class Factor:

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import large_work
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.linearisation import Linearisation
@@ -29,33 +30,57 @@ NOISE_ADVICE = "raise `noise` or lower the kernels' variances"
 """How to repair a matrix that float64 cannot factorise."""
 BLOCK_ENTRIES = 1 << 21
 """Number of covariances between data and queries that are computed together (16 MiB, within usual caches)."""
-ROUNDING_RATIO = 1e-6  # deviations of a rigid motion, relative to the largest, that are rounding errors
+ROUNDING_RATIO = 1e-12  # eigenvalues of correlations, relative to the largest, that are rounding errors
 
 
 class Features(NamedTuple):
-    """Features f at M configurations: what parameters and data add to the covariance of the fields, a column each.
+    """Features f of M configurations: what parameters and data add to the covariance of the fields, a column each.
 
-    covariance(x, x') = F(x, x') + sum_k sign_k f_k(x) f_k(x')^T, with F that of the fields alone.
+    covariance(x, x') = F(x, x') + sum_k sign_k f_k(x) f_k(x')^T, with F that of the fields. Nothing large cancels.
 
     Args:
-        values: (k, M m). signs: (k,) 1 or -1.
+        at: the linearisation, r numbers each. values: (k, M r). signs: (k,) 1 or -1.
     """
 
+    at: Linearisation
     values: Tensor
     signs: Tensor
 
     @classmethod
-    def of(cls, *parts: tuple[Tensor, int]) -> Features:
-        """Several features (k_i, M m), each with its sign."""
+    def of(cls, at: Linearisation, *parts: tuple[Tensor, int]) -> Features:
+        """Several features (k_i, M r), each with its sign."""
         signs = [values.new_full((len(values),), float(sign)) for values, sign in parts]
-        return cls(torch.cat([values for values, _ in parts]), torch.cat(signs))
+        return cls(at, torch.cat([values for values, _ in parts]), torch.cat(signs))
+
+    def beside(self, *parts: tuple[Tensor, int]) -> Features:
+        """These, and others (k_i, M r) with their signs."""
+        _, values, signs = Features.of(self.at, *parts)
+        return Features(self.at, torch.cat([self.values, values]), torch.cat([self.signs, signs]))
+
+    def rows(self, index: Tensor) -> Features:
+        """Those of some configurations (B,)."""
+        values = self.values.unflatten(1, (len(self.at.sensitivity), -1))[:, index].flatten(1)
+        return Features(self.at.rows(index), values, self.signs)
+
+    def blocks(self) -> Tensor:
+        """Covariance of every configuration of a projected linearisation with itself: (M, r, r)."""
+        values = self.values.T.reshape(*self.at.sensitivity.shape[:2], -1)
+        return self.at.fields.own_blocks() + (values * self.signs) @ values.mT
+
+    def between(self, other: Features | None = None) -> Tensor:
+        """Covariance (M r, M' r') with others, by default themselves."""
+        theirs = self if other is None else other
+        fields = self.at.fields.gram(None if other is None else other.at.fields)
+        with large_work(fields.numel()):
+            return fields.addmm_(self.values.T * self.signs, theirs.values)
 
 
 class Conditional(ABC):
-    """The Gaussian conditional of one linearisation on the data.
+    """The Gaussian conditional of linearisations on the data.
 
-    Shifts that rows of the data share are parameters of unit variance after those of the nominal map. Linearisations
-    that take part in some have columns for all; others have none.
+    Shifts that rows of the data share are parameters of unit variance after those of the nominal map, and unknowns
+    that were opened later come after these. Of columns that a linearisation has not it does not depend, and a
+    conditional leaves those out that it does not know.
 
     Attributes:
         size: number of measured coordinates or momenta that are conditioned on.
@@ -73,19 +98,12 @@ class Conditional(ABC):
         """Features of a linearisation, from which covariances between any of its configurations follow cheaply."""
 
     def posterior(self, at: Linearisation) -> Tensor:
-        """Posterior covariance at the M configurations of a projected linearisation, all at once: (M, r, r).
-
-        Nothing large cancels in covariances from features.
-        """
-        values, signs = self.features(at)
-        values = values.T.reshape(*at.sensitivity.shape[:2], -1)
-        return at.fields.own_blocks() + (values * signs) @ values.mT
+        """Posterior covariance at the M configurations of a projected linearisation, all at once: (M, r, r)."""
+        return self.features(at).blocks()
 
     def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
         """Posterior covariance of k1 between two linearisations, by default the same: (M m, M' m') in m^2."""
-        mine, signs = self.features(at)
-        theirs = mine if other is None else self.features(other).values
-        return at.fields.gram(None if other is None else other.fields) + (mine.T * signs) @ theirs
+        return self.features(at).between(None if other is None else self.features(other))
 
     def compared(self, points: Tensor, targets: Tensor, fit: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         """Points (M, 3) as they are compared with targets, m: rigid motions are errors like others.
@@ -168,56 +186,150 @@ class DataConditional(Conditional):
         with large_work(cross.numel()):
             known = self.white(cross)
         unknown = (of_parameters(at, len(B)).flatten(0, 1) * self.deviations).T - W.T @ known  # (D Lambda^-1/2)^T
-        return Features.of((known, -1), (torch.linalg.solve_triangular(B, unknown, upper=False), 1))
+        return Features.of(at, (known, -1), (torch.linalg.solve_triangular(B, unknown, upper=False), 1))
 
 
-class WithoutRigidMotions(Conditional):
-    """The same conditional without rigid motions: without a measuring device nothing says where the robot stands.
+class Fields(Conditional):
+    """The fields alone, before any data and without parameters."""
 
-    Errors e of the model at reference configurations X are split into the rigid motion w = B(X)^+ e(X) that fits them
-    best, and the rest; what counts at x is
+    size = 0
 
-        e(x) - B(x) w,    covariance  C(x, x') - g g'^T + (B(x) T - g) (B(x') T - g')^T,    g = C(x, w) T^-T,
+    def features(self, at: Linearisation) -> Features:
+        rows = at.sensitivity.flatten(0, 1)
+        return Features.of(at, (rows.new_zeros(0, len(rows)), 1))
 
-    with B(x) the derivatives of k1(x) by the twist of the base, and T T^T = C(w, w).
+
+class Opened(Conditional):
+    """The same with more unknowns, of which the data so far say nothing.
 
     Args:
-        inner: with them. reference: linearisation at X. base: numbers of the six parameters that move the base.
+        before: without them. first: number of the first of their columns.
+        deviations: (k,) of their prior.
     """
 
-    def __init__(self, inner: Conditional, reference: Linearisation, base: Sequence[int]) -> None:
-        self.size, self._inner, self.reference, self.base = inner.size, inner, reference, list(base)
-        self.fit = torch.linalg.pinv(self.motions(reference))  # (6, M m)
-        self._by_motion = self.fit @ inner.features(reference).values.T
-        values, vectors = torch.linalg.eigh(self.fit @ inner.covariance_between(reference) @ self.fit.mT)
-        self.root = vectors * values.clamp(min=0.0).sqrt()
-        self._to_white = torch.linalg.pinv(self.root, rtol=ROUNDING_RATIO)
-
-    def motions(self, at: Linearisation) -> Tensor:
-        """B (M m, 6)."""
-        return at.sensitivity[..., self.base].flatten(0, 1)
+    def __init__(self, before: Conditional, first: int, deviations: Tensor) -> None:
+        self.before, self.size, self.first, self.deviations = before, before.size, first, deviations
 
     @property
     def inner(self) -> Conditional:
-        return self._inner
+        return Opened(self.before.inner, self.first, self.deviations)
+
+    def compared(self, points: Tensor, targets: Tensor, fit: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        return self.before.compared(points, targets, fit)
+
+    def compared_slopes(self, slopes: Tensor) -> Tensor:
+        return self.before.compared_slopes(slopes)
 
     def features(self, at: Linearisation) -> Features:
-        values, signs = self.inner.features(at)
-        fields = self.fit @ self.reference.fields.gram(at.fields)
-        g = self._to_white @ (fields + self._by_motion * signs @ values)
-        left = self.root.T @ self.motions(at).T - g
-        return Features(torch.cat([values, g, left]), torch.cat([signs, signs.new_tensor([-1.0] * 6 + [1.0] * 6)]))
+        opened = of_parameters(at, self.first + len(self.deviations))[..., self.first :] * self.deviations
+        return self.before.features(at).beside((opened.flatten(0, 1).T, 1))
+
+
+class Given(Conditional):
+    """The same after more rows.
+
+    Args:
+        before: without them. rows: linearisation of what they report. noise: (O, r, r).
+
+    Raises:
+        NumericalError: their covariance is not positive definite in float64.
+    """
+
+    def __init__(self, before: Conditional, rows: Linearisation, noise: Tensor) -> None:
+        self.before, self.rows = before, before.features(rows)
+        self.size = before.size + noise.shape[:2].numel()
+        self._root = lower_root(self.rows.between() + torch.block_diag(*noise))
+
+    def features(self, at: Linearisation) -> Features:
+        found = self.before.features(at)
+        return found.beside((torch.linalg.solve_triangular(self._root, self.rows.between(found), upper=False), -1))
+
+
+class Estimated(Conditional):
+    """Errors e(x) - B(x) w of the model beside unknowns w that were estimated from it, w = A e(X) + other errors.
+
+    So it is where device and markers of another date were found by rows X. Without a measuring device nothing says
+    where the robot stands: w is the rigid motion that fits the errors at X best, which counts for none. With U = T T^T
+    the covariance of w,
+
+        C(x, x') - g g'^T + (B(x) T - g) (B(x') T - g')^T,    g = C(x, X) A^T T^-T.
+
+    Args:
+        before: C. reference: linearisation at X, M rows of m numbers. gain: A (k, M m).
+        columns: numbers of the columns B of a linearisation; zero where it has none.
+        covariance: U (k, k); by default that of A e(X).
+    """
+
+    def __init__(
+        self,
+        before: Conditional,
+        reference: Linearisation,
+        gain: Tensor,
+        columns: Sequence[int],
+        covariance: Tensor | None = None,
+    ) -> None:
+        self.before, self.size, self.gain, self.columns = before, before.size, gain, list(columns)
+        self.reference = before.features(reference)
+        covariance = gain @ self.reference.between() @ gain.T if covariance is None else covariance
+        self._by_gain = gain @ self.reference.values.T
+        self.root, self._to_white = roots(covariance)
+
+    def slopes(self, at: Linearisation) -> Tensor:
+        """B (M m, k)."""
+        return of_parameters(at, max(self.columns) + 1)[..., self.columns].flatten(0, 1)
+
+    def features(self, at: Linearisation) -> Features:
+        found = self.before.features(at)
+        fields = self.gain @ self.reference.at.fields.gram(at.fields)
+        g = self._to_white @ (fields + self._by_gain * found.signs @ found.values)
+        return found.beside((g, -1), (self.root.T @ self.slopes(at).T - g, 1))
+
+
+class WithoutRigidMotions(Estimated):
+    """The same conditional without rigid motions, see :class:`Estimated`.
+
+    Args:
+        before: with them. reference: linearisation at X. base: numbers of the six parameters that move the base.
+    """
+
+    def __init__(self, before: Conditional, reference: Linearisation, base: Sequence[int]) -> None:
+        gain = torch.linalg.pinv(reference.sensitivity[..., list(base)].flatten(0, 1))  # (6, M m)
+        super().__init__(before, reference, gain, base)
+
+    @property
+    def inner(self) -> Conditional:
+        return self.before
 
     def compared(self, points: Tensor, targets: Tensor, fit: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         T = fit(points, targets)
         return points @ T[:3, :3].mT + T[:3, 3]
 
     def compared_slopes(self, slopes: Tensor) -> Tensor:
-        return slopes - self.motions(self.reference) @ (self.fit @ slopes)
+        return slopes - self.slopes(self.reference.at) @ (self.gain @ slopes)
+
+
+def lower_root(F: Tensor) -> Tensor:
+    """L with L L^T = F (M, M); NumericalError where F is not positive definite in float64."""
+    with large_work(F.numel()):
+        L, info = torch.linalg.cholesky_ex(F)
+    if int(info):
+        raise NumericalError.of("the covariance of the rows is not positive definite", fix=NOISE_ADVICE)
+    return L
+
+
+def roots(covariance: Tensor, rounding: float = ROUNDING_RATIO) -> tuple[Tensor, Tensor]:
+    """T (k, k) with T T^T = U, and its pseudo-inverse; U may be singular, and of numbers in different units."""
+    variances = covariance.diagonal().clamp(min=0.0)
+    scale = torch.where(variances > 0.0, variances, 1.0).sqrt()
+    values, vectors = torch.linalg.eigh(covariance / scale / scale[:, None])
+    values = values.clamp(min=0.0)
+    kept = values > rounding * values[-1]
+    inverse = torch.where(kept, values, torch.inf).rsqrt()
+    return scale[:, None] * vectors * values.sqrt(), (vectors * inverse).T / scale
 
 
 def of_parameters(at: Linearisation, count: int) -> Tensor:
-    """Derivatives (M, r, count) by all parameters, zero by shifts of which a linearisation says nothing."""
+    """Derivatives (M, r, count) by the first parameters, zero by those of which a linearisation says nothing."""
     return torch.nn.functional.pad(at.sensitivity, (0, count - at.sensitivity.shape[2]))
 
 

@@ -21,8 +21,7 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.cholesky import lower_root
-from diffeo_calib.regression.conditional import DataConditional
+from diffeo_calib.regression.conditional import DataConditional, lower_root
 
 BLOCK_CONFIGURATIONS = 64  # number of configurations that are drawn together
 NEGLIGIBLE_VARIANCE_RATIO = 0.03

@@ -145,7 +145,7 @@ class ControlPointRegression(Conditional):
             expressed = self._whiten(rows.T)  # (size, M r)
             left = torch.linalg.solve_triangular(self.core, expressed, upper=False)
         fields = self.size - self.like.theta.numel() - self._shifts  # momenta
-        return Features.of((expressed[:fields], -1), (left, 1))
+        return Features.of(at, (expressed[:fields], -1), (left, 1))
 
     def _blocks(self, size: int) -> list[Tensor]:
         """Row numbers of the blocks of data that this process works on."""

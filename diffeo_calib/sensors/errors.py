@@ -20,11 +20,12 @@ SIZES = ("RMS", "median", "95 %", "max")
 """The same in heads of tables."""
 BY_ROW = ("errors", "angles", "away", "turns", "line_numbers")
 """Attributes of an evaluation with a value for each row."""
-ERRORS, SPREAD, READINGS = "errors", "spread", "readings"
+ERRORS, SPREAD, READINGS, ORIENTATION = "errors", "spread", "readings", "orientation"
 WORDS = {
     ERRORS: "distances",
     SPREAD: "distances from the middles of sockets, a spread,",
     READINGS: "errors of readings",
+    ORIENTATION: "angles",
 }
 COMPONENTS = ("dx", "dy", "dz")
 
@@ -95,13 +96,13 @@ class Evaluation:
     @property
     def title(self) -> str:
         """What the numbers are, for the head of a table."""
-        kinds = {ERRORS: "Position errors", SPREAD: "Spread within sockets"}
+        kinds = {ERRORS: "Position errors", SPREAD: "Spread within sockets", ORIENTATION: "Orientation errors"}
         return kinds.get(self.what, f"Errors of {self.kind}s")
 
     @property
     def label(self) -> str:
         """The same for one number, for axes."""
-        kinds = {ERRORS: "position error", SPREAD: "spread within sockets"}
+        kinds = {ERRORS: "position error", SPREAD: "spread within sockets", ORIENTATION: "orientation error"}
         return kinds.get(self.what, f"error of {self.kind}s")
 
     @property
@@ -121,43 +122,53 @@ class Evaluation:
         return [self.shown[1] * getattr(self, name) for name in NAMES]
 
     @property
-    def angle_sizes(self) -> list[float]:
-        """The same of angles, degrees; empty without orientations."""
-        return [] if self.angles is None else [getattr(self, f"angle_{name}") for name in NAMES]
+    def orientation(self) -> Evaluation | None:
+        """Angles between predicted and measured orientations, **degrees**; None if only points were measured."""
+        if self.angles is None:
+            return None
+        angles, turns = self.angles.rad2deg().view(len(self.errors), -1), None
+        if self.turns is not None:
+            turns = self.turns.rad2deg()
+        known = {"line_numbers": self.line_numbers, "devices": self.devices, "unit": "deg"}
+        return Evaluation(angles, away=turns, what=ORIENTATION, kind=ORIENTATION, **known)
+
+    @property
+    def each(self) -> list[Evaluation]:
+        """These, and those of orientations."""
+        return [self] if self.orientation is None else [self, self.orientation]
 
     def __repr__(self) -> str:
-        text = f"{len(known(self.errors))} {WORDS[self.what]} in {self.unit}: "
-        text += ", ".join(f"{n}={getattr(self, n):.4g}" for n in NAMES)
-        if self.angles is not None:
-            angles = ", ".join(f"{n}={getattr(self, f'angle_{n}'):.4g}" for n in NAMES)
-            text = f"{text}; {len(known(self.angles))} angles in deg: {angles}"
+        sizes = [
+            f"{len(known(one.errors))} {WORDS[one.what]} in {one.unit}: "
+            + ", ".join(f"{n}={getattr(one, n):.4g}" for n in NAMES)
+            for one in self.each
+        ]
         found = f"; {self.numbers} numbers found from these rows" * (self.numbers > 0)
-        return f"Evaluation({text}{found})"
+        return f"Evaluation({'; '.join(sizes)}{found})"
 
     def _repr_html_(self) -> str:
         """A table of the errors, for notebooks."""
-        name = "position" if self.what == ERRORS else self.title
-        each = {f"{name} [{self.shown[0]}]": self.sizes, "orientation [deg]": self.angle_sizes}
-        rows = [[what, *(f"{value:.4f}" for value in values)] for what, values in each.items() if values]
+        words = {ERRORS: "position", ORIENTATION: "orientation"}
+        rows = [
+            [f"{words.get(one.what, one.title)} [{one.shown[0]}]", *(f"{value:.4f}" for value in one.sizes)]
+            for one in self.each
+        ]
         return table_html(f"Errors of {len(self.errors)} rows", ("", *SIZES), rows)
 
     def lines(self) -> Iterator[dict[str, Any]]:
         """One entry for every row and body, as :meth:`Evaluations.to_frame` writes them: mm, px, deg."""
-        unit, per_unit = self.shown
-        sizes, away = per_unit * self.errors, None if self.away is None else per_unit * self.away
-        yield from self._lines(self.kind, sizes, away, unit)
-        if self.angles is not None:
-            turns = None if self.turns is None else self.turns.rad2deg()
-            yield from self._lines("orientation", self.angles.view(len(sizes), -1).rad2deg(), turns, "deg")
+        return (line for one in self.each for line in one._lines())
 
-    def _lines(self, kind: str, sizes: Tensor, away: Tensor | None, unit: str) -> Iterator[dict[str, Any]]:
+    def _lines(self) -> Iterator[dict[str, Any]]:
+        unit, per_unit = self.shown
+        sizes = per_unit * self.errors
         lines = range(len(sizes)) if self.line_numbers is None else self.line_numbers.tolist()
-        numbers = [[[]] * sizes.shape[1]] * len(sizes) if away is None else away.tolist()
+        numbers = [[[]] * sizes.shape[1]] * len(sizes) if self.away is None else (per_unit * self.away).tolist()
         devices = self.devices or [""] * len(sizes)
         for row, (line, device, own, parts) in enumerate(zip(lines, devices, sizes.tolist(), numbers, strict=True)):
             for marker, (size, components) in enumerate(zip(own, parts, strict=True)):
                 padded = [*components, *[torch.nan] * (3 - len(components))]
-                entry = {"row": row, "line": line, "kind": kind, "device": device, "marker": marker}
+                entry = {"row": row, "line": line, "kind": self.kind, "device": device, "marker": marker}
                 yield entry | dict(zip(COMPONENTS, padded, strict=True)) | {"size": size, "unit": unit}
 
     @property
@@ -193,30 +204,6 @@ class Evaluation:
     def quantile(self, fraction: float) -> float:
         """The size, in ``unit``, that the given fraction of markers does not exceed; NaN without any."""
         return quantile(known(self.errors), fraction)
-
-    @property
-    def angle_rms(self) -> float | None:
-        """Root mean square angle, **degrees**; None without orientations."""
-        return None if self.angles is None else float(self.angles.rad2deg().square().nanmean().sqrt())
-
-    @property
-    def angle_median(self) -> float | None:
-        """Median angle, **degrees**; None without orientations."""
-        return self.angle_quantile(0.5)
-
-    @property
-    def angle_p95(self) -> float | None:
-        """95th percentile of the angles, **degrees**; None without orientations."""
-        return self.angle_quantile(0.95)
-
-    @property
-    def angle_max(self) -> float | None:
-        """Largest angle, **degrees**; None without orientations."""
-        return self.angle_quantile(1.0)
-
-    def angle_quantile(self, fraction: float) -> float | None:
-        """The angle, **degrees**, that the given fraction of poses does not exceed; None without orientations."""
-        return None if self.angles is None else quantile(known(self.angles.rad2deg()), fraction)
 
 
 class Evaluations(Mapping[str, Evaluation]):

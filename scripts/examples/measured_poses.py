@@ -43,7 +43,7 @@ def main() -> None:
     result = dc.calibrate(robot, train)
     for name, kinematics in result.stages.items():
         errors = dc.evaluate(kinematics, test)
-        print(f"{name:24} {1e3 * errors.rms:7.4f} mm, {errors.angle_rms:.5f} degrees RMS held out")
+        print(f"{name:24} {1e3 * errors.rms:7.4f} mm, {errors.orientation.rms:.5f} degrees RMS held out")
 
     poses, covariance = result.model.predict_poses(test.q)  # (N, 4, 4), (N, 6, 6): shifts in m, turns in rad
     deviations = covariance.diagonal(dim1=-2, dim2=-1).sqrt().mean(0)

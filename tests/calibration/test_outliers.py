@@ -165,7 +165,7 @@ def test_poses_that_are_wrong_in_position_or_orientation(posed: Case) -> None:
     kept_all(result, data)
     errors, before = (dc.evaluate(model, posed.test) for model in (result.model, posed.model))
     assert errors.rms < 2.0 * before.rms
-    assert (errors.angle_rms or 9.0) < 1.5 * (before.angle_rms or 0.0)
+    assert errors.orientation.rms < 1.5 * before.orientation.rms
 
 
 def test_a_wrong_joint_reading_in_a_row_that_alone_places_the_marker(ur10_150: Case) -> None:

@@ -55,7 +55,7 @@ def brute_force(K: Tensor, R: Tensor, targets: list[int], count: int) -> tuple[l
 def test_greedy_choice_is_that_of_brute_force_for_a_model(case: str, request: pytest.FixtureRequest) -> None:
     model = request.getfixturevalue(case).model
     q = SimulatedArm(seed=1).sample(24, seed=8)
-    K = model.map.covariance_between(model.map.geodesic.linearise(q))
+    K = model.map.conditional.covariance_between(model.map.geodesic.linearise(q))
     R = model.map.new_noise.expand(len(q), -1, -1)
     rows, rms = brute_force(K, R, list(range(24)), 5)
     plan = dc.plan(model, q, 5)
@@ -103,10 +103,9 @@ def test_what_the_rows_leave_open_is_not_known(arm: Case) -> None:
     q[:, [0, 3, 5]] = 0.0
     still = dc.Measurements(q, SimulatedArm(seed=1).true_points(q))
     fitted = dc.calibrate(arm.robot, still, hyperparameters=arm.result.selection.scales).model.map
-    at, other = arm.test.q[:10], fitted.geodesic.linearise(arm.test.q[:10])
-    sensitivity = fitted.open_sensitivity(fitted.geodesic.spec.nominal, at)
-    root = sensitivity @ fitted.open_directions
-    total = (fitted.covariance_at(other) + root @ root.mT).diagonal(dim1=1, dim2=2).sum(1).mean().sqrt()
+    at, other, nominal = arm.test.q[:10], fitted.geodesic.linearise(arm.test.q[:10]), fitted.geodesic.spec.nominal
+    root = nominal.sensitivities(at, torch.zeros(nominal.parameters, dtype=at.dtype)) @ fitted.open_directions
+    total = (fitted.by_data.covariance(other) + root @ root.mT).diagonal(dim1=1, dim2=2).sum(1).mean().sqrt()
     found = dc.plan(dc.CalibratedKinematics(arm.robot, fitted), at, 2).expected_rms
     torch.testing.assert_close(found[0], total, rtol=1e-6, atol=0)
     assert float(found[2]) < 0.5 * float(found[0])

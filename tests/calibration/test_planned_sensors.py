@@ -26,7 +26,6 @@ from diffeo_calib.cameras.images import Images, sees, shown, sighted
 from diffeo_calib.cameras.images import expected as expected_errors
 from diffeo_calib.measurements.poses import inverse_poses, poses_from_marks
 from diffeo_calib.measurements.table_format import LEVER
-from diffeo_calib.regression.conditional import WithoutRigidMotions
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.sensors.set_ups import frame_slopes
@@ -65,8 +64,6 @@ def slopes_of(devices: Any, number: int, z: Tensor) -> tuple[Tensor, Tensor]:
 def naive_rms(result: Any, q: Tensor, taken: list[tuple[int, int]]) -> list[float]:
     """RMS error over q after 0, 1, ... readings (row, device), after a rigid fit: the whole covariance inverted."""
     fitted_map, devices = result.model.map, result.placement[0].devices
-    conditional = fitted_map.conditional
-    assert isinstance(conditional, WithoutRigidMotions)
     z, at = fitted_map.geodesic.linearised_value(q)
     data = fitted_map.geodesic.linearise(fitted_map.x).projected(fitted_map.slopes)
     shared = fitted_map.noise.shared.flatten(0, 1)

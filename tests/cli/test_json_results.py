@@ -63,14 +63,6 @@ def test_evaluate(folder: Path, command: Command, arm: Case) -> None:
     assert set(same["results"]["errors"]) == {"all", "used_in_the_fit"} or "all" in same["results"]["errors"]
 
 
-def test_commands_that_apply_a_model(folder: Path, command: Command) -> None:
-    """The matrix of tests/test_matrix.py holds those of `correct`, `plan` and `report`."""
-    model = "arm.safetensors"
-    assert ran(command, folder, "predict", model, "new.csv", *UNITS, "-o", "p.csv")["results"]["rows"] == 30
-    exported = ran(command, folder, "export", model, "--dh", "dh.csv")["results"]
-    assert exported["files"] == {"dh": str(folder / "dh.csv")}
-
-
 def test_an_error_is_written_too(folder: Path, command: Command) -> None:
     written = ran(command, folder, "evaluate", "none.safetensors", "new.csv", *TABLE, code=1)
     assert "none.safetensors" in written["error"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,6 @@ from command_bank import Command
 from simulated_sockets import rest_in_sockets
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.robots import SimulatedArm
 
 UNITS = ["--length", "mm", "--angle", "rad"]
@@ -70,24 +68,6 @@ def test_other_commands_name_the_ball_and_what_was_measured(
     said = re.search(r"robot's base to ([\d.]+) mm.* on its flange.* to ([\d.]+) mm", text)
     assert said is not None
     assert 0 < float(said[2]) < 0.5 * float(said[1])
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda cells: [*cells[:8], "", "", ""], r"line 2: expected a position or a socket, got neither"),
-        (lambda cells: ["spot 0", "", *cells[2:8], "", "", ""], r"line 2, column .socket.: expected the name"),
-        (lambda cells: [*cells[:9], "", ""], r"line 2, column 'y'.*: expected a finite number, got an empty cell"),
-    ],
-)  # fmt: skip
-def test_lines_of_one_kind(
-    change: Callable[[list[str]], list[str]], message: str, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(folder)
-    header, first, *rest = (folder / "t.csv").read_text().split("\n")
-    (folder / "wrong.csv").write_text("\n".join([header, ",".join(change(first.split(","))), *rest]))
-    with pytest.raises(MeasurementError, match=message):
-        read("wrong.csv")
 
 
 def test_set_ups_are_evaluated_each_in_its_place(

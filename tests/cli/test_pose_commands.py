@@ -1,99 +1,26 @@
-"""All commands with measured poses."""
+"""Poses that `predict` writes are measurements that other commands read."""
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from command_bank import FORMAT, TABLE, Command, Outcome, Site
-from product_bank import simulated_poses
-from server_bank import Server
+from command_bank import FORMAT, Command
+from kind_bank import UNITS, kind_named
 from table_bank import CONVENTIONS, read_table
 from torch.testing import assert_close
 
-import diffeo_calib as dc
 from diffeo_calib.cli.commands.predict import reading_options
-from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.csv.writing import write_predictions
 from diffeo_calib.measurements.poses import angle_between, rotation_matrices, transforms
 
 
-@dataclass(frozen=True)
-class Posed:
-    """A table of measured poses with standard deviations, the command that fits it, and what it printed."""
-
-    site: Site
-    data: dc.Measurements
-    table: list[str]
-    fitted: Outcome
-
-    @property
-    def path(self) -> Path:
-        return self.site.folder / "posed.safetensors"
-
-    @property
-    def model(self) -> dc.CalibratedKinematics:
-        loaded = dc.load(self.path)
-        assert isinstance(loaded, dc.CalibratedKinematics)
-        return loaded
-
-
-@pytest.fixture(scope="module")
-def posed_site(server: Server, tmp_path_factory: pytest.TempPathFactory) -> Posed:
-    """20 poses, joints in deg, rotations as Euler angles in rad, lever 80 mm."""
-    folder = tmp_path_factory.mktemp("posed")
-    arm, data, _ = simulated_poses(20, lever=0.08)
-    assert data.poses is not None
-    known = dc.Measurements.from_poses(
-        data.q, data.poses, data.joint_names, lever=0.08, position_std=2e-5, rotation_std=2e-4
-    )
-    site = Site(folder, arm, known)
-    arm.write_urdf(site.urdf)
-    written = replace(FORMAT, rotation=["ra", "rb", "rc"], convention="ZYX", rotation_angle="rad")
-    write_measurements(site.csv, known, written, position=["mx", "my", "mz"])
-    rotation = ["--rotation", "ra, rb ,rc", "--convention", "ZYX", "--rotation-angle", "rad", "--lever", "80"]
-    std = ["--std", "std_mx,std_my,std_mz", "--rotation-std", "std_rx,std_ry,std_rz"]
-    table = [*TABLE, *rotation, *std]
-    path = folder / "posed.safetensors"
-    options = [*site.robot(), *table, "-o", path, "--figure", folder / "e.png"]
-    return Posed(site, known, table, server(["fit", site.csv, *options]))
-
-
-def all_numbers(outcome: Outcome, *labels: str) -> list[float]:
-    """Errors in mm and in deg of one row of a table."""
-    rows = [line.split("│") for line in outcome.out.splitlines() if all(label in line for label in labels)]
-    assert len(rows) == 1, outcome.out
-    return [float(cell) for cell in (rows[0][-10:-2] if "expected RMS" in outcome.out else rows[0][-9:-1])]
-
-
-@pytest.mark.slow
-def test_fit_reads_poses_and_standard_deviations(
-    posed_site: Posed, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: list[dc.Measurements] = []
-
-    def look(_: Any, data: dc.Measurements, **__: Any) -> None:
-        seen.append(data)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", look)
-    site = posed_site.site
-    done = command("fit", site.csv, *site.robot(), *posed_site.table, "-o", tmp_path / "m", "--holdout", 0)
-    assert done.code == 130
-    (found,) = seen
-    assert found.joint_names == site.arm.nominal.joint_names
-    assert found.lever == pytest.approx(0.08)
-    for name in ("poses", "points", "std", "rotation_std", "covariance"):
-        torch.testing.assert_close(getattr(found, name), getattr(posed_site.data, name), rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "columns"),
     [
@@ -103,25 +30,21 @@ def test_fit_reads_poses_and_standard_deviations(
         (["--convention", "XYZ"], ["euler1", "euler2", "euler3"]),
     ],
 )
-def test_predict_with_poses(
-    options: list[str], columns: list[str], posed_site: Posed, command: Command, tmp_path: Path
-) -> None:
-    units = ["--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
-    done = command("predict", posed_site.path, posed_site.site.csv, *units, *options, "-o", tmp_path / "p.csv")
+def test_predict_with_poses(options: list[str], columns: list[str], command: Command, tmp_path: Path) -> None:
+    kind, path = kind_named("poses"), tmp_path / "p.csv"
+    done = command("predict", kind.file, kind.table("new")[0], *UNITS, *options, "-o", path)
     assert (done.code, done.err.strip()) == (0, "")
-    assert "20 predictions written" in done.out
     assert "joints, poses and standard deviations" in done.out
     printed = re.search(r"`evaluate` and `fit` read these poses with (--.*)", done.out)
     assert printed is not None
-    again = command("evaluate", posed_site.path, tmp_path / "p.csv", *units, *shlex.split(printed[1]))
+    again = command("evaluate", kind.file, path, *UNITS, *shlex.split(printed[1]), "--json", tmp_path / "e.json")
     assert again.code == 0
-    assert max(all_numbers(again, "20 in all")) < 1e-3
-    header, *rows = (tmp_path / "p.csv").read_text().splitlines()
-    deviations = ["std_rx", "std_ry", "std_rz"]
-    expected = [*posed_site.site.arm.nominal.joint_names, "x", "y", "z", "std_x", "std_y", "std_z"]
-    assert header.split(";") == [*expected, *columns, *deviations]
-    values = np.array([[float(cell.replace(",", ".")) for cell in row.split(";")] for row in rows])
-    poses, covariance = posed_site.model.predict_poses(posed_site.data.q)
+    assert json.loads((tmp_path / "e.json").read_text())["results"]["errors"]["all"]["rms_m"] < 1e-6
+    header, *rows = path.read_text().splitlines()
+    places, deviations = ["x", "y", "z", "std_x", "std_y", "std_z"], ["std_rx", "std_ry", "std_rz"]
+    assert header.split(",") == [*kind.robot.joint_names, *places, *columns, *deviations]
+    values = np.array([[float(cell) for cell in row.split(",")] for row in rows])
+    poses, covariance = kind.model.predict_poses(kind.new.q)
     std = np.sqrt(np.diagonal(covariance.numpy(), axis1=1, axis2=2))
     unit = "rad" if "rad" in options else "deg"
     convention = options[1] if "--convention" in options else "rotvec"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,20 +71,6 @@ def test_fit_says_where_frames_are_and_what_was_hidden(case: Case) -> None:
         words = " ".join(f"{value:.3f}" for value in place.tolist())
         assert f"measured frame in the frame of '{side}': {words} mm" in printed
     assert_close(places, case.arms.frames[:, :3, 3], rtol=0, atol=2e-3)
-
-
-def test_evaluate_and_residuals(case: Case, command: Command, tmp_path: Path) -> None:
-    to = ["--residuals", tmp_path / "r.csv", "--json", tmp_path / "r.json"]
-    done = command("evaluate", case.path, case.folder / "new.csv", *TABLE, *to)
-    assert (done.code, done.err.strip()) == (0, "")
-    expected = dc.evaluate(case.model, case.new)
-    written = json.loads((tmp_path / "r.json").read_text())["results"]["errors"]["all"]
-    assert written["rms_m"] == pytest.approx(expected.rms, rel=1e-5)
-    rows = [line.split(";") for line in (tmp_path / "r.csv").read_text().splitlines()[1:]]
-    positions = [row for row in rows if row[-1] == "mm"]
-    assert len(rows) == 2 * len(positions) == 240  # each has an orientation, too
-    last = float(positions[-1][-2].replace(",", "."))
-    assert last == pytest.approx(1e3 * float(expected.errors[-1, -1]), rel=1e-9)
 
 
 def test_predictions_are_read_back_without_errors(case: Case, command: Command, tmp_path: Path) -> None:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
 from command_bank import Command
 from trackerless_bank import write_socket_table
 
-import diffeo_calib as dc
 from diffeo_calib.robots import SimulatedArm
 
 ROBOT = ["--robot", "arm.urdf", "--base", "base_link", "--tip", "flange", "--length", "mm", "--angle", "deg"]
@@ -32,33 +30,19 @@ def test_from_a_campaign_file_to_errors(folder: Path, command: Command, monkeypa
     campaign = ['csv = "t.csv"', 'robot = "arm.urdf"', 'base = "base_link"', 'tip = "flange"', 'length = "mm"']
     campaign += ['angle = "deg"', 'socket = ["place", "socket"]', 'distance = ["a,b=50"]', "distance-std = 0.01"]
     (folder / "c.toml").write_text("\n".join([*campaign, 'output = "m.safetensors"']))
-    fitted = command("fit", "c.toml", "--json", "m.json")
+    fitted = command("fit", "c.toml")
     assert fitted.code == 0, fitted.err
     assert "Spread within sockets in mm by stage" in fitted.out
     assert "12 held out" in fitted.out, "one whole place"
     assert "known 50.000" in fitted.out
     assert "2 to 6 times" in fitted.out
     assert "robot base in the measuring frame" not in fitted.out
-    results = json.loads((folder / "m.json").read_text())["results"]
-    expected, found = results["expected_error_by_stage_m"], results["sockets"]
-    assert expected["calibrated"] == pytest.approx(results["expected_error"]["expected_error_m"])
-    assert expected["calibrated"] < expected["nominal"]
-    assert len(found["positions_m"]) == 4
-    assert 0 < found["left_out_spread_m"] < 2e-3
     units = ["--length", "mm", "--angle", "deg"]
-    done = command("evaluate", "m.safetensors", "t.csv", *SOCKETS, *units, "--json", "e.json")
+    done = command("evaluate", "m.safetensors", "t.csv", *SOCKETS, *units)
     assert done.code == 0, done.err
     assert "12 not used in the fit" in done.out
     assert done.out.count("known 50.000") == 3
     assert "expected absolute error" in done.out
-    model = dc.load("m.safetensors")
-    assert isinstance(model, dc.CalibratedKinematics)
-    data = dc.read_measurements("t.csv", model.robot, socket=["place", "socket"], length="mm", angle="deg")
-    found = json.loads(Path("e.json").read_text())["results"]
-    assert 1e3 * dc.evaluate(model, data).rms == pytest.approx(found["kinds"]["socket"]["all"]["rms"], rel=1e-9)
-    assert not found["errors"]  # a spread is none
-    strict = command("evaluate", "m.safetensors", "t.csv", *SOCKETS, *units, "--tolerance", "0.1um")
-    assert strict.code == 4
 
 
 @pytest.mark.parametrize(
@@ -67,7 +51,6 @@ def test_from_a_campaign_file_to_errors(folder: Path, command: Command, monkeypa
         ([*SOCKETS, "--position", "x,y,z"], "no column ['x', 'y', 'z']"),
         ([*SOCKETS, "--std", "s"], "--std beside `socket`; leave it out"),
         (["--distance", "a,b=50", "--distance-std", "1", "--position", "x,y,z"], "--distance-std without --socket"),
-        (["--socket", "place,hole"], "no column ['hole']"),
         ([*SOCKETS[:2], "--distance", "a=50", *SOCKETS[4:]], r"--distance a=50: expected A,B=LENGTH"),
         (["--socket", "place,socket", "--distance", "a,b=50"], "--distance without --distance-std"),
         ([*SOCKETS[:2], "--distance", "a,c=50", *SOCKETS[4:]], "a known distance: expected names of two sockets"),

@@ -79,18 +79,18 @@ def test_errors_of_poses_are_distances_of_origins_and_angles(rows: int, lever: f
     assert found.angles is not None
     np.testing.assert_allclose(found.angles.numpy(), np.radians(degrees), rtol=1e-9)
     assert found.rms == pytest.approx(float(np.sqrt(np.mean(distances**2))), rel=1e-9)
-    assert found.angle_rms == pytest.approx(float(np.sqrt(np.mean(degrees**2))), rel=1e-9)
-    assert found.angle_median == pytest.approx(float(np.median(degrees)), rel=1e-9)
-    assert found.angle_p95 == pytest.approx(float(np.percentile(degrees, 95)), rel=1e-9)
-    assert found.angle_max == pytest.approx(float(degrees.max()), rel=1e-9)
-    assert found.angle_quantile(0.25) == pytest.approx(float(np.quantile(degrees, 0.25)), rel=1e-9)
+    assert found.orientation.rms == pytest.approx(float(np.sqrt(np.mean(degrees**2))), rel=1e-9)
+    assert found.orientation.median == pytest.approx(float(np.median(degrees)), rel=1e-9)
+    assert found.orientation.p95 == pytest.approx(float(np.percentile(degrees, 95)), rel=1e-9)
+    assert found.orientation.max == pytest.approx(float(degrees.max()), rel=1e-9)
+    assert found.orientation.quantile(0.25) == pytest.approx(float(np.quantile(degrees, 0.25)), rel=1e-9)
 
 
 def test_tiny_errors_of_poses_are_not_lost() -> None:
     poses, shift, vector = random_poses(np.random.default_rng(0), 1), np.full((1, 3), 1e-9), np.full((1, 3), 1e-9)
     data = dc.Measurements.from_poses([[0.0]], poses)
     found = dc.evaluate(lambda _: mark_points(moved(poses, shift, vector), 0.1), data)
-    assert found.angle_max == pytest.approx(math.degrees(math.sqrt(3) * 1e-9), rel=1e-4)
+    assert found.orientation.max == pytest.approx(math.degrees(math.sqrt(3) * 1e-9), rel=1e-4)
     assert found.max == pytest.approx(math.sqrt(3) * 1e-9, rel=1e-4)
 
 

@@ -162,8 +162,7 @@ def test_poses_after_a_marker_and_a_marker_after_poses(arm: Case, posed: Case) -
     assert found.lever == 0.15
     errors = dc.evaluate(found, poses.rows(slice(8, None)))
     assert errors.rms < 3.0 * rms(arm.model, arm.test)
-    assert errors.angle_rms is not None
-    assert errors.angle_rms < 0.06
+    assert errors.orientation.rms < 0.06
     single = posed.model.registered(other_marker(NEW_MARKER, posed.test.q[:12], T, posed=True))
     assert single.lever is None
     rest = other_marker(NEW_MARKER, posed.test.q[12:], T, seed=6, posed=True)

@@ -14,11 +14,11 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.tool import REFERENCE_ROWS, covariance_without_placement, tool_points, tool_transform
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import angle_between, mark_points, pose_directions, poses_from_marks
+from diffeo_calib.regression.conditional import Conditional
 from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.runtime.program import TOOL_LEVER
 
@@ -107,7 +107,7 @@ def test_covariance_in_the_base_frame_is_turned_into_its_axes(arm: Case) -> None
     sensitivity[..., :6] = 0.0
     seen = model.tool_poses(q, tool, "measuring")
     wanted = pose_directions(seen, LEVER)
-    measured = wanted @ model.map.covariance_at(replace(at, sensitivity=sensitivity)) @ wanted.mT
+    measured = wanted @ model.map.by_data.covariance(replace(at, sensitivity=sensitivity)) @ wanted.mT
     R = model.geometry.base[:3, :3]
     turn = torch.block_diag(R.mT, R.mT)
     found = model.predict_tool_poses(q, tool, "base")[1]
@@ -171,12 +171,13 @@ def test_motions_of_base_and_tool_count_for_nothing(arm: Case, monkeypatch: pyte
         for twist in twists
     ]
     motion = 0.1 * torch.stack(slopes, 1)
-    known = FittedMap.covariance_between
+    conditional = type(arm.model.map.conditional)
+    known = conditional.covariance_between
 
-    def wider(self: FittedMap, at: Linearisation, other: Linearisation | None = None) -> Tensor:
+    def wider(self: Conditional, at: Linearisation, other: Linearisation | None = None) -> Tensor:
         return known(self, at, other) + motion @ motion.mT
 
-    monkeypatch.setattr(FittedMap, "covariance_between", wider)
+    monkeypatch.setattr(conditional, "covariance_between", wider)
     after = covariance_without_placement(arm.model, q, TOOL)
     assert_close(after, before, rtol=0, atol=1e-3 * float(before.diagonal(dim1=1, dim2=2).max()))
 

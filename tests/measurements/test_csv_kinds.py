@@ -208,6 +208,8 @@ def test_bad_descriptions(tmp_path: Path) -> None:
     ):
         with pytest.raises(MeasurementError, match=says(said)):
             read(tmp_path, LINES, columns)
+    with pytest.raises(MeasurementError, match=says("line 3, 5: expected a position or a socket, got neither")):
+        read(tmp_path, LINES, replace(COLUMNS, readings=()))
     touched = replace(COLUMNS, readings=(replace(plane, device="spot"),), sockets=None)
     text = LINES.replace("0.2,0.3,,,,", "0.2,0.3,1,1,1,").replace("0.4,0.5,,,,", "0.4,0.5,1,1,2,")
     found = read(tmp_path, text, touched)

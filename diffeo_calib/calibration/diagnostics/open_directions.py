@@ -192,10 +192,11 @@ def _error_with_place(fitted: FittedMap, q: Tensor, goal: Tensor, socket: Tensor
         return inf
     socket = socket[there]
     at, new = fitted.geodesic.linearise(fitted.everywhere), fitted.geodesic.linearise(q[there])
-    own, between, m = fitted.covariance_between(new), fitted.covariance_between(at, new), fitted.m
+    known, m = fitted.conditional, fitted.m
+    own, between = known.covariance_between(new), known.covariance_between(at, new)
     same = (socket[:, None] == socket).to(own) * PLACES.found_m_rad**2
     noise = torch.block_diag(*fitted.new_noise.expand(len(socket), -1, -1))
     K = own + noise + torch.kron(same, torch.eye(m, dtype=own.dtype, device=own.device))
     gain = between @ torch.linalg.solve(K, between.mT)
-    after = fitted.covariance_at(at) - diagonal_blocks(gain, len(fitted.everywhere))
+    after = known.covariance(at) - diagonal_blocks(gain, len(fitted.everywhere))
     return float(after.diagonal(dim1=1, dim2=2).sum(1).mean().clamp(min=0).sqrt())

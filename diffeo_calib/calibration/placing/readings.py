@@ -158,7 +158,7 @@ def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool
     devices, squares = best.rows.devices(fit.shifts), body_squares(fit.errors)
     noise = float((squares.sum() / sum(own.numel() for own in fit.errors)).sqrt())
     nothing, tails = torch.zeros_like(fit.covariance), Tails.none(len(squares), 1)
-    known = 0, "ball and devices found.", nothing[0], Prior(), tails, devices
+    known = nothing[0], Prior(), tails, devices
     registration = Identification(geometry, float(squares.mean().sqrt()), noise, nothing, *known)
     rows = Rows(geometry, tuple(map(ReadRows, tables, devices)), rigid=rigid)
     return registration, estimated(rows, _all_but_ball(bare) if rigid else held_parameters(bare, adrift=True), Prior())

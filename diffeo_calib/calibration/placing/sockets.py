@@ -387,7 +387,7 @@ def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> 
     if not bool(judged.any()):
         return []
     last = torch.nn.functional.pad(eye, (seen.m - 3, 0)).expand(N, -1, -1)
-    own = seen.covariance_between(seen.geodesic.linearise(resting.q).projected(last))
+    own = seen.conditional.covariance_between(seen.geodesic.linearise(resting.q).projected(last))
     places = torch.kron(PLACES.found_m_rad * rests, eye).view(N, 3, -1)
     wide = torch.eye(places.shape[2], dtype=places.dtype, device=places.device)
     noise, every = seen.new_noise[-3:, -3:].expand(N, -1, -1), torch.ones_like(predicted, dtype=torch.bool)

@@ -2,14 +2,11 @@
 
 What is known before the first one is that of a robot by its description, or of a fitted model.
 
-    K(x, x') = F(x, x') + sum_k sign_k f_k(x) f_k(x')^T
+What may have moved since, and what is not known about the devices, c ~ N(0, I), are more unknowns of the conditional. A
+measurement reports A z(x) + D c + noise.
 
-F is the covariance of the fields. The features f hold the parameters with their priors, what earlier data tell, and
-what may have moved since. What is not known about the devices, c ~ N(0, I), is one more group of numbers. A measurement
-A z(x) + D c + noise adds r features with sign -1, the rows of L^-1 (A K(x, .) + D K(c, .)) with L L^T its covariance.
-
-Measurements are chosen greedily: each is the one that lowers the mean variance over the targets most. With V the main
-directions of the targets' covariance and C_i = V^T K(targets, measurement i), this lowers their variance by
+Measurements are chosen greedily: each is the one that lowers the mean variance over the targets most. With
+C_i = K(targets, measurement i), this lowers their variance by
 
     gain_i = tr[(K_ii + R_i)^-1 C_i^T C_i],
 
@@ -19,7 +16,7 @@ models", 1996; sequential A-optimal design for predictions). Taking one costs on
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -32,12 +29,12 @@ from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.checks import as_tensor
-from diffeo_calib.common.errors import InputError, NumericalError, as_written, few
+from diffeo_calib.common.errors import InputError, as_written, few
 from diffeo_calib.common.threads import large_work
-from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
+from diffeo_calib.fitting.fitted_map import PREDICT_ROWS
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
-from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.re_registration.registered_map import robot_map
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.poses import mark_points
@@ -45,7 +42,14 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import Tails
-from diffeo_calib.regression.conditional import NOISE_ADVICE, diagonal_blocks
+from diffeo_calib.regression.conditional import (
+    Conditional,
+    Fields,
+    Opened,
+    WithoutRigidMotions,
+    diagonal_blocks,
+    lower_root,
+)
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
@@ -55,165 +59,67 @@ from diffeo_calib.sensors.set_ups import frame_slopes
 from diffeo_calib.sensors.tables import device_coordinates
 
 
-class Known(NamedTuple):
-    """Covariances F + V^T diag(signs) V of the markers at M configurations and of c shifts that measurements share.
-
-    Args:
-        at: first-order response of the markers, M of m coordinates; of its fields is F.
-        values: V (k, M m + c). signs: (k,) 1 or -1.
-    """
-
-    at: Linearisation
-    values: Tensor
-    signs: Tensor
-
-    @property
-    def m(self) -> int:
-        """Coordinates of a configuration."""
-        return self.at.sensitivity.shape[1]
-
-    @property
-    def shifts(self) -> int:
-        """Number c of the shifts."""
-        return self.values.shape[1] - self.at.sensitivity.shape[:2].numel()
-
-    def with_shifts(self, count: int) -> Known:
-        """The same with new shifts, ``count`` in all."""
-        values, new = torch.nn.functional.pad(self.values, (0, count - self.shifts)), count - self.shifts
-        own = values.new_zeros(new, values.shape[1])
-        own[:, values.shape[1] - new :] = torch.eye(new, dtype=own.dtype, device=own.device)
-        return self._replace(values=torch.cat([values, own]), signs=torch.cat([self.signs, self.signs.new_ones(new)]))
-
-    def coordinates(self, rows: Tensor) -> Tensor:
-        """Numbers of the coordinates of some configurations: (B,) -> (B m,)."""
-        return (rows[:, None] * self.m + torch.arange(self.m, device=rows.device)).flatten()
-
-    def between(self, rows: Tensor) -> Tensor:
-        """Covariance (B m, M m + c) of some configurations (B,) with everything, m^2 and m."""
-        fields = self.fields(rows)
-        with large_work(fields.numel()):
-            return fields.addmm_(self.values[:, self.coordinates(rows)].T * self.signs, self.values)
-
-    def fields(self, rows: Tensor) -> Tensor:
-        """The same of the fields alone."""
-        fields = self.at.fields
-        return torch.nn.functional.pad(fields.rows(rows).gram(fields), (0, self.shifts))
-
-    def blocks(self, rows: Tensor) -> Tensor:
-        """(B, m, m) that of some configurations, m^2."""
-        each = self.values[:, self.coordinates(rows)].view(len(self.signs), len(rows), self.m).movedim(0, 1)
-        return self.field_blocks(rows) + (each.mT * self.signs) @ each
-
-    def field_blocks(self, rows: Tensor) -> Tensor:
-        """The same of the fields alone."""
-        eye = torch.eye(self.m, dtype=self.values.dtype, device=rows.device).expand(len(rows), self.m, self.m)
-        return self.at.fields.rows(rows).projected(eye).own_blocks()
-
-    def given(self, options: Options) -> Known:
-        """After some measurements.
-
-        Raises:
-            NumericalError: their covariance is not positive definite.
-        """
-        fields = self.fields(options.rows).unflatten(0, (-1, self.m))  # (O, m, M m + c)
-        cross = (options.slopes @ fields).flatten(0, 1) + (options.of(self.values).T * self.signs) @ self.values
-        low = factor(options.of(cross) + torch.block_diag(*options.noise))
-        added = torch.linalg.solve_triangular(low, cross, upper=False)
-        values, signs = torch.cat([self.values, added]), torch.cat([self.signs, added.new_full((len(added),), -1.0)])
-        return self._replace(values=values, signs=signs)
-
-
-def factor(matrix: Tensor) -> Tensor:
-    """The lower Cholesky factor of the covariance of measurements; NumericalError unless it is positive definite."""
-    low, info = torch.linalg.cholesky_ex(0.5 * (matrix + matrix.mT))
-    if int(info):
-        raise NumericalError.of("the covariance of the planned measurements is singular", fix=NOISE_ADVICE)
-    return low
-
-
 def greedy(
     C: Tensor, own: Tensor, between: Callable[[int], Tensor], *, place: Tensor, open_: Tensor, count: int
-) -> list[int]:
-    """Options that lower the variance in k directions most, one after the other, see the module.
+) -> tuple[list[int], Tensor]:
+    """Options that lower the variance of k numbers most, one after the other, see the module.
 
     Args:
-        C: (k, M r) covariance of the directions with the M options. own: (M, r, r) that of each, with noise.
+        C: (k, M r) covariance of the numbers with the M options. own: (M, r, r) that of each, with noise.
         between: covariance (r, M r) of an option with all, without noise.
         place: (M,) where each is measured: at one place one is taken. open_: (M,) boolean: those that can be taken.
+
+    Returns:
+        the options, and (count, r, k) whose squares, summed over r, are what each takes from the variances.
+
+    Raises:
+        NumericalError: the covariance of the measurements is not positive definite.
     """
     M, r, _ = own.shape
-    order, taken = list[int](), C.new_zeros(0, M * r)
+    order, taken, lowered = list[int](), C.new_zeros(0, M * r), list[Tensor]()
+    each = C.T.contiguous().view(M, r, -1)
     for _ in range(count):
-        each = C.T.reshape(M, r, -1)
         gains = torch.linalg.solve(own, each @ each.mT).diagonal(dim1=1, dim2=2).sum(1)
         best = int(torch.where(open_, gains, -torch.inf).argmax())
         mine = slice(best * r, best * r + r)
         with large_work(taken.numel()):
-            both = torch.cat([between(best) - taken[:, mine].T @ taken, C[:, mine].T], 1)
-            both = torch.linalg.solve_triangular(factor(own[best]), both, upper=False)
+            both = torch.cat([between(best) - taken[:, mine].T @ taken, each[best]], 1)
+            both = torch.linalg.solve_triangular(lower_root(own[best]), both, upper=False)
             row, by = both[:, : M * r], both[:, M * r :]
-            C, taken, each = C - by.T @ row, torch.cat([taken, row]), row.T.reshape(M, r, r)
-        own, open_ = own - each @ each.mT, open_ & (place != place[best])
+            each.flatten(0, 1).addmm_(row.T, by, alpha=-1.0)
+            taken, less = torch.cat([taken, row]), row.T.reshape(M, r, r)
+        own, open_ = own - less @ less.mT, open_ & (place != place[best])
         order.append(best)
-    return order
+        lowered.append(by)
+    return order, torch.stack(lowered)
 
 
-MAIN_DIRECTIONS = 150
-"""Directions of the targets whose variance is followed; the rest of it is far below the noise."""
-
-
-def choose(known: Known, options: Options, targets: Tensor, scene: Scene, count: int) -> tuple[list[int], Tensor]:
+def choose(known: Conditional, options: Options, start: Start, targets: Tensor, count: int) -> tuple[list[int], Tensor]:
     """Choose ``count`` of the options, at most one at every configuration.
 
     Args:
         known: before the first. targets: (T,) numbers of the configurations where the robot shall be known.
-        scene: the configurations; it says of which errors the variance is reported.
 
     Returns:
         numbers of the options in the order in which they were taken, and the mean variance (count + 1,) of the targets'
         coordinates after 0, 1, ... of them, m^2.
     """
-    rows = known.coordinates(targets)
-    P, motions = torch.eye(len(rows), dtype=known.values.dtype, device=rows.device), scene.motions(targets)
-    if motions is not None:
-        B = motions[targets].flatten(0, 1)
+    scene, at = start.scene, known.features(start.at.rows(targets))
+    P, base = torch.eye(at.values.shape[1], dtype=at.values.dtype, device=at.values.device), start.base
+    if scene.free:
+        B = at.at.sensitivity[..., base].flatten(0, 1)
         P = P - B @ torch.linalg.pinv(B)
-    whole = P @ known.between(targets)  # (T m, M m + c)
-    own = whole[:, rows] @ P
-    V = torch.linalg.eigh(0.5 * (own + own.T)).eigenvectors[:, -MAIN_DIRECTIONS:]  # (T m, k)
-    features, A, place = options.of(known.values), options.slopes, options.rows
-    each = features.T.reshape(*A.shape[:2], -1)  # (O, r, f)
-    blocks = A @ known.field_blocks(place) @ A.mT + (each * known.signs) @ each.mT + options.noise
+    own = P @ at.between() @ P
+    seen = known.features(options.linearised(start.at, scene.shifts, start.first))
 
     def between(number: int) -> Tensor:
-        fields = options.of(A[number] @ known.fields(place[number : number + 1]))
-        return fields.addmm_(each[number] * known.signs, features)
+        return seen.rows(torch.tensor([number], dtype=torch.int64, device=P.device)).between(seen)
 
-    open_ = torch.ones_like(place, dtype=torch.bool)
-    order = greedy(options.of(V.T @ whole), blocks, between, place=place, open_=open_, count=count)
-    start = scene.along(diagonal_blocks(own, len(targets))).diagonal(dim1=1, dim2=2).mean()
-    added = (
-        known.given(options.some(torch.tensor(order, dtype=torch.int64, device=rows.device))).values[
-            len(known.values) :, rows
-        ]
-        @ P
-    )
-    seen = (added.view(-1, len(targets), known.m) @ scene.averaged.mT).view(count, A.shape[1], -1)
-    lowered = seen.square().sum(1).mean(1)
-    return order, (start - torch.cat([lowered.new_zeros(1), lowered.cumsum(0)])).clamp(min=0)
-
-
-def without_motions(known: Known, rows: Tensor, reference: Tensor, slopes: Tensor) -> Tensor:
-    """Covariances (B, m, m) of some configurations without the rigid motion that fits the errors at others best.
-
-    Args:
-        rows: (B,) row numbers. reference: (T,) those of the others. slopes: (M, m, 6) by the rigid motion.
-    """
-    fit = torch.linalg.pinv(slopes[reference].flatten(0, 1))  # (6, T m)
-    between = fit @ known.between(reference)
-    own = between[:, known.coordinates(reference)] @ fit.mT
-    cross = between[:, known.coordinates(rows)].T.reshape(len(rows), known.m, 6) @ slopes[rows].mT
-    return known.blocks(rows) - cross - cross.mT + slopes[rows] @ own @ slopes[rows].mT
+    how = {"place": options.rows, "open_": torch.ones_like(options.rows, dtype=torch.bool), "count": count}
+    order, by = greedy(P @ at.between(seen), seen.blocks() + options.noise, between, **how)
+    variance = scene.along(diagonal_blocks(own, len(targets))).diagonal(dim1=1, dim2=2).mean()
+    lowered = (by.unflatten(2, (len(targets), -1)) @ scene.averaged.mT).square().sum(1).mean((1, 2))
+    return order, torch.cat([variance[None], -lowered]).cumsum(0).clamp(min=0)
 
 
 USUAL_RESIDUAL = 3e-4
@@ -224,10 +130,25 @@ FREE = ("base", "marker", "both")
 
 
 class Start(NamedTuple):
-    """What is known at some configurations, shifts of the rows of a fit among it, and the markers there."""
+    """What is known before the first measurement, M configurations, and the markers there.
 
-    known: Known
+    Args:
+        known: the conditional. at: the configurations. scene: the markers. first: number of the first new column.
+    """
+
+    known: Conditional
+    at: Linearisation
     scene: Scene
+    first: int
+
+    @property
+    def base(self) -> list[int]:
+        """Numbers of the columns by motions of the base."""
+        return list(self.at.spec.nominal.places[:6])
+
+    def without_motions(self, known: Conditional, targets: Tensor) -> Conditional:
+        """Without the rigid motion that fits the errors at the targets best, where such motions are no errors."""
+        return WithoutRigidMotions(known, self.at.rows(targets), self.base) if self.scene.free else known
 
 
 def of_robot(
@@ -253,10 +174,9 @@ def of_robot(
     if scales is None:
         scales = defaults(_tangent_data(geometry, lever, near, residual), residual, Prior())
     data = replace(data, held=held_parameters(geometry, adrift=adrift), adrift=adrift)
-    values = (data.sensitivities * data.prior_variance(scales).sqrt()).flatten(0, 1).T
-    known, noise = Known(data.linearisation(scales), values, torch.ones_like(values[:, 0])), data.noise(scales)
+    deviations, noise = data.prior_variance(scales).sqrt(), data.noise(scales)
     scene = Scene(data.points, noise, geometry.base, Bodies(lever).averaging(noise), 3 * len(tool.points), free=adrift)
-    return Start(known, scene)
+    return Start(Opened(Fields(), 0, deviations), data.linearisation(scales), scene, len(deviations))
 
 
 class Tool(NamedTuple):
@@ -310,47 +230,25 @@ def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Start:
         model: fitted, or registered anew. q: (M, n) configurations.
         free: what may have moved since the fit, besides what a registration has left free.
     """
-    fitted, registration, conditional = model.map, model.map.registration, model.map.conditional.inner
+    fitted, fit, registration = model.map, model.map.unregistered, model.map.registration
     if registration is not None and free != registration.free:
         free = registration.free if free is None else "both"
-    noise, nominal, adrift = fitted.new_noise, fitted.geodesic.spec.nominal, fitted.workspace is not None
-    seen = device_coordinates(fitted.m, ball=model.ball, free=adrift)
-
-    def moved(at: Linearisation, rows: Tensor) -> Iterator[Tensor]:
-        """(M, m, k) what is open of the markers, or may have moved them."""
-        open_ = fitted.open_sensitivity(nominal, rows) if registration is None else None
-        if open_ is not None:
-            yield open_ @ fitted.open_directions
-        if free in ("base", "both"):
-            points = at.task[-1].points.view(len(rows), -1, 3)
-            yield PLACES.found_m_rad * frame_slopes(points, fitted.deformation.z1.view(-1, 3).mean(0))
-        if free in ("marker", "both"):
-            yield PLACES.found_m_rad * _by_marker(fitted, at)[..., :seen]
-
-    points, parts, values = [], [], []
+    adrift, tool = fitted.workspace is not None, robot_map(fit).geometry.slices["tool"]
+    seen, middle = device_coordinates(fitted.m, ball=model.ball, free=adrift), fitted.deformation.z1.view(-1, 3).mean(0)
+    points, parts = [], []
     for rows in q.split(PREDICT_ROWS):
-        z, at = fitted.geodesic.linearised_value(rows)
-        known, signs = conditional.features(at)
-        added = [each.flatten(0, 1).T for each in moved(at, rows)]
+        z, at = fitted.linearised_value(rows)
+        if registration is None:
+            columns = frame_slopes(z.unflatten(1, (-1, 3)), middle), at.sensitivity[..., tool]
+            at = at.with_columns(torch.cat(columns, 2), fit.columns)
         points.append(z)
         parts.append(at)
-        values.append(torch.cat([known, *added]))
-    whole = torch.cat(values, 1)
-    new = len(whole) - len(signs)
-    if fitted.noise.shared.shape[2] and registration is None:
-        K, c = len(fitted.geodesic.spec.prior_variance), fitted.noise.shared.shape[2]
-        shifts = conditional.features(fitted.parameters_as_points(K + torch.arange(c, device=whole.device))).values
-        whole = torch.cat([whole, torch.nn.functional.pad(shifts, (0, 0, 0, new))], 1)
-    own = Known(Linearisation.joined(parts), whole, torch.cat([signs, signs.new_ones(new)]))
-    along = noise.expand(len(q), -1, -1), model.geometry.base.to(noise), model.bodies.averaging(noise)
-    return Start(own, Scene(torch.cat(points), *along, seen, adrift, own.shifts))
-
-
-def _by_marker(fitted: FittedMap, at: Linearisation) -> Tensor:
-    """Derivatives of the markers by their places on the flange: (M, m, m)."""
-    nominal = fitted.geodesic.spec.nominal
-    if isinstance(nominal, FlangePoints):
-        return marker_slopes(fitted.geodesic, nominal, at)
-    if not isinstance(nominal, GeometryMap):
-        raise InputError.of("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__)
-    return at.sensitivity[..., nominal.geometry.slices["tool"]]
+    moved = fitted.new_noise.new_zeros(6 + fitted.m)
+    moved[:6] = PLACES.found_m_rad * (free in ("base", "both"))
+    moved[6 : 6 + seen] = PLACES.found_m_rad * (free in ("marker", "both"))
+    base, averaged = model.geometry.base.to(moved), model.bodies.averaging(fitted.new_noise)
+    shifts = 0 if registration is not None else fitted.noise.shared.shape[2]
+    noise = fitted.new_noise.expand(len(q), -1, -1)
+    scene = Scene(torch.cat(points), noise, base, averaged, seen, adrift, shifts)
+    known = Opened(fit.conditional.inner, fit.columns, moved)
+    return Start(known, Linearisation.joined(parts), scene, fit.columns + len(moved))

@@ -15,13 +15,11 @@ from torch import Tensor
 from diffeo_calib.calibration.planning.candidates import Criterion, Tracker, all_of, candidates, check_limits
 from diffeo_calib.calibration.planning.knowledge import (
     FREE,
-    Known,
     Start,
     choose,
     of_model,
     of_robot,
     tool_of,
-    without_motions,
 )
 from diffeo_calib.calibration.planning.sensors import Options, Positions, Scene, Sensor, Where
 from diffeo_calib.calibration.planning.sensors_of_model import sensor_of, without_positions
@@ -35,6 +33,7 @@ from diffeo_calib.measurements.csv.columns import Columns, Joints
 from diffeo_calib.measurements.csv.writing import write_rows
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.process.scales import Hyperparameters
+from diffeo_calib.regression.conditional import Conditional, Given, Opened
 from diffeo_calib.robots.tree import Tree
 
 SMALLEST_STROKE = 1e-9
@@ -259,14 +258,16 @@ def plan(
     own = marker, hyperparameters, sensors
     start, (at_targets, at_known, at_candidates) = _start((robot_or_model, free), (wanted, known, q), own)
     before, options = _options(start.scene, sensors, (at_known, at_candidates[0], len(known)), count)
-    knowledge = start.known.with_shifts(options.shared.shape[2])
-    knowledge = knowledge.given(before) if len(before.rows) else knowledge
-    order, variance = choose(knowledge, options, at_targets, start.scene, count)
+    shifts = start.scene.shifts
+    posterior: Conditional = Opened(start.known, start.first, options.shared.new_ones(options.shared.shape[2] - shifts))
+    if len(before.rows):
+        posterior = Given(posterior, before.linearised(start.at, shifts, start.first), before.noise)
+    order, variance = choose(posterior, options, start, at_targets, count)
     LOG.info("%d poses chosen of %d", count, len(q))
     return Plan(
         **_in_order(robot, q, options.some(order), int(at_candidates[0])),
         expected_rms=(3 * variance).sqrt(),
-        known_rms=_known_rms(robot_or_model, start.scene, knowledge, (at_candidates, at_targets)),
+        known_rms=_known_rms(robot_or_model, start, start.without_motions(posterior, at_targets), at_candidates),
         noise_rms=_noise_rms(start.scene, sensors, at_targets),
         assumed=isinstance(robot_or_model, Tree) and hyperparameters is None,
         joint_names=robot.joint_names,
@@ -379,12 +380,9 @@ def _options(
     return whole.some(whole.rows < first), whole.some(whole.rows >= first)
 
 
-def _known_rms(given: Tree | CalibratedKinematics, scene: Scene, known: Known, rows: tuple[Tensor, Tensor]) -> Tensor:
-    """RMS error of the markers, or origins, at candidates: (M,) m; ``rows``: numbers of these and of the targets."""
-    candidates, targets = rows
-    motions = scene.motions(targets)
-    blocks = known.blocks(candidates) if motions is None else without_motions(known, candidates, targets, motions)
-    blocks = scene.along(blocks)
+def _known_rms(given: Tree | CalibratedKinematics, start: Start, known: Conditional, candidates: Tensor) -> Tensor:
+    """RMS error of the markers, or origins, at candidates with these numbers: (M,) m."""
+    blocks = start.scene.along(known.covariance(start.at.rows(candidates)))
     if isinstance(given, CalibratedKinematics):
         blocks = given.map.with_second_order(blocks)
     return (3 * blocks.diagonal(dim1=1, dim2=2).mean(1)).clamp(min=0.0).sqrt()

@@ -20,6 +20,7 @@ from diffeo_calib.common.checks import as_tensor, check_number
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.device_readings import FittedDevice
+from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import Devices, numbers_text
 from diffeo_calib.sensors.kinds import known_kinds
@@ -46,13 +47,6 @@ class Scene(NamedTuple):
     seen: int
     free: bool = False
     shifts: int = 0
-
-    def motions(self, rows: Tensor) -> Tensor | None:
-        """(M, m, 6) derivatives by rigid motions about the middle of some rows; None if such motions are errors."""
-        if not self.free:
-            return None
-        points = self.points.unflatten(1, (-1, 3))
-        return frame_slopes(points, points[rows].mean((0, 1)))
 
     def along(self, blocks: Tensor) -> Tensor:
         """Covariances of the markers, or of the origins of poses, from those of the points: (M, m, m) -> (M, r, r)."""
@@ -114,11 +108,11 @@ class Options(NamedTuple):
             before, devices, names = before + own, devices + len(part.names), names + part.names
         return cls._make([*(torch.cat(values) for values in zip(*found, strict=True)), names])
 
-    def of(self, values: Tensor) -> Tensor:
-        """Numbers (k, M m + c) of the coordinates and shifts as those of all measurements: (k, O r)."""
-        c, m = self.shared.shape[2], self.slopes.shape[2]
-        at, shifts = values[:, : values.shape[1] - c].T.reshape(-1, m, len(values)), values[:, values.shape[1] - c :].T
-        return (self.slopes @ at[self.rows] + self.shared @ shifts).flatten(0, 1).T
+    def linearised(self, at: Linearisation, shifts: int, first: int) -> Linearisation:
+        """What they report, with columns by the ``shifts`` of the fit, and by new ones from number ``first`` on."""
+        told = at.rows(self.rows).projected(self.slopes)
+        told = told.with_columns(self.shared[..., :shifts], len(at.spec.prior_variance))
+        return told.with_columns(self.shared[..., shifts:], first)
 
     def some(self, index: Tensor) -> Options:
         """Some of them."""

@@ -14,10 +14,13 @@ from diffeo_calib.common.errors import with_deviation
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kinematics.re_registration.find_place import FoundPlace
 from diffeo_calib.measurements.poses import rotation_numbers
+from diffeo_calib.regression.conditional import roots
 from diffeo_calib.robots.tree import Tree
 
 LEVEL = 0.01
 """Probability that anything is named although nothing has changed."""
+
+
 RANK_TOLERANCE = 1e-9
 """Smallest eigenvalue of correlations, relative to the largest, that is not rounding."""
 
@@ -146,10 +149,8 @@ def hidden_offsets(robot: Tree, place: FoundPlace | None, changes: Changes) -> t
         places["the markers have moved"] = (slice(6, S.shape[1]), found.shift.flatten())
     hidden = []
     for instead, (own, shift) in places.items():
-        scale = covariance[own, own].diagonal().sqrt()
-        values, Q = torch.linalg.eigh(covariance[own, own] / scale / scale[:, None])
-        kept = values > RANK_TOLERANCE * values[-1]  # markers that moved together leave it singular
-        white = (Q[:, kept] / scale[:, None] / values[kept].sqrt()).mT
+        white = roots(covariance[own, own], RANK_TOLERANCE)[1]
+        white = white[white.any(1)]  # markers that moved together leave it singular
         away = white @ shift
         count, total = len(away), float(away @ away)
         if total < chi2_above(LEVEL, count):

@@ -26,11 +26,11 @@ from diffeo_calib.common.checks import check_number, check_seed
 from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.threads import small_work
-from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.find_place import find_place
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration, moved
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.regression.conditional import roots
 from diffeo_calib.robots.cartesian import is_cartesian, pose_inputs, turns_nowhere
 from diffeo_calib.robots.payload import common_mass, under_mass, words_of_mass
 from diffeo_calib.robots.tree import Tree
@@ -176,8 +176,7 @@ def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) ->
     placed = RegisteredMap(moved(fitted, found.transform), found)
     new = measured(model, q, placed(there).unflatten(1, (-1, 3)))
     rows = weighed(place_again(model, new, "other"), "other")
-    values, vectors = torch.linalg.eigh(FittedMap.joint_covariance(placed, there))
-    errors = vectors * values.clamp(min=0.0).sqrt()
+    errors, _ = roots(placed.conditional.covariance_between(placed.geodesic.linearise(there)))
     return rows.drifting([errors.unflatten(0, (len(q), -1))]).with_weights()
 
 

@@ -7,7 +7,7 @@ They are residuals y - h(k1(q; m)) of what was measured, h, from devices and mar
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import log
 from typing import Any
 
@@ -82,7 +82,7 @@ class WeighedRows(NewRows):
             transform=before.transform,
             q=before.data.q,
             noise=noise,
-            visible=model.coordinates(measured["y"]),
+            visible=model.visible,
             shared=noise[..., :0],
             deviations=torch.cat([frame, moved]),
             away=nothing[0],
@@ -141,7 +141,7 @@ class WeighedRows(NewRows):
         old = self.fitted.new_noise
         if self.observe is not None or self.fitted.slopes is not None:
             return old
-        found = self.mean_noise * region_factor(self.tails.freedom, self.noise_model.largest_freedom)
+        found = self.mean_noise * region_factor(self.tails.freedom, int(self.noise_model.freedom.max()))
         return found if float(found.trace()) > float(old.trace()) else old
 
     @property
@@ -190,7 +190,6 @@ class WeighedRows(NewRows):
     def levelled(self) -> WeighedRows:
         """The rows with the likeliest noise of every kind of device that the old fit does not know."""
         kinds, known = self.noise_model.kinds, self.fitted.slopes is None
-        kinds = torch.zeros_like(self.tails.weights, dtype=torch.int64) if kinds is None else kinds
         unknown = range(int(known), int(kinds.max()) + 1) if self.observe is not None or not known else ()
         rows = self.drifting([part.root(self.at) for part in parts_of(self.fitted)] if unknown else [])  # no noise
         for kind in unknown:
@@ -243,7 +242,6 @@ def _measured(before: Before, seen: Tensor) -> tuple[NoiseModel, Tensor, dict[st
     if told is not None and noise is not None and len(told.rows) == len(seen):
         return told.noise_model, noise, {"y": told.y, "observe": None, "placement": Placement(sets)}
     rows = stacked(before.data.q, told, readings, seen.shape[1])
-    visible = rows.noise_model.coordinates(rows.y)
     old = before.fitted.noise
     usual = old.covariance.diagonal(dim1=1, dim2=2)[old.visible].median()  # variance of what was measured, m^2
     total = torch.diag_embed(usual.expand_as(rows.y))
@@ -251,11 +249,11 @@ def _measured(before: Before, seen: Tensor) -> tuple[NoiseModel, Tensor, dict[st
         own = total[told.rows]
         own[:, : noise.shape[1], : noise.shape[1]] = noise
         total[told.rows] = own
-    if rows.noise_model.known is not None:
+    if rows.noise_model.stated:
         total = larger(total, rows.noise_model.known)
-    model = replace(rows.noise_model, known=None)
+    model = rows.noise_model.without_known
     known = {"y": rows.y, "observe": rows.observe, "placement": Placement((*sets, *readings))}
-    return model, without_hidden(total, visible), known
+    return model, without_hidden(total, model.visible), known
 
 
 def _coordinates(before: Before, new: Measurements, rows: Tensor, seen: Tensor) -> tuple[Told, Tensor, list[DeviceSet]]:
@@ -266,8 +264,6 @@ def _coordinates(before: Before, new: Measurements, rows: Tensor, seen: Tensor) 
     noise = noise_of_rows(fitted, new, T, block, 1.0)
     sets, table = SocketDevices.around_model(table, rows, seen)
     y = table.points.flatten(1)
-    sensor = replace(NoiseModel.of(table, 0.0), known=None)
-    if sensor.visible is not None:
-        y = torch.where(y.isnan(), seen[rows], y)
-        noise = without_hidden(noise, sensor.coordinates(y))
+    sensor = NoiseModel.of(table, 0.0).without_known
+    y, noise = torch.where(y.isnan(), seen[rows], y), without_hidden(noise, sensor.visible)
     return Told(rows, y, sensor), noise, [*sets, *CameraErrors.around(table, rows)]

@@ -208,7 +208,7 @@ class NewRows:
     @cached_property
     def fit_covariance(self) -> Tensor:
         """(M R, M R) posterior covariance of the fit at the rows, m^2."""
-        return self.fitted.covariance_between(self.at)
+        return self.fitted.conditional.covariance_between(self.at)
 
     @property
     def weighted_noise(self) -> Tensor:

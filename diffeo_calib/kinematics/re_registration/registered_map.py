@@ -47,7 +47,7 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.measurements.poses import POINTS, own_blocks
-from diffeo_calib.regression.conditional import Conditional
+from diffeo_calib.regression.conditional import Conditional, Estimated
 from diffeo_calib.robots.se3 import nearest_rotations, transforms
 from diffeo_calib.sensors.set_ups import frame_slopes
 
@@ -175,40 +175,18 @@ class RegisteredMap(FittedMap):
         """The same map on a device, where its inputs must be too."""
         return RegisteredMap(self.fitted.to(device), self.registration)
 
-    def _covariance(
-        self, geodesic: GeodesicDeformation, rows: Tensor, at: Linearisation, directions: Tensor | None
-    ) -> Tensor:
-        """That of the fit and of the registration."""
-        points: Any = geodesic.spec.nominal
-        return self.with_second_order(self._placed(at, directions, marker_slopes(geodesic, points, at)))
-
-    def covariance_at(self, at: Linearisation, directions: Tensor | None = None) -> Tensor:
-        """Covariance of points of the body whose places on the flange are given; as :meth:`FittedMap.covariance_at`."""
-        return self._placed(at, directions, None)
-
-    def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
-        """That of the fit alone, without the registration's."""
-        return self.fitted.covariance_between(at, other)
-
-    def joint_covariance(self, x: Tensor) -> Tensor:
-        """That of the registration included, see :meth:`FittedMap.joint_covariance`."""
-        S, found = self.place_slopes(x), self.registration
-        at = self.geodesic.linearise(x)
-        at = at.projected(torch.eye(self.m, dtype=S.dtype, device=S.device).expand(len(x), -1, -1))
-        cross = S @ (found.gain.to(S) @ self.fitted.covariance_between(self._rows, at))
-        return self.fitted.covariance_between(at) + S @ found.covariance.to(S) @ S.mT - cross - cross.mT
-
-    def _placed(self, at: Linearisation, directions: Tensor | None, by_marker: Tensor | None) -> Tensor:
-        """As :meth:`FittedMap.covariance_at`, of points with these derivatives (M, m', 3 P) by the markers, or none."""
-        found, shape = self.registration, at.sensitivity.shape[:2]
-        points = at.task[-1].points.view(shape[0], -1, 3)
-        S = frame_slopes(points, found.centre.to(points))
-        S = torch.cat([S, S.new_zeros(*shape, self.m) if by_marker is None else by_marker], -1)
-        between = self.fitted.covariance_between(self._rows, at)  # (M P 3, rows m')
-        cross = S @ (found.gain.to(S) @ between).view(-1, *shape).movedim(0, 1)
-        added = S @ found.covariance.to(S) @ S.mT - cross - cross.mT
-        added = added if directions is None else directions @ added @ directions.mT
-        return self.fitted.covariance_at(at, directions) + added
+    def linearised_value(
+        self, x: Tensor, geodesic: GeodesicDeformation | None = None, held: slice = slice(0)
+    ) -> tuple[Tensor, Linearisation]:
+        """With columns by frame and markers of the registration, which are held on other points of the body."""
+        around, found = geodesic or self.geodesic, self.registration
+        points, at = super().linearised_value(x, around, held)
+        nominal: Any = around.spec.nominal
+        if nominal.points is found.markers:
+            columns = place_slopes(around, at, points, found.centre.to(points))
+        else:
+            columns = frame_slopes(points.unflatten(1, (-1, 3)), found.centre.to(points))
+        return points, at.with_columns(columns, self.fitted.columns)
 
     @property
     def _turn_variance(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -216,20 +194,13 @@ class RegisteredMap(FittedMap):
         own = float(self.registration.covariance.diagonal()[3:6].sum())
         return self.fitted._turn_variance + own * (own > NEGLIGIBLE_TURN_RAD**2)
 
-    def place_slopes(self, q: Tensor) -> Tensor:
-        """Derivatives (N 3 P, 6 + 3 P) of the markers at q (N, n) by the frame and the markers of the registration."""
-        rows = q.to(self.deformation.x.device)
-        points, at = self.geodesic.linearised_value(rows)
-        return place_slopes(self.geodesic, at, points.detach(), self.registration.centre.to(points)).flatten(0, 1)
-
     @cached_property
-    def _rows(self) -> Linearisation:
-        return self.at_registration.linearise(self.registration.q.to(self.deformation.x.device))
-
-    @property
     def conditional(self) -> Conditional:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """That of the fit."""
-        return self.fitted.conditional
+        """That of the fit, with what the registration found from it."""
+        found, first, x = self.registration, self.fitted.columns, self.deformation.x
+        at = self.at_registration.linearise(found.q.to(x))
+        own, columns = (found.gain.to(x), range(first, first + len(found.covariance))), found.covariance.to(x)
+        return Estimated(self.fitted.conditional, at, *own, columns)
 
 
 def marker_slopes(deformation: GeodesicDeformation, points: FlangePoints, at: Linearisation) -> Tensor:

@@ -44,36 +44,33 @@ def stages(
         repeatability: RMS distance of repeated measurements from their mean, m, drawn as the limit of any model.
     """
     kinds = [evaluations] if isinstance(evaluations, Mapping) else list(evaluations)
-    angles = [all(one.angles is not None for one in kind.values()) for kind in kinds]
+    angles = [{name: one.orientation for name, one in kind.items() if one.orientation is not None} for kind in kinds]
     columns = 2 + any(angles)
-    figure, axes = panels(2 * len(kinds) + sum(angles), columns=columns, title=title)
+    figure, axes = panels(2 * len(kinds) + sum(map(bool, angles)), columns=columns, title=title)
     free = iter(axes)
     for kind, turned in zip(kinds, angles, strict=True):
         draw_distributions(next(free), kind, repeatability=repeatability)
         draw_before_after(next(free), kind)
         if turned:
-            draw_distributions(next(free), kind, angles=True)
+            draw_distributions(next(free), turned)
     return figure
 
 
 def draw_distributions(
-    axes: Axes, evaluations: Mapping[str, Evaluation], *, angles: bool = False, repeatability: float | None = None
+    axes: Axes, evaluations: Mapping[str, Evaluation], *, repeatability: float | None = None
 ) -> None:
     """Share of measurements whose error is at most a value, one curve for each stage."""
     one = next(iter(evaluations.values()))
-    unit, per_unit = ("deg", 1.0) if angles else one.shown
+    unit, per_unit = one.shown
     for (name, found), look in zip(evaluations.items(), LOOKS, strict=False):
-        turned = found.angles if angles else None
-        sizes = _sizes(found) if turned is None else np.maximum(turned.rad2deg().numpy(), SMALLEST_ERROR)
-        errors = np.sort(sizes)
+        errors = np.sort(_sizes(found))
         share = np.arange(1, len(errors) + 1) / len(errors)
-        rms = found.angle_rms if angles else per_unit * found.rms
-        label = f"{name}: {rms:.3g} {unit} RMS"
+        label = f"{name}: {per_unit * found.rms:.3g} {unit} RMS"
         axes.step(errors, 100 * share, where="post", color=look.colour, ls=look.line, lw=look.width, label=label)
     if repeatability is not None:
         axes.axvline(1e3 * repeatability, color=INK, lw=0.8, label=f"repeatability: {1e3 * repeatability:.3g} mm RMS")
     axes.set_ylim(0, 101)
-    finish(axes, x=f"{'orientation error' if angles else one.label} [{unit}]", y="measurements [%]", logarithmic="x")
+    finish(axes, x=f"{one.label} [{unit}]", y="measurements [%]", logarithmic="x")
     legend(axes, loc="lower left", bbox_to_anchor=(0.0, 1.0))
 
 
@@ -163,7 +160,8 @@ def draw_coverage(axes: Axes, predictions: Predictions) -> None:
     low, high = (100 / count * binom.ppf(p, count, SHARES.numpy()) for p in (0.025, 0.975))
     axes.fill_between(claimed, low, high, color=GREY, alpha=0.3, lw=0, label="chance (rows independent)")
     axes.plot([0, 100], [0, 100], color=GREY, lw=1)
-    axes.plot(claimed, 100 * predictions.found_shares(), "-o", color=BLUE, ms=3.5, lw=1.8, label="found")
+    found = [100 * predictions.coverage(share) for share in SHARES.tolist()]
+    axes.plot(claimed, found, "-o", color=BLUE, ms=3.5, lw=1.8, label="found")
     note(axes, 0.03, 0.7, "cautious", va="top")
     note(axes, 0.97, 0.25, "overconfident", ha="right")
     axes.set(xlim=(0, 100), ylim=(0, 101))
