@@ -46,9 +46,9 @@ from diffeo_calib.regression.conditional import (
     Conditional,
     Fields,
     Opened,
-    WithoutRigidMotions,
     diagonal_blocks,
     lower_root,
+    without_rigid_motions,
 )
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.geometry import Geometry
@@ -148,7 +148,7 @@ class Start(NamedTuple):
 
     def without_motions(self, known: Conditional, targets: Tensor) -> Conditional:
         """Without the rigid motion that fits the errors at the targets best, where such motions are no errors."""
-        return WithoutRigidMotions(known, self.at.rows(targets), self.base) if self.scene.free else known
+        return without_rigid_motions(known, self.at.rows(targets), self.base) if self.scene.free else known
 
 
 def of_robot(
@@ -250,5 +250,5 @@ def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Start:
     shifts = 0 if registration is not None else fitted.noise.shared.shape[2]
     noise = fitted.new_noise.expand(len(q), -1, -1)
     scene = Scene(torch.cat(points), noise, base, averaged, seen, adrift, shifts)
-    known = Opened(fit.conditional.inner, fit.columns, moved)
+    known = Opened(fit.with_motions, fit.columns, moved)
     return Start(known, Linearisation.joined(parts), scene, fit.columns + len(moved))
