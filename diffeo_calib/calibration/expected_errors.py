@@ -51,7 +51,7 @@ def workspace_deviation(fitted: FittedMap) -> float:
 
 def stands_free(model: CalibratedKinematics) -> bool:
     """Whether no device measured positions in the fit of a model: its frame is the robot's base."""
-    return model.map.unregistered.workspace is not None
+    return model.map.unregistered.stands_free
 
 
 OPEN_RATIO = 10.0
@@ -157,7 +157,7 @@ def expected_errors(
     def from_truth(points: Tensor) -> float:
         apart = found.without((points.flatten(1) - places).reshape(-1, 1)).view(places.shape) + places
         apart, targets = ((shown @ each[:, :, None]).view(-1, 3) for each in (apart, places))
-        if fitted.workspace is not None:
+        if fitted.stands_free:
             T = rigid_fit(apart, targets)
             apart = apart @ T[:3, :3].mT + T[:3, 3]
         bodies = len(shown) // 3
@@ -243,7 +243,7 @@ def _places(model_map: FittedMap) -> tuple[Tensor, Tensor, Tensor]:
     own = torch.tensor(nominal.places, dtype=torch.int64, device=fitted.x.device)
     opened, theta = fitted.open_directions[own], q.new_zeros(nominal.parameters)
     anywhere = nominal.sensitivities(q, theta)[..., own].flatten(0, 1)
-    if fitted.workspace is not None:
+    if fitted.stands_free:
         moved = anywhere[:, :6]
         anywhere = anywhere - moved @ (torch.linalg.pinv(moved) @ anywhere)
     root, _ = roots(fitted.with_motions.posterior(fitted.parameters_as_points(own))[0] + opened @ opened.mT)

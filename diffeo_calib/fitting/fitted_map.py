@@ -77,6 +77,11 @@ class FittedMap:
         return self.deformation.x if self.data is None else self.data
 
     @property
+    def stands_free(self) -> bool:
+        """Whether no device measured places: rigid motions count for nothing in covariances."""
+        return self.workspace is not None
+
+    @property
     def everywhere(self) -> Tensor:
         """(M, n) random configurations in the joint ranges of the rows: its workspace if it has one."""
         if self.workspace is not None:

@@ -233,7 +233,7 @@ def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Start:
     fitted, fit, registration = model.map, model.map.unregistered, model.map.registration
     if registration is not None and free != registration.free:
         free = registration.free if free is None else "both"
-    adrift, tool = fitted.workspace is not None, robot_map(fit).geometry.slices["tool"]
+    adrift, tool = fitted.stands_free, robot_map(fit).geometry.slices["tool"]
     seen, middle = device_coordinates(fitted.m, ball=model.ball, free=adrift), fitted.deformation.z1.view(-1, 3).mean(0)
     points, parts = [], []
     for rows in q.split(PREDICT_ROWS):
