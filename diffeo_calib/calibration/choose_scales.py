@@ -233,7 +233,7 @@ def _warn_of_wrong_scales(data: TangentData, left_out: LeaveOneOut) -> None:
     """Warn if leave-one-out errors differ from what the scales predict."""
     ratio = variance_ratio(data, left_out)
     # Predictions that are too wide are cautious, and a usual effect of outliers, unless the deviations were given.
-    overstated = data.noise_model.known is not None and ratio < 1 / LIMITS.variance_ratio
+    overstated = data.noise_model.stated and ratio < 1 / LIMITS.variance_ratio
     if len(data.x) >= LIMITS.fewest_judged and (overstated or ratio > LIMITS.variance_ratio):
         fix = "trust held-out errors, not the predicted deviations; measure more poses"
         if overstated:

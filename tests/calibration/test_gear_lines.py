@@ -105,7 +105,7 @@ def drawn(lines: object = LINES, *, q: Tensor | None = None, seed: int = 0) -> t
     q = arm.sample(150, seed=3) if q is None else q
     nominal = GeometryMap(arm.truth, elastic=True)
     zero = torch.zeros(nominal.parameters, dtype=torch.float64)
-    sensor = NoiseModel(1)
+    sensor = NoiseModel.alike(len(q), 1)
     data = TangentData(nominal, zero, q, arm.truth.points(q).flatten(1), sensor, Tails.none(len(q), 1))
     scales = defaults(data, 3e-5, Prior())
     matrix = data.linearisation(scales).gram() + torch.block_diag(*data.noise(scales))

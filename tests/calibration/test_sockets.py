@@ -26,7 +26,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.rows import with_attributes
-from diffeo_calib.regression.conditional import Opened, WithoutRigidMotions
+from diffeo_calib.regression.conditional import Estimated
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
 
@@ -61,10 +61,9 @@ def aligned(points: Tensor, truth: Tensor) -> Tensor:
     return points @ T[:3, :3].mT + T[:3, 3] - truth
 
 
-def gauge(model: dc.CalibratedKinematics) -> WithoutRigidMotions:
+def gauge(model: dc.CalibratedKinematics) -> Estimated:
     found = model.map.conditional
-    found = found.before if isinstance(found, Opened) else found
-    assert isinstance(found, WithoutRigidMotions)
+    assert isinstance(found, Estimated)
     return found
 
 
@@ -95,7 +94,7 @@ def test_covariances_by_the_projection_written_out(arm: SimulatedArm, result: An
     model, q = result.model, arm.sample(4, seed=3)
     found, at = gauge(model), model.map.geodesic.linearise(q)
     both = model.map.geodesic.linearise(torch.cat([q, found.reference.at.joint[0].points]))
-    C = found.inner.covariance_between(both)
+    C = found.before.covariance_between(both)
     B = both.sensitivity.flatten(0, 1)[:, :6]
     motion = torch.cat([torch.zeros(6, 12, dtype=C.dtype), torch.linalg.pinv(B[12:])], 1)
     P = (torch.eye(len(C), dtype=C.dtype) - B @ motion)[:12]

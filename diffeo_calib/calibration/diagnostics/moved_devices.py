@@ -276,9 +276,9 @@ def changes_of(data: TangentData, devices: Iterable[Hypothesis] = (), index: Ten
     places = data.places.unflatten(1, (-1, 3))
     away = (places - places.mean((0, 1))).flatten(1)[..., None]
     base, markers, away = (each if data.slopes is None else data.slopes @ each for each in (base, markers, away))
-    kinds = data.noise_model.row_kinds
-    if kinds is not None:
-        base[kinds > 0] = 0.0  # a ball in a socket does not show where the device of other rows stands
+    base = (
+        base * (data.noise_model.row_kinds == 0)[:, None, None]
+    )  # a ball in a socket does not show where the device of other rows stands
     frames = [] if data.adrift else [base, base[..., :3]]
     found = [Hypothesis(BASE, each, fix=NEW_SET_UP) for each in frames]
     found.append(Hypothesis(MARKERS, markers, fix=NEW_SET_UP))

@@ -91,9 +91,9 @@ class TangentData:
         negative residuals, which would look like another size.
         """
         kinds = self.noise_model.row_kinds
-        if self.observe is not None or (kinds is None and not self.adrift):
+        if self.observe is not None:
             return self.points
-        resting = self.visible if kinds is None else self.visible & (kinds > 0)[:, None]
+        resting = self.visible & ((kinds > 0) | self.adrift)[:, None]
         return torch.where(resting, self.y, self.points)
 
     @cached_property
@@ -126,7 +126,7 @@ class TangentData:
     @property
     def visible(self) -> Tensor:
         """(N, m) boolean: the coordinates that were measured."""
-        return self.noise_model.coordinates(self.y)
+        return self.noise_model.visible
 
     @property
     def coordinates(self) -> int:
@@ -136,10 +136,7 @@ class TangentData:
     @property
     def measured_freedom(self) -> int:
         """Degrees of freedom of the bodies that were measured: three of each marker that was seen, six of a pose."""
-        seen, freedom = self.noise_model.seen, self.noise_model.freedom
-        if not isinstance(freedom, int):
-            return int(freedom[seen].sum())
-        return freedom * (len(self.x) * self.noise_model.bodies if seen is None else int(seen.sum()))
+        return int(self.noise_model.freedom[self.noise_model.seen].sum())
 
     # --- poses as six numbers ---
 
@@ -162,7 +159,7 @@ class TangentData:
         to = basis.mT
         shared = None if self.shared is None else to @ self.shared
         numbers = {"y": self.in_numbers(self.y), "noise_model": self.noise_model.along(basis), "shared": shared}
-        observe, nominal = LinearFunctionals(to), self.nominal.with_rigid_frames()
+        observe, nominal = LinearFunctionals(to), self.nominal.changed(rigid=True)
         other = replace(self, **numbers, observe=observe, nominal=nominal)
         vars(other).update(points=self.points, jacobian=to @ self.jacobian)
         return other
@@ -215,11 +212,9 @@ class TangentData:
         if count == len(self.x):
             return torch.arange(count, device=self.x.device), self
         order = torch.randperm(len(self.x), generator=seeded(seed), device=HOST)
-        kinds = self.noise_model.row_kinds
-        if kinds is not None:
-            own = torch.nn.functional.one_hot(kinds.to(HOST)[order])
-            turn = (own * own.cumsum(0)).sum(1)
-            order = order[turn.argsort(stable=True)]
+        own = torch.nn.functional.one_hot(self.noise_model.row_kinds.to(HOST)[order])
+        turn = (own * own.cumsum(0)).sum(1)
+        order = order[turn.argsort(stable=True)]
         rows = order[:count].sort().values.to(self.x.device)
         return rows, self.rows(rows)
 
@@ -235,7 +230,7 @@ class TangentData:
     def with_gear_lines(self, lines: tuple[GearLine, ...]) -> TangentData:
         """The same measurements around a map with these gear lines, which add nothing yet."""
         waves = GearWaves(tuple(line.joint for line in lines), tuple(line.frequency for line in lines))
-        nominal = self.nominal.with_waves(waves)
+        nominal = self.nominal.changed(waves=waves)
         smooth = self.theta[: nominal.sag.stop]
         other = self._variant(nominal=nominal, theta=torch.cat([smooth, smooth.new_zeros(waves.size)]))
         vars(other).pop("sensitivities", None)
@@ -291,10 +286,10 @@ class TangentData:
             return self.noise_model.typical(scales, self.jacobian, freedom)
         whole = self.nominal.jacobian(self.x, self.theta)
         if self.beside is None:
-            return NoiseModel(whole.shape[1] // 3).typical(scales, whole, freedom)
+            return NoiseModel.alike(len(whole), whole.shape[1] // 3).typical(scales, whole, freedom)
         # tails of the rows beside are those of the geometric calibration
         known = replace(self.beside, tails=self.tails).noise_of_any_row(scales)
-        ball = NoiseModel(1).typical(scales, whole[:, -3:], freedom)
+        ball = NoiseModel.alike(len(whole), 1).typical(scales, whole[:, -3:], freedom)
         return known if len(known) == whole.shape[1] else torch.block_diag(known, ball)
 
     def noise_of_new_rows(self, scales: Hyperparameters) -> Tensor:
@@ -303,8 +298,8 @@ class TangentData:
         Rows with known deviations keep their own: the mean over images, say, is the noise of none of them.
         """
         own = self.noise(scales)
-        if self.observe is not None or self.noise_model.known is not None:
-            return own * region_factor(self.tails.freedom, self.noise_model.largest_freedom)
+        if self.observe is not None or self.noise_model.stated:
+            return own * region_factor(self.tails.freedom, int(self.noise_model.freedom.max()))
         return without_hidden(self.noise_of_any_row(scales).expand_as(own), self.visible)
 
     @cached_property
