@@ -88,8 +88,8 @@ STUCK_ROWS = 6
 
 LARGEST_LAG = 5
 """Lines between measured values and their joints."""
-LAG_CHANGE_COST = 3.0
-"""Of a change of the lag, in rows that fit nowhere."""
+LAG_CHANGE_COST, LAG_MISFIT = 3.0, 0.1
+"""Of a change of the lag, in rows that fit at the new one alone; and of a row of a run that does not fit there."""
 LAG_NEAR, LAG_GROSS = 3.0, 10.0
 """Typical distances within which a lag fits, and from which the row's own joints do not."""
 LAG_ROWS, LAG_SHARE = 3, 0.8
