@@ -16,8 +16,8 @@ from dataclasses import replace
 from functools import partial
 from typing import Literal
 
-from diffeo_calib.calibration.choose_scales import LIMITS as SCALE_LIMITS
 from diffeo_calib.calibration.choose_scales import (
+    FEWEST_POSES,
     RESIDUAL_TOLERANCE,
     ChosenScales,
     check_models,
@@ -223,7 +223,7 @@ def _result(
     model = CalibratedKinematics(robot, fitted_map, lever=placed.lever, ball=placed.ball)
     for devices in placed.placement:
         devices.warn_of_weakness(model)
-    least = gates.UNCHOSEN_FACTOR if len(data.x) < SCALE_LIMITS.fewest_poses else 1.0
+    least = gates.UNCHOSEN_FACTOR if len(data.x) < FEWEST_POSES else 1.0
     explained, found = parts(model), outliers(model, placed, data, chosen.judged, least)
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
     warn_of_outliers(found, placed.data)

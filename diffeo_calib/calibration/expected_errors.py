@@ -51,7 +51,7 @@ def workspace_deviation(fitted: FittedMap) -> float:
 
 def stands_free(model: CalibratedKinematics) -> bool:
     """Whether no device measured positions in the fit of a model: its frame is the robot's base."""
-    return model.map.unregistered.workspace is not None
+    return model.map.unregistered.stands_free
 
 
 OPEN_RATIO = 10.0
@@ -157,7 +157,9 @@ def expected_errors(
     def from_truth(points: Tensor) -> float:
         apart = found.without((points.flatten(1) - places).reshape(-1, 1)).view(places.shape) + places
         apart, targets = ((shown @ each[:, :, None]).view(-1, 3) for each in (apart, places))
-        apart = fitted.conditional.compared(apart, targets, rigid_fit)
+        if fitted.stands_free:
+            T = rigid_fit(apart, targets)
+            apart = apart @ T[:3, :3].mT + T[:3, 3]
         bodies = len(shown) // 3
         return float(((apart - targets).square().sum() / (len(q) * bodies) + own**2).sqrt())
 
@@ -237,11 +239,14 @@ def _places(model_map: FittedMap) -> tuple[Tensor, Tensor, Tensor]:
         known: Any = model_map.conditional
         rows = registration.q.to(q)
         return (known.root, *(known.slopes(model_map.linearised_value(at)[1]) for at in (q, rows)))
-    nominal, conditional = fitted.geodesic.spec.nominal, fitted.conditional
+    nominal = fitted.geodesic.spec.nominal
     own = torch.tensor(nominal.places, dtype=torch.int64, device=fitted.x.device)
     opened, theta = fitted.open_directions[own], q.new_zeros(nominal.parameters)
-    anywhere = conditional.compared_slopes(nominal.sensitivities(q, theta)[..., own].flatten(0, 1))
-    root, _ = roots(conditional.inner.posterior(fitted.parameters_as_points(own))[0] + opened @ opened.mT)
+    anywhere = nominal.sensitivities(q, theta)[..., own].flatten(0, 1)
+    if fitted.stands_free:
+        moved = anywhere[:, :6]
+        anywhere = anywhere - moved @ (torch.linalg.pinv(moved) @ anywhere)
+    root, _ = roots(fitted.with_motions.posterior(fitted.parameters_as_points(own))[0] + opened @ opened.mT)
     if registration is not None:  # its rows may show what those of the fit left open
         return root, anywhere, nominal.sensitivities(registration.q.to(q), theta)[..., own].flatten(0, 1)
     some = _some_rows(fitted.x)

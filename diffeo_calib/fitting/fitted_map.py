@@ -22,7 +22,7 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.regression.choose import condition, condition_controls
-from diffeo_calib.regression.conditional import Conditional, Opened, WithoutRigidMotions
+from diffeo_calib.regression.conditional import Conditional, Opened, without_rigid_motions
 from diffeo_calib.regression.control_points import ControlPointRegression
 
 PREDICT_ROWS, WORKSPACE_ROWS = 1024, 100  # number of configurations that are linearised together for their covariances
@@ -75,6 +75,11 @@ class FittedMap:
     def x(self) -> Tensor:
         """(N, n) configurations of the fitted measurements."""
         return self.deformation.x if self.data is None else self.data
+
+    @property
+    def stands_free(self) -> bool:
+        """Whether no device measured places: rigid motions count for nothing in covariances."""
+        return self.workspace is not None
 
     @property
     def everywhere(self) -> Tensor:
@@ -243,7 +248,7 @@ class FittedMap:
         """
         shifts = effects.new_zeros(*effects.shape[:2], len(columns))
         shifts[..., columns] = effects
-        return self.conditional.inner.posterior(at.with_columns(shifts, len(self.geodesic.spec.prior_variance)))
+        return self.with_motions.posterior(at.with_columns(shifts, len(self.geodesic.spec.prior_variance)))
 
     @of_origin
     def fitted_points(self) -> Tensor:
@@ -418,14 +423,19 @@ class FittedMap:
         return condition(at if slopes is None else at.projected(slopes), self.noise)
 
     @of_origin
+    def with_motions(self) -> Conditional:
+        """The same with what the data leave open."""
+        root = self.open_directions
+        many = root.shape[1]
+        return Opened(self.by_data, self.columns - many, root.new_ones(many)) if many else self.by_data
+
+    @of_origin
     def conditional(self) -> Conditional:
-        """The same without rigid motions where no device saw them, and with what the data leave open."""
-        found, around, root = self.by_data, self.geodesic, self.open_directions
-        if self.workspace is not None:
-            at = around.linearise(self.workspace)
-            found = WithoutRigidMotions(found, at, around.spec.nominal.places[:6])
-        first, many = self.columns - root.shape[1], root.shape[1]
-        return Opened(found, first, root.new_ones(many)) if many else found
+        """The same without rigid motions where no device saw them."""
+        if self.workspace is None:
+            return self.with_motions
+        at, base = self.geodesic.linearise(self.workspace), self.geodesic.spec.nominal.places[:6]
+        return without_rigid_motions(self.with_motions, at, base)
 
     def _configurations(self, x: object) -> Tensor:
         refuse_data_frame(x, "x")

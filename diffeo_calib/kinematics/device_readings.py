@@ -105,22 +105,15 @@ class FittedDevice(NamedTuple):
 
 
 def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[PredictedReadings]:
-    """Predicted readings of every device that a model knows; empty for devices that measure coordinates.
-
-    Args:
-        model: calibrated. q: (N, n) configurations. noise: whether the covariance is that of a new reading.
-    """
+    """Predicted readings at q (N, n) of every device that a model knows, see :meth:`predict_readings`."""
     fitted: FittedMap = model.map
     for own in model.placement:
         own.devices.warn_if_unknown()
     sets = [(own, own.devices) for own in model.placement if own.devices.reads and len(q)]
     markers = [own.devices for own in model.placement if own.kind == MountedMarkers.kind]
-    mounted = [one for own in markers for one in _mounted(model, own, q, noise=noise)]
-    if not sets:
-        return mounted
-    each = (slice(first, first + PREDICT_ROWS) for first in range(0, len(q), PREDICT_ROWS))
+    found = [one for own in markers for one in _mounted(model, own, q, noise=noise)]
+    each = (slice(first, first + PREDICT_ROWS) for first in range(0, len(q) if sets else 0, PREDICT_ROWS))
     seen = [fitted.linearised_value(q[some], fitted.geodesic.at_rows(some)) for some in each]
-    found = mounted
     for own, devices in sets:
         unit, scale, zero = own.shown or ("", (1.0,), (0.0,))  # files of old versions: as reported, lengths in m
         for number, name in enumerate(own.names):

@@ -87,13 +87,7 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Any) -> Evaluation | 
 def residuals(kinematics: Callable[[Tensor], Tensor], places: Places, data: Any) -> Evaluations:
     """Measured minus predicted values of every row, kind by kind, each in the unit of its device.
 
-    Args:
-        kinematics: as of :func:`evaluate`. places: of its devices beside the kinematics, see :func:`place`.
-        data: rows of any kinds.
-
-    Raises:
-        InputError: another number of joints or markers, or poses on one side and points on the other.
-        MeasurementError: readings of devices that ``places`` does not know.
+    Kinematics and errors as of :func:`evaluate`; places of the devices as :func:`place` finds them.
     """
     found = [
         (sensor_of(table).errors(table, _predicted(kinematics, table), places), rows)
@@ -114,9 +108,7 @@ def check_rows(kinematics: Callable[[Tensor], Tensor], data: Any) -> None:
 def place(kinematics: Callable[[Tensor], Tensor], data: Any, *, every_session: bool = False) -> Places:
     """Place what a model does not know on the rows of a table: frames of set-ups, devices of readings.
 
-    Args:
-        kinematics: (N, n) joint values -> (N, P, 3) markers, m, the ball last. data: rows of any kinds.
-        every_session: whether the rows of a single set-up are placed too; by default they are in the model's frame.
+    Rows of a single set-up are placed only with ``every_session``; by default they are in the model's frame.
 
     Raises:
         InputError: rows that a model cannot be compared with, or joints in another order.
@@ -124,12 +116,9 @@ def place(kinematics: Callable[[Tensor], Tensor], data: Any, *, every_session: b
     """
     check_rows(kinematics, data)
     model = kinematics if isinstance(kinematics, CalibratedKinematics) else None
-    unplaced = model is not None and model.own_frame
-    points = partial(_predicted, kinematics)
-    turns = None if model is None else model.turns
-    known = {"unplaced": unplaced, "every_session": every_session}
-    beside = Beside(points, devices_of(kinematics), kinematics, turns, **known)
-    parts = rows_of_one_kind(data)
+    known = {"unplaced": model is not None and model.own_frame, "every_session": every_session}
+    turns, parts = None if model is None else model.turns, rows_of_one_kind(data)
+    beside = Beside(partial(_predicted, kinematics), devices_of(kinematics), kinematics, turns, **known)
     found = Places(ball=len(parts) > 1 if model is None else model.ball)
     for table, _ in parts:
         found = found.beside(sensor_of(table).place(table, beside))
@@ -166,13 +155,7 @@ def _predicted(kinematics: Callable[[Tensor], Tensor], data: Any) -> Tensor:
 
 
 def rows_used_in_fit(model: CalibratedKinematics, q: object) -> Tensor:
-    """Which configurations the model was fitted to, up to the rounding of files.
-
-    Args:
-        model: the calibrated model. q: (N, n) joint configurations, rad or m.
-
-    Returns:
-        (N,) boolean.
+    """Which configurations (N, n), rad or m, the model was fitted to, up to the rounding of files: (N,) boolean.
 
     Raises:
         InputError: not a calibrated model, wrong shape, or values that are not finite.

@@ -16,7 +16,7 @@ import numpy as np
 
 from diffeo_calib.common.errors import RobotError
 from diffeo_calib.runtime.arrays import Array, Tableau, as_index, skew, transforms
-from diffeo_calib.runtime.chain import CalibratedChain, Masses, NominalChain
+from diffeo_calib.runtime.chain import CalibratedChain, Masses, NominalChain, Waves
 from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow, combined
 from diffeo_calib.runtime.tables import JointTables, PeriodicSum, Table, tabulate
 
@@ -108,7 +108,13 @@ def _coupling(robot: Mapping[str, Any], moving: Sequence[Mapping[str, Any]], bet
 
 
 def calibrated_chain(
-    nominal: NominalChain, base: Array, joint_errors: Array, theta: Array, coefficients: Array | None
+    nominal: NominalChain,
+    base: Array,
+    joint_errors: Array,
+    theta: Array,
+    coefficients: Array | None = None,
+    *,
+    waves: tuple[Sequence[Sequence[float]], Array] | None = None,
 ) -> CalibratedChain:
     """A chain with its errors.
 
@@ -116,8 +122,13 @@ def calibrated_chain(
         nominal: the robot. base: (4, 4) [m]. joint_errors: (n_all, 4, 4) [m].
         theta: (6 + 6 n_all,) error twists of base and joints [m, rad].
         coefficients: of the gravity sag (robots/gravity.py); None without it.
+        waves: joint and frequency of each, and coefficients (2 K,).
     """
     L, T = len(nominal.axes), len(nominal.tips)
+    config, factors = waves or ((), np.zeros(0))
+    joints, frequencies = [int(joint) for joint, _ in config], np.array([frequency for _, frequency in config])
+    units = np.eye(nominal.coupling.shape[1])[joints]
+    periodic = Waves(tuple(joints), units, frequencies, factors.reshape(-1, 2)) if joints else None
     twists = theta[: 6 + 6 * L].reshape(-1, 6)
     offsets = nominal.offsets[:L] @ joint_errors
     sag, constant = None, twists[1:]
@@ -125,7 +136,8 @@ def calibrated_chain(
         sag = Masses.of(nominal.compliances, nominal).sag(coefficients)
     else:
         offsets, constant = offsets @ transforms(constant), np.zeros_like(constant)
-    return CalibratedChain(nominal, base @ transforms(twists[0]), offsets, constant, nominal.offsets[L : L + T], sag)
+    start, tips = base @ transforms(twists[0]), nominal.offsets[L : L + T]
+    return CalibratedChain(nominal, start, offsets, constant, tips, sag, periodic)
 
 
 def recorded_flow(

@@ -29,7 +29,6 @@ MIMIC: dict[str, tuple[Mapping[str, float], float]] = {
     "second": ({"sum": -0.5, "rack": 2.0, "waist": 0.25}, 0.7),
 }
 MOVING = [name for name, kind in KINDS.items() if kind != "fixed"]
-ACTIVE = ["waist", "rail", "elbow"]
 
 
 def crooked_joints(kinds: Mapping[str, str], seed: int = 1) -> list[Joint]:
@@ -50,7 +49,6 @@ def build(joints: list[Joint], mimic: Mapping[str, tuple[Mapping[str, float], fl
     return Chain("machine", "floor", "hand", coupled)
 
 
-FREE = build(crooked_joints(KINDS))
 CHAIN = build(crooked_joints(KINDS), MIMIC)
 
 

@@ -115,8 +115,8 @@ def test_rows_are_brought_to_the_middle_of_the_column() -> None:
     drift: Any = Drift.of_table(data, ARM.nominal)[0]
     effects = drift.effects(SeenRows(nominal, plain, plain, None, zero))
     assert_close(effects @ unknowns, moved.flatten(1) - plain, rtol=0, atol=1e-5)
-    constants = torch.cat([drift.known.constants[:, :2], centre[None], size[None]], 1)
-    found = replace(drift.known, constants=constants, deviations=size[None].abs())
+    constants = torch.cat([drift.devices.constants[:, :2], centre[None], size[None]], 1)
+    found = replace(drift.devices, constants=constants, deviations=size[None].abs())
     back = found.aligned(data)
     assert_close(nominal(back.q, zero), back.points.flatten(1), rtol=0, atol=1e-5)
     assert back.covariates is None

@@ -19,9 +19,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.planning.board_images import BoardImages
 from diffeo_calib.calibration.planning.candidates import candidates
-from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
+from diffeo_calib.calibration.planning.sensors_of_model import BoardImages, sensor_of
 from diffeo_calib.cameras.images import Images, sees, shown, sighted
 from diffeo_calib.cameras.images import expected as expected_errors
 from diffeo_calib.measurements.poses import inverse_poses, poses_from_marks

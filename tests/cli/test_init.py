@@ -21,14 +21,6 @@ from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
-
-@pytest.fixture
-def frame(tmp_path: Path) -> Any:
-    """A table of the arm as a data frame, m and rad, beside its URDF."""
-    ARM.write_urdf(tmp_path / "arm.urdf")
-    return dc.Measurements(*ARM.measure(ROWS, seed=0), NAMES).to_frame()
-
-
 # --- the robot and its links ---
 
 JOINT = (

@@ -46,9 +46,9 @@ from diffeo_calib.regression.conditional import (
     Conditional,
     Fields,
     Opened,
-    WithoutRigidMotions,
     diagonal_blocks,
     lower_root,
+    without_rigid_motions,
 )
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.geometry import Geometry
@@ -148,7 +148,7 @@ class Start(NamedTuple):
 
     def without_motions(self, known: Conditional, targets: Tensor) -> Conditional:
         """Without the rigid motion that fits the errors at the targets best, where such motions are no errors."""
-        return WithoutRigidMotions(known, self.at.rows(targets), self.base) if self.scene.free else known
+        return without_rigid_motions(known, self.at.rows(targets), self.base) if self.scene.free else known
 
 
 def of_robot(
@@ -233,7 +233,7 @@ def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Start:
     fitted, fit, registration = model.map, model.map.unregistered, model.map.registration
     if registration is not None and free != registration.free:
         free = registration.free if free is None else "both"
-    adrift, tool = fitted.workspace is not None, robot_map(fit).geometry.slices["tool"]
+    adrift, tool = fitted.stands_free, robot_map(fit).geometry.slices["tool"]
     seen, middle = device_coordinates(fitted.m, ball=model.ball, free=adrift), fitted.deformation.z1.view(-1, 3).mean(0)
     points, parts = [], []
     for rows in q.split(PREDICT_ROWS):
@@ -250,5 +250,5 @@ def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Start:
     shifts = 0 if registration is not None else fitted.noise.shared.shape[2]
     noise = fitted.new_noise.expand(len(q), -1, -1)
     scene = Scene(torch.cat(points), noise, base, averaged, seen, adrift, shifts)
-    known = Opened(fit.conditional.inner, fit.columns, moved)
+    known = Opened(fit.with_motions, fit.columns, moved)
     return Start(known, Linearisation.joined(parts), scene, fit.columns + len(moved))

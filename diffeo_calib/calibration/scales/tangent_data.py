@@ -159,7 +159,7 @@ class TangentData:
         to = basis.mT
         shared = None if self.shared is None else to @ self.shared
         numbers = {"y": self.in_numbers(self.y), "noise_model": self.noise_model.along(basis), "shared": shared}
-        observe, nominal = LinearFunctionals(to), self.nominal.with_rigid_frames()
+        observe, nominal = LinearFunctionals(to), self.nominal.changed(rigid=True)
         other = replace(self, **numbers, observe=observe, nominal=nominal)
         vars(other).update(points=self.points, jacobian=to @ self.jacobian)
         return other
@@ -230,7 +230,7 @@ class TangentData:
     def with_gear_lines(self, lines: tuple[GearLine, ...]) -> TangentData:
         """The same measurements around a map with these gear lines, which add nothing yet."""
         waves = GearWaves(tuple(line.joint for line in lines), tuple(line.frequency for line in lines))
-        nominal = self.nominal.with_waves(waves)
+        nominal = self.nominal.changed(waves=waves)
         smooth = self.theta[: nominal.sag.stop]
         other = self._variant(nominal=nominal, theta=torch.cat([smooth, smooth.new_zeros(waves.size)]))
         vars(other).pop("sensitivities", None)

@@ -33,6 +33,7 @@ from diffeo_calib.kinematics.tool import ToolKinematics
 from diffeo_calib.measurements.poses import rigid_poses
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.build import calibrated_chain
+from diffeo_calib.runtime.chain import tip_poses
 
 Array = np.ndarray
 
@@ -301,10 +302,10 @@ def _rough(model: CalibratedKinematics, tools: Mapping[str, Tensor], frame: str)
     geometry, robot = model.geometry, model.robot
     start = geometry.base.numpy() if frame == "measuring" else np.eye(4)
     errors = geometry.joint_errors.numpy()
-    chain = calibrated_chain(robot.arrays, start, errors, np.zeros(6 + 6 * robot.moving), None)
+    chain = calibrated_chain(robot.arrays, start, errors, np.zeros(6 + 6 * robot.moving))
     numbers, ends = [robot.tips.index(tip) for tip in tools], chain.tips.copy()
     ends[numbers] = ends[numbers] @ np.stack([tool.numpy() for tool in tools.values()])
     chain = replace(chain, tips=ends)
     return ToolFunctions(
-        lambda q: chain.poses(q)[:, numbers], lambda q: chain.poses_and_jacobian(q)[1][:, numbers], *_shape(robot)
+        lambda q: tip_poses(chain, q)[:, numbers], lambda q: chain.poses_and_jacobian(q)[1][:, numbers], *_shape(robot)
     )

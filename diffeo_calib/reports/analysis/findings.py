@@ -41,8 +41,6 @@ from diffeo_calib.sensors.tables import divided, measured_positions, measured_ro
 LOG = logging.getLogger(__name__)
 STEPS = 4
 """Of the analysis, as they are told."""
-PROBE_CONFIGURATIONS = 60
-"""Configurations at which the share of the markers in the expected variance is judged."""
 FAR_RATIO = 3.0
 """Ratio of expected errors anywhere to those like the measured ones from which the reason is told."""
 COLUMN_WORDS = ("temp", "time", "stamp", "date", "hour")
@@ -136,17 +134,6 @@ class Findings:
     def forecast(self) -> tuple[int, float] | None:
         """Twice the rows of the fit and the error there, m; None if it cannot be told."""
         return forecast(self.learning_curve, self.limit)
-
-    @property
-    def tool(self) -> Tensor:
-        """Numbers of the parameters that place the markers of the fit."""
-        geometry = self.model.nominal.geometry
-        return torch.arange(geometry.size, device=self.rows.q.device)[geometry.slices["tool"]]
-
-    @property
-    def share_of_tool(self) -> float:
-        """Share of the expected variance that knowing the markers would remove."""
-        return self.rows.map.explained_by(self.tool, self.deviations.q[:PROBE_CONFIGURATIONS])
 
     @property
     def telling(self) -> Repeats | None:

@@ -160,7 +160,8 @@ def draw_coverage(axes: Axes, predictions: Predictions) -> None:
     low, high = (100 / count * binom.ppf(p, count, SHARES.numpy()) for p in (0.025, 0.975))
     axes.fill_between(claimed, low, high, color=GREY, alpha=0.3, lw=0, label="chance (rows independent)")
     axes.plot([0, 100], [0, 100], color=GREY, lw=1)
-    axes.plot(claimed, 100 * predictions.found_shares(), "-o", color=BLUE, ms=3.5, lw=1.8, label="found")
+    found = [100 * predictions.coverage(share) for share in SHARES.tolist()]
+    axes.plot(claimed, found, "-o", color=BLUE, ms=3.5, lw=1.8, label="found")
     note(axes, 0.03, 0.7, "cautious", va="top")
     note(axes, 0.97, 0.25, "overconfident", ha="right")
     axes.set(xlim=(0, 100), ylim=(0, 101))
