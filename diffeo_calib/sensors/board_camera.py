@@ -91,6 +91,12 @@ class BoardCameras(Extrinsics):
 
     kind = "camera"
 
+    @classmethod
+    def of(cls, cameras: Mapping[str, BoardCamera]) -> BoardCameras:
+        """Cameras by their names."""
+        numbers = torch.stack([own.numbers for own in cameras.values()])
+        return cls(tuple(cameras), numbers, torch.stack([own.camera.deviations for own in cameras.values()]))
+
     @property
     def cameras(self) -> dict[str, BoardCamera]:
         each = zip(self.names, map(BoardCamera.of, self.constants), strict=True)

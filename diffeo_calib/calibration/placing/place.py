@@ -341,11 +341,10 @@ def _by_coordinates(
     robot: Tree, data: Any, own: Coordinates, readings: list[OtherReadings], progress: Progress
 ) -> Placed:
     """Registration and geometric calibration of rows that tell coordinates, and devices of readings around them."""
-    count = len(data)
     own.table.check_every_marker_seen()
-    sessions, table = Sessions.of_table(robot, own, count, progress)
+    sessions, table = Sessions.of_table(robot, own, progress)
     LOG.info("calibrating %s with %r", robot.name, table)
-    sockets, table, stages = coordinate_stages(robot, own._replace(table=table), count, progress)
+    sockets, table, stages = coordinate_stages(robot, own._replace(table=table), progress)
     LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", *(1e3 * stage.rms for stage in stages))
     warn_of_joints_below_tip(robot, table)
     warn_of_open_directions(robot, table, stages[0])

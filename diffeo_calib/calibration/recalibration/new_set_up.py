@@ -142,7 +142,7 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
             place, seen = _place_of_device(old, nominal, model.lever, device.table, stated)
             geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])
             geometry = replace(geometry, base=place.registration.transform @ geometry.base)
-            sessions, own = Sessions.beside(own, device, geometry, seen, len(new))
+            sessions, own = Sessions.beside(own, device, geometry, seen)
     return Before(old, nominal, new, own, readings, place, sessions, ball, new_ball)
 
 
