@@ -29,7 +29,7 @@ from diffeo_calib.kinematics.evaluation import (
     rows_used_in_fit,
 )
 from diffeo_calib.kinematics.joint_ranges import warn_outside_range
-from diffeo_calib.measurements.csv.writing import write_rows
+from diffeo_calib.measurements.csv.lines import write_rows
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, Evaluations
 from diffeo_calib.sensors.set_ups import MeasuringFrames

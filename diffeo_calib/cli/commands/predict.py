@@ -23,9 +23,8 @@ from diffeo_calib.kinematics.device_readings import PredictedReadings
 from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, warn_outside_range
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.columns import Columns
-from diffeo_calib.measurements.csv.files import read_configurations
+from diffeo_calib.measurements.csv.files import Predictions, read_configurations, write_predictions
 from diffeo_calib.measurements.csv.joints import PoseColumns
-from diffeo_calib.measurements.csv.writing import Predictions, write_predictions
 from diffeo_calib.measurements.table_format import BESIDE, TableFormat, options_of
 
 ROWS_AT_ONCE = 2048
