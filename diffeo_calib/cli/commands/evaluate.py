@@ -32,7 +32,7 @@ from diffeo_calib.kinematics.joint_ranges import warn_outside_range
 from diffeo_calib.measurements.csv.writing import write_rows
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, Evaluations
-from diffeo_calib.sensors.set_ups import MeasuringFrames
+from diffeo_calib.sensors.set_ups import SESSION
 
 COLUMNS = ("line", "used_in_fit", "kind", "device", "marker", "dx", "dy", "dz", "size", "unit")
 """Of the table of residuals."""
@@ -57,8 +57,8 @@ def run(options: EvaluateOptions) -> None:
         write_rows(options.residuals, COLUMNS, [list(_residuals(found, used, source))], source.table)
         record.add(files={"residuals": options.residuals})
         say(f"residuals: {options.residuals}")
-    if isinstance(places.frames, MeasuringFrames):
-        record.add(session_transforms=places.frames.entry())
+    if SESSION in places.devices:
+        record.add(session_transforms=places.devices[SESSION].entry())
     if places.numbers:
         record.add(found_from_rows={"numbers": places.numbers, "sentences": list(places.found)})
     say(*map(plain, places.found))
