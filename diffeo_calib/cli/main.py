@@ -137,7 +137,7 @@ Json = Annotated[
         "--json",
         metavar="FILE",
         callback=_remember,
-        help="Also write the results to this file, for programs, as diffeo_calib/cli/result.schema.json says.",
+        help="Also write the results to this file, for programs.",
     ),
 ]
 

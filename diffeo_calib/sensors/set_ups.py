@@ -84,7 +84,7 @@ class SetUps(Extrinsics):
         """Also rows that name no set-up; MeasurementError for rows of one that is not known."""
 
     @abstractmethod
-    def increments(self, points: Tensor, slopes: Tensor | None, by_tool: Tensor, centre: Tensor) -> Tensor:
+    def increments(self, points: Tensor, slopes: Tensor, by_tool: Tensor, centre: Tensor) -> Tensor:
         """What increments with their prior deviations do to R numbers of N rows: (N, R, k).
 
         Args:
@@ -203,10 +203,9 @@ class MeasuringFrames(SetUps):
     def aligned(self, data: Any) -> Any:
         return data.in_frames(torch.linalg.inv(self.of_rows(data).unflatten(1, (4, 4))))
 
-    def increments(self, points: Tensor, slopes: Tensor | None, by_tool: Tensor, centre: Tensor) -> Tensor:
+    def increments(self, points: Tensor, slopes: Tensor, by_tool: Tensor, centre: Tensor) -> Tensor:
         """What is left of the differences between the frames, and markers mounted again."""
-        frame = self.unit * frame_slopes(points, centre)
-        frame = frame if slopes is None else slopes @ frame
+        frame = slopes @ (self.unit * frame_slopes(points, centre))
         return torch.cat([frame, PLACES.remounted_m * by_tool], 2)[..., : self.increments_each]
 
     def stepped(self, constants: Tensor, steps: Tensor, centre: Tensor, T: Tensor) -> Tensor:
@@ -245,7 +244,7 @@ class MountedMarkers(SetUps):
         shifts = self.of_rows(data).unflatten(1, (-1, 3))
         return data.shifted(-(_turned(self.turns, data)[:, : shifts.shape[1]] @ shifts[..., None])[..., 0])
 
-    def increments(self, points: Tensor, slopes: Tensor | None, by_tool: Tensor, centre: Tensor) -> Tensor:
+    def increments(self, points: Tensor, slopes: Tensor, by_tool: Tensor, centre: Tensor) -> Tensor:
         return self.unit * by_tool
 
     def stepped(self, constants: Tensor, steps: Tensor, centre: Tensor, T: Tensor) -> Tensor:
@@ -288,9 +287,9 @@ class MountedFrames(SetUps):
     def aligned(self, data: Any) -> Any:
         return data.on_frames(self.of_rows(data).unflatten(1, (4, 4)))
 
-    def increments(self, points: Tensor, slopes: Tensor | None, by_tool: Tensor, centre: Tensor) -> Tensor:
+    def increments(self, points: Tensor, slopes: Tensor, by_tool: Tensor, centre: Tensor) -> Tensor:
         found = self.unit * own_slopes(points[:, :3])
-        return found if slopes is None else slopes[..., : found.shape[1]] @ found
+        return slopes[..., : found.shape[1]] @ found
 
     def in_any_frame(self, data: Measurements) -> Measurements:
         if not data.remounted or not set(data.device_names) <= {*self.names, ""}:

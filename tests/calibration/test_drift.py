@@ -113,7 +113,8 @@ def test_rows_are_brought_to_the_middle_of_the_column() -> None:
     moved = away + centre + (a * size[:3])[:, None] + turn + (a * size[6])[..., None] * away
     data = dc.Measurements(q, moved).with_covariates(time=time)
     drift: Any = Drift.of_table(data, ARM.nominal)[0]
-    effects = drift.effects(SeenRows(nominal, plain, plain, None, zero))
+    whole = torch.eye(6, dtype=torch.float64).expand(len(plain), 6, 6)
+    effects = drift.effects(SeenRows(nominal, plain, plain, whole, zero))
     assert_close(effects @ unknowns, moved.flatten(1) - plain, rtol=0, atol=1e-5)
     constants = torch.cat([drift.devices.constants[:, :2], centre[None], size[None]], 1)
     found = replace(drift.devices, constants=constants, deviations=size[None].abs())

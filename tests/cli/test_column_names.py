@@ -198,6 +198,8 @@ def test_poses_as_matrices(names: list[str], named: bool) -> None:
         ("xIst", ("x", "ist"), ""),
         ("POSX_mm", ("pos", "x"), "mm"),
         ("m_x", ("m", "x"), ""),
+        ("tvec[2]", ("tvec", "z"), ""),
+        ("rvec_0", ("rvec", "x"), ""),
         ("current_joint_1", ("actual", "joint", "1"), ""),
         ("joint_current_1 [A]", ("joint", "current", "1", "a"), ""),
     ],

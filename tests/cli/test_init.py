@@ -347,6 +347,17 @@ def test_a_proposal_is_that_of_the_table(written: tuple[str, str, str, str], tmp
     assert (options["--joints"], options["--base"], options["--tip"]) == (",".join(NAMES), "base_link", "flange")
 
 
+def test_cells_that_are_no_numbers_are_named(tmp_path: Path, init: Proposed, proposed: Proposed) -> None:
+    q, points = rows()
+    proposed((NAMES, q), (XYZ, points), (["x2", "y2", "z2"], points + 30.0))
+    lines = (tmp_path / "t.csv").read_text().splitlines()
+    lines[5] = ",".join([*lines[5].split(",")[:-2], "#VALUE!", "1"])
+    (tmp_path / "t.csv").write_text("\n".join(lines))
+    entries, text = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
+    assert entries["position"] == ["x,y,z"]
+    assert "line 6, column 'y2': expected a number, got '#VALUE!'" in text
+
+
 @pytest.mark.parametrize(("count", "message"), [(ROWS, "one clear reading"), (3, "3 row(s)")])
 def test_a_robot_that_explains_nothing_is_refused(count: int, message: str, tmp_path: Path, proposed: Proposed) -> None:
     points = 1e3 * SimulatedArm(seed=4).measure(count, seed=9)[1][:, 0]

@@ -89,6 +89,13 @@ def test_init_joins_by_the_column_with_the_most_common_texts(tmp_path: Path) -> 
     ]
 
 
+def test_init_joins_by_columns_of_other_names_that_name_the_same_rows(tmp_path: Path) -> None:
+    (tmp_path / "j.csv").write_text("pose,a\nP1,1\nP2,2\nP3,4\n")
+    (tmp_path / "p.csv").write_text("Name;x\nP3;1\nP1;2\nP2;3\n")
+    _, entries = with_places(tmp_path / "j.csv", Places(places=tmp_path / "p.csv"), tmp_path)
+    assert [entry.value for entry in entries] == ["p.csv", "pose=Name"]
+
+
 def test_init_says_what_is_missing(files: Files, tmp_path: Path, command: Command) -> None:
     done = command("init", files.joints, files.urdf, "-o", tmp_path / "c.toml")
     assert "if they are in another file: --places FILE --by name;" in done.error

@@ -99,6 +99,17 @@ def test_nearest_times_within_half_a_step(tmp_path: Path) -> None:
     assert [line for line, _ in read_cells(other, ",")[1]] == [3, 6]
 
 
+@pytest.mark.parametrize(("second", "order"), [(3.1, [2, 3, 4]), (7.0, [2, 4])])
+def test_a_row_each_of_the_same_stops_by_two_clocks(second: float, order: list[int], tmp_path: Path) -> None:
+    """Pauses that agree tell the offset; else the times are compared as they are."""
+    joints, places = ("t,a", "0,1", "3,2", "11,3"), ("t,x", "50.0,1", f"{50 + second},2", "61.0,3")
+    if len(order) == 2:
+        places = ("t,x", "0.1,1", f"{second},2", "11.2,3")
+    found = joined(tmp_path, joints, places, "t")
+    assert [line for line, _ in read_cells(found, ",")[1]] == order
+    assert ("-50.00 added" in found.sentence) == (len(order) == 3)
+
+
 @pytest.mark.parametrize("offset", [0.0, 1.37, None])  # None: both on the same grid of times
 def test_recordings_with_clocks_of_their_own(offset: float | None, tmp_path: Path) -> None:
     """One line for every stop, from its middle; columns that only count or that do not move do not matter."""

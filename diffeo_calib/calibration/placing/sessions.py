@@ -132,9 +132,7 @@ class Sessions(DeviceSet):
         """Numbers of the sessions but the reference."""
         return [number for number in range(len(self.names)) if number != self.reference]
 
-    def increments(
-        self, points: Tensor, by_tool: Tensor, centre: Tensor, session: Tensor, slopes: Tensor | None = None
-    ) -> Tensor:
+    def increments(self, points: Tensor, by_tool: Tensor, centre: Tensor, session: Tensor, slopes: Tensor) -> Tensor:
         """What the sessions but the reference leave open, (N, R, k (S - 1)): see :meth:`SetUps.increments`.
 
         Args:

@@ -29,6 +29,8 @@ from diffeo_calib.measurements.stops import LIMITS, NOISE_FACTOR, Recording, Sto
 SEPARATORS = (",", ";", "\t", "|")
 MOVED = 1e-3
 """Part of the range of a column by which it moves at least, unless its noise is larger."""
+CLOCKS_AGREE = 0.1
+"""Spread of the differences of two clocks at most, relative to the pauses between rows, and to how these differ."""
 Array = np.ndarray
 Pairs = list[tuple[int, int]]
 """Numbers of lines with the same joint values: of the joints and of the places."""
@@ -121,6 +123,13 @@ def joined_file(
 def _by_time(joints: Array, places: Array) -> tuple[Pairs, str]:
     """Times (N,) and (M,) that are the nearest to each other, within half a step; and in words."""
     step = min(float(np.median(np.diff(np.sort(own)))) for own in (joints, places))
+    if len(joints) == len(places):
+        away = joints - places
+        offset, spread = float(np.median(away)), float(np.ptp(away))
+        # Two clocks, one row each of the same stops: pauses that differ from each other agree.
+        if abs(offset) > 0.5 * step and spread < CLOCKS_AGREE * min(step, float(np.ptp(np.diff(joints)))):
+            every = range(len(joints))
+            return list(zip(every, every, strict=True)), f"by time, {offset:+.2f} added to those of the places"
     nearest = [(_nearest(joints, at), place) for place, at in enumerate(places)]
     apart = {pair: float(abs(joints[pair[0]] - places[pair[1]])) for pair in nearest}
     pairs = [one for one in nearest if apart[one] < 0.5 * step and _nearest(places, joints[one[0]]) == one[1]]

@@ -11,7 +11,7 @@ import csv
 import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import combinations, islice
+from itertools import combinations, islice, zip_longest
 from math import isnan
 from pathlib import Path
 from typing import NamedTuple
@@ -62,7 +62,8 @@ class CsvLines:
         self._last, self._extra = 0, 0  # line before the rows, and empty cells at the end of rows
         self._text, notes = _text(path, sep)
         lines = list(islice(self._cells(), HEAD))
-        if sep == " " and len({len(cells) for _, cells in lines}) > 1:  # columns that spaces align
+        each = list(zip_longest(*(cells for _, cells in lines), fillvalue=None))
+        if sep == " " and any(None in cells or not any(cells) for cells in each):  # columns that spaces align
             self._aligned = True
             lines = list(islice(self._cells(), HEAD))
         if not any(any(cells) for _, cells in lines):

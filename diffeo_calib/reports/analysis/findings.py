@@ -174,8 +174,7 @@ def find(
     rows = FitRows(model, measured)
     kinematics = stages_of(model, rows) if stages is None else stages
     progress("analysis", 1, STEPS)
-    new = None if data is None else _new_rows(model, data, rows)
-    if new is not None and (bool(new.any()) or not rows.of_positions):
+    if data is not None and (bool((new := _new_rows(model, data, rows)).any()) or not rows.of_positions):
         aligned = measured if rows.of_positions and measured is not None and len(measured) == len(data) else None
         errors = _by_stage(data, aligned, kinematics, own, places)
         shown = _of_table(model, data, new, measured, own, errors=errors)

@@ -67,8 +67,9 @@ class FitRows:
         posed = model.registration is None or self.map.m % (3 * POINTS) == 0
         self.q, self.on, self.lever = self.map.x, model.nominal.geometry.on, model.lever if posed else None
         self.of_positions = not model.ball and self.map.slopes is None
-        same = measured is not None and measured.q.shape == self.q.shape and measured.points[0].numel() == self.map.m
-        self._measured = measured if same and torch.equal(measured.q.to(HOST), self.q) else None
+        self._measured = None
+        if measured is not None and measured.q.shape == self.q.shape and measured.points[0].numel() == self.map.m:
+            self._measured = measured if torch.equal(measured.q.to(HOST), self.q) else None
 
     def __len__(self) -> int:
         return len(self.q)
