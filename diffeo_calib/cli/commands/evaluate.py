@@ -43,7 +43,7 @@ from diffeo_calib.measurements.csv.lines import write_rows
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import BESIDE, TableFormat, options_of
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, Evaluations
-from diffeo_calib.sensors.set_ups import MeasuringFrames
+from diffeo_calib.sensors.set_ups import SESSION
 
 COLUMNS = ("line", "used_in_fit", "kind", "device", "marker", "dx", "dy", "dz", "size", "unit")
 """Of the table of residuals."""
@@ -68,8 +68,8 @@ def run(options: EvaluateOptions) -> None:
         write_rows(options.residuals, COLUMNS, [list(_residuals(found, used, source))], source.table)
         record.add(files={"residuals": options.residuals})
         say(f"residuals: {options.residuals}")
-    if isinstance(places.frames, MeasuringFrames):
-        record.add(session_transforms=places.frames.entry())
+    if SESSION in places.devices:
+        record.add(session_transforms=places.devices[SESSION].entry())
     if places.numbers:
         record.add(found_from_rows={"numbers": places.numbers, "sentences": list(places.found)})
     say(*map(plain, places.found))
