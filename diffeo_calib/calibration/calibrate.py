@@ -26,7 +26,7 @@ from diffeo_calib.calibration.choose_scales import (
 )
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import lengths, warn_of_lengths, worth_it
-from diffeo_calib.calibration.diagnostics.moved_devices import change_during
+from diffeo_calib.calibration.diagnostics.moved_devices import change_during, crooked_axis
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.outliers import (
     outliers,
@@ -154,9 +154,9 @@ def calibrate(
             calibration exceeds 5 % of the markers' spread and no other reading explains it; a column holds one value
             although the robot moves; the rows show no errors of the robot; too few poses to
             select scales; leave-one-out errors contradict the scales; during the measurements something moved or
-            drifted, a joint offset or a zero changed; a length of robot or device is not what it is said to be; wrong
-            rows follow one another; more than 40 % of the rows are outliers; the joint values are rounded and this
-            limits the accuracy.
+            drifted, a joint offset or a zero changed; a length of robot or device is not what it is said to be; a
+            guide is not straight or a bearing wobbles; wrong rows follow one another; more than 40 % of the rows are
+            outliers; the joint values are rounded and this limits the accuracy.
     """
     check_arguments(robot, measurements, hyperparameters)
     check_models(scales_of, robot)
@@ -247,7 +247,7 @@ def _result(
         rows=len(data.x),
         parts={part.name: part.displacement for part in explained},
         effective_parameters=chosen.left_out.effective,
-        length_in_doubt=warn_of_lengths(found_lengths),
+        length_in_doubt=max(warn_of_lengths(found_lengths) or 0.0, crooked_axis(data, scales) or 0.0) or None,
         warnings="\n".join(warned) or None,
     )
     return CalibrationResult(

@@ -76,7 +76,7 @@ class ExpectedError:
         whole: the same with these places. measured: at the rows of the fit.
         open_places: names of these places.
         size: standard deviation of the robot's size, relative. size_share: its part of ``workspace``, from 0 to 1.
-        doubt: distance, m, by which points move with a length that is in doubt; it is in ``workspace`` and ``whole``.
+        doubt: distance, m, by which points move with what is in doubt; it is in ``workspace`` and ``whole``.
     """
 
     workspace: float
@@ -116,7 +116,7 @@ class ExpectedError:
         text = f"{1e3 * self.workspace:.3f} mm RMS"
         if self.doubt:
             settled = max(self.workspace**2 - self.doubt**2, 0.0) ** 0.5
-            text = f"{text}, with the length in doubt ({1e3 * settled:.3f} mm if it is right as given)"
+            text = f"{text}, with what is in doubt ({1e3 * settled:.3f} mm without it)"
         if self.open_places:
             what = f"{' and '.join(self.open_places)}, which the rows leave open"
             text = f"{text} apart from {what} ({1e3 * self.whole:.3f} mm with it)"

@@ -30,6 +30,10 @@ ROW_ODDS = 6.0
 """Log odds of a number that differs from row to row: clean images have less than zero, focal lengths that differ by
 0.1 % fourteen and more."""
 
+AXIS_WAVES, AXIS_ODDS, AXIS_LEFT = 6, 6.0, 0.9
+"""Half waves of the errors of an axis over its range; log odds from which they are clear, less than two where there are
+none; and the part of the RMS left-out error that remains with them at most."""
+
 # --- rows of a campaign, one by one ---
 
 WRONG_ROW_CHANCE, UNDONE_CHANCE = 1e-8, 1e-3

@@ -189,13 +189,10 @@ class SocketDevices(DeviceSet):
             if len(block) > 1:  # at several places
                 pair = [name.rpartition(SEPARATOR)[2] for name in pair]
             name = f"the distance of '{pair[0]}' and '{pair[1]}' ({1e3 * length:.2f} mm)"
-            yield Hypothesis(
-                name, effects if data.slopes is None else data.slopes @ effects, ("mm", 1e-3), fix, about=VALUE
-            )
+            yield Hypothesis(name, data.slopes @ effects, ("mm", 1e-3), fix, about=VALUE)
 
     def effects(self, data: Seen) -> Tensor:
-        effects = self.shared(*data.points.shape)
-        return effects if data.slopes is None else data.slopes @ effects
+        return data.slopes @ self.shared(*data.points.shape)
 
     def settled(self, found: Settled) -> SocketDevices:
         root, positions = self.root, self.positions - (self.root @ found.shifts).view(-1, 3)
