@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -29,6 +29,7 @@ from diffeo_calib.robots.se3 import skew
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+T = TypeVar("T")
 MODEL_FRAME = "the frame of the model"
 SMALLEST_M = 1e-12
 """Of a column of a linear system, against division by zero."""
@@ -96,6 +97,10 @@ class Extrinsics(ABC):
             markers: (P, 3) old places of the markers from the new ones, in the frames of their tips, m.
         """
         return self.constants
+
+    def aligned(self, data: T) -> T:
+        """Rows that these measured as those of the model's own set-up."""
+        return data
 
     def sentences(self) -> list[str]:
         """What is known of each of them, in the frame of the model."""

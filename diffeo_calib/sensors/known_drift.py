@@ -95,7 +95,7 @@ class KnownDrift(Extrinsics):
         away = kinematics(data.q + moved[:, OFFSETS:]).detach() - centre
         return centre + moved[:, None, :3] + (1.0 + moved[:, GROWTH, None, None]) * (away @ R.mT)
 
-    def aligned(self, data: Any) -> Any:
+    def undone(self, data: Any) -> Any:
         """Measured positions as they would be in the middle of the columns, which they then do not tell any more."""
         moved = self.ramp(data) @ self.sizes.to(data.q)
         centre = self.centre.to(moved)

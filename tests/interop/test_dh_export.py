@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 import torch
 from export_bank import configurations, own_poses, wrong
-from mimic_bank import CHAIN
 from product_bank import Case
-from robots_bank import CHAINS, draw
+from robots_bank import CHAIN, CHAINS, draw
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 

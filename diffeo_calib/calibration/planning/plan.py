@@ -30,7 +30,7 @@ from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.csv.columns import Columns, Joints
-from diffeo_calib.measurements.csv.writing import write_rows
+from diffeo_calib.measurements.csv.lines import write_rows
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.regression.conditional import Conditional, Given, Opened

@@ -43,8 +43,7 @@ from diffeo_calib.kinematics.re_registration.register_again import both_dates, c
 from diffeo_calib.kinematics.re_registration.registered_map import Registration, moved
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.sensors.errors import Evaluations
-from diffeo_calib.sensors.places import PlacedDevices
-from diffeo_calib.sensors.set_ups import mounted_of
+from diffeo_calib.sensors.places import PlacedDevices, mounted_of
 
 LOG = logging.getLogger(__name__)
 CERTIFICATES = "coupling_residual", "end_residual", "energy", "status"

@@ -44,8 +44,7 @@ from diffeo_calib.robots.payload import joined_masses
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import sensor_of
 from diffeo_calib.sensors.known_drift import KnownDrift
-from diffeo_calib.sensors.places import PlacedDevices
-from diffeo_calib.sensors.set_ups import mounted_of
+from diffeo_calib.sensors.places import PlacedDevices, mounted_of
 from diffeo_calib.sensors.tables import rows_of_one_kind
 
 LOG = logging.getLogger(__name__)

@@ -241,7 +241,7 @@ def _by_stage(
     for name in before:
         rows = data if measured is None else measured
         at = place(stages[name], rows) if measured is not None or places is None else places[name]
-        at = at if measured is not None else replace(at, frames=at.frames or own.frames, ball=own.ball)
+        at = at if measured is not None else replace(at, devices={**own.devices, **at.devices}, ball=own.ball)
         found[name] = residuals(stages[name], at, rows)
     return found | {last: residuals(stages[last], own, data)}
 
