@@ -23,8 +23,7 @@ from diffeo_calib.calibration.diagnostics.hypotheses import worth_it
 from diffeo_calib.calibration.placing.drift import FRAME_M_RAD, GROWTH, OFFSET_RAD_M, Drift
 from diffeo_calib.calibration.placing.placement import SeenRows
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.measurements.csv.files import read_observations
-from diffeo_calib.measurements.csv.writing import write_measurements
+from diffeo_calib.measurements.csv.files import read_observations, write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import Geometry, SimulatedArm
 from diffeo_calib.sensors.known_drift import KnownDrift

@@ -146,11 +146,7 @@ SMALLEST_GAIN = 1e-20
 def box_search(
     tool: ToolFunctions, targets: Targets, q: Array, box: Box, *, poses: Array | None = None
 ) -> tuple[Array, Array, Array]:
-    """Search the nearest point of every row, from ``q`` (N, n) inside the box.
-
-    Returns:
-        (N, n) joint values, (N, T, 4, 4) poses of the tools, (N,) whether they reach the targets.
-    """
+    """Search the nearest point of every row, from ``q`` (N, n) inside the box; returns as :func:`chord_search`."""
     search = _Search(tool, targets, q, box, tool.poses(q) if poses is None else poses)
     for _ in range(MOST_NEWTON_STEPS):
         if not len(search.todo):

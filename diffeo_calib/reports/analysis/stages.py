@@ -44,7 +44,7 @@ def stages_of(model: CalibratedKinematics, rows: FitRows | None = None) -> dict[
     rows are not known, or stand in several places (models with control points, registered or recalibrated models), base
     and markers are those that fit the model best.
     """
-    rows = FitRows(model) if rows is None else rows
+    rows = rows or FitRows(model)
     mounted_anew = isinstance(rows.map.geodesic.spec.at_controls, SessionMarkers)
     if not rows.known or mounted_anew or model.registration is not None or model.rigid_errors is None:
         geometries = nominal_kinematics(model).geometry, geometric_kinematics(model).geometry
