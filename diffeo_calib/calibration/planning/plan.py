@@ -264,11 +264,17 @@ def plan(
         posterior = Given(posterior, before.linearised(start.at, shifts, start.first), before.noise)
     order, variance = choose(posterior, options, start, at_targets, count)
     LOG.info("%d poses chosen of %d", count, len(q))
+    kept = start.without_motions(posterior, at_targets)
+    blocks = start.scene.along(kept.covariance(start.at.rows(at_candidates)))
+    if isinstance(robot_or_model, CalibratedKinematics):
+        blocks = robot_or_model.map.with_second_order(blocks)
+    noise = 3 * start.scene.along(start.scene.noise[at_targets]).diagonal(dim1=1, dim2=2).mean()
+    stated = next((3 * one.std**2 for one in sensors if one.of_positions and one.std is not None), float(noise))
     return Plan(
         **_in_order(robot, q, options.some(order), int(at_candidates[0])),
         expected_rms=(3 * variance).sqrt(),
-        known_rms=_known_rms(robot_or_model, start, start.without_motions(posterior, at_targets), at_candidates),
-        noise_rms=_noise_rms(start.scene, sensors, at_targets),
+        known_rms=(3 * blocks.diagonal(dim1=1, dim2=2).mean(1)).clamp(min=0.0).sqrt(),
+        noise_rms=stated**0.5,
         assumed=isinstance(robot_or_model, Tree) and hyperparameters is None,
         joint_names=robot.joint_names,
         kinds=robot.kinds,
@@ -328,15 +334,16 @@ def drawn(
     each: list[tuple[int, Tensor | None, Tensor, Where | None]] = [
         (len(sensors) - len(held) - len(seen), None, markers.mean(0), None),
         *((1, None, markers.mean(0), where) for where in seen),
-        (len(held), torch.cat(held) if held else None, markers[-1], None),
+        (int(bool(held)), torch.cat(held) if held else None, markers[-1], None),  # all sockets are one sensor
     ]
+    whole = sum(number for number, *_ in each)
     for number, places, marker, where in each:
         if number:
             criteria = [one for one in (None if where is None else where.keep, keep) if one is not None]
             found.append(
                 candidates(
                     given.robot if isinstance(given, CalibratedKinematics) else given,
-                    -(-count * number // len(sensors)),
+                    -(-count * number // whole),
                     ranges=({} if where is None else where.ranges) | dict(ranges or {}),
                     keep=all_of(criteria),
                     tracker=None if tracker is None else replace(tracker, marker=marker.tolist()),
@@ -378,21 +385,6 @@ def _options(
         registered = registered.some((registered.rows >= registration) & (registered.rows < first))
         whole = Options.joined([whole, registered], scene.shifts)._replace(names=every.names)
     return whole.some(whole.rows < first), whole.some(whole.rows >= first)
-
-
-def _known_rms(given: Tree | CalibratedKinematics, start: Start, known: Conditional, candidates: Tensor) -> Tensor:
-    """RMS error of the markers, or origins, at candidates with these numbers: (M,) m."""
-    blocks = start.scene.along(known.covariance(start.at.rows(candidates)))
-    if isinstance(given, CalibratedKinematics):
-        blocks = given.map.with_second_order(blocks)
-    return (3 * blocks.diagonal(dim1=1, dim2=2).mean(1)).clamp(min=0.0).sqrt()
-
-
-def _noise_rms(scene: Scene, sensors: Sequence[Sensor], targets: Tensor) -> float:
-    """RMS noise of a measured position, m: of the first sensor with positions of a stated deviation, or of the rows."""
-    stated = next((one.std for one in sensors if one.of_positions and one.std is not None), None)
-    noise = scene.along(scene.noise[targets]).diagonal(dim1=1, dim2=2).mean()
-    return float(3 * noise) ** 0.5 if stated is None else 3**0.5 * stated
 
 
 def _check_belonging(given: Tree | CalibratedKinematics, of_robots: dict[str, object], free: str | None) -> None:

@@ -158,7 +158,9 @@ def recalibrate(
     progress("changes", 0, 1)
     changes, drifts = find_changes(rows, seed=seed) if drift == "tested" else (Changes(), [])
     LOG.info("changes: %s", changes)
-    warn_of_groups(changes)
+    if groups := dict.fromkeys(one.where for one in changes.found if one.where):  # no model holds for all of them
+        what = f"the new rows do not belong to one robot: only {' and '.join(groups)} deviates from the old model"
+        warn_user(sentence(what, fix="check what happened between them, and recalibrate with the rows since then"))
     warn_of_places(before, marker, outliers=False, excess=not drifts)
     if drift == "tested":
         drifts = [*drifts, *usual_drift(rows, drifts)]
@@ -244,14 +246,6 @@ LARGEST_OUTLIER_PART = 0.5
 """Part of the rows that may hardly count: with more of them it is not clear which rows are wrong."""
 LARGEST_EXCESS = 10.0
 """Residuals by this factor above the expected ones are not those of a worn joint."""
-
-
-def warn_of_groups(changes: Changes) -> None:
-    """Warn of changes that only a part of the new rows shows: no model holds for all of them."""
-    groups = dict.fromkeys(one.where for one in changes.found if one.where)
-    if groups:
-        what = f"the new rows do not belong to one robot: only {' and '.join(groups)} deviates from the old model"
-        warn_user(sentence(what, fix="check what happened between them, and recalibrate with the rows since then"))
 
 
 def warn_of_contradictions(rows: WeighedRows, excess: float) -> None:
