@@ -225,7 +225,7 @@ class Contacts(Sensor):
         return Evaluation(size, None, away[:, None], lines, distances, what=SPREAD, kind="socket", devices=names)
 
     def settled(self, data: Measurements, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
-        return (PlacedDevices(SocketPlaces.of(points[:, -1], data)),)
+        return (PlacedDevices(SocketPlaces.around(points[:, -1], data)),)
 
 
 class OtherDevices(Sensor):

@@ -83,6 +83,8 @@ class Extrinsics(ABC):
     kind: ClassVar[str]
     reads: ClassVar[bool] = False
     """Whether they report readings of a model's points."""
+    seen_points: ClassVar[int] = 0
+    """Points of the tool that they see."""
 
     names: tuple[str, ...]
     constants: Tensor
@@ -162,7 +164,7 @@ class Devices(Extrinsics):
     stated_as: ClassVar[str] = ""
     """How a user writes where a new device is, to plan poses for it: the numbers of :meth:`stated`."""
     seen_points: ClassVar[int] = 1
-    """Points of the tool that it sees: the ball, or three of each measured frame."""
+    """The ball, or three points of each measured frame."""
     increments_each: ClassVar[int]
     """Increments k of a device."""
     numbers_each: ClassVar[int] = 1
@@ -242,6 +244,11 @@ class Devices(Extrinsics):
     def where(self, number: int) -> str:
         """Where a device is, in words."""
         return ", ".join(f"{value:.3f}" for value in self.constants[number].tolist())
+
+    @property
+    def places(self) -> Tensor | None:
+        """(D, 3) to which the ball must be brought to be seen, m; None if anywhere will do."""
+        return None
 
     def sees(self, points: Tensor, device: Tensor) -> Tensor:
         """(N,) boolean: whether these devices (N,) can measure points (N, 3), m."""

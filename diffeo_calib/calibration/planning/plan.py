@@ -333,15 +333,16 @@ def drawn(
     each: list[tuple[int, Tensor | None, Tensor, Where | None]] = [
         (len(sensors) - len(held) - len(seen), None, markers.mean(0), None),
         *((1, None, markers.mean(0), where) for where in seen),
-        (len(held), torch.cat(held) if held else None, markers[-1], None),
+        (int(bool(held)), torch.cat(held) if held else None, markers[-1], None),  # all sockets are one sensor
     ]
+    whole = sum(number for number, *_ in each)
     for number, places, marker, where in each:
         if number:
             criteria = [one for one in (None if where is None else where.keep, keep) if one is not None]
             found.append(
                 candidates(
                     given.robot if isinstance(given, CalibratedKinematics) else given,
-                    -(-count * number // len(sensors)),
+                    -(-count * number // whole),
                     ranges=({} if where is None else where.ranges) | dict(ranges or {}),
                     keep=all_of(criteria),
                     tracker=None if tracker is None else replace(tracker, marker=marker.tolist()),
