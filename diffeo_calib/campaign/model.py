@@ -395,7 +395,7 @@ def _flags(values: Sequence[bool]) -> Tensor:
 
 def _freedom(data: TangentData, row: int) -> int:
     """Degrees of freedom of the bodies that a row shows."""
-    return data.rows(torch.tensor([row], dtype=torch.int64, device=HOST)).measured_freedom
+    return int(data.noise_model.freedom[row][data.noise_model.seen[row]].sum())
 
 
 def limit_of(error: float, covariance: Tensor, scales_deviation: float) -> float:

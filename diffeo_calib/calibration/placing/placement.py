@@ -133,10 +133,6 @@ class DeviceSet(ABC):
     def with_rows(self: S, other: OtherRows) -> S:
         """The same devices with other rows in place of their own; MeasurementError for other devices."""
 
-    def aligned(self, data: T) -> T:
-        """Measured positions in the frame of the model."""
-        return data
-
     def at_places(self, table: T) -> T:
         """Rows that tell coordinates where these devices put them."""
         return table
@@ -245,7 +241,7 @@ class Placement(tuple[DeviceSet, ...]):
     def aligned(self, data: T) -> T:
         """Measured positions in the frame of the model; unchanged where one set-up measured all."""
         for own in self:
-            data = own.aligned(data)
+            data = own.devices.aligned(data)
         return data
 
     def at_places(self, data: T) -> T:

@@ -105,7 +105,7 @@ class TangentData:
         """(N, r, 3 P) of the observation at k0."""
         if self.observe is not None:
             return self.observe.slope(self.points)
-        N, m = self.y.shape
+        N, m = self.points.shape
         return torch.eye(m, dtype=self.x.dtype, device=self.x.device).expand(N, m, m)
 
     @cached_property
@@ -137,11 +137,6 @@ class TangentData:
     def coordinates(self) -> int:
         """Number of coordinates that were measured."""
         return int(self.visible.sum())
-
-    @property
-    def measured_freedom(self) -> int:
-        """Degrees of freedom of the bodies that were measured: three of each marker that was seen, six of a pose."""
-        return int(self.noise_model.freedom[self.noise_model.seen].sum())
 
     # --- poses as six numbers ---
 
