@@ -371,7 +371,7 @@ class CampaignModel:
 
         Without a measuring device rigid motions of all of them do not.
         """
-        q, shifts = self.asked[1], 0 if self.data.shared is None else self.data.shared.shape[2]
+        q, shifts = self.asked[1], self.data.shared.shape[2]
         at = replace(self.data, nominal=self.data.nominal.typical, x=q, shared=None, observe=None, beside=None)
         A, points = Bodies(self.placed.lever).averaging(at.points), at.points.unflatten(1, (-1, 3))
         nothing, S = points.new_zeros(len(q), len(A)), torch.nn.functional.pad(A @ at.sensitivities, (0, shifts))
@@ -395,7 +395,7 @@ def _flags(values: Sequence[bool]) -> Tensor:
 
 def _freedom(data: TangentData, row: int) -> int:
     """Degrees of freedom of the bodies that a row shows."""
-    return data.rows(torch.tensor([row], dtype=torch.int64, device=HOST)).measured_freedom
+    return int(data.noise_model.freedom[row][data.noise_model.seen[row]].sum())
 
 
 def limit_of(error: float, covariance: Tensor, scales_deviation: float) -> float:

@@ -109,8 +109,7 @@ def load_numpy(path: str | os.PathLike[str]) -> NumpyKinematics:
     """
     header, arrays = read_arrays(Path(path))
     try:
-        program = _program(header, arrays)
-        joints = active_joints(header["nominal"])
+        program, joints = _program(header, arrays), active_joints(header["nominal"])
         limits = np.array([[joint["lower"], joint["upper"]] for joint in joints], dtype=np.float64)  # None is NaN
         limits = np.where(np.isnan(limits), [-np.inf, np.inf], limits)
         tool = np.array(header.get("tool", np.eye(4)), dtype=np.float64)

@@ -28,10 +28,9 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import Beside, check_shown, sensor_of
-from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
 from diffeo_calib.sensors.known_drift import KnownDrift
-from diffeo_calib.sensors.places import Places
+from diffeo_calib.sensors.places import Places, known_devices
 from diffeo_calib.sensors.tables import divided, measured_positions, rows_of_one_kind
 
 LARGEST_ERROR_PER_REACH = 0.1
@@ -118,7 +117,7 @@ def place(kinematics: Callable[[Tensor], Tensor], data: Any, *, every_session: b
     model = kinematics if isinstance(kinematics, CalibratedKinematics) else None
     known = {"unplaced": model is not None and model.own_frame, "every_session": every_session}
     turns, parts = None if model is None else model.turns, rows_of_one_kind(data)
-    beside = Beside(partial(_predicted, kinematics), devices_of(kinematics), kinematics, turns, **known)
+    beside = Beside(partial(_predicted, kinematics), known_devices(kinematics), turns, **known)
     found = Places(ball=len(parts) > 1 if model is None else model.ball)
     for table, _ in parts:
         found = found.beside(sensor_of(table).place(table, beside))
@@ -126,14 +125,6 @@ def place(kinematics: Callable[[Tensor], Tensor], data: Any, *, every_session: b
     sentences = [f"{found.numbers} numbers in all were found from the rows that are judged"] * (found.numbers > 0)
     sentences += [] if drift is None else drift.in_rows(data)
     return replace(found, found=(*found.found, *sentences))
-
-
-def devices_of(model: object) -> dict[str, Devices]:
-    """The devices of readings whose places a model knows, by kind; none for other kinematics."""
-    found = dict[str, Devices]()
-    for own in [own.devices for own in getattr(model, "placement", None) or () if own.devices.reads]:
-        found[own.kind] = found[own.kind].beside(own) if own.kind in found else own
-    return found
 
 
 def placement_sentences(model: object) -> list[str]:
@@ -179,16 +170,11 @@ def rows_of_other_frames(model: CalibratedKinematics, q: Tensor) -> int:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What errors of a model mean.
+    """What errors of a model mean."""
 
-    Args:
-        refusal: why they say nothing about the robot; None if they do. causes: likely causes of large errors.
-        moved: whether something that moved explains errors that say nothing.
-    """
-
-    refusal: str | None = None
-    causes: Sequence[str] = ()
-    moved: bool = False
+    refusal: str | None = None  # why they say nothing about the robot; None if they do
+    causes: Sequence[str] = ()  # likely causes of large errors
+    moved: bool = False  # whether something that moved explains errors that say nothing
 
 
 def judged(
@@ -202,7 +188,7 @@ def judged(
     """
     impossible = LARGEST_ERROR_PER_REACH * model.robot.reach
     for table, _ in divided(data)[1]:
-        devices = places.devices[table.column_kind]
+        devices = places.devices[table.kind]
         away = devices.errors(table, devices.points_of(_predicted(model, table))).norm(dim=1)
         if (median := float(away.median())) > impossible:
             fix = "check the unit of the readings (--length), their columns (--reading), and the device of every row"
@@ -234,7 +220,7 @@ def positions_of(model: CalibratedKinematics, places: Places, data: Any) -> Meas
     if own is None:
         return None
     own = places.aligned(own)
-    return sensor_of(own).with_points(own if drift is None else drift.aligned(own), model)
+    return sensor_of(own).with_points(own if drift is None else drift.undone(own), model)
 
 
 def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> str | None:
@@ -289,19 +275,13 @@ MOST_ROWS = 500
 
 
 class Motion(NamedTuple):
-    """A motion that explains errors.
+    """A motion that explains errors."""
 
-    Args:
-        what: "the measuring device" or "the marker". shift: m, of the device at the middle of the rows.
-        turn: rad, 0 for a marker. explained: part of the squared error.
-        left: (N, m) the errors that remain, m, NaN where hidden.
-    """
-
-    what: str
-    shift: float
-    turn: float
-    explained: float
-    left: Tensor
+    what: str  # "the measuring device" or "the marker"
+    shift: float  # m, of the device at the middle of the rows
+    turn: float  # rad, 0 for a marker
+    explained: float  # part of the squared error
+    left: Tensor  # (N, m) the errors that remain, m, NaN where hidden
 
     @property
     def sentence(self) -> str:

@@ -202,11 +202,6 @@ class CalibratedChain:
         """Number of active joints."""
         return self.nominal.coupling.shape[1]
 
-    @property
-    def serial(self) -> bool:
-        """Whether the joints follow one another to a single tip, and nothing else bends them."""
-        return self.nominal.before.tolist() == list(range(-1, len(self.nominal.axes)))
-
     def poses_and_jacobian(self, q: Array) -> tuple[Array, Array]:
         """Poses (N, T, 4, 4) and their derivatives (N, T, 6, n).
 
@@ -318,9 +313,7 @@ def load_slopes(robot: Any, sag: Any, nominal: Any) -> Any:
     """Derivatives of the twist coordinates e . m by the moving joints: (N, K, n_all).
 
     Turning joint k moves what it carries, M_fk = 1, by z_k x (o_f - o_k), a slide by z_k; e turns where M_lk = 1.
-
-    Args:
-        robot: axes, revolute, moved, signs of a :class:`NominalChain`. nominal: (N, F, 4, 4) see nominal_frames.
+    ``robot``: axes, revolute, moved, signs of a :class:`NominalChain`.
     """
     (N, F), L, revolute = nominal.shape[:2], len(robot.axes), robot.revolute[:, None]
     e, m = loads(sag, nominal)

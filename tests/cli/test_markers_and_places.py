@@ -11,8 +11,7 @@ from command_bank import Command
 from diffeo_calib.cli.guesses import with_places
 from diffeo_calib.cli.options import Places, Rows, Units
 from diffeo_calib.cli.tables import as_at_the_fit
-from diffeo_calib.measurements.csv.lines import read_cells
-from diffeo_calib.measurements.csv.writing import write_rows
+from diffeo_calib.measurements.csv.lines import read_cells, write_rows
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 

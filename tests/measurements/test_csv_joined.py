@@ -10,9 +10,8 @@ import pytest
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
+from diffeo_calib.measurements.csv.joined import JoinedFile, Recording, StopLimits, joined_file, pictured, stops
 from diffeo_calib.measurements.csv.lines import read_cells
-from diffeo_calib.measurements.stops import Recording, StopLimits, pictured, stops
 
 JOINTS = ("pose,a,b", "p1,1,2", "p2,3,4", "p3,5,6")
 PLACES = ("x,y,z,pose", "9,9,9,p3", "", "8,8,8,p1", "7,7,7,p4")

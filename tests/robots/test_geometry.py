@@ -6,8 +6,7 @@ from math import pi
 
 import pytest
 import torch
-from mimic_bank import CHAIN, errors_of
-from robots_bank import draw
+from robots_bank import CHAIN, draw, errors_of
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError

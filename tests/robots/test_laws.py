@@ -11,8 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
-from mimic_bank import CHAIN
-from robots_bank import CHAINS, CROOKED, LIFT, draw, every_chain
+from robots_bank import CHAIN, CHAINS, CROOKED, LIFT, draw, every_chain
 from simulated_body import HANDS, URDF_FILE
 from torch import Tensor
 from torch.func import jacfwd, jacrev, jvp, vmap

@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from mimic_bank import CHAIN, KINDS, MOVING, build, crooked_joints, expand
-from robots_bank import LIFT, draw
+from robots_bank import CHAIN, KINDS, LIFT, MOVING, build, crooked_joints, draw, expand
 
 from diffeo_calib.common.errors import RobotError
 from diffeo_calib.robots import Chain, DHRow, Joint, from_dh, load_urdf

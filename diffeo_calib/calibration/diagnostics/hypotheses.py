@@ -178,8 +178,7 @@ def _lengths_of(data: TangentData) -> Iterator[Hypothesis]:
     away = data.places.unflatten(1, (-1, 3)) - geometry.base[:3, 3].to(data.x.device)
 
     def seen(motion: Tensor) -> Tensor:
-        motion = motion.flatten(1)[..., None]
-        return motion if data.slopes is None else data.slopes @ motion
+        return data.slopes @ motion.flatten(1)[..., None]
 
     yield Hypothesis("the size of the robot", seen(away), PERCENT, OF_ROBOT)
     if not data.adrift:  # a device has axes

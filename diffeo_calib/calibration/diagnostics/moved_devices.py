@@ -313,7 +313,7 @@ def changes_of(data: TangentData, devices: Iterable[Hypothesis] = (), index: Ten
         markers = markers @ torch.block_diag(*rigid_motions(geometry.tool.flatten()).to(markers.device))
     places = data.places.unflatten(1, (-1, 3))
     away = (places - places.mean((0, 1))).flatten(1)[..., None]
-    base, markers, away = (each if data.slopes is None else data.slopes @ each for each in (base, markers, away))
+    base, markers, away = (data.slopes @ each for each in (base, markers, away))
     base = (
         base * (data.noise_model.row_kinds == 0)[:, None, None]
     )  # a ball in a socket does not show where the device of other rows stands

@@ -63,8 +63,7 @@ class Drift(DeviceSet):
         centre = places.mean((0, 1)) if self.centre is None else self.centre
         frame, away = FRAME_M_RAD * frame_slopes(places, centre), (places - centre).flatten(1)[..., None]
         offsets = OFFSET_RAD_M * data.nominal.jacobian(self.q, data.y.new_zeros(data.nominal.parameters))
-        whole = torch.cat([frame, GROWTH * away, offsets], 2)
-        whole = whole if data.slopes is None else data.slopes @ whole
+        whole = data.slopes @ torch.cat([frame, GROWTH * away, offsets], 2)
         return (whole[:, :, None] * self.ramp[:, None, :, None]).flatten(2)
 
     def settled(self, found: Settled) -> Drift:

@@ -141,7 +141,7 @@ class LensAndBoard(CameraErrors):
         for number, camera in enumerate(self.shared.cameras.values()):
             own = self.shared.seen_by == number
             effects[self.rows[own], : self.shared.slopes.shape[1]] = self.shared.slopes[own] @ camera.longer[:, None]
-        effects = effects if data.slopes is None else data.slopes @ effects
+        effects = data.slopes @ effects
         yield Hypothesis("the focal length of the images", effects, ("%", 1e-2), FOCUS, about=ROW)
 
     @property
@@ -246,10 +246,9 @@ def _places(data: Measurements, rows: Tensor, registration: Identification, sess
     geometry = registration.geometry
     slopes = geometry.sensitivities(data.q).flatten(1, 2)
     base, tool = (slopes[..., geometry.slices[name]] for name in ("base", "tool"))
-    own = [
-        one.increments(data.points, tool, data.points.mean((0, 1)), one.by_row(int(rows.max()) + 1)[rows])
-        for one in sessions
-    ]
+    whole = torch.eye(slopes.shape[1], dtype=slopes.dtype, device=slopes.device).expand(len(slopes), -1, -1)
+    at = data.points, tool, data.points.mean((0, 1))
+    own = [one.increments(*at, one.by_row(int(rows.max()) + 1)[rows], whole) for one in sessions]
     return torch.cat([base, tool, *own], 2)
 
 

@@ -37,14 +37,14 @@ class SeenRows(NamedTuple):
     """N rows around k0, as sets of devices see them; so are those of a tangent model.
 
     Args:
-        nominal: k0. y: (N, R) m. points: (N, 3 P) m. slopes: (N, R, 3 P) of what was measured; None for all
-            coordinates. sensitivities: (N, R, K).
+        nominal: k0. y: (N, R) m. points: (N, 3 P) m. slopes: (N, R, 3 P) of what was measured.
+        sensitivities: (N, R, K).
     """
 
     nominal: GeometryMap
     y: Tensor
     points: Tensor
-    slopes: Tensor | None
+    slopes: Tensor
     sensitivities: Tensor
 
 
@@ -133,10 +133,6 @@ class DeviceSet(ABC):
     def with_rows(self: S, other: OtherRows) -> S:
         """The same devices with other rows in place of their own; MeasurementError for other devices."""
 
-    def aligned(self, data: T) -> T:
-        """Measured positions in the frame of the model."""
-        return data
-
     def at_places(self, table: T) -> T:
         """Rows that tell coordinates where these devices put them."""
         return table
@@ -223,10 +219,9 @@ class Placement(tuple[DeviceSet, ...]):
         """Those of all devices, see :meth:`DeviceSet.views`."""
         return {name: view for own in self for name, view in own.views().items()}
 
-    def shared(self, data: Seen) -> Tensor | None:
-        """Effects of all devices, side by side: (N, R, c); None without any."""
-        effects = [own.effects(data) for own in self]
-        return torch.cat(effects, dim=2) if effects else None
+    def shared(self, data: Seen) -> Tensor:
+        """Effects of all devices, side by side: (N, R, c)."""
+        return torch.cat([data.y.new_zeros(*data.y.shape, 0), *(own.effects(data) for own in self)], 2)
 
     def settled(self, fitted: Fit, around: FittedMap, centre: Tensor, transform: Tensor, **known: Any) -> Placement:
         """All devices where a fit puts them, whose last shifts are theirs.
@@ -246,7 +241,7 @@ class Placement(tuple[DeviceSet, ...]):
     def aligned(self, data: T) -> T:
         """Measured positions in the frame of the model; unchanged where one set-up measured all."""
         for own in self:
-            data = own.aligned(data)
+            data = own.devices.aligned(data)
         return data
 
     def at_places(self, data: T) -> T:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -20,9 +20,8 @@ from torch import Tensor
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register, register_inliers
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherLabel, OtherRows, Seen, Settled
-from diffeo_calib.common.errors import MeasurementError, few, listed, sentence, warn_user
+from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.fitting.result import Progress
-from diffeo_calib.measurements.checks import numbers_of
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
@@ -78,7 +77,7 @@ class Sessions(DeviceSet):
         found, median = cls.find(robot, rows, set_up_kind(rows))
         if rows.lever is None:
             _doubt(robot, rows, median)
-        return [found.of_rows(own.rows[table.socket_numbers < 0])], found.aligned(table)
+        return [found.of_rows(own.rows[table.socket_numbers < 0])], found.devices.aligned(table)
 
     @classmethod
     def find(cls, robot: Tree, data: Measurements, kind: type[SetUps]) -> tuple[Sessions, float]:
@@ -90,7 +89,7 @@ class Sessions(DeviceSet):
         geometry = register_inliers(robot, data.largest_session())[0].geometry
         for _ in range(ROUNDS):  # a better geometry gives better places
             found = cls.around(data, kind, geometry, geometry.points(data.q))
-            together = found.aligned(data)
+            together = found.devices.aligned(data)
             start = register(robot, data.q, together.points, marker_tips(robot, data)).geometry
             geometry = identify(start, data.q, together.points).geometry
         away = (geometry.points(data.q) - together.points).norm(dim=2)
@@ -118,17 +117,12 @@ class Sessions(DeviceSet):
         if len(device.table.present_sessions) < 2:
             return [], own
         found = Sessions.around(device.table, set_up_kind(device.table), geometry, seen)
-        return [found.of_rows(own.rows[device.rows])], own._replace(table=found.aligned(own.table))
+        return [found.of_rows(own.rows[device.rows])], own._replace(table=found.devices.aligned(own.table))
 
     @property
     def transforms(self) -> Tensor:
         """(S, 4, 4) from the frame of the reference to that of each session, or on the tool, m."""
         return self.devices.constants.unflatten(1, (4, 4))
-
-    def aligned(self, data: Any) -> Any:
-        """The rows of all sessions as those of the reference; MeasurementError for a session that is not known."""
-        self.numbers(data)
-        return self.devices.aligned(data)
 
     def groups(self) -> list[tuple[str, Tensor]]:
         """Rows (k,) of each session by its name in words."""
@@ -139,9 +133,7 @@ class Sessions(DeviceSet):
         """Numbers of the sessions but the reference."""
         return [number for number in range(len(self.names)) if number != self.reference]
 
-    def increments(
-        self, points: Tensor, by_tool: Tensor, centre: Tensor, session: Tensor, slopes: Tensor | None = None
-    ) -> Tensor:
+    def increments(self, points: Tensor, by_tool: Tensor, centre: Tensor, session: Tensor, slopes: Tensor) -> Tensor:
         """What the sessions but the reference leave open, (N, R, k (S - 1)): see :meth:`SetUps.increments`.
 
         Args:
@@ -169,7 +161,7 @@ class Sessions(DeviceSet):
         return replace(self, devices=moved if found.known is None else moved.after(found.known))
 
     def views(self) -> dict[str, View]:
-        return dict(zip(self.names, self.devices.views(), strict=True))
+        return {name: partial(self.devices.view, number) for number, name in enumerate(self.names)}
 
     def labels(self, own: Coordinates, seen: Tensor) -> Iterator[OtherLabel]:
         session = self.by_row(int(own.rows.max()) + 1)[own.rows]
@@ -187,20 +179,9 @@ class Sessions(DeviceSet):
         device = None if other.coordinates is None else measured_rows(other.coordinates.table)
         rows = number = self.rows[:0]
         if other.coordinates is not None and device is not None:
-            number = self.numbers(device.table)
+            number = self.devices.numbers(device.table)
             rows, number = other.coordinates.rows[device.rows][number != NO_SOCKET], number[number != NO_SOCKET]
         return replace(self, rows=rows, device=number, centre=other.centre)
-
-    def numbers(self, data: Any) -> Tensor:
-        """(N,) number here of each row's session, -1 for none; MeasurementError for a session that is not known."""
-        if data.session is None:
-            raise MeasurementError.of("the measurements have no sessions", fix="pass data.with_sessions(names)")
-        names = data.device_names
-        unknown = [name for name in dict.fromkeys(names) if name and name not in self.names]
-        if unknown:
-            fix = "register the model with rows of the new set-up"
-            raise MeasurementError.of(f"the sessions {unknown}", expected=f"some of {listed(self.names)}", fix=fix)
-        return numbers_of(names, self.names)
 
 
 def _doubt(robot: Tree, data: Measurements, median: float) -> None:

@@ -49,7 +49,7 @@ from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import VALUE, Hypothesis
 from diffeo_calib.sensors.set_ups import View, frame_slopes
-from diffeo_calib.sensors.sockets import SocketPlaces, socket_errors
+from diffeo_calib.sensors.sockets import IN_SOCKET_M, SocketPlaces, socket_errors
 from diffeo_calib.sensors.tables import Coordinates
 
 T = TypeVar("T")
@@ -58,8 +58,6 @@ ALIKE = 0.05
 """Deviation of a block's distance from one place to another, relative to that of the distance itself."""
 FEWEST_BESIDE = 2
 """Rows of a socket besides one that are needed to judge it."""
-IN_SOCKET_M = 0.02
-"""Largest distance of the ball from the place of a socket, stated roughly, at which it counts as resting there."""
 ROUNDS = 2
 """Geometric calibrations, after each of which the sockets are placed again."""
 
@@ -189,13 +187,10 @@ class SocketDevices(DeviceSet):
             if len(block) > 1:  # at several places
                 pair = [name.rpartition(SEPARATOR)[2] for name in pair]
             name = f"the distance of '{pair[0]}' and '{pair[1]}' ({1e3 * length:.2f} mm)"
-            yield Hypothesis(
-                name, effects if data.slopes is None else data.slopes @ effects, ("mm", 1e-3), fix, about=VALUE
-            )
+            yield Hypothesis(name, data.slopes @ effects, ("mm", 1e-3), fix, about=VALUE)
 
     def effects(self, data: Seen) -> Tensor:
-        effects = self.shared(*data.points.shape)
-        return effects if data.slopes is None else data.slopes @ effects
+        return data.slopes @ self.shared(*data.points.shape)
 
     def settled(self, found: Settled) -> SocketDevices:
         root, positions = self.root, self.positions - (self.root @ found.shifts).view(-1, 3)

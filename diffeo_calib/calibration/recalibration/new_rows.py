@@ -183,8 +183,8 @@ class WeighedRows(NewRows):
             **measured,
         )
         by_tool = pad(rows.by_places[..., 6:], (before.nominal.geometry.slices["tool"].start, 0))
-        shared = rows.placement.shared(SeenRows(before.nominal, rows.y, rows.seen[0], rows.slopes, by_tool))
-        return rows if shared is None else rows.changed(shared=shared)
+        at = SeenRows(before.nominal, rows.y, rows.seen[0], rows.slopes, by_tool)
+        return rows.changed(shared=rows.placement.shared(at))
 
     @property
     def weighted_noise(self) -> Tensor:

@@ -34,7 +34,7 @@ from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import check_shown, sensor_of
-from diffeo_calib.sensors.set_ups import mounted_of
+from diffeo_calib.sensors.places import mounted_of
 from diffeo_calib.sensors.tables import (
     Coordinates,
     OtherReadings,

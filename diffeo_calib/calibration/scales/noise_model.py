@@ -58,18 +58,6 @@ FINEST_SHARE = 0.3
 """The same relative to the finest direction of known errors: it adds a tenth to their variance."""
 
 
-def _precision(known: Tensor, otherwise: float) -> float:
-    """Median of the smallest known deviations of poses along any direction, m, of known covariances (N, T, 9, 9).
-
-    A slack of that size would drown what images of a board tell across the line of sight: a tenth of that along it.
-    """
-    if known.shape[2] < FREEDOM_OF_POSES:
-        return otherwise
-    smallest = torch.linalg.eigvalsh(known)[..., -FREEDOM_OF_POSES]
-    smallest = smallest[smallest > SMALLEST_NOISE_M**2]
-    return float(smallest.median().sqrt()) if len(smallest) else otherwise
-
-
 @dataclass(frozen=True)
 class NoiseModel:
     """How N rows were measured.
@@ -106,7 +94,12 @@ class NoiseModel:
         size, visible, known = data.bodies.points, data.visible.repeat_interleave(3, 1), data.covariance
         plain = cls.alike(len(data), data.markers // size, 3 * size)
         known, modes = plain.known if known is None else known, data.bodies.modes(data)
-        slack = min(SLACK_SHARE * residual, FINEST_SHARE * _precision(own_blocks(known, plain.bodies), residual))
+        finest = known.new_zeros(0)  # deviation of poses along any direction
+        if 3 * size >= FREEDOM_OF_POSES:
+            finest = torch.linalg.eigvalsh(own_blocks(known, plain.bodies))[..., -FREEDOM_OF_POSES]
+            finest = finest[finest > SMALLEST_NOISE_M**2]
+        # that size would drown what images of a board tell across the line of sight: a tenth of that along it
+        slack = min(SLACK_SHARE * residual, FINEST_SHARE * (float(finest.median()) ** 0.5 if len(finest) else residual))
         kinds = plain.kinds if data.body_kinds is None else data.body_kinds
         return cls(visible, kinds, known, plain.modes if modes is None else modes, slack)
 

@@ -172,18 +172,12 @@ def log_posterior(logarithms: Tensor, centre: Hyperparameters, data: TangentData
         by_noise = sum((own * block).sum() for own, block in zip(numbers.diagonal_blocks(slope), noise, strict=True))
         explained = (root * (S.T @ mu)).square() - 1.0 + torch.cholesky_inverse(factor.B).diagonal()
         by_unknowns = 0.5 * explained @ variance[wide].log() + ((slope @ narrow) * narrow).sum(0) @ variance[~wide]
-        density = _log_prior(point - centre.logarithms(), centre.amplitudes())
+        away, amplitudes = point - centre.logarithms(), centre.amplitudes()
+        widths = torch.where(amplitudes, torch.where(away.detach() > 0, GROWTH, SHRINKAGE), LENGTH)
+        density = -0.5 * (away / widths).square().sum()
         (data.pairs.inner(values, slope) + by_noise + by_unknowns + density).backward()
     gradient = torch.zeros_like(point) if point.grad is None else point.grad
     return LogPosterior(factor.log_density(numbers.target, mu), float(density.detach()), gradient)
-
-
-def _log_prior(away: Tensor, amplitudes: Tensor) -> Tensor:
-    """Log density of logarithms relative to their centre, up to a constant: scalar."""
-    widths, grown = torch.full_like(away, LENGTH), away.detach() > 0
-    widths[amplitudes & grown] = GROWTH
-    widths[amplitudes & ~grown] = SHRINKAGE
-    return -0.5 * (away / widths).square().sum()
 
 
 class _Search:

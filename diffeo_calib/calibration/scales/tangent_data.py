@@ -53,7 +53,7 @@ class TangentData:
         noise_model: how they were measured.
         tails: weights of the measurements.
         place_deviation: prior standard deviation of base and markers, m and rad.
-        shared: (N, m, c) effects of c shifts of unit variance that rows share, m; see :class:`Noise`.
+        shared: (N, m, c) effects of c shifts of unit variance that rows share, m; none by default.
         held: numbers of the parameters theta that stay zero.
         adrift: whether no device says where the robot stands.
         observe: what was measured of the markers; their coordinates by default.
@@ -67,11 +67,15 @@ class TangentData:
     noise_model: NoiseModel
     tails: Tails
     place_deviation: float = PLACES.found_m_rad
-    shared: Tensor | None = None
+    shared: Tensor = None  # pyright: ignore[reportAssignmentType]  # a tensor once it is made
     held: tuple[int, ...] = ()
     adrift: bool = False
     observe: Observation | None = None
     beside: TangentData | None = None
+
+    def __post_init__(self) -> None:
+        if self.shared is None:
+            object.__setattr__(self, "shared", self.y.new_zeros(*self.y.shape, 0))
 
     @property
     def space(self) -> Space:
@@ -97,9 +101,12 @@ class TangentData:
         return torch.where(resting, self.y, self.points)
 
     @cached_property
-    def slopes(self) -> Tensor | None:
-        """(N, r, 3 P) of the observation at k0; None if coordinates were measured."""
-        return None if self.observe is None else self.observe.slope(self.points)
+    def slopes(self) -> Tensor:
+        """(N, r, 3 P) of the observation at k0."""
+        if self.observe is not None:
+            return self.observe.slope(self.points)
+        N, m = self.points.shape
+        return torch.eye(m, dtype=self.x.dtype, device=self.x.device).expand(N, m, m)
 
     @cached_property
     def values(self) -> Tensor:
@@ -109,14 +116,12 @@ class TangentData:
     @cached_property
     def jacobian(self) -> Tensor:
         """(N, m, n) Dk0, m/rad or m/m."""
-        slopes, whole = self.slopes, self.nominal.jacobian(self.x, self.theta)
-        return whole if slopes is None else slopes @ whole
+        return self.slopes @ self.nominal.jacobian(self.x, self.theta)
 
     @cached_property
     def sensitivities(self) -> Tensor:
         """(N, m, K) S, derivatives by theta."""
-        slopes, whole = self.slopes, self.nominal.sensitivities(self.x, self.theta)
-        return whole if slopes is None else slopes @ whole
+        return self.slopes @ self.nominal.sensitivities(self.x, self.theta)
 
     @cached_property
     def target(self) -> Tensor:
@@ -132,11 +137,6 @@ class TangentData:
     def coordinates(self) -> int:
         """Number of coordinates that were measured."""
         return int(self.visible.sum())
-
-    @property
-    def measured_freedom(self) -> int:
-        """Degrees of freedom of the bodies that were measured: three of each marker that was seen, six of a pose."""
-        return int(self.noise_model.freedom[self.noise_model.seen].sum())
 
     # --- poses as six numbers ---
 
@@ -157,8 +157,8 @@ class TangentData:
         if basis is None:
             return self
         to = basis.mT
-        shared = None if self.shared is None else to @ self.shared
-        numbers = {"y": self.in_numbers(self.y), "noise_model": self.noise_model.along(basis), "shared": shared}
+        numbers = {"y": self.in_numbers(self.y), "noise_model": self.noise_model.along(basis)}
+        numbers["shared"] = to @ self.shared
         observe, nominal = LinearFunctionals(to), self.nominal.changed(rigid=True)
         other = replace(self, **numbers, observe=observe, nominal=nominal)
         vars(other).update(points=self.points, jacobian=to @ self.jacobian)
@@ -194,8 +194,7 @@ class TangentData:
         sensor, tails = self.noise_model.rows(index), self.tails.rows(index)
         changes = {"x": self.x[index], "y": self.y[index], "noise_model": sensor, "tails": tails}
         changes["nominal"] = self.nominal.rows(index)
-        if self.shared is not None:
-            changes["shared"] = self.shared[index]
+        changes["shared"] = self.shared[index]
         if self.observe is not None:
             changes["observe"] = self.observe.rows(index)
         return self._variant(lambda values: values[index], **changes)
@@ -251,7 +250,7 @@ class TangentData:
         spec = ModelSpec(self.nominal, *kernels, self.prior_variance(scales), 3)
         points = self.points.reshape(-1, 3)
         eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(len(points), 3, 3)
-        effect = eye if self.slopes is None else self.slopes
+        effect = eye if self.observe is None else self.slopes
         joint, task = NodeSensitivity(1.0, self.x, self.jacobian), NodeSensitivity(1.0, points, effect)
         return Linearisation(spec, [joint], [task], self.sensitivities)
 
@@ -306,12 +305,8 @@ class TangentData:
     def numbers(self) -> Numbers:
         """All that the rows tell; the shifts that they share are the last unknowns."""
         told = self.told
-        S = told.sensitivities if told.shared is None else torch.cat([told.sensitivities, told.shared], 2)
-        slopes = told.slopes
-        if slopes is None:
-            R = told.y.shape[1]
-            slopes = torch.eye(R, dtype=self.x.dtype, device=self.x.device).expand(len(self.x), R, R)
-        return Numbers.of(self.x, self.points, told.visible, target=told.target, S=S, J=told.jacobian, A=slopes)
+        S = torch.cat([told.sensitivities, told.shared], 2)
+        return Numbers.of(self.x, self.points, told.visible, target=told.target, S=S, J=told.jacobian, A=told.slopes)
 
     @cached_property
     def pairs(self) -> Covariance:
@@ -320,8 +315,7 @@ class TangentData:
 
     def unknowns_variance(self, scales: Hyperparameters) -> Tensor:
         """(K,) prior variances of theta and of the shifts."""
-        shifts = self.x.new_ones(0 if self.shared is None else self.shared.shape[2])
-        return torch.cat([self.prior_variance(scales), shifts])
+        return torch.cat([self.prior_variance(scales), self.x.new_ones(self.shared.shape[2])])
 
     def prior(self, scales: Hyperparameters) -> Process:
         """What is known before these rows."""
