@@ -246,15 +246,12 @@ class OtherDevices(Sensor):
         if known is not None and set(data.names) <= set(known.names):
             return Places(joined([known]))
         names = tuple(name for name in data.names if known is None or name not in known.names)
-        new = torch.tensor([name in names for name in data.names], dtype=torch.bool, device=data.device.device)
-        rows = data.rows(new[data.device])
+        rows = of_devices(data, names)
         devices = placed(rows, beside.points(rows))
         free = int((devices.deviations > KNOWN_DEVIATION).sum())
-        if known is not None:
-            devices = known.beside(devices)
-        names = few([f"'{name}'" for name in names])
-        sentence = f"the places of the devices of {data.kind}s were found from these rows: {names}"
-        return Places(joined([devices]), found=(sentence,), numbers=free)
+        words = few([f"'{name}'" for name in names])
+        sentence = f"the places of the devices of {data.kind}s were found from these rows: {words}"
+        return Places(joined([devices] if known is None else [known, devices]), found=(sentence,), numbers=free)
 
     def errors(self, data: Readings, points: Tensor, places: Places) -> Evaluation:
         devices = places.devices.get(data.kind)

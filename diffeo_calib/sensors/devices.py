@@ -83,6 +83,8 @@ class Extrinsics(ABC):
     kind: ClassVar[str]
     reads: ClassVar[bool] = False
     """Whether they report readings of a model's points."""
+    set_up: ClassVar[bool] = False
+    """Whether they are set-ups: one alone is that of its model, and every fit finds them anew."""
     seen_points: ClassVar[int] = 0
     """Points of the tool that they see."""
 
@@ -115,16 +117,6 @@ class Extrinsics(ABC):
     def elsewhere(self) -> Tensor:
         """(D,) boolean: set-ups in another frame than the model's, or with other markers."""
         return torch.zeros(len(self.names), dtype=torch.bool, device=self.constants.device)
-
-    @property
-    def of_model(self) -> bool:
-        """Whether this is one set-up alone, whose frame and markers are those of the model."""
-        return False
-
-    @property
-    def fitted_again(self) -> bool:
-        """Whether a fit to rows of known devices finds them anew, as it does set-ups."""
-        return False
 
     @property
     def cameras(self) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -160,7 +161,7 @@ class Sessions(DeviceSet):
         return replace(self, devices=moved if found.known is None else moved.after(found.known))
 
     def views(self) -> dict[str, View]:
-        return dict(zip(self.names, self.devices.views(), strict=True))
+        return {name: partial(self.devices.view, number) for number, name in enumerate(self.names)}
 
     def labels(self, own: Coordinates, seen: Tensor) -> Iterator[OtherLabel]:
         session = self.by_row(int(own.rows.max()) + 1)[own.rows]

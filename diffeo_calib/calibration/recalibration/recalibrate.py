@@ -233,7 +233,7 @@ def _with_settled(
         for k, other in enumerate(found):
             if not own.devices.same_set(other.devices):
                 continue
-            if own.devices.fitted_again:
+            if own.devices.set_up:
                 found[k] = own.beside(other)
             else:
                 number = torch.tensor([other.names.index(name) for name in own.names], dtype=torch.int64, device=HOST)
