@@ -27,7 +27,6 @@ from diffeo_calib.sensors.kinds import known_kinds
 SEPARATORS = (",", ";", "\t", "|", " ")
 DECIMALS = (".", ",")
 ROWS_LOOKED_AT = 50
-"""Rows that are looked at."""
 PIXELS = ("u", "v"), ("pixelu", "pixelv"), ("upx", "vpx")
 """Names of columns of images."""
 LENS, SOME_LENS = "FX,FY,CX,CY", "1000,1000,500,500"
@@ -323,7 +322,6 @@ def _without(one: Column, words: frozenset[str]) -> str:
 
 
 USUAL_SIZES = (640, 480), (1280, 720), (1280, 960), (1920, 1080), (2048, 1536), (2592, 1944), (4096, 3072), (8192, 8192)
-"""Widths and heights of images, pixels."""
 BELOW = (12, 13, 14)
 """Places of the zeros below a rotation, of a matrix by rows."""
 

@@ -26,7 +26,6 @@ SEED: dict[str, Any] = {"default": 0, "min": 0, "max": 2**63 - 1}
 """The largest as in common/checks.py, which loads torch."""
 DRAWN = 3000
 CORNERS = "corners="
-"""Begin of --reading for images of a board."""
 
 
 def option(

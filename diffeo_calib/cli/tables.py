@@ -25,6 +25,7 @@ from diffeo_calib.cli.options import CORNERS, Rows, Targets, Units, has
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.files import PROGRAM
+from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.files import read_joints, read_observations
 from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
 from diffeo_calib.measurements.csv.joints import PoseColumns
@@ -386,11 +387,8 @@ def reading_columns(text: str, device: str | None, names: Sequence[str] = ()) ->
 
 def _number(text: str) -> float | None:
     """A finite number; None for the name of a column."""
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if isfinite(value) else None
+    value = number(text.strip(), ".")
+    return value if value is not None and isfinite(value) else None
 
 
 def stated_numbers(option: str, text: str, counts: Sequence[int], expected: str = "") -> list[float]:

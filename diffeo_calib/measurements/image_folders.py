@@ -25,7 +25,6 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 FLIPPED, KALIBR = ("right-up", "left-down"), " (numbers run upwards, as in grids of Kalibr)"
 """Orders of grids of markers in which numbers run to the right and upwards, and what is said of them."""
 THUMBNAIL_WIDTH_PX = 320
-"""Width of an image in the overview, pixels."""
 Progress = Callable[[str, int, int], None]
 
 

@@ -27,7 +27,6 @@ SEPARATOR = "/"
 """Between the name of a place and that of a socket: "front/0"."""
 Distances = Mapping[tuple[str, str], float]
 ONE_SESSION: dict[str, object] = {"session": None, "session_names": (), "remounted": False}
-"""Attributes of rows that were measured in one set-up."""
 BALL = "ball"
 """Name of the last marker, if the other ones have names."""
 FLATTERY = (

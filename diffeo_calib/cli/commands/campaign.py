@@ -33,7 +33,6 @@ from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
 from diffeo_calib.reports.live import Page, served, state_of
 
 JOURNAL = ".journal"
-"""Suffix of the journal beside a table."""
 LOOK_SECONDS = 0.1
 LONGEST = 200
 """Characters of an option in a journal; of longer ones it holds a hash."""

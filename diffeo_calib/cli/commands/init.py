@@ -58,7 +58,6 @@ NOT_RAISED = 1.01
 FLANGES = ("flange", "tool0")
 """Ends of the names of links to which tools are screwed."""
 COLUMNS = ("joints", "position", "marker", "socket", "rotation", "std", "reading", "by", *NAMED)
-"""Entries that name columns."""
 
 
 def run(given: InitOptions) -> None:
