@@ -17,7 +17,7 @@ is known as poorly: that of all joints is then no smaller than that of any robot
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import hypot
 from typing import Any
 
@@ -296,7 +296,9 @@ def with_open_directions(fitted: FittedMap, measurements: Measurements, registra
     least[parts["joints"]] = (unseen[:, None] * twist).flatten()
     least[nominal.sag] = _unseen_sag(nominal, q)
     variance = torch.maximum(before, least.square())
-    return fitted if torch.equal(variance, before) else fitted.with_deformation(fitted.geodesic.with_prior(variance))
+    return (
+        fitted if torch.equal(variance, before) else replace(fitted, deformation=fitted.geodesic.with_prior(variance))
+    )
 
 
 def _unseen_sag(nominal: GeometryMap, q: Tensor) -> Tensor:

@@ -67,21 +67,16 @@ def own_shifts(shared: Tensor, slopes: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class FittedDevice(NamedTuple):
-    """A device of readings beside a fit, where the model has it.
+    """A device of readings beside a fit, where the model has it."""
 
-    Args:
-        devices: it alone, with the standard deviations of its k unknowns after the rows on which it was placed.
-        columns: (c,) boolean, the shifts of the fit that move it; None for a device that measured no row of the fit, or
-            of a model that was moved since.
-        root: (k, k') what each of these does to its unknowns; without them the root of their covariance by the rows on
-            which it was placed.
-        noise: (r, r) of a reading by its rows of the fit, m^2; None without any.
-    """
-
-    devices: Devices
+    devices: Devices  # it alone, with the standard deviations of its k unknowns after the rows on which it was placed
+    # (k, k') what each of these does to its unknowns; without them the root of their covariance by the rows on which it
+    # was placed
     root: Tensor
+    # (c,) boolean, the shifts of the fit that move it; None for a device that measured no row of the fit, or of a model
+    # that was moved since
     columns: Tensor | None = None
-    noise: Tensor | None = None
+    noise: Tensor | None = None  # (r, r) of a reading by its rows of the fit, m^2; None without any
 
     @classmethod
     def of(cls, fitted: FittedMap, own: PlacedDevices, number: int) -> FittedDevice:

@@ -170,16 +170,11 @@ def rows_of_other_frames(model: CalibratedKinematics, q: Tensor) -> int:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What errors of a model mean.
+    """What errors of a model mean."""
 
-    Args:
-        refusal: why they say nothing about the robot; None if they do. causes: likely causes of large errors.
-        moved: whether something that moved explains errors that say nothing.
-    """
-
-    refusal: str | None = None
-    causes: Sequence[str] = ()
-    moved: bool = False
+    refusal: str | None = None  # why they say nothing about the robot; None if they do
+    causes: Sequence[str] = ()  # likely causes of large errors
+    moved: bool = False  # whether something that moved explains errors that say nothing
 
 
 def judged(
@@ -280,19 +275,13 @@ MOST_ROWS = 500
 
 
 class Motion(NamedTuple):
-    """A motion that explains errors.
+    """A motion that explains errors."""
 
-    Args:
-        what: "the measuring device" or "the marker". shift: m, of the device at the middle of the rows.
-        turn: rad, 0 for a marker. explained: part of the squared error.
-        left: (N, m) the errors that remain, m, NaN where hidden.
-    """
-
-    what: str
-    shift: float
-    turn: float
-    explained: float
-    left: Tensor
+    what: str  # "the measuring device" or "the marker"
+    shift: float  # m, of the device at the middle of the rows
+    turn: float  # rad, 0 for a marker
+    explained: float  # part of the squared error
+    left: Tensor  # (N, m) the errors that remain, m, NaN where hidden
 
     @property
     def sentence(self) -> str:

@@ -20,6 +20,7 @@ from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.device_readings import FittedDevice
 from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.regression.conditional import Conditional, without_rigid_motions
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.kinds import WITHOUT_READINGS, known_kinds
@@ -27,9 +28,10 @@ from diffeo_calib.sensors.set_ups import frame_slopes
 
 
 class Scene(NamedTuple):
-    """M configurations as a robot or model has them.
+    """M configurations as a robot or model has them, and what is known there before the first measurement.
 
     Args:
+        known: the conditional. at: the configurations. first: number of the first new column.
         points: (M, m) coordinates of the markers, m.
         noise: (M, m, m) covariance of one measurement of them, m^2.
         base: (4, 4) the robot's base in their frame, m.
@@ -39,6 +41,9 @@ class Scene(NamedTuple):
         shifts: number c0 of the shifts that rows of the fit shared.
     """
 
+    known: Conditional
+    at: Linearisation
+    first: int
     points: Tensor
     noise: Tensor
     base: Tensor
@@ -46,6 +51,15 @@ class Scene(NamedTuple):
     seen: int
     free: bool = False
     shifts: int = 0
+
+    @property
+    def motions(self) -> list[int]:
+        """Numbers of the columns by motions of the base."""
+        return list(self.at.spec.nominal.places[:6])
+
+    def without_motions(self, known: Conditional, targets: Tensor) -> Conditional:
+        """Without the rigid motion that fits the errors at the targets best, where such motions are no errors."""
+        return without_rigid_motions(known, self.at.rows(targets), self.motions) if self.free else known
 
     def along(self, blocks: Tensor) -> Tensor:
         """Covariances of the markers, or of the origins of poses, from those of the points: (M, m, m) -> (M, r, r)."""
@@ -107,11 +121,11 @@ class Options(NamedTuple):
             before, devices, names = before + own, devices + len(part.names), names + part.names
         return cls._make([*(torch.cat(values) for values in zip(*found, strict=True)), names])
 
-    def linearised(self, at: Linearisation, shifts: int, first: int) -> Linearisation:
-        """What they report, with columns by the ``shifts`` of the fit, and by new ones from number ``first`` on."""
-        told = at.rows(self.rows).projected(self.slopes)
-        told = told.with_columns(self.shared[..., :shifts], len(at.spec.prior_variance))
-        return told.with_columns(self.shared[..., shifts:], first)
+    def linearised(self, scene: Scene) -> Linearisation:
+        """What they report, with columns by the shifts of the fit, and by new ones."""
+        told = scene.at.rows(self.rows).projected(self.slopes)
+        told = told.with_columns(self.shared[..., : scene.shifts], len(scene.at.spec.prior_variance))
+        return told.with_columns(self.shared[..., scene.shifts :], scene.first)
 
     def some(self, index: Tensor) -> Options:
         """Some of them."""
