@@ -193,7 +193,7 @@ class Devices(Extrinsics):
 
     @staticmethod
     def turned(values: Tensor, T: Tensor) -> Tensor:
-        """Readings (N, r) in another frame, to which T (4, 4) leads: others than these where they are along its axes."""
+        """Readings (N, r) in another frame, to which T (4, 4) leads: others only where they are along its axes."""
         return values
 
     @classmethod
