@@ -55,7 +55,8 @@ class Hypothesis(NamedTuple):
     Args:
         name: in words. effects: (N, r, U) derivatives of N rows by its unknowns, m. unit: of a single unknown, and its
             size in m, rad or relative; None to report the motion. fix: what to do about it.
-        about: :data:`CHANGE`, :data:`VALUE` or :data:`ROW`.
+        about: :data:`CHANGE`, :data:`VALUE` or :data:`ROW`. usual: its deviation in right rows, of a ratio that the fit
+            takes up; 0 for what it cannot tell from the robot's size.
     """
 
     name: str
@@ -63,6 +64,7 @@ class Hypothesis(NamedTuple):
     unit: tuple[str, float] | None = None
     fix: str = "name the rows before and after as two devices, or use those before or after it"
     about: str = CHANGE
+    usual: float = 0.0
 
     def amount(self, size: float, sign: str = "") -> str:
         """A size of its unknown, m, rad or relative, with its unit."""

@@ -17,8 +17,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
 from diffeo_calib.calibration.identification.identification import identify
-from diffeo_calib.calibration.identification.registration import register, register_inliers
+from diffeo_calib.calibration.identification.registration import register, register_inliers, spread
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherLabel, OtherRows, Seen, Settled, by_row
 from diffeo_calib.common.errors import MeasurementError, few, listed, sentence, warn_user
 from diffeo_calib.fitting.result import Progress
@@ -100,7 +102,14 @@ class Sessions(DeviceSet):
             start = register(robot, data.q, together.points, marker_tips(robot, data)).geometry
             geometry = identify(start, data.q, together.points).geometry
         away, numbers = (geometry.points(data.q) - together.points).norm(dim=2), found.session
-        return found, max(float(away[numbers == number].nanmedian()) for number in numbers.unique().tolist())
+        median, worst = max((float(away[numbers == one].nanmedian()), one) for one in numbers.unique().tolist())
+        alone = data.rows(numbers == worst).with_sessions(None)
+        if median > gates.GEOMETRIC_RESIDUAL * spread(alone.points):
+            try:
+                refuse_mistakes(robot, alone)
+            except MeasurementError as error:
+                raise MeasurementError(f"session '{found.names[worst]}': {error}") from error
+        return found, median
 
     @classmethod
     def around(cls, data: Measurements, kind: type[SetUps], geometry: Geometry, seen: Tensor) -> Sessions:

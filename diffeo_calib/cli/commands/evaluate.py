@@ -28,7 +28,7 @@ from diffeo_calib.kinematics.evaluation import (
     rows_of_other_frames,
     rows_used_in_fit,
 )
-from diffeo_calib.kinematics.joint_ranges import warn_outside_range
+from diffeo_calib.kinematics.joint_ranges import repeated_lines, warn_outside_range
 from diffeo_calib.measurements.csv.writing import write_rows
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, Evaluations
@@ -46,6 +46,7 @@ def run(options: EvaluateOptions) -> None:
     models.check_payload_column(model, source.table.payload)
     say(*models.provenance_lines(model))
     data = source.read(model.robot)
+    say(*repeated_lines(model, data.q))
     if options.free is not None:
         return _registered(model, data, options)
     check_rows(model, data)
