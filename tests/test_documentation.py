@@ -27,7 +27,7 @@ MOST_LINES = 130
 ELSEWHERE = {
     "camera.md": "scripts/examples/board_afternoon.py",
     "live.md": "tests/campaign",
-    "makers.md": "tests/cli/test_makers.py",
+    "makers.md": "tests/cli/test_column_names.py",
 }
 """Pages whose commands other tests run; here their options are checked."""
 

@@ -37,12 +37,11 @@ from kind_bank import (
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.cli import record
 from diffeo_calib.common.errors import DiffeoCalibError
+from diffeo_calib.reports.results import SCHEMA
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 
-SCHEMA = json.loads((Path(record.__file__).parent / "result.schema.json").read_text(encoding="utf-8"))
 NEW_ROWS_FACTOR = 1.6
 """A model of fewer or of newly placed rows may be worse than that of the fit by this factor."""
 EXPECTED_FACTOR = 2.5

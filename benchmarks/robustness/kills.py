@@ -27,7 +27,7 @@ import matplotlib.figure  # noqa: F401  # before the commands are forked
 import scipy.spatial.transform  # noqa: F401
 
 import diffeo_calib as dc
-from diffeo_calib.cli.commands import correct, evaluate, export, fit, predict  # noqa: F401
+from diffeo_calib.cli.commands import correct, evaluate, export, fit  # noqa: F401
 from diffeo_calib.cli.main import main as command_line
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat

@@ -16,8 +16,8 @@ from dataclasses import replace
 from functools import partial
 from typing import Literal
 
-from diffeo_calib.calibration.choose_scales import LIMITS as SCALE_LIMITS
 from diffeo_calib.calibration.choose_scales import (
+    FEWEST_POSES,
     RESIDUAL_TOLERANCE,
     ChosenScales,
     check_models,
@@ -27,7 +27,7 @@ from diffeo_calib.calibration.choose_scales import (
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import lengths, warn_of_lengths, worth_it
 from diffeo_calib.calibration.diagnostics.mixed_rows import other_payloads, two_tools
-from diffeo_calib.calibration.diagnostics.moved_devices import change_during
+from diffeo_calib.calibration.diagnostics.moved_devices import change_during, crooked_axis
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.outliers import (
     outliers,
@@ -155,9 +155,9 @@ def calibrate(
             calibration exceeds 5 % of the markers' spread and no other reading explains it; a column holds one value
             although the robot moves; the rows show no errors of the robot; too few poses to
             select scales; leave-one-out errors contradict the scales; during the measurements something moved or
-            drifted, a joint offset or a zero changed; a length of robot or device is not what it is said to be; wrong
-            rows follow one another; more than 40 % of the rows are outliers; the joint values are rounded and this
-            limits the accuracy.
+            drifted, a joint offset or a zero changed; a length of robot or device is not what it is said to be; a
+            guide is not straight or a bearing wobbles; wrong rows follow one another; more than 40 % of the rows are
+            outliers; the joint values are rounded and this limits the accuracy.
     """
     check_arguments(robot, measurements, hyperparameters)
     check_models(scales_of, robot)
@@ -224,7 +224,7 @@ def _result(
     model = CalibratedKinematics(robot, fitted_map, lever=placed.lever, ball=placed.ball)
     for devices in placed.placement:
         devices.warn_of_weakness(model)
-    least = gates.UNCHOSEN_FACTOR if len(data.x) < SCALE_LIMITS.fewest_poses else 1.0
+    least = gates.UNCHOSEN_FACTOR if len(data.x) < FEWEST_POSES else 1.0
     explained, found = parts(model), outliers(model, placed, data, chosen.judged, least)
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
     warn_of_outliers(found, placed.data)
@@ -251,7 +251,7 @@ def _result(
         rows=len(data.x),
         parts={part.name: part.displacement for part in explained},
         effective_parameters=chosen.left_out.effective,
-        length_in_doubt=warn_of_lengths(found_lengths),
+        length_in_doubt=max(warn_of_lengths(found_lengths) or 0.0, crooked_axis(data, scales) or 0.0) or None,
         warnings="\n".join(warned) or None,
     )
     return CalibrationResult(

@@ -26,8 +26,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.calibration.scales.gear_lines import LIMITS as LINE_LIMITS
-from diffeo_calib.calibration.scales.gear_lines import find_gear_lines
+from diffeo_calib.calibration.scales import gear_lines
 from diffeo_calib.calibration.scales.leave_one_out import (
     LeaveOneOut,
     cross_validated_inflation,
@@ -46,28 +45,16 @@ from diffeo_calib.maps.noise import Noise
 from diffeo_calib.process.scales import DEVIATIONS, SCALES, GearLine, Hyperparameters
 from diffeo_calib.robots.tree import Tree
 
-
-@dataclass(frozen=True)
-class ScaleLimits:
-    """When scales are selected, and when they are warned about.
-
-    Args:
-        fewest_poses: different poses below which the data cannot determine the scales: defaults are used.
-        noise_share: share of the registration's residual that counts as noise where the geometry has more parameters
-            than there are data.
-        fewest_judged: rows below which leave-one-out errors are too few to judge the scales.
-        variance_ratio: factor between leave-one-out and predicted variances from which the scales are warned about.
-        coordinates: measured coordinates of the random rows that stand for all rows where there are more.
-    """
-
-    fewest_poses: int = 12
-    noise_share: float = 0.3
-    fewest_judged: int = 30
-    variance_ratio: float = 2.5
-    coordinates: int = 8000
-
-
-LIMITS = ScaleLimits()
+FEWEST_POSES = 12
+"""Different poses below which the data cannot determine the scales: defaults are used."""
+NOISE_SHARE = 0.3
+"""Of the registration's residual, which counts as noise where the geometry has more parameters than there are data."""
+FEWEST_JUDGED = 30
+"""Rows below which leave-one-out errors are too few to judge the scales."""
+VARIANCE_RATIO = 2.5
+"""Factor between leave-one-out and predicted variances from which the scales are warned about."""
+MOST_COORDINATES = 8000
+"""Measured coordinates of the random rows that stand for all rows where there are more."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +104,7 @@ def choose_scales(
     Warns:
         DiffeoCalibWarning: too few poses to select scales; leave-one-out errors contradict the scales.
     """
-    rows, some = data.sample(len(data.x), LIMITS.coordinates, seed)
+    rows, some = data.sample(len(data.x), MOST_COORDINATES, seed)
     if len(rows) < len(data.x):
         stages, how = (registration, identification), {"given": given, "models": models}
         chosen = choose_scales(some, measurements[rows], *stages, **how, seed=seed, progress=progress)
@@ -138,15 +125,15 @@ def choose_scales(
         found = Selection(scales, f"those of {len(models)} other model{'s' * (len(models) > 1)}")
         data = weighed(data, scales, seed)
         return _inflated(found, None, data, measurements, seed=seed, progress=progress)
-    if poses < LIMITS.fewest_poses:
+    if poses < FEWEST_POSES:
         count = f"{poses} poses" if poses == len(measurements) else f"{poses} different poses"
-        fix = f"measure at least {LIMITS.fewest_poses} poses, better 60; trust held-out errors only"
+        fix = f"measure at least {FEWEST_POSES} poses, better 60; trust held-out errors only"
         warn_user(sentence(f"{count} are too few to select scales: defaults are used", fix=fix))
         found = Selection(centre, f"defaults, since {count} are too few to select them")
     else:
         found, data = _selected(centre, data, seed, progress)
         found = replace(found, scales=with_payload_factor(data, found.scales, seed))
-        if poses >= LINE_LIMITS.fewest_poses and not found.interrupted:
+        if poses >= gear_lines.FEWEST_POSES and not found.interrupted:
             found, data = _with_gear_lines(centre, found, data, seed, progress)
             centre = replace(centre, lines=found.scales.lines)
         centre = replace(centre, payload=found.scales.payload)
@@ -171,7 +158,7 @@ def _inflated(
     factor, row_scales, resting = 1.0, None, measurements.places >= 0
     if not bool(resting.all()):
         inflation: float | None = few
-        if centre is None or (poses >= LIMITS.fewest_poses and not found.interrupted):
+        if centre is None or (poses >= FEWEST_POSES and not found.interrupted):
             inflation = cross_validated_inflation(centre, found.scales, data, groups, seed=seed, progress=progress)
             found = replace(found, interrupted=inflation is None)
         factor = max(inflation or few, measurements.smallest_inflation)
@@ -189,7 +176,7 @@ def noise_of_few(data: TangentData, poses: int, registration: Identification, id
     """Noise of the geometric calibration; of the registration where geometry can fit the data exactly, m."""
     if poses * data.coordinates / len(data.x) > data.nominal.geometry.size:
         return identification.noise
-    return max(identification.noise, LIMITS.noise_share * registration.noise)
+    return max(identification.noise, NOISE_SHARE * registration.noise)
 
 
 def _selected(
@@ -216,7 +203,7 @@ def _with_gear_lines(
 ) -> tuple[Selection, TangentData]:
     """The same with the gear lines that the data show: the other scales and the weights follow from what is left."""
     progress("gear lines", 0, 1)
-    lines = find_gear_lines(data, found.scales, seed)
+    lines = gear_lines.find_gear_lines(data, found.scales, seed)
     if not lines:
         return found, data
     data, start = data.with_gear_lines(lines), replace(found.scales, lines=lines)
@@ -233,8 +220,8 @@ def _warn_of_wrong_scales(data: TangentData, left_out: LeaveOneOut) -> None:
     """Warn if leave-one-out errors differ from what the scales predict."""
     ratio = variance_ratio(data, left_out)
     # Predictions that are too wide are cautious, and a usual effect of outliers, unless the deviations were given.
-    overstated = data.noise_model.known is not None and ratio < 1 / LIMITS.variance_ratio
-    if len(data.x) >= LIMITS.fewest_judged and (overstated or ratio > LIMITS.variance_ratio):
+    overstated = data.noise_model.stated and ratio < 1 / VARIANCE_RATIO
+    if len(data.x) >= FEWEST_JUDGED and (overstated or ratio > VARIANCE_RATIO):
         fix = "trust held-out errors, not the predicted deviations; measure more poses"
         if overstated:
             fix = "the given standard deviations are larger than the errors: check `std` and its unit"

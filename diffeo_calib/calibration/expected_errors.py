@@ -17,7 +17,7 @@ is known as poorly: that of all joints is then no smaller than that of any robot
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import hypot
 from typing import Any
 
@@ -51,7 +51,7 @@ def workspace_deviation(fitted: FittedMap) -> float:
 
 def stands_free(model: CalibratedKinematics) -> bool:
     """Whether no device measured positions in the fit of a model: its frame is the robot's base."""
-    return model.map.unregistered.workspace is not None
+    return model.map.unregistered.stands_free
 
 
 OPEN_RATIO = 10.0
@@ -76,7 +76,7 @@ class ExpectedError:
         whole: the same with these places. measured: at the rows of the fit.
         open_places: names of these places.
         size: standard deviation of the robot's size, relative. size_share: its part of ``workspace``, from 0 to 1.
-        doubt: distance, m, by which points move with a length that is in doubt; it is in ``workspace`` and ``whole``.
+        doubt: distance, m, by which points move with what is in doubt; it is in ``workspace`` and ``whole``.
     """
 
     workspace: float
@@ -116,7 +116,7 @@ class ExpectedError:
         text = f"{1e3 * self.workspace:.3f} mm RMS"
         if self.doubt:
             settled = max(self.workspace**2 - self.doubt**2, 0.0) ** 0.5
-            text = f"{text}, with the length in doubt ({1e3 * settled:.3f} mm if it is right as given)"
+            text = f"{text}, with what is in doubt ({1e3 * settled:.3f} mm without it)"
         if self.open_places:
             what = f"{' and '.join(self.open_places)}, which the rows leave open"
             text = f"{text} apart from {what} ({1e3 * self.whole:.3f} mm with it)"
@@ -157,7 +157,9 @@ def expected_errors(
     def from_truth(points: Tensor) -> float:
         apart = found.without((points.flatten(1) - places).reshape(-1, 1)).view(places.shape) + places
         apart, targets = ((shown @ each[:, :, None]).view(-1, 3) for each in (apart, places))
-        apart = fitted.conditional.compared(apart, targets, rigid_fit)
+        if fitted.stands_free:
+            T = rigid_fit(apart, targets)
+            apart = apart @ T[:3, :3].mT + T[:3, 3]
         bodies = len(shown) // 3
         return float(((apart - targets).square().sum() / (len(q) * bodies) + own**2).sqrt())
 
@@ -237,11 +239,14 @@ def _places(model_map: FittedMap) -> tuple[Tensor, Tensor, Tensor]:
         known: Any = model_map.conditional
         rows = registration.q.to(q)
         return (known.root, *(known.slopes(model_map.linearised_value(at)[1]) for at in (q, rows)))
-    nominal, conditional = fitted.geodesic.spec.nominal, fitted.conditional
+    nominal = fitted.geodesic.spec.nominal
     own = torch.tensor(nominal.places, dtype=torch.int64, device=fitted.x.device)
     opened, theta = fitted.open_directions[own], q.new_zeros(nominal.parameters)
-    anywhere = conditional.compared_slopes(nominal.sensitivities(q, theta)[..., own].flatten(0, 1))
-    root, _ = roots(conditional.inner.posterior(fitted.parameters_as_points(own))[0] + opened @ opened.mT)
+    anywhere = nominal.sensitivities(q, theta)[..., own].flatten(0, 1)
+    if fitted.stands_free:
+        moved = anywhere[:, :6]
+        anywhere = anywhere - moved @ (torch.linalg.pinv(moved) @ anywhere)
+    root, _ = roots(fitted.with_motions.posterior(fitted.parameters_as_points(own))[0] + opened @ opened.mT)
     if registration is not None:  # its rows may show what those of the fit left open
         return root, anywhere, nominal.sensitivities(registration.q.to(q), theta)[..., own].flatten(0, 1)
     some = _some_rows(fitted.x)
@@ -291,7 +296,9 @@ def with_open_directions(fitted: FittedMap, measurements: Measurements, registra
     least[parts["joints"]] = (unseen[:, None] * twist).flatten()
     least[nominal.sag] = _unseen_sag(nominal, q)
     variance = torch.maximum(before, least.square())
-    return fitted if torch.equal(variance, before) else fitted.with_deformation(fitted.geodesic.with_prior(variance))
+    return (
+        fitted if torch.equal(variance, before) else replace(fitted, deformation=fitted.geodesic.with_prior(variance))
+    )
 
 
 def _unseen_sag(nominal: GeometryMap, q: Tensor) -> Tensor:

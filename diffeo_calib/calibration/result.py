@@ -29,7 +29,7 @@ from diffeo_calib.kinematics.transmission import NamedGearLine, gear_lines
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
 from diffeo_calib.sensors.known_drift import KnownDrift
-from diffeo_calib.sensors.places import Places
+from diffeo_calib.sensors.places import Places, joined
 from diffeo_calib.sensors.tables import with_positions
 
 STAGES = NOMINAL, GEOMETRIC, CALIBRATED = "nominal", "geometric", "calibrated"
@@ -127,8 +127,8 @@ class CalibrationResult:
     def places(self, stage: str = STAGES[-1]) -> Places:
         """Where the devices are as of a stage: frames of sessions, devices of readings."""
         devices = self.placed.devices_by_stage[STAGES.index(stage)]
-        by_key = {own.data.column_kind: found for own, found in zip(self.readings, devices, strict=True)}
-        return Places(self.placement, by_key, self.placed.ball)
+        others = [own.devices for own in self.placement if not own.devices.reads]
+        return Places(joined([*others, *devices]), self.placed.ball)
 
     @property
     def left_out(self) -> Evaluations:
@@ -196,4 +196,4 @@ def _rows(result: CalibrationResult, data: Any, errors: Any, kind: str) -> Any:
     if errors[kind] is not errors.positions:
         return own
     seen, drift = result.aligned(own.device_rows()), KnownDrift.of(result.model)
-    return seen if drift is None else drift.aligned(seen)
+    return seen if drift is None else drift.undone(seen)

@@ -14,14 +14,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.choose_scales import LIMITS as SCALE_LIMITS
-from diffeo_calib.calibration.choose_scales import choose_scales, noise_of_few, variance_ratio
+from diffeo_calib.calibration.choose_scales import VARIANCE_RATIO, choose_scales, noise_of_few, variance_ratio
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.moved_devices import changes_of
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.planning.candidates import candidates, ranges_around
 from diffeo_calib.calibration.planning.knowledge import greedy
-from diffeo_calib.calibration.scales.selection import SCALE_PRIOR, defaults
+from diffeo_calib.calibration.scales.selection import GROWTH, defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.campaign.verdicts import Seen, Verdict, find_change, measure
 from diffeo_calib.common.device import HOST
@@ -119,7 +118,7 @@ class CampaignModel:
                 known = replace(known, lines=())
             chosen = choose_scales(data, rows, *stages, given=known, seed=seed)
         ratio = variance_ratio(chosen.data, chosen.left_out) if first else 0.0
-        if ratio > SCALE_LIMITS.variance_ratio:  # around wrong places all later rows would be wrong
+        if ratio > VARIANCE_RATIO:  # around wrong places all later rows would be wrong
             expected, got = "squared errors of single rows as the others predict them", f"{ratio:.2g} times that"
             fix = "measure more rows, then the model is made"
             raise MeasurementError.of("the first rows do not fit together yet", expected=expected, got=got, fix=fix)
@@ -218,7 +217,7 @@ class CampaignModel:
             white.append(torch.linalg.solve_triangular(low, half.T, upper=False).flatten())
             slopes.append((value - value_before) / (2 * LOG_SCALE_STEP))
         W, g = torch.stack(white), torch.tensor(slopes, dtype=point.dtype, device=point.device)
-        F = 0.5 * W @ W.T + torch.eye(len(g), dtype=W.dtype, device=W.device) / SCALE_PRIOR.growth**2
+        F = 0.5 * W @ W.T + torch.eye(len(g), dtype=W.dtype, device=W.device) / GROWTH**2
         return float(g @ torch.linalg.solve(F, g)) ** 0.5
 
     @property
@@ -372,7 +371,7 @@ class CampaignModel:
 
         Without a measuring device rigid motions of all of them do not.
         """
-        q, shifts = self.asked[1], 0 if self.data.shared is None else self.data.shared.shape[2]
+        q, shifts = self.asked[1], self.data.shared.shape[2]
         at = replace(self.data, nominal=self.data.nominal.typical, x=q, shared=None, observe=None, beside=None)
         A, points = Bodies(self.placed.lever).averaging(at.points), at.points.unflatten(1, (-1, 3))
         nothing, S = points.new_zeros(len(q), len(A)), torch.nn.functional.pad(A @ at.sensitivities, (0, shifts))
@@ -396,7 +395,7 @@ def _flags(values: Sequence[bool]) -> Tensor:
 
 def _freedom(data: TangentData, row: int) -> int:
     """Degrees of freedom of the bodies that a row shows."""
-    return data.rows(torch.tensor([row], dtype=torch.int64, device=HOST)).measured_freedom
+    return int(data.noise_model.freedom[row][data.noise_model.seen[row]].sum())
 
 
 def limit_of(error: float, covariance: Tensor, scales_deviation: float) -> float:

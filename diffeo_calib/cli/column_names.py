@@ -121,6 +121,8 @@ def column(name: str) -> Column:
     for place, word in enumerate(words):  # the current position, not the current of a motor
         if word == "current" and {*words[place + 1 :]} & ({*WORDS["joint"], *WORDS["tool"], *"xyz"} - {"a"}):
             words[place] = "actual"
+    if words[-2:-1] in (["tvec"], ["rvec"]) and words[-1] in ("0", "1", "2"):  # of OpenCV
+        words[-1] = "xyz"[int(words[-1])]
     return Column(name, tuple(words), unit)
 
 

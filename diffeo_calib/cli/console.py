@@ -116,12 +116,16 @@ def plain(text: object) -> str:
     return escape("\n".join(printable(line) for line in str(text).split("\n")))
 
 
+KEYWORDS = "length angle joint_length sep decimal duplicates joints position marker rotation convention rotation_angle"
+KEYWORDS += " std rotation_std controls tip payload"
+"""Keywords of Python that are options."""
+
+
 def _as_options(text: str) -> str:
     """Keywords of Python as options: ``sep=';'`` -> ``--sep ';'``, `rotation_angle` -> --rotation-angle."""
-    given = r"\b(sep|decimal|angle|length|joint_length|convention|duplicates|position|joints|rotation_angle)=('[^']*')"
-    text = re.sub(given, lambda found: f"--{found[1].replace('_', '-')} {found[2]}", text)
-    named = r"`(length|joint_length|angle|rotation|convention|rotation_angle|std|rotation_std|controls|tip|payload)`"
-    return re.sub(named, lambda found: f"--{found[1].replace('_', '-')}", text)
+    names = KEYWORDS.replace(" ", "|")
+    text = re.sub(rf"\b({names})=('[^']*')", lambda found: f"--{found[1].replace('_', '-')} {found[2]}", text)
+    return re.sub(f"`({names})`", lambda found: f"--{found[1].replace('_', '-')}", text)
 
 
 INTERRUPTED = "interrupted before there was a result to keep"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import MISSING, dataclass
+from dataclasses import MISSING
 from pathlib import Path
 from typing import Literal
 
@@ -41,7 +41,6 @@ class Command(Options):
     """The options of a command; its work is ``run`` of the module of its name in ``commands``, which takes them."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class FitOptions(Command):
     """Calibrate a robot, test it on held-out rows, save the model.
 
@@ -75,7 +74,6 @@ class FitOptions(Command):
     duplicates: str = option("Exactly repeated rows: error, keep or drop.", default="error")
 
 
-@dataclass(frozen=True, kw_only=True)
 class CampaignOptions(Command):
     """Judge rows while they are measured.
 
@@ -104,7 +102,6 @@ class CampaignOptions(Command):
     accepted: Path | None = written("Table of the accepted rows to write when the campaign ends, for `fit`.", "CSV")
 
 
-@dataclass(frozen=True, kw_only=True)
 class RecordOptions(Command):
     """Turn a ROS bag into a table, one row for each stop.
 
@@ -127,7 +124,6 @@ class RecordOptions(Command):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class EvaluateOptions(Command):
     """Measure the errors of a model on a table of measurements.
 
@@ -149,7 +145,6 @@ class EvaluateOptions(Command):
     excludes = (("--tolerance --residuals", "--free"),)
 
 
-@dataclass(frozen=True, kw_only=True)
 class InitOptions(Command):
     """Propose the options of `fit` for a table and a robot.
 
@@ -165,7 +160,6 @@ class InitOptions(Command):
     force: bool = option("Replace a campaign file that was edited.", default=False)
 
 
-@dataclass(frozen=True, kw_only=True)
 class ImagesOptions(Command):
     """Find a printed board in a folder of images.
 
@@ -195,7 +189,6 @@ class ImagesOptions(Command):
     decimal: str = option("Decimal mark of both tables.", default=".")
 
 
-@dataclass(frozen=True, kw_only=True)
 class PredictOptions(Command):
     """Predict positions or poses for a table of joint values.
 
@@ -212,7 +205,6 @@ class PredictOptions(Command):
     payload: str | None = option(metavar="COLUMN")
 
 
-@dataclass(frozen=True, kw_only=True)
 class CorrectOptions(Command):
     """Correct a program, so that the robot goes where it is told.
 
@@ -256,7 +248,6 @@ class CorrectOptions(Command):
     payload: float | None = option(MASS, "MASS")
 
 
-@dataclass(frozen=True, kw_only=True)
 class ExportOptions(Command):
     """Write a model in the formats of other programs.
 
@@ -317,7 +308,6 @@ class ExportOptions(Command):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class PlanOptions(Command):
     """Plan which poses to measure, and say how many are needed.
 
@@ -359,7 +349,6 @@ class PlanOptions(Command):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class RecalibrateOptions(Command):
     """Say what has changed since a fit, or calibrate anew.
 
@@ -391,7 +380,6 @@ class RecalibrateOptions(Command):
     needs = (("--drift --note", "-o"),)
 
 
-@dataclass(frozen=True, kw_only=True)
 class ReportOptions(Command):
     """Write a report about a model, for a browser or a printer.
 
@@ -417,7 +405,6 @@ class ReportOptions(Command):
     needs = (("--position --socket --reading --length --angle --against", "CSV"),)
 
 
-@dataclass(frozen=True, kw_only=True)
 class DemoOptions(Command):
     """Simulate a robot and calibrate it as a user would.
 

@@ -106,11 +106,11 @@ def guess_sheet(path: Path) -> Sheet:
             continue
         lines, cells = zip(*rows, strict=True)
         columns = {name: texts for name, *texts in zip(file.header, *cells, strict=True) if name}
+        nameless = file.header == [str(k + 1) for k in range(len(columns))]
+        held = {name: texts for name, texts in columns.items() if not (nameless and _counts(texts))}
         for decimal in (mark for mark in DECIMALS if mark != sep):
-            numbers = tuple(name for name, texts in columns.items() if _readable(texts, decimal))
-            odd = [
-                cell for name in columns if name not in numbers for cell in _odd(name, lines, columns[name], decimal)
-            ]
+            numbers = tuple(name for name, texts in held.items() if _readable(texts, decimal))
+            odd = [cell for name in held if name not in numbers for cell in _odd(name, lines, held[name], decimal)]
             why = str(bad_cells(path, odd, "a number", number_hint(odd[0][2], decimal))) if odd else ""
             found.append(Sheet(path, sep, decimal, tuple(columns), numbers, tuple(file.notes), why))
     best = max(found, key=lambda sheet: len(sheet.numbers), default=None)
@@ -121,6 +121,12 @@ def guess_sheet(path: Path) -> Sheet:
         fix = "check that one line names the columns, and that the lines below hold numbers"
         raise MeasurementError.of(f"'{path}' is no table of numbers with any usual separator", fix=fix)
     return best
+
+
+def _counts(texts: Sequence[str]) -> bool:
+    """Whether a column numbers the rows, from any number on."""
+    first, *others = numbers_in(texts, ".")
+    return first is not None and first.is_integer() and others == [first + k for k in range(1, len(others) + 1)] != []
 
 
 def _readable(texts: Sequence[str], decimal: str) -> bool:
@@ -487,6 +493,10 @@ def with_places(csv: Path, given: Places, folder: Path) -> tuple[Path, list[Choi
         return csv, []
     joints, places = guess_sheet(csv), guess_sheet(given.places)
     common = {name: len({*own} & {*places.cells[name]}) for name, own in joints.cells.items() if name in places.cells}
+    if not common:  # columns that name the same rows
+        each = product(joints.cells.items(), places.cells.items())
+        pairs = [f"{own}={other}" for (own, names), (other, others) in each if sorted(names) == sorted({*others})]
+        common = dict.fromkeys(pairs if len(pairs) == 1 else [], 1)
     if given.by is None and not common:
         expected, got = "a column that both files have", " and ".join(few(own.header, 12) for own in (joints, places))
         fix = "add one, such as the number of the pose, or name two: --by COLUMN=OTHER"

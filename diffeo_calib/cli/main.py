@@ -57,7 +57,7 @@ JOINED = ("rotation-std",)
 """Entries that may be lists of columns although the option can be repeated."""
 LONGEST_FILE = 1 << 20
 """Bytes: a file of options is short."""
-IN_FILE_OF = {"report": "fit", "record": "images", "demo": "fit"}
+IN_FILE_OF = {"report": "fit", "record": "images", "demo": "fit", "predict": "evaluate"}
 """Command -> that whose file holds its work."""
 FORMER = {"compare": "recalibrate"}
 """Former name of a command -> that which does the same now."""
@@ -137,7 +137,7 @@ Json = Annotated[
         "--json",
         metavar="FILE",
         callback=_remember,
-        help="Also write the results to this file, for programs, as diffeo_calib/cli/result.schema.json says.",
+        help="Also write the results to this file, for programs.",
     ),
 ]
 

@@ -129,7 +129,7 @@ def provenance_lines(model: CalibratedKinematics) -> Iterator[str]:
         yield model.provenance.sentence(model.robot.name, len(model.configurations))
     drift = KnownDrift.of(model)
     if drift is not None:
-        yield from drift.sentences()
+        yield from drift.of_joints()
 
 
 def another_date_lines(model: CalibratedKinematics) -> Iterator[str]:

@@ -1,6 +1,6 @@
 """What an option is, and the groups of options that several commands share. Imports nothing slow: help appears at once.
 
-A group is a frozen dataclass whose fields are options, or groups of more of them.
+A group is a subclass of :class:`Options`: a frozen dataclass whose fields are options, or groups of more of them.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from dataclasses import MISSING, Field, dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
+
+from typing_extensions import dataclass_transform
 
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.table_format import described
@@ -83,6 +85,7 @@ class Option(NamedTuple):
         return cls(own.name, hint, own.default, names, (*names, how["metavar"])[0], kind, how)
 
 
+@dataclass_transform(frozen_default=True, kw_only_default=True)
 class Options:
     """A group of options.
 
@@ -93,6 +96,9 @@ class Options:
     needs: ClassVar[tuple[tuple[str, str], ...]] = ()
     excludes: ClassVar[tuple[tuple[str, str], ...]] = ()
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    def __init_subclass__(cls) -> None:
+        dataclass(frozen=True, kw_only=True)(cls)
 
     @classmethod
     @cache
@@ -140,7 +146,6 @@ MASS = "Mass that the robot carries, for a model with payloads."
 ROBOT = "The robot's description: a URDF, or a table of its Denavit-Hartenberg parameters, one line per joint."
 
 
-@dataclass(frozen=True, kw_only=True)
 class Units(Options):
     """How tables are written; a model knows that of the table of its fit."""
 
@@ -158,7 +163,6 @@ class Units(Options):
     decimal: str | None = option()
 
 
-@dataclass(frozen=True, kw_only=True)
 class Places(Options):
     """Measured places in a file of their own."""
 
@@ -173,7 +177,6 @@ class Places(Options):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class Rows(Places):
     """Columns of the measurements in a table, of any kinds."""
 
@@ -226,7 +229,6 @@ class Rows(Places):
         return any(text.startswith(CORNERS) for text in self.reading or ())
 
 
-@dataclass(frozen=True, kw_only=True)
 class Links(Options):
     """Which part of the robot in a file."""
 
@@ -242,7 +244,6 @@ class Links(Options):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class Robot(Options):
     """Which robot was measured; none where --robot-pose names commanded poses."""
 
@@ -250,7 +251,6 @@ class Robot(Options):
     robot: Path | None = option(ROBOT, "FILE")
 
 
-@dataclass(frozen=True, kw_only=True)
 class Targets(Options):
     """Columns of the poses that a tool shall have."""
 
@@ -262,7 +262,6 @@ class Targets(Options):
     rotation_angle: Angle | None = option()
 
 
-@dataclass(frozen=True, kw_only=True)
 class Candidates(Options):
     """Configurations to choose from: a table, or random ones within what the cell allows."""
 

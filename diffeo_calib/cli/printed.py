@@ -21,6 +21,7 @@ from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
+from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.poses import POINTS, rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.errors import SIZES, Evaluation, shown_unit
@@ -86,12 +87,11 @@ def parts_table(parts: Sequence[Part]) -> Table:
 
 def outlier_lines(outliers: Sequence[Outlier], rows: int, what: str = "training rows") -> Iterator[str]:
     """Sentences about rows that look wrong, the worst first; ``what`` the ``rows`` are."""
-    if not outliers:
-        return
     flagged = len({outlier.row for outlier in outliers})
-    kept = "" if outliers[0].weight is None else "; none was dropped"
-    yield f"{flagged} of {rows} {what} look wrong (numbers are lines of the file){kept}:"
-    for outlier in outliers[:MOST_OUTLIERS]:
+    for place, outlier in enumerate(outliers[:MOST_OUTLIERS]):
+        if place == 0:
+            kept = "" if outlier.weight is None else "; none was dropped"
+            yield f"{flagged} of {rows} {what} look wrong (numbers are lines of the file){kept}:"
         marker = "" if outlier.marker is None else f", marker {outlier.marker}"
         marker = f", {plain(outlier.tip)}" if outlier.tip is not None else marker
         weight = "" if outlier.weight is None else f", weight {outlier.weight:.2g}"
@@ -212,11 +212,8 @@ def parsed_limit(text: str | None) -> Limit | None:
         return None
     units = {kind.unit[0]: (kind.unit[0], 1.0) for kind in known_kinds().values()} | UNITS
     name = max((name for name in units if text.endswith(name)), key=len, default="")
-    try:
-        value = float(text.removesuffix(name)) if name else -1.0
-    except ValueError:
-        value = -1.0
-    if not 0.0 < value < inf:
+    value = number(text.removesuffix(name), ".") if name else None
+    if value is None or not 0.0 < value < inf:
         expected = "a length above zero with its unit, such as 0.15mm, or pixels, such as 0.5px"
         raise InputError.of(f"--tolerance {text}", expected=expected)
     unit, per_unit = units[name]

@@ -1,4 +1,4 @@
-"""Results of a command for programs: --json FILE. The format is that of result.schema.json, with its own version.
+"""Results of a command for programs: --json FILE, as reports/results.py says.
 
 A command adds its results while it runs. The file is written when the command ends, with its exit code, its warnings
 and its error if there was one. The result of an earlier run is removed before anything else: a command that ends before
@@ -22,13 +22,11 @@ import typer
 
 from diffeo_calib.common.errors import DiffeoCalibError, InputError
 from diffeo_calib.common.files import IMAGE_SUFFIXES, PROGRAM, check_writable, write_whole
+from diffeo_calib.reports.results import FORMAT, SIZES, VERSION
 
 if TYPE_CHECKING:
     from diffeo_calib.sensors.errors import Evaluation
 
-VERSION = 3
-"""Of the format. Entries may be added to one version; none is removed or changes its meaning."""
-FORMAT = "diffeo_calib result"
 OPTION = "--json"
 EXIT_ERROR, EXIT_INTERRUPTED = 1, 130
 
@@ -101,23 +99,22 @@ def remove_earlier(arguments: Sequence[str]) -> None:
                     path.unlink()
 
 
-NAMES = "rms", "median", "p95", "max"
 ERRORS = "errors"
 """As in sensors/errors.py, which loads torch."""
 
 
 def errors_entry(errors: Evaluation) -> dict[str, object]:
     """Errors of measured positions in m, and of orientations in degrees (null without), over some rows."""
-    entry = {"rows": errors.count} | {f"{name}_m": getattr(errors, name) for name in NAMES}
-    return entry | {f"angle_{name}_deg": getattr(errors.orientation, name, None) for name in NAMES}
+    entry = {"rows": errors.count} | {f"{name}_m": getattr(errors, name) for name in SIZES}
+    return entry | {f"angle_{name}_deg": getattr(errors.orientation, name, None) for name in SIZES}
 
 
 def kind_entry(errors: Evaluation) -> dict[str, object]:
     """Errors of rows of any kind in the unit in which they are shown, and of orientations in degrees."""
     unit, per_unit = errors.shown
     entry = {"rows": errors.count, "what": errors.what, "unit": unit}
-    entry |= {name: per_unit * getattr(errors, name) for name in NAMES}
-    return entry | {f"angle_{name}_deg": getattr(errors.orientation, name, None) for name in NAMES}
+    entry |= {name: per_unit * getattr(errors, name) for name in SIZES}
+    return entry | {f"angle_{name}_deg": getattr(errors.orientation, name, None) for name in SIZES}
 
 
 def entries_by_kind(found: Mapping[str, Any]) -> dict[str, Any]:

@@ -62,7 +62,7 @@ def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
     return replace(
         table,
         **{name: getattr(rows, name) for name in as_typed},
-        position=_position_triples(rows.position or []) or None,
+        position=[_split_names(text) for text in rows.position or ()] or None,
         rotation=_names_of_each(rows.rotation),
         lever=LEVER if rows.lever is None else rows.lever / table.per_metre,
         camera_on_tool=rows.camera_on_tool and not rows.images,
@@ -253,7 +253,8 @@ class ProgramTable:
             raise InputError.of("--position", expected=f"{tools} of them", got=len(position), fix=fix)
         turned = Rows(rotation=rotation, convention=given.convention, rotation_angle=given.rotation_angle)
         table = replace(with_rows(self.table, turned) if rotation else self.table, kinds=robot.kinds)
-        table = replace(table, joints=joint_columns(self.joints, robot), position=_position_triples(position))
+        names = [_split_names(text) for text in position]
+        table = replace(table, joints=joint_columns(self.joints, robot), position=names)
         data = read_observations(self.csv, table, duplicates="keep", growing=True)  # 0, 0, 0 is a target
         lines = [line for line, _ in read_cells(self.csv, table.sep, numeric_columns(table).names)[1]]
         if len(data) < len(lines):
@@ -314,14 +315,6 @@ def joint_columns(joints: str | PoseColumns | None, robot: Tree) -> list[str] | 
         order = ", ".join(robot.joint_names)
         raise InputError.of(f"--joints {joints}", expected=f"{robot.n} columns, in the order {order}", got=len(names))
     return names
-
-
-def _position_triples(position: list[str]) -> list[list[str]]:
-    triples = [_split_names(text) for text in position]
-    for triple in triples:
-        if len(triple) != 3:
-            raise typer.BadParameter(f"expected three columns X,Y,Z, got {','.join(triple)}", param_hint="--position")
-    return triples
 
 
 def _split_names(text: str) -> list[str]:

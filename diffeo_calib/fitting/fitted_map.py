@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -22,7 +22,7 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.regression.choose import condition, condition_controls
-from diffeo_calib.regression.conditional import Conditional, Opened, WithoutRigidMotions
+from diffeo_calib.regression.conditional import Conditional, Opened, without_rigid_motions
 from diffeo_calib.regression.control_points import ControlPointRegression
 
 PREDICT_ROWS, WORKSPACE_ROWS = 1024, 100  # number of configurations that are linearised together for their covariances
@@ -43,6 +43,7 @@ class of_origin(cached_property[T]):  # used like cached_property
 
 
 @methods_outside_inference_mode
+@dataclass(eq=False, repr=False)
 class FittedMap:
     """k1 = psi o k0 o phi^-1 with fitted momenta.
 
@@ -56,25 +57,31 @@ class FittedMap:
         y: (N, r) what was measured, or (N, m), m; None where it is not known (:meth:`measured` then derives it).
     """
 
-    def __init__(
-        self,
-        deformation: Deformation,
-        noise: Noise,
-        data: Tensor | None = None,
-        new_noise: Tensor | None = None,
-        workspace: Tensor | None = None,
-        *,
-        slopes: Tensor | None = None,
-        y: Tensor | None = None,
-    ) -> None:
-        self.deformation, self.noise, self.slopes, self.y = deformation, noise, slopes, y
-        self.data, self.workspace = data, workspace
-        self.new_noise = noise.covariance.mean(0) if new_noise is None else new_noise
+    deformation: Deformation
+    noise: Noise
+    data: Tensor | None = None
+    new_noise: Tensor = None  # pyright: ignore[reportAssignmentType]  # a tensor once it is made
+    workspace: Tensor | None = None
+    slopes: Tensor | None = field(default=None, kw_only=True)
+    y: Tensor | None = field(default=None, kw_only=True)
+    registration: Any = field(default=None, init=False)
+    """Result of a registration, where the map has been placed anew."""
+    _origin: FittedMap | None = field(default=None, init=False)
+    """The map with the nominal map of the fit, whose rows all covariances follow from."""
+
+    def __post_init__(self) -> None:
+        if self.new_noise is None:
+            self.new_noise = self.noise.covariance.mean(0)
 
     @property
     def x(self) -> Tensor:
         """(N, n) configurations of the fitted measurements."""
         return self.deformation.x if self.data is None else self.data
+
+    @property
+    def stands_free(self) -> bool:
+        """Whether no device measured places: rigid motions count for nothing in covariances."""
+        return self.workspace is not None
 
     @property
     def everywhere(self) -> Tensor:
@@ -88,15 +95,7 @@ class FittedMap:
 
     def without_rigid_motions(self) -> FittedMap:
         """The same map whose covariances leave out rigid motions over the joint ranges of its rows."""
-        return self._changed(workspace=self.everywhere)
-
-    def with_deformation(self, deformation: Deformation) -> FittedMap:
-        """The same map with another deformation at the same rows."""
-        return self._changed(deformation=deformation)
-
-    def _changed(self, **changes: Any) -> FittedMap:
-        parts = {name: getattr(self, name) for name in ("deformation", "noise", *TENSORS)}
-        return FittedMap(**parts | changes)
+        return replace(self, workspace=self.everywhere)
 
     @property
     def unregistered(self) -> FittedMap:
@@ -112,11 +111,6 @@ class FittedMap:
     def m(self) -> int:
         """Number of task coordinates."""
         return self.new_noise.shape[0]
-
-    registration: Any = None
-    """Result of a registration, where the map has been placed anew."""
-    _origin: FittedMap | None = None
-    """The map with the nominal map of the fit, whose rows all covariances follow from."""
 
     def with_nominal(self, nominal: NominalMap) -> FittedMap:
         """The same map around another nominal map with the same parameters, with what it knows of its covariances."""
@@ -139,7 +133,7 @@ class FittedMap:
         if device == self.x.device:
             return self  # with what it has computed for its covariances
         moved = {name: part.to(device) for name in TENSORS if (part := getattr(self, name)) is not None}
-        return self._changed(deformation=self.deformation.to(device), noise=self.noise.to(device), **moved)
+        return replace(self, deformation=self.deformation.to(device), noise=self.noise.to(device), **moved)
 
     def __call__(self, x: object) -> Tensor:
         """Calibrated task coordinates.
@@ -243,7 +237,7 @@ class FittedMap:
         """
         shifts = effects.new_zeros(*effects.shape[:2], len(columns))
         shifts[..., columns] = effects
-        return self.conditional.inner.posterior(at.with_columns(shifts, len(self.geodesic.spec.prior_variance)))
+        return self.with_motions.posterior(at.with_columns(shifts, len(self.geodesic.spec.prior_variance)))
 
     @of_origin
     def fitted_points(self) -> Tensor:
@@ -311,7 +305,7 @@ class FittedMap:
         spec = replace(spec, **kernels, prior_variance=factor * spec.prior_variance)
         noise = Noise(factor * self.noise.covariance, factor**0.5 * self.noise.shared)
         deformation = GeodesicDeformation(spec, old.x, momenta, old.integrator)
-        return self._changed(deformation=deformation, noise=noise, new_noise=factor * self.new_noise)
+        return replace(self, deformation=deformation, noise=noise, new_noise=factor * self.new_noise)
 
     def parameter_covariance(self, which: Tensor) -> Tensor:
         """Posterior covariance of the parameters theta with these numbers: (k,) -> (k, k) in m^2, m rad or rad^2."""
@@ -418,14 +412,19 @@ class FittedMap:
         return condition(at if slopes is None else at.projected(slopes), self.noise)
 
     @of_origin
+    def with_motions(self) -> Conditional:
+        """The same with what the data leave open."""
+        root = self.open_directions
+        many = root.shape[1]
+        return Opened(self.by_data, self.columns - many, root.new_ones(many)) if many else self.by_data
+
+    @of_origin
     def conditional(self) -> Conditional:
-        """The same without rigid motions where no device saw them, and with what the data leave open."""
-        found, around, root = self.by_data, self.geodesic, self.open_directions
-        if self.workspace is not None:
-            at = around.linearise(self.workspace)
-            found = WithoutRigidMotions(found, at, around.spec.nominal.places[:6])
-        first, many = self.columns - root.shape[1], root.shape[1]
-        return Opened(found, first, root.new_ones(many)) if many else found
+        """The same without rigid motions where no device saw them."""
+        if self.workspace is None:
+            return self.with_motions
+        at, base = self.geodesic.linearise(self.workspace), self.geodesic.spec.nominal.places[:6]
+        return without_rigid_motions(self.with_motions, at, base)
 
     def _configurations(self, x: object) -> Tensor:
         refuse_data_frame(x, "x")

@@ -6,7 +6,7 @@ The texts are Jinja templates in the folder ``c``; ``/*% ... %*/`` are statement
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from math import isinf
@@ -24,6 +24,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.kinematics.provenance import package_version
 from diffeo_calib.kinematics.tool import checked_tip, tool_transform
+from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.arrays import Array
 from diffeo_calib.runtime.chain import NominalChain, Sag
 from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow
@@ -62,10 +63,6 @@ class CFiles:
         """Bytes of the source."""
         return len(self.texts[0])
 
-    def write(self) -> None:
-        """Write both, or neither; InputError if that is not possible."""
-        write_together(self.contents)
-
 
 def write_c(
     model: CalibratedKinematics,
@@ -96,7 +93,7 @@ def write_c(
     other origin; a prefix that is no name in C.
     """
     files = c_files(model, path, tool, frame, prefix=prefix, tip=tip)
-    files.write()
+    write_together(files.contents)
     return files
 
 
@@ -138,20 +135,17 @@ def c_files(
         frame=inverse(program.chain.start) if frame == "base" else np.eye(4),
         limits=robot.limits.numpy(),
         robot=_comment(robot.name),
-        joints=[_comment(line) for line in _joints(model)],
+        joints=[_comment(line) for line in _joints(robot)],
         frame_name=FRAME_NAMES[frame],
         remarks=[_comment(line) for line in _remarks(model, chosen, carrier)],
     )
     return CFiles(source, header, name, texts)
 
 
-def _joints(model: CalibratedKinematics) -> list[str]:
-    units = {joint.name: "m" if joint.kind == "prismatic" else "rad" for joint in model.robot.joints}
-    lines = []
-    for name, (low, high) in zip(model.robot.joint_names, model.robot.limits.tolist(), strict=True):
+def _joints(robot: Tree) -> Iterator[str]:
+    for name, turns, (low, high) in zip(robot.joint_names, robot.periodic, robot.limits.tolist(), strict=True):
         limits = "no limits" if isinf(low) and isinf(high) else f"{low:.6g} to {high:.6g}"
-        lines.append(f"{name} [{units[name]}]: {limits}")
-    return lines
+        yield f"{name} [{'rad' if turns else 'm'}]: {limits}"
 
 
 def _remarks(model: CalibratedKinematics, tool: Array, tip: str) -> list[str]:
@@ -194,37 +188,40 @@ def c_source(
     for tip, run in groupby(program.on):
         runs.append((tip, first, len(list(run))))
         first += runs[-1][2]
-    contents = texts | {
-        "stem": stem,
-        "prefix": prefix,
-        "macro": prefix.upper(),
-        "n": chain.n,
-        "markers": len(program.markers),
-        "generated": f"{GENERATED} {package_version()}",
-        "lanes": LANES,
-        "tree": not chain.serial,
-        "parents": nominal.before[: joints + len(chain.tips)],
-        "on_path": nominal.ancestors[joints:][: len(chain.tips)] * 1,
-        "groups": runs,
-        "program_tip": program.tip,
-        "flows": flows,
-        "flow_names": [flow["name"] for flow in flows],
-        "profiles": sorted({term["term"].profile for term in terms}),
-        "widths": sorted({term["width"] for term in terms}),
-        "tabulated": any(flow["tables"] for flow in flows),
-        "chain": chain,
-        "nominal": nominal,
-        "waves": chain.waves,
-        "moving": joints,
-        "slides": not nominal.revolute.all(),
-        "coupled": not np.array_equal(nominal.coupling, np.eye(joints)) or bool(nominal.coupling_offset.any()),
-        "sag": None if chain.sag is None else _sag_constants(nominal, chain.sag),
-        "markers_in_flange": program.markers,
-        "tool_points": tool_points(tool, TOOL_LEVER),
-        "framed": not np.array_equal(frame, np.eye(4)),
-        "frame": frame,
-        "limits": limits,
-    }
+    contents = (
+        texts
+        | {
+            "stem": stem,
+            "prefix": prefix,
+            "macro": prefix.upper(),
+            "n": chain.n,
+            "markers": len(program.markers),
+            "generated": f"{GENERATED} {package_version()}",
+            "lanes": LANES,
+            "tree": nominal.before.tolist() != list(range(-1, joints)),  # more than joints that follow one another
+            "parents": nominal.before[: joints + len(chain.tips)],
+            "on_path": nominal.ancestors[joints:][: len(chain.tips)] * 1,
+            "groups": runs,
+            "program_tip": program.tip,
+            "flows": flows,
+            "flow_names": [flow["name"] for flow in flows],
+            "profiles": sorted({term["term"].profile for term in terms}),
+            "widths": sorted({term["width"] for term in terms}),
+            "tabulated": any(flow["tables"] for flow in flows),
+            "chain": chain,
+            "nominal": nominal,
+            "waves": chain.waves,
+            "moving": joints,
+            "slides": not nominal.revolute.all(),
+            "coupled": not np.array_equal(nominal.coupling, np.eye(joints)) or bool(nominal.coupling_offset.any()),
+            "sag": None if chain.sag is None else _sag_constants(nominal, chain.sag),
+            "markers_in_flange": program.markers,
+            "tool_points": tool_points(tool, TOOL_LEVER),
+            "framed": not np.array_equal(frame, np.eye(4)),
+            "frame": frame,
+            "limits": limits,
+        }
+    )
     source, header = (_ENVIRONMENT.get_template(f"model.{kind}.jinja").render(contents) for kind in ("c", "h"))
     return source, header
 

@@ -28,10 +28,7 @@ Header = dict[str, Any]
 
 
 def read_arrays(path: Path) -> tuple[Header, dict[str, np.ndarray]]:
-    """Header and arrays of a file, after checking its format and checksum.
-
-    Raises ModelFileError: the file cannot be read, or has another format or a wrong checksum.
-    """
+    """Header and arrays of a file; ModelFileError: it cannot be read, or has another format or a wrong checksum."""
     if not path.is_file():
         raise ModelFileError.of(f"there is no model file {path}", fix="check the path")
     unreadable, written = f"{path} cannot be read as a model file", "pass a file written by `save` or `fit -o`"

@@ -74,7 +74,12 @@ def mjcf_text(geometry: Geometry) -> str:
     if mimics := [joint for joint in chain.joints if joint.mimic is not None]:
         together = etree.SubElement(root, "equality")
         for joint in mimics:
-            etree.SubElement(together, "joint", **_following(joint, chain))
+            (driver, factor), *others = (joint.mimic or {"": 0.0}).items()
+            if others or driver not in chain.moving_names:
+                fix, expected = "write a URDF, or the whole model as a program", "one joint of the chain that drives it"
+                raise InputError.of(f"mimic joint '{joint.name}'", expected=expected, got=joint.mimic, fix=fix)
+            follows = {"joint2": driver, "polycoef": f"{joint.mimic_offset!r} {factor!r} 0 0 0"}
+            etree.SubElement(together, "joint", joint1=joint.name, **follows)
     return etree.tostring(root, pretty_print=True, encoding="unicode")
 
 
@@ -84,16 +89,6 @@ def _motion(joint: Joint) -> dict[str, str]:
     if isfinite(joint.lower) and isfinite(joint.upper) and joint.kind != "continuous" and joint.lower < joint.upper:
         found["range"] = f"{joint.lower!r} {joint.upper!r}"
     return found
-
-
-def _following(joint: Joint, chain: Tree) -> dict[str, str]:
-    """A mimic joint as a polynomial of the joint that drives it."""
-    drivers = list((joint.mimic or {}).items())
-    if len(drivers) != 1 or drivers[0][0] not in chain.moving_names:
-        fix, expected = "write a URDF, or the whole model as a program", "one joint of the chain that drives it"
-        raise InputError.of(f"mimic joint '{joint.name}'", expected=expected, got=drivers, fix=fix)
-    (driver, factor), *_ = drivers
-    return {"joint1": joint.name, "joint2": driver, "polycoef": f"{joint.mimic_offset!r} {factor!r} 0 0 0"}
 
 
 def _links(chain: Tree) -> dict[str, tuple[str, Any]]:

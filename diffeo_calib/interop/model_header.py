@@ -31,6 +31,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
 from diffeo_calib.kinematics.provenance import Provenance, Summary, entries_of, record_of
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
+from diffeo_calib.kinematics.tool import tool_transform
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
@@ -116,7 +117,7 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
     if isinstance(model, CalibratedKinematics):
         tensors |= {name: getattr(model, name) for name in ROBOT_TENSORS}
         known = {
-            "tool": model.tool.tolist() if model.has_tool else None,
+            "tool": None if torch.equal(model.tool, tool_transform(None)) else model.tool.tolist(),
             "tool_tip": model.tool_tip,
             "urdf": model.robot.source,
             "provenance": None if model.provenance is None else entries_of(model.provenance),

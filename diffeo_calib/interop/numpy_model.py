@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from diffeo_calib.common.errors import InputError, ModelFileError, as_written
 from diffeo_calib.interop.container import UNSOUND, Header, read_arrays
 from diffeo_calib.runtime.arrays import MOST_STEPS, TABLEAUS, Array
 from diffeo_calib.runtime.build import active_joints, calibrated_chain, nominal_chain, recorded_flow, recorded_stages
-from diffeo_calib.runtime.chain import waves_of
+from diffeo_calib.runtime.chain import tip_poses
 from diffeo_calib.runtime.program import FRAMES, Program
 
 
@@ -110,8 +109,7 @@ def load_numpy(path: str | os.PathLike[str]) -> NumpyKinematics:
     """
     header, arrays = read_arrays(Path(path))
     try:
-        program = _program(header, arrays)
-        joints = active_joints(header["nominal"])
+        program, joints = _program(header, arrays), active_joints(header["nominal"])
         limits = np.array([[joint["lower"], joint["upper"]] for joint in joints], dtype=np.float64)  # None is NaN
         limits = np.where(np.isnan(limits), [-np.inf, np.inf], limits)
         tool = np.array(header.get("tool", np.eye(4)), dtype=np.float64)
@@ -145,14 +143,13 @@ def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
     waves, theta, size = nominal.get("waves", []), arrays.get("unladen_theta", arrays["theta"]), 6 + 6 * len(chain.axes)
     shifts, last = theta[size : size + tool.size].reshape(-1, 3), len(theta) - 2 * len(waves)
     sag = theta[size + tool.size : last] if nominal["elastic"] else None
-    k0 = calibrated_chain(chain, arrays["base"], arrays["joint_errors"], theta, sag)
-    k0 = replace(k0, waves=waves_of(waves, k0.n, theta[last:]))
+    k0 = calibrated_chain(chain, arrays["base"], arrays["joint_errors"], theta, sag, waves=(waves, theta[last:]))
     tableau, steps = TABLEAUS[integrator["kind"]](), integrator["steps"]
     if not isinstance(steps, int) or isinstance(steps, bool) or not 1 <= steps <= MOST_STEPS:
         expected = f"an integer of at least 1 and at most {MOST_STEPS}"
         raise InputError.of("the number of time steps", expected=expected, got=as_written(steps))
     joint, xi = recorded_stages(kernels[0], arrays["x"], arrays["momenta_x"], tableau, steps)
-    tip, markers = k0.poses(xi[0])[:, on], tool + shifts  # (N, P, 4, 4); of every control those of its session
+    tip, markers = tip_poses(k0, xi[0])[:, on], tool + shifts  # (N, P, 4, 4); of every control those of its session
     if "session" in arrays:
         markers = (arrays["session_tools"] + shifts)[arrays["session"].astype(np.int64)]
     z0 = (tip[..., :3, :3] @ markers[..., None])[..., 0] + tip[..., :3, 3]

@@ -15,7 +15,7 @@ the model's where the measured poses can hardly tell one from the other (a tool 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from math import sqrt
 from typing import NamedTuple
@@ -94,12 +94,15 @@ def rigid_kinematics(model: CalibratedKinematics, *, transmission: bool = False)
     if start.markers != own.markers:  # a registration found others
         start = start.with_tool(own.tool, own.on)
     first = identify(start, on.x, on.y)  # prior deviations by maximum likelihood
-    candidates = {PROJECTION: _refit(model, on, like=first)}
+    fits: dict[str, Callable[[Compared], Geometry]] = {PROJECTION: lambda rows: _refit(model, rows, like=first)}
     if model.rigid_errors is not None and not transmission:
-        candidates[GEOMETRIC] = _placed(model, model.rigid_errors, on)
-    validated = _validate(model, candidates, first, on)
+        fits[GEOMETRIC] = lambda rows: _placed(model, model.rigid_errors, rows)
+    fold, validated = torch.randperm(len(on.x), generator=seeded(0), device=HOST) % FOLDS, dict[str, float]()
+    for name, fit in fits.items():
+        parts = [on.rows(fold == k).distances(fit(on.rows(fold != k))) for k in range(min(FOLDS, len(fold)))]
+        validated[name] = float(torch.cat([part.square().flatten() for part in parts]).mean().sqrt())
     how = min(validated, key=lambda name: validated[name])
-    return on.compared(candidates[how], how, validated)
+    return on.compared(fits[how](on), how, validated)
 
 
 def geometry_of(kinematics: CalibratedKinematics | Geometry) -> Geometry:
@@ -184,10 +187,10 @@ class Compared(NamedTuple):
 
 
 def _with_errors(
-    model: CalibratedKinematics, joint_errors: Tensor | None, how: str, *, transmission: bool = False
+    model: CalibratedKinematics, errors: Tensor | None, how: str, *, transmission: bool = False
 ) -> RigidKinematics:
     on = Compared.of(model, transmission=transmission)
-    return on.compared(_placed(model, joint_errors, on), how, {})
+    return on.compared(_placed(model, errors, on), how, {})
 
 
 def _noise(rms: float) -> float:
@@ -215,19 +218,3 @@ def _placed(model: CalibratedKinematics, joint_errors: Tensor | None, on: Compar
     near = identify(start, on.x, on.y, noise=_noise(best.rms), prior=prior)
     found = near if near.rms < TOLERATED_RMS_RATIO * best.rms + SMALLEST_NOISE_M else best
     return replace(found.geometry, joint_errors=start.joint_errors)
-
-
-def _validate(
-    model: CalibratedKinematics, candidates: Mapping[str, Geometry], first: Identification, on: Compared
-) -> dict[str, float]:
-    """RMS distance of each candidate from the model at configurations left out of its fit, m."""
-    fold = torch.randperm(len(on.x), generator=seeded(0), device=HOST) % FOLDS
-    squares: dict[str, list[Tensor]] = {name: [] for name in candidates}
-    for out in (fold == k for k in range(min(FOLDS, len(fold)))):
-        kept = on.rows(~out)
-        for name, geometry in candidates.items():
-            again = (
-                _refit(model, kept, like=first) if name == PROJECTION else _placed(model, geometry.joint_errors, kept)
-            )
-            squares[name].append(on.rows(out).distances(again).square().flatten())
-    return {name: float(torch.cat(parts).mean().sqrt()) for name, parts in squares.items()}

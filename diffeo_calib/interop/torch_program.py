@@ -157,7 +157,7 @@ class TorchProgram(nn.Module):
         self.output = output
         self.to_frame: Tensor | None
         self.register_buffer("to_frame", None)
-        deformation: Any = (model.map if isinstance(model, CalibratedKinematics) else model).deformation
+        deformation: Any = _map_of(model).deformation
         self.of_robot = robot
         program, marks = program_of(deformation) if robot else None, None
         if isinstance(model, CalibratedKinematics) and output == "tool_poses":
@@ -197,12 +197,8 @@ def export_torch(
     """Write a calibrated model as a program of torch, which runs without this package.
 
     ``torch.export.load(path).module()`` is a function of q (N, n) for any number N of rows; AOTInductor compiles the
-    file for C++. It holds what :class:`TorchProgram` computes, and no checks of its input other than its type and
-    number of columns.
-
-    Args:
-        model, output, tool, frame, dtype: see :class:`TorchProgram`.
-        path: the file, ``*.pt2``; an existing file is replaced atomically.
+    file for C++. It holds what :class:`TorchProgram`, with these arguments, computes, and no checks of its input other
+    than its type and number of columns. ``path`` is ``*.pt2``; an existing file is replaced atomically.
 
     Raises InputError: as :class:`TorchProgram`, or a file that cannot be written. NumericalError: the program disagrees
     with the model.
@@ -231,14 +227,11 @@ def export_onnx(
     frame: str = "base",
     dtype: torch.dtype = torch.float64,
 ) -> None:
-    """Write a calibrated model as an ONNX file, for onnxruntime and other programs.
+    """Write a calibrated model as an ONNX file ``*.onnx``, for onnxruntime and other programs.
 
     Its input ``q`` is (N, n) with any number N of rows, its output has the name of ``output``. It holds what
-    :class:`TorchProgram` computes. Needs the packages onnx and onnxscript: ``pip install diffeo_calib[onnx]``.
-
-    Args:
-        model, output, tool, frame, dtype: see :class:`TorchProgram`.
-        path: the file, ``*.onnx``; an existing file is replaced atomically.
+    :class:`TorchProgram`, with these arguments, computes. An existing file is replaced atomically. Needs the packages
+    onnx and onnxscript: ``pip install diffeo_calib[onnx]``.
 
     Raises InputError: as :class:`TorchProgram`, packages that are not installed, or a file that cannot be written.
     """
@@ -292,9 +285,13 @@ def _description(model: CalibratedKinematics | FittedMap, output: str, frame: st
     return found
 
 
+def _map_of(model: CalibratedKinematics | FittedMap) -> FittedMap:
+    return model.map if isinstance(model, CalibratedKinematics) else model
+
+
 def _example(model: CalibratedKinematics | FittedMap, dtype: torch.dtype) -> Tensor:
     """Some configurations of the fit."""
-    x = (model.map if isinstance(model, CalibratedKinematics) else model).x
+    x = _map_of(model).x
     return x[torch.arange(EXAMPLE_ROWS, device=x.device) % len(x)].detach().to(dtype)
 
 
@@ -302,17 +299,18 @@ def _check_arguments(model: CalibratedKinematics | FittedMap, output: str, tool:
     if not isinstance(model, (CalibratedKinematics, FittedMap)):
         fix = "pass `result.model` or `fit.model`"
         raise InputError.of("`model`", expected="a calibrated model", got=type(model).__name__, fix=fix)
-    known = OUTPUTS if isinstance(model, CalibratedKinematics) else OUTPUTS[:1]
+    robot = model if isinstance(model, CalibratedKinematics) else None
+    known = OUTPUTS[:1] if robot is None else OUTPUTS
     if output not in known:
         raise InputError.of("`output`", expected=" or ".join(map(repr, known)), got=as_written(output))
-    if output == "poses" and isinstance(model, CalibratedKinematics) and model.lever is None:
+    if output == "poses" and robot is not None and robot.lever is None:
         what, fix = "this model was calibrated with points: it has no poses", 'ask for "tool_poses" or "points"'
         raise InputError.of(what, fix=fix)
     if tool is not None and output != "tool_poses":
         raise InputError.of("`tool` was given", expected='output="tool_poses"', got=as_written(output))
     if dtype not in PRECISIONS:
         raise InputError.of("`dtype`", expected="torch.float64 or torch.float32", got=as_written(dtype))
-    fitted = model.map if isinstance(model, CalibratedKinematics) else model
+    fitted = _map_of(model)
     deformation, got = fitted.deformation, f"the {fitted.formulation} one"
     if not isinstance(deformation, GeodesicDeformation):
         raise InputError.of("`model`", expected="an exact model", got=got, fix='fit with formulation="exact"')

@@ -73,9 +73,13 @@ class Kernel(ABC):
             rows = [_slope(v[:, k].sum(), at, graph) for k in range(v.shape[1])]
         return (v if graph else v.detach()), torch.stack(rows, 1)
 
-    def gradient(self, x: Tensor, c: Tensor, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradient of sum_ij c_i^T K(x_i, q_j) a_j in c, which is v(x), and in x: (M, n) each."""
-        graph = _recorded(x, c, q, a)
+    def gradient(self, x: Tensor | None, c: Tensor, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient of sum_ij c_i^T K(x_i, q_j) a_j in c, which is v(x), and in x: (M, n) each.
+
+        Args:
+            x: (M, n), or None for the control points q themselves, with c = a. c: (M, n). q, a: as :meth:`field`.
+        """
+        x, graph = (q if x is None else x), _recorded(x, c, q, a)
         with torch.enable_grad():
             at = _copy_of(x, graph)
             v = self.field(at, q, a)
@@ -84,7 +88,7 @@ class Kernel(ABC):
 
     def hamiltonian_gradient(self, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
         """Gradient of H(q, a) = 1/2 sum_ij a_i^T K(q_i, q_j) a_j in a, which is v(q), and in q: (N, n) each."""
-        return self.gradient(q, a, q, a)
+        return self.gradient(None, a, q, a)
 
     def hessian_product(self, q: Tensor, a: Tensor, dq: Tensor, da: Tensor) -> tuple[Tensor, Tensor]:
         """Derivative of H's gradient (dH/da, dH/dq) along (dq, da): (N, n) each."""

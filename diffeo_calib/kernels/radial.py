@@ -224,23 +224,16 @@ class RadialKernel(Kernel):
         dv = features.pull(at[:, None, :], slope)  # (M, r, D) -> (M, r, n)
         return self._expand(v, n), self._expand(dv.mT, n).mT
 
-    def gradient(self, x: Tensor, c: Tensor, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
+    def gradient(self, x: Tensor | None, c: Tensor, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
         check_points(x, q, a)
-        check_points(None, x, c)
+        at, n = (q if x is None else x), q.shape[-1]
+        check_points(None, at, c)
         if self._field_vanishes(a):
-            return torch.zeros_like(x), torch.zeros_like(x)
-        features = self._features(x.shape[-1])
-        rows = Points(features.lift(x), self._reduce(c))
+            return torch.zeros_like(at), torch.zeros_like(at)
+        features = self._features(n)
+        rows = None if x is None else Points(features.lift(x), self._reduce(c))
         v, g = self._sum(GRADIENT, rows, Points(features.lift(q), self._reduce(a)))
-        return self._expand(v, x.shape[-1]), features.pull(x, g)
-
-    def hamiltonian_gradient(self, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
-        check_points(None, q, a)
-        if self._field_vanishes(a):
-            return torch.zeros_like(q), torch.zeros_like(q)
-        features = self._features(q.shape[-1])
-        v, g = self._sum(GRADIENT, None, Points(features.lift(q), self._reduce(a)))
-        return self._expand(v, q.shape[-1]), features.pull(q, g)
+        return self._expand(v, n), features.pull(at, g)
 
     def hessian_product(self, q: Tensor, a: Tensor, dq: Tensor, da: Tensor) -> tuple[Tensor, Tensor]:
         check_points(None, q, a)

@@ -88,24 +88,13 @@ class CalibratedKinematics:
     ) -> None:
         self.bodies = Bodies(lever)
         self.bodies.check_points(map.m // 3)
-        self.robot = robot
-        self.map = map
-        self.summary = summary
-        self.lever = lever
+        self.robot, self.map, self.summary, self.lever = robot, map, summary, lever
         self.tool = tool_transform(tool)
         self.tool_tip = None if tool_tip is None else checked_tip(robot, tool_tip)
         known = rigid_errors is not None
         self.rigid_errors = replace(self.nominal.geometry, joint_errors=rigid_errors).joint_errors if known else None
-        self.provenance = provenance
+        self.provenance, self.placement, self.scales, self.learnt = provenance, placement, scales, learnt
         self.ball = ball or map.workspace is not None
-        self.placement = placement
-        self.scales = scales
-        self.learnt = learnt
-
-    @property
-    def has_tool(self) -> bool:
-        """Whether there is a tool centre point apart from the tip."""
-        return not torch.equal(self.tool, tool_transform(None))
 
     def with_tool(self, tool: object, tip: str | None = None) -> CalibratedKinematics:
         """The same model with another tool centre point in the tip's frame, (4, 4) or position (3,) in m.
@@ -165,11 +154,7 @@ class CalibratedKinematics:
         return self._with(provenance=provenance)
 
     def with_fit(self, fitted: FittedMap, provenance: Provenance, *, ball: bool | None = None) -> CalibratedKinematics:
-        """The same robot with its tool and another fit, which replaces what a registration found.
-
-        Args:
-            fitted: its map. provenance: where it comes from. ball: see the class; as before by default.
-        """
+        """The same robot with its tool and another fit, which replaces what a registration found."""
         changes = {"map": fitted, "provenance": provenance, "placement": (), "learnt": None}
         return self._with(**changes, ball=self.ball if ball is None else ball)
 
@@ -280,7 +265,7 @@ class CalibratedKinematics:
 
     @property
     def markers(self) -> int:
-        """P, the number of markers; a model of poses represents every pose by three points."""
+        """P, the number of markers; three for every frame of a model of poses."""
         return self.map.m // 3
 
     @property
@@ -349,12 +334,9 @@ class CalibratedKinematics:
         """
         q = self._joints(q)
         known = self.map.deformation.at_controls(q) if takes_program(q) else None
-        if known is not None:
-            return known.unflatten(1, (-1, 3))
-        program = self._program_for(q)
-        if program is not None:
+        if known is None and (program := self._program_for(q)) is not None:
             return torch.from_numpy(program.points(q.numpy()))
-        return self.map.deformation(q).unflatten(1, (-1, 3))
+        return (self.map.deformation(q) if known is None else known).unflatten(1, (-1, 3))
 
     def poses(self, q: object) -> Tensor:
         """Poses of the measured frame in the measuring frame, by a least-squares fit to its three points.
@@ -365,8 +347,7 @@ class CalibratedKinematics:
         Raises:
             InputError: wrong shape, values that are not finite, or a model that was not calibrated with poses.
         """
-        lever = self.bodies.pose_lever()
-        return of_frames(frames_of_points(self(q), lever))
+        return of_frames(frames_of_points(self(q), self.bodies.pose_lever()))
 
     def predict_poses(self, q: object, *, noise: bool = True) -> tuple[Tensor, Tensor]:
         """Poses and their covariances; see :meth:`predict`.
@@ -393,8 +374,7 @@ class CalibratedKinematics:
     def jacobian(self, q: object) -> Tensor:
         """Exact derivative of the markers by the joints: (N, n) -> (N, P, 3, n), m/rad or m/m; raises like the call."""
         q = self._joints(q)
-        program = self._program_for(q)
-        if program is not None:
+        if (program := self._program_for(q)) is not None:
             return torch.from_numpy(program.points_and_jacobian(q.numpy())[1])
         return self.map.deformation.jacobian(q).unflatten(1, (-1, 3))
 

@@ -26,6 +26,9 @@ from diffeo_calib.sensors.devices import Devices, Extrinsics
 from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import MountedMarkers, seen_mounted
 
+MOTION_SHARE = 0.01
+"""Effects of a shift of a fit that differ from a motion by less than this share are those of the motion."""
+
 
 @dataclass(frozen=True, eq=False)
 class PredictedReadings:
@@ -49,22 +52,31 @@ class PredictedReadings:
         return self.covariance.diagonal(dim1=1, dim2=2).clamp(min=0).sqrt()
 
 
-class FittedDevice(NamedTuple):
-    """A device of readings beside a fit, where the model has it.
+def own_shifts(shared: Tensor, slopes: Tensor) -> tuple[Tensor, Tensor]:
+    """Shifts of a fit that are motions of one device: which (c,) of them, boolean, and these motions (k, k').
 
     Args:
-        devices: it alone, with the standard deviations of its k unknowns after the rows on which it was placed.
-        columns: (c,) boolean, its unknowns among the shifts of the fit; None for a device that measured no row of the
-            fit, or of a model that was moved since.
-        root: (k, k) root of the prior covariance of its unknowns, in the order of these columns; without them of the
-            covariance by the rows on which it was placed.
-        noise: (r, r) of a reading by its rows of the fit, m^2; None without any.
+        shared: (M, r, c) effects of all shifts on its rows. slopes: (M, r, k) of these rows by motions of the device.
     """
+    columns, slopes = (shared != 0).any(1).any(0), slopes.flatten(0, 1)
+    effects = shared[..., columns].flatten(0, 1)
+    motions = torch.linalg.pinv(slopes) @ effects
+    rigid = (effects - slopes @ motions).norm(dim=0) < MOTION_SHARE * effects.norm(dim=0)
+    columns[columns.clone()] = rigid
+    return columns, motions[:, rigid]
 
-    devices: Devices
+
+class FittedDevice(NamedTuple):
+    """A device of readings beside a fit, where the model has it."""
+
+    devices: Devices  # it alone, with the standard deviations of its k unknowns after the rows on which it was placed
+    # (k, k') what each of these does to its unknowns; without them the root of their covariance by the rows on which it
+    # was placed
     root: Tensor
+    # (c,) boolean, the shifts of the fit that move it; None for a device that measured no row of the fit, or of a model
+    # that was moved since
     columns: Tensor | None = None
-    noise: Tensor | None = None
+    noise: Tensor | None = None  # (r, r) of a reading by its rows of the fit, m^2; None without any
 
     @classmethod
     def of(cls, fitted: FittedMap, own: PlacedDevices, number: int) -> FittedDevice:
@@ -76,13 +88,10 @@ class FittedDevice(NamedTuple):
             return placed
         numbers, shared = fitted.noise.visible[rows][0], fitted.noise.shared[rows]
         placed = placed._replace(noise=fitted.noise.covariance[rows][:, numbers][:, :, numbers].median(0).values)
-        columns = (shared != 0).any(1).any(0)
-        if fitted.registration is not None or fitted.slopes is None or int(columns.sum()) != len(deviations):
-            return placed
         slopes = placed.by_increments(fitted.fitted_points[rows, -3 * devices.seen_points :])
-        effects = shared[:, numbers][..., columns]
-        root = torch.linalg.lstsq(slopes.flatten(0, 1), effects.flatten(0, 1), driver="gelsd").solution
-        return placed._replace(columns=columns, root=root)
+        columns, root = own_shifts(shared[:, numbers], slopes)
+        known = fitted.registration is None and bool(columns.any())
+        return placed._replace(columns=columns, root=root) if known else placed
 
     def by_increments(self, points: Tensor) -> Tensor:
         """(N, r, k) derivatives of readings of points (N, 3 P'), which it sees, by its unknowns, m."""
@@ -105,22 +114,15 @@ class FittedDevice(NamedTuple):
 
 
 def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[PredictedReadings]:
-    """Predicted readings of every device that a model knows; empty for devices that measure coordinates.
-
-    Args:
-        model: calibrated. q: (N, n) configurations. noise: whether the covariance is that of a new reading.
-    """
+    """Predicted readings at q (N, n) of every device that a model knows, see :meth:`predict_readings`."""
     fitted: FittedMap = model.map
     for own in model.placement:
         own.devices.warn_if_unknown()
     sets = [(own, own.devices) for own in model.placement if own.devices.reads and len(q)]
     markers = [own.devices for own in model.placement if own.kind == MountedMarkers.kind]
-    mounted = [one for own in markers for one in _mounted(model, own, q, noise=noise)]
-    if not sets:
-        return mounted
-    each = (slice(first, first + PREDICT_ROWS) for first in range(0, len(q), PREDICT_ROWS))
+    found = [one for own in markers for one in _mounted(model, own, q, noise=noise)]
+    each = (slice(first, first + PREDICT_ROWS) for first in range(0, len(q) if sets else 0, PREDICT_ROWS))
     seen = [fitted.linearised_value(q[some], fitted.geodesic.at_rows(some)) for some in each]
-    found = mounted
     for own, devices in sets:
         unit, scale, zero = own.shown or ("", (1.0,), (0.0,))  # files of old versions: as reported, lengths in m
         for number, name in enumerate(own.names):

@@ -28,10 +28,9 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import Beside, check_shown, sensor_of
-from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
 from diffeo_calib.sensors.known_drift import KnownDrift
-from diffeo_calib.sensors.places import Places
+from diffeo_calib.sensors.places import Places, known_devices
 from diffeo_calib.sensors.tables import divided, measured_positions, rows_of_one_kind
 
 LARGEST_ERROR_PER_REACH = 0.1
@@ -87,13 +86,7 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Any) -> Evaluation | 
 def residuals(kinematics: Callable[[Tensor], Tensor], places: Places, data: Any) -> Evaluations:
     """Measured minus predicted values of every row, kind by kind, each in the unit of its device.
 
-    Args:
-        kinematics: as of :func:`evaluate`. places: of its devices beside the kinematics, see :func:`place`.
-        data: rows of any kinds.
-
-    Raises:
-        InputError: another number of joints or markers, or poses on one side and points on the other.
-        MeasurementError: readings of devices that ``places`` does not know.
+    Kinematics and errors as of :func:`evaluate`; places of the devices as :func:`place` finds them.
     """
     found = [
         (sensor_of(table).errors(table, _predicted(kinematics, table), places), rows)
@@ -114,9 +107,7 @@ def check_rows(kinematics: Callable[[Tensor], Tensor], data: Any) -> None:
 def place(kinematics: Callable[[Tensor], Tensor], data: Any, *, every_session: bool = False) -> Places:
     """Place what a model does not know on the rows of a table: frames of set-ups, devices of readings.
 
-    Args:
-        kinematics: (N, n) joint values -> (N, P, 3) markers, m, the ball last. data: rows of any kinds.
-        every_session: whether the rows of a single set-up are placed too; by default they are in the model's frame.
+    Rows of a single set-up are placed only with ``every_session``; by default they are in the model's frame.
 
     Raises:
         InputError: rows that a model cannot be compared with, or joints in another order.
@@ -124,12 +115,9 @@ def place(kinematics: Callable[[Tensor], Tensor], data: Any, *, every_session: b
     """
     check_rows(kinematics, data)
     model = kinematics if isinstance(kinematics, CalibratedKinematics) else None
-    unplaced = model is not None and model.own_frame
-    points = partial(_predicted, kinematics)
-    turns = None if model is None else model.turns
-    known = {"unplaced": unplaced, "every_session": every_session}
-    beside = Beside(points, devices_of(kinematics), kinematics, turns, **known)
-    parts = rows_of_one_kind(data)
+    known = {"unplaced": model is not None and model.own_frame, "every_session": every_session}
+    turns, parts = None if model is None else model.turns, rows_of_one_kind(data)
+    beside = Beside(partial(_predicted, kinematics), known_devices(kinematics), turns, **known)
     found = Places(ball=len(parts) > 1 if model is None else model.ball)
     for table, _ in parts:
         found = found.beside(sensor_of(table).place(table, beside))
@@ -137,14 +125,6 @@ def place(kinematics: Callable[[Tensor], Tensor], data: Any, *, every_session: b
     sentences = [f"{found.numbers} numbers in all were found from the rows that are judged"] * (found.numbers > 0)
     sentences += [] if drift is None else drift.in_rows(data)
     return replace(found, found=(*found.found, *sentences))
-
-
-def devices_of(model: object) -> dict[str, Devices]:
-    """The devices of readings whose places a model knows, by kind; none for other kinematics."""
-    found = dict[str, Devices]()
-    for own in [own.devices for own in getattr(model, "placement", None) or () if own.devices.reads]:
-        found[own.kind] = found[own.kind].beside(own) if own.kind in found else own
-    return found
 
 
 def placement_sentences(model: object) -> list[str]:
@@ -166,13 +146,7 @@ def _predicted(kinematics: Callable[[Tensor], Tensor], data: Any) -> Tensor:
 
 
 def rows_used_in_fit(model: CalibratedKinematics, q: object) -> Tensor:
-    """Which configurations the model was fitted to, up to the rounding of files.
-
-    Args:
-        model: the calibrated model. q: (N, n) joint configurations, rad or m.
-
-    Returns:
-        (N,) boolean.
+    """Which configurations (N, n), rad or m, the model was fitted to, up to the rounding of files: (N,) boolean.
 
     Raises:
         InputError: not a calibrated model, wrong shape, or values that are not finite.
@@ -196,16 +170,11 @@ def rows_of_other_frames(model: CalibratedKinematics, q: Tensor) -> int:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What errors of a model mean.
+    """What errors of a model mean."""
 
-    Args:
-        refusal: why they say nothing about the robot; None if they do. causes: likely causes of large errors.
-        moved: whether something that moved explains errors that say nothing.
-    """
-
-    refusal: str | None = None
-    causes: Sequence[str] = ()
-    moved: bool = False
+    refusal: str | None = None  # why they say nothing about the robot; None if they do
+    causes: Sequence[str] = ()  # likely causes of large errors
+    moved: bool = False  # whether something that moved explains errors that say nothing
 
 
 def judged(
@@ -219,7 +188,7 @@ def judged(
     """
     impossible = LARGEST_ERROR_PER_REACH * model.robot.reach
     for table, _ in divided(data)[1]:
-        devices = places.devices[table.column_kind]
+        devices = places.devices[table.kind]
         away = devices.errors(table, devices.points_of(_predicted(model, table))).norm(dim=1)
         if (median := float(away.median())) > impossible:
             fix = "check the unit of the readings (--length), their columns (--reading), and the device of every row"
@@ -251,7 +220,7 @@ def positions_of(model: CalibratedKinematics, places: Places, data: Any) -> Meas
     if own is None:
         return None
     own = places.aligned(own)
-    return sensor_of(own).with_points(own if drift is None else drift.aligned(own), model)
+    return sensor_of(own).with_points(own if drift is None else drift.undone(own), model)
 
 
 def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> str | None:
@@ -306,19 +275,13 @@ MOST_ROWS = 500
 
 
 class Motion(NamedTuple):
-    """A motion that explains errors.
+    """A motion that explains errors."""
 
-    Args:
-        what: "the measuring device" or "the marker". shift: m, of the device at the middle of the rows.
-        turn: rad, 0 for a marker. explained: part of the squared error.
-        left: (N, m) the errors that remain, m, NaN where hidden.
-    """
-
-    what: str
-    shift: float
-    turn: float
-    explained: float
-    left: Tensor
+    what: str  # "the measuring device" or "the marker"
+    shift: float  # m, of the device at the middle of the rows
+    turn: float  # rad, 0 for a marker
+    explained: float  # part of the squared error
+    left: Tensor  # (N, m) the errors that remain, m, NaN where hidden
 
     @property
     def sentence(self) -> str:

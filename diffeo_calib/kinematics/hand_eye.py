@@ -19,14 +19,12 @@ from torch import Tensor
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.device_readings import own_shifts
 from diffeo_calib.measurements.images import ONLY_CAMERA
 from diffeo_calib.measurements.poses import inverse_poses, pose_directions, poses_from_marks, rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import skew
 from diffeo_calib.sensors.set_ups import NUMBERS_OF_A_FRAME, SESSION, TRANSFORMS, frame_slopes, own_slopes
-
-RIGID_MOTION_SHARE = 0.01
-"""Effects of a frame's shift differ from a rigid motion of the fitted points by less than this share."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,19 +203,13 @@ class SetUp(NamedTuple):
         shared, points = fitted.noise.shared, fitted.fitted_points.unflatten(1, (-1, 3))
         others = torch.ones(len(shared), dtype=torch.bool, device=shared.device)
         others[rows] = False
-        columns = (shared[rows] != 0).any(1).any(0) & ~(shared[others] != 0).any(1).any(0)
-        if not bool(columns.any()):
-            return columns, shared.new_zeros(NUMBERS_OF_A_FRAME, 0)
-        effects = shared[rows][..., columns].flatten(0, 1)
-        slopes = self._slopes(points[rows]).flatten(0, 1)
-        twists = torch.linalg.lstsq(slopes, effects, driver="gelsd").solution
-        left = (effects - slopes @ twists).norm(dim=0)
-        rigid = left < RIGID_MOTION_SHARE * effects.norm(dim=0)
-        columns[columns.clone()] = rigid
-        if int(rigid.sum()) != NUMBERS_OF_A_FRAME and (self.framed or bool(rigid.any())):
+        own = shared[rows] * ~(shared[others] != 0).any(1).any(0)
+        columns, twists = own_shifts(own, self._slopes(points[rows]))
+        rigid = int(columns.sum())
+        if rigid != NUMBERS_OF_A_FRAME and bool((own != 0).any()) and (self.framed or rigid):
             what = "the hand-eye transform of one of several cameras"
             raise InputError.of(what, expected="a model in the place of its fit", fix="calibrate with all rows")
-        return columns, twists[:, rigid]
+        return columns, twists
 
     def view(self, poses: Tensor) -> Tensor:
         """What is measured of poses (M, 4, 4) of the model's tool, m."""

@@ -100,14 +100,7 @@ def refuse_other_angles(model: Any, q: object) -> None:
 
 
 def warn_outside_range(model: Any, q: object) -> None:
-    """Warn of configurations outside the joint ranges of the fit, where the model's errors are not known.
-
-    Args:
-        model: the calibrated model. q: (N, n) joint configurations, rad or m.
-
-    Warns:
-        DiffeoCalibWarning: with the number of rows and the names of the joints.
-    """
+    """Warn of configurations (N, n) outside the joint ranges of the fit: how many rows, and which joints."""
     outside = joints_outside_range(model, q)
     if bool(outside.any()):
         names = [name for name, out in zip(model.robot.joint_names, outside.any(0).tolist(), strict=True) if out]
@@ -120,12 +113,7 @@ def warn_outside_range(model: Any, q: object) -> None:
 def check_same_robot(model: Any, data: Any) -> None:
     """Refuse rows of other joints than a model's, in another order or unit of angles, or of a payload elsewhere.
 
-    Args:
-        model: a calibrated model. data: rows of any kinds.
-
-    Raises:
-        InputError: joints in another order. MeasurementError: see :func:`refuse_other_angles` and
-            :meth:`Sensor.check_angles`.
+    Raises InputError: joints in another order. MeasurementError: angles in another unit.
     """
     check_joint_order(model.robot, data)
     check_payload_link(model.nominal.load.link, data)

@@ -76,21 +76,14 @@ class GeometryMap(NominalMap):
 
     def with_geometry(self, geometry: Geometry) -> GeometryMap:
         """The same parameters around another geometry of the same chain."""
-        return self._with(geometry=geometry)
-
-    def with_waves(self, waves: GearWaves) -> GeometryMap:
-        """The same map with other waves, whose coefficients are the last parameters."""
-        return self._with(waves=waves)
+        return self.changed(geometry=geometry)
 
     def with_payload(self, load: Payload | None) -> GeometryMap:
         """The same map with other masses of its payload."""
-        return self if load is self.load else self._with(payload=load or None)
+        return self if load is self.load else self.changed(payload=load or None)
 
-    def with_rigid_frames(self) -> GeometryMap:
-        """The same map of the points of frames, see ``rigid``."""
-        return self._with(rigid=True)
-
-    def _with(self, **changes: Any) -> GeometryMap:
+    def changed(self, **changes: Any) -> GeometryMap:
+        """The same map with other arguments."""
         own = {"geometry": self.geometry, "waves": self.waves, "payload": self.payload, "rigid": self.rigid}
         return GeometryMap(elastic=self.elasticity is not None, **own | changes)
 
@@ -128,15 +121,15 @@ class GeometryMap(NominalMap):
 
     def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
         """Marker positions in m: (N, 3 P)."""
-        x = self._turned(x, theta)
+        x = self.turned(x, theta)
         return self.geometry.points(x, self._errors(x, theta)).flatten(1)
 
     def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
         """Dk0 in m/rad or m/m: (N, 3 P, n)."""
-        slopes = self._smooth_jacobian(self._turned(x, theta), theta)
+        slopes = self._smooth_jacobian(self.turned(x, theta), theta)
         return slopes * self.waves.slopes(x, self.wave_coefficients(theta))[:, None] if self.waves.size else slopes
 
-    def _turned(self, x: Tensor, theta: Tensor) -> Tensor:
+    def turned(self, x: Tensor, theta: Tensor) -> Tensor:
         """The joint values with the waves of their gears."""
         return self.waves.turned(x, self.wave_coefficients(theta)) if self.waves.size else x
 
@@ -152,12 +145,13 @@ class GeometryMap(NominalMap):
 
     def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
         """d k0 / d theta in m/m or m/rad: (N, 3 P, K)."""
-        turned = self._turned(x, theta)
+        turned = self.turned(x, theta)
         by_error = self.geometry.sensitivities(turned, self._errors(turned, theta))
         parts = [by_error.flatten(1, 2)]
         if self.rigid:
-            tool = self.geometry.slices["tool"]
-            parts = [parts[0][..., : tool.start], parts[0][..., tool] @ self._rigid_tool().to(x.device)]
+            tool, moves = self.geometry.slices["tool"], rigid_motions(self.geometry.tool.flatten())
+            kept = torch.block_diag(*(moves @ moves.mT)).to(x.device)  # (3 P, 3 P) what moves every frame as a whole
+            parts = [parts[0][..., : tool.start], parts[0][..., tool] @ kept]
         if self.elasticity is not None:
             parts.append(self.elasticity.sensitivities(turned, self._by_twist(by_error)))
         if self.waves.size:
@@ -165,15 +159,11 @@ class GeometryMap(NominalMap):
             parts.append(self._smooth_jacobian(turned, theta)[..., joints] * self.waves.columns(x)[:, None])
         return torch.cat(parts, dim=2)
 
-    def _rigid_tool(self) -> Tensor:
-        """Projection (3 P, 3 P) of shifts of the tool's points on those that move every frame as a rigid body."""
-        moves = rigid_motions(self.geometry.tool.flatten())
-        return torch.block_diag(*(moves @ moves.mT))
-
     def _errors(self, x: Tensor, theta: Tensor) -> Tensor:
         """Error parameters of the geometry: (K,), or (N, K) where the robot deflects."""
         errors, coefficients = self.split(theta)
-        if self.elasticity is None or _all_zero(coefficients):
+        live = wrapped(coefficients) or coefficients.requires_grad or bool(coefficients.any())
+        if self.elasticity is None or not live:  # sag that vanishes, in value and derivatives, need not be computed
             return errors
         joints = self.geometry.slices["joints"]
         deflected = errors[joints] + self.elasticity.twists(x, coefficients).flatten(1)
@@ -191,11 +181,6 @@ def rigid_motions(points: Tensor) -> Tensor:
     arms = arms - arms.mean(-2, keepdim=True)
     eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*arms.shape, 3)
     return torch.linalg.qr(torch.cat([eye, -skew(arms)], -1).flatten(-3, -2)).Q
-
-
-def _all_zero(coefficients: Tensor) -> bool:
-    """Whether the sag is known to vanish, in value and derivatives, so that it need not be computed."""
-    return not (wrapped(coefficients) or coefficients.requires_grad or bool(coefficients.any()))
 
 
 class FlangePoints(NominalMap):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import cast
 from weakref import WeakKeyDictionary
 
@@ -18,7 +17,6 @@ from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.runtime.arrays import Array
 from diffeo_calib.runtime.build import calibrated_chain, recorded_flow
-from diffeo_calib.runtime.chain import waves_of
 from diffeo_calib.runtime.flow import RecordedFlow
 from diffeo_calib.runtime.program import Program
 
@@ -35,9 +33,8 @@ def takes_program(q: Tensor) -> bool:
 def program_of(deformation: Deformation) -> Program | None:
     """The program of a robot's calibrated map, made at its first use.
 
-    Returns:
-        None for maps without constant stages: adaptive time steps, users' kernels, the Eulerian formulation, and maps
-        on another device than the CPU.
+    None for maps without constant stages: adaptive time steps, users' kernels, the Eulerian formulation, and maps on
+    another device than the CPU.
     """
     if deformation not in _PROGRAMS:
         _PROGRAMS[deformation] = _program(deformation)
@@ -47,13 +44,11 @@ def program_of(deformation: Deformation) -> Program | None:
 def _program(deformation: Deformation) -> Program | None:
     if not isinstance(deformation, GeodesicDeformation):
         return None
-    nominal, theta = deformation.spec.nominal, deformation.momenta.theta
-    points = nominal.points if isinstance(nominal, FlangePoints) else None
-    on = nominal.map.geometry.on if isinstance(nominal, FlangePoints) else None
-    nominal = nominal.fitted if isinstance(nominal, FlangePoints) else nominal
+    asked, theta = deformation.spec.nominal, deformation.momenta.theta
+    other = asked if isinstance(asked, FlangePoints) else None
+    nominal = asked if other is None else other.fitted
     if not isinstance(nominal, GeometryMap) or nominal.load.by_row:
         return None
-    own = on or nominal.geometry.on
     flows = deformation.joint_flow, deformation.task_flow
     radial = all(isinstance(term, RadialKernel) for flow in flows for term in flow.kernel.terms)
     if not radial or not isinstance(deformation.integrator, RungeKutta) or deformation.x.device.type != "cpu":
@@ -65,13 +60,12 @@ def _program(deformation: Deformation) -> Program | None:
         _array(geometry.joint_errors),
         _array(errors),
         None if nominal.elasticity is None else _array(nominal.elasticity.folded(coefficients)),
+        waves=(nominal.waves.to_config(), _array(nominal.wave_coefficients(theta))),
     )
-    waves = waves_of(nominal.waves.to_config(), geometry.chain.n, _array(nominal.wave_coefficients(theta)))
-    chain = replace(chain, waves=waves)
     joint, task = (_recorded(flow, deformation.integrator) for flow in flows)
-    points = geometry.absorb(errors.detach().cpu()).tool if points is None else points
-    tips = geometry.chain.tips
-    return Program(joint, chain, task, _array(points), tuple(tips.index(tip) for tip in own), tips)
+    points = geometry.absorb(errors.detach().cpu()).tool if other is None else other.points
+    tips, on = geometry.chain.tips, geometry.on if other is None else other.map.geometry.on
+    return Program(joint, chain, task, _array(points), tuple(map(tips.index, on)), tips)
 
 
 def _recorded(flow: Flow, integrator: RungeKutta) -> RecordedFlow:

@@ -24,7 +24,6 @@ from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes
 from diffeo_calib.maps.geodesic import GeodesicDeformation
-from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import mark_points, marks, pose_directions, poses_from_marks, rigid_poses
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime import program
@@ -39,10 +38,8 @@ class ToolKinematics:
     """Poses of a tool centre point: values, exact Jacobian, covariance.
 
     Args:
-        fitted: the calibrated map of the measured markers.
-        nominal: its nominal map.
-        tool: (4, 4) tool centre point in the tip's frame, m.
-        frame: "base" of the robot, or "measuring" for that of the device.
+        fitted: the calibrated map of the measured markers. nominal: its nominal map.
+        tool: (4, 4) tool centre point in the tip's frame, m. frame: "base" of the robot, or "measuring".
         tip: name of the tip that carries it; the robot's only one by default.
 
     Raises:
@@ -53,8 +50,7 @@ class ToolKinematics:
         self, fitted: FittedMap, nominal: GeometryMap, tool: Tensor, frame: str, tip: str | None = None
     ) -> None:
         if frame not in FRAMES:
-            expected = " or ".join(repr(name) for name in FRAMES)
-            raise InputError.of("`frame`", expected=expected, got=as_written(frame))
+            raise InputError.of("`frame`", expected=" or ".join(map(repr, FRAMES)), got=as_written(frame))
         self.fitted, self.nominal, self.tool, self.frame = fitted, nominal, tool, frame
         self.tip = checked_tip(nominal.geometry.chain, tip)
 
@@ -150,13 +146,8 @@ def tool_points(tool: Tensor, lever: float = TOOL_LEVER) -> Tensor:
 
 
 def pose_slopes(points: Tensor, slopes: Tensor, lever: float = TOOL_LEVER) -> Tensor:
-    """Derivatives (N, 6, n) of the poses that fit three points best, see :func:`program.pose_slopes`.
-
-    Args:
-        points: (N, 3, 3) m. slopes: (N, 3, 3, n). lever: distance of the points from the frame's origin, m.
-    """
-    one = torch.eye(3, dtype=points.dtype, device=points.device)
-    use = torch, marks(points.device), one
+    """Derivatives (N, 6, n) of the poses that fit three points best, see :func:`program.pose_slopes`."""
+    use = torch, marks(points.device), torch.eye(3, dtype=points.dtype, device=points.device)
     return program.pose_slopes(points, slopes, poses_from_marks(points, lever)[:, :3, :3], use)
 
 
@@ -181,19 +172,13 @@ def covariance_without_placement(model: Any, q: Tensor, tool: Tensor, tip: str |
     points, at = kinematics.deformation.linearised_value(rows)
     covariance = fitted.conditional.covariance_between(at)  # open directions are those of both motions
     points = points.unflatten(1, (3, 3))
-    motions = _motions(kinematics, at, points).flatten(0, 1)  # (9 (R + M), 12)
-    reference, own = motions.split([9 * len(every), 9 * len(q)])
-    eye = torch.eye(len(own), dtype=own.dtype, device=own.device)
-    rest = torch.cat([-own @ torch.linalg.pinv(reference, rtol=SMALLEST_MOTION), eye], 1)
+    base, own = frame_slopes(points, points.mean((0, 1))), tool_points(tool).to(points)  # a motion of the base moves
+    flange = FlangePoints(kinematics.nominal, own, on=(kinematics.tip,) * 3)  # the points, one of the tool these
+    by_place = marker_slopes(kinematics.deformation, flange, at) @ frame_slopes(own[None], own.mean(0))[0]
+    motions = torch.cat([base, by_place], 2).flatten(0, 1)  # (9 (R + M), 12)
+    reference, asked = motions.split([9 * len(every), 9 * len(q)])
+    eye = torch.eye(len(asked), dtype=own.dtype, device=own.device)
+    rest = torch.cat([-asked @ torch.linalg.pinv(reference, rtol=SMALLEST_MOTION), eye], 1)
     seen = poses_from_marks(points[len(every) :], TOOL_LEVER)
     rest = pose_directions(seen, TOOL_LEVER) @ rest.unflatten(0, (-1, 9))  # (M, 6, 9 (R + M))
     return rest @ covariance @ rest.mT
-
-
-def _motions(kinematics: ToolKinematics, at: Linearisation, points: Tensor) -> Tensor:
-    """Derivatives of points (N, 3, 3) by a motion of the base and one of the tool on its flange: (N, 9, 12)."""
-    base = frame_slopes(points, points.mean((0, 1)))
-    own = tool_points(kinematics.tool).to(points)
-    flange = FlangePoints(kinematics.nominal, own, on=(kinematics.tip,) * 3)
-    by_place = marker_slopes(kinematics.deformation, flange, at)
-    return torch.cat([base, by_place @ frame_slopes(own[None], own.mean(0))[0]], 2)

@@ -22,9 +22,7 @@ def transmission(deformation: Deformation, robot: Tree, joint: str, values: obje
     """Motion of a joint beyond its reading, see :meth:`CalibratedKinematics.transmission`: (M,) -> (M,) rad or m."""
     x, index = _configurations(robot, joint, values)
     nominal, smooth = deformation.spec.nominal, smooth_transmission(deformation, robot, joint, values)
-    if not isinstance(nominal, GeometryMap) or not nominal.waves.size:
-        return smooth
-    turned = nominal.waves.turned(x, nominal.wave_coefficients(deformation.momenta.theta))
+    turned = nominal.turned(x, deformation.momenta.theta) if isinstance(nominal, GeometryMap) else x
     return smooth + (turned - x)[:, index]
 
 
@@ -57,22 +55,14 @@ MULTIPLES = (2, 3, 4)
 
 @dataclass(frozen=True)
 class NamedGearLine:
-    """amplitude cos(frequency q - phase) of one joint.
+    """amplitude cos(frequency q - phase) of one joint."""
 
-    Args:
-        joint: its name.
-        frequency: rad per rad of the joint: periods per turn; the ratio of a gear or a multiple of it.
-        amplitude: rad. phase: rad.
-        multiple: how often the frequency contains that of another line of the robot; 1 if there is none.
-        displacement: RMS displacement of the markers by it over the model's configurations, m.
-    """
-
-    joint: str
-    frequency: float
-    amplitude: float
-    phase: float
-    multiple: int
-    displacement: float
+    joint: str  # its name
+    frequency: float  # rad per rad of the joint: periods per turn; the ratio of a gear or a multiple of it
+    amplitude: float  # rad
+    phase: float  # rad
+    multiple: int  # how often the frequency contains that of another line of the robot; 1 if there is none
+    displacement: float  # RMS displacement of the markers by it over the model's configurations, m
 
     @property
     def sentence(self) -> str:
@@ -87,23 +77,13 @@ def gear_lines(model: Any) -> tuple[NamedGearLine, ...]:
     waves, coefficients = nominal.waves, nominal.wave_coefficients(theta).view(-1, 2)
     if not waves.size:
         return ()
-    moved = _displacements(model, theta)
+    sensitivities = nominal.sensitivities(model.configurations, theta)[..., nominal.sag.stop :]
+    effects = (sensitivities * coefficients.flatten()).unflatten(-1, (-1, 2)).sum(-1)  # (N, 3 P, K)
+    moved = effects.unflatten(1, (-1, 3)).square().sum(2).mean((0, 1)).sqrt().tolist()
     found = []
     for k, (joint, frequency) in enumerate(zip(waves.joints, waves.frequencies, strict=True)):
         C, S = coefficients[k].tolist()
-        name, multiple = model.robot.joint_names[joint], _multiple(frequency, waves.frequencies)
-        found.append(NamedGearLine(name, frequency, hypot(C, S), atan2(S, C), multiple, moved[k]))
+        others = [m for m in MULTIPLES if any(abs(frequency / m - one) <= SAME_RATIO for one in waves.frequencies)]
+        what = model.robot.joint_names[joint], frequency, hypot(C, S), atan2(S, C), [*others, 1][0]
+        found.append(NamedGearLine(*what, moved[k]))
     return tuple(sorted(found, key=lambda line: -line.displacement))
-
-
-def _displacements(model: Any, theta: Tensor) -> list[float]:
-    """RMS displacement of the markers by every line, m."""
-    nominal = model.nominal
-    sensitivities = nominal.sensitivities(model.configurations, theta)[..., nominal.sag.stop :]
-    effects = (sensitivities * nominal.wave_coefficients(theta)).unflatten(-1, (-1, 2)).sum(-1)  # (N, 3 P, K)
-    return effects.unflatten(1, (-1, 3)).square().sum(2).mean((0, 1)).sqrt().tolist()
-
-
-def _multiple(frequency: float, others: tuple[float, ...]) -> int:
-    near = (k for k in MULTIPLES if any(abs(frequency / k - other) <= SAME_RATIO for other in others))
-    return next(near, 1)

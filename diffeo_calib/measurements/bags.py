@@ -14,8 +14,8 @@ import torch
 from diffeo_calib.cameras.detection import opencv
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, warn_user
+from diffeo_calib.measurements.csv.joined import Array, Recording
 from diffeo_calib.measurements.poses import rotation_matrices, rotation_numbers
-from diffeo_calib.measurements.stops import Array, Recording
 from diffeo_calib.robots.se3 import transforms
 
 KINDS = "PointStamped, PoseStamped, PoseWithCovarianceStamped, TransformStamped, Odometry, TFMessage or images"

@@ -173,8 +173,11 @@ class Covariance:
     def matrix(self, values: Values) -> Tensor:
         """(Ma, Mb), without a graph."""
         joint, task = values.joint.values.transpose(0, 1), values.task.values[0]  # (Na, n, Nb), (Ta, Tb)
-        by_joint = torch.cat([_times(joint[..., part.rows], part.J) for part in self.b.parts], 2)  # (Na, n, Mb)
-        by_point = torch.cat([_times_points(task[:, part.points], part.A) for part in self.b.parts], 2)  # (Ta, 3, Mb)
+        by_joint = torch.cat(
+            [(joint[..., part.rows, None] * part.J.permute(2, 0, 1)).flatten(2) for part in self.b.parts], 2
+        )  # (Na, n, Mb)
+        of_points = ((task[:, part.points].unflatten(1, part.A.shape[::2]), part.A) for part in self.b.parts)
+        by_point = torch.cat([torch.einsum("tjp,jrpc->tcjr", *each).flatten(2) for each in of_points], 2)  # (Ta, 3, Mb)
         total = by_joint.new_empty(len(self.a.target), len(self.b.target))
         for part in self.a.parts:
             N, _, P, _ = part.A.shape
@@ -194,7 +197,8 @@ class Covariance:
         for part in self.a.parts:
             half = part.A.flatten(2).mT @ weights[part.numbers].view(*part.cells.shape, -1)
             half = half.view(-1, 3, half.shape[2])  # (N P, 3, Mb)
-            rows.append(torch.cat([_summed_points(half[..., other.numbers], other.A) for other in self.b.parts], 1))
+            each = ((half[..., other.numbers].unflatten(2, other.A.shape[:2]), other.A) for other in self.b.parts)
+            rows.append(torch.cat([torch.einsum("tcjr,jrpc->tjp", *one).flatten(1) for one in each], 1))
         return values.joint.inner(joint) + values.task.inner(torch.cat(rows)[None])
 
 
@@ -209,18 +213,3 @@ def joint_weights(a: Numbers, b: Numbers, weights: Tensor) -> Tensor:
         ]
         rows.append(torch.cat(own, 2))
     return torch.cat(rows)
-
-
-def _times(values: Tensor, J: Tensor) -> Tensor:
-    """Values (Na, n, N) of every component times J^T of N rows (N, r, n): (Na, n, N r)."""
-    return (values[..., None] * J.permute(2, 0, 1)).flatten(2)
-
-
-def _times_points(values: Tensor, A: Tensor) -> Tensor:
-    """Values (Ta, N P) times A^T of N rows (N, r, P, 3): (Ta, 3, N r)."""
-    return torch.einsum("tjp,jrpc->tcjr", values.unflatten(1, A.shape[::2]), A).flatten(2)
-
-
-def _summed_points(half: Tensor, A: Tensor) -> Tensor:
-    """The weights of the values in :func:`_times_points`: (Ta, 3, N r) -> (Ta, N P)."""
-    return torch.einsum("tcjr,jrpc->tjp", half.unflatten(2, A.shape[:2]), A).flatten(1)

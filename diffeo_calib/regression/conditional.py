@@ -14,7 +14,7 @@ Shifts that rows share (:class:`Noise`) are parameters, too.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -88,11 +88,6 @@ class Conditional(ABC):
 
     size: int
 
-    @property
-    def inner(self) -> Conditional:
-        """The same with rigid motions, where they are left out."""
-        return self
-
     @abstractmethod
     def features(self, at: Linearisation) -> Features:
         """Features of a linearisation, from which covariances between any of its configurations follow cheaply."""
@@ -104,18 +99,6 @@ class Conditional(ABC):
     def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
         """Posterior covariance of k1 between two linearisations, by default the same: (M m, M' m') in m^2."""
         return self.features(at).between(None if other is None else self.features(other))
-
-    def compared(self, points: Tensor, targets: Tensor, fit: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        """Points (M, 3) as they are compared with targets, m: rigid motions are errors like others.
-
-        Args:
-            fit: the best rigid transform (4, 4) from points to targets.
-        """
-        return points
-
-    def compared_slopes(self, slopes: Tensor) -> Tensor:
-        """Derivatives (M m, k) of k1 at the map's workspace as they are compared, see :meth:`compared`."""
-        return slopes
 
     def covariance(self, at: Linearisation, directions: Tensor | None = None) -> Tensor:
         """Posterior covariance of k1 at the M configurations of a linearisation.
@@ -210,16 +193,6 @@ class Opened(Conditional):
     def __init__(self, before: Conditional, first: int, deviations: Tensor) -> None:
         self.before, self.size, self.first, self.deviations = before, before.size, first, deviations
 
-    @property
-    def inner(self) -> Conditional:
-        return Opened(self.before.inner, self.first, self.deviations)
-
-    def compared(self, points: Tensor, targets: Tensor, fit: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        return self.before.compared(points, targets, fit)
-
-    def compared_slopes(self, slopes: Tensor) -> Tensor:
-        return self.before.compared_slopes(slopes)
-
     def features(self, at: Linearisation) -> Features:
         opened = of_parameters(at, self.first + len(self.deviations))[..., self.first :] * self.deviations
         return self.before.features(at).beside((opened.flatten(0, 1).T, 1))
@@ -285,27 +258,14 @@ class Estimated(Conditional):
         return found.beside((g, -1), (self.root.T @ self.slopes(at).T - g, 1))
 
 
-class WithoutRigidMotions(Estimated):
+def without_rigid_motions(before: Conditional, reference: Linearisation, base: Sequence[int]) -> Estimated:
     """The same conditional without rigid motions, see :class:`Estimated`.
 
     Args:
         before: with them. reference: linearisation at X. base: numbers of the six parameters that move the base.
     """
-
-    def __init__(self, before: Conditional, reference: Linearisation, base: Sequence[int]) -> None:
-        gain = torch.linalg.pinv(reference.sensitivity[..., list(base)].flatten(0, 1))  # (6, M m)
-        super().__init__(before, reference, gain, base)
-
-    @property
-    def inner(self) -> Conditional:
-        return self.before
-
-    def compared(self, points: Tensor, targets: Tensor, fit: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        T = fit(points, targets)
-        return points @ T[:3, :3].mT + T[:3, 3]
-
-    def compared_slopes(self, slopes: Tensor) -> Tensor:
-        return slopes - self.slopes(self.reference.at) @ (self.gain @ slopes)
+    gain = torch.linalg.pinv(reference.sensitivity[..., list(base)].flatten(0, 1))  # (6, M m)
+    return Estimated(before, reference, gain, base)
 
 
 def lower_root(F: Tensor) -> Tensor:

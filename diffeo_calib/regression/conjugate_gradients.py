@@ -65,9 +65,9 @@ def partial_cholesky(
     return factor, rest, chosen
 
 
-def pivots(linearisation: Linearisation, count: int, seed: int = 0) -> Tensor:
+def pivots(linearisation: Linearisation, count: int) -> Tensor:
     """Row numbers of ``count`` configurations that together explain most of G: (count,)."""
-    chosen = partial_cholesky(linearisation, 0.0, count, block=BLOCK_CONFIGURATIONS // 4, seed=seed)[2]
+    chosen = partial_cholesky(linearisation, 0.0, count, block=BLOCK_CONFIGURATIONS // 4)[2]
     unused = torch.ones(len(linearisation.sensitivity), dtype=torch.bool, device=chosen.device)
     unused[chosen] = False
     return torch.cat([chosen, unused.nonzero()[:, 0][: count - len(chosen)]])

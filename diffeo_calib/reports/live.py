@@ -115,8 +115,7 @@ def state_of(campaign: Campaign, words: tuple[str, str], found: Next | None) -> 
     """
     robot, count, known = campaign.robot, len(campaign), campaign.expected_error
     seen = [(one.row + 1, 1e3 * one.expected_error) for one in campaign.verdicts if one.expected_error is not None]
-    steps = [] if found is None else [(count + step, 1e3 * value) for step, value in enumerate(found.expected)]
-    next_q = campaign.candidates[:0] if found is None else found.q[:1]
+    next_q, expected = (campaign.candidates[:0], ()) if found is None else (found.q[:1], found.expected)
     verdicts = [
         {"line": one.line, "text": str(one), "accepted": one.accepted, "fits": one.fits}
         for one in campaign.verdicts[: -SHOWN_ROWS - 1 : -1]
@@ -129,7 +128,7 @@ def state_of(campaign: Campaign, words: tuple[str, str], found: Next | None) -> 
         "pose": words[1],
         "goal": None if campaign.goal is None else 1e3 * campaign.goal,
         "curve": seen[:: max(1, len(seen) // SHOWN_POSES)],
-        "forecast": steps,
+        "forecast": [(count + step, 1e3 * value) for step, value in enumerate(expected)],
         "verdicts": verdicts,
         "done": done,
         "next": next_tips,

@@ -16,7 +16,7 @@ import numpy as np
 
 from diffeo_calib.common.errors import RobotError
 from diffeo_calib.runtime.arrays import Array, Tableau, as_index, skew, transforms
-from diffeo_calib.runtime.chain import CalibratedChain, Masses, NominalChain
+from diffeo_calib.runtime.chain import CalibratedChain, Masses, NominalChain, Waves
 from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow, combined
 from diffeo_calib.runtime.tables import JointTables, PeriodicSum, Table, tabulate
 
@@ -108,7 +108,13 @@ def _coupling(robot: Mapping[str, Any], moving: Sequence[Mapping[str, Any]], bet
 
 
 def calibrated_chain(
-    nominal: NominalChain, base: Array, joint_errors: Array, theta: Array, coefficients: Array | None
+    nominal: NominalChain,
+    base: Array,
+    joint_errors: Array,
+    theta: Array,
+    coefficients: Array | None = None,
+    *,
+    waves: tuple[Sequence[Sequence[float]], Array] | None = None,
 ) -> CalibratedChain:
     """A chain with its errors.
 
@@ -116,8 +122,13 @@ def calibrated_chain(
         nominal: the robot. base: (4, 4) [m]. joint_errors: (n_all, 4, 4) [m].
         theta: (6 + 6 n_all,) error twists of base and joints [m, rad].
         coefficients: of the gravity sag (robots/gravity.py); None without it.
+        waves: joint and frequency of each, and coefficients (2 K,).
     """
     L, T = len(nominal.axes), len(nominal.tips)
+    config, factors = waves or ((), np.zeros(0))
+    joints, frequencies = [int(joint) for joint, _ in config], np.array([frequency for _, frequency in config])
+    units = np.eye(nominal.coupling.shape[1])[joints]
+    periodic = Waves(tuple(joints), units, frequencies, factors.reshape(-1, 2)) if joints else None
     twists = theta[: 6 + 6 * L].reshape(-1, 6)
     offsets = nominal.offsets[:L] @ joint_errors
     sag, constant = None, twists[1:]
@@ -125,7 +136,8 @@ def calibrated_chain(
         sag = Masses.of(nominal.compliances, nominal).sag(coefficients)
     else:
         offsets, constant = offsets @ transforms(constant), np.zeros_like(constant)
-    return CalibratedChain(nominal, base @ transforms(twists[0]), offsets, constant, nominal.offsets[L : L + T], sag)
+    start, tips = base @ transforms(twists[0]), nominal.offsets[L : L + T]
+    return CalibratedChain(nominal, start, offsets, constant, tips, sag, periodic)
 
 
 def recorded_flow(
@@ -137,20 +149,18 @@ def recorded_flow(
         kernel: terms as in model files (kernels/radial.py). stages: (S, 2, C, n) controls and momenta at every stage.
         coefficients: (s, s), weights: (s,) of the Runge-Kutta method.
     """
-    rest: list[RadialTerm] = []
-    alone: dict[int, list[RadialTerm]] = {}
+    rest, alone, smooth = list[RadialTerm](), dict[int, list[RadialTerm]](), dict[int, list[Table]]()
     steps, n = len(stages) // len(weights), stages.shape[-1]
     for config in kernel:
         term, joint = radial_term(config, stages), config["output"]
-        if not term.weights.any():
-            continue
-        if joint is not None and _inputs(config, n) == ([], [joint]) and stages.shape[2] <= MOST_TABULATED:
-            alone.setdefault(joint, []).append(term)
+        own = joint is not None and _inputs(config, n) == ([], [joint]) and stages.shape[2] <= MOST_TABULATED
+        if term.weights.any():
+            (alone.setdefault(joint, []) if own else rest).append(term)
+    for joint, terms in sorted(alone.items()):
+        if (tables := _joint_tables(terms, stages[:, 0, :, joint], joint)) is None:
+            rest += terms
         else:
-            rest.append(term)
-    tables = {joint: _joint_tables(terms, stages[:, 0, :, joint], joint) for joint, terms in sorted(alone.items())}
-    smooth = {joint: found for joint, found in tables.items() if found}
-    rest += [term for joint, terms in alone.items() if joint not in smooth for term in terms]
+            smooth[joint] = tables
     together = JointTables.of(list(smooth), list(zip(*smooth.values(), strict=True)), n) if smooth else None
     steps = steps if rest or together else 0
     return RecordedFlow(n, steps, coefficients / max(steps, 1), weights / max(steps, 1), tuple(rest), together)
@@ -158,14 +168,10 @@ def recorded_flow(
 
 def _joint_tables(terms: Sequence[RadialTerm], controls: Array, joint: int) -> list[Table] | None:
     """Tables of a joint's own function at every stage, for controls (S, C); None if it is too rough for them."""
-    found = []
+    found = list[Table]()
     for stage, angles in enumerate(controls):
-        sums = [
-            PeriodicSum(term.profile, 1.0 / float(term.scales[0]), angles, term.weights[stage, :, joint])
-            for term in terms
-        ]
-        table = tabulate(sums)
-        if table is None:
+        sums = [(term.profile, 1.0 / float(term.scales[0]), angles, term.weights[stage, :, joint]) for term in terms]
+        if (table := tabulate([PeriodicSum(*one) for one in sums])) is None:
             return None
         found.append(table)
     return found
@@ -203,13 +209,10 @@ def radial_term(config: Mapping[str, Any], stages: Array) -> RadialTerm:
 def recorded_stages(
     kernel: Sequence[Mapping[str, Any]], q: Array, a: Array, tableau: Tableau, steps: int
 ) -> tuple[Array, Array]:
-    """Integrate the controls over t in [0, 1].
+    """Integrate the controls over t in [0, 1]: the states at every stage (S, 2, C, n), and at the end (2, C, n).
 
     Args:
-        kernel: terms as in model files. q, a: (C, n) controls and momenta at time 0.
-        tableau: coefficients and weights. steps: number of equal steps.
-
-    Returns the states at every stage (S, 2, C, n), and at the end (2, C, n).
+        kernel: terms as in model files. q, a: (C, n) controls and momenta at time 0. steps: number of equal ones.
     """
     coefficients, weights = (t / steps for t in tableau)
     state, stages = np.stack([q, a]), []

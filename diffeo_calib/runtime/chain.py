@@ -35,17 +35,6 @@ class Waves(NamedTuple):
     coefficients: Any  # (K, 2) C and S, rad or m
 
 
-def waves_of(config: Sequence[Sequence[float]], size: int, coefficients: Array) -> Waves | None:
-    """The waves, joint and frequency of each, that a model file describes; None without any.
-
-    Args:
-        size: number of joints. coefficients: (2 K,).
-    """
-    joints = tuple(int(joint) for joint, _ in config)
-    frequencies = np.array([frequency for _, frequency in config], dtype=np.float64)
-    return Waves(joints, np.eye(size)[list(joints)], frequencies, coefficients.reshape(-1, 2)) if config else None
-
-
 def turned(waves: Waves, x: Any, use: Any = NUMPY) -> Any:
     """Joint values with their waves: (N, n) -> (N, n)."""
     angles, (C, S) = x[:, list(waves.joints)] * waves.frequencies, waves.coefficients.T
@@ -213,15 +202,6 @@ class CalibratedChain:
         """Number of active joints."""
         return self.nominal.coupling.shape[1]
 
-    @property
-    def serial(self) -> bool:
-        """Whether the joints follow one another to a single tip, and nothing else bends them."""
-        return self.nominal.before.tolist() == list(range(-1, len(self.nominal.axes)))
-
-    def poses(self, q: Array) -> Array:
-        """Poses of the tips in the measuring frame: (N, n) -> (N, T, 4, 4) [m]."""
-        return tip_poses(self, q)
-
     def poses_and_jacobian(self, q: Array) -> tuple[Array, Array]:
         """Poses (N, T, 4, 4) and their derivatives (N, T, 6, n).
 
@@ -257,12 +237,7 @@ class CalibratedChain:
 
 
 def tip_poses(chain: Any, q: Any, use: Any = NUMPY) -> Any:
-    """Poses of the tips: (N, n) -> (N, T, 4, 4) [m].
-
-    Args:
-        chain: the constants of a :class:`CalibratedChain`, as arrays of the library. q: joint values.
-        use: the library; NumPy by default.
-    """
+    """Poses of the tips in the measuring frame, by arrays of a library: q (N, n) -> (N, T, 4, 4) [m]."""
     at = q if chain.waves is None else turned(chain.waves, q, use)
     motions = joint_motions(chain.nominal.motions, moving_values(chain.nominal, at), use)
     offsets = chain.offsets
@@ -338,9 +313,7 @@ def load_slopes(robot: Any, sag: Any, nominal: Any) -> Any:
     """Derivatives of the twist coordinates e . m by the moving joints: (N, K, n_all).
 
     Turning joint k moves what it carries, M_fk = 1, by z_k x (o_f - o_k), a slide by z_k; e turns where M_lk = 1.
-
-    Args:
-        robot: axes, revolute, moved, signs of a :class:`NominalChain`. nominal: (N, F, 4, 4) see nominal_frames.
+    ``robot``: axes, revolute, moved, signs of a :class:`NominalChain`.
     """
     (N, F), L, revolute = nominal.shape[:2], len(robot.axes), robot.revolute[:, None]
     e, m = loads(sag, nominal)

@@ -92,12 +92,12 @@ class RecordedFlow:
 
     def __call__(self, x: Array) -> Array:
         """The flow of points (N, n)."""
-        return np.concatenate([advanced(self, x[rows], NUMPY) for rows in self._blocks(len(x))])
+        return np.concatenate([advanced(self, some, NUMPY) for some in self._blocks(x)])
 
     def with_jacobian(self, x: Array) -> tuple[Array, Array]:
         """The flow (N, n) and its Jacobian (N, n, n)."""
-        parts = [self._with_jacobian(x[rows]) for rows in self._blocks(len(x))]
-        return np.concatenate([p for p, _ in parts]), np.concatenate([m for _, m in parts])
+        points, slopes = zip(*map(self._with_jacobian, self._blocks(x)), strict=True)
+        return np.concatenate(points), np.concatenate(slopes)
 
     def _with_jacobian(self, x: Array) -> tuple[Array, Array]:
         M = np.broadcast_to(np.eye(self.size), (len(x), self.size, self.size))
@@ -120,10 +120,9 @@ class RecordedFlow:
             dv += slope
         return v, dv
 
-    def _blocks(self, rows: int) -> Iterator[slice]:
-        largest = max((term.size for term in self.terms), default=64)
-        size = max(BLOCK // max(largest, 64), 1)
-        return (slice(first, first + size) for first in range(0, max(rows, 1), size))
+    def _blocks(self, x: Array) -> Iterator[Array]:
+        size = max(BLOCK // max([64, *(term.size for term in self.terms)]), 1)
+        return (x[first : first + size] for first in range(0, max(len(x), 1), size))
 
 
 def combined(x: Array, coefficients: Iterable[float], slopes: Sequence[Array]) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 
 from diffeo_calib.common.threads import one_thread
 from diffeo_calib.runtime.arrays import Array, cross
-from diffeo_calib.runtime.chain import CalibratedChain
+from diffeo_calib.runtime.chain import CalibratedChain, tip_poses
 from diffeo_calib.runtime.flow import RecordedFlow
 
 TOOL_LEVER = 0.1
@@ -43,7 +43,7 @@ class Program:
         """Points in the measuring frame: q (N, n), points (P, 3) in the tip's frame -> (N, P, 3) [m]."""
         points, on = self._placed(points)
         with one_thread() if len(q) > FEW_ROWS else nullcontext():
-            tip = self.chain.poses(self.joint_flow(q))[:, on]  # (N, P, 4, 4)
+            tip = tip_poses(self.chain, self.joint_flow(q))[:, on]  # (N, P, 4, 4)
             placed = (tip[..., :3, :3] @ points[..., None])[..., 0] + tip[..., :3, 3]
             return self.task_flow(placed.reshape(-1, 3)).reshape(placed.shape)
 

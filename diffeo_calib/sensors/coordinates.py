@@ -24,7 +24,7 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import ERRORS, READINGS, SPREAD, Evaluation, Evaluations
 from diffeo_calib.sensors.kinds import kind_of
-from diffeo_calib.sensors.places import BALL_IS_THE_MARKER, PlacedDevices, Places, placed
+from diffeo_calib.sensors.places import BALL_IS_THE_MARKER, PlacedDevices, Places, joined, placed
 from diffeo_calib.sensors.set_ups import ROWS, Turns, check_same_markers, set_up_kind
 from diffeo_calib.sensors.sockets import SocketPlaces, socket_errors, sockets_of
 from diffeo_calib.sensors.tables import Coordinates
@@ -44,15 +44,13 @@ class Beside:
 
     Args:
         points: a table -> (N, P, 3) points of the tool under the payloads of its rows, m, the ball last.
-        devices: those of readings whose places are known, by kind.
-        model: that knows where set-ups are. turns: of its tips; None for kinematics that do not tell.
+        known: devices whose places are known, by kind. turns: of its tips; None for kinematics that do not tell.
         unplaced: whether positions are in another frame than that of the kinematics, which no device has seen.
         every_session: whether the frame of a single set-up is to be found too.
     """
 
     points: Callable[[Any], Tensor]
-    devices: Mapping[str, Devices]
-    model: object = None
+    known: Mapping[str, Any]
     turns: Turns | None = None
     unplaced: bool = False
     every_session: bool = False
@@ -124,19 +122,19 @@ class Positions(Sensor):
 
         The rows of a single unknown set-up are those of a model that knows none, unless no device shares its frame.
         """
-        known = set_up_kind(data).known_to(beside.model, beside.turns)
+        known = set_up_kind(data).among(beside.known, beside.turns)
         if beside.unplaced and not data.remounted:
             data = data.with_sessions([name or ROWS for name in data.device_names])
         names = dict.fromkeys(name for name in data.device_names if name)
         frames, new = known.only(names), [name for name in names if name not in known.names]
         sought = data.remounted or len(names) > 1 or beside.every_session or beside.unplaced
         if not new or not (sought or known.names):
-            return Places(frames) if frames.names else Places()
+            return Places(joined([frames] if frames.names else []))
         rows = of_devices(data, new)
         found = type(known).of(beside.points(rows), rows, beside.turns)
         frames = frames.beside(found)
         said = [BALL_IS_THE_MARKER] if frames.names == (ROWS,) else found.found_sentences()
-        return Places(frames, found=tuple(said), numbers=found.fitted_numbers)
+        return Places(joined([frames]), found=tuple(said), numbers=found.fitted_numbers)
 
     def errors(self, data: Measurements, points: Tensor, places: Places) -> Evaluation:
         names, data = data.device_names, places.aligned(data)
@@ -227,7 +225,7 @@ class Contacts(Sensor):
         return Evaluation(size, None, away[:, None], lines, distances, what=SPREAD, kind="socket", devices=names)
 
     def settled(self, data: Measurements, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
-        return (PlacedDevices(SocketPlaces.of(points[:, -1], data)),)
+        return (PlacedDevices(SocketPlaces.around(points[:, -1], data)),)
 
 
 class OtherDevices(Sensor):
@@ -244,22 +242,19 @@ class OtherDevices(Sensor):
         check_ball(model, "readings of a ball", "such readings", "readings")
 
     def place(self, data: Readings, beside: Beside) -> Places:
-        known = beside.devices.get(data.kind)
+        known = beside.known.get(data.kind)
         if known is not None and set(data.names) <= set(known.names):
-            return Places(devices={data.column_kind: known})
+            return Places(joined([known]))
         names = tuple(name for name in data.names if known is None or name not in known.names)
-        new = torch.tensor([name in names for name in data.names], dtype=torch.bool, device=data.device.device)
-        rows = data.rows(new[data.device])
+        rows = of_devices(data, names)
         devices = placed(rows, beside.points(rows))
         free = int((devices.deviations > KNOWN_DEVIATION).sum())
-        if known is not None:
-            devices = known.beside(devices)
-        names = few([f"'{name}'" for name in names])
-        sentence = f"the places of the devices of {data.kind}s were found from these rows: {names}"
-        return Places(devices={data.column_kind: devices}, found=(sentence,), numbers=free)
+        words = few([f"'{name}'" for name in names])
+        sentence = f"the places of the devices of {data.kind}s were found from these rows: {words}"
+        return Places(joined([devices] if known is None else [known, devices]), found=(sentence,), numbers=free)
 
     def errors(self, data: Readings, points: Tensor, places: Places) -> Evaluation:
-        devices = places.devices.get(data.column_kind)
+        devices = places.devices.get(data.kind)
         if devices is None:
             fix = "pass rows of the devices of the calibration"
             raise MeasurementError.of("`data`", expected="readings of the calibration", got=f"{data.kind}s", fix=fix)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -29,6 +29,7 @@ from diffeo_calib.robots.se3 import skew
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+T = TypeVar("T")
 MODEL_FRAME = "the frame of the model"
 SMALLEST_M = 1e-12
 """Of a column of a linear system, against division by zero."""
@@ -84,6 +85,10 @@ class Extrinsics(ABC):
     kind: ClassVar[str]
     reads: ClassVar[bool] = False
     """Whether they report readings of a model's points."""
+    set_up: ClassVar[bool] = False
+    """Whether they are set-ups: one alone is that of its model, and every fit finds them anew."""
+    seen_points: ClassVar[int] = 0
+    """Points of the tool that they see."""
 
     names: tuple[str, ...]
     constants: Tensor
@@ -99,6 +104,10 @@ class Extrinsics(ABC):
         """
         return self.constants
 
+    def aligned(self, data: T) -> T:
+        """Rows that these measured as those of the model's own set-up."""
+        return data
+
     def sentences(self) -> list[str]:
         """What is known of each of them, in the frame of the model."""
         return []
@@ -110,16 +119,6 @@ class Extrinsics(ABC):
     def elsewhere(self) -> Tensor:
         """(D,) boolean: set-ups in another frame than the model's, or with other markers."""
         return torch.zeros(len(self.names), dtype=torch.bool, device=self.constants.device)
-
-    @property
-    def of_model(self) -> bool:
-        """Whether this is one set-up alone, whose frame and markers are those of the model."""
-        return False
-
-    @property
-    def fitted_again(self) -> bool:
-        """Whether a fit to rows of known devices finds them anew, as it does set-ups."""
-        return False
 
     @property
     def cameras(self) -> dict[str, Any]:
@@ -159,7 +158,7 @@ class Devices(Extrinsics):
     stated_as: ClassVar[str] = ""
     """How a user writes where a new device is, to plan poses for it: the numbers of :meth:`stated`."""
     seen_points: ClassVar[int] = 1
-    """Points of the tool that it sees: the ball, or three of each measured frame."""
+    """The ball, or three points of each measured frame."""
     increments_each: ClassVar[int]
     """Increments k of a device."""
     numbers_each: ClassVar[int] = 1
@@ -239,6 +238,11 @@ class Devices(Extrinsics):
     def where(self, number: int) -> str:
         """Where a device is, in words."""
         return ", ".join(f"{value:.3f}" for value in self.constants[number].tolist())
+
+    @property
+    def places(self) -> Tensor | None:
+        """(D, 3) to which the ball must be brought to be seen, m; None if anywhere will do."""
+        return None
 
     def sees(self, points: Tensor, device: Tensor) -> Tensor:
         """(N,) boolean: whether these devices (N,) can measure points (N, 3), m."""

@@ -5,7 +5,7 @@ Where the devices of a calibration were found: what a model keeps of them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,6 +18,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError, sentence, w
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.sensors.devices import Devices, Extrinsics, check_devices
 from diffeo_calib.sensors.kinds import extrinsics, kind_of
+from diffeo_calib.sensors.set_ups import SetUps, mounted_kind
 
 BALL_IS_THE_MARKER = (
     "the model was calibrated without a measuring device: the frame of these positions was found from them, 6 numbers, "
@@ -31,27 +32,44 @@ class Places:
     """Devices beside a model.
 
     Args:
-        frames: of the set-ups of measured positions; None where these are in the frame of the model.
-        devices: those of readings, see :attr:`Readings.column_kind`.
+        devices: by kind: set-ups of measured positions, where these are in other frames, and devices of readings.
         ball: whether the last marker is a ball that no device of positions measures.
         found: what was found from the rows that are judged, in sentences. numbers: how many numbers that took.
     """
 
-    frames: Any = None
-    devices: Mapping[object, Devices] = field(default_factory=dict)
+    devices: Mapping[str, Any] = field(default_factory=dict)
     ball: bool = False
     found: tuple[str, ...] = ()
     numbers: int = 0
 
     def aligned(self, data: Any) -> Any:
         """Measured positions in the frame of the model."""
-        return data if self.frames is None else self.frames.aligned(data)
+        for own in self.devices.values():
+            data = own.aligned(data)
+        return data
 
     def beside(self, other: Places) -> Places:
         """Both of them."""
-        devices, found = {**self.devices, **other.devices}, (*self.found, *other.found)
-        frames, ball = self.frames or other.frames, self.ball or other.ball
-        return Places(frames, devices, ball, found, self.numbers + other.numbers)
+        devices, found = joined([*self.devices.values(), *other.devices.values()]), (*self.found, *other.found)
+        return Places(devices, self.ball or other.ball, found, self.numbers + other.numbers)
+
+
+def joined(devices: Iterable[Extrinsics]) -> dict[str, Any]:
+    """All devices of each kind."""
+    found = dict[str, Any]()
+    for own in devices:
+        found[own.kind] = found[own.kind].beside(own) if own.kind in found else own
+    return found
+
+
+def known_devices(model: object) -> dict[str, Any]:
+    """The devices that a model knows, by kind; none for other kinematics."""
+    return joined(own.devices for own in getattr(model, "placement", None) or ())
+
+
+def mounted_of(model: Any) -> SetUps:
+    """What is on the tool in every set-up that a calibrated model knows, for rows that were mounted anew."""
+    return mounted_kind(model.lever).among(known_devices(model), model.turns)
 
 
 LARGEST_SHARE = 0.5

@@ -8,7 +8,7 @@ K X M (several cameras on the tool).
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError, few
+from diffeo_calib.common.errors import InputError, MeasurementError, few, listed
 from diffeo_calib.common.quantiles import largest_known
 from diffeo_calib.measurements.checks import numbers_of, rare_names
 from diffeo_calib.measurements.poses import angle_between, frames_of_points, poses_from_marks, poses_of_triangles
@@ -54,6 +54,7 @@ class SetUps(Extrinsics):
         increments_each: numbers of a set-up that a fit leaves open.
     """
 
+    set_up = True
     shape: ClassVar[tuple[int, int]] = (4, 4)
     """Of the constants of one."""
     key: ClassVar[str] = "mountings"
@@ -74,20 +75,17 @@ class SetUps(Extrinsics):
         """
 
     @classmethod
-    def known_to(cls, model: Any, turns: Turns | None) -> Self:
-        """Those of this kind that a model knows."""
+    def among(cls, known: Mapping[str, Any], turns: Turns | None) -> Self:
+        """Those of this kind among the devices that a model knows, by kind."""
         none = torch.zeros(0, 0, dtype=torch.float64, device=HOST)
-        found = cls((), none, none)
-        for own in getattr(model, "placement", None) or ():
-            found = found.beside(own.devices) if own.kind == cls.kind else found
-        return replace(found, turns=turns)
+        return replace(known.get(cls.kind, cls((), none, none)), turns=turns)
 
     @abstractmethod
-    def aligned(self, data: Measurements) -> Measurements:
-        """Rows of these set-ups as those of the model's; so are rows that name no set-up."""
+    def aligned(self, data: Any) -> Any:
+        """Also rows that name no set-up; MeasurementError for rows of one that is not known."""
 
     @abstractmethod
-    def increments(self, points: Tensor, slopes: Tensor | None, by_tool: Tensor, centre: Tensor) -> Tensor:
+    def increments(self, points: Tensor, slopes: Tensor, by_tool: Tensor, centre: Tensor) -> Tensor:
         """What increments with their prior deviations do to R numbers of N rows: (N, R, k).
 
         Args:
@@ -121,17 +119,9 @@ class SetUps(Extrinsics):
         """(S,) boolean: the set-ups but the model's."""
         return (self.constants != self.same).any(1)
 
-    @property
-    def of_model(self) -> bool:
-        return len(self.names) == 1
-
-    @property
-    def fitted_again(self) -> bool:
-        return True
-
-    def views(self) -> list[View]:
-        """How each set-up sees poses of the model; as the model where markers were mounted anew."""
-        return [lambda poses: poses for _ in self.names]
+    def view(self, number: int, poses: Tensor) -> Tensor:
+        """What a set-up sees of poses (M, 4, 4) of the model, m; the same where markers were mounted anew."""
+        return poses
 
     def moved(self, others: Sequence[int], steps: Tensor, std: Tensor, centre: Tensor, T: Tensor) -> Self:
         """Some set-ups (T,) after increments (T, k), in prior deviations, and with their deviations.
@@ -171,8 +161,18 @@ class SetUps(Extrinsics):
 
     def of_rows(self, data: Measurements) -> Tensor:
         """(N, c) the constants of every row."""
-        whose = numbers_of(data.device_names, ["" if name == ROWS else name for name in self.names])
-        return torch.cat([self.constants, self.same[None]])[whose].to(data.points)
+        return torch.cat([self.constants, self.same[None]])[self.numbers(data)].to(data.points)
+
+    def numbers(self, data: Any) -> Tensor:
+        """(N,) number here of each row's set-up, -1 for none; MeasurementError for one that is not known."""
+        names, known = data.device_names, ["" if name == ROWS else name for name in self.names]
+        if data.session is None and known != [""]:
+            raise MeasurementError.of("the measurements have no sessions", fix="pass data.with_sessions(names)")
+        unknown = [name for name in dict.fromkeys(names) if name and name not in known]
+        if unknown:
+            fix = "register the model with rows of the new set-up"
+            raise MeasurementError.of(f"the sessions {unknown}", expected=f"some of {listed(self.names)}", fix=fix)
+        return numbers_of(names, known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,13 +193,12 @@ class MeasuringFrames(SetUps):
         free = NUMBERS_OF_A_FRAME + 3 * data.markers * (not cameras)
         return cls(names, found, found[:, :0], turns, free)
 
-    def aligned(self, data: Measurements) -> Measurements:
+    def aligned(self, data: Any) -> Any:
         return data.in_frames(torch.linalg.inv(self.of_rows(data).unflatten(1, (4, 4))))
 
-    def increments(self, points: Tensor, slopes: Tensor | None, by_tool: Tensor, centre: Tensor) -> Tensor:
+    def increments(self, points: Tensor, slopes: Tensor, by_tool: Tensor, centre: Tensor) -> Tensor:
         """What is left of the differences between the frames, and markers mounted again."""
-        frame = self.unit * frame_slopes(points, centre)
-        frame = frame if slopes is None else slopes @ frame
+        frame = slopes @ (self.unit * frame_slopes(points, centre))
         return torch.cat([frame, PLACES.remounted_m * by_tool], 2)[..., : self.increments_each]
 
     def stepped(self, constants: Tensor, steps: Tensor, centre: Tensor, T: Tensor) -> Tensor:
@@ -210,8 +209,8 @@ class MeasuringFrames(SetUps):
     def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
         return (self.constants.unflatten(1, (4, 4)) @ torch.linalg.inv(T)).flatten(1)
 
-    def views(self) -> list[View]:
-        return [lambda poses, T=T: T @ poses for T in self.constants.unflatten(1, (4, 4))]
+    def view(self, number: int, poses: Tensor) -> Tensor:
+        return self.constants[number].view(4, 4) @ poses
 
     def sentence(self, number: int) -> str:
         shift, turn = _size(self.constants[number])
@@ -234,11 +233,11 @@ class MountedMarkers(SetUps):
         shifts, deviations = (torch.stack(each).flatten(1).to(HOST) for each in zip(*found, strict=True))
         return cls(names, shifts, deviations, turns, 3 * data.markers)
 
-    def aligned(self, data: Measurements) -> Measurements:
+    def aligned(self, data: Any) -> Any:
         shifts = self.of_rows(data).unflatten(1, (-1, 3))
         return data.shifted(-(_turned(self.turns, data)[:, : shifts.shape[1]] @ shifts[..., None])[..., 0])
 
-    def increments(self, points: Tensor, slopes: Tensor | None, by_tool: Tensor, centre: Tensor) -> Tensor:
+    def increments(self, points: Tensor, slopes: Tensor, by_tool: Tensor, centre: Tensor) -> Tensor:
         return self.unit * by_tool
 
     def stepped(self, constants: Tensor, steps: Tensor, centre: Tensor, T: Tensor) -> Tensor:
@@ -278,12 +277,12 @@ class MountedFrames(SetUps):
         M = poses_from_marks(points, lever).flatten(1)
         return cls(names, M, torch.cat([shifts, shifts / lever], 1), turns, NUMBERS_OF_A_FRAME)
 
-    def aligned(self, data: Measurements) -> Measurements:
+    def aligned(self, data: Any) -> Any:
         return data.on_frames(self.of_rows(data).unflatten(1, (4, 4)))
 
-    def increments(self, points: Tensor, slopes: Tensor | None, by_tool: Tensor, centre: Tensor) -> Tensor:
+    def increments(self, points: Tensor, slopes: Tensor, by_tool: Tensor, centre: Tensor) -> Tensor:
         found = self.unit * own_slopes(points[:, :3])
-        return found if slopes is None else slopes[..., : found.shape[1]] @ found
+        return slopes[..., : found.shape[1]] @ found
 
     def in_any_frame(self, data: Measurements) -> Measurements:
         if not data.remounted or not set(data.device_names) <= {*self.names, ""}:
@@ -309,8 +308,8 @@ class MountedFrames(SetUps):
         mean = transforms(nearest_rotations(change[:, :3, :3].mean(0)), change[:, :3, 3].mean(0))
         return (mean @ self.constants.unflatten(1, (4, 4))).flatten(1)
 
-    def views(self) -> list[View]:
-        return [lambda poses, M=M: poses @ M for M in self.constants.unflatten(1, (4, 4))]
+    def view(self, number: int, poses: Tensor) -> Tensor:
+        return poses @ self.constants[number].view(4, 4)
 
     def sentence(self, number: int) -> str:
         shift, turn = _size(self.constants[number])
@@ -331,11 +330,6 @@ def set_up_kind(data: Measurements) -> type[SetUps]:
 def mounted_kind(lever: float | None) -> type[SetUps]:
     """What is mounted on a tool: markers, or frames, whose points are at the distance ``lever``, m."""
     return MountedMarkers if lever is None else MountedFrames
-
-
-def mounted_of(model: Any) -> SetUps:
-    """What is on the tool in every set-up that a calibrated model knows, for rows that were mounted anew."""
-    return mounted_kind(model.lever).known_to(model, model.turns)
 
 
 def check_same_markers(points: Tensor, measured: Tensor) -> None:

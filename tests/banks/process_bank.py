@@ -50,7 +50,7 @@ class Case:
     @property
     def variance(self) -> Tensor:
         """(K,) of the unknowns, shared shifts last."""
-        shifts = 0 if self.data.shared is None else self.data.shared.shape[2]
+        shifts = self.data.shared.shape[2]
         return torch.cat([self.data.prior_variance(self.scales), torch.ones(shifts, dtype=torch.float64)])
 
     @cached_property
@@ -64,7 +64,7 @@ class Case:
     def unknowns(self) -> Tensor:
         """(N R, K) their derivatives by the unknowns."""
         told = self.data.told
-        S = told.sensitivities if told.shared is None else torch.cat([told.sensitivities, told.shared], 2)
+        S = torch.cat([told.sensitivities, told.shared], 2)
         return S.flatten(0, 1)
 
     @cached_property

@@ -114,11 +114,8 @@ def weighted(setting: Setting, seed: int = 0) -> TangentData:
 
 def covariance(data: TangentData, scales: dc.Hyperparameters) -> Tensor:
     """Of all numbers of the rows, hidden ones too, by fields, unknowns, shared shifts and noise: (N m, N m)."""
-    total = data.linearisation(scales).gram() + torch.block_diag(*data.weighted_noise(scales))
-    if data.shared is not None:
-        shared = data.shared.flatten(0, 1)
-        total = total + shared @ shared.T
-    return total
+    shared = data.shared.flatten(0, 1)
+    return data.linearisation(scales).gram() + torch.block_diag(*data.weighted_noise(scales)) + shared @ shared.T
 
 
 # --- formulas -----------------------------------------------------------------------------------------------------

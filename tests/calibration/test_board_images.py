@@ -183,7 +183,7 @@ def test_a_tracker_is_found_from_poses_of_the_tool() -> None:
     values = torch.stack([Trackers.read(truth, body) for body in bodies])
     assert_close(values, ((bodies[:, :3, :3] @ marker + bodies[:, :3, 3]) @ B[:3, :3].mT) + B[:3, 3])
     found = Trackers.start(values, bodies)
-    tracker = Trackers(("device",), found[None], found.new_full((9,), 0.1))
+    tracker = Trackers(("device",), found[None], found.new_full((1, 9), 0.1))
     data = dc.Readings.of("marker", torch.zeros(len(values), 6), values, numbers=3, doubt=False)
     marks = mark_points(bodies, LEVER).flatten(1)
     assert_close(tracker.refined(data, marks).constants[0], truth, rtol=0, atol=1e-6)

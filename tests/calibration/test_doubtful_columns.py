@@ -27,7 +27,7 @@ from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.fitting.result import silent
-from diffeo_calib.measurements.csv.writing import write_rows
+from diffeo_calib.measurements.csv.lines import write_rows
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import Geometry, Joint, SimulatedArm, from_dh

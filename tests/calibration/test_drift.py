@@ -23,8 +23,7 @@ from diffeo_calib.calibration.diagnostics.hypotheses import worth_it
 from diffeo_calib.calibration.placing.drift import FRAME_M_RAD, GROWTH, OFFSET_RAD_M, Drift
 from diffeo_calib.calibration.placing.placement import SeenRows
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.measurements.csv.files import read_observations
-from diffeo_calib.measurements.csv.writing import write_measurements
+from diffeo_calib.measurements.csv.files import read_observations, write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import Geometry, SimulatedArm
 from diffeo_calib.sensors.known_drift import KnownDrift
@@ -113,11 +112,12 @@ def test_rows_are_brought_to_the_middle_of_the_column() -> None:
     moved = away + centre + (a * size[:3])[:, None] + turn + (a * size[6])[..., None] * away
     data = dc.Measurements(q, moved).with_covariates(time=time)
     drift: Any = Drift.of_table(data, ARM.nominal)[0]
-    effects = drift.effects(SeenRows(nominal, plain, plain, None, zero))
+    whole = torch.eye(6, dtype=torch.float64).expand(len(plain), 6, 6)
+    effects = drift.effects(SeenRows(nominal, plain, plain, whole, zero))
     assert_close(effects @ unknowns, moved.flatten(1) - plain, rtol=0, atol=1e-5)
-    constants = torch.cat([drift.known.constants[:, :2], centre[None], size[None]], 1)
-    found = replace(drift.known, constants=constants, deviations=size[None].abs())
-    back = found.aligned(data)
+    constants = torch.cat([drift.devices.constants[:, :2], centre[None], size[None]], 1)
+    found = replace(drift.devices, constants=constants, deviations=size[None].abs())
+    back = found.undone(data)
     assert_close(nominal(back.q, zero), back.points.flatten(1), rtol=0, atol=1e-5)
     assert back.covariates is None
     assert_close(found.points(lambda q: nominal(q, zero).view(-1, 2, 3), data), moved, rtol=0, atol=1e-5)

@@ -17,7 +17,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.choose_scales import scales_of_models
 from diffeo_calib.calibration.identification.identification import Prior
-from diffeo_calib.calibration.scales.gear_lines import LIMITS, _fall, _Scan, find_gear_lines
+from diffeo_calib.calibration.scales.gear_lines import _fall, _Scan, find_gear_lines
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -105,7 +105,7 @@ def drawn(lines: object = LINES, *, q: Tensor | None = None, seed: int = 0) -> t
     q = arm.sample(150, seed=3) if q is None else q
     nominal = GeometryMap(arm.truth, elastic=True)
     zero = torch.zeros(nominal.parameters, dtype=torch.float64)
-    sensor = NoiseModel(1)
+    sensor = NoiseModel.alike(len(q), 1)
     data = TangentData(nominal, zero, q, arm.truth.points(q).flatten(1), sensor, Tails.none(len(q), 1))
     scales = defaults(data, 3e-5, Prior())
     matrix = data.linearisation(scales).gram() + torch.block_diag(*data.noise(scales))
@@ -144,7 +144,7 @@ def test_no_line_where_other_frequencies_explain_the_same() -> None:
 def test_the_scan_is_that_of_least_squares() -> None:
     """Against dense generalised least squares, at frequencies of the scan and between them."""
     data, scales = drawn()
-    scan = _Scan(data, scales, LIMITS)
+    scan = _Scan(data, scales)
     K = covariance(data, scales)
     whiten = torch.linalg.inv(torch.linalg.cholesky(K))
     r = whiten @ data.target.flatten()

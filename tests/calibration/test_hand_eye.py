@@ -23,20 +23,19 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.scales.noise_model import with_best_seen_point
-from diffeo_calib.cli import record
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_sentences
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.poses import inverse_poses
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.reports.results import SCHEMA
 from diffeo_calib.robots.se3 import rotation, twist_transform
 
 ROWS, TEST_ROWS = 60, 100
 POSITION_STD, ROTATION_STD = 1e-4, 1e-3
 MIDDLE = (-0.2, 0.15, 0.0)
 """Of a board whose origin is in a corner, m."""
-SCHEMA = json.loads((Path(record.__file__).parent / "result.schema.json").read_text(encoding="utf-8"))
 TABLE = TableFormat("mm", "deg", rotation=["a", "b", "c"], convention="rotvec", camera_on_tool=True)
 OPTIONS = ["--position", "x,y,z", "--rotation", "a,b,c", "--convention", "rotvec", "--rotation-angle", "deg"]
 OPTIONS += ["--length", "mm", "--angle", "deg", "--base", "base_link", "--tip", "flange"]

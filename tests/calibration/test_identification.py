@@ -42,7 +42,6 @@ def test_identification_recovers_a_rigid_arm(markers: int) -> None:
     assert start.rms > 5e-4
     assert rms(found.geometry, test, arm.true_points(test)) < 1e-7
     assert found.noise == pytest.approx(1e-6)  # no finer: noise-free data
-    assert found.status.startswith("converged")
 
 
 def test_identification_estimates_the_noise_and_its_own_error() -> None:
@@ -157,7 +156,6 @@ def test_a_step_to_where_nothing_can_be_measured_is_shortened() -> None:
     rows: Any = Ahead()
     one, none = torch.ones(1, 1, dtype=torch.float64), torch.zeros(1, 0, dtype=torch.float64)
     found = solve(rows, one, none)
-    assert found.converged
     assert float(found.shifts[0]) == pytest.approx(0.5, abs=1e-4)
     with pytest.raises(InputError, match="behind"):
         solve(rows, one, none, start=(one[0], one[0]))

@@ -15,8 +15,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.scales import leave_one_out as one_out
 from diffeo_calib.calibration.scales.leave_one_out import (
-    FoldLimits,
     LeaveOneOut,
     cross_validated_inflation,
     estimate_tails,
@@ -186,8 +186,6 @@ def test_few_data_inflate_the_regions_as_student_s_t_does() -> None:
 
 # --- folds ------------------------------------------------------------------------------------------------------------
 
-BRIEF = FoldLimits(iterations=1)
-
 
 def narrow(setting: Setting) -> TangentData:
     """With weights of any size, and a narrow prior of the base: G + R spans eight powers of ten with the usual."""
@@ -271,12 +269,13 @@ def test_right_scales_predict_folds_with_errors_as_large_as_the_measured_ones() 
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.08)
 
 
-def test_right_scales_are_hardly_widened() -> None:
+def test_right_scales_are_hardly_widened(monkeypatch: pytest.MonkeyPatch) -> None:
     """By the uncertainty of the factor, and by what a search changes that sees fewer rows."""
     setting, found = built("sliding"), []
+    monkeypatch.setattr(one_out, "ITERATIONS", 1)
     for seed in range(5):
         data = drawn(setting, seed)
-        factor = cross_validated_inflation(setting.scales, setting.scales, data, groups(data), seed=seed, limits=BRIEF)
+        factor = cross_validated_inflation(setting.scales, setting.scales, data, groups(data), seed=seed)
         found.append(factor or 0.0)
     assert min(found) > 0.5
     assert 0.9 < np.median(found) < 1.7, found

@@ -46,7 +46,7 @@ def test_as_accurate_as_in_one_session(result: Any) -> None:
 
 
 def test_the_shifts_are_found(result: Any) -> None:
-    found = result.sessions.set_ups
+    found = result.sessions.devices
     order = ["abc".index(name) for name in found.names]
     away = (found.constants - SHIFTS[order]).abs()
     assert bool((away < 5 * found.deviations + 1e-9).all())

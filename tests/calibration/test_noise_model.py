@@ -39,7 +39,7 @@ def turned(vectors: Tensor) -> Tensor:
 
 
 def pose_sensor(rows: int, slack: float = 2e-6) -> NoiseModel:
-    return NoiseModel(1, 9, modes=mark_jacobian(poses(rows), LEVER)[:, None], slack=slack)
+    return replace(NoiseModel.alike(rows, 1, 9), modes=mark_jacobian(poses(rows), LEVER)[:, None], slack=slack)
 
 
 def covariances(rows: int, m: int, seed: int) -> Tensor:
@@ -81,14 +81,14 @@ def test_covariance_of_poses_is_that_of_simulated_noise() -> None:
     moved[:, :3, :3] = turned(turn * normal(DRAWS, 3, seed=3)) @ moved[:, :3, :3]
     moved[:, :3, 3] += shift * normal(DRAWS, 3, seed=4)
     draws = (mark_points(moved, data.lever) - mark_points(data.poses[:1], data.lever)).flatten(1)
-    sensor = replace(NoiseModel.of(data, 0.0), known=None)
+    sensor = NoiseModel.of(data, 0.0).without_known
     close_to_sample(sensor.covariance(scales, framed.tangent_data.jacobian)[0], draws)
 
 
 @pytest.mark.parametrize("markers", [1, 3])
 def test_squares_of_markers(markers: int) -> None:
     """r_k^T R_kk^-1 r_k, every marker by itself."""
-    sensor, m = NoiseModel(markers), 3 * markers
+    sensor, m = NoiseModel.alike(4, markers), 3 * markers
     covariance, errors = covariances(4, m, seed=8), normal(4, m, seed=9)
     found = sensor.squares(covariance, errors[:, :, None] * errors[:, None])
     assert found.shape == (4, markers)

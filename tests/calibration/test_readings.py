@@ -80,7 +80,7 @@ def test_likelihood_and_its_slope_of_distances() -> None:
     observe = ReadPoints(FixedPoints.read, fixed, 3)
     y = observe.value(nominal(x, theta)) + 1e-4 * normal(len(x), 1, seed=5)
     tails = type(whole.tails).none(len(x), 1)
-    data = TangentData(nominal, theta, x, y, NoiseModel(1, size=1), tails, observe=observe)
+    data = TangentData(nominal, theta, x, y, NoiseModel.alike(len(x), 1, 1), tails, observe=observe)
     scales = replace(shaken(setting.scales, 3), task_amplitude=torch.tensor(1e-3, dtype=torch.float64))
     A = torch.block_diag(*observe.slope(nominal(x, theta)))
     expected = A @ tangent_covariance(scales, nominal, theta, x) @ A.T

@@ -49,7 +49,6 @@ def test_registration_finds_any_frame_and_marker(seed: int, markers: int) -> Non
     torch.testing.assert_close(found.geometry.base, truth.base, rtol=0, atol=1e-9)
     torch.testing.assert_close(found.geometry.tool, truth.tool, rtol=0, atol=1e-9)
     assert found.rms < 1e-12
-    assert found.status.startswith("converged")
 
 
 def test_registration_is_a_minimum_and_reports_its_deviations() -> None:
@@ -62,7 +61,6 @@ def test_registration_is_a_minimum_and_reports_its_deviations() -> None:
     torch.testing.assert_close(gradient[parts["tool"]], -weight * geometry.tool.flatten(), rtol=1e-3, atol=1e-10)
     assert bool((found.deviations[parts["joints"]] == 0).all())
     assert bool((found.deviations[parts["base"]] > 0).all())
-    assert "mm RMS" in found.status
 
 
 def test_registration_from_four_poses_needs_its_many_starts() -> None:
@@ -72,13 +70,6 @@ def test_registration_from_four_poses_needs_its_many_starts() -> None:
         found = register(ARM.nominal, q, truth.points(q))
         torch.testing.assert_close(found.geometry.base, truth.base, rtol=0, atol=1e-6)
         assert found.rms < 1e-12
-
-
-def test_three_poses_of_one_marker_fit_in_several_ways_and_the_status_says_so() -> None:
-    truth, q = somewhere(7), ARM.sample(3)
-    found = register(ARM.nominal, q, truth.points(q))
-    assert found.rms < 1e-12
-    assert "only as many coordinates as unknowns" in found.status
 
 
 @pytest.mark.parametrize(("markers", "poses", "need"), [(1, 2, 3), (2, 1, 2), (3, 1, 2)])
@@ -97,26 +88,24 @@ def test_joints_that_never_move_leave_directions_undetermined() -> None:
     q[:] = q[0]
     stuck = register(ARM.nominal, q, truth.points(q))
     assert stuck.rms < 1e-9
-    assert "6 of 9 directions of base and markers undetermined" in stuck.status
     assert identify(stuck.geometry, q, truth.points(q)).rms < 1e-6
 
 
 SLIDE, DOWN = (0, pi / 2, 0, pi / 2, "prismatic"), (0, 0, 0, 0, "prismatic")
 OPEN = [
-    ([(0.5, 0, 0), (0.4, 0, 0), (0.2, 0, 0)], [[0.03, -0.02, 0.0]], "1 of 9 directions"),  # in a plane
-    ([SLIDE, SLIDE, DOWN], [[0.0, 0.0, 0.0]], "3 of 9 directions"),  # never turns
+    ([(0.5, 0, 0), (0.4, 0, 0), (0.2, 0, 0)], [[0.03, -0.02, 0.0]]),  # in a plane
+    ([SLIDE, SLIDE, DOWN], [[0.0, 0.0, 0.0]]),  # never turns
 ]
 
 
-@pytest.mark.parametrize(("rows", "tool", "words"), OPEN)
-def test_directions_that_no_row_can_show_belong_to_the_base(rows: Any, tool: Any, words: str) -> None:
+@pytest.mark.parametrize(("rows", "tool"), OPEN)
+def test_directions_that_no_row_can_show_belong_to_the_base(rows: Any, tool: Any) -> None:
     chain = from_dh(rows, name="machine")
     truth = replace(Geometry.nominal(chain), base=somewhere(9).base, tool=torch.tensor(tool, dtype=torch.float64))
     q = draw(40, 3)
     found = register(chain, q, truth.points(q))
     torch.testing.assert_close(found.geometry.base, truth.base, rtol=0, atol=1e-9)
     torch.testing.assert_close(found.geometry.tool, truth.tool, rtol=0, atol=1e-9)
-    assert words in found.status
 
 
 # --- joint offsets far from the description ---------------------------------------------------------------------------
@@ -189,7 +178,6 @@ def test_long_chains_are_registered_and_identified(chain: Chain) -> None:
     start = register(chain, q, truth.points(q))
     found = identify(start.geometry, q, truth.points(q))
     assert start.rms > 5e-4
-    assert found.status.startswith("converged")
     error = (found.geometry.points(test) - truth.points(test)).norm(dim=-1)
     assert float(error.max()) < 1e-6
 

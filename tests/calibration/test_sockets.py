@@ -26,7 +26,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.rows import with_attributes
-from diffeo_calib.regression.conditional import Opened, WithoutRigidMotions
+from diffeo_calib.regression.conditional import Estimated
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
 
@@ -61,10 +61,9 @@ def aligned(points: Tensor, truth: Tensor) -> Tensor:
     return points @ T[:3, :3].mT + T[:3, 3] - truth
 
 
-def gauge(model: dc.CalibratedKinematics) -> WithoutRigidMotions:
+def gauge(model: dc.CalibratedKinematics) -> Estimated:
     found = model.map.conditional
-    found = found.before if isinstance(found, Opened) else found
-    assert isinstance(found, WithoutRigidMotions)
+    assert isinstance(found, Estimated)
     return found
 
 
@@ -86,7 +85,7 @@ def test_the_sockets_are_where_they_are(result: Any, rows: SocketRows) -> None:
     truth = torch.stack([rows.positions[name] for name in found.names])
     errors = aligned(found.positions, truth)
     assert float(errors.norm(dim=1).square().mean().sqrt()) < 6e-5
-    assert 0.1 < float((errors / found.deviations).square().mean()) < 2.5
+    assert 0.1 < float((errors / found.devices.deviations).square().mean()) < 2.5
     first, second = found.positions[0], found.positions[1]
     assert abs(float((first - second).norm()) - 0.05) < 2e-5  # known to 1e-5
 
@@ -95,7 +94,7 @@ def test_covariances_by_the_projection_written_out(arm: SimulatedArm, result: An
     model, q = result.model, arm.sample(4, seed=3)
     found, at = gauge(model), model.map.geodesic.linearise(q)
     both = model.map.geodesic.linearise(torch.cat([q, found.reference.at.joint[0].points]))
-    C = found.inner.covariance_between(both)
+    C = found.before.covariance_between(both)
     B = both.sensitivity.flatten(0, 1)[:, :6]
     motion = torch.cat([torch.zeros(6, 12, dtype=C.dtype), torch.linalg.pinv(B[12:])], 1)
     P = (torch.eye(len(C), dtype=C.dtype) - B @ motion)[:12]
@@ -131,7 +130,7 @@ def test_places_left_out_by_leaving_them_out(data: dc.Measurements, placed: Plac
     tangent, devices = placed.tangent_data(), placed.placement.one(SocketDevices)
     scales = defaults(tangent, placed.identification.noise, placed.identification.prior)
     chosen = ChosenScales(Selection(scales, "defaults"), tangent, leave_one_out(tangent, scales))
-    socket, own = devices.socket, devices.sockets.place[devices.socket] == 2
+    socket, own = devices.device, devices.sockets.place[devices.device] == 2
     rest, gone = (flags.nonzero()[:, 0] for flags in (~own, own))
     mu = tangent.rows(rest).process(scales).mu.view(-1, 3)
     gram = tangent.linearisation(scales).gram().view(len(data), 3, len(data), 3)
@@ -177,7 +176,7 @@ def test_geometry_does_not_depend_on_where_the_sockets_are_thought(arm: Simulate
     for shift in (0.0, 3e-3):
         away = shift * torch.tensor([1.0, -1.0, 0.5]).double()
         places = SocketDevices.around(with_attributes(data, sockets=bare), found.positions + away)
-        placed, shared = places.at_places(data), places.shared(3).unflatten(1, (-1, 3))
+        placed, shared = places.at_places(data), places.shared(len(data), 3).unflatten(1, (-1, 3))
         held = held_parameters(geometry, adrift=True)
         given = 1e-4, Prior()
         thetas.append(identify(geometry, placed.q, placed.points, *given, shared=shared, held=held).theta)

@@ -163,7 +163,7 @@ def data() -> dc.Measurements:
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """Samples of a few rows."""
     monkeypatch.setattr(identification, "COORDINATES", 3 * SAMPLED)
-    monkeypatch.setattr(choose_scales, "LIMITS", replace(choose_scales.LIMITS, coordinates=3 * SAMPLED))
+    monkeypatch.setattr(choose_scales, "MOST_COORDINATES", 3 * SAMPLED)
     monkeypatch.setattr(fitting, "SAMPLE_COORDINATES", 3 * SAMPLED)
     monkeypatch.setattr(calibrate, "MAX_DENSE", 3 * SAMPLED)
     monkeypatch.setattr(calibrate, "AUTO_CONTROLS", 40)

@@ -236,7 +236,7 @@ def test_a_plane_is_named_where_it_matters(result: Any) -> None:
     def warned(positions: torch.Tensor, expected_error: float) -> list[str]:
         with warnings.catch_warnings(record=True) as texts:
             warnings.simplefilter("always")
-            warn_of_flat_places(result.model.map, positions, found.socket, found.sockets.place, expected_error)
+            warn_of_flat_places(result.model.map, positions, found.device, found.sockets.place, expected_error)
         return [str(text.message) for text in texts]
 
     assert warned(flat, found.workspace_deviation) == []

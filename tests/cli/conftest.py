@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from command_bank import Command, Outcome, Site, make_site, run_process
 from commanded_bank import write_columns
-from init_bank import ARM, Proposed
+from init_bank import ARM, NAMES, ROWS, Proposed
 from server_bank import Server
 from torch import Tensor
 
@@ -97,3 +97,10 @@ def proposed(tmp_path: Path, init: Proposed) -> Proposed:
         return init(table, tmp_path / robot)
 
     return propose
+
+
+@pytest.fixture
+def frame(tmp_path: Path) -> Any:
+    """A table of the arm as a data frame, m and rad, beside its URDF."""
+    ARM.write_urdf(tmp_path / "arm.urdf")
+    return dc.Measurements(*ARM.measure(ROWS, seed=0), NAMES).to_frame()

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow  # calibrations by the dozen
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--sep", ","], r"`sep` and `decimal`: expected different characters.*--sep ';'"),
+        (["--sep", ","], r"--sep and --decimal: expected different characters.*--sep ';'"),
         (["--tip", "hand"], r"no link 'hand'.*its links are base_link, .*flange"),
         (["--tip", "flnage"], r"did you mean 'flange'"),
         (["--tip", "flange", "--tip", "wrist_link"], r"--tip: expected 1, one for each --position, got 2"),

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import pytest
 
 from diffeo_calib.cli.column_names import column
@@ -198,6 +201,8 @@ def test_poses_as_matrices(names: list[str], named: bool) -> None:
         ("xIst", ("x", "ist"), ""),
         ("POSX_mm", ("pos", "x"), "mm"),
         ("m_x", ("m", "x"), ""),
+        ("tvec[2]", ("tvec", "z"), ""),
+        ("rvec_0", ("rvec", "x"), ""),
         ("current_joint_1", ("actual", "joint", "1"), ""),
         ("joint_current_1 [A]", ("joint", "current", "1", "a"), ""),
     ],
@@ -216,3 +221,25 @@ def test_places_are_no_rotations() -> None:
         places = [[f"{body}_{axis}" for axis in "xyz"] for body in "ab"]
         found = bodies_in(["Goal roll", "Goal pitch", "Goal yaw", *each[0], *each[1], *places[0], *places[1]])
         assert [own.turn for own in found] == each
+
+
+PAGE = Path(__file__).parents[2] / "scripts/docs/pages/howto/makers.md"
+ROBOTS = PAGE.read_text(encoding="utf-8").split("\n## ")[1]
+SERIES = {
+    maker: names.removesuffix(",...").split(",") for maker, names in re.findall(r"\n\| ([^|]*) \| `([^`]*)`", ROBOTS)
+}
+PLACES = ["X [mm]", "Y [mm]", "Z [mm]"]
+
+
+@pytest.mark.parametrize("maker", SERIES)
+def test_joints_of_a_maker_are_found_beside_their_speeds(maker: str) -> None:
+    own = [name for name in SERIES[maker] if name != "timestamp"]
+    joints = [name.removesuffix(".pos") if "." in name else f"j{k}" for k, name in enumerate(own, 1)]
+    joints = ["q1", "q2"] if maker.startswith("ROS") else joints
+    columns = [*SERIES[maker], *(f"d{name}" for name in own), *PLACES]
+    assert guess_joints(columns, joints)[0].names == own
+    assert [own.place for own in bodies_in(columns)] == [PLACES]
+
+
+def test_every_maker_is_tested() -> None:
+    assert len(SERIES) == ROBOTS.count("\n| ") - 1 >= 11

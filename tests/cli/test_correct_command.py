@@ -12,20 +12,20 @@ import numpy as np
 import pytest
 import torch
 from command_bank import Command, Site
-from recorded_bank import made_with
+from deformation_bank import made_with
 from table_bank import held
 from torch import Tensor
 from two_arms_bank import HANDS
 from two_arms_bank import robot as two_arms
 
 import diffeo_calib as dc
-from diffeo_calib.cli import record
 from diffeo_calib.cli.options import Targets
 from diffeo_calib.cli.tables import ProgramTable
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.tool import tool_transform
 from diffeo_calib.measurements.poses import angle_between, rotation_matrices, transforms
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.reports.results import SCHEMA
 
 UNITS = ["--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
 TOOL = [30.0, -20.0, 150.0, 10.0, 20.0, -30.0]  # mm, and a rotation vector in deg
@@ -215,7 +215,7 @@ def test_wrong_options(options: list[str], message: str, site: Site, program: Pa
 def recorded_misses(path: Path) -> dict[str, Any]:
     """Of a file of --json, which is as its schema says."""
     written = json.loads(path.read_text())
-    jsonschema.validate(written, json.loads((Path(record.__file__).parent / "result.schema.json").read_text()))
+    jsonschema.validate(written, SCHEMA)
     return written["results"]["misses"]
 
 

@@ -133,7 +133,7 @@ def test_blocks_do_not_change_predictions_or_errors(
     path, names = site.folder / "model.safetensors", ("whole.csv", "blocks.csv")
     printed = []
     for name, rows in zip(names, (2048, 7), strict=True):
-        monkeypatch.setattr("diffeo_calib.cli.commands.predict.ROWS_AT_ONCE", rows)
+        monkeypatch.setattr("diffeo_calib.cli.commands.evaluate.ROWS_AT_ONCE", rows)
         assert command("predict", path, site.csv, *TABLE[2:], "-o", tmp_path / name).code == 0
         printed.append(command("evaluate", path, site.csv, *TABLE).out)
     whole, blocks = (

@@ -14,34 +14,22 @@ from diffeo_calib.measurements.table_format import TableFormat
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    "words",
     [
-        ["fit"],
-        ["fit", "t.csv", "--robot", "r.urdf"],
-        ["nonsense"],
-        ["evaluate", "m", "t.csv", "--position", "x,y,z", "--length", "km", "--angle", "rad"],
-        ["evaluate", "m", "t.csv", "--position", "x,y,z", "--length", "m", "--angle", "rad", "--surprise"],
-        ["fit", "t.csv", "--holdout", "1.5"],
-        ["fit", "t.csv", "--holdout", "nan"],
-        [
-            "evaluate",
-            "m",
-            "t.csv",
-            "--position",
-            "x,y,z",
-            "--length",
-            "m",
-            "--angle",
-            "rad",
-            "--rotation-angle",
-            "turn",
-        ],
-        ["demo", "--seed", "-1"],
-        ["demo", "--count", "3"],
+        "fit",
+        "fit t.csv --robot r.urdf",
+        "nonsense",
+        "evaluate m t.csv --position x,y,z --length km --angle rad",
+        "evaluate m t.csv --position x,y,z --length m --angle rad --surprise",
+        "fit t.csv --holdout 1.5",
+        "fit t.csv --holdout nan",
+        "evaluate m t.csv --position x,y,z --length m --angle rad --rotation-angle turn",
+        "demo --seed -1",
+        "demo --count 3",
     ],
 )
-def test_wrong_usage_is_exit_2(arguments: list[str], command: Command) -> None:
-    done = command(*arguments)
+def test_wrong_usage_is_exit_2(words: str, command: Command) -> None:
+    done = command(*words.split())
     assert done.code == 2
     assert "Traceback" not in done.err
     assert "Usage" in done.err

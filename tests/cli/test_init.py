@@ -21,14 +21,6 @@ from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
-
-@pytest.fixture
-def frame(tmp_path: Path) -> Any:
-    """A table of the arm as a data frame, m and rad, beside its URDF."""
-    ARM.write_urdf(tmp_path / "arm.urdf")
-    return dc.Measurements(*ARM.measure(ROWS, seed=0), NAMES).to_frame()
-
-
 # --- the robot and its links ---
 
 JOINT = (
@@ -353,6 +345,17 @@ def test_a_proposal_is_that_of_the_table(written: tuple[str, str, str, str], tmp
     assert options["--sep"] == ("tab" if sep == "\t" else sep)
     assert [words[k + 1] for k, word in enumerate(words) if word == "--position"] == [",".join(p) for p in positions]
     assert (options["--joints"], options["--base"], options["--tip"]) == (",".join(NAMES), "base_link", "flange")
+
+
+def test_cells_that_are_no_numbers_are_named(tmp_path: Path, init: Proposed, proposed: Proposed) -> None:
+    q, points = rows()
+    proposed((NAMES, q), (XYZ, points), (["x2", "y2", "z2"], points + 30.0))
+    lines = (tmp_path / "t.csv").read_text().splitlines()
+    lines[5] = ",".join([*lines[5].split(",")[:-2], "#VALUE!", "1"])
+    (tmp_path / "t.csv").write_text("\n".join(lines))
+    entries, text = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
+    assert entries["position"] == ["x,y,z"]
+    assert "line 6, column 'y2': expected a number, got '#VALUE!'" in text
 
 
 @pytest.mark.parametrize(("count", "message"), [(ROWS, "one clear reading"), (3, "3 row(s)")])

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from command_bank import Command
-from init_bank import ARM, NAMES, ROWS, XYZ, Proposed, reasons
+from init_bank import ARM, ROWS, XYZ, Proposed, reasons
 from kind_bank import kind_named
 from product_bank import simulated_poses
 from trackerless_bank import write_socket_table, write_wire_table
@@ -21,13 +21,6 @@ from diffeo_calib.cli.main import app, expanded
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
-
-
-@pytest.fixture
-def frame(tmp_path: Path) -> Any:
-    """A table of the arm as a data frame, m and rad, beside its URDF."""
-    ARM.write_urdf(tmp_path / "arm.urdf")
-    return dc.Measurements(*ARM.measure(ROWS, seed=0), NAMES).to_frame()
 
 
 def test_sockets_are_proposed(tmp_path: Path, proposed: Proposed, init: Proposed) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,10 @@ from command_bank import Command
 from product_bank import Case
 
 import diffeo_calib as dc
-from diffeo_calib.cli import record
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.reports.results import RESULTS, SCHEMA
 
-SCHEMA = json.loads((Path(record.__file__).parent / "result.schema.json").read_text(encoding="utf-8"))
 TABLE = ["--position", "x,y,z", "--length", "mm", "--angle", "deg"]
 UNITS = TABLE[2:]
 
@@ -45,8 +45,12 @@ def ran(command: Command, folder: Path, *arguments: object, code: int = 0) -> di
     return written
 
 
-def test_the_schema_is_one() -> None:
+def test_the_schema_is_one_and_knows_what_commands_add() -> None:
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
+    sources = [path.read_text(encoding="utf-8") for path in (Path(dc.__file__).parent / "cli").rglob("*.py")]
+    calls = [node for source in sources for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)]
+    added = {word.arg for call in calls if ast.unparse(call.func) == "record.add" for word in call.keywords if word.arg}
+    assert {"rows", "files", "parts"} <= added <= set(RESULTS)
 
 
 def test_evaluate(folder: Path, command: Command, arm: Case) -> None:

@@ -11,8 +11,7 @@ from command_bank import Command
 from diffeo_calib.cli.guesses import with_places
 from diffeo_calib.cli.options import Places, Rows, Units
 from diffeo_calib.cli.tables import as_at_the_fit
-from diffeo_calib.measurements.csv.lines import read_cells
-from diffeo_calib.measurements.csv.writing import write_rows
+from diffeo_calib.measurements.csv.lines import read_cells, write_rows
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
@@ -74,7 +73,8 @@ def test_init_joins_two_files(files: Files, tmp_path: Path, command: Command, in
     assert 'by = "name"  # 29 lines of places.csv are joined with lines of joints.csv by name; lines without' in text
     for words in ('places.csv"  # the measured', 'marker = "reflector"', 'length = "mm"', "# all columns are used"):
         assert words in text
-    assert command("fit", tmp_path / "c.toml", "--position", "x").err.endswith("expected three columns X,Y,Z, got x\n")
+    done = command("fit", tmp_path / "c.toml", "--position", "x")
+    assert "--position: expected three names of columns" in done.error
 
 
 def test_init_joins_by_the_column_with_the_most_common_texts(tmp_path: Path) -> None:
@@ -86,6 +86,13 @@ def test_init_joins_by_the_column_with_the_most_common_texts(tmp_path: Path) -> 
         (2, ["1.5", "R1", "8", "2", "0.4", "R1", "1"]),
         (3, ["0.5", "R1", "7", "1", "1.6", "R1", "2"]),
     ]
+
+
+def test_init_joins_by_columns_of_other_names_that_name_the_same_rows(tmp_path: Path) -> None:
+    (tmp_path / "j.csv").write_text("pose,a\nP1,1\nP2,2\nP3,4\n")
+    (tmp_path / "p.csv").write_text("Name;x\nP3;1\nP1;2\nP2;3\n")
+    _, entries = with_places(tmp_path / "j.csv", Places(places=tmp_path / "p.csv"), tmp_path)
+    assert [entry.value for entry in entries] == ["p.csv", "pose=Name"]
 
 
 def test_init_says_what_is_missing(files: Files, tmp_path: Path, command: Command) -> None:
@@ -105,7 +112,7 @@ def test_init_says_what_is_missing(files: Files, tmp_path: Path, command: Comman
         (["fit", "JOINTS", "--by", "name"], "--by without --places"),
         (["campaign", "JOINTS", "--places", "PLACES", "--by", "name"], "--places or --marker, of a table that grows"),
         (["campaign", "WHOLE", "--marker", "reflector"], "--places or --marker, of a table that grows"),
-        (["fit", "WHOLE", "--marker", "reflector", "--socket", "x"], "`marker` (reflector): expected one position"),
+        (["fit", "WHOLE", "--marker", "reflector", "--socket", "x"], "--marker (reflector): expected one position"),
     ],
 )
 def test_options_that_do_not_go_together(words: list[str], message: str, files: Files, command: Command) -> None:

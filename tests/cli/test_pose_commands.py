@@ -16,8 +16,8 @@ from kind_bank import UNITS, kind_named
 from table_bank import CONVENTIONS, read_table
 from torch.testing import assert_close
 
-from diffeo_calib.cli.commands.predict import reading_options
-from diffeo_calib.measurements.csv.writing import write_predictions
+from diffeo_calib.cli.commands.evaluate import reading_options
+from diffeo_calib.measurements.csv.files import write_predictions
 from diffeo_calib.measurements.poses import angle_between, rotation_matrices, transforms
 
 

@@ -22,6 +22,7 @@ atexit.register(lambda: print("loaded:", *(name for name in {SLOW} if name in sy
 from diffeo_calib.__main__ import main
 main()
 """
+ALL = "fit campaign record evaluate init images predict correct export plan recalibrate report demo"
 COMMANDS = ("fit", "evaluate", "predict", "correct", "export", "plan", "demo")
 
 
@@ -40,24 +41,7 @@ def test_help_and_version_load_nothing_slow(arguments: list[str]) -> None:
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (
-            "diffeo-calib ",
-            [
-                "fit",
-                "campaign",
-                "record",
-                "evaluate",
-                "init",
-                "images",
-                "predict",
-                "correct",
-                "export",
-                "plan",
-                "recalibrate",
-                "report",
-                "demo",
-            ],
-        ),
+        ("diffeo-calib ", ALL.split()),
         ("diffeo-calib pre", ["predict"]),
         ("diffeo-calib fit --ro", ["--robot", "--robot-pose", "--rotation", "--rotation-angle", "--rotation-std"]),
         ("diffeo-calib fit --length ", ["m", "mm", "cm", "inch"]),

@@ -55,6 +55,13 @@ def test_the_second_device_refuses_to_mix() -> None:
         assert device.operations.calls > 3
 
 
+@every_case
+def test_kernels_move_with_all_their_numbers(case: Case) -> None:
+    """Also those that operations would bring along each time."""
+    parts = [value for term in case.kernel.to("meta").terms for value in vars(term).values()]
+    assert {part.device.type for part in parts if isinstance(part, Tensor)} == {"meta"}
+
+
 @every_place
 @every_formula
 @every_profile

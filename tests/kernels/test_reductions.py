@@ -1,4 +1,4 @@
-"""Kernel sums compared with an explicit loop over pairs, and the choice of a backend."""
+"""Kernel sums of every backend on unusual input, and the choice of a backend. Their values: test_kernels.py."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ import torch
 from math_bank import torch_threads
 from sum_bank import (
     FAR,
-    NAIVE,
     ROWS,
-    Naive,
     apart,
     assert_same,
     every_formula,
@@ -29,16 +27,6 @@ from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile, Profil
 from diffeo_calib.kernels.reductions import backends
 from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Formula
-
-
-@every_profile
-@torch_backends
-@pytest.mark.parametrize(("formula", "naive", "atol"), NAIVE.values(), ids=NAIVE.keys())
-def test_sums_are_those_of_a_loop_over_pairs(
-    formula: Formula, naive: Naive, atol: float, profile: Profile, backend: Backend
-) -> None:
-    i, j = apart()
-    assert_same(backends.evaluate(formula, profile, i, j, backend), naive(profile, i, j), atol)
 
 
 @every_formula

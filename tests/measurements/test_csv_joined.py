@@ -10,9 +10,8 @@ import pytest
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
+from diffeo_calib.measurements.csv.joined import JoinedFile, Recording, StopLimits, joined_file, pictured, stops
 from diffeo_calib.measurements.csv.lines import read_cells
-from diffeo_calib.measurements.stops import Recording, StopLimits, pictured, stops
 
 JOINTS = ("pose,a,b", "p1,1,2", "p2,3,4", "p3,5,6")
 PLACES = ("x,y,z,pose", "9,9,9,p3", "", "8,8,8,p1", "7,7,7,p4")
@@ -97,6 +96,17 @@ def test_nearest_times_within_half_a_step(tmp_path: Path) -> None:
     assert "1 of places.csv (3.4)" in found.sentence
     other = joined(tmp_path, ("t,a", "0.8,10", "3.4,11", "6.3,12"), ("t,x", *joints[1:]), "t")
     assert [line for line, _ in read_cells(other, ",")[1]] == [3, 6]
+
+
+@pytest.mark.parametrize(("second", "order"), [(3.1, [2, 3, 4]), (7.0, [2, 4])])
+def test_a_row_each_of_the_same_stops_by_two_clocks(second: float, order: list[int], tmp_path: Path) -> None:
+    """Pauses that agree tell the offset; else the times are compared as they are."""
+    joints, places = ("t,a", "0,1", "3,2", "11,3"), ("t,x", "50.0,1", f"{50 + second},2", "61.0,3")
+    if len(order) == 2:
+        places = ("t,x", "0.1,1", f"{second},2", "11.2,3")
+    found = joined(tmp_path, joints, places, "t")
+    assert [line for line, _ in read_cells(found, ",")[1]] == order
+    assert ("-50.00 added" in found.sentence) == (len(order) == 3)
 
 
 @pytest.mark.parametrize("offset", [0.0, 1.37, None])  # None: both on the same grid of times

@@ -83,6 +83,7 @@ READ = {
     "thousands and decimal commas": (separated(";", [NAMES, *SPACED]), {"sep": ";", "decimal": ","}, ""),
     "minus signs": (PLAIN.replace("-", "\u2212"), {}, ""),
     "spaces that do not break": (PLAIN.replace(",", "\u00a0,\u00a0"), {}, ""),
+    "columns that spaces align": (separated("   ", [NAMES, *CELLS]), {"sep": " "}, ""),
     "a column without a name": (
         separated(",", [["", *NAMES], *([str(k), *row] for k, row in enumerate(CELLS))]),
         {},
@@ -125,6 +126,11 @@ def test_columns_without_names_are_named_by_their_places(name: str, read: Reader
         assert_close(numbers(read, content, ["1", "2", "3", "4", "5"]), expected, rtol=1e-12, atol=1e-12)
     with pytest.raises(MeasurementError, match=says("no column ['q1'", "no header line", "'1', '2', '3'")):
         numbers(read, content, NAMES)
+
+
+def test_a_column_that_numbers_the_rows_is_no_joint(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("".join(f"{k},{line}\n" for k, line in enumerate(ROWS.splitlines())))
+    assert guess_sheet(tmp_path / "t.csv").numbers == ("2", "3", "4", "5", "6")
 
 
 MARKERS = {
@@ -191,13 +197,13 @@ def lost(*rows: int, cells: str = "0,0.000,0") -> str:
     )
 
 
-@pytest.mark.parametrize("rows", [(3,), (2, 5)])
-def test_a_marker_at_the_origin_far_from_all_rows_was_not_seen(rows: tuple[int, ...], read: Reader) -> None:
+@pytest.mark.parametrize(("rows", "mark"), [((3,), "0"), ((2, 5), "0"), ((2, 5), "-9999")])
+def test_a_marker_at_the_origin_far_from_all_rows_was_not_seen(rows: tuple[int, ...], mark: str, read: Reader) -> None:
     at = ", ".join(str(row + 2) for row in rows)
     with pytest.warns(DiffeoCalibWarning) as said:
-        data = read(lost(*rows), NAMES[:2], NAMES[2:], **FORMAT)
+        data = read(lost(*rows, cells=f"{mark},{mark}.0,{mark}"), NAMES[:2], NAMES[2:], **FORMAT)
     assert [text.split(".csv': ")[1] for text in map(str, (one.message for one in said))] == [
-        f"x, y, z are 0, 0, 0 in line {at}, far from other rows: taken as not seen",
+        f"x, y, z are {mark}, {mark}, {mark} in line {at}, far from other rows: taken as not seen",
         f"no marker was seen in line {at}: {len(rows)} row(s) left out",
     ]
     assert data.line_numbers.tolist() == [k + 2 for k in range(8) if k not in rows]
@@ -209,6 +215,7 @@ def test_a_marker_near_the_origin_or_a_single_one_not_clearly_far_away_stays(rea
     assert len(read(separated(",", [NAMES, *near]), NAMES[:2], NAMES[2:], **FORMAT)) == 8
     first = [[*row[:2], f"{30 * k}", f"{k**2}", "0"] for k, row in enumerate(CELLS) if k != 1]
     assert len(read(separated(",", [NAMES, *first]), NAMES[:2], NAMES[2:], **FORMAT)) == 7
+    assert len(read(lost(3, cells="-9999,-9999,-9999"), NAMES[:2], NAMES[2:], **FORMAT)) == 8
 
 
 def test_marks_of_rows_are_labels_where_all_have_them(read: Reader) -> None:

@@ -21,8 +21,7 @@ import diffeo_calib as dc
 from diffeo_calib.cli.options import Targets, Units
 from diffeo_calib.cli.tables import MeasuredTable, ProgramTable, table_format
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
-from diffeo_calib.measurements.csv.files import read_joints, read_measurements, write_measurements
-from diffeo_calib.measurements.csv.writing import write_predictions
+from diffeo_calib.measurements.csv.files import read_joints, read_measurements, write_measurements, write_predictions
 from diffeo_calib.measurements.table_format import TableFormat
 
 

@@ -11,8 +11,7 @@ import torch
 from table_bank import POSITION, says, some
 
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.measurements.csv.files import write_measurements
-from diffeo_calib.measurements.csv.writing import write_predictions
+from diffeo_calib.measurements.csv.files import write_measurements, write_predictions
 from diffeo_calib.measurements.poses import rotation_matrices
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat

@@ -15,9 +15,8 @@ from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.files import read_joints, read_poses, write_measurements
 from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
-from diffeo_calib.measurements.csv.lines import read_cells
+from diffeo_calib.measurements.csv.lines import read_cells, write_columns
 from diffeo_calib.measurements.csv.tables import TableOrigin
-from diffeo_calib.measurements.csv.writing import write_columns
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, UNITS_PER_METRE, TableFormat
 from diffeo_calib.robots.se3 import transforms

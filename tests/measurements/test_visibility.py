@@ -143,7 +143,21 @@ def test_marker_that_no_line_shows_is_a_mistake(read: Reader) -> None:
 
 
 @pytest.mark.parametrize(
-    "cell", ["inf", "1e13", "-3.697314E+28", "-", "----", "hidden", "MISSING", "#N/A", "n/a", "NULL"]
+    "cell",
+    [
+        "inf",
+        "1e13",
+        "-3.697314E+28",
+        "-",
+        "----",
+        "hidden",
+        "MISSING",
+        "#N/A",
+        "n/a",
+        "NULL",
+        "Out of View",
+        "-1.#IND00",
+    ],
 )
 def test_usual_marks_of_a_lost_marker_hide_it(read: Reader, cell: str) -> None:
     with pytest.warns(DiffeoCalibWarning, match=says(f"'{cell}' (3)", "line 3")):

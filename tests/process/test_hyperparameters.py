@@ -86,7 +86,7 @@ def test_fields_without_support_vanish(setting: Setting) -> None:
 def test_inflated_scales_scale_the_covariance(setting: Setting) -> None:
     """Except the parts that do not depend on them: prior of the places, known noise, slack, the smallest noise."""
     data = setting.tangent_data
-    sensor = replace(data.noise_model, known=None, slack=0.0, smallest_noise=0.0)
+    sensor = replace(data.noise_model.without_known, slack=0.0, smallest_noise=0.0)
     data = replace(data, noise_model=sensor, place_deviation=1e-9)
     scales = setting.scales
     inflated = scales.inflated(1.7)

@@ -6,8 +6,7 @@ from math import pi
 
 import pytest
 import torch
-from mimic_bank import CHAIN, FREE, errors_of, expand
-from robots_bank import draw
+from robots_bank import CHAIN, draw, errors_of
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
@@ -60,6 +59,9 @@ def test_poses_carry_the_markers(geometry: Geometry) -> None:
     poses = geometry.poses(q)
     expected = torch.einsum("nab,pb->npa", poses[:, :3, :3], geometry.tool) + poses[:, None, :3, 3]
     torch.testing.assert_close(geometry.points(q), expected)
+    names, first = geometry.parameter_names, geometry.chain.moving_names[0]
+    assert len(names) == geometry.size
+    assert (names[0], names[6], names[-1]) == ("base tx [m]", f"{first} tx [m]", "marker 2 z [m]")
 
 
 def test_absorbing_theta_changes_no_point(geometry: Geometry, theta: Tensor) -> None:
@@ -89,14 +91,3 @@ def test_wrong_input_is_explained(chain: Chain) -> None:
             replace(geometry, **{name: value})
     with pytest.raises(InputError, match=r"expected \(7, 4, 4\), got \(3, 4, 4\); pass one .* `chain.moving_names`"):
         replace(Geometry.nominal(CHAIN), joint_errors=eye.repeat(3, 1, 1))
-
-
-def test_points_equal_those_of_the_robot_with_all_joints_active() -> None:
-    coupled, free = errors_of(CHAIN), errors_of(FREE)
-    q, theta = draw(5, 3), draw(coupled.size, seed=2, size=0.1)
-    full = expand(q)
-    torch.testing.assert_close(coupled.points(q, theta), free.points(full, theta), rtol=0, atol=1e-13)
-    torch.testing.assert_close(coupled.sensitivities(q, theta), free.sensitivities(full, theta), rtol=0, atol=1e-13)
-    torch.testing.assert_close(coupled.poses(q), free.poses(full), rtol=0, atol=1e-13)
-    assert coupled.size == len(coupled.parameter_names) == 6 + 6 * 7 + 3 * 2
-    assert (coupled.parameter_names[6], coupled.parameter_names[-1]) == ("early tx [m]", "marker 1 z [m]")

@@ -77,30 +77,6 @@ def test_centres_of_mass_beside_the_origins_are_nearly_explained() -> None:
         assert unexplained(used, torques[:, joint]) < share * float(torques[:, joint].abs().max())
 
 
-@every_chain
-def test_amounts_are_moments_of_weights_at_the_places(chain: Chain) -> None:
-    """Written out: e . sum_f (o_f - o_l) x c_f, and on a slide the force along it."""
-    sag, q = GravitySag(chain), draw(7, chain.n)
-    w, at = draw(sag.size, seed=3), origins(chain, draw(7, chain.n))
-    expected = torch.zeros(7, chain.moving, 6, dtype=torch.float64)
-    start = 0
-    for compliance in sag.compliances:
-        e, joint = direction(chain, compliance, q), compliance.joint
-        forces = w[start : start + compliance.size].view(-1, 3)
-        start += compliance.size
-        if compliance.places:
-            load = torch.zeros(7, 3, dtype=torch.float64)
-            for place, force in zip(compliance.places, forces, strict=True):
-                load += torch.linalg.cross(at[:, place] - at[:, joint], force.expand(7, 3))
-        else:
-            load = forces.expand(7, 3)
-        expected[:, joint] += (e * load).sum(1, keepdim=True) * torch.from_numpy(compliance.direction)
-    torch.testing.assert_close(sag.twists(q, w), expected, rtol=1e-12, atol=1e-13)
-
-
-# --- twists, features and slopes ----------------------------------------------------------------------------------
-
-
 # --- the compliances of a chain --------------------------------------------------------------------------------------
 
 

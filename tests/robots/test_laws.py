@@ -11,8 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
-from mimic_bank import CHAIN
-from robots_bank import CHAINS, CROOKED, LIFT, draw, every_chain
+from robots_bank import CHAIN, CHAINS, CROOKED, LIFT, draw, every_chain
 from simulated_body import HANDS, URDF_FILE
 from torch import Tensor
 from torch.func import jacfwd, jacrev, jvp, vmap
@@ -254,17 +253,24 @@ def moment_about(robot: Tree, q: Tensor, joint: int, e: Tensor, masses: Tensor) 
     return (energies[1] - energies[0]) / (2 * h)
 
 
-@every_view
+@every_robot
 def test_features_are_moments_of_everything_that_a_joint_carries(robot: Tree) -> None:
+    """And the direction of the force along a slide."""
     sag, q = GravitySag(robot), draw(12, robot.n)
     masses = draw(len(robot.before), seed=1).abs()
     masses[~torch.from_numpy(robot.arrays.moved).any(1)] = 0.0
     features = sag.features(q).split([c.size for c in sag.compliances], dim=1)
     for compliance, values in zip(sag.compliances, features, strict=True):
         only = torch.zeros_like(masses)
-        places = list(compliance.places)
+        places, axis = list(compliance.places), torch.from_numpy(compliance.axis)
+        if not places:
+            turn = robot.places(q)[:, compliance.joint, :3, :3]
+            ground = robot.ground_place
+            turn = turn if ground is None else robot.places(q)[:, ground, :3, :3].mT @ turn
+            assert_close(values, turn @ axis, rtol=0, atol=1e-14)
+            continue
         only[places] = masses[places]
-        expected = moment_about(robot, q, compliance.joint, torch.from_numpy(compliance.axis), only)
+        expected = moment_about(robot, q, compliance.joint, axis, only)
         found = -9.81 * (values.view(len(q), -1, 3)[..., 2] * masses[places]).sum(1)
         assert_close(found, expected, rtol=0, atol=2e-8)
 

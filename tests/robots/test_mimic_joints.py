@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from mimic_bank import CHAIN, FREE, KINDS, MOVING, build, crooked_joints, expand
-from robots_bank import LIFT, draw
+from robots_bank import CHAIN, KINDS, LIFT, MOVING, build, crooked_joints, draw, expand
 
 from diffeo_calib.common.errors import RobotError
 from diffeo_calib.robots import Chain, DHRow, Joint, from_dh, load_urdf
@@ -29,14 +28,6 @@ def test_coupling_is_constant_and_resolved_to_active_joints() -> None:
     q = draw(5, 3)
     torch.testing.assert_close(CHAIN.moving_values(q), expand(q), rtol=0, atol=1e-15)
     assert torch.equal(CHAIN.moving_values(q)[:, [1, 2, 4]], q)
-
-
-def test_it_is_the_same_robot_as_one_with_all_joints_active() -> None:
-    q = draw(6, 3)
-    full = expand(q)
-    torch.testing.assert_close(CHAIN(q), FREE(full), rtol=0, atol=1e-14)
-    torch.testing.assert_close(CHAIN.joint_frames(q), FREE.joint_frames(full), rtol=0, atol=1e-14)
-    torch.testing.assert_close(CHAIN.jacobian(q), FREE.jacobian(full) @ CHAIN.coupling, rtol=0, atol=1e-13)
 
 
 def slide(name: str, lower: float, upper: float, mimic: Mapping[str, float] | None = None, offset: float = 0) -> Joint:

@@ -35,6 +35,10 @@ ROW_ODDS = 6.0
 """Log odds of a number that differs from row to row: clean images have less than zero, focal lengths that differ by
 0.1 % fourteen and more."""
 
+AXIS_WAVES, AXIS_ODDS, AXIS_LEFT = 6, 6.0, 0.9
+"""Half waves of the errors of an axis over its range; log odds from which they are clear, less than two where there are
+none; and the part of the RMS left-out error that remains with them at most."""
+
 # --- rows of a campaign, one by one ---
 
 WRONG_ROW_CHANCE, UNDONE_CHANCE = 1e-8, 1e-3
@@ -98,8 +102,8 @@ STUCK_ROWS = 6
 
 LARGEST_LAG = 5
 """Lines between measured values and their joints."""
-LAG_CHANGE_COST = 3.0
-"""Of a change of the lag, in rows that fit nowhere."""
+LAG_CHANGE_COST, LAG_MISFIT = 3.0, 0.1
+"""Of a change of the lag, in rows that fit at the new one alone; and of a row of a run that does not fit there."""
 LAG_NEAR, LAG_GROSS = 3.0, 10.0
 """Typical distances within which a lag fits, and from which the row's own joints do not."""
 LAG_ROWS, LAG_SHARE = 3, 0.8

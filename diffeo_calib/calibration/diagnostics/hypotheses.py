@@ -83,9 +83,9 @@ class Evidence(NamedTuple):
         return 0.5 * (gains - scaled.log1p().sum(1).view(-1, *[1] * (gains.ndim - 1)))
 
 
-def opened(process: Process, E: Tensor) -> Process:
-    """The same rows beside unknowns of any size, with effects (M, U) on their numbers."""
-    E = E / E.norm(dim=0).clamp(min=torch.finfo(E.dtype).tiny)
+def opened(process: Process, E: Tensor, size: float | None = None) -> Process:
+    """The same rows beside unknowns of this RMS size, of any by default, with effects (M, U) on their numbers."""
+    E = E / E.norm(dim=0).clamp(min=torch.finfo(E.dtype).tiny) if size is None else size * E
     W = torch.linalg.solve_triangular(process.factor.L, E, upper=False)
     factor, variance = Factor(process.factor.L, torch.cat([process.factor.W, W], 1)), E.new_ones(E.shape[1])
     return replace(process, variance=torch.cat([process.variance, variance]), factor=factor)
@@ -185,8 +185,7 @@ def _lengths_of(data: TangentData) -> Iterator[Hypothesis]:
     away = data.places.unflatten(1, (-1, 3)) - geometry.base[:3, 3].to(data.x.device)
 
     def seen(motion: Tensor) -> Tensor:
-        motion = motion.flatten(1)[..., None]
-        return motion if data.slopes is None else data.slopes @ motion
+        return data.slopes @ motion.flatten(1)[..., None]
 
     yield Hypothesis("the size of the robot", seen(away), PERCENT, OF_ROBOT)
     if not data.adrift:  # a device has axes

@@ -104,7 +104,7 @@ def warn_of_what_is_open(data: TangentData, devices: Sequence[Devices]) -> None:
     Args:
         data: the rows around the geometric calibration. devices: where readings were found to come from.
     """
-    if data.shared is None:
+    if not data.shared.shape[2]:
         return
     whole = data.nominal.jacobian(data.x, data.theta)
     seen = data.jacobian.square().mean((0, 1)).sqrt() / whole.square().mean((0, 1)).sqrt().clamp(min=1e-9)

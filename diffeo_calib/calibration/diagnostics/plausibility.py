@@ -197,7 +197,7 @@ def warn_of_rounding(robot: Tree, data: Any, tangent: TangentData, left_out: Lea
     if not steps or len(data) < gates.DIGIT_ROWS:
         return
     variances = tangent.x.new_tensor([0.0 if own is None else own[0] ** 2 / 12 for own in each])  # uniform
-    points = tangent.noise_model.bodies if tangent.noise_model.modes is None else tangent.y.shape[1] // 3
+    points = tangent.y.shape[1] // 3 if tangent.noise_model.modes.shape[1] else tangent.noise_model.bodies
     caused = float((tangent.jacobian.square() @ variances).unflatten(1, (points, -1)).sum(-1).mean().sqrt())
     seen = left_out.errors.unflatten(1, (points, -1))
     squares, size = seen.square().nansum(-1)[~seen.isnan().all(-1)], seen.shape[2]

@@ -1,9 +1,9 @@
 """Rows that are wrong together: out of step with their joints, or one after the other.
 
 Row i measured at lag k belongs to the joints k lines below its own, for instance because one of two logs lost a line. A
-lag fits where the prediction of those joints is near the measured points. The most likely lags along the table are a
-shortest path: every row costs up to one, less the better its lag fits, and every change of the lag costs as much as a
-few rows that fit nowhere.
+lag fits where the prediction of those joints is near the measured points. Every row scores up to one, the better its
+lag fits and the worse all others do; the run of rows with the largest sum is out of step if it exceeds the price of its
+ends. Rows that look wrong and follow one another are such a run as well.
 """
 
 from __future__ import annotations
@@ -78,16 +78,30 @@ def out_of_step(predicted: Tensor, measured: Tensor, line_numbers: Tensor, typic
         rows, others = _paired(lines, number - gates.LARGEST_LAG)
         each[rows] = largest_known((predicted[others] - measured[rows]).norm(dim=-1))
     costs = (distances / (gates.LAG_NEAR * typical)).square().clamp(max=1.0).nan_to_num(1.0)
-    path = _cheapest_path(costs, gates.LAG_CHANGE_COST)
-    own, steps = distances[gates.LARGEST_LAG], []
-    starts = [row for row in range(len(path)) if row == 0 or path[row] != path[row - 1]]
-    for start, end in zip(starts, [*starts[1:], len(path)], strict=True):
-        there, lag = distances[path[start], start:end], path[start] - gates.LARGEST_LAG
+    own, steps = distances[gates.LARGEST_LAG], list[tuple[int, Step]]()
+    least, second = costs.topk(2, dim=0, largest=False).values
+    scores = torch.where(costs == least, second, least) - costs - gates.LAG_MISFIT * (costs == 1.0) * ~distances.isnan()
+    scores[gates.LARGEST_LAG] = -1.0
+    while True:
+        runs = [(*best_run(each), number) for number, each in enumerate(scores)]
+        ends = [gates.LAG_CHANGE_COST * ((start > 0) + (end < len(lines))) for _, start, end, _ in runs]
+        gain, start, end, number = max((run[0] - end, *run[1:]) for run, end in zip(runs, ends, strict=True))
+        if gain <= 0.0:
+            return [step for _, step in sorted(steps)]
+        there, scores[:, start:end] = distances[number, start:end], -float(len(lines))
         fits = there <= gates.LAG_NEAR * typical
         moved = int((fits & (own[start:end] > gates.LAG_GROSS * typical)).sum())
-        if lag and moved >= gates.LAG_ROWS and int(fits.sum()) >= gates.LAG_SHARE * int((~there.isnan()).sum()):
-            steps.append(Step(int(lines[start]), int(lines[end - 1]), lag, end == len(lines), moved))
-    return steps
+        if moved >= gates.LAG_ROWS and int(fits.sum()) >= gates.LAG_SHARE * int((~there.isnan()).sum()):
+            last = end == len(lines)
+            steps.append((start, Step(int(lines[start]), int(lines[end - 1]), number - gates.LARGEST_LAG, last, moved)))
+
+
+def best_run(scores: Tensor) -> tuple[float, int, int]:
+    """Largest sum of scores (N,) that follow one another, the first and last + 1 of these; zeros at the ends count."""
+    sums = torch.cat([scores.new_zeros(1), scores.cumsum(0)])
+    rises = sums - sums.cummin(0).values
+    end = int((rises == rises.max()).nonzero()[-1])
+    return float(rises[end]), int(sums[: end + 1].argmin()), end
 
 
 def _paired(line_numbers: Tensor, lag: int) -> tuple[Tensor, Tensor]:
@@ -96,20 +110,6 @@ def _paired(line_numbers: Tensor, lag: int) -> tuple[Tensor, Tensor]:
     at = torch.searchsorted(line_numbers, wanted).clamp(max=len(line_numbers) - 1)
     rows = (line_numbers[at] == wanted).nonzero()[:, 0]
     return rows, at[rows]
-
-
-def _cheapest_path(costs: Tensor, change_cost: float) -> list[int]:
-    """The state of every row that minimises the sum of its costs (states, N) and of the changes: N states."""
-    total, before = costs[:, 0], []
-    for column in costs.unbind(1)[1:]:
-        best = int(total.argmin())
-        changed = total > total[best] + change_cost
-        before.append(torch.where(changed, best, torch.arange(len(total), device=total.device)))
-        total = torch.where(changed, total[best] + change_cost, total) + column
-    path = [int(total.argmin())]
-    for previous in reversed(before):
-        path.append(int(previous[path[-1]]))
-    return path[::-1]
 
 
 def check_row_order(robot: Tree, data: Measurements, registration: Identification) -> None:
@@ -176,14 +176,8 @@ def find_block(wrong: Tensor) -> tuple[int, int] | None:
     if count < gates.BLOCK_ROWS or share >= gates.BLOCK_SHARE:
         return None
     gain, loss = log(gates.BLOCK_SHARE / share), log((1 - gates.BLOCK_SHARE) / (1 - share))
-    best, score, start, place = log(n / gates.BLOCK_CHANCE), 0.0, 0, None
-    for row, bad in enumerate(wrong.tolist()):
-        if score <= 0:
-            score, start = 0.0, row
-        score += gain if bad else loss
-        if score > best:
-            best, place = score, (start, row + 1)
-    return place
+    total, start, end = best_run(torch.where(wrong, gain, loss))
+    return (start, end) if total > log(n / gates.BLOCK_CHANCE) else None
 
 
 def block_text(model: CalibratedKinematics, data: Measurements, wrong: Sequence[Outlier]) -> str | None:

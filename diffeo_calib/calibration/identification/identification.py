@@ -82,8 +82,6 @@ class Identification:
         noise: standard deviation of one measured coordinate, given or estimated [m]; for Student's t its scale.
         covariance: (K, K) posterior covariance of the parameters at ``geometry`` [m, rad]; rows of parameters that
             were held fixed are zero.
-        iterations: steps taken.
-        status: how the search ended, in one sentence.
         theta: (K,) estimated parameters of the geometry that the search started from [m, rad].
         prior: the prior, given or estimated.
         tails: weights of the measurements (N, P), 1 where they are hidden; all 1 if the noise was given or is Gaussian.
@@ -95,8 +93,6 @@ class Identification:
     rms: float
     noise: float
     covariance: Tensor
-    iterations: int
-    status: str
     theta: Tensor
     prior: Prior
     tails: Tails
@@ -114,8 +110,8 @@ class Identification:
         whole = geometry.with_tool(torch.cat([geometry.tool, own.tool]), (*geometry.on, *own.on))
         covariance = geometry.tool.new_zeros(whole.size, whole.size)
         covariance[:-3, :-3], covariance[-3:, -3:] = self.covariance, ball.covariance[-3:, -3:]
-        theta, status = torch.cat([self.theta, self.theta.new_zeros(3)]), f"{self.status[:-1]}; {ball.status}"
-        return replace(self, geometry=whole, covariance=covariance, theta=theta, status=status)
+        theta = torch.cat([self.theta, self.theta.new_zeros(3)])
+        return replace(self, geometry=whole, covariance=covariance, theta=theta)
 
 
 def held_parameters(geometry: Geometry, *, adrift: bool = False) -> tuple[int, ...]:
@@ -168,7 +164,7 @@ def identify(
         return estimated(rows, held, prior)
     sigma, used = rows.parts[0].q.new_full(points.shape[:2], noise), prior or Prior()
     fit = solve(rows, sigma, used.root(geometry, held), **PRECISE)
-    return _identification(rows, fit, noise, "given", prior=used, tails=Tails.none(*points.shape[:2]))
+    return _identification(rows, fit, noise, used, Tails.none(*points.shape[:2]))
 
 
 class MeasuredPoints(NamedTuple):
@@ -306,7 +302,7 @@ def estimated(rows: Rows, held: Sequence[int], prior: Prior | None = None) -> Id
             by default.
     """
     some = replace(rows, parts=tuple(own.sample() for own in rows.parts))
-    used, steps, zero = prior or Prior(), 0, rows.geometry.tool.new_zeros(rows.geometry.size)
+    used, zero = prior or Prior(), rows.geometry.tool.new_zeros(rows.geometry.size)
     at = zero, zero.new_zeros(sum(rows.freedom))
     errors = some.errors(*at)
     dim = torch.cat([torch.full_like(own[..., 0], own.shape[2]) for own in errors])
@@ -318,7 +314,7 @@ def estimated(rows: Rows, held: Sequence[int], prior: Prior | None = None) -> Id
         root = used.root(rows.geometry, held)
         fit = solve(some, level / tails.weights.sqrt(), root, start=at, **PRECISE)
         at = fit.theta, fit.shifts
-        used, steps = used if prior else _scaled(used, root, rows.geometry, fit), steps + fit.iterations
+        used = used if prior else _scaled(used, root, rows.geometry, fit)
         determined = float(fit.leverage.sum())  # number of parameters that the data determine
         squares, numbers = body_squares(fit.errors), sum(int((~own.isnan()).sum()) for own in fit.errors)
         total = float((tails.weights * squares).nansum())
@@ -327,19 +323,16 @@ def estimated(rows: Rows, held: Sequence[int], prior: Prior | None = None) -> Id
         if abs(level - before) < NOISE_CHANGE * level:
             break
     left_out = body_squares(fit.errors) / (1.0 - fit.leverage / dim).square()
-    fit = fit._replace(iterations=steps, errors=rows.errors(*at))
+    fit = fit._replace(errors=rows.errors(*at))
     if len(tails.weights) < sum(len(own) for own in fit.errors):
         tails = reweight(body_squares(fit.errors) / level**2, 3)
-    found = _identification(rows, fit, level, "estimated", prior=used, tails=tails)
-    return replace(found, left_out=float(left_out.nanmean().sqrt()))
+    return replace(_identification(rows, fit, level, used, tails), left_out=float(left_out.nanmean().sqrt()))
 
 
-def _identification(rows: Rows, fit: Fit, level: float, how: str, *, prior: Prior, tails: Tails) -> Identification:
+def _identification(rows: Rows, fit: Fit, level: float, prior: Prior, tails: Tails) -> Identification:
     """A fit, with the errors of all rows."""
     rms = float(body_squares(fit.errors).nanmean().sqrt())
-    ended = f"{'converged' if fit.converged else 'stopped before converging'} after {fit.iterations} steps"
-    status = f"{ended}: {in_mm(rms, level, how)}."
-    known = fit.covariance, fit.iterations, status, fit.theta, prior, tails, rows.devices(fit.shifts)
+    known = fit.covariance, fit.theta, prior, tails, rows.devices(fit.shifts)
     return Identification(rows.geometry.absorb(fit.theta), rms, level, *known)
 
 
@@ -371,8 +364,6 @@ class Fit(NamedTuple):
     shifts: Tensor
     errors: list[Tensor]
     leverage: Tensor
-    iterations: int
-    converged: bool
 
 
 def solve(
@@ -421,10 +412,4 @@ def solve(
     theta, shifts, known = root @ u[:f], u[f:], root @ V[:f]
     leverage = torch.from_numpy(np.square(U[: -len(u)]).sum(1)).split([own.numel() for own in hidden])
     each = torch.cat([own.view(h.shape).sum(2) for own, h in zip(leverage, hidden, strict=True)])
-    left = rows.errors(theta, shifts)
-    return Fit(theta, known @ known.mT, shifts, left, each, int(found.nfev), found.status > 0)
-
-
-def in_mm(rms: float, noise: float, how: str) -> str:
-    """Say how large residual and noise are."""
-    return f"residual {1e3 * rms:.4g} mm RMS, noise {1e3 * noise:.4g} mm per coordinate ({how})"
+    return Fit(theta, known @ known.mT, shifts, rows.errors(theta, shifts), each)

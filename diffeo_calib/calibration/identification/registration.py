@@ -35,7 +35,6 @@ from diffeo_calib.calibration.identification.identification import (
     Rows,
     held_parameters,
     identify,
-    in_mm,
     solve,
 )
 from diffeo_calib.common.device import HOST, seeded
@@ -46,7 +45,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.cartesian import turns_nowhere
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.placement import MAX_ITERATIONS, PLACES, UNDETERMINED_MOTION_M, place
+from diffeo_calib.robots.placement import PLACES, UNDETERMINED_MOTION_M, place
 from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import marker_tips
@@ -90,7 +89,15 @@ def register(robot: Tree | Geometry, q: Tensor, points: Tensor, on: tuple[str, .
     if turns_nowhere(chain):  # where the marker sits, or the middle of several, belongs to the base
         middle = tool.mean(0)
         base, tool = base @ transforms(torch.eye(3, dtype=tool.dtype, device=tool.device), middle), tool - middle
-    return _registered(replace(bare, base=base, tool=tool), q, points, found.iterations)
+    geometry = replace(bare, base=base, tool=tool)
+    rms = float((geometry.points(q) - points).square().sum(-1).nanmean().sqrt())
+    parts, held = geometry.slices, held_parameters(geometry)
+    every = [number for name in ("base", "tool") for number in range(geometry.size)[parts[name]]]
+    sought = [number for number in every if number not in held]
+    slopes = geometry.sensitivities(q)[..., sought][seen_markers(points)].flatten(0, 1)  # (3 S, 6 + 3 P)
+    rank = int((torch.linalg.svdvals(slopes) > UNDETERMINED_MOTION_M * sqrt(len(slopes) / 3)).sum())  # of S sightings
+    noise = rms * sqrt(len(slopes) / 3 / max(len(slopes) - rank, 1))
+    return _start(geometry, (rms, noise), slopes, sought, len(q))
 
 
 def can_register(points: Tensor) -> bool:
@@ -99,40 +106,8 @@ def can_register(points: Tensor) -> bool:
     return enough and bool(seen_markers(points).any(0).all())
 
 
-def _registered(geometry: Geometry, q: Tensor, points: Tensor, iterations: int) -> Identification:
-    """Residual, covariance and status of a registration."""
-    parts, held = geometry.slices, held_parameters(geometry)
-    every = [number for name in ("base", "tool") for number in range(geometry.size)[parts[name]]]
-    sought = [number for number in every if number not in held]
-    rms = float((geometry.points(q) - points).square().sum(-1).nanmean().sqrt())
-    slopes = geometry.sensitivities(q)[..., sought][seen_markers(points)].flatten(0, 1)  # (3 S, 6 + 3 P)
-    s = torch.linalg.svdvals(slopes)
-    rank = int((s > UNDETERMINED_MOTION_M * sqrt(len(slopes) / 3)).sum())  # of S sightings of markers
-    noise = rms * sqrt(len(slopes) / 3 / max(len(slopes) - rank, 1))
-    done = "converged" if iterations < MAX_ITERATIONS else "stopped before converging"
-    status = f"{done} after {iterations} steps: {in_mm(rms, noise, 'estimated')}"
-    if rank < len(sought):
-        status += (
-            f"; these poses leave {len(sought) - rank} of {len(sought)} directions of base and markers undetermined"
-            " (chosen so that the markers are close to the tip): turn more joints, above all the wrist"
-        )
-    elif len(slopes) == rank:
-        status += (
-            "; there are only as many coordinates as unknowns, so other bases and markers may fit as well: measure "
-            "more poses"
-        )
-    return _start(geometry, (rms, noise), slopes, sought, rows=len(q), status=f"{status}.", iterations=iterations)
-
-
 def _start(
-    geometry: Geometry,
-    errors: tuple[float, float],
-    slopes: Tensor,
-    sought: Sequence[int],
-    *,
-    rows: int,
-    status: str,
-    iterations: int = 0,
+    geometry: Geometry, errors: tuple[float, float], slopes: Tensor, sought: Sequence[int], rows: int
 ) -> Identification:
     """Places that were found in closed form, as a geometric calibration is described; all weights are 1.
 
@@ -151,7 +126,7 @@ def _start(
     numbers = torch.tensor(sought, dtype=torch.int64, device=slopes.device)
     covariance[numbers[:, None], numbers] = root @ root.mT
     theta, tails = slopes.new_zeros(geometry.size), Tails.none(rows, geometry.markers, device=slopes.device)
-    return Identification(geometry, rms, noise, covariance, iterations, status, theta, Prior(), tails)
+    return Identification(geometry, rms, noise, covariance, theta, Prior(), tails)
 
 
 ROUNDS = 30
@@ -209,9 +184,8 @@ def register_sockets(robot: Tree | Geometry, q: Tensor, socket: Tensor) -> Socke
     tilt = torch.linalg.svdvals(slopes) / len(A) ** 0.5
     rms, median = float(distances.square().mean().sqrt()), float(distances.median())
     errors = rms, max(median / sqrt(MEDIAN_CHI2_3), SMALLEST_NOISE_M)
-    status = f"spread within sockets {1e3 * rms:.4g} mm RMS, median {1e3 * median:.4g} mm."
     ball = range(geometry.size)[geometry.slices["tool"]]
-    found = _start(geometry, errors, slopes, [*ball], rows=len(A), status=status)
+    found = _start(geometry, errors, slopes, [*ball], len(A))
     return SocketRegistration(found, _means(seen, socket, weights), distances, tilt)
 
 

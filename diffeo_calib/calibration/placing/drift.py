@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
+from diffeo_calib.common.device import HOST
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.known_drift import OFFSETS, KnownDrift
-from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import frame_slopes
 
 FRAME_M_RAD, GROWTH, OFFSET_RAD_M = 1e-3, 3e-4, 1e-3
@@ -31,11 +31,11 @@ class Drift(DeviceSet):
     """Drift of N rows with K columns.
 
     Args:
-        known: what was found, or zero before a fit. ramp: (N, K) from -1/2 to 1/2. q: (N, n) configurations.
+        devices: what was found, or zero before a fit. ramp: (N, K) from -1/2 to 1/2. q: (N, n) configurations.
         centre: (3,) about which the frame turns and lengths grow, m; by default the middle of the rows.
     """
 
-    known: KnownDrift
+    devices: KnownDrift
     ramp: Tensor
     q: Tensor
     centre: Tensor | None = None
@@ -50,41 +50,38 @@ class Drift(DeviceSet):
         nothing = values.new_zeros(values.shape[1], OFFSETS + len(joints))
         ends = values.amin(0), values.amax(0), *values.new_zeros(3, len(nothing))
         known = KnownDrift(data.covariate_names, torch.cat([torch.stack(ends, 1), nothing], 1), nothing, joints)
-        return [cls(known, known.ramp(data), data.q)]
+        none = torch.zeros(0, dtype=torch.int64, device=HOST)
+        return [cls(known, none, none, known.ramp(data), data.q)]
 
     @property
     def size(self) -> int:
         """Shift, turn, growth and joint offsets for each column."""
-        return self.known.sizes.numel()
+        return self.devices.sizes.numel()
 
     def effects(self, data: Seen) -> Tensor:
         places = data.points.unflatten(1, (-1, 3))
         centre = places.mean((0, 1)) if self.centre is None else self.centre
         frame, away = FRAME_M_RAD * frame_slopes(places, centre), (places - centre).flatten(1)[..., None]
         offsets = OFFSET_RAD_M * data.nominal.jacobian(self.q, data.y.new_zeros(data.nominal.parameters))
-        whole = torch.cat([frame, GROWTH * away, offsets], 2)
-        whole = whole if data.slopes is None else data.slopes @ whole
+        whole = data.slopes @ torch.cat([frame, GROWTH * away, offsets], 2)
         return (whole[:, :, None] * self.ramp[:, None, :, None]).flatten(2)
 
     def settled(self, found: Settled) -> Drift:
-        own = found.shifts.new_tensor([FRAME_M_RAD] * 6 + [GROWTH] + [OFFSET_RAD_M] * len(self.known.joints))
+        own = found.shifts.new_tensor([FRAME_M_RAD] * 6 + [GROWTH] + [OFFSET_RAD_M] * len(self.devices.joints))
         shifts, deviations = (
-            own * each.view(len(self.known.names), -1) for each in (found.shifts, found.covariance.diagonal().sqrt())
+            own * each.view(len(self.names), -1) for each in (found.shifts, found.covariance.diagonal().sqrt())
         )
-        constants = torch.cat([self.known.constants[:, :2], found.centre.expand(len(shifts), 3), shifts], 1)
-        known = replace(self.known, constants=constants, deviations=deviations)
-        return replace(self, known=known, centre=found.centre)
+        constants = torch.cat([self.devices.constants[:, :2], found.centre.expand(len(shifts), 3), shifts], 1)
+        known = replace(self.devices, constants=constants, deviations=deviations)
+        return replace(self, devices=known, centre=found.centre)
 
     def with_rows(self, other: OtherRows) -> Drift:
-        return replace(self, ramp=self.known.ramp(other.data), q=other.data.q, centre=other.centre)
-
-    def placed(self) -> PlacedDevices:
-        return PlacedDevices(self.known)
+        return replace(self, ramp=self.devices.ramp(other.data), q=other.data.q, centre=other.centre)
 
     def sentences(self) -> list[str]:
         """How much drifted with each column, of what is known well."""
-        return list(self.known.of_joints())
+        return list(self.devices.of_joints())
 
     def entry(self) -> dict[str, object]:
         """Unknowns in m and rad over the range of every column."""
-        return {"drift": dict(zip(self.known.names, self.known.sizes.tolist(), strict=True))}
+        return {"drift": dict(zip(self.names, self.devices.sizes.tolist(), strict=True))}

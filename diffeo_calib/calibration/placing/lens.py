@@ -15,13 +15,13 @@ from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, See
 from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.cameras.board import LENS
 from diffeo_calib.cameras.images import Camera, expected, sees
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
 from diffeo_calib.measurements.images import SharedErrors
 from diffeo_calib.measurements.poses import inverse_poses, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.sensors.board_camera import BoardCamera, BoardCameras, Explained, camera_sentences
+from diffeo_calib.sensors.board_camera import BoardCamera, BoardCameras, Explained
 from diffeo_calib.sensors.devices import OUTLIER_MEDIANS, ROW, Hypothesis, median_weights
-from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import View
 
 T = TypeVar("T")
@@ -43,16 +43,16 @@ class CameraErrors(DeviceSet):
 
     Args:
         shared: the cameras as images alone show them, and what their c errors do to the points of the M poses, m.
-        rows: (M,) rows of these poses in the whole table.
     """
 
+    devices: BoardCameras
     shared: SharedErrors
-    rows: Tensor
 
     @classmethod
     def around(cls, data: Measurements, rows: Tensor) -> list[Any]:
         """Those of the images of a table beside a model, none for other tables; arguments as of :meth:`of_table`."""
-        return [cls(shared, rows) for shared in data.shared_errors()]
+        none = torch.zeros(0, 1, dtype=torch.float64, device=HOST)  # no entry for the model file
+        return [cls(BoardCameras((), none, none), rows, one.seen_by, one) for one in data.shared_errors()]
 
     @property
     def size(self) -> int:
@@ -67,7 +67,7 @@ class CameraErrors(DeviceSet):
         if other.aligned is None:
             raise MeasurementError.of("rows of a camera", expected="images", got="none")
         (shared,) = other.aligned.table.shared_errors()
-        return replace(self, shared=shared, rows=other.aligned.rows)
+        return replace(self, shared=shared, rows=other.aligned.rows, device=shared.seen_by)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,16 +75,14 @@ class LensAndBoard(CameraErrors):
     """Lenses and board of a calibration.
 
     Args:
-        on_tool: whether the camera is on the tool, else the board. lever: of the poses, m.
+        devices: the cameras, with what each explains at the tool by its rows: before a fit nothing.
+        lever: of the poses, m.
         apart: (M, 9, c) the same effects apart from the places of the robot and of what is on the tool.
-        explained: at the tool, by the rows of each camera; what the fit says is zero before it.
         larger: how much longer lengths in the images are than those of the robot, as a share.
     """
 
-    on_tool: bool
     lever: float
     apart: Tensor
-    explained: tuple[Explained, ...]
     larger: float
 
     @classmethod
@@ -103,17 +101,18 @@ class LensAndBoard(CameraErrors):
         found: list[Any] = []
         for shared in data.shared_errors():
             away = (data.points - registration.geometry.points(data.q)).norm(dim=2)
-            explained = list[Explained]()
-            for number in range(len(shared.cameras)):
+            cameras, on_tool = dict[str, BoardCamera](), data.board is not None
+            for number, (name, camera) in enumerate(shared.cameras.items()):
                 own = shared.seen_by == number
                 nominal = registration.rms if len(shared.cameras) == 1 else float(away[own].square().mean().sqrt())
-                explained.append(Explained(nominal, 0.0, 0.0, 0.0, 0.0, _corners(shared, number)))
+                explained = Explained(nominal, 0.0, 0.0, 0.0, 0.0, _corners(shared, number))
+                cameras[name] = BoardCamera(camera, on_tool, explained)
             free = _places(data, rows, registration, sessions)
             apart, places = shared.slopes.flatten(0, 1), free.flatten(0, 1)
             apart = apart - places @ torch.linalg.lstsq(places, apart, driver="gelsd").solution
             larger = _relative_size(data, registration, free)
-            own = data.bodies.pose_lever(), apart.view_as(shared.slopes), tuple(explained), larger
-            found.append(cls(shared, rows, data.board is not None, *own))
+            own = data.bodies.pose_lever(), apart.view_as(shared.slopes), larger
+            found.append(cls(BoardCameras.of(cameras), rows, shared.seen_by, shared, *own))
             if abs(larger) >= SIZE_WARNED:
                 what = "the size of the board does not fit that of the robot"
                 got = f"lengths in the images {100 * abs(larger):.1f} % {'larger' if larger > 0 else 'smaller'}"
@@ -124,34 +123,44 @@ class LensAndBoard(CameraErrors):
         return found
 
     def settled(self, found: Settled) -> LensAndBoard:
-        spread, cameras, explained = torch.linalg.cholesky(found.covariance), {}, []
-        for number, (name, camera) in enumerate(self.shared.cameras.items()):
+        spread, cameras = torch.linalg.cholesky(found.covariance), dict[str, BoardCamera]()
+        for number, (name, own) in enumerate(self.devices.cameras.items()):
+            camera = self.shared.cameras[name]
             change, root = camera.root @ found.shifts, camera.root @ spread
             effects = self.apart[self.shared.seen_by == number] @ torch.linalg.pinv(camera.root)
             lens, board = (_at_tool(effects, change, part) for part in PARTS)
             lens_std, board_std = (_at_tool(effects, root, part) for part in PARTS)
             known = {"lens": lens, "board": board, "lens_std": lens_std, "board_std": board_std}
-            explained.append(replace(self.explained[number], **known))
-            cameras[name] = replace(camera, unknowns=camera.unknowns + change, root=root)
-        return replace(self, shared=self.shared._replace(cameras=cameras), explained=tuple(explained))
+            camera = replace(camera, unknowns=camera.unknowns + change, root=root)
+            cameras[name] = BoardCamera(camera, own.on_tool, replace(own.explained, **known))
+        shared = self.shared._replace(cameras={name: own.camera for name, own in cameras.items()})
+        return replace(self, shared=shared, devices=BoardCameras.of(cameras))
 
     def hypotheses(self, data: Seen) -> Iterator[Hypothesis]:
         effects = data.points.new_zeros(*data.points.shape, 1)
         for number, camera in enumerate(self.shared.cameras.values()):
             own = self.shared.seen_by == number
             effects[self.rows[own], : self.shared.slopes.shape[1]] = self.shared.slopes[own] @ camera.longer[:, None]
-        effects = effects if data.slopes is None else data.slopes @ effects
+        effects = data.slopes @ effects
         yield Hypothesis("the focal length of the images", effects, ("%", 1e-2), FOCUS, about=ROW)
 
     @property
     def bodies(self) -> Mapping[str, str]:
         return ON_TOOL if self.on_tool else FIXED
 
+    @property
+    def on_tool(self) -> bool:
+        """Whether the camera is on the tool, else the board."""
+        return next(iter(self.devices.cameras.values())).on_tool
+
     def widened(self, table: Measurements) -> LensAndBoard:
         """The same with the noise of the images as a table of them has it now."""
         (shared,) = table.shared_errors()
-        explained = tuple(replace(own, corners=_corners(shared, k)) for k, own in enumerate(self.explained))
-        return replace(self, shared=shared, explained=explained)
+        cameras = {
+            name: replace(own, explained=replace(own.explained, corners=_corners(shared, number)))
+            for number, (name, own) in enumerate(self.devices.cameras.items())
+        }
+        return replace(self, shared=shared, devices=BoardCameras.of(cameras))
 
     def sees(self, row: int, points: Tensor, views: Mapping[str, View]) -> Tensor:
         seen = self._boards(row, points, views)
@@ -182,19 +191,8 @@ class LensAndBoard(CameraErrors):
             poses = view(poses)
         return camera, inverse_poses(poses) if self.on_tool else poses
 
-    def placed(self) -> PlacedDevices:
-        numbers = torch.stack([own.numbers for own in self._cameras])
-        deviations = torch.stack([own.camera.deviations for own in self._cameras])
-        cameras = BoardCameras(tuple(self.shared.cameras), numbers, deviations)
-        return PlacedDevices(cameras, self.rows, self.shared.seen_by)
-
-    @property
-    def _cameras(self) -> list[BoardCamera]:
-        each = zip(self.shared.cameras.values(), self.explained, strict=True)
-        return [BoardCamera(camera, self.on_tool, explained) for camera, explained in each]
-
     def sentences(self) -> list[str]:
-        lines = list(camera_sentences(dict(zip(self.shared.cameras, self._cameras, strict=True))))
+        lines = super().sentences()
         if abs(self.larger) >= SIZE_WARNED:
             lines.append(
                 f"not decided: lengths that differ by {100 * abs(self.larger):.1f} % are counted with the arm, but the "
@@ -208,7 +206,7 @@ class LensAndBoard(CameraErrors):
     def entry(self) -> dict[str, object]:
         found = {
             name: own.camera.entry() | {"explained_m": vars(own.explained) | {"arm": own.explained.arm}}
-            for name, own in zip(self.shared.cameras, self._cameras, strict=True)
+            for name, own in self.devices.cameras.items()
         }
         return {"cameras": found} if len(found) > 1 else {"camera": next(iter(found.values()))}
 
@@ -248,7 +246,9 @@ def _places(data: Measurements, rows: Tensor, registration: Identification, sess
     geometry = registration.geometry
     slopes = geometry.sensitivities(data.q).flatten(1, 2)
     base, tool = (slopes[..., geometry.slices[name]] for name in ("base", "tool"))
-    own = [one.increments(data.points, tool, data.points.mean((0, 1)), rows) for one in sessions]
+    whole = torch.eye(slopes.shape[1], dtype=slopes.dtype, device=slopes.device).expand(len(slopes), -1, -1)
+    at = data.points, tool, data.points.mean((0, 1))
+    own = [one.increments(*at, one.by_row(int(rows.max()) + 1)[rows], whole) for one in sessions]
     return torch.cat([base, tool, *own], 2)
 
 

@@ -83,39 +83,26 @@ def stacked(q: Tensor, own: Told | None, readings: Sequence[ReadingDevices], dim
     y, visible = q.new_zeros(N, bodies * size), torch.zeros(N, bodies * size, dtype=torch.bool, device=q.device)
     known = q.new_zeros(N, bodies * size, bodies * size)
     kinds, parts = torch.zeros(N, bodies, dtype=torch.int64, device=q.device), []
-    first, modes = 0, None
+    first, modes, slack = 0, known.new_zeros(N, 0, size, 6), 0.0
     if own is not None:
         rows = own.rows
         parts.append(Part.of_coordinates(rows, own.y.shape[1]))
-        y[rows], visible[rows] = own.y, own.noise_model.coordinates(own.y)
-        if own.noise_model.known is not None:
-            known[rows] = own.noise_model.known
-        if own.noise_model.kinds is not None:
-            kinds[rows] = own.noise_model.kinds
-        first, each = own.noise_model.kind_count, own.noise_model.modes
-        if each is not None:
-            modes = each.new_zeros(N, *each.shape[1:])
-            modes[rows] = each
+        y[rows], visible[rows], known[rows] = own.y, own.noise_model.visible, own.noise_model.known
+        kinds[rows], first, slack = own.noise_model.kinds, own.noise_model.kind_count, own.noise_model.slack
+        modes = known.new_zeros(N, *own.noise_model.modes.shape[1:])
+        modes[rows] = own.noise_model.modes
     every = torch.arange(dim, device=q.device)
     for kind, one in enumerate(readings, first):
         place, seen = (one.rows[:, None], one.numbers), every[-3 * one.devices.seen_points :]
         parts.append(Part(one.rows, seen, one.numbers, one.devices.observation(one.device)))
         y[place], visible[place] = one.devices.values(one.data), True
         kinds[one.rows, 0] = kind
-        if modes is not None:
+        if modes.shape[1]:
             modes[one.rows[:, None], 0, one.numbers, one.numbers] = 1.0
         if one.data.std is not None:
             metres = one.devices.metres[one.device][:, None]
             known[one.rows[:, None], one.numbers, one.numbers] = (one.data.std * metres).square()
-    noise = NoiseModel(
-        bodies,
-        size,
-        known if bool(known.any()) else None,
-        modes,
-        0.0 if own is None else own.noise_model.slack,
-        visible=None if bool(visible.all()) else visible,
-        kinds=kinds if int(kinds.max()) else None,
-    )
+    noise = NoiseModel(visible, kinds, known, modes, slack)
     return StackedRows(y, noise, Stacked(N, bodies * size, dim, parts))
 
 
@@ -354,11 +341,10 @@ def _by_coordinates(
     robot: Tree, data: Any, own: Coordinates, readings: list[OtherReadings], progress: Progress
 ) -> Placed:
     """Registration and geometric calibration of rows that tell coordinates, and devices of readings around them."""
-    count = len(data)
     own.table.check_every_marker_seen()
-    sessions, table = Sessions.of_table(robot, own, count, progress)
+    sessions, table = Sessions.of_table(robot, own, progress)
     LOG.info("calibrating %s with %r", robot.name, table)
-    sockets, table, stages = coordinate_stages(robot, own._replace(table=table), count, progress)
+    sockets, table, stages = coordinate_stages(robot, own._replace(table=table), progress)
     LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", *(1e3 * stage.rms for stage in stages))
     warn_of_joints_below_tip(robot, table)
     warn_of_open_directions(robot, table, stages[0])

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -23,8 +24,8 @@ from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.rows import NO_SOCKET
-from diffeo_calib.sensors.devices import Hypothesis
-from diffeo_calib.sensors.places import PlacedDevices
+from diffeo_calib.sensors.devices import Extrinsics, Hypothesis
+from diffeo_calib.sensors.places import PlacedDevices, Shown
 from diffeo_calib.sensors.set_ups import SetUps, View
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings
 
@@ -36,14 +37,14 @@ class SeenRows(NamedTuple):
     """N rows around k0, as sets of devices see them; so are those of a tangent model.
 
     Args:
-        nominal: k0. y: (N, R) m. points: (N, 3 P) m. slopes: (N, R, 3 P) of what was measured; None for all
-            coordinates. sensitivities: (N, R, K).
+        nominal: k0. y: (N, R) m. points: (N, 3 P) m. slopes: (N, R, 3 P) of what was measured.
+        sensitivities: (N, R, K).
     """
 
     nominal: GeometryMap
     y: Tensor
     points: Tensor
-    slopes: Tensor | None
+    slopes: Tensor
     sensitivities: Tensor
 
 
@@ -87,15 +88,33 @@ class Settled(NamedTuple):
     known: SetUps | None = None
 
 
-def by_row(count: int, rows: Tensor, device: Tensor) -> Tensor:
-    """(N,) numbers of the devices of ``count`` rows: those (M,) of some rows (M,), -1 elsewhere."""
-    found = torch.full((count,), NO_SOCKET, dtype=torch.int64, device=HOST)
-    found[rows] = device
-    return found
-
-
+@dataclass(frozen=True, eq=False)
 class DeviceSet(ABC):
-    """Devices of one kind and the rows that they measured."""
+    """Devices of one kind and the rows that they measured.
+
+    Args:
+        devices: where they are; before a fit the deviations of their increments are those of the prior.
+        rows: (M,) numbers of the rows that they measured. device: (M,) which of them did.
+    """
+
+    devices: Extrinsics
+    rows: Tensor
+    device: Tensor
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the devices."""
+        return self.devices.names
+
+    def by_row(self, count: int) -> Tensor:
+        """(N,) numbers of the devices of all rows, -1 for rows of none."""
+        found = torch.full((count,), NO_SOCKET, dtype=torch.int64, device=HOST)
+        found[self.rows] = self.device
+        return found
+
+    def of_rows(self: S, rows: Tensor) -> S:
+        """The same among more rows, of which these (M,) are those here."""
+        return replace(self, rows=rows[self.rows])
 
     @property
     @abstractmethod
@@ -114,17 +133,18 @@ class DeviceSet(ABC):
     def with_rows(self: S, other: OtherRows) -> S:
         """The same devices with other rows in place of their own; MeasurementError for other devices."""
 
-    def aligned(self, data: T) -> T:
-        """Measured positions in the frame of the model."""
-        return data
-
     def at_places(self, table: T) -> T:
         """Rows that tell coordinates where these devices put them."""
         return table
 
-    def placed(self) -> PlacedDevices | None:
-        """Their entries for the model file; None for nothing."""
+    @property
+    def shown(self) -> Shown | None:
+        """See :class:`PlacedDevices`."""
         return None
+
+    def placed(self) -> PlacedDevices:
+        """Their entries for the model file."""
+        return PlacedDevices(self.devices, self.rows, self.device, self.shown)
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:  # noqa: B027
         """Warn (DiffeoCalibWarning) of what these devices leave open in a model, and of what would show it."""
@@ -172,7 +192,7 @@ class DeviceSet(ABC):
 
     def sentences(self) -> list[str]:
         """Where the devices are."""
-        return []
+        return self.devices.sentences()
 
     def entry(self) -> dict[str, Any]:
         """Where the devices are, for programs, in m and rad."""
@@ -199,10 +219,9 @@ class Placement(tuple[DeviceSet, ...]):
         """Those of all devices, see :meth:`DeviceSet.views`."""
         return {name: view for own in self for name, view in own.views().items()}
 
-    def shared(self, data: Seen) -> Tensor | None:
-        """Effects of all devices, side by side: (N, R, c); None without any."""
-        effects = [own.effects(data) for own in self]
-        return torch.cat(effects, dim=2) if effects else None
+    def shared(self, data: Seen) -> Tensor:
+        """Effects of all devices, side by side: (N, R, c)."""
+        return torch.cat([data.y.new_zeros(*data.y.shape, 0), *(own.effects(data) for own in self)], 2)
 
     def settled(self, fitted: Fit, around: FittedMap, centre: Tensor, transform: Tensor, **known: Any) -> Placement:
         """All devices where a fit puts them, whose last shifts are theirs.
@@ -222,7 +241,7 @@ class Placement(tuple[DeviceSet, ...]):
     def aligned(self, data: T) -> T:
         """Measured positions in the frame of the model; unchanged where one set-up measured all."""
         for own in self:
-            data = own.aligned(data)
+            data = own.devices.aligned(data)
         return data
 
     def at_places(self, data: T) -> T:
@@ -243,7 +262,7 @@ class Placement(tuple[DeviceSet, ...]):
 
     def placed(self) -> tuple[PlacedDevices, ...]:
         """Entries of all devices for the model file."""
-        return tuple(found for own in self if (found := own.placed()) is not None)
+        return tuple(found for own in self if (found := own.placed()).names)
 
 
 class OtherLabel(NamedTuple):

@@ -36,7 +36,7 @@ from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.devices import Devices, Hypothesis, check_devices
 from diffeo_calib.sensors.kinds import kind_of
-from diffeo_calib.sensors.places import PlacedDevices, fitting_devices
+from diffeo_calib.sensors.places import Shown, fitting_devices
 from diffeo_calib.sensors.tables import OtherReadings, ball_tip
 
 ROUGH_M = 2e-3
@@ -55,14 +55,11 @@ class ReadingDevices(DeviceSet):
     """The devices of readings of one kind.
 
     Args:
-        data: the readings. devices: where their devices are.
-        rows: (M,) numbers of the rows among those of the calibration.
-        frame: the frame of their places, in words.
+        data: the readings. frame: that of the places of their devices, in words.
     """
 
-    data: Readings
     devices: Devices
-    rows: Tensor
+    data: Readings
     frame: str
 
     @property
@@ -75,9 +72,8 @@ class ReadingDevices(DeviceSet):
         return torch.arange(self.data.values.shape[1], device=self.rows.device)
 
     @property
-    def device(self) -> Tensor:
-        """(M,) number of each row's device."""
-        return self.devices.numbers(self.data)
+    def shown(self) -> Shown:
+        return self.data.shown
 
     def _seen(self, data: Seen) -> Tensor:
         """(M, 3 k) coordinates of what the devices see, m."""
@@ -104,8 +100,7 @@ class ReadingDevices(DeviceSet):
 
     def with_rows(self, other: OtherRows) -> ReadingDevices:
         own = next(one for one in other.readings if one.table.column_kind == self.data.column_kind)
-        self.devices.numbers(own.table)  # refuses other devices
-        return replace(self, data=own.table, rows=own.rows)
+        return replace(self, data=own.table, rows=own.rows, device=self.devices.numbers(own.table))
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:
         """Warn if most of the expected error is the robot's size."""
@@ -116,12 +111,9 @@ class ReadingDevices(DeviceSet):
     def sentences(self) -> list[str]:
         return [self.devices.sentence(number, own, self.frame) for number, own in enumerate(self.devices.deviations)]
 
-    def placed(self) -> PlacedDevices:
-        return PlacedDevices(self.devices, self.rows, self.device, self.data.shown)
-
     def entry(self) -> dict[str, object]:
         values = {"constants": self.devices.constants, "deviations": self.devices.deviations}
-        own = {what: dict(zip(self.devices.names, each.tolist(), strict=True)) for what, each in values.items()}
+        own = {what: dict(zip(self.names, each.tolist(), strict=True)) for what, each in values.items()}
         return {"devices": own}
 
 
@@ -158,7 +150,7 @@ def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool
     devices, squares = best.rows.devices(fit.shifts), body_squares(fit.errors)
     noise = float((squares.sum() / sum(own.numel() for own in fit.errors)).sqrt())
     nothing, tails = torch.zeros_like(fit.covariance), Tails.none(len(squares), 1)
-    known = 0, "ball and devices found.", nothing[0], Prior(), tails, devices
+    known = nothing[0], Prior(), tails, devices
     registration = Identification(geometry, float(squares.mean().sqrt()), noise, nothing, *known)
     rows = Rows(geometry, tuple(map(ReadRows, tables, devices)), rigid=rigid)
     return registration, estimated(rows, _all_but_ball(bare) if rigid else held_parameters(bare, adrift=True), Prior())
@@ -207,7 +199,8 @@ def reading_sets(
 ) -> tuple[ReadingDevices, ...]:
     """Sets of devices and the rows that they measured; ``beside``: rows of the same robot that tell coordinates."""
     frame = "the robot's base" if beside is None or beside.without_device else "the measuring frame"
-    return tuple(ReadingDevices(table, own, rows, frame) for (table, rows), own in zip(readings, devices, strict=True))
+    each = zip(readings, devices, strict=True)
+    return tuple(ReadingDevices(own, rows, own.numbers(table), table, frame) for (table, rows), own in each)
 
 
 def stages_beside(stages: Stages, readings: Sequence[OtherReadings], table: Measurements) -> Stages:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -21,16 +21,14 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register, register_inliers, spread
-from diffeo_calib.calibration.placing.placement import DeviceSet, OtherLabel, OtherRows, Seen, Settled, by_row
-from diffeo_calib.common.errors import MeasurementError, few, listed, sentence, warn_user
+from diffeo_calib.calibration.placing.placement import DeviceSet, OtherLabel, OtherRows, Seen, Settled
+from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.fitting.result import Progress
-from diffeo_calib.measurements.checks import numbers_of
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import marker_tips
-from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import (
     SESSION,
     MeasuringFrames,
@@ -52,24 +50,19 @@ class Sessions(DeviceSet):
     """Difference between sessions: measuring frames, or what is on the tool.
 
     Args:
-        set_ups: the sessions.
         reference: the one whose frame and markers are those of the model.
-        session: (N,) number of the session of each row of a calibration, -1 for rows of none.
         markers: P that a device saw, the first ones of the geometry.
         centre: (3,) about which frames turn, m; by default the middle of the rows.
     """
 
-    set_ups: SetUps
+    devices: SetUps
     reference: int
-    session: Tensor
     markers: int
     centre: Tensor | None = None
 
     @classmethod
-    def of_table(
-        cls, robot: Tree, own: Coordinates, count: int, progress: Progress
-    ) -> tuple[list[Sessions], Measurements]:
-        """The sessions of a table of ``count`` rows, and the rows as those of one; none for one session.
+    def of_table(cls, robot: Tree, own: Coordinates, progress: Progress) -> tuple[list[Sessions], Measurements]:
+        """The sessions of rows, and these as those of one; none for one session.
 
         Raises:
             MeasurementError: a session with too few rows, rows that do not fit the robot, or sessions without a device.
@@ -86,7 +79,7 @@ class Sessions(DeviceSet):
         found, median = cls.find(robot, rows, set_up_kind(rows))
         if rows.lever is None:
             _doubt(robot, rows, median)
-        return [found.of_rows(own.rows[table.socket_numbers < 0], count)], found.aligned(table)
+        return [found.of_rows(own.rows[table.socket_numbers < 0])], found.devices.aligned(table)
 
     @classmethod
     def find(cls, robot: Tree, data: Measurements, kind: type[SetUps]) -> tuple[Sessions, float]:
@@ -98,17 +91,19 @@ class Sessions(DeviceSet):
         geometry = register_inliers(robot, data.largest_session())[0].geometry
         for _ in range(ROUNDS):  # a better geometry gives better places
             found = cls.around(data, kind, geometry, geometry.points(data.q))
-            together = found.aligned(data)
+            together = found.devices.aligned(data)
             start = register(robot, data.q, together.points, marker_tips(robot, data)).geometry
             geometry = identify(start, data.q, together.points).geometry
-        away, numbers = (geometry.points(data.q) - together.points).norm(dim=2), found.session
-        median, worst = max((float(away[numbers == one].nanmedian()), one) for one in numbers.unique().tolist())
-        alone = data.rows(numbers == worst).with_sessions(None)
+        away = (geometry.points(data.q) - together.points).norm(dim=2)
+        median, rows, name = max(
+            ((float(away[rows].nanmedian()), rows, name) for name, rows in found.groups()), key=lambda one: one[0]
+        )
+        alone = data.rows(rows).with_sessions(None)
         if median > gates.GEOMETRIC_RESIDUAL * spread(alone.points):
             try:
                 refuse_mistakes(robot, alone)
             except MeasurementError as error:
-                raise MeasurementError(f"session '{found.names[worst]}': {error}") from error
+                raise MeasurementError(f"{name}: {error}") from error
         return found, median
 
     @classmethod
@@ -117,117 +112,87 @@ class Sessions(DeviceSet):
         names, session = sessions_of(data)
         reference = int(torch.bincount(session[session != NO_SOCKET], minlength=len(names)).argmax())
         found = kind.of(seen, data, geometry.marker_turns)
-        return cls(found.with_reference(reference), reference, session, data.markers)
+        rows = (session != NO_SOCKET).nonzero()[:, 0]
+        return cls(found.with_reference(reference), rows, session[rows], reference, data.markers)
 
     @staticmethod
     def beside(
-        own: Coordinates, device: Coordinates, geometry: Geometry, seen: Tensor, count: int
+        own: Coordinates, device: Coordinates, geometry: Geometry, seen: Tensor
     ) -> tuple[list[Sessions], Coordinates]:
         """The sessions of new rows, and these as of the largest one; none for one session.
 
         Args:
-            own: rows of a table of ``count`` rows. device: those of them that a device measured.
+            own: rows of a table. device: those of them that a device measured.
             geometry: of the robot in the frame of the largest session. seen: (M, P, 3) their points there, m.
         """
         if len(device.table.present_sessions) < 2:
             return [], own
         found = Sessions.around(device.table, set_up_kind(device.table), geometry, seen)
-        return [found.of_rows(own.rows[device.rows], count)], own._replace(table=found.aligned(own.table))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.set_ups.names
+        return [found.of_rows(own.rows[device.rows])], own._replace(table=found.devices.aligned(own.table))
 
     @property
     def transforms(self) -> Tensor:
         """(S, 4, 4) from the frame of the reference to that of each session, or on the tool, m."""
-        return self.set_ups.constants.unflatten(1, (4, 4))
-
-    def aligned(self, data: Any) -> Any:
-        """The rows of all sessions as those of the reference; MeasurementError for a session that is not known."""
-        self.numbers(data)
-        return self.set_ups.aligned(data)
+        return self.devices.constants.unflatten(1, (4, 4))
 
     def groups(self) -> list[tuple[str, Tensor]]:
         """Rows (k,) of each session by its name in words."""
-        return [(f"session '{name}'", (self.session == k).nonzero()[:, 0]) for k, name in enumerate(self.names)]
+        return [(f"session '{name}'", self.rows[self.device == k]) for k, name in enumerate(self.names)]
 
     @property
     def others(self) -> list[int]:
         """Numbers of the sessions but the reference."""
         return [number for number in range(len(self.names)) if number != self.reference]
 
-    def increments(
-        self, points: Tensor, by_tool: Tensor, centre: Tensor, rows: Tensor | slice, slopes: Tensor | None = None
-    ) -> Tensor:
+    def increments(self, points: Tensor, by_tool: Tensor, centre: Tensor, session: Tensor, slopes: Tensor) -> Tensor:
         """What the sessions but the reference leave open, (N, R, k (S - 1)): see :meth:`SetUps.increments`.
 
         Args:
-            rows: numbers of the N rows.
+            session: (N,) numbers of the rows' sessions.
         """
-        session, own = self.session[rows].to(points.device), self.set_ups.increments(points, slopes, by_tool, centre)
+        own = self.devices.increments(points, slopes, by_tool, centre)
+        session = session.to(points.device)
         return torch.cat([own * (session == number)[:, None, None] for number in self.others], dim=2)
 
     @property
     def size(self) -> int:
         """Numbers of each session but the reference."""
-        return len(self.others) * self.set_ups.increments_each
+        return len(self.others) * self.devices.increments_each
 
     def effects(self, data: Seen) -> Tensor:
         tool, places = data.nominal.geometry.slices["tool"], data.points.unflatten(1, (-1, 3))
         by_tool = data.sensitivities[..., tool.start : tool.start + 3 * self.markers]
         centre = places.mean((0, 1)) if self.centre is None else self.centre
-        return self.increments(places, by_tool, centre, slice(None), data.slopes)
+        return self.increments(places, by_tool, centre, self.by_row(len(data.y)), data.slopes)
 
     def settled(self, found: Settled) -> Sessions:
-        steps, k = found.shifts.view(len(self.others), -1), self.set_ups.deviations.shape[1]
+        steps, k = found.shifts.view(len(self.others), -1), self.devices.deviations.shape[1]
         std = found.covariance.diagonal().clamp(min=0).sqrt().view_as(steps) if k else steps[:, :0]
-        moved = self.set_ups.moved(self.others, steps, std, found.centre, found.transform)
-        return replace(self, set_ups=moved if found.known is None else moved.after(found.known))
+        moved = self.devices.moved(self.others, steps, std, found.centre, found.transform)
+        return replace(self, devices=moved if found.known is None else moved.after(found.known))
 
     def views(self) -> dict[str, View]:
-        return dict(zip(self.names, self.set_ups.views(), strict=True))
+        return {name: partial(self.devices.view, number) for number, name in enumerate(self.names)}
 
     def labels(self, own: Coordinates, seen: Tensor) -> Iterator[OtherLabel]:
-        session, points, count = self.session[own.rows], own.table.points, self.markers
-        for number, name in enumerate(self.names if self.set_ups.kind == SESSION else ()):
+        session = self.by_row(int(own.rows.max()) + 1)[own.rows]
+        points, count = own.table.points, self.markers
+        for number, name in enumerate(self.names if self.devices.kind == SESSION else ()):
             T = torch.linalg.inv(self.transforms[number]) @ self.transforms[session]
             away = points[:, :count] @ T[:, :3, :3].mT + T[:, None, :3, 3] - seen[:, :count]
             applies = (session != number) & (session != NO_SOCKET)
             yield OtherLabel(f"session '{name}'", applies, away.norm(dim=-1).nanmean(1))
 
-    def placed(self) -> PlacedDevices:
-        rows = (self.session != NO_SOCKET).nonzero()[:, 0]
-        return PlacedDevices(self.set_ups, rows, self.session[rows])
-
     def entry(self) -> dict[str, object]:
-        return {self.set_ups.key: self.set_ups.entry()}
-
-    def sentences(self) -> list[str]:
-        return self.set_ups.sentences()
+        return {self.devices.key: self.devices.entry()}
 
     def with_rows(self, other: OtherRows) -> Sessions:
         device = None if other.coordinates is None else measured_rows(other.coordinates.table)
-        if other.coordinates is None or device is None:
-            session = self.session.new_full((len(other.data),), NO_SOCKET)
-        else:
-            session = by_row(len(other.data), other.coordinates.rows[device.rows], self.numbers(device.table))
-        return replace(self, session=session, centre=other.centre)
-
-    def numbers(self, data: Any) -> Tensor:
-        """(N,) number here of each row's session, -1 for none; MeasurementError for a session that is not known."""
-        if data.session is None:
-            raise MeasurementError.of("the measurements have no sessions", fix="pass data.with_sessions(names)")
-        names = data.device_names
-        unknown = [name for name in dict.fromkeys(names) if name and name not in self.names]
-        if unknown:
-            fix = "register the model with rows of the new set-up"
-            raise MeasurementError.of(f"the sessions {unknown}", expected=f"some of {listed(self.names)}", fix=fix)
-        return numbers_of(names, self.names)
-
-    def of_rows(self, rows: Tensor, count: int) -> Sessions:
-        """The same for ``count`` rows of a calibration, of which these (M,) have sessions."""
-        return replace(self, session=by_row(count, rows, self.session))
+        rows = number = self.rows[:0]
+        if other.coordinates is not None and device is not None:
+            number = self.devices.numbers(device.table)
+            rows, number = other.coordinates.rows[device.rows][number != NO_SOCKET], number[number != NO_SOCKET]
+        return replace(self, rows=rows, device=number, centre=other.centre)
 
 
 def _doubt(robot: Tree, data: Measurements, median: float) -> None:

@@ -34,7 +34,7 @@ from diffeo_calib.calibration.identification.registration import (
     register_sockets,
     socket_means,
 )
-from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled, by_row
+from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -48,9 +48,8 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import VALUE, Hypothesis
-from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import View, frame_slopes
-from diffeo_calib.sensors.sockets import SocketPlaces, socket_errors
+from diffeo_calib.sensors.sockets import IN_SOCKET_M, SocketPlaces, socket_errors
 from diffeo_calib.sensors.tables import Coordinates
 
 T = TypeVar("T")
@@ -59,8 +58,6 @@ ALIKE = 0.05
 """Deviation of a block's distance from one place to another, relative to that of the distance itself."""
 FEWEST_BESIDE = 2
 """Rows of a socket besides one that are needed to judge it."""
-IN_SOCKET_M = 0.02
-"""Largest distance of the ball from the place of a socket, stated roughly, at which it counts as resting there."""
 ROUNDS = 2
 """Geometric calibrations, after each of which the sockets are placed again."""
 
@@ -87,9 +84,7 @@ class SocketDevices(DeviceSet):
 
     Args:
         sockets: their names and known distances.
-        positions: (S, 3) most probable places, m. root: (3 S, 3 S) square root of the covariance of these before the
-            fit, m.
-        socket: (N,) number of the socket of each row of the calibration, -1 for rows of none.
+        root: (3 S, 3 S) square root of the covariance of their places before the fit, m.
         by_device: whether a device measured other rows.
         covariance: (3 S, 3 S) of the positions, m^2; after a fit without a device without rigid motions of all of them.
         left_out: every place, predicted by all other rows.
@@ -97,10 +92,9 @@ class SocketDevices(DeviceSet):
             the true ones over the joint ranges of the rows; without a device after the best rigid motion.
     """
 
+    devices: SocketPlaces
     sockets: Sockets
-    positions: Tensor
     root: Tensor
-    socket: Tensor
     by_device: bool
     covariance: Tensor
     left_out: tuple[PlaceErrors, ...] = ()
@@ -123,7 +117,9 @@ class SocketDevices(DeviceSet):
         factor = torch.linalg.cholesky(precision)
         root = torch.linalg.solve_triangular(factor, eye, upper=False).mT
         places = positions + (root @ (root.mT @ push)).view(-1, 3)
-        return cls(sockets, places, root, data.socket_numbers, not data.without_device, root @ root.mT)
+        covariance, rows = root @ root.mT, (data.socket_numbers != NO_SOCKET).nonzero()[:, 0]
+        devices = SocketPlaces(sockets.names, places, _deviations(covariance))
+        return cls(devices, rows, data.socket_numbers[rows], sockets, root, not data.without_device, covariance)
 
     @classmethod
     def around_model(cls, table: Measurements, rows: Tensor, seen: Tensor) -> tuple[list[DeviceSet], Measurements]:
@@ -137,17 +133,18 @@ class SocketDevices(DeviceSet):
         socket = table.socket_numbers
         resting = socket != NO_SOCKET
         found = cls.around(table, socket_means(seen[rows][resting, -3:], socket[resting]))
-        return [found.of_rows(rows, len(seen))], found.at_places(table)
+        return [found.of_rows(rows)], found.at_places(table)
 
-    def of_rows(self, rows: Tensor, count: int) -> SocketDevices:
-        """The same for ``count`` rows of a calibration, of which these (M,) are the rows here."""
-        return replace(self, socket=by_row(count, rows, self.socket))
+    @property
+    def positions(self) -> Tensor:
+        """(S, 3) most probable places, m."""
+        return self.devices.constants
 
-    def shared(self, coordinates: int) -> Tensor:
-        """Uncertainty of the places, as errors of the last marker that rows share: (N, 3 P, 3 S), m."""
-        rows, own = self.socket != NO_SOCKET, self.root.view(len(self.positions), 3, -1)
-        effects = own.new_zeros(len(self.socket), coordinates, own.shape[2])
-        effects[rows, -3:] = own[self.socket[rows]]
+    def shared(self, count: int, coordinates: int) -> Tensor:
+        """Uncertainty of the places, as errors of the last marker that ``count`` rows share: (N, 3 P, 3 S), m."""
+        own = self.root.view(len(self.positions), 3, -1)
+        effects = own.new_zeros(count, coordinates, own.shape[2])
+        effects[self.rows, -3:] = own[self.device]
         return effects
 
     def at_places(self, table: Measurements) -> Measurements:
@@ -158,7 +155,7 @@ class SocketDevices(DeviceSet):
         return with_attributes(table, points=points)
 
     def places_at(self, row: int) -> Tensor | None:
-        return None if self.socket[row] == NO_SOCKET else self.positions
+        return self.positions if bool((self.rows == row).any()) else None
 
     def sees(self, row: int, points: Tensor, views: Mapping[str, View]) -> Tensor:
         places = self.places_at(row)
@@ -174,10 +171,6 @@ class SocketDevices(DeviceSet):
         return with_attributes(like, socket=nearest, sockets=self.sockets)
 
     @property
-    def names(self) -> tuple[str, ...]:
-        return self.sockets.names
-
-    @property
     def size(self) -> int:
         return self.root.shape[1]
 
@@ -188,38 +181,37 @@ class SocketDevices(DeviceSet):
             for first, second, _ in block:
                 along = self.positions[second] - self.positions[first]
                 for number, sign in ((first, -0.5), (second, 0.5)):
-                    effects[self.socket == number, -3:, 0] = sign * along / along.norm()
+                    effects[self.rows[self.device == number], -3:, 0] = sign * along / along.norm()
             first, second, length = block[0]
             pair = [self.names[number] for number in (first, second)]
             if len(block) > 1:  # at several places
                 pair = [name.rpartition(SEPARATOR)[2] for name in pair]
             name = f"the distance of '{pair[0]}' and '{pair[1]}' ({1e3 * length:.2f} mm)"
-            yield Hypothesis(
-                name, effects if data.slopes is None else data.slopes @ effects, ("mm", 1e-3), fix, about=VALUE
-            )
+            yield Hypothesis(name, data.slopes @ effects, ("mm", 1e-3), fix, about=VALUE)
 
     def effects(self, data: Seen) -> Tensor:
-        effects = self.shared(data.points.shape[1])
-        return effects if data.slopes is None else data.slopes @ effects
+        return data.slopes @ self.shared(*data.points.shape)
 
     def settled(self, found: Settled) -> SocketDevices:
         root, positions = self.root, self.positions - (self.root @ found.shifts).view(-1, 3)
         if found.fitted.workspace is not None:
             B = frame_slopes(positions[None], positions.mean(0))[0]  # (3 S, 6)
             root = root - B @ (torch.linalg.pinv(B) @ root)
+        covariance = root @ found.covariance @ root.mT
         return replace(
             self,
-            positions=positions,
-            covariance=root @ found.covariance @ root.mT,
+            devices=SocketPlaces(self.names, positions, _deviations(covariance)),
+            covariance=covariance,
             left_out=() if found.chosen is None else self._left_out(found.chosen),
             workspace_deviation=workspace_deviation(found.fitted),
         )
 
     def with_rows(self, other: OtherRows) -> SocketDevices:
-        socket = self.socket.new_full((len(other.data),), NO_SOCKET)
+        rows = socket = self.rows[:0]
         if other.coordinates is not None:
-            socket = by_row(len(other.data), other.coordinates.rows, self.named(other.coordinates.table).socket_numbers)
-        return replace(self, socket=socket)
+            socket = self.named(other.coordinates.table).socket_numbers
+            rows, socket = other.coordinates.rows[socket != NO_SOCKET], socket[socket != NO_SOCKET]
+        return replace(self, rows=rows, device=socket)
 
     def named(self, table: Measurements) -> Measurements:
         """The rows of a table with these sockets; MeasurementError for others."""
@@ -236,7 +228,8 @@ class SocketDevices(DeviceSet):
         data, sockets, found = chosen.data, self.sockets, []
         numbers, process = data.numbers, data.process(chosen.selection.scales)
         shared = numbers.S[:, data.sensitivities.shape[2] :]
-        place = torch.where(self.socket == NO_SOCKET, NO_SOCKET, sockets.place[self.socket])
+        socket = self.by_row(len(data.y))
+        place = torch.where(socket == NO_SOCKET, NO_SOCKET, sockets.place[socket])
         ball = numbers.cells % numbers.shape[1] >= numbers.shape[1] - 3
         for number, name in enumerate(sockets.place_names):
             index = (ball & (place[numbers.owner] == number)).nonzero()[:, 0]
@@ -245,31 +238,22 @@ class SocketDevices(DeviceSet):
             others = process.mu - process.inverse[:, index] @ errors  # K^-1 y without the place
             errors = errors + shared[index] @ (shared.T @ others)
             predicted = data.y[rows, -3:] - errors.view(-1, 3)
-            away, distances = socket_errors(predicted, self.socket[rows], sockets)
+            away, distances = socket_errors(predicted, socket[rows], sockets)
             spread = float(away.square().sum(1).mean().sqrt())
             found.append(PlaceErrors(name, len(rows), spread, tuple(one.error for one in distances)))
         return tuple(found)
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:
         """Warn of sockets near a plane if one place away from it would make the expected error smaller."""
-        place = self.sockets.place
+        place, socket = self.sockets.place, self.by_row(len(model.configurations))
         if model.map.workspace is not None:
-            warn_of_flat_places(model.map, self.positions, self.socket, place, self.workspace_deviation)
-
-    @property
-    def deviations(self) -> Tensor:
-        """(S, 3) standard deviations of the coordinates, m."""
-        return self.covariance.diagonal().clamp(min=0).sqrt().view(-1, 3)
+            warn_of_flat_places(model.map, self.positions, socket, place, self.workspace_deviation)
 
     @property
     def left_out_spread(self) -> float:
         """Root mean square distance from the middle of its socket over the rows of all places, each left out, m."""
         rows = sum(one.rows for one in self.left_out)
         return (sum(one.rows * one.spread**2 for one in self.left_out) / rows) ** 0.5
-
-    def placed(self) -> PlacedDevices:
-        rows = (self.socket != NO_SOCKET).nonzero()[:, 0]
-        return PlacedDevices(SocketPlaces(self.names, self.positions, self.deviations), rows, self.socket[rows])
 
     def entry(self) -> dict[str, object]:
         """Positions by name, and spread of places left out, for programs; in m."""
@@ -284,7 +268,7 @@ class SocketDevices(DeviceSet):
             f"socket '{name}': {', '.join(f'{1e3 * v:.3f}' for v in place)} mm in {frame}, deviations "
             f"{among}{', '.join(f'{1e3 * v:.3f}' for v in deviation)} mm"
             for name, place, deviation in zip(
-                self.names, self.positions.tolist(), self.deviations.tolist(), strict=True
+                self.names, self.positions.tolist(), self.devices.deviations.tolist(), strict=True
             )
         ]
         for one in self.left_out:
@@ -294,13 +278,18 @@ class SocketDevices(DeviceSet):
         return [*lines, f"spread within sockets, each place left out: {1e3 * self.left_out_spread:.4f} mm"]
 
 
+def _deviations(covariance: Tensor) -> Tensor:
+    """(S, 3) standard deviations of places, m."""
+    return covariance.diagonal().clamp(min=0).sqrt().view(-1, 3)
+
+
 def coordinate_stages(
-    robot: Tree, own: Coordinates, count: int, progress: Progress
+    robot: Tree, own: Coordinates, progress: Progress
 ) -> tuple[list[DeviceSet], Measurements, tuple[Identification, Identification]]:
     """Sockets, the rows placed there, and registration and geometric calibration, of rows that tell coordinates.
 
     Args:
-        robot: n joints. own: the rows, in one measuring frame. count: rows of the whole table.
+        robot: n joints. own: the rows, in one measuring frame.
 
     Raises:
         MeasurementError: rows that cannot belong to this robot, or too few.
@@ -308,7 +297,7 @@ def coordinate_stages(
     progress("registration", 0, 1)
     if own.table.sockets is not None:
         places, table, stages = stages_by_sockets(robot, own.table)
-        return [places.of_rows(own.rows, count)], table, stages
+        return [places.of_rows(own.rows)], table, stages
     registration = registered(robot, own.table)
     progress("geometry", 0, 1)
     identification = identify(registration.geometry, own.table.q, own.table.points)
@@ -345,7 +334,7 @@ def stages_by_sockets(
     geometry, places = registration.geometry, SocketDevices.around(data, found.positions)
     held = held_parameters(geometry, adrift=start is None)
     for _ in range(ROUNDS):
-        placed, shared = places.at_places(data), places.shared(3 * data.markers).unflatten(1, (-1, 3))
+        placed, shared = places.at_places(data), places.shared(len(data), 3 * data.markers).unflatten(1, (-1, 3))
         identification = identify(geometry, placed.q, placed.points, shared=shared, held=held)
         ball = identification.geometry.points(resting.q)[:, -1]
         places = SocketDevices.around(data, socket_means(ball, resting.socket_numbers))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from math import cos, isfinite, pi
 from os import PathLike
 from typing import Any
@@ -83,34 +84,12 @@ def all_of(criteria: Sequence[Criterion]) -> Criterion | None:
     return criterion if criteria else None
 
 
-def above_floor(robot: Tree, height: float, points: Tensor) -> Criterion:
-    """Whether all moving points are above a height in the robot's base frame, m.
-
-    Args:
-        robot: the chain. height: of the floor. points: (P, 3) on the tool, in the tip's frame, m.
-    """
-    return lambda q: (_links(robot, q, points)[..., 2] >= height).all(1)
-
-
-def outside_column(robot: Tree, column: Sequence[float], points: Tensor) -> Criterion:
+def outside_column(robot: Tree, column: object, points: Tensor) -> Criterion:
     """Whether all moving points are outside an upright cylinder.
 
     Args:
         robot: the chain. column: x, y and radius, and the height of its top if it ends, in the robot's base frame, m.
         points: (P, 3) on the tool, in the tip's frame, m.
-    """
-    x, y, radius, *top = column
-
-    def criterion(q: Tensor) -> Tensor:
-        places = _links(robot, q, points)
-        inside = (places[..., 0] - x).square() + (places[..., 1] - y).square() < radius**2
-        return ~(inside & (places[..., 2] < top[0]) if top else inside).any(1)
-
-    return criterion
-
-
-def check_column(column: object) -> list[float]:
-    """x, y, radius and perhaps the top of a column.
 
     Raises:
         InputError: other numbers.
@@ -118,7 +97,14 @@ def check_column(column: object) -> list[float]:
     numbers = as_tensor(column, "column", (3,), also=((4,),), fix="pass x, y, radius and perhaps the top, in m")
     if not float(numbers[2]) > 0:
         raise InputError.of("the radius of `column`", expected="a positive number of m", got=float(numbers[2]))
-    return numbers.tolist()
+    x, y, radius, *top = numbers.tolist()
+
+    def criterion(q: Tensor) -> Tensor:
+        places = _links(robot, q, points)
+        inside = (places[..., 0] - x).square() + (places[..., 1] - y).square() < radius**2
+        return ~(inside & (places[..., 2] < top[0]) if top else inside).any(1)
+
+    return criterion
 
 
 def _links(robot: Tree, q: Tensor, points: Tensor) -> Tensor:
@@ -323,9 +309,9 @@ def _criteria(robot: Tree, keep: object, tracker: object, floor: float | None, c
         found["tracker"] = tracker.sees(robot)
     if floor is not None:
         check_number(floor, "`floor`, a height in m", above=-float("inf"))
-        found["floor"] = above_floor(robot, float(floor), points)
+        found["floor"] = lambda q: (_links(robot, q, points)[..., 2] >= floor).all(1)
     if column is not None:
-        found["column"] = outside_column(robot, check_column(column), points)
+        found["column"] = outside_column(robot, column, points)
     if keep is not None:
         found["keep"] = keep
     return found
@@ -387,16 +373,11 @@ def collision_free(
         fix = "pip install 'diffeo_calib[collisions]', or pass your own check as `keep`"
         raise InputError.of("collisions need the package pinocchio, which is not installed", fix=fix) from error
     world = _World(pin, robot, [str(path) for path in packages])
-    lower, upper = joint_ranges(robot, _unlimited(robot))
+    ends = zip(robot.joint_names, robot.periodic, robot.limits.isfinite().all(1).tolist(), strict=True)
+    lower, upper = joint_ranges(robot, {name: (0.0, 1.0) for name, turns, limited in ends if not (turns or limited)})
     draw = np.random.default_rng(seed).random((ALWAYS_DRAWS, robot.n))
     world.leave_out_constant(lower.numpy() + (upper - lower).numpy() * draw)
     return lambda q: torch.tensor([world.free(row) for row in q.cpu().numpy()], dtype=torch.bool, device=HOST)
-
-
-def _unlimited(robot: Tree) -> dict[str, tuple[float, float]]:
-    """Any range for prismatic joints without limits."""
-    ends = zip(robot.joint_names, robot.periodic, robot.limits.isfinite().all(1).tolist(), strict=True)
-    return {name: (0.0, 1.0) for name, turns, limited in ends if not (turns or limited)}
 
 
 class _World:
@@ -424,7 +405,8 @@ class _World:
             raise InputError.of(f"pinocchio finds no joint {few(missing)} in the URDF", fix="pass your own check")
         self.joints = [self.model.joints[self.model.getJointId(name)] for name in robot.moving_names]
         self.robot = robot
-        self._pairs([pair for pair in self._all_pairs() if not self._joined(*pair)])
+        pairs = combinations(range(self.bodies.ngeoms), 2)
+        self._pairs([pair for pair in pairs if not self._joined(*pair)])
 
     def free(self, q: np.ndarray) -> bool:
         """Whether no pair collides: q (n,)."""
@@ -444,10 +426,6 @@ class _World:
         for first, second in pairs:
             self.bodies.addCollisionPair(self.pin.CollisionPair(first, second))
         self.checked = self.pin.GeometryData(self.bodies)
-
-    def _all_pairs(self) -> list[tuple[int, int]]:
-        count = self.bodies.ngeoms
-        return [(first, second) for first in range(count) for second in range(first + 1, count)]
 
     def _joined(self, first: int, second: int) -> bool:
         """Whether two bodies move together or are neighbours."""

@@ -27,11 +27,12 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
 from diffeo_calib.calibration.diagnostics.row_order import find_block
 from diffeo_calib.calibration.recalibration.changes import LEVEL, Change, Changes, Offset
-from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, WeighedRows
-from diffeo_calib.calibration.recalibration.parts import (
+from diffeo_calib.calibration.recalibration.new_rows import (
     OFFSET_DEVIATION_RAD_M,
+    OUTLIER_WEIGHT,
     ChangedPart,
     Drift,
+    WeighedRows,
     offsets_of,
     parts_of,
 )

@@ -2,14 +2,16 @@
 
 They are residuals y - h(k1(q; m)) of what was measured, h, from devices and markers that were found before
 (new_set_up.py), and whose places are known by their prior deviations (kinematics/re_registration/new_rows.py).
+
+Parts of a robot that may have changed since its calibration: hypotheses whose priors are those of the old model.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import log
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,11 +24,14 @@ from diffeo_calib.calibration.placing.placement import DeviceSet, Placement, See
 from diffeo_calib.calibration.placing.readings import ReadingDevices, reading_sets
 from diffeo_calib.calibration.placing.sockets import SocketDevices
 from diffeo_calib.calibration.recalibration.new_set_up import Before
-from diffeo_calib.calibration.recalibration.parts import parts_of
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.re_registration.find_place import MARKER_DEVIATIONS, UNMOVED_LOG_ODDS
 from diffeo_calib.kinematics.re_registration.new_rows import NewRows, larger, noise_of_rows, typical_noise
+from diffeo_calib.kinematics.re_registration.registered_map import robot_map
+from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails, reweight
@@ -35,6 +40,87 @@ from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import errors_of_kinds
 from diffeo_calib.sensors.errors import Evaluations
 from diffeo_calib.sensors.places import fitting_devices
+
+SMALLEST_AMPLITUDE_SHARE = 0.5
+"""A small transmission error counts with this share of the largest joint's amplitude: it may have grown."""
+OFFSET_DEVIATION_RAD_M = 3e-4
+"""Of a joint offset, to which the sizes of changes are relative: they span 0.05 to 5 mrad."""
+NEGLIGIBLE_EIGENVALUE_SHARE = 1e-6
+"""Eigenvalues of a transmission's covariance below this share of the largest are left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChangedPart:
+    """A part of a model that may have changed.
+
+    Args:
+        name: of the joint, or "gravity" or "geometry".
+        joint: the column of the joint whose error or offset it is; None for parameters of the nominal map.
+        kernel: that of the joint's error; None for its offset, which all readings lack since then.
+        deviations: (K,) prior standard deviations of the parameters, zero of those that it leaves alone.
+    """
+
+    name: str
+    joint: int | None = None
+    kernel: RadialKernel | None = None
+    deviations: Tensor | None = None
+
+    @property
+    def offset(self) -> bool:
+        """Whether it is the offset of a joint."""
+        return self.joint is not None and self.kernel is None
+
+    def shapes(self, at: Linearisation) -> Tensor:
+        """(M, c) columns whose products are the prior covariance of the joint's errors, rad or m."""
+        points = at.joint[0].points
+        if self.kernel is None:
+            return torch.full_like(points[:, :1], OFFSET_DEVIATION_RAD_M)
+        one = points.new_zeros(len(points), 1, points.shape[1])
+        one[:, 0, self.joint] = 1.0
+        values, vectors = torch.linalg.eigh(self.kernel.gram(points, one, points, one))
+        kept = values > NEGLIGIBLE_EIGENVALUE_SHARE * values[-1]
+        return vectors[:, kept] * values[kept].sqrt()
+
+    def root(self, at: Linearisation) -> Tensor:
+        """(M, m, c) columns whose products are the part's prior covariance at M configurations, m."""
+        if self.deviations is not None:
+            return (at.sensitivity * self.deviations)[..., self.deviations > 0]
+        return at.joint_to_start[:, :, self.joint, None] * self.shapes(at)[:, None]
+
+
+class Drift(NamedTuple):
+    """A part that has changed, and the variance of its change relative to its old variance."""
+
+    part: ChangedPart
+    variance: float
+
+    def root(self, at: Linearisation) -> Tensor:
+        """(M, m, c) columns whose products are the covariance of the change at M configurations, m."""
+        return self.variance**0.5 * self.part.root(at)
+
+
+def offsets_of(fitted: FittedMap) -> list[ChangedPart]:
+    """The offsets of all joints, which are tested beside the parts: the geometry has them, among much else."""
+    names = robot_map(fitted).geometry.chain.joint_names
+    return [ChangedPart(f"the offset of {name}", joint) for joint, name in enumerate(names)]
+
+
+def parts_of(fitted: FittedMap) -> list[ChangedPart]:
+    """The parts of a robot's map: every joint with a transmission term, gravity, geometry."""
+    spec, nominal = fitted.geodesic.spec, robot_map(fitted)
+    names = nominal.geometry.chain.joint_names
+    own = {t.output: t for t in spec.joint_kernel.terms if isinstance(t, RadialKernel) and t.output is not None}
+    least = SMALLEST_AMPLITUDE_SHARE**2 * max((float(term.variance) for term in own.values()), default=0.0)
+    found: list[ChangedPart] = []
+    for joint, term in own.items() if least > 0 else ():
+        kernel = RadialKernel.from_config(term.to_config() | {"variance": max(float(term.variance), least)})
+        found.append(ChangedPart(names[joint], joint, kernel))
+    for name, columns in (("gravity", nominal.sag), ("geometry", nominal.geometry.slices["joints"])):
+        deviations = torch.zeros_like(spec.prior_variance)
+        deviations[columns] = spec.prior_variance[columns].sqrt()
+        found += [ChangedPart(name, deviations=deviations)] if bool(deviations.any()) else []
+    return found
+
 
 ROUNDS = 20
 WEIGHT_CHANGE = 0.01
@@ -82,7 +168,7 @@ class WeighedRows(NewRows):
             transform=before.transform,
             q=before.data.q,
             noise=noise,
-            visible=model.coordinates(measured["y"]),
+            visible=model.visible,
             shared=noise[..., :0],
             deviations=torch.cat([frame, moved]),
             away=nothing[0],
@@ -97,8 +183,8 @@ class WeighedRows(NewRows):
             **measured,
         )
         by_tool = pad(rows.by_places[..., 6:], (before.nominal.geometry.slices["tool"].start, 0))
-        shared = rows.placement.shared(SeenRows(before.nominal, rows.y, rows.seen[0], rows.slopes, by_tool))
-        return rows if shared is None else rows.changed(shared=shared)
+        at = SeenRows(before.nominal, rows.y, rows.seen[0], rows.slopes, by_tool)
+        return rows.changed(shared=rows.placement.shared(at))
 
     @property
     def weighted_noise(self) -> Tensor:
@@ -141,7 +227,7 @@ class WeighedRows(NewRows):
         old = self.fitted.new_noise
         if self.observe is not None or self.fitted.slopes is not None:
             return old
-        found = self.mean_noise * region_factor(self.tails.freedom, self.noise_model.largest_freedom)
+        found = self.mean_noise * region_factor(self.tails.freedom, int(self.noise_model.freedom.max()))
         return found if float(found.trace()) > float(old.trace()) else old
 
     @property
@@ -190,7 +276,6 @@ class WeighedRows(NewRows):
     def levelled(self) -> WeighedRows:
         """The rows with the likeliest noise of every kind of device that the old fit does not know."""
         kinds, known = self.noise_model.kinds, self.fitted.slopes is None
-        kinds = torch.zeros_like(self.tails.weights, dtype=torch.int64) if kinds is None else kinds
         unknown = range(int(known), int(kinds.max()) + 1) if self.observe is not None or not known else ()
         rows = self.drifting([part.root(self.at) for part in parts_of(self.fitted)] if unknown else [])  # no noise
         for kind in unknown:
@@ -243,7 +328,6 @@ def _measured(before: Before, seen: Tensor) -> tuple[NoiseModel, Tensor, dict[st
     if told is not None and noise is not None and len(told.rows) == len(seen):
         return told.noise_model, noise, {"y": told.y, "observe": None, "placement": Placement(sets)}
     rows = stacked(before.data.q, told, readings, seen.shape[1])
-    visible = rows.noise_model.coordinates(rows.y)
     old = before.fitted.noise
     usual = old.covariance.diagonal(dim1=1, dim2=2)[old.visible].median()  # variance of what was measured, m^2
     total = torch.diag_embed(usual.expand_as(rows.y))
@@ -251,11 +335,11 @@ def _measured(before: Before, seen: Tensor) -> tuple[NoiseModel, Tensor, dict[st
         own = total[told.rows]
         own[:, : noise.shape[1], : noise.shape[1]] = noise
         total[told.rows] = own
-    if rows.noise_model.known is not None:
+    if rows.noise_model.stated:
         total = larger(total, rows.noise_model.known)
-    model = replace(rows.noise_model, known=None)
+    model = rows.noise_model.without_known
     known = {"y": rows.y, "observe": rows.observe, "placement": Placement((*sets, *readings))}
-    return model, without_hidden(total, visible), known
+    return model, without_hidden(total, model.visible), known
 
 
 def _coordinates(before: Before, new: Measurements, rows: Tensor, seen: Tensor) -> tuple[Told, Tensor, list[DeviceSet]]:
@@ -266,8 +350,6 @@ def _coordinates(before: Before, new: Measurements, rows: Tensor, seen: Tensor) 
     noise = noise_of_rows(fitted, new, T, block, 1.0)
     sets, table = SocketDevices.around_model(table, rows, seen)
     y = table.points.flatten(1)
-    sensor = replace(NoiseModel.of(table, 0.0), known=None)
-    if sensor.visible is not None:
-        y = torch.where(y.isnan(), seen[rows], y)
-        noise = without_hidden(noise, sensor.coordinates(y))
+    sensor = NoiseModel.of(table, 0.0).without_known
+    y, noise = torch.where(y.isnan(), seen[rows], y), without_hidden(noise, sensor.visible)
     return Told(rows, y, sensor), noise, [*sets, *CameraErrors.around(table, rows)]

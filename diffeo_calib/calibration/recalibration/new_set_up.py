@@ -34,7 +34,7 @@ from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import check_shown, sensor_of
-from diffeo_calib.sensors.set_ups import mounted_of
+from diffeo_calib.sensors.places import mounted_of
 from diffeo_calib.sensors.tables import (
     Coordinates,
     OtherReadings,
@@ -85,7 +85,7 @@ class Before:
     @property
     def stands_free(self) -> bool:
         """Whether still no device says where the robot stands."""
-        return self.place is None and self.fitted.workspace is not None
+        return self.place is None and self.fitted.stands_free
 
     @property
     def own_markers(self) -> Tensor:
@@ -142,13 +142,13 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
             place, seen = _place_of_device(old, nominal, model.lever, device.table, stated)
             geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])
             geometry = replace(geometry, base=place.registration.transform @ geometry.base)
-            sessions, own = Sessions.beside(own, device, geometry, seen, len(new))
+            sessions, own = Sessions.beside(own, device, geometry, seen)
     return Before(old, nominal, new, own, readings, place, sessions, ball, new_ball)
 
 
 def knows_ball(model: CalibratedKinematics) -> bool:
     """Whether the last marker of the fit is a ball whose position no device measured."""
-    return model.ball or model.map.unregistered.workspace is not None
+    return model.ball or model.map.unregistered.stands_free
 
 
 def _check_robot(model: CalibratedKinematics, new: Any, own: Coordinates | None, readings: list[OtherReadings]) -> None:

@@ -43,8 +43,7 @@ from diffeo_calib.kinematics.re_registration.register_again import both_dates, c
 from diffeo_calib.kinematics.re_registration.registered_map import Registration, moved
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.sensors.errors import Evaluations
-from diffeo_calib.sensors.places import PlacedDevices
-from diffeo_calib.sensors.set_ups import mounted_of
+from diffeo_calib.sensors.places import PlacedDevices, mounted_of
 
 LOG = logging.getLogger(__name__)
 CERTIFICATES = "coupling_residual", "end_residual", "energy", "status"
@@ -159,7 +158,9 @@ def recalibrate(
     progress("changes", 0, 1)
     changes, drifts = find_changes(rows, seed=seed) if drift == "tested" else (Changes(), [])
     LOG.info("changes: %s", changes)
-    warn_of_groups(changes)
+    if groups := dict.fromkeys(one.where for one in changes.found if one.where):  # no model holds for all of them
+        what = f"the new rows do not belong to one robot: only {' and '.join(groups)} deviates from the old model"
+        warn_user(sentence(what, fix="check what happened between them, and recalibrate with the rows since then"))
     warn_of_places(before, marker, outliers=False, excess=not drifts)
     if drift == "tested":
         drifts = [*drifts, *usual_drift(rows, drifts)]
@@ -232,7 +233,7 @@ def _with_settled(
         for k, other in enumerate(found):
             if not own.devices.same_set(other.devices):
                 continue
-            if own.devices.fitted_again:
+            if own.devices.set_up:
                 found[k] = own.beside(other)
             else:
                 number = torch.tensor([other.names.index(name) for name in own.names], dtype=torch.int64, device=HOST)
@@ -245,14 +246,6 @@ LARGEST_OUTLIER_PART = 0.5
 """Part of the rows that may hardly count: with more of them it is not clear which rows are wrong."""
 LARGEST_EXCESS = 10.0
 """Residuals by this factor above the expected ones are not those of a worn joint."""
-
-
-def warn_of_groups(changes: Changes) -> None:
-    """Warn of changes that only a part of the new rows shows: no model holds for all of them."""
-    groups = dict.fromkeys(one.where for one in changes.found if one.where)
-    if groups:
-        what = f"the new rows do not belong to one robot: only {' and '.join(groups)} deviates from the old model"
-        warn_user(sentence(what, fix="check what happened between them, and recalibrate with the rows since then"))
 
 
 def warn_of_contradictions(rows: WeighedRows, excess: float) -> None:

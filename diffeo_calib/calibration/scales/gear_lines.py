@@ -16,7 +16,6 @@ and q_i + q_j: the whole scan costs less than one factorisation of K.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import log, pi
 
 import torch
@@ -32,56 +31,41 @@ SMALLEST_CORNER = 1e-6
 """Smallest eigenvalue of A relative to the largest at which cosine and sine can be told apart."""
 
 
-@dataclass(frozen=True)
-class ScanLimits:
-    """Size and level of the scan.
-
-    Args:
-        lowest, highest, step: frequencies, rad per rad. bins: of the Fourier transforms, a power of two.
-        fewest_poses: different poses below which there is no scan.
-        per_scale: measured coordinates for each scale below which there is none: scales that were overfitted make the
-            noise too small and lines of chance (17 joints, 150 poses of one marker).
-        coordinates: largest number of measured coordinates in the scan.
-        false_alarms: share of robots without lines on which chance alone makes one. Real residuals are not quite white:
-            at one in twenty a UR10 showed a line in one series that was not there in another.
-        clearance: fall of the sum of squares by which a line must surpass other frequencies that explain the same.
-        most_lines: after which the scan ends.
-    """
-
-    lowest: float = 8.0
-    highest: float = 420.0
-    step: float = 0.04
-    bins: int = 1 << 18
-    fewest_poses: int = 60
-    per_scale: int = 6
-    coordinates: int = 3000
-    false_alarms: float = 0.001
-    clearance: float = 6.0
-    most_lines: int = 20
+LOWEST, HIGHEST, STEP = 8.0, 420.0, 0.04
+"""Frequencies of the scan, rad per rad."""
+BINS = 1 << 18
+"""Of the Fourier transforms, a power of two."""
+FEWEST_POSES = 60
+"""Different poses below which there is no scan."""
+PER_SCALE = 6
+"""Measured coordinates for each scale below which there is none: scales that were overfitted make the noise too small
+and lines of chance (17 joints, 150 poses of one marker)."""
+MOST_COORDINATES = 3000
+"""Measured coordinates in the scan."""
+FALSE_ALARMS = 0.001
+"""Share of robots without lines on which chance alone makes one. Real residuals are not quite white: at one in twenty a
+UR10 showed a line in one series that was not there in another."""
+CLEARANCE = 6.0
+"""Fall of the sum of squares by which a line must surpass other frequencies that explain the same."""
+MOST_LINES = 20
 
 
-LIMITS = ScanLimits()
-
-
-def find_gear_lines(
-    data: TangentData, scales: Hyperparameters, seed: int = 0, *, limits: ScanLimits = LIMITS
-) -> tuple[GearLine, ...]:
+def find_gear_lines(data: TangentData, scales: Hyperparameters, seed: int = 0) -> tuple[GearLine, ...]:
     """The lines that chance does not explain, the clearest first, without those that the scales have already.
 
     Args:
         data: the measurements with the weights of their tails.
         scales: of all other parts of the model; their own lines count as found.
         seed: draws the rows of the scan if there are too many.
-        limits: size and level of the scan.
     """
-    if data.coordinates < limits.per_scale * len(scales.logarithms()):
+    if data.coordinates < PER_SCALE * len(scales.logarithms()):
         return ()
-    data = data.sample(len(data.x), limits.coordinates, seed)[1]
+    data = data.sample(len(data.x), MOST_COORDINATES, seed)[1]
     turning = [joint for joint, periodic in enumerate(data.space.periodic) if periodic]
-    scan = _Scan(data, scales, limits)
+    scan = _Scan(data, scales)
     found: list[GearLine] = []
     falls = {joint: scan.falls(joint) for joint in turning}
-    while falls and len(found) < limits.most_lines:
+    while falls and len(found) < MOST_LINES:
         joint = max(falls, key=lambda one: float(falls[one].max()))
         if float(falls[joint].max()) < scan.threshold(list(falls)):
             break
@@ -103,7 +87,7 @@ def _ambiguous(falls: dict[int, Tensor], after: dict[int, Tensor], joint: int, f
     Args:
         falls, after: T of every joint without and with the line. joint, frequency: of the line.
     """
-    least = float(falls[joint].max()) - scan.limits.clearance
+    least = float(falls[joint].max()) - CLEARANCE
     for other, before in falls.items():
         rivals = (before > least) & (after[other] < 0.5 * before)
         if other == joint:
@@ -116,14 +100,8 @@ def _ambiguous(falls: dict[int, Tensor], after: dict[int, Tensor], joint: int, f
 class _Scan:
     """K^-1 and what the scan needs of it; lines that were found are projected out."""
 
-    def __init__(
-        self,
-        data: TangentData,
-        scales: Hyperparameters,
-        limits: ScanLimits,
-        state: tuple[Tensor, Tensor] | None = None,
-    ) -> None:
-        self.data, self.scales, self.limits, self.numbers = data, scales, limits, data.numbers
+    def __init__(self, data: TangentData, scales: Hyperparameters, state: tuple[Tensor, Tensor] | None = None) -> None:
+        self.data, self.scales, self.numbers = data, scales, data.numbers
         if state is None:
             process = data.process(scales)
             state = process.inverse, process.mu
@@ -133,9 +111,9 @@ class _Scan:
         self.pairs = joint_weights(numbers, numbers, self.inverse).transpose(0, 1)  # (n, N, N) J_l^T K^-1 J_l
         rows = [(part.J.mT @ self.mu[part.numbers].view(*part.cells.shape, 1))[..., 0] for part in numbers.parts]
         self.rows = torch.cat(rows).T  # (n, N) J_l^T K^-1 r
-        first, last = (round(w / limits.step) for w in (limits.lowest, limits.highest))
+        first, last = (round(w / STEP) for w in (LOWEST, HIGHEST))
         self._steps = slice(first, last + 1)
-        self.frequencies = limits.step * torch.arange(first, last + 1, dtype=data.x.dtype, device=data.x.device)
+        self.frequencies = STEP * torch.arange(first, last + 1, dtype=data.x.dtype, device=data.x.device)
 
     def falls(self, joint: int) -> Tensor:
         """T of a joint at all frequencies (F,), relative to what chance gives on average if the scales are too low."""
@@ -150,7 +128,7 @@ class _Scan:
 
     def _transform(self, places: Tensor, values: Tensor) -> Tensor:
         """sum values e^(i w places) at all frequencies: complex (F,). Values are shared by the two nearest bins."""
-        bins, step = self.limits.bins, self.limits.step
+        bins, step = BINS, STEP
         spacing = 2.0 * pi / (bins * step)
         at = (places / spacing).flatten()
         low = at.floor()
@@ -176,7 +154,7 @@ class _Scan:
         """The frequency of the largest T within two steps."""
         for reach in (2.0, 0.2):
             offsets = torch.linspace(-reach, reach, 41, dtype=self.data.x.dtype, device=self.data.x.device)
-            near = frequency + self.limits.step * offsets
+            near = frequency + STEP * offsets
             frequency = float(near[_fall(*self._exact(joint, near)).argmax()])
         return frequency
 
@@ -203,7 +181,7 @@ class _Scan:
         _, A = self._normal_equations(joint, frequency)
         weights = torch.linalg.solve(A, U.T)
         inverse = self.inverse - U @ weights
-        return _Scan(self.data, self.scales, self.limits, (inverse, inverse @ self.numbers.target))
+        return _Scan(self.data, self.scales, (inverse, inverse @ self.numbers.target))
 
     def _columns(self, joint: int, frequency: float) -> Tensor:
         """X (N m, 2)."""
@@ -220,13 +198,11 @@ class _Scan:
         return 4.0 * pi / max(float(q.max() - q.min()), 1e-9)
 
     def threshold(self, joints: list[int]) -> float:
-        """The T that the largest of these joints exceeds by chance with the probability ``false_alarms``."""
-        spans = [(self.limits.highest - self.limits.lowest) * self._spread(joint) for joint in joints]
+        """The T that the largest of these joints exceeds by chance with the probability :data:`FALSE_ALARMS`."""
+        spans = [(HIGHEST - LOWEST) * self._spread(joint) for joint in joints]
         level = 10.0
         for _ in range(50):  # a contraction
-            level = 2.0 * log(
-                sum(1.0 + span * (level / (2.0 * pi)) ** 0.5 for span in spans) / self.limits.false_alarms
-            )
+            level = 2.0 * log(sum(1.0 + span * (level / (2.0 * pi)) ** 0.5 for span in spans) / FALSE_ALARMS)
         return level
 
     def _spread(self, joint: int) -> float:

@@ -196,30 +196,18 @@ def left_out_rows(data: TangentData, scales: Hyperparameters, part: Tensor, new:
     return errors, data.noise_model.squares(predicted, errors[:, :, None] * errors[:, None])
 
 
-@dataclass(frozen=True)
-class FoldLimits:
-    """Size of the cross-validation.
-
-    Args:
-        outside: rows, or motions, outside of the sample on which scales were chosen from which these judge them.
-        coordinates: measured coordinates of a random part that stands for all rows where there are more.
-        folds: number of folds, at most one for each configuration.
-        iterations: of the search for scales without a fold.
-        near: distance of consecutive rows, relative to that of any two, below which they belong to one motion.
-        fewest_motions: below which repeats alone are left out together.
-        outlier_weight: of a row below which it is a gross error, which no region is meant to hold.
-    """
-
-    outside: int = 100
-    coordinates: int = 3000
-    folds: int = 5
-    iterations: int = 10
-    near: float = 0.2
-    fewest_motions: int = 5
-    outlier_weight: float = 0.05
-
-
-LIMITS = FoldLimits()
+FEWEST_OUTSIDE = 100
+"""Rows, or motions, outside of the sample on which scales were chosen from which these judge them."""
+MOST_COORDINATES = 3000
+"""Measured coordinates of a random part that stands for all rows where there are more."""
+FOLDS, ITERATIONS = 5, 10
+"""Number of folds, at most one for each configuration; iterations of the search for scales without a fold."""
+NEAR = 0.2
+"""Distance of consecutive rows, relative to that of any two, below which they belong to one motion."""
+FEWEST_MOTIONS = 5
+"""Below which repeats alone are left out together."""
+OUTLIER_WEIGHT = 0.05
+"""Of a row below which it is a gross error, which no region is meant to hold."""
 FEWEST_PLACES = 2
 """Places that a single one counts as: without a second one nothing can be left out."""
 
@@ -231,7 +219,6 @@ def cross_validated_inflation(
     groups: Tensor,
     *,
     seed: int = 0,
-    limits: FoldLimits = LIMITS,
     progress: Progress = silent,
 ) -> float | None:
     """Factor on all variances with which 95 % regions hold rows outside of the fit, see above.
@@ -241,7 +228,6 @@ def cross_validated_inflation(
         scales: the selected ones. data: the measurements.
         groups: (N,) a number for each configuration, the same for its repeats.
         seed: draws the folds, as it drew the sample on which the scales were selected.
-        limits: size of the cross-validation.
         progress: called as ``progress(task, done, total)``.
 
     Returns:
@@ -250,17 +236,17 @@ def cross_validated_inflation(
     chosen, _ = data.sample(SEARCH_LIMITS.poses, SEARCH_LIMITS.coordinates, seed)
     new = torch.ones(len(data.x), dtype=torch.bool, device=data.x.device)
     new[chosen] = centre is None
-    rows, data = data.sample(len(data.x), limits.coordinates, seed)
-    numbers, new = motions(data.x, groups[rows], limits), new[rows]
-    if centre is None or len(numbers[new].unique()) >= limits.outside:
+    rows, data = data.sample(len(data.x), MOST_COORDINATES, seed)
+    numbers, new = motions(data.x, groups[rows]), new[rows]
+    if centre is None or len(numbers[new].unique()) >= FEWEST_OUTSIDE:
         squares = left_out_squares(data, scales, torch.where(torch.isin(numbers, numbers[new]), numbers, -1))
         squares[~new] = nan
     else:
-        found = _squares_of_folds(centre, scales, data, numbers, seed=seed, limits=limits, progress=progress)
+        found = _squares_of_folds(centre, scales, data, numbers, seed=seed, progress=progress)
         if found is None:
             return None
         squares = found
-    squares = squares.masked_fill(data.tails.weights < limits.outlier_weight, nan)
+    squares = squares.masked_fill(data.tails.weights < OUTLIER_WEIGHT, nan)
     seen = (~squares.isnan()).any(1)
     each = torch.bincount(numbers[seen], minlength=int(numbers.max()) + 1)[numbers].clamp(min=1)
     weights = (1.0 / (each * squares.shape[1]))[:, None].expand_as(squares)
@@ -274,12 +260,11 @@ def _squares_of_folds(
     numbers: Tensor,
     *,
     seed: int,
-    limits: FoldLimits,
     progress: Progress,
 ) -> Tensor | None:
     """Squares (N, bodies) of all rows with scales that were selected without their fold; None after Ctrl-C."""
-    search = replace(SEARCH_LIMITS, iterations=limits.iterations)
-    squares, folds = torch.full_like(data.tails.weights, nan), random_folds(numbers, limits.folds, seed)
+    search = replace(SEARCH_LIMITS, iterations=ITERATIONS)
+    squares, folds = torch.full_like(data.tails.weights, nan), random_folds(numbers, FOLDS, seed)
     try:
         for done, (inside, rows) in enumerate(folds):
             progress("cross-validation", done, len(folds))
@@ -328,7 +313,7 @@ def random_folds(groups: Tensor, count: int, seed: int) -> list[tuple[Tensor, Te
     return [((fold != k).nonzero()[:, 0], (fold == k).nonzero()[:, 0]) for k in range(min(count, configurations))]
 
 
-def motions(x: Tensor, groups: Tensor, limits: FoldLimits = LIMITS) -> Tensor:
+def motions(x: Tensor, groups: Tensor) -> Tensor:
     """(N,) number 0, 1, ... of the motion that each row belongs to: consecutive rows that are close, and repeats.
 
     Args:
@@ -336,7 +321,7 @@ def motions(x: Tensor, groups: Tensor, limits: FoldLimits = LIMITS) -> Tensor:
     """
     scaled = x / (0.5 * (x.amax(0) - x.amin(0))).clamp(min=torch.finfo(x.dtype).tiny)
     usual = (2.0 * (scaled - scaled.mean(0)).square().sum(1).mean()).sqrt()
-    apart = (scaled[1:] - scaled[:-1]).norm(dim=1) >= limits.near * usual
+    apart = (scaled[1:] - scaled[:-1]).norm(dim=1) >= NEAR * usual
     runs = torch.cat([apart.new_zeros(1), apart]).cumsum(0)
     labels, before = runs, torch.full_like(runs, -1)
     while not bool((labels == before).all()):
@@ -345,7 +330,7 @@ def motions(x: Tensor, groups: Tensor, limits: FoldLimits = LIMITS) -> Tensor:
             lowest = labels.new_full((int(together.max()) + 1,), len(x))
             labels = lowest.scatter_reduce(0, together, labels, "amin")[together]
     found = labels.unique(return_inverse=True)[1]
-    return found if int(found.max()) + 1 >= limits.fewest_motions else groups.unique(return_inverse=True)[1]
+    return found if int(found.max()) + 1 >= FEWEST_MOTIONS else groups.unique(return_inverse=True)[1]
 
 
 def left_out_squares(data: TangentData, scales: Hyperparameters, part: Tensor) -> Tensor:

@@ -38,7 +38,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.maps.noise import mean_block, without_hidden
 from diffeo_calib.measurements.bodies import seen_board
@@ -58,59 +58,80 @@ FINEST_SHARE = 0.3
 """The same relative to the finest direction of known errors: it adds a tenth to their variance."""
 
 
-def _precision(known: Tensor | None, bodies: int, otherwise: float) -> float:
-    """Median of the smallest known deviations of poses along any direction, m, of known covariances (N, R, R).
-
-    A slack of that size would drown what images of a board tell across the line of sight: a tenth of that along it.
-    """
-    size = 0 if known is None else known.shape[1] // bodies
-    if known is None or size < FREEDOM_OF_POSES:
-        return otherwise
-    smallest = torch.linalg.eigvalsh(own_blocks(known, bodies))[..., -FREEDOM_OF_POSES]
-    smallest = smallest[smallest > SMALLEST_NOISE_M**2]
-    return float(smallest.median().sqrt()) if len(smallest) else otherwise
-
-
 @dataclass(frozen=True)
 class NoiseModel:
     """How N rows were measured.
 
     Args:
-        bodies: B, the things with independent noise that a row reports: markers, poses, readings.
-        size: F, numbers of each body: 3 coordinates of a marker, 9 of the three points of a pose.
-        known: (N, R, R) covariance that is known beforehand, m^2, or None.
+        visible: (N, R) boolean: the numbers that were measured. kinds: (N, B) int64, number of each body's kind of
+            device: 0 errs by ``sensor_noise``, k by the k-th of ``other_noise``. B bodies, such as markers, poses or
+            readings, have independent noise, and F = R / B numbers each.
+        known: (N, R, R) covariance that is known beforehand, m^2.
         modes: (N, T, F, 6) displacements of the numbers of the first T bodies, poses, by a shift and a turn, zero where
-            one is hidden; each number by itself where a row reports something else; None if no poses were measured.
+            one is hidden; each number by itself where a row reports something else. T may be 0.
         slack: standard deviation of the single points of a pose, m.
         smallest_noise: standard deviation that is added to every number, m.
-        visible: (N, R) boolean: the numbers that were measured; None if all were.
-        kinds: (N, B) int64, number of each body's kind of device: 0 errs by ``sensor_noise``, k by the k-th of
-            ``other_noise``; None if all are of one kind.
     """
 
-    bodies: int
-    size: int = 3
-    known: Tensor | None = None
-    modes: Tensor | None = None
+    visible: Tensor
+    kinds: Tensor
+    known: Tensor
+    modes: Tensor
     slack: float = 0.0
     smallest_noise: float = SMALLEST_NOISE_M
-    visible: Tensor | None = None
-    kinds: Tensor | None = None
+
+    @classmethod
+    def alike(cls, rows: int, bodies: int, size: int = 3) -> NoiseModel:
+        """N rows that report as many bodies of one kind with as many numbers each."""
+        known = torch.zeros(rows, bodies * size, bodies * size, dtype=torch.float64, device=HOST)
+        kinds = torch.zeros(rows, bodies, dtype=torch.int64, device=HOST)
+        visible = torch.ones(rows, bodies * size, dtype=torch.bool, device=HOST)
+        return cls(visible, kinds, known, known.new_zeros(rows, 0, size, FREEDOM_OF_POSES))
 
     @classmethod
     def of(cls, data: Measurements, residual: float) -> NoiseModel:
         """That of measured coordinates; ``residual`` is that of the geometric calibration per coordinate, m."""
-        visible = None if bool(data.visible.all()) else data.visible.repeat_interleave(3, 1)
-        size, known = data.bodies.points, data.covariance
-        count = data.markers // size
-        slack = min(SLACK_SHARE * residual, FINEST_SHARE * _precision(known, count, residual))
-        own = count, 3 * size, known, data.bodies.modes(data), slack
-        return cls(*own, visible=visible, kinds=data.body_kinds)
+        size, visible, known = data.bodies.points, data.visible.repeat_interleave(3, 1), data.covariance
+        plain = cls.alike(len(data), data.markers // size, 3 * size)
+        known, modes = plain.known if known is None else known, data.bodies.modes(data)
+        finest = known.new_zeros(0)  # deviation of poses along any direction
+        if 3 * size >= FREEDOM_OF_POSES:
+            finest = torch.linalg.eigvalsh(own_blocks(known, plain.bodies))[..., -FREEDOM_OF_POSES]
+            finest = finest[finest > SMALLEST_NOISE_M**2]
+        # that size would drown what images of a board tell across the line of sight: a tenth of that along it
+        slack = min(SLACK_SHARE * residual, FINEST_SHARE * (float(finest.median()) ** 0.5 if len(finest) else residual))
+        kinds = plain.kinds if data.body_kinds is None else data.body_kinds
+        return cls(visible, kinds, known, plain.modes if modes is None else modes, slack)
 
     def rows(self, index: Tensor) -> NoiseModel:
         """That of some configurations."""
-        parts = {name: getattr(self, name) for name in ("known", "modes", "visible", "kinds")}
-        return replace(self, **{name: part[index] for name, part in parts.items() if part is not None})
+        own = self.visible[index], self.kinds[index], self.known[index], self.modes[index]
+        return NoiseModel(*own, self.slack, self.smallest_noise)
+
+    @property
+    def bodies(self) -> int:
+        """B."""
+        return self.kinds.shape[1]
+
+    @property
+    def size(self) -> int:
+        """F, numbers of each body: 3 coordinates of a marker, 9 of the three points of a pose."""
+        return self.visible.shape[1] // self.bodies
+
+    @property
+    def stated(self) -> bool:
+        """Whether something is known beforehand."""
+        return bool(self.known.any())
+
+    @property
+    def without_known(self) -> NoiseModel:
+        """The same of rows whose noise is not known beforehand."""
+        return replace(self, known=torch.zeros_like(self.known))
+
+    @property
+    def of_poses(self) -> bool:
+        """Whether all bodies are poses of points."""
+        return self.modes.shape[1] == self.bodies and self.size > FREEDOM_OF_POSES
 
     @property
     def rigid_basis(self) -> Tensor | None:
@@ -118,138 +139,96 @@ class NoiseModel:
 
         Errors of poses, and what moves them, are such motions: the other numbers of their points tell nothing.
         """
-        if self.modes is None or self.modes.shape[1:3] != (self.bodies, self.size) or self.size <= FREEDOM_OF_POSES:
-            return None
-        return block_diagonal(torch.linalg.qr(self.modes).Q)
+        return block_diagonal(torch.linalg.qr(self.modes).Q) if self.of_poses else None
 
     def along(self, basis: Tensor) -> NoiseModel:
         """That of six numbers of every pose, those of :attr:`rigid_basis`."""
-        modes = None if self.modes is None else torch.linalg.qr(self.modes).Q.mT @ self.modes
-        known = None if self.known is None else basis.mT @ self.known @ basis
-        visible = None if self.seen is None else self.seen.repeat_interleave(FREEDOM_OF_POSES, 1)
-        return replace(self, size=FREEDOM_OF_POSES, modes=modes, known=known, visible=visible)
+        modes = torch.linalg.qr(self.modes).Q.mT @ self.modes
+        visible = self.seen.repeat_interleave(FREEDOM_OF_POSES, 1)
+        return replace(self, modes=modes, known=basis.mT @ self.known @ basis, visible=visible)
 
     @property
     def kind_count(self) -> int:
         """Kinds of devices."""
-        return 1 if self.kinds is None else int(self.kinds.max()) + 1
+        return int(self.kinds.max()) + 1
 
     @property
-    def row_kinds(self) -> Tensor | None:
-        """(N,) the kind of each row's first body that was seen; None if all are of one kind."""
-        if self.kinds is None or self.seen is None:
-            return None
-        first = self.seen.to(torch.int64).argmax(1)
-        return self.kinds.gather(1, first[:, None])[:, 0]
-
-    def coordinates(self, values: Tensor) -> Tensor:
-        """(N, R) boolean: the measured ones of numbers (N, R)."""
-        return torch.ones_like(values, dtype=torch.bool) if self.visible is None else self.visible
+    def row_kinds(self) -> Tensor:
+        """(N,) the kind of each row's first body that was seen."""
+        return self.kinds.gather(1, self.seen.to(torch.int64).argmax(1)[:, None])[:, 0]
 
     @property
-    def seen(self) -> Tensor | None:
-        """(N, bodies) boolean: the bodies that were seen; None if all were."""
-        return None if self.visible is None else self.visible.unflatten(1, (self.bodies, -1)).any(2)
+    def seen(self) -> Tensor:
+        """(N, B) boolean: the bodies that were seen."""
+        return self.visible.unflatten(1, (self.bodies, -1)).any(2)
 
     @property
-    def freedom(self) -> int | Tensor:
-        """Numbers that tell of each body: 3 coordinates of a point, 6 of a pose; (N, bodies) where bodies differ."""
-        poses = 0 if self.modes is None else self.modes.shape[1]
-        if self.visible is None and poses in (0, self.bodies):
-            return 6 if poses else self.size
-        if self.visible is None or self.seen is None:
-            raise InputError.of("poses beside other bodies", expected="which numbers were measured")
-        own = self.visible.unflatten(1, (self.bodies, -1)).sum(2)
-        if self.modes is not None:
-            own[:, :poses] = (self.modes != 0.0).any(2).sum(2)
-        usual = int(own.max())
-        return usual if bool(((own == usual) | (own == 0)).all()) else own.clamp(min=1)
-
-    @property
-    def largest_freedom(self) -> int:
-        """Of any body."""
-        freedom = self.freedom
-        return freedom if isinstance(freedom, int) else int(freedom.max())
+    def freedom(self) -> Tensor:
+        """(N, B) numbers that tell of each body, such as 3 coordinates of a point and 6 of a pose; 1 where hidden."""
+        own, poses = self.visible.unflatten(1, (self.bodies, -1)).sum(2), self.modes.shape[1]
+        own[:, :poses] = (self.modes != 0.0).any(2).sum(2)
+        return (own * self.seen).clamp(min=1)
 
     def of_freedom(self, value: Callable[[int], float], like: Tensor) -> Tensor:
-        """A function of each body's degrees of freedom: like squares (N, bodies)."""
-        freedom = self.freedom
-        if isinstance(freedom, int):
-            return torch.full_like(like, value(freedom))
-        found = torch.zeros_like(like)
+        """A function of each body's degrees of freedom: like squares (N, B)."""
+        found, freedom = torch.zeros_like(like), self.freedom
         for number in freedom.unique().tolist():
             found[freedom == number] = value(number)
         return found
 
     def covariance(self, scales: Hyperparameters, jacobian: Tensor) -> Tensor:
         """R_i without tails: Jacobian of k0 (N, R, n) -> (N, R, R) in m^2; absent numbers carry no information."""
-        total = self._of_all(scales, jacobian)
-        total = total if self.known is None else total + self.known
-        return total if self.visible is None else without_hidden(total, self.visible)
+        total = self._of_all(scales, jacobian) + self._of_poses(scales) + self.known
+        return without_hidden(total, self.visible)
 
     def mean_covariance(self, scales: Hyperparameters, jacobian: Tensor) -> Tensor:
         """The mean of R_i without tails, everything visible: (R, R) in m^2."""
-        mean = self._of_all(scales, jacobian).mean(0)
-        seen = self.coordinates(jacobian[..., 0])
-        if self.modes is not None and self.visible is not None:  # modes of hidden poses are not known
-            own = self._of_poses(self.modes, scales, jacobian.shape[1])
-            mean = mean - own.mean(0) + mean_block(own, seen)
-        return mean if self.known is None else mean + mean_block(self.known, seen)
+        own = self._of_poses(scales) + self.known  # not known of hidden poses
+        return self._of_all(scales, jacobian).mean(0) + mean_block(own, self.visible)
 
     def typical(self, scales: Hyperparameters, jacobian: Tensor, freedom: float) -> Tensor:
         """The same (R, R), inflated so that its 95 % region holds 95 %: by heavy tails, and where the rows differ."""
-        mean, seen = self.mean_covariance(scales, jacobian), self.coordinates(jacobian[..., 0])
-        between_rows = differing_factor(self.covariance(scales, jacobian), mean, seen)
-        return mean * between_rows * region_factor(freedom, self.largest_freedom)
+        mean = self.mean_covariance(scales, jacobian)
+        between_rows = differing_factor(self.covariance(scales, jacobian), mean, self.visible)
+        return mean * between_rows * region_factor(freedom, int(self.freedom.max()))
 
     def _of_all(self, scales: Hyperparameters, jacobian: Tensor) -> Tensor:
-        """R_i without what is known, as if everything were visible."""
+        """R_i of joints and single numbers, as if everything were visible."""
         levels = scales.sensor_noise.reshape(1)
         levels = levels if scales.other_noise is None else torch.cat([levels, scales.other_noise.reshape(-1)])
-        kinds = self.kinds
-        if kinds is None:
-            kinds = torch.zeros(1, self.bodies, dtype=torch.int64, device=jacobian.device)
-        single = levels.square()[kinds.clamp(max=len(levels) - 1)]
-        if self.modes is not None:
-            posed = (torch.arange(self.bodies, device=kinds.device) < self.modes.shape[1]) & (kinds == 0)
-            single = torch.where(posed, self.slack**2, single)
-        single = (single + self.smallest_noise**2).repeat_interleave(jacobian.shape[1] // self.bodies, 1)
-        total = jacobian * scales.joint_noise.square() @ jacobian.mT + torch.diag_embed(single)
-        return total if self.modes is None else total + self._of_poses(self.modes, scales, jacobian.shape[1])
+        single = levels.square()[self.kinds.clamp(max=len(levels) - 1)]
+        posed = (torch.arange(self.bodies, device=self.kinds.device) < self.modes.shape[1]) & (self.kinds == 0)
+        single = torch.where(posed, self.slack**2, single) + self.smallest_noise**2
+        single = single.repeat_interleave(self.size, 1)
+        return jacobian * scales.joint_noise.square() @ jacobian.mT + torch.diag_embed(single)
 
-    def _of_poses(self, modes: Tensor, scales: Hyperparameters, count: int) -> Tensor:
-        """Covariance (N, R, R) of the shifts and turns of poses among R = ``count`` numbers."""
+    def _of_poses(self, scales: Hyperparameters) -> Tensor:
+        """Covariance (N, R, R) of the shifts and turns of poses."""
         size = torch.cat([scales.sensor_noise.expand(3), scales.rotation_noise.expand(3)])
-        own = (modes * size.square()) @ modes.mT
-        if self.kinds is not None:
-            own = own * (self.kinds == 0)[:, : own.shape[1], None, None]
-        own = block_diagonal(own)
-        return torch.nn.functional.pad(own, (0, count - own.shape[1]) * 2)
+        poses = self.modes.shape[1]
+        own = (self.modes * size.square()) @ self.modes.mT * (self.kinds == 0)[:, :poses, None, None]
+        return torch.nn.functional.pad(block_diagonal(own), (0, self.size * (self.bodies - poses)) * 2)
 
     def weighted(self, covariance: Tensor, tails: Tails) -> Tensor:
         """R_i with every body's noise divided by its weight, 1 where hidden; correlations are kept."""
-        per_number = tails.weights.rsqrt().repeat_interleave(covariance.shape[1] // self.bodies, 1)
+        per_number = tails.weights.rsqrt().repeat_interleave(self.size, 1)
         return per_number[:, :, None] * covariance * per_number[:, None, :]
 
     def squares(self, covariance: Tensor, errors: Tensor) -> Tensor:
-        """Squared distances (N, bodies), in units of the noise, of errors with second moments (N, R, R).
+        """Squared distances (N, B), in units of the noise, of errors with second moments (N, R, R).
 
         NaN for hidden bodies.
         """
-        blocks = [own_blocks(matrix, self.bodies) for matrix in (covariance, errors)]
-        seen = self.seen
-        if self.modes is not None and self.modes.shape[1] == self.bodies:
+        blocks, seen = [own_blocks(matrix, self.bodies) for matrix in (covariance, errors)], self.seen
+        absent = ~self.visible.unflatten(1, (self.bodies, -1))
+        if self.modes.shape[1] == self.bodies:
             to_body = torch.linalg.pinv(self.modes)  # (N, T, 6, 9)
             blocks = [to_body @ matrix @ to_body.mT for matrix in blocks]
-            absent = None if seen is None else (self.modes == 0.0).all(2) | ~seen[..., None]
-        else:
-            absent = None if self.visible is None else ~self.visible.unflatten(1, (self.bodies, -1))
-        if absent is not None:
-            both = absent[..., None] | absent[..., None, :]
-            eye = torch.eye(absent.shape[2], dtype=covariance.dtype, device=covariance.device)
-            blocks = [torch.where(both, eye, blocks[0]), blocks[1].masked_fill(both, 0.0)]
-        found = torch.linalg.solve(*blocks).diagonal(dim1=-2, dim2=-1).sum(-1)
-        return found if seen is None else found.masked_fill(~seen, nan)
+            absent = (self.modes == 0.0).all(2) | ~seen[..., None]
+        both = absent[..., None] | absent[..., None, :]
+        eye = torch.eye(absent.shape[2], dtype=covariance.dtype, device=covariance.device)
+        found = torch.linalg.solve(torch.where(both, eye, blocks[0]), blocks[1].masked_fill(both, 0.0))
+        return found.diagonal(dim1=-2, dim2=-1).sum(-1).masked_fill(~seen, nan)
 
 
 def differing_factor(covariance: Tensor, mean: Tensor, seen: Tensor) -> float:

@@ -66,24 +66,12 @@ class SearchLimits:
         return int(min(max(wanted, self.fewest_first), self.most_first))
 
 
-@dataclass(frozen=True)
-class ScalePrior:
-    """Log-normal prior of the scales around their defaults: standard deviations in e-folds.
-
-    Args:
-        length: of length scales and noise.
-        growth: of amplitudes above their defaults. shrinkage: of amplitudes below.
-    """
-
-    length: float = 1.0
-    growth: float = 1.0
-    shrinkage: float = 2.0
-
-
+LENGTH, GROWTH, SHRINKAGE = 1.0, 1.0, 2.0
+"""Log-normal prior of the scales around their defaults, standard deviations in e-folds: of length scales and noise, of
+amplitudes above their defaults, and of those below."""
 SEARCH_LIMITS = SearchLimits()
 SHORT = 0.3
 """Of the default length scales and noise."""
-SCALE_PRIOR = ScalePrior()
 
 
 @dataclass(frozen=True)
@@ -155,14 +143,12 @@ class LogPosterior(NamedTuple):
     gradient: Tensor
 
 
-def log_posterior(
-    logarithms: Tensor, centre: Hyperparameters, data: TangentData, prior: ScalePrior = SCALE_PRIOR
-) -> LogPosterior | None:
+def log_posterior(logarithms: Tensor, centre: Hyperparameters, data: TangentData) -> LogPosterior | None:
     """Log posterior density of scales given by their logarithms, and its gradient by these.
 
     Args:
         logarithms: of the scales, see :meth:`Hyperparameters.logarithms`.
-        centre: centre of the prior. data: the measurements. prior: its widths.
+        centre: centre of the prior. data: the measurements.
 
     Returns:
         None where G + R is not positive definite in float64.
@@ -186,18 +172,12 @@ def log_posterior(
         by_noise = sum((own * block).sum() for own, block in zip(numbers.diagonal_blocks(slope), noise, strict=True))
         explained = (root * (S.T @ mu)).square() - 1.0 + torch.cholesky_inverse(factor.B).diagonal()
         by_unknowns = 0.5 * explained @ variance[wide].log() + ((slope @ narrow) * narrow).sum(0) @ variance[~wide]
-        density = _log_prior(point - centre.logarithms(), centre.amplitudes(), prior)
+        away, amplitudes = point - centre.logarithms(), centre.amplitudes()
+        widths = torch.where(amplitudes, torch.where(away.detach() > 0, GROWTH, SHRINKAGE), LENGTH)
+        density = -0.5 * (away / widths).square().sum()
         (data.pairs.inner(values, slope) + by_noise + by_unknowns + density).backward()
     gradient = torch.zeros_like(point) if point.grad is None else point.grad
     return LogPosterior(factor.log_density(numbers.target, mu), float(density.detach()), gradient)
-
-
-def _log_prior(away: Tensor, amplitudes: Tensor, prior: ScalePrior) -> Tensor:
-    """Log density of logarithms relative to their centre, up to a constant: scalar."""
-    widths, grown = torch.full_like(away, prior.length), away.detach() > 0
-    widths[amplitudes & grown] = prior.growth
-    widths[amplitudes & ~grown] = prior.shrinkage
-    return -0.5 * (away / widths).square().sum()
 
 
 class _Search:

@@ -53,7 +53,7 @@ class TangentData:
         noise_model: how they were measured.
         tails: weights of the measurements.
         place_deviation: prior standard deviation of base and markers, m and rad.
-        shared: (N, m, c) effects of c shifts of unit variance that rows share, m; see :class:`Noise`.
+        shared: (N, m, c) effects of c shifts of unit variance that rows share, m; none by default.
         held: numbers of the parameters theta that stay zero.
         adrift: whether no device says where the robot stands.
         observe: what was measured of the markers; their coordinates by default.
@@ -67,11 +67,15 @@ class TangentData:
     noise_model: NoiseModel
     tails: Tails
     place_deviation: float = PLACES.found_m_rad
-    shared: Tensor | None = None
+    shared: Tensor = None  # pyright: ignore[reportAssignmentType]  # a tensor once it is made
     held: tuple[int, ...] = ()
     adrift: bool = False
     observe: Observation | None = None
     beside: TangentData | None = None
+
+    def __post_init__(self) -> None:
+        if self.shared is None:
+            object.__setattr__(self, "shared", self.y.new_zeros(*self.y.shape, 0))
 
     @property
     def space(self) -> Space:
@@ -91,15 +95,18 @@ class TangentData:
         negative residuals, which would look like another size.
         """
         kinds = self.noise_model.row_kinds
-        if self.observe is not None or (kinds is None and not self.adrift):
+        if self.observe is not None:
             return self.points
-        resting = self.visible if kinds is None else self.visible & (kinds > 0)[:, None]
+        resting = self.visible & ((kinds > 0) | self.adrift)[:, None]
         return torch.where(resting, self.y, self.points)
 
     @cached_property
-    def slopes(self) -> Tensor | None:
-        """(N, r, 3 P) of the observation at k0; None if coordinates were measured."""
-        return None if self.observe is None else self.observe.slope(self.points)
+    def slopes(self) -> Tensor:
+        """(N, r, 3 P) of the observation at k0."""
+        if self.observe is not None:
+            return self.observe.slope(self.points)
+        N, m = self.points.shape
+        return torch.eye(m, dtype=self.x.dtype, device=self.x.device).expand(N, m, m)
 
     @cached_property
     def values(self) -> Tensor:
@@ -109,14 +116,12 @@ class TangentData:
     @cached_property
     def jacobian(self) -> Tensor:
         """(N, m, n) Dk0, m/rad or m/m."""
-        slopes, whole = self.slopes, self.nominal.jacobian(self.x, self.theta)
-        return whole if slopes is None else slopes @ whole
+        return self.slopes @ self.nominal.jacobian(self.x, self.theta)
 
     @cached_property
     def sensitivities(self) -> Tensor:
         """(N, m, K) S, derivatives by theta."""
-        slopes, whole = self.slopes, self.nominal.sensitivities(self.x, self.theta)
-        return whole if slopes is None else slopes @ whole
+        return self.slopes @ self.nominal.sensitivities(self.x, self.theta)
 
     @cached_property
     def target(self) -> Tensor:
@@ -126,20 +131,12 @@ class TangentData:
     @property
     def visible(self) -> Tensor:
         """(N, m) boolean: the coordinates that were measured."""
-        return self.noise_model.coordinates(self.y)
+        return self.noise_model.visible
 
     @property
     def coordinates(self) -> int:
         """Number of coordinates that were measured."""
         return int(self.visible.sum())
-
-    @property
-    def measured_freedom(self) -> int:
-        """Degrees of freedom of the bodies that were measured: three of each marker that was seen, six of a pose."""
-        seen, freedom = self.noise_model.seen, self.noise_model.freedom
-        if not isinstance(freedom, int):
-            return int(freedom[seen].sum())
-        return freedom * (len(self.x) * self.noise_model.bodies if seen is None else int(seen.sum()))
 
     # --- poses as six numbers ---
 
@@ -160,9 +157,9 @@ class TangentData:
         if basis is None:
             return self
         to = basis.mT
-        shared = None if self.shared is None else to @ self.shared
-        numbers = {"y": self.in_numbers(self.y), "noise_model": self.noise_model.along(basis), "shared": shared}
-        observe, nominal = LinearFunctionals(to), self.nominal.with_rigid_frames()
+        numbers = {"y": self.in_numbers(self.y), "noise_model": self.noise_model.along(basis)}
+        numbers["shared"] = to @ self.shared
+        observe, nominal = LinearFunctionals(to), self.nominal.changed(rigid=True)
         other = replace(self, **numbers, observe=observe, nominal=nominal)
         vars(other).update(points=self.points, jacobian=to @ self.jacobian)
         return other
@@ -197,8 +194,7 @@ class TangentData:
         sensor, tails = self.noise_model.rows(index), self.tails.rows(index)
         changes = {"x": self.x[index], "y": self.y[index], "noise_model": sensor, "tails": tails}
         changes["nominal"] = self.nominal.rows(index)
-        if self.shared is not None:
-            changes["shared"] = self.shared[index]
+        changes["shared"] = self.shared[index]
         if self.observe is not None:
             changes["observe"] = self.observe.rows(index)
         return self._variant(lambda values: values[index], **changes)
@@ -215,11 +211,9 @@ class TangentData:
         if count == len(self.x):
             return torch.arange(count, device=self.x.device), self
         order = torch.randperm(len(self.x), generator=seeded(seed), device=HOST)
-        kinds = self.noise_model.row_kinds
-        if kinds is not None:
-            own = torch.nn.functional.one_hot(kinds.to(HOST)[order])
-            turn = (own * own.cumsum(0)).sum(1)
-            order = order[turn.argsort(stable=True)]
+        own = torch.nn.functional.one_hot(self.noise_model.row_kinds.to(HOST)[order])
+        turn = (own * own.cumsum(0)).sum(1)
+        order = order[turn.argsort(stable=True)]
         rows = order[:count].sort().values.to(self.x.device)
         return rows, self.rows(rows)
 
@@ -235,7 +229,7 @@ class TangentData:
     def with_gear_lines(self, lines: tuple[GearLine, ...]) -> TangentData:
         """The same measurements around a map with these gear lines, which add nothing yet."""
         waves = GearWaves(tuple(line.joint for line in lines), tuple(line.frequency for line in lines))
-        nominal = self.nominal.with_waves(waves)
+        nominal = self.nominal.changed(waves=waves)
         smooth = self.theta[: nominal.sag.stop]
         other = self._variant(nominal=nominal, theta=torch.cat([smooth, smooth.new_zeros(waves.size)]))
         vars(other).pop("sensitivities", None)
@@ -256,7 +250,7 @@ class TangentData:
         spec = ModelSpec(self.nominal, *kernels, self.prior_variance(scales), 3)
         points = self.points.reshape(-1, 3)
         eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(len(points), 3, 3)
-        effect = eye if self.slopes is None else self.slopes
+        effect = eye if self.observe is None else self.slopes
         joint, task = NodeSensitivity(1.0, self.x, self.jacobian), NodeSensitivity(1.0, points, effect)
         return Linearisation(spec, [joint], [task], self.sensitivities)
 
@@ -291,10 +285,10 @@ class TangentData:
             return self.noise_model.typical(scales, self.jacobian, freedom)
         whole = self.nominal.jacobian(self.x, self.theta)
         if self.beside is None:
-            return NoiseModel(whole.shape[1] // 3).typical(scales, whole, freedom)
+            return NoiseModel.alike(len(whole), whole.shape[1] // 3).typical(scales, whole, freedom)
         # tails of the rows beside are those of the geometric calibration
         known = replace(self.beside, tails=self.tails).noise_of_any_row(scales)
-        ball = NoiseModel(1).typical(scales, whole[:, -3:], freedom)
+        ball = NoiseModel.alike(len(whole), 1).typical(scales, whole[:, -3:], freedom)
         return known if len(known) == whole.shape[1] else torch.block_diag(known, ball)
 
     def noise_of_new_rows(self, scales: Hyperparameters) -> Tensor:
@@ -303,20 +297,16 @@ class TangentData:
         Rows with known deviations keep their own: the mean over images, say, is the noise of none of them.
         """
         own = self.noise(scales)
-        if self.observe is not None or self.noise_model.known is not None:
-            return own * region_factor(self.tails.freedom, self.noise_model.largest_freedom)
+        if self.observe is not None or self.noise_model.stated:
+            return own * region_factor(self.tails.freedom, int(self.noise_model.freedom.max()))
         return without_hidden(self.noise_of_any_row(scales).expand_as(own), self.visible)
 
     @cached_property
     def numbers(self) -> Numbers:
         """All that the rows tell; the shifts that they share are the last unknowns."""
         told = self.told
-        S = told.sensitivities if told.shared is None else torch.cat([told.sensitivities, told.shared], 2)
-        slopes = told.slopes
-        if slopes is None:
-            R = told.y.shape[1]
-            slopes = torch.eye(R, dtype=self.x.dtype, device=self.x.device).expand(len(self.x), R, R)
-        return Numbers.of(self.x, self.points, told.visible, target=told.target, S=S, J=told.jacobian, A=slopes)
+        S = torch.cat([told.sensitivities, told.shared], 2)
+        return Numbers.of(self.x, self.points, told.visible, target=told.target, S=S, J=told.jacobian, A=told.slopes)
 
     @cached_property
     def pairs(self) -> Covariance:
@@ -325,8 +315,7 @@ class TangentData:
 
     def unknowns_variance(self, scales: Hyperparameters) -> Tensor:
         """(K,) prior variances of theta and of the shifts."""
-        shifts = self.x.new_ones(0 if self.shared is None else self.shared.shape[2])
-        return torch.cat([self.prior_variance(scales), shifts])
+        return torch.cat([self.prior_variance(scales), self.x.new_ones(self.shared.shape[2])])
 
     def prior(self, scales: Hyperparameters) -> Process:
         """What is known before these rows."""

@@ -23,8 +23,7 @@ from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, warn_outsi
 from diffeo_calib.kinematics.tool import checked_tip, covariance_without_placement, tool_transform
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.joints import PoseColumns
-from diffeo_calib.measurements.csv.lines import read_cells
-from diffeo_calib.measurements.csv.writing import Column, write_columns
+from diffeo_calib.measurements.csv.lines import Column, read_cells, write_columns
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
 from diffeo_calib.robots.cartesian import is_cartesian

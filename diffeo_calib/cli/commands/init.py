@@ -87,6 +87,7 @@ def run(given: InitOptions) -> None:
         "# Options of `diffeo-calib fit`, proposed by `diffeo-calib init`: check every line.",
         *(choice.line() for choice in choices),
         f"# columns that are not used: {few(unused, 20)}" if unused else "# all columns are used",
+        *([f"# {sheet.odd}"] if sheet.odd else []),
     ]
     content = ("\n".join(lines) + "\n").encode()
     if output.exists() and not given.force and output.read_bytes() != content:

@@ -36,8 +36,8 @@ from diffeo_calib.kinematics.compensation.problem import (
     Status,
     by_joint,
     joint_limits,
-    largest_motion,
     mobilities,
+    usual_motion,
 )
 from diffeo_calib.kinematics.compensation.search import Box, box_search, reached
 from diffeo_calib.kinematics.compensation.targets import Array, Targets, checked_targets, finite_rows, tool_functions
@@ -183,7 +183,8 @@ def compensate(
     if not any(robot.periodic):
         v = rough.jacobian(np.zeros((1, robot.n)))[0, :, :3]
         goals = replace(goals, along=v @ np.linalg.pinv(v, rcond=LEAST_DIRECTION))
-    motion = largest_motion(robot, bound, BOUND_FACTOR_BETWEEN_ROWS if following and bound is None else 1.0)
+    usual = usual_motion(robot, BOUND_FACTOR_BETWEEN_ROWS if following and bound is None else 1.0)
+    motion = by_joint(robot, bound, "bound", usual)
     aimed = np.ones((len(begin), 1), dtype=bool) if goals.free is None else ~goals.free
     mobility = mobilities(robot, weights, tuple(tools), aimed)
     problem = CompensationProblem(exact, rough, goals, begin, joint_limits(robot, limits), motion, mobility)
@@ -205,8 +206,7 @@ def compensate(
 def _starts(start: object, robot: Tree, targets: Tensor) -> tuple[Array, bool]:
     """(N, n) starts, and whether only the first one counts."""
     fix = "pass the joints of `robot.joint_names`, one row per target, or one start for the first row"
-    start = named_columns(start, robot.joint_names, "start")
-    start = real_tensor(start, "start")
+    start = real_tensor(named_columns(start, robot.joint_names, "start"), "start")
     if start.ndim == 1 and targets.ndim > 1:
         first = finite_rows(start, "start", (robot.n,), fix)
         return np.tile(first, (len(targets), 1)), True
@@ -231,7 +231,7 @@ def _pace(robot: Tree, problem: CompensationProblem, rate: object, time: object,
         got = f"{times[late[0] + 1]:g} after {times[late[0]]:g}"
         raise InputError.of(f"`time`, row {late[0] + 1}", expected="increasing times", got=got, fix="sort the rows")
     slowest = problem.bound * (ROWS_PER_BOUND if time is None else 1.0)
-    return Pace(times, slowest if rate is None else by_joint(robot, rate, "rate", slowest))
+    return Pace(times, by_joint(robot, rate, "rate", slowest))
 
 
 def _tools(model: CalibratedKinematics, tool: object, goals: Targets) -> dict[str, Tensor]:
@@ -274,14 +274,10 @@ ROUNDING = 1e-14
 
 @dataclass(frozen=True, eq=False)
 class Pace:
-    """How fast corrections may change.
+    """How fast corrections may change."""
 
-    Args:
-        times: (N,) increasing, s or rows. rate: (n,) rad or m per unit of time.
-    """
-
-    times: Array
-    rate: Array
+    times: Array  # (N,) increasing, s or rows
+    rate: Array  # (n,) rad or m per unit of time
 
     def limited(self, corrections: Array, firm: Array) -> Array:
         """Corrections (N, n), NaN where there are none, at a limited rate; ``firm`` (N,) rows come first."""
@@ -323,7 +319,7 @@ def solve_path(problem: CompensationProblem, pace: Pace) -> tuple[Solution, Arra
         rows = np.flatnonzero((np.abs(slow - q) > SAME_CORRECTION_TOLERANCE).any(1))
         if not len(rows):
             break
-        part, still = problem.take(rows), held[rows]
+        part, still = problem.started(rows, start[rows]), held[rows]
         box = part.box()
         at = np.clip(slow[rows], box.low, box.high)
         box = Box(box.start, np.where(still, at, box.low), np.where(still, at, box.high), box.mobility * ~still)
@@ -348,11 +344,7 @@ def _judged(problem: CompensationProblem, before: Solution, q: Array) -> Solutio
 
 
 def follow(problem: CompensationProblem, first: Array) -> tuple[CompensationProblem, Solution]:
-    """Commands that each start at the command of the row before, the first at ``first`` (n,).
-
-    Returns:
-        the problem with these starts, and its solution.
-    """
+    """The problem whose rows start at the command of the row before, the first at ``first`` (n,), and its solution."""
     rows, at = [], first
     starts = np.empty((len(problem.targets), len(first)))
     for row in range(len(starts)):

@@ -29,19 +29,13 @@ LIMIT_SLACK = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """Limits of the active joints, including those of the mimic joints that one joint drives.
+    """Limits of the active joints, including those of the mimic joints that one joint drives."""
 
-    Args:
-        low: (n,) rad or m. high: (n,).
-        matrix: (k, n) of mimic joints that several joints drive: least <= matrix q <= most.
-        least: (k,). most: (k,).
-    """
-
-    low: Array
-    high: Array
-    matrix: Array
-    least: Array
-    most: Array
+    low: Array  # (n,) rad or m
+    high: Array  # (n,)
+    matrix: Array  # (k, n) of mimic joints that several joints drive: least <= matrix q <= most
+    least: Array  # (k,)
+    most: Array  # (k,)
 
     def within(self, start: Array, q: Array) -> Array:
         """Commands on the way from ``start`` to ``q`` (N, n) where the mimic joints of several joints stay in limits.
@@ -63,7 +57,15 @@ def joint_limits(chain: Tree, given: object) -> Limits:
     Raises:
         InputError: another shape, NaN, or a lower limit above the upper one.
     """
-    active = chain.limits.numpy() if given is None else _given_limits(chain, given)
+    fix = "pass the lower and the upper limit of every joint of `robot.joint_names`, infinite for none"
+    active = (chain.limits if given is None else real_tensor(given, "limits").detach().cpu()).numpy()
+    if active.shape != (chain.n, 2):
+        raise InputError.of("`limits` has the wrong shape", expected=f"({chain.n}, 2)", got=active.shape, fix=fix)
+    wrong = ~(active[:, 0] <= active[:, 1])
+    if wrong.any():
+        joint = int(wrong.argmax())
+        what = f"`limits` of joint '{chain.joint_names[joint]}'"
+        raise InputError.of(what, expected="lower <= upper", got=active[joint].tolist(), fix=fix)
     low, high = active[:, 0].copy(), active[:, 1].copy()
     coupling, constant = chain.coupling.numpy(), chain.coupling_offset.numpy()
     moving = [joint for joint in chain.joints if joint.kind != "fixed"]
@@ -83,18 +85,15 @@ def joint_limits(chain: Tree, given: object) -> Limits:
     return Limits(low, high, coupling[shared], least, most)
 
 
-def largest_motion(chain: Tree, bound: object, scale: float = 1.0) -> Array:
-    """(n,) how far a correction may move each joint, rad or m; ``scale`` multiplies the defaults.
-
-    Raises:
-        InputError: not a positive number, or one for each joint.
-    """
-    usual = scale * np.where(np.array(chain.periodic), TURN_BOUND, SLIDE_BOUND)
-    return usual if bound is None else by_joint(chain, bound, "bound", usual)
+def usual_motion(chain: Tree, scale: float) -> Array:
+    """(n,) how far a correction may move each joint by default, rad or m."""
+    return scale * np.where(np.array(chain.periodic), TURN_BOUND, SLIDE_BOUND)
 
 
 def by_joint(chain: Tree, value: object, name: str, usual: Array) -> Array:
-    """A positive number for all turning joints, ``usual`` (n,) for the others, or one number for each joint: (n,)."""
+    """A positive number for all turning joints, ``usual`` (n,) for the others and for None, or one for each: (n,)."""
+    if value is None:
+        return usual
     if np.ndim(value) == 0:  # pyright: ignore[reportArgumentType]
         return np.where(np.array(chain.periodic), float(positive(value, name)), usual)
     return positive(value, name, (chain.n,)).numpy().copy()
@@ -103,30 +102,13 @@ def by_joint(chain: Tree, value: object, name: str, usual: Array) -> Array:
 def mobilities(chain: Tree, weights: object, tips: Sequence[str], aimed: Array) -> Array:
     """(N, n) inverse of the cost of each joint's motion; 0 by default for joints that move no tip with a target.
 
-    Args:
-        chain: n joints. weights: (n,) or None. tips: T names. aimed: (N, T) True where a tip has a target.
-
-    Raises:
-        InputError: not one positive number for each joint.
+    ``weights``: (n,) positive numbers, or None. ``tips``: T names. ``aimed``: (N, T) where a tip has a target.
     """
     if weights is None:
         coupling = chain.coupling.numpy()
         moving = np.stack([(coupling[chain.path_to(tip).numpy()] != 0).any(0) for tip in tips])  # (T, n)
         return np.any(aimed[:, :, None] & moving, axis=1).astype(np.float64)
     return np.tile(1.0 / positive(weights, "weights", (chain.n,)).numpy(), (len(aimed), 1))
-
-
-def _given_limits(chain: Tree, given: object) -> Array:
-    fix = "pass the lower and the upper limit of every joint of `robot.joint_names`, infinite for none"
-    values = real_tensor(given, "limits").detach().cpu().numpy()
-    if values.shape != (chain.n, 2):
-        raise InputError.of("`limits` has the wrong shape", expected=f"({chain.n}, 2)", got=values.shape, fix=fix)
-    wrong = ~(values[:, 0] <= values[:, 1])
-    if wrong.any():
-        joint = int(np.flatnonzero(wrong)[0])
-        what = f"`limits` of joint '{chain.joint_names[joint]}'"
-        raise InputError.of(what, expected="lower <= upper", got=values[joint].tolist(), fix=fix)
-    return values
 
 
 ROWS_AT_ONCE = 4096
@@ -142,26 +124,15 @@ class Solution(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CompensationProblem:
-    """N targets, the boxes of their commands, and the kinematics.
+    """N targets, the boxes of their commands, and the kinematics."""
 
-    Args:
-        tool: the calibrated kinematics. rough: those of its geometry.
-        targets: N targets.
-        start: (N, n) rad or m. limits: of the joints, and of mimic joints.
-        bound: (n,) largest motion. mobility: (N, n) inverse cost of each joint's motion, 0 if it must stay.
-    """
-
-    tool: ToolFunctions
-    rough: ToolFunctions
-    targets: Targets
-    start: Array
-    limits: Limits
-    bound: Array
-    mobility: Array
-
-    def take(self, rows: Array) -> CompensationProblem:
-        """Some of the rows."""
-        return self.started(rows, self.start[rows])
+    tool: ToolFunctions  # the calibrated kinematics
+    rough: ToolFunctions  # those of its geometry
+    targets: Targets  # N targets
+    start: Array  # (N, n) rad or m
+    limits: Limits  # of the joints, and of mimic joints
+    bound: Array  # (n,) largest motion
+    mobility: Array  # (N, n) inverse cost of each joint's motion, 0 if it must stay
 
     def started(self, rows: Array, start: Array) -> CompensationProblem:
         """Some of the rows (R,) from other starts (R, n)."""
@@ -185,7 +156,7 @@ class CompensationProblem:
         possible = np.flatnonzero(np.all(box.low <= box.high, axis=1))
         for first in range(0, len(possible), ROWS_AT_ONCE):
             rows = possible[first : first + ROWS_AT_ONCE]
-            own, box = self.take(rows), self.box(rows)
+            own, box = self.started(rows, self.start[rows]), self.box(rows)
             q, seen, done = own.search(box, np.clip(box.start, box.low, box.high))
             solved = own.keep_mimics(Solution(q, seen, own._codes(q, seen, done)))
             for whole, part in zip(found, solved, strict=True):
@@ -250,13 +221,10 @@ class CompensationProblem:
         return found
 
     def _blames(self, targets: Targets, q: Array, poses: Array, start: Array) -> tuple[Array, Array]:
-        """Whether weak directions at ``q`` (R, n) alone keep the bound from sufficing, and whether they lead there.
+        """(R,) whether weak directions at ``q`` (R, n) alone keep the bound from sufficing; whether they lead there.
 
         Along the direction v of the joints that moves the tool least, the tool goes s t + c t^2 / 2 in the direction u.
         Where that bends back before it has gone as far as the target, the workspace probably ends before it.
-
-        Returns:
-            (R,) boolean each.
         """
         slopes = self._slopes(targets, q)
         error = targets.errors(poses) * targets.to_metres(self.tool.length)
@@ -267,18 +235,15 @@ class CompensationProblem:
         strong = (np.where(weak, 0.0, motion)[:, None, :] @ Vt)[:, 0] + (q - start) / self.bound
         each, main = np.arange(len(q)), np.where(weak, np.abs(motion), -1.0).argmax(1)
         v, u, far, slope = Vt[each, main], U[each, :, main], parts[each, main], s[each, main]
-        bend = np.einsum("nk,nk->n", u, self._bend(targets, q, v * self.bound))
+        way, speeds = v * self.bound, list[Array]()  # of the joints; of the tool at both sides of q along it
+        for side in (1.0, -1.0):
+            speeds.append((self._slopes(targets, q + side * DIFFERENCE * way) @ v[:, :, None])[:, :, 0])
+        bend = np.einsum("nk,nk->n", u, (speeds[0] - speeds[1]) / (2.0 * DIFFERENCE))
         ends = (bend * far < 0) & (slope**2 < 2.0 * np.abs(bend * far))
-        length = self.tool.length * np.square(v * self.bound).sum(1)
+        length = self.tool.length * np.square(way).sum(1)
         ends &= np.abs(bend) > BENT_WORKSPACE_CURVATURE * length
         near = (np.abs(strong).max(1) <= 1.0) & (np.abs(far) <= s[:, 0])
         return weak.any(1) & near, ~ends
-
-    def _bend(self, targets: Targets, q: Array, way: Array) -> Array:
-        """(R, k) second derivative of the tool along a way (R, n) of the joints."""
-        ends = [q + side * DIFFERENCE * way for side in (1.0, -1.0)]
-        speeds = [self._slopes(targets, at) @ (way / self.bound)[:, :, None] for at in ends]
-        return (speeds[0] - speeds[1])[:, :, 0] / (2.0 * DIFFERENCE)
 
     def _slopes(self, targets: Targets, q: Array) -> Array:
         """(R, k, n) of the tool, in m, by motions of the joints in bounds."""

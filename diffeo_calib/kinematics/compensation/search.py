@@ -34,19 +34,12 @@ RELATIVE_RIDGE = 1e-12
 
 @dataclass(eq=False)
 class Box:
-    """Where the joints may be, and what their motion costs.
+    """Where the joints may be, and what their motion costs."""
 
-    Args:
-        start: (N, n) commands before the correction, rad or m.
-        low: (N, n) and
-        high: (N, n) what the joints' limits and the bound of motion leave.
-        mobility: (N, n) motion of a joint where it costs nothing extra; 0 for a joint that must not move.
-    """
-
-    start: Array
-    low: Array
+    start: Array  # (N, n) commands before the correction, rad or m
+    low: Array  # (N, n) what the joints' limits and the bound of motion leave, to high
     high: Array
-    mobility: Array
+    mobility: Array  # (N, n) motion of a joint where it costs nothing extra; 0 for a joint that must not move
 
     def take(self, rows: Array) -> Box:
         """The boxes of some rows."""
@@ -146,11 +139,7 @@ SMALLEST_GAIN = 1e-20
 def box_search(
     tool: ToolFunctions, targets: Targets, q: Array, box: Box, *, poses: Array | None = None
 ) -> tuple[Array, Array, Array]:
-    """Search the nearest point of every row, from ``q`` (N, n) inside the box.
-
-    Returns:
-        (N, n) joint values, (N, T, 4, 4) poses of the tools, (N,) whether they reach the targets.
-    """
+    """Search the nearest point of every row, from ``q`` (N, n) inside the box; returns as :func:`chord_search`."""
     search = _Search(tool, targets, q, box, tool.poses(q) if poses is None else poses)
     for _ in range(MOST_NEWTON_STEPS):
         if not len(search.todo):

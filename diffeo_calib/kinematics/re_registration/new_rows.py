@@ -183,14 +183,16 @@ class NewRows:
         return points.detach(), at
 
     @cached_property
-    def slopes(self) -> Tensor | None:
-        """(M, R, 3 P) of what was measured; None for all coordinates."""
-        return None if self.observe is None else self.observe.slope(self.seen[0]).detach()
+    def slopes(self) -> Tensor:
+        """(M, R, 3 P) of what was measured."""
+        points, m = self.seen[0], self.seen[0].shape[1]
+        eye = torch.eye(m, dtype=points.dtype, device=points.device).expand(len(points), m, m)
+        return eye if self.observe is None else self.observe.slope(points).detach()
 
     @cached_property
     def at(self) -> Linearisation:
         """Linearised prediction of the fit for the measured numbers."""
-        return self.seen[1] if self.slopes is None else self.seen[1].projected(self.slopes)
+        return self.seen[1] if self.observe is None else self.seen[1].projected(self.slopes)
 
     @cached_property
     def residual(self) -> Tensor:
@@ -202,8 +204,7 @@ class NewRows:
     def by_places(self) -> Tensor:
         """(M, R, 6 + 3 P) derivatives by frame and markers."""
         deformation = self.fitted.geodesic.with_nominal(self.points)
-        found = place_slopes(deformation, self.seen[1], self.seen[0], self.centre)
-        return found if self.slopes is None else self.slopes @ found
+        return self.slopes @ place_slopes(deformation, self.seen[1], self.seen[0], self.centre)
 
     @cached_property
     def fit_covariance(self) -> Tensor:

@@ -44,8 +44,7 @@ from diffeo_calib.robots.payload import joined_masses
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import sensor_of
 from diffeo_calib.sensors.known_drift import KnownDrift
-from diffeo_calib.sensors.places import PlacedDevices
-from diffeo_calib.sensors.set_ups import mounted_of
+from diffeo_calib.sensors.places import PlacedDevices, mounted_of
 from diffeo_calib.sensors.tables import rows_of_one_kind
 
 LOG = logging.getLogger(__name__)
@@ -216,7 +215,7 @@ def devices_beside(model: Any, data: Any) -> tuple[PlacedDevices, ...]:
         for own in sensor_of(part).settled(part, points, model.turns):
             alike = [number for number, old in enumerate(found) if own.devices.same_set(old.devices)]
             same = alike[0] if alike else len(found)
-            alone = [] if own.devices.of_model else [own]
+            alone = [] if own.devices.set_up and len(own.names) == 1 else [own]
             found[same : same + 1] = [own.beside(old) for old in found[same : same + 1]] or alone
     return tuple(found)
 

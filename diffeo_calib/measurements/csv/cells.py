@@ -19,7 +19,8 @@ from diffeo_calib.common.errors import LONGEST_NAME, MOST_NAMES, MeasurementErro
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MISSING = re.compile(
     r"|[+-]?nan|#?n/?a|n\.a\.|#nv|null|none|nil|-+|\*+|\?+"
-    r"|missing|lost|occluded|hidden|invisible|not visible",
+    r"|[+-]?1\.#(ind|[qs]?nan)0*|missing|lost|occluded|hidden|invalid|no data|out of view"
+    r"|invisible|not (visible|tracked|found|available)",
     re.IGNORECASE,
 )
 _INFINITE = re.compile(r"[+-]?inf(inity)?", re.IGNORECASE)

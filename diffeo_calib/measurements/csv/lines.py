@@ -1,4 +1,4 @@
-"""Lines of a table in a text file: its encoding, its header, and what is no row.
+"""Lines of a table in a text file, read and written: its encoding, its header, and what is no row.
 
 What is unmistakable is read and noted: lines before the header, comments, a row of units, no header at all. Neither
 units nor robots are known here.
@@ -10,18 +10,25 @@ import codecs
 import csv
 import io
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import combinations, islice
-from math import isnan
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import combinations, islice, zip_longest
+from math import isfinite, isnan
+from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
 from diffeo_calib.common.errors import MeasurementError, few, listed
+from diffeo_calib.common.files import WholeFile
 from diffeo_calib.measurements.csv.cells import number, repeated
 from diffeo_calib.measurements.csv.sheets import MARKS, as_text
+from diffeo_calib.measurements.table_format import TableFormat
 
 Lines = list[tuple[int, list[str]]]
 """Line number in the file and cells of every line that is not blank."""
+
+Cells = Sequence[Sequence[float | str]]
+"""Rows of cells: numbers and texts."""
+Column = Sequence[str] | Sequence[float]
 
 HEAD = 200
 """Lines among which the header is."""
@@ -62,7 +69,8 @@ class CsvLines:
         self._last, self._extra = 0, 0  # line before the rows, and empty cells at the end of rows
         self._text, notes = _text(path, sep)
         lines = list(islice(self._cells(), HEAD))
-        if sep == " " and len({len(cells) for _, cells in lines}) > 1:  # columns that spaces align
+        each = list(zip_longest(*(cells for _, cells in lines), fillvalue=None))
+        if sep == " " and any(None in cells or not any(cells) for cells in each):  # columns that spaces align
             self._aligned = True
             lines = list(islice(self._cells(), HEAD))
         if not any(any(cells) for _, cells in lines):
@@ -295,3 +303,37 @@ def _numbers(cells: Sequence[str]) -> int:
     found = sum(map(_value, filled))
     counted = found > 3 and filled in ([str(k + first) for k in range(len(filled))] for first in (0, 1))
     return 0 if counted or 2 * found < len(filled) else found
+
+
+def write_rows(path: str | PathLike[str], names: Sequence[str], blocks: Iterable[Cells], table: TableFormat) -> None:
+    """Write rows (B, columns) whose numbers are already in the units of the file; InputError if that fails.
+
+    Texts are written as they are, NaN becomes an empty cell.
+    """
+
+    def cell(value: str | float) -> str:
+        if isinstance(value, str):
+            return value
+        return repr(value).replace(".", table.decimal) if isfinite(value) else ""
+
+    with WholeFile(path) as file:
+        file.write(csv_text([names], table.sep))
+        for block in blocks:
+            file.write(csv_text((map(cell, row) for row in block), table.sep))
+
+
+def csv_text(rows: Iterable[Iterable[object]], sep: str, end: str = "\r\n") -> bytes:
+    """Rows of cells as CSV."""
+    text = io.StringIO(newline="")
+    csv.writer(text, delimiter=sep, lineterminator=end).writerows(rows)
+    return text.getvalue().encode()
+
+
+def write_columns(path: Path, sheet: TextTable, cells: Mapping[str, Column], table: TableFormat) -> None:
+    """Write a table with other and more columns; overwrites.
+
+    ``cells``: name -> texts, or numbers in the units of the file, of which NaN is an empty cell.
+    """
+    added = {name: own for name, own in cells.items() if name not in sheet.header}
+    kept = [cells.get(name, [row[k] for _, row in sheet.rows]) for k, name in enumerate(sheet.header)]
+    write_rows(path, [*sheet.header, *added], [list(zip(*kept, *added.values(), strict=True))], table)

@@ -160,7 +160,7 @@ def read_table(
             raise MeasurementError.of(what, expected=f"some line that {own.word}", fix=fix)
     markers = columns.hideable[: len(columns.table.triples)]
     for own in markers if zeros else ():
-        _hide_zeros(path, columns, numbers, lines, own)
+        _hide_marks(path, columns, numbers, lines, own)
     whole = FileRows(path, columns, columns.to_si(numbers), dict(zip(named, words, strict=True)), lines)
     if not markers or columns.all_hidden:
         return whole
@@ -214,24 +214,29 @@ def _numbers(
     return numbers.masked_fill(gaps, math.nan), notes
 
 
-def _hide_zeros(path: Path, columns: Columns, numbers: Tensor, lines: Sequence[int], own: Hideable) -> None:
-    """Write NaN where a marker is at 0, 0, 0 though it never comes near: a device that does not see it says so.
+def _hide_marks(path: Path, columns: Columns, numbers: Tensor, lines: Sequence[int], own: Hideable) -> None:
+    """Write NaN where a marker is at 0, 0, 0, or thrice at -9999, far from all rows: a device does not see it then.
 
-    One such row may be the frame's origin, or the first pose: all others must be farther from it than from one another.
+    One row at 0, 0, 0 may be the frame's origin, or the first pose: all others must be farther from it than from one
+    another. Another number must stand in rows of several configurations.
     """
     points, q = numbers[:, own.values[:3]], numbers[:, : len(columns.joints.columns)]
-    lost, seen = (points == 0.0).all(1), points[(points.abs() > 0.0).any(1)]
-    some = seen[:FEW_ROWS].unique(dim=0)
-    if not bool(lost.any()) or len(some) < 2:
-        return
-    apart = torch.cdist(some, some).fill_diagonal_(math.inf).amin(1)
-    limit = apart.median() if len(q[lost].unique(dim=0)) > 1 else MUCH_FARTHER * apart.amax()
-    if bool(seen.norm(dim=1).amin() > limit):
-        for place in (*own.values, *own.deviations):
-            numbers[lost, place] = math.nan
-        at = few([lines[row] for row in lost.nonzero()[:, 0].tolist()])
-        names = few([columns.names[k] for k in own.values[:3]])
-        warn_user(f"file '{path}': {names} are 0, 0, 0 in line {at}, far from other rows: taken as not seen")
+    alike = (points == points[:, :1]).all(1)
+    for mark in points[alike, 0].unique().tolist():
+        lost = alike & (points[:, 0] == mark)
+        seen = points[~lost & points.isfinite().all(1)] - mark
+        some, single = seen[:FEW_ROWS].unique(dim=0), len(q[lost].unique(dim=0)) == 1
+        if len(some) < 2 or (single and mark != 0.0):
+            continue
+        apart = torch.cdist(some, some).fill_diagonal_(math.inf).amin(1)
+        limit = MUCH_FARTHER * apart.amax() if single or mark != 0.0 else apart.median()
+        if bool(seen.norm(dim=1).amin() > limit):
+            for place in (*own.values, *own.deviations):
+                numbers[lost, place] = math.nan
+            at = few([lines[row] for row in lost.nonzero()[:, 0].tolist()])
+            names = few([columns.names[k] for k in own.values[:3]])
+            said = ", ".join([f"{mark:g}"] * 3)
+            warn_user(f"file '{path}': {names} are {said} in line {at}, far from other rows: taken as not seen")
 
 
 def _check_units(file: CsvLines, columns: Columns) -> None:

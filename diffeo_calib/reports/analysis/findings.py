@@ -41,8 +41,6 @@ from diffeo_calib.sensors.tables import divided, measured_positions, measured_ro
 LOG = logging.getLogger(__name__)
 STEPS = 4
 """Of the analysis, as they are told."""
-PROBE_CONFIGURATIONS = 60
-"""Configurations at which the share of the markers in the expected variance is judged."""
 FAR_RATIO = 3.0
 """Ratio of expected errors anywhere to those like the measured ones from which the reason is told."""
 COLUMN_WORDS = ("temp", "time", "stamp", "date", "hour")
@@ -64,35 +62,25 @@ class RowsOfKind(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Findings:
-    """Numbers of a report.
-
-    Args:
-        model: the model. stages: kinematics to compare: nominal, geometric, calibrated. rows: those of the fit.
-        kinds: the rows that the report shows, by kind; empty without rows. new: whether the model has not seen them.
-        predictions: measured positions among them, predicted by a model that has not seen them; None without any.
-        outliers: rows that look wrong, and ``moved``: what else happened to them.
-        repeats: what repeated configurations show; None if there are none.
-        learning_curve: number of rows -> error of others, m; empty if the rows of the fit are not known.
-        columns: further columns of the table that errors are shown against, by name.
-        expected: stage -> RMS error of positions that the model expects over the joint ranges of its rows, m.
-        deviations: what it expects at random configurations there, and at those of the fit.
-        devices: where devices are, and what was found from the rows shown.
-    """
+    """Numbers of a report."""
 
     model: CalibratedKinematics
-    stages: Mapping[str, Kinematics]
-    rows: FitRows
-    kinds: Mapping[str, RowsOfKind]
-    new: bool
+    stages: Mapping[str, Kinematics]  # kinematics to compare: nominal, geometric, calibrated
+    rows: FitRows  # those of the fit
+    kinds: Mapping[str, RowsOfKind]  # the rows that the report shows, by kind; empty without rows
+    new: bool  # whether the model has not seen them
+    # measured positions among them, predicted by a model that has not seen them; None without any
     predictions: Predictions | None
-    outliers: Sequence[Outlier]
-    moved: Sequence[str]
-    repeats: Repeats | None
+    outliers: Sequence[Outlier]  # rows that look wrong
+    moved: Sequence[str]  # what else happened to the rows
+    repeats: Repeats | None  # what repeated configurations show; None if there are none
+    # number of rows -> error of others, m; empty if the rows of the fit are not known
     learning_curve: Sequence[tuple[int, float]]
-    columns: Mapping[str, Tensor]
+    columns: Mapping[str, Tensor]  # further columns of the table that errors are shown against, by name
+    # stage -> RMS error of positions that the model expects over the joint ranges of its rows, m
     expected: Mapping[str, float]
-    deviations: Deviations
-    devices: Sequence[str]
+    deviations: Deviations  # what it expects at random configurations there, and at those of the fit
+    devices: Sequence[str]  # where devices are, and what was found from the rows shown
 
     @property
     def parts(self) -> Sequence[Part]:
@@ -138,17 +126,6 @@ class Findings:
         return forecast(self.learning_curve, self.limit)
 
     @property
-    def tool(self) -> Tensor:
-        """Numbers of the parameters that place the markers of the fit."""
-        geometry = self.model.nominal.geometry
-        return torch.arange(geometry.size, device=self.rows.q.device)[geometry.slices["tool"]]
-
-    @property
-    def share_of_tool(self) -> float:
-        """Share of the expected variance that knowing the markers would remove."""
-        return self.rows.map.explained_by(self.tool, self.deviations.q[:PROBE_CONFIGURATIONS])
-
-    @property
     def telling(self) -> Repeats | None:
         """Repeated configurations, if they are enough for one number that speaks of the robot."""
         return self.repeats if self.repeats is not None and self.repeats.telling else None
@@ -187,8 +164,7 @@ def find(
     rows = FitRows(model, measured)
     kinematics = stages_of(model, rows) if stages is None else stages
     progress("analysis", 1, STEPS)
-    new = None if data is None else _new_rows(model, data, rows)
-    if new is not None and (bool(new.any()) or not rows.of_positions):
+    if data is not None and (bool((new := _new_rows(model, data, rows)).any()) or not rows.of_positions):
         aligned = measured if rows.of_positions and measured is not None and len(measured) == len(data) else None
         errors = _by_stage(data, aligned, kinematics, own, places)
         shown = _of_table(model, data, new, measured, own, errors=errors)
@@ -255,7 +231,7 @@ def _by_stage(
     for name in before:
         rows = data if measured is None else measured
         at = place(stages[name], rows) if measured is not None or places is None else places[name]
-        at = at if measured is not None else replace(at, frames=at.frames or own.frames, ball=own.ball)
+        at = at if measured is not None else replace(at, devices={**own.devices, **at.devices}, ball=own.ball)
         found[name] = residuals(stages[name], at, rows)
     return found | {last: residuals(stages[last], own, data)}
 

@@ -44,6 +44,8 @@ LEARNING_SUBSETS = 5
 LEARNING_SHARES = (0.1, 0.15, 0.25, 0.4, 0.6, 0.8)
 FEWEST_LEARNED = 15
 """Rows from which a learning curve starts."""
+OUTLIER_NOISE = 4.0
+"""Variance, in typical ones, above which the noise of a row is that of an outlier."""
 SHARES = torch.linspace(0.05, 0.95, 19, dtype=torch.float64, device="cpu")
 """Claimed shares at which a model's uncertainty is compared with the errors found."""
 
@@ -61,11 +63,9 @@ class FitRows:
     """
 
     def __init__(self, model: CalibratedKinematics, measured: Measurements | None = None) -> None:
-        own = model.to(HOST)
-        self.map: FittedMap = own.map.unregistered
-        registered = own.registration is not None
-        self.lever = (model.lever if self.map.m % (3 * POINTS) == 0 else None) if registered else model.lever
-        self.q, self.on = self.map.x, model.nominal.geometry.on
+        self.map: FittedMap = model.to(HOST).map.unregistered
+        posed = model.registration is None or self.map.m % (3 * POINTS) == 0
+        self.q, self.on, self.lever = self.map.x, model.nominal.geometry.on, model.lever if posed else None
         self.of_positions = not model.ball and self.map.slopes is None
         self._measured = None
         if measured is not None and measured.q.shape == self.q.shape and measured.points[0].numel() == self.map.m:
@@ -86,11 +86,7 @@ class FitRows:
 
     @cached_property
     def points(self) -> Tensor:
-        """(N, P, 3) measured markers, m; NaN where they were hidden.
-
-        Raises:
-            InputError: they are not known.
-        """
+        """(N, P, 3) measured markers, m; NaN where they were hidden. InputError: they are not known."""
         if self.map.data is None:
             measured = self.map.measured().detach()
             return measured.masked_fill(~self.map.noise.visible, nan).unflatten(1, (-1, 3))
@@ -122,7 +118,7 @@ class FitRows:
             return [(torch.arange(n, device=HOST), known)]
         order = torch.randperm(n, generator=seeded(0), device=HOST)
         parts = [part.sort().values for part in order.tensor_split(ceil(n * m / BLOCK_COORDINATES))]
-        return [(rows, CholeskyRegression(self._linearised[1].rows(rows), self.map.noise.rows(rows))) for rows in parts]
+        return [(rows, CholeskyRegression(self.linearised[1].rows(rows), self.map.noise.rows(rows))) for rows in parts]
 
     @cached_property
     def left_out(self) -> tuple[Tensor, Tensor]:
@@ -141,81 +137,67 @@ class FitRows:
     def learning_curve(self) -> list[tuple[int, float]]:
         """Number of rows -> RMS distance of other rows from their prediction with the scales of the whole fit, m.
 
-        Subsets are drawn at random from one block; the last number is that of all
-        rows that predict one. Outliers keep their small weights and do not count as errors.
+        Subsets are drawn at random from one block; the last number is that of all rows that predict one. Outliers keep
+        their small weights and do not count as errors.
         """
         block, m = self.blocks[0][0], self.target.shape[1]
         n = min(len(block), ceil(BLOCK_COORDINATES / m))
         sizes = sorted({max(FEWEST_LEARNED, round(share * n)) for share in LEARNING_SHARES})
         squares: dict[int, list[Tensor]] = {size: [] for size in sizes if n - size >= FEWEST_LEARNED}
+        variances = self.map.noise.covariance.diagonal(dim1=1, dim2=2)
+        sizes_of_noise = variances.masked_fill(~self.map.noise.visible, nan).nanmean(1)
+        inliers = sizes_of_noise <= OUTLIER_NOISE * sizes_of_noise.median()  # (N,)
         for seed in range(LEARNING_SUBSETS):
             rows = block[torch.randperm(len(block), generator=seeded(seed), device=HOST)[:n]]
             target, noise = self.target[rows], self.map.noise.rows(rows)
-            unseen = ~noise.visible | ~self._inliers[rows, None]
+            unseen = ~noise.visible | ~inliers[rows, None]
             # The factor of the first rows is the first part of that of all: one serves every size.
-            factor = torch.linalg.cholesky(noise.add_to(self._linearised[1].rows(rows).gram()))
+            factor = torch.linalg.cholesky(noise.add_to(self.linearised[1].rows(rows).gram()))
             white = torch.linalg.solve_triangular(factor, target.reshape(-1, 1), upper=False)
             for size, found in squares.items():
                 predicted = (factor[size * m :, : size * m] @ white[: size * m]).view(-1, m)
                 error = (target[size:] - predicted).masked_fill(unseen[size:], nan)
                 found.append(error.reshape(-1, 3).square().sum(-1))
         curve = [(size, float(torch.cat(values).nanmean().sqrt())) for size, values in squares.items()]
-        left_out = self.left_out[0][block][self._inliers[block]].reshape(-1, 3)
+        left_out = self.left_out[0][block][inliers[block]].reshape(-1, 3)
         return [*curve, (len(block), float(left_out.square().sum(-1).nanmean().sqrt()))]
 
-    @cached_property
-    def _inliers(self) -> Tensor:
-        """(N,) rows whose noise is not that of an outlier: at most four times the typical variance."""
-        variances = self.map.noise.covariance.diagonal(dim1=1, dim2=2)
-        sizes = variances.masked_fill(~self.map.noise.visible, nan).nanmean(1)
-        return sizes <= 4.0 * sizes.median()
-
     def transmission_deviation(self, joint: int, values: Tensor) -> Tensor:
-        """Posterior standard deviation of a joint's transmission error, its mean over ``values`` left out.
+        """Posterior standard deviation (M,) of a joint's transmission error at values (M,), rad or m; zero without one.
 
-        Args:
-            joint: its number. values: (M,) values of the joint, rad or m.
-
-        Returns:
-            (M,) rad or m; zero if the model has no transmission of this joint.
+        The mean of the error over the values is left out.
         """
         terms = self.map.geodesic.spec.joint_kernel.terms
         own = [t for t in terms if isinstance(t, RadialKernel) and t.columns == (joint,) and t.output == joint]
         regression = self.blocks[0][1]
-        data = regression.linearisation
-        q = self.q.mean(0).repeat(len(values), 1)
+        data, q = regression.linearisation, self.q.mean(0).repeat(len(values), 1)
         q[:, joint] = values
-        along = torch.zeros(len(values), 1, self.q.shape[1], dtype=q.dtype, device=q.device)
+        along = torch.zeros_like(q)[:, None]
         along[:, :, joint] = 1.0
         centred = torch.eye(len(values), dtype=q.dtype, device=q.device) - 1.0 / len(values)
-        total = q.new_zeros(len(values), len(values))
-        cross = q.new_zeros(len(data.sensitivity) * data.sensitivity.shape[1], len(values))
+        total, cross = q.new_zeros(len(values), len(values)), q.new_zeros(*data.sensitivity.shape[:2], len(values))
         for kernel in own:
             for node in data.joint:
                 total += kernel.gram(q, node.weight * along, q, along)
-                cross += kernel.gram(node.points, node.weight * node.effect, q, along)
-        solved = regression.solve(cross.view(*data.sensitivity.shape[:2], -1))
+                cross += kernel.gram(node.points, node.weight * node.effect, q, along).view_as(cross)
+        solved, cross = regression.solve(cross), cross.flatten(0, 1)
         covariance = total - cross.T @ solved.flatten(0, 1)
         return (centred @ covariance @ centred).diagonal().clamp(min=0.0).sqrt()
 
     @cached_property
     def target(self) -> Tensor:
         """(N, m) measured (where hidden: predicted) minus the linear model at zero fields and parameters, m."""
-        value, at = self._linearised
+        value, at = self.linearised
         measured = self.points.flatten(1)
         response = self.map.geodesic.linear_response(at, elsewhere=self.map.data is not None)
         return torch.where(measured.isnan(), value, measured) - value + response
 
     @cached_property
-    def _linearised(self) -> tuple[Tensor, Linearisation]:
+    def linearised(self) -> tuple[Tensor, Linearisation]:
+        """(N, m) the markers by the fit itself, m, and the first order around them."""
         at_controls = self.map.data is None  # rows with places or payloads of their own
         value, at = self.map.geodesic.linearised_value(None if at_controls else self.q)
         return value, at if self.map.slopes is None else at.projected(self.map.slopes)
-
-    @property
-    def predicted(self) -> Tensor:
-        """(N, P, 3) the markers by the fit itself, m."""
-        return self._linearised[0].unflatten(1, (-1, 3))
 
 
 def forecast(curve: Sequence[tuple[int, float]], limit: float) -> tuple[int, float] | None:
@@ -232,23 +214,14 @@ def forecast(curve: Sequence[tuple[int, float]], limit: float) -> tuple[int, flo
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """N measured rows of B bodies each: markers, or the origins of measured frames.
+    """N measured rows of B bodies each: markers, or the origins of measured frames."""
 
-    Args:
-        data: the rows.
-        measured: (N, B, 3) positions, m, NaN where hidden.
-        predicted: (N, B, 3) of a model that has not seen the row, m.
-        covariance: (N, B, 3, 3) of a new measurement as the model claims it, m^2.
-        errors: distances, and angles where poses were measured.
-        left_out: whether these are rows of the fit, each predicted by all others.
-    """
-
-    data: Measurements
-    measured: Tensor
-    predicted: Tensor
-    covariance: Tensor
-    errors: Evaluation
-    left_out: bool
+    data: Measurements  # the rows
+    measured: Tensor  # (N, B, 3) positions, m, NaN where hidden
+    predicted: Tensor  # (N, B, 3) of a model that has not seen the row, m
+    covariance: Tensor  # (N, B, 3, 3) of a new measurement as the model claims it, m^2
+    errors: Evaluation  # distances, and angles where poses were measured
+    left_out: bool  # whether these are rows of the fit, each predicted by all others
 
     @classmethod
     def of(cls, model: CalibratedKinematics, data: Measurements | None = None) -> Predictions:
@@ -265,7 +238,7 @@ class Predictions:
         data, (errors, covariance) = rows.measurements, rows.left_out
         points = rows.points - errors.unflatten(1, (-1, 3))
         found = _errors(points, data)
-        predicted, covariance = data.bodies.claimed(points, covariance, rows.predicted)
+        predicted, covariance = data.bodies.claimed(points, covariance, rows.linearised[0].unflatten(1, (-1, 3)))
         return cls(data, data.origins, predicted, covariance, found, left_out=True)
 
     def __len__(self) -> int:
@@ -291,10 +264,6 @@ class Predictions:
         solved = torch.linalg.solve(self.covariance, self.away[..., None])[..., 0]
         return (self.away * solved).sum(-1)
 
-    def found_shares(self) -> Tensor:
-        """Shares of errors inside the regions that claim :data:`SHARES`."""
-        return SHARES.new_tensor([self.coverage(share) for share in SHARES.tolist()])
-
     def inside(self, share: float = 0.95) -> tuple[int, int]:
         """Number of errors inside the regions that claim ``share``, and of all."""
         squares = known(self.squares)
@@ -314,8 +283,4 @@ class Predictions:
 
 def _errors(points: Tensor, data: Measurements) -> Evaluation:
     """Errors of predicted points (N, P, 3), m."""
-
-    def predicted(_: Tensor) -> Tensor:
-        return points
-
-    return residuals(predicted, place(predicted, data), data).main
+    return residuals(lambda _: points, place(lambda _: points, data), data).main

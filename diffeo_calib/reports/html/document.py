@@ -12,19 +12,8 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from diffeo_calib.common.errors import printable
+from diffeo_calib.reports.plots import style
 from diffeo_calib.reports.plots.joints import joint_label, joint_values
-from diffeo_calib.reports.plots.style import (
-    BLUE,
-    FAINT,
-    FRAME,
-    GREEN,
-    GREY,
-    GRID,
-    INK,
-    ORANGE,
-    PURPLE,
-    Frame,
-)
 from diffeo_calib.robots.tree import Tree
 
 FOLDER = Path(__file__).parent
@@ -48,23 +37,17 @@ class Table(NamedTuple):
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page.
+    """A part of the page."""
 
-    Args:
-        name: its anchor. title: its heading. see: one sentence about what to see here.
-        tables, pictures, notes, text: its contents, in this order; ``scene`` comes before the pictures.
-        scene: points (N, 3) in m, and errors of each stage as arrows there (N, 3) in m, drawn with one scale.
-        text: lines to be shown as they are.
-    """
-
-    name: str
-    title: str
-    see: str
+    name: str  # its anchor
+    title: str  # its heading
+    see: str  # one sentence about what to see here; then follow tables, the scene, pictures, notes and text
     tables: Sequence[Table] = ()
+    # points (N, 3) in m, and errors of each stage as arrows there (N, 3) in m, drawn with one scale
     scene: Mapping[str, Any] | None = None
     pictures: Sequence[Picture] = ()
     notes: Sequence[str] = ()
-    text: Sequence[str] = ()
+    text: Sequence[str] = ()  # lines to be shown as they are
 
 
 def page(**parts: Any) -> str:
@@ -81,12 +64,13 @@ def page(**parts: Any) -> str:
 
 DOT = 0.2
 """Length of a stroke, in the units of the drawing (1/72 inch), below which it is a dot."""
-VARIABLES = {INK: "ink", FAINT: "faint", GRID: "grid", GREY: "grey"}
-VARIABLES |= {ORANGE: "orange", BLUE: "blue", GREEN: "green", PURPLE: "purple"}
-"""Colour of a figure -> the variable of the page's style that replaces it."""
+VARIABLES = ("ink", "faint", "grid", "grey", "orange", "blue", "green", "purple")
+"""Variables of the page's style that replace the colours of this name."""
 
 
-def panel(name: str, label: str, draw: Callable[..., None], *what: Any, frame: Frame = FRAME, **how: Any) -> Picture:
+def panel(
+    name: str, label: str, draw: Callable[..., None], *what: Any, frame: style.Frame = style.FRAME, **how: Any
+) -> Picture:
     """A picture of one panel, drawn by ``draw(axes, *what, **how)``.
 
     Args:
@@ -109,31 +93,25 @@ def panel(name: str, label: str, draw: Callable[..., None], *what: Any, frame: F
     svg = re.sub(r'(id="|url\(#|xlink:href="#)', rf"\g<1>{name}-", svg)
     svg = re.sub(r'<svg [^>]*viewBox="([^"]*)"[^>]*>', r'<svg viewBox="\1" aria-hidden="true">', svg, count=1)
     svg = svg.replace("xlink:href", "href")
-    for colour, variable in VARIABLES.items():
-        svg = re.sub(colour, f"var(--{variable})", svg, flags=re.IGNORECASE)
+    for variable in VARIABLES:
+        svg = re.sub(getattr(style, variable.upper()), f"var(--{variable})", svg, flags=re.IGNORECASE)
     svg = re.sub(r"font: ([0-9.]+)px [^;\"]*", r"font-size: \1px", svg)
     svg = re.sub(r'\b(?:d|x|y|transform)="[^"]*"', lambda found: re.sub(r"(\.\d{2})\d+", r"\1", found[0]), svg)
     svg = re.sub(r"M (\S+) (\S+)\nL (\S+) \2\n", _dot, re.sub(r"\s*\n\s*", "\n", svg))
-    return Picture(_with_classes(svg, name), label)
+    styles = dict[str, str]()  # of many markers, each written once
+
+    def short(found: re.Match[str]) -> str:
+        return f'{found[1]}class="{styles.setdefault(found[2], f"{name}-{len(styles)}")}"'
+
+    svg = re.sub(r'(<use [^>]*)style="([^"]*)"', short, svg)
+    rules = "".join(f".{key}{{{own}}}" for own, key in styles.items())
+    return Picture(svg.replace(">", f"><style>{rules}</style>", 1) if rules else svg, label)
 
 
 def _dot(stroke: re.Match[str]) -> str:
     """A stroke that is too short to be seen as one of no length, whose round ends are a dot."""
     x, y, end = stroke.groups()
     return f"M{x} {y}h0" if abs(float(end) - float(x)) < DOT else stroke[0]
-
-
-def _with_classes(svg: str, name: str) -> str:
-    """The same drawing, the styles of its many markers written once."""
-    styles: dict[str, str] = {}
-
-    def short(found: re.Match[str]) -> str:
-        key = styles.setdefault(found[2], f"{name}-{len(styles)}")
-        return f'{found[1]}class="{key}"'
-
-    svg = re.sub(r'(<use [^>]*)style="([^"]*)"', short, svg)
-    rules = "".join(f".{key}{{{style}}}" for style, key in styles.items())
-    return svg.replace(">", f"><style>{rules}</style>", 1) if rules else svg
 
 
 def millimetres(metres: float) -> str:

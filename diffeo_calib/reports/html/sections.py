@@ -15,40 +15,18 @@ from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics, measured_words
 from diffeo_calib.kinematics.evaluation import at_payloads
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_sentences
-from diffeo_calib.kinematics.provenance import Provenance
 from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.measurements.bodies import matrix_lines
 from diffeo_calib.reports.analysis.findings import Findings, RowsOfKind
 from diffeo_calib.reports.analysis.predictions import FitRows, Predictions
 from diffeo_calib.reports.analysis.stages import STANDARD_REPEATS, Kinematics
 from diffeo_calib.reports.html import sentences
-from diffeo_calib.reports.html.document import (
-    Picture,
-    Section,
-    Table,
-    joint_values_by_row,
-    marker_name,
-    millimetres,
-    panel,
-    rough_millimetres,
-)
-from diffeo_calib.reports.plots.errors import (
-    draw_before_after,
-    draw_coverage,
-    draw_distributions,
-    draw_learning_curve,
-    draw_residuals,
-)
-from diffeo_calib.reports.plots.joints import (
-    PART_WIDTH,
-    draw_expected,
-    draw_parts,
-    draw_transmission,
-    joint_label,
-    joint_unit,
-    joint_values,
-    short,
-)
+from diffeo_calib.reports.html.document import Picture, Section, Table, joint_values_by_row, marker_name, panel
+from diffeo_calib.reports.html.document import millimetres as mm
+from diffeo_calib.reports.html.document import rough_millimetres as rough
+from diffeo_calib.reports.plots import errors as plots
+from diffeo_calib.reports.plots import joints
+from diffeo_calib.reports.plots.joints import joint_label, joint_unit, joint_values
 from diffeo_calib.reports.plots.style import PANEL, Frame
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.payload import payload_sentence
@@ -75,13 +53,13 @@ def stage_pictures(stages: Mapping[str, Evaluation], suffix: str, repeatability:
     some = next(iter(stages.values()))
     label = f"Share of rows whose {some.label} is at most a value."
     how = {"repeatability": repeatability, "frame": UNDER_LEGEND}
-    yield panel(f"distributions{suffix}", label, draw_distributions, stages, **how)
+    yield panel(f"distributions{suffix}", label, plots.draw_distributions, stages, **how)
     label = f"Every row: {some.label} of the calibrated model against that of the stage before it."
-    yield panel(f"before-after{suffix}", label, draw_before_after, stages, frame=UNDER_LEGEND)
+    yield panel(f"before-after{suffix}", label, plots.draw_before_after, stages, frame=UNDER_LEGEND)
     turned = {name: one.orientation for name, one in stages.items() if one.orientation is not None}
     if turned:
         label = "Share of rows whose orientation error is at most a value."
-        yield panel(f"angles{suffix}", label, draw_distributions, turned, frame=UNDER_LEGEND)
+        yield panel(f"angles{suffix}", label, plots.draw_distributions, turned, frame=UNDER_LEGEND)
 
 
 def stage_table(stages: Mapping[str, Evaluation]) -> Table:
@@ -134,26 +112,24 @@ def how_good(found: Findings) -> Section:
 def where(found: Findings) -> Section:
     """What the model expects of its positions, by stage and against every joint; the poses to measure next."""
     robot, error, plan = found.model.robot, found.deviations.error, found.deviations.next
-    label = "Error that the model itself expects against {}: dashed anywhere in the measured ranges, solid where "
-    words, what = f"{label}it was measured.", (draw_expected, robot)
-    pictures = [
-        panel(f"expected-{k}", words.format(printable(name)), *what, k, found.deviations, key=k == 0)
-        for k, name in enumerate(robot.joint_names)
-    ]
+    pictures, solid = list[Picture](), "dashed anywhere in the measured ranges, solid where it was measured."
+    for k, name in enumerate(robot.joint_names):
+        label, what = f"Error that the model itself expects against {printable(name)}: {solid}", (robot, k)
+        pictures.append(panel(f"expected-{k}", label, joints.draw_expected, *what, found.deviations, key=k == 0))
     scene = None if found.predictions is None else _scene(found.stages, found.predictions)
     arrows = "Arrows point from the predicted to the measured place, with one scale in all views. Below: "
     see = arrows * (scene is not None) + (
         "The error that the model itself expects, without the noise of a measurement: "
-        f"{rough_millimetres(error.measured)} mm RMS at the measured configurations; anywhere in the measured joint "
+        f"{rough(error.measured)} mm RMS at the measured configurations; anywhere in the measured joint "
         f"ranges {printable(error.sentence)}"
     )
     if found.model.own_frame:
         see += ", after a rigid fit, because no device says where the robot stands"
-    rows = [[name, millimetres(value)] for name, value in found.expected.items()]
+    rows = [[name, mm(value)] for name, value in found.expected.items()]
     tables = [Table("Expected error of positions by stage", ["stage", "RMS [mm]"], rows)]
     notes = [*sentences.unlike_poses(found), *sentences.worst_range(found)]
     if plan is not None:
-        q, then = plan.q[plan.rank.argsort()], rough_millimetres(float(plan.expected_rms[-1]))
+        q, then = plan.q[plan.rank.argsort()], rough(float(plan.expected_rms[-1]))
         caption = f"Where to measure next: {len(q)} poses that would lower the expected error most"
         ranks = ["rank", *(str(rank) for rank in range(1, len(q) + 1))]
         tables.append(Table(caption, ranks, joint_values_by_row(robot, q)))
@@ -164,27 +140,29 @@ def where(found: Findings) -> Section:
 
 def _scene(stages: Mapping[str, Kinematics], seen: Predictions) -> dict[str, Any]:
     there = ~seen.measured.isnan().any(2)  # of the sightings
-    step, away = -(-int(there.sum()) // MOST_POINTS), dict[str, Tensor]()
-    *before, (last, _) = stages.items()
-    for name, kinematics in before:
-        away[name] = seen.measured - seen.data.bodies.origins(at_payloads(kinematics, seen.data)(seen.data.q).detach())
+    step, errors = -(-int(there.sum()) // MOST_POINTS), dict[str, list[list[float]]]()
 
     def listed(values: Tensor, digits: int) -> list[list[float]]:
         return [[round(value, digits) for value in row] for row in values[there][::step].tolist()]
 
-    errors = {name: listed(own, SCENE_DECIMALS + 2) for name, own in (away | {last: seen.away}).items()}
+    for number, (name, kinematics) in enumerate(stages.items(), 1):
+        own = seen.predicted  # of the model, which has not seen the rows
+        if number < len(stages):
+            own = seen.data.bodies.origins(at_payloads(kinematics, seen.data)(seen.data.q).detach())
+        errors[name] = listed(seen.measured - own, SCENE_DECIMALS + 2)
     return {"points": listed(seen.measured, SCENE_DECIMALS), "errors": errors}
 
 
 def why(found: Findings) -> Section:
     """What each part of the model explains: sag, waves of its gears, and corrections of the geometry."""
-    left = 0.3 + PER_LETTER * max(len(short(part.name)) for part in found.parts)
-    frame = Frame((PART_WIDTH, 0.9 + 0.24 * len(found.parts)), left=left)
+    parts = found.parts
+    left = 0.3 + PER_LETTER * max(len(joints.short(part.name)) for part in parts)
+    frame = Frame((joints.PART_WIDTH, 0.9 + 0.24 * len(parts)), left=left)
     label = "What each part of the model explains (parts may cancel)."
-    pictures = [panel("parts", label, draw_parts, found.parts, frame=frame)]
+    pictures = [panel("parts", label, joints.draw_parts, parts, frame=frame)]
     label = "motion beyond its reading, with its 95 % band; below, where the joint was measured."
     for joint, name in enumerate(found.model.robot.joint_names):
-        what = draw_transmission, found.model, found.rows, joint
+        what = joints.draw_transmission, found.model, found.rows, joint
         pictures.append(panel(f"transmission-{joint}", f"{printable(name)}: {label}", *what))
     see, tables = "A wide band means that the joint was measured too little there.", list[Table]()
     notes = ["Coupled joint errors depend on several joints, task space on the place of the marker."]
@@ -200,26 +178,22 @@ def why(found: Findings) -> Section:
 
 
 def _corrections(model: CalibratedKinematics, fit_rows: FitRows) -> Table:
-    """Error twists of the joints in the model's geometry, with deviations."""
+    """Error twists of the joints in the model's geometry, with deviations in mm or mrad.
+
+    Those are "open" whose deviation the rows hardly lower from that of the prior.
+    """
     nominal = model.nominal
-    joints = nominal.geometry.slices["joints"]
-    found = nominal.split(model.map.deformation.momenta.theta)[0][joints].view(-1, 6)
-    numbers = torch.arange(nominal.geometry.size, device=found.device)[joints]
-    claimed = fit_rows.map.parameter_covariance(numbers).diagonal().sqrt().view(-1, 6)
-    prior = model.map.geodesic.spec.prior_variance[: nominal.geometry.size][joints].sqrt().view(-1, 6)
-    rows = [
-        [name, *(_correction(*entry) for entry in zip(*(values.tolist() for values in entries), strict=True))]
-        for name, *entries in zip(model.robot.moving_names, found, claimed, prior, strict=True)
-    ]
+    which = nominal.geometry.slices["joints"]
+    theta, numbers = model.map.deformation.momenta.theta, torch.arange(nominal.geometry.size, device=fit_rows.q.device)
+    claimed = fit_rows.map.parameter_covariance(numbers[which]).diagonal().sqrt()
+    prior = model.map.geodesic.spec.prior_variance[: nominal.geometry.size][which].sqrt()
+    rows = [[name] for name in model.robot.moving_names]
+    entries = zip(*(each.tolist() for each in (nominal.split(theta)[0][which], claimed, prior)), strict=True)
+    for number, (value, deviation, before) in enumerate(entries):
+        known = deviation <= OPEN_SHARE * before or abs(value) >= deviation
+        rows[number // 6].append(f"{1e3 * value:.3f} \u00b1 {1e3 * deviation:.3f}" if known else "open")
     header = ["before joint", *(f"{axis} [mm]" for axis in "xyz"), *(f"r{axis} [mrad]" for axis in "xyz")]
     return Table("Geometry corrections with their standard deviations", header, rows)
-
-
-def _correction(value: float, deviation: float, prior: float) -> str:
-    """A correction in mm or mrad with its deviation; "open" if the rows hardly lower that of the prior."""
-    if deviation > OPEN_SHARE * prior and abs(value) < deviation:
-        return "open"
-    return f"{1e3 * value:.3f} \u00b1 {1e3 * deviation:.3f}"
 
 
 LISTED_ROWS = 5
@@ -237,8 +211,8 @@ def trust(found: Findings) -> Section:
     tables += [_largest(found, own) for own in found.kinds.values()]
     notes = list(found.moved)
     if registered is not None:
-        each = f"each predicted by the others {millimetres(registered.left_out_rms)} mm"
-        after = f"{registered.rows} rows, RMS {millimetres(registered.rms_after)} mm"
+        each = f"each predicted by the others {mm(registered.left_out_rms)} mm"
+        after = f"{registered.rows} rows, RMS {mm(registered.rms_after)} mm"
         notes.append(f"The model was registered anew with {after}; {each}.")
     elif not notes and seen is not None:
         notes.append("No device or marker moved, and no block of rows is wrong.")
@@ -248,11 +222,11 @@ def trust(found: Findings) -> Section:
     pictures = list[Picture]()
     if seen is not None:
         label = "Found against claimed shares of errors; on the diagonal the claims are true."
-        pictures.append(panel("coverage", label, draw_coverage, seen))
+        pictures.append(panel("coverage", label, plots.draw_coverage, seen))
     if found.learning_curve:
         label = "Error of rows of the fit when a model knows fewer of them, each row left out in turn."
         what = found.learning_curve, found.forecast, found.limit if found.repeats else None
-        pictures.append(panel("learning", label, draw_learning_curve, *what))
+        pictures.append(panel("learning", label, plots.draw_learning_curve, *what))
     pictures += _residuals(found)
     return Section("trust", "Can I trust it", sentences.judged(found), tables, None, pictures, notes)
 
@@ -269,11 +243,11 @@ def _residuals(found: Findings) -> Iterator[Picture]:
             missing = int((~values.isfinite()).sum())
             label += f" {missing} of {len(values)} rows have no value." * (missing > 0)
             given = values, errors, printable(name)
-            yield panel(f"residuals-{place}-{number}", label, draw_residuals, *given, key=number == 0)
+            yield panel(f"residuals-{place}-{number}", label, plots.draw_residuals, *given, key=number == 0)
         for joint, name in enumerate(robot.joint_names):
             label = f"{what} against {printable(name)}, their RMS dashed."
             given = joint_values(robot, joint, q[:, joint]), errors, joint_label(robot, joint)
-            yield panel(f"residuals-{place}-joint-{joint}", label, draw_residuals, *given, key=False)
+            yield panel(f"residuals-{place}-joint-{joint}", label, plots.draw_residuals, *given, key=False)
 
 
 def _largest(found: Findings, own: RowsOfKind) -> Table:
@@ -285,7 +259,7 @@ def _largest(found: Findings, own: RowsOfKind) -> Table:
     what = f"Largest: {own.errors.label}" if len(found.kinds) > 1 else "Largest errors"
     if seen is not None and own.errors.what == ERRORS and len(seen) == len(own.lines):
         what += ", and what the model expects of a measurement there"
-        lines.append(["expected RMS [mm]", *(millimetres(float(seen.claimed[row, body[row]])) for row in order)])
+        lines.append(["expected RMS [mm]", *(mm(float(seen.claimed[row, body[row]])) for row in order)])
     lines += joint_values_by_row(found.model.robot, own.q[order])
     if own.errors.errors.shape[1] > 1:
         lines.insert(0, ["marker", *(marker_name(int(body[row]), found.model.on) for row in order)])
@@ -293,10 +267,10 @@ def _largest(found: Findings, own: RowsOfKind) -> Table:
 
 
 def _outliers(outliers: Sequence[Outlier], tips: Sequence[str]) -> Table:
-    some = outliers[:MOST_OUTLIERS]
-    markers = ["" if one.marker is None else marker_name(one.marker, tips) for one in some]
-    pairs = zip(some, markers, strict=True)
-    rows = [[str(one.number), marker, millimetres(one.distance), one.reason] for one, marker in pairs]
+    rows = [
+        [str(one.number), "" if one.marker is None else marker_name(one.marker, tips), mm(one.distance), one.reason]
+        for one in outliers[:MOST_OUTLIERS]
+    ]
     more = f" (the worst {MOST_OUTLIERS} of {len(outliers)})" if len(outliers) > MOST_OUTLIERS else ""
     caption = f"Rows that look wrong{more}; none was dropped"
     return Table(caption, ["row", "marker", "off by [mm]", "why"], rows, numeric=False)
@@ -314,8 +288,8 @@ def repeatability(found: Findings) -> Section:
     some = zip(repeats.lines.tolist(), repeats.counts.tolist(), values, strict=True)
     named = [(f"row {line}", str(count), own) for line, count, own in some][:MOST_REPEATS]
     named += [("worst", "", values.amax(0)), ("mean", "", values.mean(0))]
-    rows = [[pose, count, *map(millimetres, own.tolist())] for pose, count, own in named]
-    poses, away = f"{len(values)} poses were measured several times", f"{millimetres(repeats.deviation)} mm RMS away"
+    rows = [[pose, count, *map(mm, own.tolist())] for pose, count, own in named]
+    poses, away = f"{len(values)} poses were measured several times", f"{mm(repeats.deviation)} mm RMS away"
     see = f"{poses}: single measurements are {away} from their mean, which limits the RMS error of any model."
     few = f", from fewer than its {STANDARD_REPEATS} attainments" * (int(repeats.counts.min()) < STANDARD_REPEATS)
     note = (
@@ -330,38 +304,27 @@ def repeatability(found: Findings) -> Section:
 
 
 def record(model: CalibratedKinematics, data_sha256: str | None) -> Section:
-    """Everything needed to make the model again."""
-    lines = [*_origin(model.provenance, data_sha256), *_fit(model), "robot base in the measuring frame, 4 x 4 [m]:"]
-    lines += [*matrix_lines(model.geometry.base), *model.bodies.place_lines(model)]
-    lines += hand_eye_sentences(HandEye.of_fit(model))
-    return Section("record", "Record", "Everything needed to make this model again.", text=lines)
-
-
-def _origin(made: Provenance | None, data_sha256: str | None) -> Iterator[str]:
-    """When the model was made, how, and of which table."""
+    """Everything needed to make the model again: when, how and of which table, robot, rows and ranges, how it ended."""
+    made, robot, lines = model.provenance, model.robot, list[str]()
     if made is not None:
-        yield f"fitted        {made.date} (UTC) with {PACKAGE} {made.version}"
-        if made.command:
-            yield f"command       {printable(made.command)}"
-        yield f"table         sha256 {made.table_sha256}"
-        if made.note:
-            yield f"note          {printable(made.note)}"
+        lines.append(f"fitted        {made.date} (UTC) with {PACKAGE} {made.version}")
+        lines += [f"command       {printable(made.command)}"] * bool(made.command)
+        lines.append(f"table         sha256 {made.table_sha256}")
+        lines += [f"note          {printable(made.note)}"] * bool(made.note)
     if data_sha256 is not None:
         same = made is not None and data_sha256 == made.table_sha256
-        yield f"data shown    {'the same table, rows of the fit left out' if same else 'sha256 ' + data_sha256}"
-
-
-def _fit(model: CalibratedKinematics) -> Iterator[str]:
-    """Robot, rows and ranges of the fit, and how it ended."""
-    robot, limits = model.robot, (model.configurations.amin(0), model.configurations.amax(0))
-    yield f"robot         {printable(robot.base)} to {printable(robot.tip)}, {robot.n} joints"
-    yield f"fitted to     {len(model.configurations)} rows, {measured_words(model)}"
-    for joint, name in enumerate(robot.joint_names):
-        low, high = (float(joint_values(robot, joint, end[joint])) for end in limits)
-        yield f"  {printable(name)}: {low:.2f} to {high:.2f} {joint_unit(robot, joint)}"
-    summary = model.summary
-    if summary is not None:
-        residuals = f"coupling {summary.coupling_residual:.1e}, end {summary.end_residual:.1e} (residuals)"
-        certified = isfinite(summary.coupling_residual) and isfinite(summary.end_residual)
-        yield f"optimum       {residuals if certified else 'without certificate: fewer control points than rows'}"
-        yield f"status        {summary.status}; scales: {summary.scales}"
+        lines.append(f"data shown    {'the same table, rows of the fit left out' if same else 'sha256 ' + data_sha256}")
+    lines.append(f"robot         {printable(robot.base)} to {printable(robot.tip)}, {robot.n} joints")
+    lines.append(f"fitted to     {len(model.configurations)} rows, {measured_words(model)}")
+    for joint, (name, values) in enumerate(zip(robot.joint_names, model.configurations.mT, strict=True)):
+        low, high = (float(joint_values(robot, joint, end)) for end in values.aminmax())
+        lines.append(f"  {printable(name)}: {low:.2f} to {high:.2f} {joint_unit(robot, joint)}")
+    if (summary := model.summary) is not None:
+        certificate = f"coupling {summary.coupling_residual:.1e}, end {summary.end_residual:.1e} (residuals)"
+        if not (isfinite(summary.coupling_residual) and isfinite(summary.end_residual)):
+            certificate = "without certificate: fewer control points than rows"
+        lines.append(f"optimum       {certificate}")
+        lines.append(f"status        {summary.status}; scales: {summary.scales}")
+    lines += ["robot base in the measuring frame, 4 x 4 [m]:", *matrix_lines(model.geometry.base)]
+    lines += [*model.bodies.place_lines(model), *hand_eye_sentences(HandEye.of_fit(model))]
+    return Section("record", "Record", "Everything needed to make this model again.", text=lines)

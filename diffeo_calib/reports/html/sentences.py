@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import torch
+
 from diffeo_calib.calibration.expected_errors import STILL_RANGE
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.quantiles import binomial_band, largest_known
@@ -14,8 +16,8 @@ from diffeo_calib.sensors.errors import ERRORS
 
 WORTHWHILE_ERROR_FACTOR = 1.1
 """More rows are not worth it where the forecast is less than this factor below the error now."""
-BLAMED_VARIANCE_SHARE = 0.5
-"""Share of the expected variance that knowing the markers would remove, from which they are blamed."""
+BLAMED_VARIANCE_SHARE, PROBE_CONFIGURATIONS = 0.5, 60
+"""Share of the expected variance, at so many configurations, that knowing the markers would remove: they are blamed."""
 OPEN_M = 1e-3
 """Deviation of a marker, m, in a direction that the rows leave open, from which it is blamed."""
 ENOUGH_FOR_P95 = 20
@@ -141,12 +143,14 @@ def unlike_poses(found: Findings) -> Iterator[str]:
     """A sentence about poses unlike the measured ones if they are much less certain, and why."""
     if not found.unlike:
         return
-    rows, tool = found.rows, found.tool
+    rows, geometry = found.rows, found.model.nominal.geometry
+    tool = torch.arange(geometry.size, device=rows.q.device)[geometry.slices["tool"]]
     open_directions = rows.map.open_directions[tool]
     variances = rows.map.parameter_covariance(tool).diagonal() + open_directions.square().sum(1)
     number, axis = divmod(int(variances.argmax()), 3)
     why, what = "", "unlike them"
-    if found.share_of_tool > BLAMED_VARIANCE_SHARE or bool((open_directions.abs() > OPEN_M).any()):
+    share = rows.map.explained_by(tool, found.deviations.q[:PROBE_CONFIGURATIONS])
+    if share > BLAMED_VARIANCE_SHARE or bool((open_directions.abs() > OPEN_M).any()):
         marker, along = found.model.bodies.name(number, len(rows.on)), f"{'xyz'[axis]} of {printable(rows.on[number])}"
         why = f", because {marker} and base can hardly be told apart along {along}"
         what = "in which the tool is turned about other axes"

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -22,8 +23,6 @@ from diffeo_calib.sensors.errors import Evaluation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 SMALLEST_ERROR = 1e-9
 """Smaller errors in mm, px or deg are drawn as this one: a logarithmic axis has no zero."""
@@ -101,9 +100,7 @@ ARROW_SHARE = 0.12
 def workspace(model: CalibratedKinematics, data: Measurements | None = None, title: str = "") -> Figure:
     """Errors as arrows at the measured places, geometric calibration beside the model, enlarged by one factor.
 
-    Args:
-        model: a calibrated model. data: rows that took no part in its fit; by default the rows of the fit.
-        title: of the figure.
+    Of rows that took no part in the fit; by default of those of the fit, each predicted by all others.
     """
     seen = Predictions.of(model, data)
     geometric = seen.data.bodies.origins(stages_of(model)[GEOMETRIC](seen.data.q))
@@ -114,24 +111,19 @@ def workspace(model: CalibratedKinematics, data: Measurements | None = None, tit
     factor = ARROW_SHARE * size / max(float(before.norm(dim=-1).max()), float(after.norm(dim=-1).max()), 1e-12)
     for number, (errors, name) in enumerate(((before, GEOMETRIC), (after, CALIBRATED)), 1):
         axes: Any = figure.add_subplot(1, 2, number, projection="3d")
-        _arrows(axes, places, errors, factor)
+        lengths = errors.norm(dim=-1)
+        colours = colormaps["viridis"]((lengths / lengths.max().clamp(min=1e-12)).numpy())
+        axes.scatter(*places.T.numpy(), s=4, color=colours)
+        arrows = {"color": colours, "linewidth": 1, "arrow_length_ratio": 0.2}
+        axes.quiver(*places.T.numpy(), *(factor * errors).T.numpy(), **arrows)
+        axes.set_box_aspect((places.amax(0) - places.amin(0)).clamp(min=1e-3).tolist())
+        axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+        axes.tick_params(labelsize=7, colors=FAINT)
         rms = 1e3 * float(errors.square().sum(-1).mean().sqrt())
         axes.set_title(f"{name}: {rms:.3g} mm RMS, arrows x {factor:.0f}", fontsize=9, color=INK)
     if title:
         figure.suptitle(style.literal(title), fontsize=11, color=INK)
     return figure
-
-
-def _arrows(axes: Axes3D, places: Tensor, errors: Tensor, factor: float) -> None:
-    from matplotlib import colormaps  # noqa: PLC0415
-
-    xyz, arrows, lengths = places, factor * errors, errors.norm(dim=-1)
-    colours = colormaps["viridis"]((lengths / lengths.max().clamp(min=1e-12)).numpy())
-    axes.scatter(*xyz.T.numpy(), s=4, color=colours)
-    axes.quiver(*xyz.T.numpy(), *arrows.T.numpy(), color=colours, linewidth=1, arrow_length_ratio=0.2)
-    axes.set_box_aspect((xyz.amax(0) - xyz.amin(0)).clamp(min=1e-3).tolist())
-    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
-    axes.tick_params(labelsize=7, colors=FAINT)
 
 
 FEWEST_BINNED = 30
@@ -141,10 +133,7 @@ FEWEST_BINNED = 30
 def uncertainty(model: CalibratedKinematics, data: Measurements | None = None, title: str = "") -> Figure:
     """Shares of errors inside the model's own regions against the shares that these claim.
 
-    Args:
-        model: a calibrated model.
-        data: rows that took no part in its fit; by default the rows of the fit, each predicted by all others.
-        title: of the figure.
+    ``data``: rows that took no part in its fit; by default the rows of the fit, each predicted by all others.
     """
     figure, (axes,) = panels(1, title=title)
     draw_coverage(axes, Predictions.of(model, data))
@@ -160,7 +149,8 @@ def draw_coverage(axes: Axes, predictions: Predictions) -> None:
     low, high = (100 / count * binom.ppf(p, count, SHARES.numpy()) for p in (0.025, 0.975))
     axes.fill_between(claimed, low, high, color=GREY, alpha=0.3, lw=0, label="chance (rows independent)")
     axes.plot([0, 100], [0, 100], color=GREY, lw=1)
-    axes.plot(claimed, 100 * predictions.found_shares(), "-o", color=BLUE, ms=3.5, lw=1.8, label="found")
+    found = [100 * predictions.coverage(share) for share in SHARES.tolist()]
+    axes.plot(claimed, found, "-o", color=BLUE, ms=3.5, lw=1.8, label="found")
     note(axes, 0.03, 0.7, "cautious", va="top")
     note(axes, 0.97, 0.25, "overconfident", ha="right")
     axes.set(xlim=(0, 100), ylim=(0, 101))

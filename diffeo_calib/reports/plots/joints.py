@@ -50,10 +50,8 @@ def transmissions(model: CalibratedKinematics, title: str = "") -> Figure:
 def draw_transmission(axes: Axes, model: CalibratedKinematics, rows: FitRows, joint: int) -> None:
     """Transmission error of one joint without gear lines, its mean over the measured range left out."""
     robot, name = model.robot, model.robot.joint_names[joint]
-    measured = rows.q[:, joint]
-    values = torch.linspace(
-        float(measured.min()), float(measured.max()), POINTS, dtype=measured.dtype, device=measured.device
-    )
+    measured, share = rows.q[:, joint], torch.linspace(0.0, 1.0, POINTS, dtype=torch.float64, device=rows.q.device)
+    values = torch.lerp(measured.min(), measured.max(), share)
     error = smooth_transmission(model.map.deformation, robot, name, values.to(model.configurations.device)).cpu()
     error = 1e3 * (error - error.mean())
     band = 1e3 * TWO_SIDED_95 * rows.transmission_deviation(joint, values)
@@ -111,10 +109,8 @@ def draw_expected(axes: Axes, robot: Tree, joint: int, found: Deviations, *, key
     near, short = joint_values(robot, joint, found.measured[:, joint]), 1e3 * found.measured_deviation
     dots(axes, values, lengths, colour=GREY, size=2.2)
     dots(axes, near, short, colour=BLUE, size=2.2)
-    for x, y, look, label in (
-        (values, lengths, LOOKS[1], "anywhere in the ranges"),
-        (near, short, LOOKS[2], "as measured"),
-    ):
+    anywhere = values, lengths, LOOKS[1], "anywhere in the ranges"
+    for x, y, look, label in (anywhere, (near, short, LOOKS[2], "as measured")):
         axes.plot(*rms_in_bins(x, y), color=look.colour, ls=look.line, lw=look.width, label=label)
     wide = float(lengths.max()) > WIDE_RATIO * float(short.min())
     if not wide:

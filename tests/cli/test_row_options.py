@@ -1,0 +1,281 @@
+"""Balls in sockets, readings, payloads, and rows of several kinds on the command line, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from command_bank import Command
+from kind_bank import UNITS, kind_named
+from simulated_sockets import rest_in_sockets
+from torch.testing import assert_close
+from trackerless_bank import write_socket_table, write_wire_table
+
+import diffeo_calib as dc
+from diffeo_calib.cli.options import Rows, Units
+from diffeo_calib.cli.tables import measured_table
+from diffeo_calib.measurements.csv.sensors import ReadingColumns
+from diffeo_calib.robots import SimulatedArm
+
+ROBOT, DEG = ["--robot", "arm.urdf", "--base", "base_link", "--tip", "flange"], ["--length", "mm", "--angle", "deg"]
+SOCKETS = ["--socket", "place,socket", "--distance", "a,b=50", "--distance-std", "0.01"]
+
+
+@pytest.fixture(scope="module")
+def sockets(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A table of 3 places x 2 sockets x 6 rows, and its robot."""
+    where, arm = tmp_path_factory.mktemp("sockets"), SimulatedArm(seed=1)
+    arm.write_urdf(where / "arm.urdf")
+    write_socket_table(where / "t.csv", arm, "ab", 1)
+    return where
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("given_scales")
+def test_from_a_campaign_file_to_errors(sockets: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(sockets)
+    campaign = ['csv = "t.csv"', 'robot = "arm.urdf"', 'base = "base_link"', 'tip = "flange"', 'length = "mm"']
+    campaign += ['angle = "deg"', 'socket = ["place", "socket"]', 'distance = ["a,b=50"]', "distance-std = 0.01"]
+    (sockets / "c.toml").write_text("\n".join([*campaign, 'output = "m.safetensors"']))
+    fitted = command("fit", "c.toml")
+    assert fitted.code == 0, fitted.err
+    assert "Spread within sockets in mm by stage" in fitted.out
+    assert "12 held out" in fitted.out, "one whole place"
+    assert "known 50.000" in fitted.out
+    assert "2 to 6 times" in fitted.out
+    assert "robot base in the measuring frame" not in fitted.out
+    done = command("evaluate", "m.safetensors", "t.csv", *SOCKETS, *DEG)
+    assert done.code == 0, done.err
+    assert "12 not used in the fit" in done.out
+    assert done.out.count("known 50.000") == 3
+    assert "expected absolute error" in done.out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([*SOCKETS, "--position", "x,y,z"], "no column ['x', 'y', 'z']"),
+        ([*SOCKETS, "--std", "s"], "--std beside `socket`; leave it out"),
+        (["--distance", "a,b=50", "--distance-std", "1", "--position", "x,y,z"], "--distance-std without --socket"),
+        ([*SOCKETS[:2], "--distance", "a=50", *SOCKETS[4:]], r"--distance a=50: expected A,B=LENGTH"),
+        (["--socket", "place,socket", "--distance", "a,b=50"], "--distance without --distance-std"),
+        ([*SOCKETS[:2], "--distance", "a,c=50", *SOCKETS[4:]], "a known distance: expected names of two sockets"),
+        ([*SOCKETS[:2], "--distance", "a,b=50000", *SOCKETS[4:]], "check the unit of `distances`"),
+    ],
+)
+def test_refused_sockets(
+    options: list[str], message: str, sockets: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(sockets)
+    done = command("fit", "t.csv", *ROBOT, *DEG, *options, "-o", "none.safetensors")
+    assert done.code in (1, 2)
+    assert message in " ".join(done.err.split())
+    assert not Path("none.safetensors").exists()
+
+
+@pytest.mark.usefixtures("given_scales")
+def test_a_wrong_distance_is_warned_of(sockets: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(sockets)
+    options = *SOCKETS[:2], "--distance", "a,b=60", *SOCKETS[4:]
+    done = command("fit", "t.csv", *ROBOT, *DEG, *options, "-o", "warned.safetensors")
+    assert done.code == 0
+    assert "the known distance of the sockets 'spot" in " ".join(done.err.split())
+
+
+def test_one_of_both_is_required(sockets: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(sockets)
+    done = command("fit", "t.csv", *ROBOT, *DEG, "-o", "none.safetensors")
+    assert done.code == 2
+    assert "--position" in done.err
+
+
+WIRE = ["--reading", "distance=wire", "--session", "anchor"]
+
+
+@pytest.fixture(scope="module")
+def wires(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """64 rows of a wire that is pulled from two anchors in turn, and the robot."""
+    where, arm = tmp_path_factory.mktemp("wire"), SimulatedArm(seed=1)
+    arm.write_urdf(where / "arm.urdf")
+    write_wire_table(where / "t.csv", arm, 1)
+    return where
+
+
+@pytest.mark.parametrize(
+    ("text", "columns"),
+    [
+        ("distance=400", ReadingColumns("distance", 400.0)),
+        ("distance=bar", ReadingColumns("distance", ("bar",))),
+        ("displacement=wire", ReadingColumns("distance", ("wire",), offset_std=1.0)),
+        ("height=0", ReadingColumns("height", 0.0)),
+        ("image=u, v,900,910,320.5,-2", ReadingColumns("image", ("u", "v"), None, 0.0, (900.0, 910.0, 320.5, -2.0))),
+    ],
+)
+def test_options_become_columns(text: str, columns: ReadingColumns) -> None:
+    units = Units(length="mm", angle="deg", sep=";", decimal=",")
+    table = measured_table(Path("t.csv"), Rows(reading=[text]), units, "error")
+    assert table.table.readings == (columns,)
+    assert (table.table.sep, table.table.decimal, table.duplicates) == (";", ",", "error")
+
+
+def test_a_number_that_names_a_column_is_that_column(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("a,b,7\n10,20,100\n20,30,400\n")
+    for text, values in {"7": ("7",), "7.0": 7.0}.items():
+        rows, units = Rows(reading=[f"distance={text}"]), Units(length="mm", angle="deg")
+        table = measured_table(tmp_path / "t.csv", rows, units)
+        assert table.table.readings == (ReadingColumns("distance", values),)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([*WIRE, "--position", "x,y,z"], "no column ['x', 'y', 'z']"),
+        (["--reading", "length=wire"], "--reading length=wire: expected distance=COLUMN"),
+        (["--reading", "distance=wire,anchor"], "--reading distance=wire,anchor: expected"),
+        (["--reading", "image=u,v"], "--reading image=u,v: expected distance=COLUMN"),
+        (["--reading", "image=u,v,0,1,2,3"], "focal lengths FX, FY are positive"),
+        (["--reading", "image=u,v,9,9,2,x"], "--reading image=u,v,9,9,2,x: expected"),
+        (
+            ["--reading", "distance=0"],
+            "--reading distance=0: expected a distance above 0; write the length of the ball bar",
+        ),
+        (["--reading", "distance=wire", "--tip", "tool"], "tool"),
+    ],
+)
+def test_refused_readings(
+    options: list[str], message: str, wires: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(wires)
+    done = command("fit", "t.csv", *ROBOT, *DEG, *options, "-o", "none.safetensors")
+    assert done.code in (1, 2)
+    assert message in " ".join(done.err.split())
+    assert not Path("none.safetensors").exists()
+
+
+RAD = ["--length", "mm", "--angle", "rad"]
+POSITION = ["--position", "x,y,z"]
+TRACKED = 11
+"""Too few to search for scales: defaults are quick."""
+
+
+@pytest.fixture(scope="module")
+def mixtures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A table of 11 positions and 2 places x 2 sockets x 3 rows, shuffled, and its robot."""
+    where, arm = tmp_path_factory.mktemp("mixture"), SimulatedArm(seed=1, markers=2)
+    rows = rest_in_sockets(arm, seed=1, places=2, rows=3)
+    arm.write_urdf(where / "arm.urdf")
+    q, points = arm.measure(TRACKED, seed=3)
+    seen = zip(q.tolist(), (1e3 * points[:, 1]).tolist(), strict=True)
+    lines = [["", "", *map(repr, angles), *map(repr, place)] for angles, place in seen]
+    for angles, name in zip(rows.q.tolist(), rows.names, strict=True):
+        place, socket = name.split("/")
+        lines.insert(3, [f"spot {place}", "ab"[int(socket)], *map(repr, angles), "", "", ""])
+    header = ["place", "socket", *arm.nominal.joint_names, "x", "y", "z"]
+    (where / "t.csv").write_text("\n".join(map(",".join, [header, *lines])))
+    return where
+
+
+def read(path: Path | str = "t.csv", **options: object) -> dc.Measurements:
+    robot = dc.load_urdf("arm.urdf", "base_link", "flange")
+    given = {"socket": ["place", "socket"], "length": "mm", "angle": "rad"} | options
+    return dc.read_measurements(path, robot, ["x", "y", "z"], **given)  # pyright: ignore[reportArgumentType]
+
+
+def test_other_commands_name_the_ball_and_what_was_measured(
+    mixtures: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(mixtures)
+    model = dc.calibrate(dc.load_urdf("arm.urdf", "base_link", "flange"), read()).model
+    dc.save(model, "other.safetensors")
+    assert command("predict", "other.safetensors", "t.csv", *RAD, "-o", "p.csv").code == 0
+    header = Path("p.csv").read_text().splitlines()[0].split(",")[6:]
+    prefixes = ("marker_", "ball_")
+    assert header == [f"{prefix}{kind}{axis}" for prefix in prefixes for kind in ("", "std_") for axis in "xyz"]
+    places = [f"{prefix}{axis}" for prefix in prefixes for axis in "xyz"]
+    assert list(model.to_frame(model.configurations[:2]).columns) == [*places, *(f"std_{name}" for name in places)]
+    planned = command("plan", "other.safetensors", "-n", 3, "--draw", 20, *RAD, "-o", "next.csv")
+    assert planned.code == 0, planned.err
+    assert Path("next.csv").read_text().splitlines()[0].endswith(",rank,device")
+    assert "socket 1: " in planned.out
+    assert "held out" not in planned.out
+    corrected = command("correct", "other.safetensors", "p.csv", *RAD, "-o", "c.csv")
+    assert corrected.code == 0, corrected.err
+    text = " ".join(corrected.out.split())
+    said = re.search(r"robot's base to ([\d.]+) mm.* on its flange.* to ([\d.]+) mm", text)
+    assert said is not None
+    assert 0 < float(said[2]) < 0.5 * float(said[1])
+
+
+def test_set_ups_are_evaluated_each_in_its_place(
+    mixtures: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The device moves by 100 mm before the rows of b: errors stay what they are, and so does the spread in sockets."""
+    monkeypatch.chdir(mixtures)
+    model = "placed.safetensors"
+    assert command("fit", "t.csv", *ROBOT, *RAD, *POSITION, *SOCKETS, "--holdout", "0", "-o", model).code == 0
+    header, *lines = (mixtures / "t.csv").read_text().split("\n")
+    moved = []
+    for number, line in enumerate(lines):
+        cells, day = line.split(","), "" if line.startswith("spot") else "ab"[number % 2]
+        if day == "b":
+            cells[-3] = repr(float(cells[-3]) + 100.0)
+        moved.append(",".join([*cells, day]))
+    (mixtures / "moved.csv").write_text("\n".join([f"{header},day", *moved]))
+    written = []
+    for options in (["t.csv"], ["moved.csv", "--session", "day"]):
+        done = command("evaluate", model, *options, *POSITION, *SOCKETS, *RAD, "--json", "e.json")
+        assert done.code == 0, done.err
+        written.append(json.loads(Path("e.json").read_text())["results"])
+    assert "the frames of 2 sessions were found from these rows, 12 numbers in all" in " ".join(done.out.split())
+    still, placed = written
+    assert placed["kinds"]["socket"] == still["kinds"]["socket"]
+    assert placed["errors"]["all"]["rows"] == TRACKED
+    assert placed["errors"]["all"]["rms_m"] <= still["errors"]["all"]["rms_m"]
+    a, b = (torch.tensor(placed["session_transforms"][name], dtype=torch.float64) for name in "ab")
+    torch.testing.assert_close(
+        b[:3, 3] - a[:3, 3], torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64), rtol=0, atol=2e-3
+    )
+
+
+@pytest.mark.slow
+def test_models_with_payloads_ask_for_them(tmp_path: Path, command: Command) -> None:
+    kind = kind_named("payloads")
+    table, options = kind.table("new")
+    at = options.index("--payload")
+    without, out = [*options[:at], *options[at + 2 :]], ["-o", tmp_path / "out"]
+    for words in (
+        ["evaluate", kind.file, table, *without],
+        ["report", kind.file, table, *without, *out],
+        ["recalibrate", kind.file, table, *without, *out],
+        ["predict", kind.file, table, *UNITS, *out],
+        ["correct", kind.file, table, *UNITS, *out],
+    ):
+        refused = command(*words)
+        assert refused.code == 1
+        assert "payload" in refused.error
+
+
+@pytest.mark.slow
+def test_a_mass_that_is_a_number_holds_for_all_rows(tmp_path: Path, command: Command) -> None:
+    kind = kind_named("payloads")
+    done = command("predict", kind.file, kind.table("new")[0], *UNITS, "--payload", "4", "-o", tmp_path / "p.csv")
+    assert done.code == 0, done.err
+    written = np.genfromtxt(tmp_path / "p.csv", delimiter=",", names=True)
+    places = torch.from_numpy(np.stack([written[axis] for axis in "xyz"], 1)) / 1e3
+    assert_close(places, kind.model.with_payload(4.0)(kind.new.q).detach()[:, 0], rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_masses_that_cannot_be(tmp_path: Path, command: Command) -> None:
+    kind = kind_named("payloads")
+    table, options = kind.table("new")
+    text = table.read_text().splitlines()
+    cells = text[2].split(",")
+    cells[text[0].split(",").index("payload")] = "-5"
+    (tmp_path / "t.csv").write_text("\n".join([*text[:2], ",".join(cells), *text[3:]]) + "\n")
+    done = command("evaluate", kind.file, tmp_path / "t.csv", *options)
+    assert "line 3, column 'payload': expected a mass of 0 or more, got '-5'" in done.error
