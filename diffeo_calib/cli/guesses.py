@@ -27,7 +27,6 @@ from diffeo_calib.sensors.kinds import known_kinds
 SEPARATORS = (",", ";", "\t", "|", " ")
 DECIMALS = (".", ",")
 ROWS_LOOKED_AT = 50
-"""Rows that are looked at."""
 PIXELS = ("u", "v"), ("pixelu", "pixelv"), ("upx", "vpx")
 """Names of columns of images."""
 LENS, SOME_LENS = "FX,FY,CX,CY", "1000,1000,500,500"
@@ -323,7 +322,6 @@ def _without(one: Column, words: frozenset[str]) -> str:
 
 
 USUAL_SIZES = (640, 480), (1280, 720), (1280, 960), (1920, 1080), (2048, 1536), (2592, 1944), (4096, 3072), (8192, 8192)
-"""Widths and heights of images, pixels."""
 BELOW = (12, 13, 14)
 """Places of the zeros below a rotation, of a matrix by rows."""
 
@@ -354,18 +352,13 @@ def entries(tables: Sequence[Any], **why: str) -> Iterator[Choice]:
 
 @dataclass(frozen=True)
 class RowColumns:
-    """Columns of what was measured, by their names.
+    """Columns of what was measured, by their names."""
 
-    Args:
-        bodies: of positions or poses. sockets: of place and socket. readings: texts of `fit --reading`.
-        named: option -> column of the device or its set-up, the payload, time, temperature. left: not used, and why.
-    """
-
-    bodies: list[Body]
-    sockets: list[str]
-    readings: list[str]
-    named: dict[str, str]
-    left: Sequence[str] = ()
+    bodies: list[Body]  # of positions or poses
+    sockets: list[str]  # of place and socket
+    readings: list[str]  # texts of `fit --reading`
+    named: dict[str, str]  # option -> column of the device or its set-up, the payload, time, temperature
+    left: Sequence[str] = ()  # not used, and why
 
     @property
     def markers(self) -> list[list[str]]:

@@ -51,20 +51,15 @@ length, or a number that differs from row to row."""
 
 
 class Hypothesis(NamedTuple):
-    """Something that may be wrong, or change, of a device, the robot or its tool.
+    """Something that may be wrong, or change, of a device, the robot or its tool."""
 
-    Args:
-        name: in words. effects: (N, r, U) derivatives of N rows by its unknowns, m. unit: of a single unknown, and its
-            size in m, rad or relative; None to report the motion. fix: what to do about it.
-        about: :data:`CHANGE`, :data:`VALUE` or :data:`ROW`. usual: its deviation in right rows, of a ratio that the fit
-            takes up; 0 for what it cannot tell from the robot's size.
-    """
-
-    name: str
-    effects: Tensor
+    name: str  # in words
+    effects: Tensor  # (N, r, U) derivatives of N rows by its unknowns, m
+    # of a single unknown, and its size in m, rad or relative; None to report the motion
     unit: tuple[str, float] | None = None
-    fix: str = "name the rows before and after as two devices, or use those before or after it"
-    about: str = CHANGE
+    fix: str = "name the rows before and after as two devices, or use those before or after it"  # what to do about it
+    about: str = CHANGE  # :data:`CHANGE`, :data:`VALUE` or :data:`ROW`
+    # its deviation in right rows, of a ratio that the fit takes up; 0 for what it cannot tell from the robot's size
     usual: float = 0.0
 
     def amount(self, size: float, sign: str = "") -> str:

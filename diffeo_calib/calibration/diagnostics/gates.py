@@ -26,8 +26,9 @@ WORTH = 0.97
 SURE = 3.0
 """Standard deviations from which a fall of squared left-out errors is no chance."""
 
-TWO_TOOLS_LEFT = 0.45
-"""Part of the left-out error that may remain with two tools in turn: noise that is halved by its sign leaves .8."""
+MIXED_ROWS, TWO_TOOLS_LEFT = 40, 0.45
+"""Rows below which tools or payloads of each prove nothing, and the part of the left-out error that may remain with two
+tools in turn: noise that is halved by its sign leaves .8."""
 PAYLOAD_ODDS, PAYLOADS_LEFT = 12.0, 0.75
 """Log odds of other payloads, beyond those by chance where every row may have any, and the part of the left-out error
 that may remain with them: of right columns 5 at most beyond chance, and .9 or more remain."""

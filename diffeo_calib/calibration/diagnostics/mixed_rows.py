@@ -88,7 +88,7 @@ def two_tools(data: TangentData, scales: Hyperparameters, lines: Tensor) -> str 
     """
     rows, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed=0)
     change = next((one for one in changes_of(some) if one.name == MARKERS), None)
-    if change is None:
+    if change is None or len(rows) < gates.MIXED_ROWS:
         return None
     process, N = some.process(scales), len(rows)
     E = change.effects * some.place_deviation
@@ -119,7 +119,7 @@ def other_payloads(data: TangentData, scales: Hyperparameters, lines: Tensor) ->
         data: N rows. scales: those of the model. lines: (N,) of the rows in their file.
     """
     masses, unit = data.nominal.load.masses.to(data.x), data.nominal.load.unit
-    if not data.nominal.load.by_row or len(masses.unique()) > gates.MOST_MASSES:
+    if not data.nominal.load.by_row or len(masses.unique()) > gates.MOST_MASSES or len(masses) < gates.MIXED_ROWS:
         return None
     rows, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed=0)
     process, part, own = some.process(scales), some.nominal.sag, masses[rows] / unit

@@ -46,7 +46,6 @@ from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, Evaluation
 from diffeo_calib.sensors.set_ups import SESSION
 
 COLUMNS = ("line", "used_in_fit", "kind", "device", "marker", "dx", "dy", "dz", "size", "unit")
-"""Of the table of residuals."""
 
 
 def run(options: EvaluateOptions) -> None:

@@ -27,7 +27,6 @@ Lines = list[tuple[int, list[str]]]
 """Line number in the file and cells of every line that is not blank."""
 
 Cells = Sequence[Sequence[float | str]]
-"""Rows of cells: numbers and texts."""
 Column = Sequence[str] | Sequence[float]
 
 HEAD = 200
@@ -36,14 +35,12 @@ AT_ONCE = 1 << 13
 """Bytes by which a file is judged."""
 WIDE = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 COMMENTS = "#", "%", "//"
-"""Marks that begin a comment."""
 DAMAGED = re.compile(r"#[A-Z/0]+[!?]")
 """Cells such as #VALUE! and #DIV/0!, with which spreadsheets say that a formula failed: no comments."""
 LENGTHS = {"m": "m", "mm": "mm", "cm": "cm", "um": "um", "µm": "um", "in": "inch", "inch": "inch"}
 ANGLES = {"rad": "rad", "radians": "rad", "mrad": "mrad", "deg": "deg", "degrees": "deg", "°": "deg"}
 """Units as they are written, and their names."""
 OTHERS = re.compile(r"[mu]?s|sec|min|h|k?g|nm?|°?c|k|v|px|pixels?|%|-|none")
-"""Further units."""
 
 
 class CsvLines:
