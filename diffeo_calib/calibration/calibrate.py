@@ -26,6 +26,7 @@ from diffeo_calib.calibration.choose_scales import (
 )
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import lengths, warn_of_lengths, worth_it
+from diffeo_calib.calibration.diagnostics.mixed_rows import other_payloads, two_tools
 from diffeo_calib.calibration.diagnostics.moved_devices import change_during, crooked_axis
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.outliers import (
@@ -227,10 +228,13 @@ def _result(
     explained, found = parts(model), outliers(model, placed, data, chosen.judged, least)
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
     warn_of_outliers(found, placed.data)
-    changed = placed.mislabelled(model, found)
-    if changed is None:
-        devices, lines = placed.placement.hypotheses(data, CHANGE), placed.data.line_numbers
-        changed = change_during(lines, data, scales, chosen.left_out, devices, bodies=placed.placement.bodies)
+    lines, devices = placed.data.line_numbers, placed.placement.hypotheses(data, CHANGE)
+    changed = (
+        placed.mislabelled(model, found)
+        or other_payloads(data, scales, lines)
+        or change_during(lines, data, scales, chosen.left_out, devices, bodies=placed.placement.bodies)
+        or two_tools(data, scales, lines)
+    )
     warn_of_contradictions(model, placed.coordinates, found, changed)
     warn_of_rounding(robot, placed.data, data, chosen.left_out)
     found_lengths = lengths(data, scales, placed.placement.hypotheses(data, VALUE))
