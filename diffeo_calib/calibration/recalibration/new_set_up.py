@@ -49,27 +49,18 @@ from diffeo_calib.sensors.tables import (
 
 @dataclass(frozen=True, eq=False)
 class Before:
-    """The old map in its own frame, and the new rows.
+    """The old map in its own frame, and the new rows."""
 
-    Args:
-        fitted: the old map, with the ball of the new rows. nominal: its nominal map.
-        data: the new rows. coordinates: those that tell coordinates, with the markers of the map, in the frame of the
-            largest set-up. readings: the others.
-        place: where device and markers were found; None where no device measured coordinates.
-        sessions: frames of the set-ups, if there are several: a set of devices.
-        ball: (3,) where the new rows by themselves put the ball on its tip, m; None without one.
-        new_ball: whether the old model does not know it.
-    """
-
-    fitted: FittedMap
-    nominal: GeometryMap
-    data: Any
+    fitted: FittedMap  # the old map, with the ball of the new rows
+    nominal: GeometryMap  # its nominal map
+    data: Any  # the new rows
+    # those that tell coordinates, with the markers of the map, in the frame of the largest set-up
     coordinates: Coordinates | None
-    readings: list[OtherReadings]
-    place: FoundPlace | None
-    sessions: list[Sessions]
-    ball: Tensor | None
-    new_ball: bool
+    readings: list[OtherReadings]  # the others
+    place: FoundPlace | None  # where device and markers were found; None where no device measured coordinates
+    sessions: list[Sessions]  # frames of the set-ups, if there are several: a set of devices
+    ball: Tensor | None  # (3,) where the new rows by themselves put the ball on its tip, m; None without one
+    new_ball: bool  # whether the old model does not know it
 
     @property
     def registration(self) -> Registration | None:

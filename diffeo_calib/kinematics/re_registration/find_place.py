@@ -146,20 +146,14 @@ def _priors(free: str, marker_std: float | None, *, known: bool) -> tuple[float,
 
 @dataclass(frozen=True, eq=False)
 class SetUp:
-    """What may be open in rows of a new set-up, and where a search for it may begin.
+    """What may be open in rows of a new set-up, and where a search for it may begin."""
 
-    Args:
-        model: the map, placed anew before or not. nominal: that of the fit, under the payloads of the rows.
-        data: M rows that show P points. old: (P, 3) where the model has them, or at the tip, m.
-        known: whether they may be there. free: (6 + 3 P,) boolean, which unknowns of frame and points may have moved.
-    """
-
-    model: FittedMap
-    nominal: GeometryMap
-    data: Measurements
-    old: Tensor
-    known: bool
-    free: Tensor
+    model: FittedMap  # the map, placed anew before or not
+    nominal: GeometryMap  # that of the fit, under the payloads of the rows
+    data: Measurements  # M rows that show P points
+    old: Tensor  # (P, 3) where the model has them, or at the tip, m
+    known: bool  # whether they may be there
+    free: Tensor  # (6 + 3 P,) boolean, which unknowns of frame and points may have moved
 
     @classmethod
     def of(
