@@ -218,9 +218,7 @@ def _result(
         left_out=left_out,
         inflation=rows.inflation,
         fit=fitted,
-        shift=None
-        if found is None
-        else (again.geometry.tool - fitted_markers(place.fitted)) * place.seen_before[:, None],
+        shift=None if found is None else away * place.seen_before[:, None],
         hidden=hidden_offsets(model.robot, place.place, changes),
     )
 
