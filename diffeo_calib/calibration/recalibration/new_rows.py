@@ -30,7 +30,7 @@ from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.re_registration.find_place import MARKER_DEVIATIONS, UNMOVED_LOG_ODDS
 from diffeo_calib.kinematics.re_registration.new_rows import NewRows, larger, noise_of_rows, typical_noise
-from diffeo_calib.kinematics.re_registration.registered_map import robot_map
+from diffeo_calib.kinematics.re_registration.registered_map import fitted_markers, robot_map
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.measurements.table import Measurements
@@ -284,7 +284,7 @@ def weighed(before: Before, marker: str) -> WeighedRows:
     Args:
         before: the old map, and where devices and markers are. marker: see :func:`diffeo_calib.recalibrate`.
     """
-    own, place, ball = before.own_markers, before.place, None if before.new_ball else before.ball
+    own, place, ball = fitted_markers(before.fitted), before.place, None if before.new_ball else before.ball
     other, known = own.clone(), slice(len(own) - before.new_ball)
     if place is not None:
         other[known] = place.registration.markers[known]

@@ -79,12 +79,6 @@ class Before:
         return self.place is None and self.fitted.stands_free
 
     @property
-    def own_markers(self) -> Tensor:
-        """(P, 3) the markers of the map, in the frames of their tips, m."""
-        theta = self.fitted.deformation.momenta.theta
-        return self.nominal.geometry.tool + theta[self.nominal.geometry.slices["tool"]].view(-1, 3)
-
-    @property
     def seen_before(self) -> Tensor:
         """(P,) boolean: the markers that new rows show and that old rows showed."""
         seen = torch.zeros(self.nominal.geometry.markers, dtype=torch.bool, device=HOST)

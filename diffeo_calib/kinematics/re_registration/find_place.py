@@ -26,7 +26,13 @@ from diffeo_calib.common.quantiles import known
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
 from diffeo_calib.kinematics.re_registration.new_rows import NewRows, noise_of_rows
-from diffeo_calib.kinematics.re_registration.registered_map import HARDLY, Registration, turned, undetermined
+from diffeo_calib.kinematics.re_registration.registered_map import (
+    HARDLY,
+    Registration,
+    fitted_markers,
+    turned,
+    undetermined,
+)
 from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_points, tool_transform
 from diffeo_calib.maps.noise import measured_coordinates, without_hidden
 from diffeo_calib.measurements.bodies import Bodies
@@ -154,9 +160,8 @@ class SetUp:
         cls, model: FittedMap, nominal: GeometryMap, lever: float | None, data: Measurements, free: str, *, ball: bool
     ) -> SetUp:
         """The rows beside a model; arguments and errors as of :func:`find_place`."""
-        before, theta = model.registration, model.unregistered.deformation.momenta.theta
-        markers = nominal.geometry.tool + theta[nominal.geometry.slices["tool"]].view(-1, 3)
-        markers = markers if before is None else before.markers
+        before = model.registration
+        markers = fitted_markers(model.unregistered) if before is None else before.markers
         own, seen = Bodies(lever), data.bodies
         known = own.kind == seen.kind and data.markers == len(markers)
         if known:
