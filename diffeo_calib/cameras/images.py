@@ -158,21 +158,13 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Sights:
-    """Measurements from N images of one camera.
+    """Measurements from N images of one camera."""
 
-    Args:
-        camera: lens and board.
-        poses: (N, 4, 4) of the board in the camera's frame, m.
-        covariance: (N, 6, 6) of the own errors of shift (m) and turn (rad), in the camera's axes.
-        shared: (N, 6, c) effects of the c errors, of unit variance, that all images share.
-        rms: (N,) of the corners' errors, pixels.
-    """
-
-    camera: Camera
-    poses: Tensor
-    covariance: Tensor
-    shared: Tensor
-    rms: Tensor
+    camera: Camera  # lens and board
+    poses: Tensor  # (N, 4, 4) of the board in the camera's frame, m
+    covariance: Tensor  # (N, 6, 6) of the own errors of shift (m) and turn (rad), in the camera's axes
+    shared: Tensor  # (N, 6, c) effects of the c errors, of unit variance, that all images share
+    rms: Tensor  # (N,) of the corners' errors, pixels
 
 
 def sighted(images: Images, camera: Camera | None = None, board: BoardPrior | None = None) -> Sights:

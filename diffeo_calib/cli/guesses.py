@@ -352,18 +352,13 @@ def entries(tables: Sequence[Any], **why: str) -> Iterator[Choice]:
 
 @dataclass(frozen=True)
 class RowColumns:
-    """Columns of what was measured, by their names.
+    """Columns of what was measured, by their names."""
 
-    Args:
-        bodies: of positions or poses. sockets: of place and socket. readings: texts of `fit --reading`.
-        named: option -> column of the device or its set-up, the payload, time, temperature. left: not used, and why.
-    """
-
-    bodies: list[Body]
-    sockets: list[str]
-    readings: list[str]
-    named: dict[str, str]
-    left: Sequence[str] = ()
+    bodies: list[Body]  # of positions or poses
+    sockets: list[str]  # of place and socket
+    readings: list[str]  # texts of `fit --reading`
+    named: dict[str, str]  # option -> column of the device or its set-up, the payload, time, temperature
+    left: Sequence[str] = ()  # not used, and why
 
     @property
     def markers(self) -> list[list[str]]:

@@ -187,19 +187,15 @@ def _stated(words: Sequence[str], group: type[Units] | type[Rows]) -> dict[str, 
 
 @dataclass(frozen=True)
 class MeasuredTable:
-    """A table of measurements as the options describe it.
-
-    Args:
-        joints: names of the joint columns, separated by commas; None if they are named after the robot's joints; or
-            the columns of a pose. table: what it holds, but for the joints.
-        duplicates: what to do with exactly repeated rows. growing: whether rows will be added.
-    """
+    """A table of measurements as the options describe it."""
 
     csv: Path
+    # names of the joint columns, separated by commas; None if they are named after the robot's joints; or the columns
+    # of a pose
     joints: str | PoseColumns | None
-    table: TableFormat
-    duplicates: str = "keep"
-    growing: bool = False
+    table: TableFormat  # what it holds, but for the joints
+    duplicates: str = "keep"  # what to do with exactly repeated rows
+    growing: bool = False  # whether rows will be added
 
     def read(self, robot: Tree, tips: Sequence[str] = ()) -> Any:
         """The rows of a robot, under the names of its own joints, as of :func:`read_observations`.

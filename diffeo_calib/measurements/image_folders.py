@@ -42,21 +42,14 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Folder:
-    """Corners found in the images of a folder.
+    """Corners found in the images of a folder."""
 
-    Args:
-        name: of the folder, and of its camera. board: that was looked for. header: names of the joint columns.
-        images: in the order of the table.
-        size: width and height, pixels.
-        paired: how rows and images were, unless the table names these.
-    """
-
-    name: str
-    board: Board
-    header: list[str]
-    images: list[Seen]
-    size: tuple[int, int]
-    paired: str
+    name: str  # of the folder, and of its camera
+    board: Board  # that was looked for
+    header: list[str]  # names of the joint columns
+    images: list[Seen]  # in the order of the table
+    size: tuple[int, int]  # width and height, pixels
+    paired: str  # how rows and images were, unless the table names these
 
     @property
     def used(self) -> list[Seen]:

@@ -40,20 +40,15 @@ LARGEST_MEDIAN_M = 5e-3
 
 @dataclass(frozen=True)
 class Beside:
-    """Kinematics that rows are compared with.
+    """Kinematics that rows are compared with."""
 
-    Args:
-        points: a table -> (N, P, 3) points of the tool under the payloads of its rows, m, the ball last.
-        known: devices whose places are known, by kind. turns: of its tips; None for kinematics that do not tell.
-        unplaced: whether positions are in another frame than that of the kinematics, which no device has seen.
-        every_session: whether the frame of a single set-up is to be found too.
-    """
-
+    # a table -> (N, P, 3) points of the tool under the payloads of its rows, m, the ball last
     points: Callable[[Any], Tensor]
-    known: Mapping[str, Any]
-    turns: Turns | None = None
+    known: Mapping[str, Any]  # devices whose places are known, by kind
+    turns: Turns | None = None  # of its tips; None for kinematics that do not tell
+    # whether positions are in another frame than that of the kinematics, which no device has seen
     unplaced: bool = False
-    every_session: bool = False
+    every_session: bool = False  # whether the frame of a single set-up is to be found too
 
 
 class Sensor(ABC):
