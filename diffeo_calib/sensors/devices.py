@@ -59,6 +59,8 @@ class Hypothesis(NamedTuple):
     unit: tuple[str, float] | None = None
     fix: str = "name the rows before and after as two devices, or use those before or after it"  # what to do about it
     about: str = CHANGE  # :data:`CHANGE`, :data:`VALUE` or :data:`ROW`
+    # its deviation in right rows, of a ratio that the fit takes up; 0 for what it cannot tell from the robot's size
+    usual: float = 0.0
 
     def amount(self, size: float, sign: str = "") -> str:
         """A size of its unknown, m, rad or relative, with its unit."""
