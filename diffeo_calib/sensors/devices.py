@@ -59,6 +59,8 @@ class Hypothesis(NamedTuple):
     unit: tuple[str, float] | None = None
     fix: str = "name the rows before and after as two devices, or use those before or after it"  # what to do about it
     about: str = CHANGE  # :data:`CHANGE`, :data:`VALUE` or :data:`ROW`
+    # its deviation in right rows, of a ratio that the fit takes up; 0 for what it cannot tell from the robot's size
+    usual: float = 0.0
 
     def amount(self, size: float, sign: str = "") -> str:
         """A size of its unknown, m, rad or relative, with its unit."""
@@ -191,6 +193,11 @@ class Devices(Extrinsics):
         """Constants (c,) of one device after increments (k,)."""
         return constants + increments
 
+    @staticmethod
+    def turned(values: Tensor, T: Tensor) -> Tensor:
+        """Readings (N, r) in another frame, to which T (4, 4) leads: others only where they are along its axes."""
+        return values
+
     @classmethod
     def check_seen(cls, constants: Tensor, points: Tensor) -> None:
         """Raise InputError for points (N, 3 k) of which devices with constants (N, c) have no reading."""
@@ -309,15 +316,15 @@ class Devices(Extrinsics):
         return [self.sentence(number, own, MODEL_FRAME) for number, own in enumerate(self.deviations)]
 
     def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
-        return torch.stack([self.only([name])._carried(before, after) for name in self.names])
+        return torch.stack([self.only([name])._carried(T, before, after) for name in self.names])
 
-    def _carried(self, before: Tensor, after: Tensor) -> Tensor:
+    def _carried(self, T: Tensor, before: Tensor, after: Tensor) -> Tensor:
         """Constants (c,) of the device that reads of points (N, P, 3) what this one reads of others, m."""
         old, new = self.points_of(before), self.points_of(after)
         own = torch.zeros(len(old), dtype=torch.int64, device=old.device)
         sees = self.sees(old, own)
         old, new, own = old[sees], new[sees], own[sees]
-        values = self.observation(own).value(old) / self.metres
+        values = self.turned(self.observation(own).value(old) / self.metres, T)
         start = replace(self, constants=self.start(values, self.bodies(new))[None])
         return start.refined(Readings(self.kind, old[:, :1], values, own, self.names), new).constants[0]
 
