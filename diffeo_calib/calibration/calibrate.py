@@ -17,6 +17,7 @@ from functools import partial
 from typing import Literal
 
 from diffeo_calib.calibration.choose_scales import (
+    FEWEST_JUDGED,
     FEWEST_POSES,
     RESIDUAL_TOLERANCE,
     ChosenScales,
@@ -25,7 +26,12 @@ from diffeo_calib.calibration.choose_scales import (
     robot_problem,
 )
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.hypotheses import lengths, warn_of_lengths, worth_it
+from diffeo_calib.calibration.diagnostics.hypotheses import (
+    lengths,
+    warn_of_lengths,
+    warn_of_taken_scales,
+    worth_it,
+)
 from diffeo_calib.calibration.diagnostics.mixed_rows import other_payloads, two_tools
 from diffeo_calib.calibration.diagnostics.moved_devices import change_during, crooked_axis
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_what_is_open
@@ -182,6 +188,8 @@ def calibrate(
             again = choose(drifting.tangent_data(), measurements, *stages)
             if worth_it(chosen.left_out.errors, again.left_out.errors):
                 placed, chosen = drifting, again
+        if scales_of and len(data.x) >= FEWEST_JUDGED and not chosen.selection.interrupted:
+            warn_of_taken_scales(chosen.left_out, choose(data, measurements, *stages, models=()).left_out)
         how = chosen.selection
         if not how.interrupted and (widened := placed.widened(chosen.data, how.scales)):
             placed, found = widened
@@ -243,10 +251,7 @@ def _result(
         leave_one_out_rms=placed.by_kind(chosen.left_out.errors).positions_rms,
         outliers=len(found),
         noise_degrees_of_freedom=data.tails.freedom,
-        coupling_residual=fitted.coupling_residual,
-        end_residual=fitted.end_residual,
-        energy=fitted.energy,
-        status=fitted.status,
+        **{name: getattr(fitted, name) for name in ("coupling_residual", "end_residual", "energy", "status")},
         scales=chosen.selection.status,
         rows=len(data.x),
         parts={part.name: part.displacement for part in explained},

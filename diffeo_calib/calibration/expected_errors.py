@@ -189,14 +189,10 @@ class OpenPlaces:
 
     With S and S_0 the derivatives of the points anywhere and in the rows by these places, of deviations D, the
     directions w of unit variance that |S D w|^2 = c^2 (|S_0 D w|^2 + noise^2) for a large c.
-
-    Args:
-        motions: (M m, k) of the points at the configurations of the workspace.
-        directions: (6 + 3 P, k) of base and markers, m and rad.
     """
 
-    motions: Tensor
-    directions: Tensor
+    motions: Tensor  # (M m, k) of the points at the configurations of the workspace
+    directions: Tensor  # (6 + 3 P, k) of base and markers, m and rad
 
     @classmethod
     def of(cls, fitted: FittedMap) -> OpenPlaces:

@@ -9,12 +9,19 @@ from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
-
-from typing_extensions import dataclass_transform
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.table_format import described
+
+if TYPE_CHECKING:
+    from typing_extensions import dataclass_transform
+else:  # what type checkers alone understand, and Python 3.10 does not have
+
+    def dataclass_transform(**_: object) -> Any:
+        """Nothing at run time."""
+        return lambda kind: kind
+
 
 Kind = Literal["read", "write", "source", "later", "folder"]
 """A file must exist, is written, is written with a header beside it, may come later; or is a folder that is made."""

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import outside_inference_mode
+from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.joint_ranges import SAME_CONFIGURATION, check_same_robot, fitted_configurations
@@ -154,6 +154,14 @@ def rows_used_in_fit(model: CalibratedKinematics, q: object) -> Tensor:
     fitted = fitted_configurations(model)
     blocks = model.robot.joint_values(q).detach().split(ROWS_AT_ONCE)  # pyright: ignore[reportArgumentType]
     return torch.cat([torch.cdist(block, fitted, p=inf).amin(1) < SAME_CONFIGURATION for block in blocks])
+
+
+def unseen(model: CalibratedKinematics, q: Tensor) -> Tensor:
+    """(N,) which configurations took no part in the fit, nor in a registration."""
+    new = ~rows_used_in_fit(model, q)
+    if model.registration is not None:
+        new &= torch.cdist(q, model.registration.q.to(q), p=inf).amin(1) > SAME_CONFIGURATION
+    return new.to(HOST)
 
 
 def rows_of_other_frames(model: CalibratedKinematics, q: Tensor) -> int:

@@ -155,24 +155,17 @@ def hand_eye_sentences(found: Mapping[str, HandEye]) -> Iterator[str]:
 
 
 class SetUp(NamedTuple):
-    """A set-up of a model: where it measured, and what was on the tool.
+    """A set-up of a model: where it measured, and what was on the tool."""
 
-    Args:
-        transform: (4, 4) from the model's measuring frame to its own, m. mount: (4, 4) from what it had on the tool to
-            that of the model, m.
-        framed: whether the measuring frame was moved, not what is on the tool.
-        columns: (c,) boolean, the shifts of the fit that move its rows, not those of the others; None for the model's.
-        twists: (6, k) shift and turn by each of them, m and rad: of the measuring frame about the model's origin, or
-            of what is on the tool along the axes of the model's tool.
-        mount_std: (6,) deviations of what is on the tool where no row of the fit tells of them.
-    """
-
-    transform: Tensor
-    mount: Tensor
-    framed: bool = False
+    transform: Tensor  # (4, 4) from the model's measuring frame to its own, m
+    mount: Tensor  # (4, 4) from what it had on the tool to that of the model, m
+    framed: bool = False  # whether the measuring frame was moved, not what is on the tool
+    # (c,) boolean, the shifts of the fit that move its rows, not those of the others; None for the model's
     columns: Tensor | None = None
+    # (6, k) shift and turn by each of them, m and rad: of the measuring frame about the model's origin, or of what is
+    # on the tool along the axes of the model's tool
     twists: Tensor | None = None
-    mount_std: Tensor | None = None
+    mount_std: Tensor | None = None  # (6,) deviations of what is on the tool where no row of the fit tells of them
 
     @classmethod
     def of(cls, model: CalibratedKinematics, name: str | None) -> SetUp:

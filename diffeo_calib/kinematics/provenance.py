@@ -165,7 +165,7 @@ def read(value: Any, hint: Any, name: str, what: str) -> Any:
     kinds = get_args(hint) or (hint,)
     if value is None and type(None) in kinds:
         return None
-    kind = kinds[0]
+    kind: Any = kinds[0]
     if kind is float and value == INFINITE:
         return inf
     accepted = (int, float) if kind is float else kind  # a whole number may stand for a float

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -150,3 +151,25 @@ def test_a_slide_in_inch_is_refused_by_name(tmp_path: Path) -> None:
     q[:, 0] /= 0.0254
     message = r"prismatic joints seem to be 39.37 times too large.*`joint_length`"
     refused((message, lambda: dc.calibrate(robot, dc.Measurements(q, y, doubt=False))))
+
+
+def larger(tmp_path: Path, factor: float) -> dc.Tree:
+    """The arm with all lengths multiplied."""
+    text = re.sub(
+        'xyz="([^"]*)" rpy',
+        lambda found: f'xyz="{" ".join(str(factor * float(word)) for word in found[1].split())}" rpy',
+        URDF_FILE.read_text(encoding="utf-8"),
+    )
+    (tmp_path / "larger.urdf").write_text(text, encoding="utf-8")
+    return dc.load_urdf(tmp_path / "larger.urdf", "base_link", "flange")
+
+
+def test_scales_of_robots_that_do_not_suit_are_refused_or_named(tmp_path: Path) -> None:
+    q, y = SimulatedArm(0).measure(60, seed=9)
+    robot, other = larger(tmp_path, 1.4), SimulatedArm(77).measure(60, seed=3)
+    model = dc.calibrate(robot, dc.Measurements(other[0], 1.4 * other[1])).model
+    with pytest.warns(DiffeoCalibWarning, match="`scales_of` does not suit these rows: got leave-one-out errors"):
+        dc.calibrate(ARM.nominal, dc.Measurements(q, y), scales_of=[model])
+    data = dc.Measurements(q, y)
+    message = "`scales_of`, model 1: expected one of about 0.*got a reach of"
+    refused((message, lambda: dc.calibrate(larger(tmp_path, 0.6), data, scales_of=[model])))

@@ -55,23 +55,16 @@ NO_MISTAKE_FOUND = (
 
 @dataclass(frozen=True)
 class Reading:
-    """Measurements as they might have been meant.
+    """Measurements as they might have been meant."""
 
-    Args:
-        robot: the chain. q: (N, n) rad or m. points: (N, P, 3) m.
-        words: what was changed.
-        option: the option that reads the table so, where readings differ by one option alone; else empty.
-        partial: whether it explains a part of the measurements only, and is used if nothing else explains them.
-        on: tips of the markers; the robot's first tip by default.
-    """
-
-    robot: Tree
-    q: Tensor
-    points: Tensor
-    words: str = ""
-    option: str = ""
+    robot: Tree  # the chain
+    q: Tensor  # (N, n) rad or m
+    points: Tensor  # (N, P, 3) m
+    words: str = ""  # what was changed
+    option: str = ""  # the option that reads the table so, where readings differ by one option alone; else empty
+    # whether it explains a part of the measurements only, and is used if nothing else explains them
     partial: bool = False
-    on: tuple[str, ...] = ()
+    on: tuple[str, ...] = ()  # tips of the markers; the robot's first tip by default
 
     @classmethod
     def of(cls, robot: Tree, data: Measurements) -> Reading:

@@ -47,18 +47,12 @@ TOLD_APART = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Sessions(DeviceSet):
-    """Difference between sessions: measuring frames, or what is on the tool.
-
-    Args:
-        reference: the one whose frame and markers are those of the model.
-        markers: P that a device saw, the first ones of the geometry.
-        centre: (3,) about which frames turn, m; by default the middle of the rows.
-    """
+    """Difference between sessions: measuring frames, or what is on the tool."""
 
     devices: SetUps
-    reference: int
-    markers: int
-    centre: Tensor | None = None
+    reference: int  # the one whose frame and markers are those of the model
+    markers: int  # P that a device saw, the first ones of the geometry
+    centre: Tensor | None = None  # (3,) about which frames turn, m; by default the middle of the rows
 
     @classmethod
     def of_table(cls, robot: Tree, own: Coordinates, progress: Progress) -> tuple[list[Sessions], Measurements]:

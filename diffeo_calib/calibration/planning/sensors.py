@@ -28,29 +28,18 @@ from diffeo_calib.sensors.set_ups import frame_slopes
 
 
 class Scene(NamedTuple):
-    """M configurations as a robot or model has them, and what is known there before the first measurement.
+    """M configurations as a robot or model has them, and what is known there before the first measurement."""
 
-    Args:
-        known: the conditional. at: the configurations. first: number of the first new column.
-        points: (M, m) coordinates of the markers, m.
-        noise: (M, m, m) covariance of one measurement of them, m^2.
-        base: (4, 4) the robot's base in their frame, m.
-        averaged: (r, m) the markers, or the origins of measured poses. seen: the first coordinates, of points that a
-            device of positions sees.
-        free: whether nothing says where the robot stands in the frame of a measuring device.
-        shifts: number c0 of the shifts that rows of the fit shared.
-    """
-
-    known: Conditional
-    at: Linearisation
-    first: int
-    points: Tensor
-    noise: Tensor
-    base: Tensor
-    averaged: Tensor
-    seen: int
-    free: bool = False
-    shifts: int = 0
+    known: Conditional  # the conditional
+    at: Linearisation  # the configurations
+    first: int  # number of the first new column
+    points: Tensor  # (M, m) coordinates of the markers, m
+    noise: Tensor  # (M, m, m) covariance of one measurement of them, m^2
+    base: Tensor  # (4, 4) the robot's base in their frame, m
+    averaged: Tensor  # (r, m) the markers, or the origins of measured poses
+    seen: int  # the first coordinates, of points that a device of positions sees
+    free: bool = False  # whether nothing says where the robot stands in the frame of a measuring device
+    shifts: int = 0  # number c0 of the shifts that rows of the fit shared
 
     @property
     def motions(self) -> list[int]:
@@ -89,20 +78,14 @@ class Where(NamedTuple):
 
 
 class Options(NamedTuple):
-    """Measurements that can be made: O of them.
+    """Measurements that can be made: O of them."""
 
-    Args:
-        rows: (O,) numbers of the configurations. slopes: (O, r, m) A. shared: (O, r, c) D, the c0 shifts of the fit
-            first. noise: (O, r, r), m^2.
-        device: (O,) numbers of the devices. names: of the devices.
-    """
-
-    rows: Tensor
-    slopes: Tensor
-    shared: Tensor
-    noise: Tensor
-    device: Tensor
-    names: tuple[str, ...]
+    rows: Tensor  # (O,) numbers of the configurations
+    slopes: Tensor  # (O, r, m) A
+    shared: Tensor  # (O, r, c) D, the c0 shifts of the fit first
+    noise: Tensor  # (O, r, r), m^2
+    device: Tensor  # (O,) numbers of the devices
+    names: tuple[str, ...]  # of the devices
 
     @classmethod
     def joined(cls, parts: Sequence[Options], shifts: int) -> Options:
@@ -229,14 +212,10 @@ class Sensor(ABC):
 
 @dataclass(frozen=True)
 class Positions(Sensor):
-    """Positions of the markers, or poses.
+    """Positions of the markers, or poses."""
 
-    Args:
-        whole: whether poses of frames are measured, or their origins. new: whether by a device of no row of the model.
-    """
-
-    whole: bool = False
-    new: bool = False
+    whole: bool = False  # whether poses of frames are measured, or their origins
+    new: bool = False  # whether by a device of no row of the model
     of_positions: ClassVar[bool] = True
 
     def beside_others(self) -> Sensor:
@@ -268,14 +247,11 @@ class Positions(Sensor):
 
 @dataclass(frozen=True)
 class DeviceReadings(Sensor):
-    """Readings of the ball, of one kind.
+    """Readings of the ball, of one kind."""
 
-    Args:
-        devices: where they are, in the robot's base frame.
-        fitted: what a fit knows of the only one, which is in the frame of the model's positions; None for new devices.
-    """
-
+    # where they are, in the robot's base frame
     devices: Devices = None  # pyright: ignore[reportAssignmentType]  # always given
+    # what a fit knows of the only one, which is in the frame of the model's positions; None for new devices
     fitted: FittedDevice | None = None
 
     @classmethod

@@ -39,21 +39,16 @@ SMALLEST_REST_M = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class BoardImages(Sensor):
-    """Images of the board by one camera of a fit.
+    """Images of the board by one camera of a fit."""
 
-    Args:
-        name: of the camera. seen: lens, board and what its images showed. lever: of the model's poses, m.
-        set_up: where it is.
-        effects: (14, c0) of the shifts of the fit on lens and board; None where these are new shifts, as beside a
-            registration. rest: (9, 9) noise of a pose beyond that of its corners, m^2.
-    """
-
-    name: str = ""
+    name: str = ""  # of the camera
+    # lens, board and what its images showed
     seen: BoardCamera = None  # pyright: ignore[reportAssignmentType]  # always given
-    lever: float = 0.0
-    set_up: SetUp = None  # pyright: ignore[reportAssignmentType]
+    lever: float = 0.0  # of the model's poses, m
+    set_up: SetUp = None  # pyright: ignore[reportAssignmentType]  # where it is
+    # (14, c0) of the shifts of the fit on lens and board; None where these are new shifts, as beside a registration
     effects: Tensor | None = None
-    rest: Tensor | None = None
+    rest: Tensor | None = None  # (9, 9) noise of a pose beyond that of its corners, m^2
 
     @property
     def camera(self) -> Camera:

@@ -50,19 +50,13 @@ SMALLEST_FREEDOM = 8.0
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """Errors of each configuration's measurement as predicted from all others of its block.
+    """Errors of each configuration's measurement as predicted from all others of its block."""
 
-    Args:
-        errors: (N, m) measured minus predicted, m; NaN where markers are hidden.
-        squares: (N, bodies) squared distances in units of the predicted covariance, tails left out; NaN as well.
-        effective: effective number of parameters, trace of G (G + R)^-1; None with several blocks, since no block
-            is the whole fit.
-        numbers: how many were measured; those of the errors by default. A pose has six, its three points nine errors.
-    """
-
-    errors: Tensor
-    squares: Tensor
+    errors: Tensor  # (N, m) measured minus predicted, m; NaN where markers are hidden
+    squares: Tensor  # (N, bodies) squared distances in units of the predicted covariance, tails left out; NaN as well
+    # effective number of parameters, trace of G (G + R)^-1; None with several blocks, since no block is the whole fit
     effective: float | None
+    # how many were measured; those of the errors by default. A pose has six, its three points nine errors
     numbers: int | None = None
 
     @property

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import inf
 from typing import Any, NamedTuple
 
 import torch
@@ -26,9 +25,8 @@ from diffeo_calib.kinematics.evaluation import (
     placement_sentences,
     positions_of,
     residuals,
-    rows_used_in_fit,
+    unseen,
 )
-from diffeo_calib.kinematics.joint_ranges import SAME_CONFIGURATION
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
@@ -196,14 +194,6 @@ def find(
 
 NOTHING: dict[str, Any] = {"kinds": {}, "new": False, "predictions": None, "outliers": (), "moved": ()}
 """What a report shows of rows without any; of others with these entries."""
-
-
-def unseen(model: CalibratedKinematics, q: Tensor) -> Tensor:
-    """(N,) which configurations took no part in the fit, nor in a registration."""
-    new = ~rows_used_in_fit(model, q)
-    if model.registration is not None:
-        new &= torch.cdist(q, model.registration.q.to(q), p=inf).amin(1) > SAME_CONFIGURATION
-    return new.to(HOST)
 
 
 def _new_rows(model: CalibratedKinematics, data: Any, rows: FitRows) -> Tensor:
