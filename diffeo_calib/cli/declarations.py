@@ -412,7 +412,7 @@ class DemoOptions(Command):
     """
 
     output: Path = option("Folder to write everything to.", "FOLDER", Path("demo_output"), kind="folder")
-    count: int = option("Number of simulated measurements.", default=300, min=20)
+    count: int = option("Number of simulated measurements.", default=300, min=20, max=1_000_000)
     seed: int = option("Seed of the arm and the noise.", **SEED)
 
 

@@ -254,7 +254,7 @@ def _entries(path: Path) -> dict[str, Any]:
         return {name.replace("_", "-"): value for name, value in entries.items()}
     except OSError as error:
         raise InputError.of(f"{path} cannot be read ({error.strerror})", fix="check the path") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # TOML, text or a name that is none, or lists in lists
         fix = 'write one option per line: length = "mm"'
         raise InputError.of(f"{path} is no TOML", got=str(error), fix=fix) from error
 

@@ -118,6 +118,7 @@ def test_outliers_hardly_count() -> None:
     clean, spoilt = (dc.recalibrate(old(), rows, drift="none") for rows in (new, shifted(new, away)))
     assert spoilt.outliers == (3,)
     assert rms(spoilt.model) < 1.2 * rms(clean.model)
+    assert spoilt.inflation < 1.5 * clean.inflation  # regions are those of the robot, not of the wrong row
 
 
 def test_another_marker() -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import log
+from math import log, nan
 from typing import Any
 
 import torch
@@ -34,7 +34,7 @@ from diffeo_calib.kinematics.re_registration.registered_map import fitted_marker
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.process.tails import Tails, reweight
+from diffeo_calib.process.tails import Tails, gross_weights, reweight
 from diffeo_calib.regression.regions import OTHER_DATE, region_factor, region_scale
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import errors_of_kinds
@@ -233,7 +233,10 @@ class WeighedRows(NewRows):
         if self.observe is None and self.fitted.slopes is None:
             noise = noise * (self.new_noise.trace() / self.mean_noise.trace())
         squares = self.noise_model.squares(covariance - self.weighted_noise + noise, error @ error.mT)
-        return max(1.0, region_scale(squares, self.noise_model.freedom, prior=OTHER_DATE))
+        dim = self.noise_model.freedom
+        if (weights := gross_weights(squares, dim)) is not None:  # gross rows are named, and say nothing of the robot
+            squares = squares.masked_fill(weights < OUTLIER_WEIGHT, nan)
+        return max(1.0, region_scale(squares, dim, prior=OTHER_DATE))
 
     def _expected_squares(self) -> Tensor:
         """Expected squared distances of the errors in units of the noise without weights: (M, bodies)."""
