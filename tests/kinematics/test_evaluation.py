@@ -73,7 +73,7 @@ def test_errors_of_poses_are_distances_of_origins_and_angles(rows: int, lever: f
     poses = random_poses(rng, rows)
     shifts, vectors = 1e-3 * rng.normal(size=(rows, 3)), 1e-2 * rng.normal(size=(rows, 3))
     data = dc.Measurements.from_poses(rng.normal(size=(rows, 2)), poses, lever=lever)
-    found = dc.evaluate(lambda _: mark_points(moved(poses, shifts, vectors), lever), data)
+    found: Any = dc.evaluate(lambda _: mark_points(moved(poses, shifts, vectors), lever), data)
     distances, degrees = np.linalg.norm(shifts, axis=1), np.degrees(np.linalg.norm(vectors, axis=1))
     np.testing.assert_allclose(found.errors.numpy(), distances[:, None], rtol=1e-9)
     assert found.angles is not None
