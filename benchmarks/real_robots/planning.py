@@ -192,7 +192,7 @@ def carried_over(model: dc.CalibratedKinematics, new: dc.Measurements, test: dc.
         placed = model.registered(new, free="base", learn=False)
     start = of_model(placed, torch.cat([new.q, test.q]), "base")
     measured, tested = (start.at.rows(own) for own in torch.arange(len(start.at.xi)).split([len(new), len(test)]))
-    inner = start.known.covariance_between(measured) + torch.block_diag(*start.scene.noise[: len(new)])
+    inner = start.known.covariance_between(measured) + torch.block_diag(*start.noise[: len(new)])
     residual = torch.linalg.solve(inner, (new.points - placed(new.q)).flatten())
     known = start.known.covariance_between(tested, measured) @ residual
     errors = (placed(test.q) + known.view_as(test.points) - test.points).norm(dim=-1).flatten()

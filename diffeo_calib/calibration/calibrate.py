@@ -17,6 +17,7 @@ from functools import partial
 from typing import Literal
 
 from diffeo_calib.calibration.choose_scales import (
+    FEWEST_JUDGED,
     FEWEST_POSES,
     RESIDUAL_TOLERANCE,
     ChosenScales,
@@ -25,7 +26,13 @@ from diffeo_calib.calibration.choose_scales import (
     robot_problem,
 )
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.hypotheses import lengths, warn_of_lengths, worth_it
+from diffeo_calib.calibration.diagnostics.hypotheses import (
+    lengths,
+    warn_of_lengths,
+    warn_of_taken_scales,
+    worth_it,
+)
+from diffeo_calib.calibration.diagnostics.mixed_rows import other_payloads, two_tools
 from diffeo_calib.calibration.diagnostics.moved_devices import change_during, crooked_axis
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.outliers import (
@@ -181,6 +188,8 @@ def calibrate(
             again = choose(drifting.tangent_data(), measurements, *stages)
             if worth_it(chosen.left_out.errors, again.left_out.errors):
                 placed, chosen = drifting, again
+        if scales_of and len(data.x) >= FEWEST_JUDGED and not chosen.selection.interrupted:
+            warn_of_taken_scales(chosen.left_out, choose(data, measurements, *stages, models=()).left_out)
         how = chosen.selection
         if not how.interrupted and (widened := placed.widened(chosen.data, how.scales)):
             placed, found = widened
@@ -227,10 +236,13 @@ def _result(
     explained, found = parts(model), outliers(model, placed, data, chosen.judged, least)
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
     warn_of_outliers(found, placed.data)
-    changed = placed.mislabelled(model, found)
-    if changed is None:
-        devices, lines = placed.placement.hypotheses(data, CHANGE), placed.data.line_numbers
-        changed = change_during(lines, data, scales, chosen.left_out, devices, bodies=placed.placement.bodies)
+    lines, devices = placed.data.line_numbers, placed.placement.hypotheses(data, CHANGE)
+    changed = (
+        placed.mislabelled(model, found)
+        or other_payloads(data, scales, lines)
+        or change_during(lines, data, scales, chosen.left_out, devices, bodies=placed.placement.bodies)
+        or two_tools(data, scales, lines)
+    )
     warn_of_contradictions(model, placed.coordinates, found, changed)
     warn_of_rounding(robot, placed.data, data, chosen.left_out)
     found_lengths = lengths(data, scales, placed.placement.hypotheses(data, VALUE))
@@ -239,10 +251,7 @@ def _result(
         leave_one_out_rms=placed.by_kind(chosen.left_out.errors).positions_rms,
         outliers=len(found),
         noise_degrees_of_freedom=data.tails.freedom,
-        coupling_residual=fitted.coupling_residual,
-        end_residual=fitted.end_residual,
-        energy=fitted.energy,
-        status=fitted.status,
+        **{name: getattr(fitted, name) for name in ("coupling_residual", "end_residual", "energy", "status")},
         scales=chosen.selection.status,
         rows=len(data.x),
         parts={part.name: part.displacement for part in explained},

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import inf
 from typing import Any
 
 import torch
@@ -283,6 +284,10 @@ def _problem(data: TangentData, scales: Hyperparameters, noise: Tensor | None) -
     return problem.with_nominal_of_rows(data.nominal)
 
 
+MOST_REACH = 1.5
+"""Of robots of the same type, relative to each other: tools differ."""
+
+
 def check_models(models: object, robot: Tree) -> None:
     """Raise InputError unless these are models, with scales, of robots with the same kinds of joints."""
     if not isinstance(models, Sequence):
@@ -296,6 +301,10 @@ def check_models(models: object, robot: Tree) -> None:
         if own != other or robot.moving != model.robot.moving:
             got = f"{model.robot.n} joints, {sum(other)} of them revolute, {model.robot.moving} moving"
             expected = f"{robot.n} joints, {sum(own)} of them revolute, {robot.moving} moving, as of '{robot.name}'"
+            raise InputError.of(what, expected=expected, got=got, fix="pass models of the same type of robot")
+        ratio = model.robot.reach / robot.reach if robot.reach < inf else 1.0
+        if not 1 / MOST_REACH < ratio < MOST_REACH:
+            got, expected = f"a reach of {model.robot.reach:.3g} m", f"one of about {robot.reach:.3g} m"
             raise InputError.of(what, expected=expected, got=got, fix="pass models of the same type of robot")
         if model.scales is None:
             fix = "calibrate it again with this version"

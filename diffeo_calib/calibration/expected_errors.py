@@ -17,7 +17,7 @@ is known as poorly: that of all joints is then no smaller than that of any robot
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import hypot
 from typing import Any
 
@@ -189,14 +189,10 @@ class OpenPlaces:
 
     With S and S_0 the derivatives of the points anywhere and in the rows by these places, of deviations D, the
     directions w of unit variance that |S D w|^2 = c^2 (|S_0 D w|^2 + noise^2) for a large c.
-
-    Args:
-        motions: (M m, k) of the points at the configurations of the workspace.
-        directions: (6 + 3 P, k) of base and markers, m and rad.
     """
 
-    motions: Tensor
-    directions: Tensor
+    motions: Tensor  # (M m, k) of the points at the configurations of the workspace
+    directions: Tensor  # (6 + 3 P, k) of base and markers, m and rad
 
     @classmethod
     def of(cls, fitted: FittedMap) -> OpenPlaces:
@@ -296,7 +292,9 @@ def with_open_directions(fitted: FittedMap, measurements: Measurements, registra
     least[parts["joints"]] = (unseen[:, None] * twist).flatten()
     least[nominal.sag] = _unseen_sag(nominal, q)
     variance = torch.maximum(before, least.square())
-    return fitted if torch.equal(variance, before) else fitted.with_deformation(fitted.geodesic.with_prior(variance))
+    return (
+        fitted if torch.equal(variance, before) else replace(fitted, deformation=fitted.geodesic.with_prior(variance))
+    )
 
 
 def _unseen_sag(nominal: GeometryMap, q: Tensor) -> Tensor:

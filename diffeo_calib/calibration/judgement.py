@@ -97,15 +97,11 @@ def expected_rms(model: CalibratedKinematics, data: Measurements, bodies: int) -
 
 
 class Accuracy(NamedTuple):
-    """What is compared with a limit.
+    """What is compared with a limit."""
 
-    Args:
-        value: RMS error, in ``unit``: m or that of readings. of: what it is of, in words.
-    """
-
-    value: float
+    value: float  # RMS error, in ``unit``: m or that of readings
     unit: str
-    of: str
+    of: str  # what it is of, in words
 
 
 def accuracy(

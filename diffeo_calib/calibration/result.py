@@ -161,14 +161,10 @@ class CalibrationResult:
 
 @dataclass(frozen=True)
 class KindErrors:
-    """Errors of the rows of one kind.
+    """Errors of the rows of one kind."""
 
-    Args:
-        stages: name of the stage -> its errors. rows: the table, measured positions in the frame of the model.
-    """
-
-    stages: dict[str, Evaluation]
-    rows: Any
+    stages: dict[str, Evaluation]  # name of the stage -> its errors
+    rows: Any  # the table, measured positions in the frame of the model
 
     @property
     def one(self) -> Evaluation:

@@ -52,21 +52,15 @@ BENT = "corners that no plane explains"
 
 @dataclass(frozen=True, eq=False)
 class Board:
-    """A printed board.
+    """A printed board."""
 
-    Args:
-        text: as it was written. points: (K, 3) its corners, m, from its middle.
-        find: grey image -> corners, which may be none. markers: grey image -> numbers of all markers and their corners
-            (M, 4, 2), pixels; none of a chessboard. layout: number of each marker of the board -> its corners (4, 3),
-            m. fewest: corners that an image must show.
-    """
-
-    text: str
-    points: np.ndarray
-    find: Callable[[np.ndarray], Found]
+    text: str  # as it was written
+    points: np.ndarray  # (K, 3) its corners, m, from its middle
+    find: Callable[[np.ndarray], Found]  # grey image -> corners, which may be none
+    # grey image -> numbers of all markers and their corners (M, 4, 2), pixels; none of a chessboard
     markers: Callable[[np.ndarray], Found]
-    layout: dict[int, np.ndarray]
-    fewest: int
+    layout: dict[int, np.ndarray]  # number of each marker of the board -> its corners (4, 3), m
+    fewest: int  # corners that an image must show
 
     @classmethod
     def of(cls, text: str) -> Board:

@@ -46,9 +46,7 @@ BENT_WHOLE = {"mei", "ds", "ucm", "fov", "xi", "kb", "kb4"}
 OTHER = re.compile("inverse|modified|division|prism")
 """Words of another distortion."""
 WORD = re.compile(r"""(?<![\w.])["']?([A-Za-z_][\w.]*)(?:["'][ \t]*:|[ \t]*:(?=[\s\[{"']|$))""")
-"""A name before its value."""
 LARGEST_FILE = 1_000_000
-"""Bytes of a file that no camera has."""
 LARGEST = 1e6
 """Above all numbers of cameras: focal lengths are some thousand pixels."""
 BOARD, ROOT = "board", "root"

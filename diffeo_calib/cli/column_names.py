@@ -52,16 +52,11 @@ LONGEST_LABEL = 6
 
 @dataclass(frozen=True)
 class Column:
-    """A column by its name.
+    """A column by its name."""
 
-    Args:
-        name: as written. words: in lower case, without the unit; numbers and axes are words of their own.
-        unit: mm, m, cm, um, inch, rad, mrad, deg or kg; empty where the name says none.
-    """
-
-    name: str
-    words: tuple[str, ...]
-    unit: str = ""
+    name: str  # as written
+    words: tuple[str, ...]  # in lower case, without the unit; numbers and axes are words of their own
+    unit: str = ""  # mm, m, cm, um, inch, rad, mrad, deg or kg; empty where the name says none
 
     @property
     def plain(self) -> str:
@@ -70,15 +65,11 @@ class Column:
 
 
 class Group(NamedTuple):
-    """Columns whose names differ by a label alone.
-
-    Args:
-        before, after: the words that all have in common. names: label -> column.
-    """
+    """Columns whose names differ by a label alone, between the words that all have in common."""
 
     before: tuple[str, ...]
     after: tuple[str, ...]
-    names: dict[str, str]
+    names: dict[str, str]  # label -> column
 
     @property
     def shared(self) -> frozenset[str]:

@@ -27,7 +27,6 @@ from diffeo_calib.sensors.kinds import known_kinds
 SEPARATORS = (",", ";", "\t", "|", " ")
 DECIMALS = (".", ",")
 ROWS_LOOKED_AT = 50
-"""Rows that are looked at."""
 PIXELS = ("u", "v"), ("pixelu", "pixelv"), ("upx", "vpx")
 """Names of columns of images."""
 LENS, SOME_LENS = "FX,FY,CX,CY", "1000,1000,500,500"
@@ -70,21 +69,15 @@ ENTRIES += [[str(k + first) for k in range(16)] for first in (0, 1)] + [labels[:
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table as it seems to be written.
-
-    Args:
-        path: of the file. sep, decimal: between cells, and in numbers. header: all columns. numbers: those that hold
-            numbers alone.
-        notes: what the reader decided. odd: which cells are no numbers in columns that seem to hold some; or empty.
-    """
+    """A table as it seems to be written."""
 
     path: Path
     sep: str
     decimal: str
-    header: tuple[str, ...]
-    numbers: tuple[str, ...]
-    notes: tuple[str, ...] = ()
-    odd: str = ""
+    header: tuple[str, ...]  # all columns
+    numbers: tuple[str, ...]  # those that hold numbers alone
+    notes: tuple[str, ...] = ()  # what the reader decided
+    odd: str = ""  # which cells are no numbers in columns that seem to hold some
 
     @cached_property
     def cells(self) -> dict[str, list[str]]:
@@ -218,17 +211,12 @@ def _goes_on(columns: Sequence[str], group: Group) -> set[str]:
 
 
 class Body(NamedTuple):
-    """Columns of a place, and of the rotation beside it, if any.
-
-    Args:
-        place, turn: columns. usual: what such names of a rotation usually mean. left: what the place is, if no device
-            measured it.
-    """
+    """Columns of a place, and of the rotation beside it, if any."""
 
     place: list[str]
     turn: list[str]
-    usual: str = ""
-    left: str = ""
+    usual: str = ""  # what such names of a rotation usually mean
+    left: str = ""  # what the place is, if no device measured it
 
     @property
     def words(self) -> set[str]:
@@ -323,7 +311,6 @@ def _without(one: Column, words: frozenset[str]) -> str:
 
 
 USUAL_SIZES = (640, 480), (1280, 720), (1280, 960), (1920, 1080), (2048, 1536), (2592, 1944), (4096, 3072), (8192, 8192)
-"""Widths and heights of images, pixels."""
 BELOW = (12, 13, 14)
 """Places of the zeros below a rotation, of a matrix by rows."""
 
@@ -354,18 +341,13 @@ def entries(tables: Sequence[Any], **why: str) -> Iterator[Choice]:
 
 @dataclass(frozen=True)
 class RowColumns:
-    """Columns of what was measured, by their names.
+    """Columns of what was measured, by their names."""
 
-    Args:
-        bodies: of positions or poses. sockets: of place and socket. readings: texts of `fit --reading`.
-        named: option -> column of the device or its set-up, the payload, time, temperature. left: not used, and why.
-    """
-
-    bodies: list[Body]
-    sockets: list[str]
-    readings: list[str]
-    named: dict[str, str]
-    left: Sequence[str] = ()
+    bodies: list[Body]  # of positions or poses
+    sockets: list[str]  # of place and socket
+    readings: list[str]  # texts of `fit --reading`
+    named: dict[str, str]  # option -> column of the device or its set-up, the payload, time, temperature
+    left: Sequence[str] = ()  # not used, and why
 
     @property
     def markers(self) -> list[list[str]]:

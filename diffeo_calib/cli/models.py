@@ -129,7 +129,7 @@ def provenance_lines(model: CalibratedKinematics) -> Iterator[str]:
         yield model.provenance.sentence(model.robot.name, len(model.configurations))
     drift = KnownDrift.of(model)
     if drift is not None:
-        yield from drift.sentences()
+        yield from drift.of_joints()
 
 
 def another_date_lines(model: CalibratedKinematics) -> Iterator[str]:
@@ -137,6 +137,10 @@ def another_date_lines(model: CalibratedKinematics) -> Iterator[str]:
     drift = KnownDrift.of(model)
     if drift is not None:
         yield f"{drift.of_another_date}: these rows meet the model as it was at {drift.holds()}"
+
+
+LONGEST_TOOL_PER_REACH = 5.0
+"""From where a tool is refused: its unit is wrong."""
 
 
 def tool_in_tip(model: CalibratedKinematics, text: str | None, tool_from: str, table: TableFormat) -> Tensor:
@@ -147,8 +151,10 @@ def tool_in_tip(model: CalibratedKinematics, text: str | None, tool_from: str, t
         return model.tool
     tool = tool_frame(text, table)
     if (length := float(tool[:3, 3].norm())) > model.robot.reach:
-        what = f"--tool is {length:g} m long, more than the robot reaches"
-        warn_user(sentence(what, fix="check the unit (--length)"))
+        what, fix = f"--tool is {length:g} m long, more than the robot reaches", "check the unit (--length)"
+        if length > LONGEST_TOOL_PER_REACH * model.robot.reach:
+            raise InputError.of(what, expected=f"at most {model.robot.reach:.3g} m", fix=fix)
+        warn_user(sentence(what, fix=fix))
     if tool_from == "tip":
         return tool
     tip = model.tool_tip or model.robot.tips[0]

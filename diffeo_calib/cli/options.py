@@ -9,12 +9,19 @@ from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
-
-from typing_extensions import dataclass_transform
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.table_format import described
+
+if TYPE_CHECKING:
+    from typing_extensions import dataclass_transform
+else:  # what type checkers alone understand, and Python 3.10 does not have
+
+    def dataclass_transform(**_: object) -> Any:
+        """Nothing at run time."""
+        return lambda kind: kind
+
 
 Kind = Literal["read", "write", "source", "later", "folder"]
 """A file must exist, is written, is written with a header beside it, may come later; or is a folder that is made."""
@@ -26,7 +33,6 @@ SEED: dict[str, Any] = {"default": 0, "min": 0, "max": 2**63 - 1}
 """The largest as in common/checks.py, which loads torch."""
 DRAWN = 3000
 CORNERS = "corners="
-"""Begin of --reading for images of a board."""
 
 
 def option(
@@ -60,20 +66,15 @@ def written(text: str, metavar: str, default: Any = None) -> Any:
 
 
 class Option(NamedTuple):
-    """An option, or an argument, as typer takes it.
+    """An option, or an argument, as typer takes it."""
 
-    Args:
-        field: its name in Python. hint: type of its value. default: MISSING where one is required. names: as typed,
-            none of an argument. shown: in messages. kind: what happens to its file. how: its help and limits.
-    """
-
-    field: str
-    hint: Any
-    default: Any
-    names: tuple[str, ...]
-    shown: str
-    kind: Kind
-    how: dict[str, Any]
+    field: str  # its name in Python
+    hint: Any  # type of its value
+    default: Any  # MISSING where one is required
+    names: tuple[str, ...]  # as typed, none of an argument
+    shown: str  # in messages
+    kind: Kind  # what happens to its file
+    how: dict[str, Any]  # its help and limits
 
     @classmethod
     def of(cls, own: Field[Any], hint: Any) -> Option:
@@ -87,14 +88,10 @@ class Option(NamedTuple):
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 class Options:
-    """A group of options.
+    """A group of options."""
 
-    Attributes:
-        needs: options, and others of which each of them needs one. excludes: and others that it cannot stand beside.
-    """
-
-    needs: ClassVar[tuple[tuple[str, str], ...]] = ()
-    excludes: ClassVar[tuple[tuple[str, str], ...]] = ()
+    needs: ClassVar[tuple[tuple[str, str], ...]] = ()  # options, and others of which each of them needs one
+    excludes: ClassVar[tuple[tuple[str, str], ...]] = ()  # and others that it cannot stand beside
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
     def __init_subclass__(cls) -> None:

@@ -69,21 +69,15 @@ LARGEST_DEVIATION = 0.01
 
 @dataclass(frozen=True)
 class Source:
-    """One way to read a table.
+    """One way to read a table."""
 
-    Args:
-        sheet: the table. robot: whose ``joints`` columns it has, or a machine with its
-            poses. rows: what was measured. table: the format; joints and rows are entered when it is read.
-        tips: of the markers, where several are. said: entries of the campaign that were decided so far.
-    """
-
-    sheet: Sheet
-    robot: Tree
+    sheet: Sheet  # the table
+    robot: Tree  # whose ``joints`` columns it has, or a machine with its poses
     joints: Any
-    rows: RowColumns
-    table: TableFormat
-    tips: Sequence[str] = ()
-    said: tuple[Choice, ...] = ()
+    rows: RowColumns  # what was measured
+    table: TableFormat  # the format; joints and rows are entered when it is read
+    tips: Sequence[str] = ()  # of the markers, where several are
+    said: tuple[Choice, ...] = ()  # entries of the campaign that were decided so far
 
     def into(self, **formats: Any) -> Source:
         """The same in another format."""

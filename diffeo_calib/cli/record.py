@@ -105,14 +105,14 @@ ERRORS = "errors"
 
 def errors_entry(errors: Evaluation) -> dict[str, object]:
     """Errors of measured positions in m, and of orientations in degrees (null without), over some rows."""
-    entry = {"rows": errors.count} | {f"{name}_m": getattr(errors, name) for name in SIZES}
+    entry: dict[str, object] = {"rows": errors.count} | {f"{name}_m": getattr(errors, name) for name in SIZES}
     return entry | {f"angle_{name}_deg": getattr(errors.orientation, name, None) for name in SIZES}
 
 
 def kind_entry(errors: Evaluation) -> dict[str, object]:
     """Errors of rows of any kind in the unit in which they are shown, and of orientations in degrees."""
     unit, per_unit = errors.shown
-    entry = {"rows": errors.count, "what": errors.what, "unit": unit}
+    entry: dict[str, object] = {"rows": errors.count, "what": errors.what, "unit": unit}
     entry |= {name: per_unit * getattr(errors, name) for name in SIZES}
     return entry | {f"angle_{name}_deg": getattr(errors.orientation, name, None) for name in SIZES}
 

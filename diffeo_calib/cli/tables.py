@@ -25,6 +25,7 @@ from diffeo_calib.cli.options import CORNERS, Rows, Targets, Units, has
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.files import PROGRAM
+from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.files import read_joints, read_observations
 from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
 from diffeo_calib.measurements.csv.joints import PoseColumns
@@ -186,19 +187,15 @@ def _stated(words: Sequence[str], group: type[Units] | type[Rows]) -> dict[str, 
 
 @dataclass(frozen=True)
 class MeasuredTable:
-    """A table of measurements as the options describe it.
-
-    Args:
-        joints: names of the joint columns, separated by commas; None if they are named after the robot's joints; or
-            the columns of a pose. table: what it holds, but for the joints.
-        duplicates: what to do with exactly repeated rows. growing: whether rows will be added.
-    """
+    """A table of measurements as the options describe it."""
 
     csv: Path
+    # names of the joint columns, separated by commas; None if they are named after the robot's joints; or the columns
+    # of a pose
     joints: str | PoseColumns | None
-    table: TableFormat
-    duplicates: str = "keep"
-    growing: bool = False
+    table: TableFormat  # what it holds, but for the joints
+    duplicates: str = "keep"  # what to do with exactly repeated rows
+    growing: bool = False  # whether rows will be added
 
     def read(self, robot: Tree, tips: Sequence[str] = ()) -> Any:
         """The rows of a robot, under the names of its own joints, as of :func:`read_observations`.
@@ -390,11 +387,8 @@ def reading_columns(text: str, device: str | None, names: Sequence[str] = ()) ->
 
 def _number(text: str) -> float | None:
     """A finite number; None for the name of a column."""
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if isfinite(value) else None
+    value = number(text.strip(), ".")
+    return value if value is not None and isfinite(value) else None
 
 
 def stated_numbers(option: str, text: str, counts: Sequence[int], expected: str = "") -> list[float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -43,6 +43,7 @@ class of_origin(cached_property[T]):  # used like cached_property
 
 
 @methods_outside_inference_mode
+@dataclass(eq=False, repr=False)
 class FittedMap:
     """k1 = psi o k0 o phi^-1 with fitted momenta.
 
@@ -56,20 +57,21 @@ class FittedMap:
         y: (N, r) what was measured, or (N, m), m; None where it is not known (:meth:`measured` then derives it).
     """
 
-    def __init__(
-        self,
-        deformation: Deformation,
-        noise: Noise,
-        data: Tensor | None = None,
-        new_noise: Tensor | None = None,
-        workspace: Tensor | None = None,
-        *,
-        slopes: Tensor | None = None,
-        y: Tensor | None = None,
-    ) -> None:
-        self.deformation, self.noise, self.slopes, self.y = deformation, noise, slopes, y
-        self.data, self.workspace = data, workspace
-        self.new_noise = noise.covariance.mean(0) if new_noise is None else new_noise
+    deformation: Deformation
+    noise: Noise
+    data: Tensor | None = None
+    new_noise: Tensor = None  # pyright: ignore[reportAssignmentType]  # a tensor once it is made
+    workspace: Tensor | None = None
+    slopes: Tensor | None = field(default=None, kw_only=True)
+    y: Tensor | None = field(default=None, kw_only=True)
+    registration: Any = field(default=None, init=False)
+    """Result of a registration, where the map has been placed anew."""
+    _origin: FittedMap | None = field(default=None, init=False)
+    """The map with the nominal map of the fit, whose rows all covariances follow from."""
+
+    def __post_init__(self) -> None:
+        if self.new_noise is None:
+            self.new_noise = self.noise.covariance.mean(0)
 
     @property
     def x(self) -> Tensor:
@@ -93,15 +95,7 @@ class FittedMap:
 
     def without_rigid_motions(self) -> FittedMap:
         """The same map whose covariances leave out rigid motions over the joint ranges of its rows."""
-        return self._changed(workspace=self.everywhere)
-
-    def with_deformation(self, deformation: Deformation) -> FittedMap:
-        """The same map with another deformation at the same rows."""
-        return self._changed(deformation=deformation)
-
-    def _changed(self, **changes: Any) -> FittedMap:
-        parts = {name: getattr(self, name) for name in ("deformation", "noise", *TENSORS)}
-        return FittedMap(**parts | changes)
+        return replace(self, workspace=self.everywhere)
 
     @property
     def unregistered(self) -> FittedMap:
@@ -117,11 +111,6 @@ class FittedMap:
     def m(self) -> int:
         """Number of task coordinates."""
         return self.new_noise.shape[0]
-
-    registration: Any = None
-    """Result of a registration, where the map has been placed anew."""
-    _origin: FittedMap | None = None
-    """The map with the nominal map of the fit, whose rows all covariances follow from."""
 
     def with_nominal(self, nominal: NominalMap) -> FittedMap:
         """The same map around another nominal map with the same parameters, with what it knows of its covariances."""
@@ -144,7 +133,7 @@ class FittedMap:
         if device == self.x.device:
             return self  # with what it has computed for its covariances
         moved = {name: part.to(device) for name in TENSORS if (part := getattr(self, name)) is not None}
-        return self._changed(deformation=self.deformation.to(device), noise=self.noise.to(device), **moved)
+        return replace(self, deformation=self.deformation.to(device), noise=self.noise.to(device), **moved)
 
     def __call__(self, x: object) -> Tensor:
         """Calibrated task coordinates.
@@ -316,7 +305,7 @@ class FittedMap:
         spec = replace(spec, **kernels, prior_variance=factor * spec.prior_variance)
         noise = Noise(factor * self.noise.covariance, factor**0.5 * self.noise.shared)
         deformation = GeodesicDeformation(spec, old.x, momenta, old.integrator)
-        return self._changed(deformation=deformation, noise=noise, new_noise=factor * self.new_noise)
+        return replace(self, deformation=deformation, noise=noise, new_noise=factor * self.new_noise)
 
     def parameter_covariance(self, which: Tensor) -> Tensor:
         """Posterior covariance of the parameters theta with these numbers: (k,) -> (k, k) in m^2, m rad or rad^2."""

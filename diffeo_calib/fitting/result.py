@@ -66,26 +66,16 @@ def silent(task: str, done: int, total: int) -> None:
 
 @dataclass(frozen=True)
 class Solution:
-    """The result of a solver: the best momenta, and why it stopped.
+    """The result of a solver: the best momenta, and why it stopped."""
 
-    Args:
-        momenta: best momenta.
-        stop: reason to stop.
-        history: energy at the start and after every iteration (L-BFGS: every few iterations).
-        iterations: number of accepted iterations.
-        evaluations: number of forward runs of the two flows, including those of gradients.
-        measure: final value of the solver's criterion. limit: of iterations.
-        advice: what to change if the solver did not converge.
-    """
-
-    momenta: Momenta
-    stop: Stop
-    history: list[float]
-    iterations: int
-    evaluations: int
-    measure: float = nan
-    limit: int = 0
-    advice: str = ""
+    momenta: Momenta  # best momenta
+    stop: Stop  # reason to stop
+    history: list[float]  # energy at the start and after every iteration (L-BFGS: every few iterations)
+    iterations: int  # number of accepted iterations
+    evaluations: int  # number of forward runs of the two flows, including those of gradients
+    measure: float = nan  # final value of the solver's criterion
+    limit: int = 0  # of iterations
+    advice: str = ""  # what to change if the solver did not converge
 
     @property
     def status(self) -> str:

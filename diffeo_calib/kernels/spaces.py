@@ -49,17 +49,12 @@ class Space:
 
 @dataclass(frozen=True)
 class FeatureMap:
-    """The map F of the module docstring on some coordinates of a space; D features: lines, cosines, sines.
+    """The map F of the module docstring on some coordinates of a space; D features: lines, cosines, sines."""
 
-    Args:
-        columns: the coordinates of x that it depends on, in increasing order.
-        periodic: for each of these columns, whether it is a circle.
-        lengthscale: scalar or one positive value per column; unit of the coordinate for a line,
-            a pure number for a circle (concentration = lengthscale^-2).
-    """
-
-    columns: tuple[int, ...]
-    periodic: tuple[bool, ...]
+    columns: tuple[int, ...]  # the coordinates of x that it depends on, in increasing order
+    periodic: tuple[bool, ...]  # for each of these columns, whether it is a circle
+    # scalar or one positive value per column; unit of the coordinate for a line, a pure number for a circle
+    # (concentration = lengthscale^-2)
     lengthscale: Tensor
 
     def __post_init__(self) -> None:

@@ -26,22 +26,19 @@ from diffeo_calib.sensors.devices import Devices, Extrinsics
 from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import MountedMarkers, seen_mounted
 
+MOTION_SHARE = 0.01
+"""Effects of a shift of a fit that differ from a motion by less than this share are those of the motion."""
+
 
 @dataclass(frozen=True, eq=False)
 class PredictedReadings:
-    """Predicted readings of one device at N configurations.
+    """Predicted readings of one device at N configurations."""
 
-    Args:
-        kind: of its readings; "position" of markers that were mounted anew. device: its name, or that of the session.
-        unit: of the readings.
-        mean: (N, r) readings; NaN where the device cannot see its target. covariance: (N, r, r) of these.
-    """
-
-    kind: str
-    device: str
-    unit: str
-    mean: Tensor
-    covariance: Tensor
+    kind: str  # of its readings; "position" of markers that were mounted anew
+    device: str  # its name, or that of the session
+    unit: str  # of the readings
+    mean: Tensor  # (N, r) readings; NaN where the device cannot see its target
+    covariance: Tensor  # (N, r, r) of these
 
     @property
     def deviations(self) -> Tensor:
@@ -49,22 +46,31 @@ class PredictedReadings:
         return self.covariance.diagonal(dim1=1, dim2=2).clamp(min=0).sqrt()
 
 
-class FittedDevice(NamedTuple):
-    """A device of readings beside a fit, where the model has it.
+def own_shifts(shared: Tensor, slopes: Tensor) -> tuple[Tensor, Tensor]:
+    """Shifts of a fit that are motions of one device: which (c,) of them, boolean, and these motions (k, k').
 
     Args:
-        devices: it alone, with the standard deviations of its k unknowns after the rows on which it was placed.
-        columns: (c,) boolean, its unknowns among the shifts of the fit; None for a device that measured no row of the
-            fit, or of a model that was moved since.
-        root: (k, k) root of the prior covariance of its unknowns, in the order of these columns; without them of the
-            covariance by the rows on which it was placed.
-        noise: (r, r) of a reading by its rows of the fit, m^2; None without any.
+        shared: (M, r, c) effects of all shifts on its rows. slopes: (M, r, k) of these rows by motions of the device.
     """
+    columns, slopes = (shared != 0).any(1).any(0), slopes.flatten(0, 1)
+    effects = shared[..., columns].flatten(0, 1)
+    motions = torch.linalg.pinv(slopes) @ effects
+    rigid = (effects - slopes @ motions).norm(dim=0) < MOTION_SHARE * effects.norm(dim=0)
+    columns[columns.clone()] = rigid
+    return columns, motions[:, rigid]
 
-    devices: Devices
+
+class FittedDevice(NamedTuple):
+    """A device of readings beside a fit, where the model has it."""
+
+    devices: Devices  # it alone, with the standard deviations of its k unknowns after the rows on which it was placed
+    # (k, k') what each of these does to its unknowns; without them the root of their covariance by the rows on which it
+    # was placed
     root: Tensor
+    # (c,) boolean, the shifts of the fit that move it; None for a device that measured no row of the fit, or of a model
+    # that was moved since
     columns: Tensor | None = None
-    noise: Tensor | None = None
+    noise: Tensor | None = None  # (r, r) of a reading by its rows of the fit, m^2; None without any
 
     @classmethod
     def of(cls, fitted: FittedMap, own: PlacedDevices, number: int) -> FittedDevice:
@@ -76,13 +82,10 @@ class FittedDevice(NamedTuple):
             return placed
         numbers, shared = fitted.noise.visible[rows][0], fitted.noise.shared[rows]
         placed = placed._replace(noise=fitted.noise.covariance[rows][:, numbers][:, :, numbers].median(0).values)
-        columns = (shared != 0).any(1).any(0)
-        if fitted.registration is not None or fitted.slopes is None or int(columns.sum()) != len(deviations):
-            return placed
         slopes = placed.by_increments(fitted.fitted_points[rows, -3 * devices.seen_points :])
-        effects = shared[:, numbers][..., columns]
-        root = torch.linalg.lstsq(slopes.flatten(0, 1), effects.flatten(0, 1), driver="gelsd").solution
-        return placed._replace(columns=columns, root=root)
+        columns, root = own_shifts(shared[:, numbers], slopes)
+        known = fitted.registration is None and bool(columns.any())
+        return placed._replace(columns=columns, root=root) if known else placed
 
     def by_increments(self, points: Tensor) -> Tensor:
         """(N, r, k) derivatives of readings of points (N, 3 P'), which it sees, by its unknowns, m."""

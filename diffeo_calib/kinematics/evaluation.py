@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import outside_inference_mode
+from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.joint_ranges import SAME_CONFIGURATION, check_same_robot, fitted_configurations
@@ -156,6 +156,14 @@ def rows_used_in_fit(model: CalibratedKinematics, q: object) -> Tensor:
     return torch.cat([torch.cdist(block, fitted, p=inf).amin(1) < SAME_CONFIGURATION for block in blocks])
 
 
+def unseen(model: CalibratedKinematics, q: Tensor) -> Tensor:
+    """(N,) which configurations took no part in the fit, nor in a registration."""
+    new = ~rows_used_in_fit(model, q)
+    if model.registration is not None:
+        new &= torch.cdist(q, model.registration.q.to(q), p=inf).amin(1) > SAME_CONFIGURATION
+    return new.to(HOST)
+
+
 def rows_of_other_frames(model: CalibratedKinematics, q: Tensor) -> int:
     """How many of the configurations (N, n) were fitted in another session than that of the model's measuring frame.
 
@@ -170,16 +178,11 @@ def rows_of_other_frames(model: CalibratedKinematics, q: Tensor) -> int:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What errors of a model mean.
+    """What errors of a model mean."""
 
-    Args:
-        refusal: why they say nothing about the robot; None if they do. causes: likely causes of large errors.
-        moved: whether something that moved explains errors that say nothing.
-    """
-
-    refusal: str | None = None
-    causes: Sequence[str] = ()
-    moved: bool = False
+    refusal: str | None = None  # why they say nothing about the robot; None if they do
+    causes: Sequence[str] = ()  # likely causes of large errors
+    moved: bool = False  # whether something that moved explains errors that say nothing
 
 
 def judged(
@@ -280,19 +283,13 @@ MOST_ROWS = 500
 
 
 class Motion(NamedTuple):
-    """A motion that explains errors.
+    """A motion that explains errors."""
 
-    Args:
-        what: "the measuring device" or "the marker". shift: m, of the device at the middle of the rows.
-        turn: rad, 0 for a marker. explained: part of the squared error.
-        left: (N, m) the errors that remain, m, NaN where hidden.
-    """
-
-    what: str
-    shift: float
-    turn: float
-    explained: float
-    left: Tensor
+    what: str  # "the measuring device" or "the marker"
+    shift: float  # m, of the device at the middle of the rows
+    turn: float  # rad, 0 for a marker
+    explained: float  # part of the squared error
+    left: Tensor  # (N, m) the errors that remain, m, NaN where hidden
 
     @property
     def sentence(self) -> str:

@@ -19,14 +19,12 @@ from torch import Tensor
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.device_readings import own_shifts
 from diffeo_calib.measurements.images import ONLY_CAMERA
 from diffeo_calib.measurements.poses import inverse_poses, pose_directions, poses_from_marks, rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import skew
 from diffeo_calib.sensors.set_ups import NUMBERS_OF_A_FRAME, SESSION, TRANSFORMS, frame_slopes, own_slopes
-
-RIGID_MOTION_SHARE = 0.01
-"""Effects of a frame's shift differ from a rigid motion of the fitted points by less than this share."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,24 +155,17 @@ def hand_eye_sentences(found: Mapping[str, HandEye]) -> Iterator[str]:
 
 
 class SetUp(NamedTuple):
-    """A set-up of a model: where it measured, and what was on the tool.
+    """A set-up of a model: where it measured, and what was on the tool."""
 
-    Args:
-        transform: (4, 4) from the model's measuring frame to its own, m. mount: (4, 4) from what it had on the tool to
-            that of the model, m.
-        framed: whether the measuring frame was moved, not what is on the tool.
-        columns: (c,) boolean, the shifts of the fit that move its rows, not those of the others; None for the model's.
-        twists: (6, k) shift and turn by each of them, m and rad: of the measuring frame about the model's origin, or
-            of what is on the tool along the axes of the model's tool.
-        mount_std: (6,) deviations of what is on the tool where no row of the fit tells of them.
-    """
-
-    transform: Tensor
-    mount: Tensor
-    framed: bool = False
+    transform: Tensor  # (4, 4) from the model's measuring frame to its own, m
+    mount: Tensor  # (4, 4) from what it had on the tool to that of the model, m
+    framed: bool = False  # whether the measuring frame was moved, not what is on the tool
+    # (c,) boolean, the shifts of the fit that move its rows, not those of the others; None for the model's
     columns: Tensor | None = None
+    # (6, k) shift and turn by each of them, m and rad: of the measuring frame about the model's origin, or of what is
+    # on the tool along the axes of the model's tool
     twists: Tensor | None = None
-    mount_std: Tensor | None = None
+    mount_std: Tensor | None = None  # (6,) deviations of what is on the tool where no row of the fit tells of them
 
     @classmethod
     def of(cls, model: CalibratedKinematics, name: str | None) -> SetUp:
@@ -205,19 +196,13 @@ class SetUp(NamedTuple):
         shared, points = fitted.noise.shared, fitted.fitted_points.unflatten(1, (-1, 3))
         others = torch.ones(len(shared), dtype=torch.bool, device=shared.device)
         others[rows] = False
-        columns = (shared[rows] != 0).any(1).any(0) & ~(shared[others] != 0).any(1).any(0)
-        if not bool(columns.any()):
-            return columns, shared.new_zeros(NUMBERS_OF_A_FRAME, 0)
-        effects = shared[rows][..., columns].flatten(0, 1)
-        slopes = self._slopes(points[rows]).flatten(0, 1)
-        twists = torch.linalg.lstsq(slopes, effects, driver="gelsd").solution
-        left = (effects - slopes @ twists).norm(dim=0)
-        rigid = left < RIGID_MOTION_SHARE * effects.norm(dim=0)
-        columns[columns.clone()] = rigid
-        if int(rigid.sum()) != NUMBERS_OF_A_FRAME and (self.framed or bool(rigid.any())):
+        own = shared[rows] * ~(shared[others] != 0).any(1).any(0)
+        columns, twists = own_shifts(own, self._slopes(points[rows]))
+        rigid = int(columns.sum())
+        if rigid != NUMBERS_OF_A_FRAME and bool((own != 0).any()) and (self.framed or rigid):
             what = "the hand-eye transform of one of several cameras"
             raise InputError.of(what, expected="a model in the place of its fit", fix="calibrate with all rows")
-        return columns, twists[:, rigid]
+        return columns, twists
 
     def view(self, poses: Tensor) -> Tensor:
         """What is measured of poses (M, 4, 4) of the model's tool, m."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import pi
+from math import inf, pi
 from typing import Any
 
 import torch
@@ -15,6 +15,8 @@ from diffeo_calib.sensors.tables import rows_of_one_kind
 
 SAME_CONFIGURATION = 1e-9
 """Largest difference [rad or m] between the joint values of one row in two files, which comes from rounding."""
+REPEATED = 1e-3
+"""Distance [rad or m] within which rows repeat a configuration: robots do, and so do copies with fewer digits."""
 TELLING_ROWS, TELLING_MOTION = 10, 0.25
 """Rows, and their median range of a joint relative to the fit's, from which they move as those of the fit."""
 RANGE_MARGIN = 0.25
@@ -56,6 +58,15 @@ def fitted_configurations(model: object) -> Tensor:
     if not isinstance(found, Tensor):
         raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
     return found
+
+
+def repeated_lines(model: Any, q: Tensor) -> list[str]:
+    """A sentence if all configurations (N, n) are those of the fit: they say little about other poses."""
+    fitted = fitted_configurations(model)
+    if not len(q) or bool((torch.cdist(q, fitted.to(q), p=inf).amin(1) > REPEATED).any()):
+        return []
+    what = f"all {len(q)} rows repeat joint values of the fit: errors at other poses are larger, and copies of its rows"
+    return [f"{what}, also with fewer digits, tell nothing new"]
 
 
 def refuse_other_angles(model: Any, q: object) -> None:

@@ -19,17 +19,11 @@ from diffeo_calib.maps.nominal import NominalMap
 
 @dataclass(frozen=True)
 class Momenta:
-    """The unknowns of a fit.
+    """The unknowns of a fit."""
 
-    Args:
-        joint: (N, n) initial momenta b of the joint-space geodesic.
-        task: (N P, d) initial momenta p of the task-space geodesic, the paper's P0.
-        theta: (K,) parameters of the nominal map, K may be 0.
-    """
-
-    joint: Tensor
-    task: Tensor
-    theta: Tensor
+    joint: Tensor  # (N, n) initial momenta b of the joint-space geodesic
+    task: Tensor  # (N P, d) initial momenta p of the task-space geodesic, the paper's P0
+    theta: Tensor  # (K,) parameters of the nominal map, K may be 0
 
     def towards(self, other: Momenta, step: float) -> Momenta:
         """The point ``self + step (other - self)``."""
@@ -56,23 +50,15 @@ class Momenta:
 
 @dataclass(frozen=True)
 class ModelSpec:
-    """The fixed part of a model, whatever the momenta: k0, the two kernels and the prior of theta.
+    """The fixed part of a model, whatever the momenta: k0, the two kernels and the prior of theta."""
 
-    Args:
-        nominal: k0.
-        joint_kernel: K_V on joint space.
-        task_kernel: K_W on task space R^d.
-        prior_variance: (K,) variances of theta.
-        task_dim: d; markers are consecutive groups of d values of k0.
-        at_controls: k0 at the control configurations, one for one, if it is another one there: the markers of a robot
-            that was measured in several set-ups.
-    """
-
-    nominal: NominalMap
-    joint_kernel: Kernel
-    task_kernel: Kernel
-    prior_variance: Tensor
-    task_dim: int
+    nominal: NominalMap  # k0
+    joint_kernel: Kernel  # K_V on joint space
+    task_kernel: Kernel  # K_W on task space R^d
+    prior_variance: Tensor  # (K,) variances of theta
+    task_dim: int  # d; markers are consecutive groups of d values of k0
+    # k0 at the control configurations, one for one, if it is another one there: the markers of a robot that was
+    # measured in several set-ups
     at_controls: NominalMap | None = None
 
     @property
@@ -92,21 +78,14 @@ class ModelSpec:
 
 
 class Deformation(ABC):
-    """k1 for given unknowns, in any formulation.
+    """k1 for given unknowns, in any formulation."""
 
-    Attributes:
-        formulation: "exact" or "eulerian".
-        spec: nominal map, kernels, prior. x: (N, n) control configurations.
-        momenta: the unknowns. integrator: time stepping.
-        z1: (N, m) k1(x).
-    """
-
-    formulation: ClassVar[str]
-    spec: ModelSpec
-    x: Tensor
-    momenta: Momenta
-    integrator: Integrator
-    z1: Tensor
+    formulation: ClassVar[str]  # "exact" or "eulerian"
+    spec: ModelSpec  # nominal map, kernels, prior
+    x: Tensor  # (N, n) control configurations
+    momenta: Momenta  # the unknowns
+    integrator: Integrator  # time stepping
+    z1: Tensor  # (N, m) k1(x)
 
     @abstractmethod
     def __call__(self, x: Tensor) -> Tensor:

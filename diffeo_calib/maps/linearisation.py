@@ -18,17 +18,12 @@ GRAM_ROWS = 64
 
 @dataclass(frozen=True)
 class NodeSensitivity:
-    """One node of the time grid: field values at ``points`` move the end by ``effect``.
+    """One node of the time grid: field values at ``points`` move the end by ``effect``."""
 
-    Args:
-        weight: quadrature weight c of the node.
-        points: (L Q, k) points at which the field acts.
-        effect: (L, r, Q k) derivative of L ends by the field's values at Q consecutive points each; Q = 1, except in
-            linearisations of functions of several markers (:meth:`Linearisation.projected`).
-    """
-
-    weight: float
-    points: Tensor
+    weight: float  # quadrature weight c of the node
+    points: Tensor  # (L Q, k) points at which the field acts
+    # (L, r, Q k) derivative of L ends by the field's values at Q consecutive points each; Q = 1, except in
+    # linearisations of functions of several markers (:meth:`Linearisation.projected`)
     effect: Tensor
 
     @property
@@ -78,18 +73,12 @@ class Linearisation:
     """First-order effect on k1 of the fields at every time node and of theta.
 
     At zero momenta this is the tangent model k1 = k0 + Dk0 K_V b + K_W p + S theta.
-
-    Args:
-        spec: kernels and prior.
-        joint: sensitivities to v_s at M configurations, effects Theta_s (M, m, n).
-        task: sensitivities to w_t at M P marker points, effects Phi_t (M P, d, d).
-        sensitivity: Dpsi S (M, m, K).
     """
 
-    spec: ModelSpec
-    joint: list[NodeSensitivity]
-    task: list[NodeSensitivity]
-    sensitivity: Tensor
+    spec: ModelSpec  # kernels and prior
+    joint: list[NodeSensitivity]  # sensitivities to v_s at M configurations, effects Theta_s (M, m, n)
+    task: list[NodeSensitivity]  # sensitivities to w_t at M P marker points, effects Phi_t (M P, d, d)
+    sensitivity: Tensor  # Dpsi S (M, m, K)
 
     @property
     def sides(self) -> tuple[tuple[Kernel, list[NodeSensitivity]], tuple[Kernel, list[NodeSensitivity]]]:

@@ -115,18 +115,12 @@ class LinearFunctionals(Observation):
 
 @dataclass(frozen=True)
 class Part:
-    """The rows of one kind in a :class:`Stacked` observation.
+    """The rows of one kind in a :class:`Stacked` observation."""
 
-    Args:
-        rows: (M,) numbers of the rows. points: (k,) numbers of the coordinates that they see, of the m of a row.
-        numbers: (r,) where the r numbers stand among the R of a row.
-        observe: of these coordinates in these rows, M of them.
-    """
-
-    rows: Tensor
-    points: Tensor
-    numbers: Tensor
-    observe: Observation
+    rows: Tensor  # (M,) numbers of the rows
+    points: Tensor  # (k,) numbers of the coordinates that they see, of the m of a row
+    numbers: Tensor  # (r,) where the r numbers stand among the R of a row
+    observe: Observation  # of these coordinates in these rows, M of them
 
     @classmethod
     def of_coordinates(cls, rows: Tensor, count: int) -> Part:

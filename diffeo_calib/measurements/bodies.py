@@ -42,13 +42,9 @@ class Predicted(NamedTuple):
 
 @dataclass(frozen=True)
 class Bodies:
-    """Markers, or measured frames on one or several tips. Tables ``data`` are :class:`Measurements` of such bodies.
+    """Markers, or measured frames on one or several tips. Tables ``data`` are :class:`Measurements` of such bodies."""
 
-    Args:
-        lever: distance of the points of a frame from its origin, m; None for markers.
-    """
-
-    lever: float | None = None
+    lever: float | None = None  # distance of the points of a frame from its origin, m; None for markers
 
     def __post_init__(self) -> None:
         if self.lever is not None:
@@ -217,17 +213,12 @@ class Bodies:
 
 
 class SeenBoard(NamedTuple):
-    """A board that a camera on the tool saw in N rows.
+    """A board that a camera on the tool saw in N rows."""
 
-    Args:
-        board: (N, 3) its origin in the camera's frame, m. origins: (N, 3) the same in the measuring frame.
-        axes: (N, 3, 3) of the camera. lever: of the points that represent its poses, m.
-    """
-
-    board: Tensor
-    origins: Tensor
-    axes: Tensor
-    lever: float
+    board: Tensor  # (N, 3) its origin in the camera's frame, m
+    origins: Tensor  # (N, 3) the same in the measuring frame
+    axes: Tensor  # (N, 3, 3) of the camera
+    lever: float  # of the points that represent its poses, m
 
 
 def seen_board(data: Any) -> SeenBoard | None:

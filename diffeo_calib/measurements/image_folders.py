@@ -25,7 +25,6 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 FLIPPED, KALIBR = ("right-up", "left-down"), " (numbers run upwards, as in grids of Kalibr)"
 """Orders of grids of markers in which numbers run to the right and upwards, and what is said of them."""
 THUMBNAIL_WIDTH_PX = 320
-"""Width of an image in the overview, pixels."""
 Progress = Callable[[str, int, int], None]
 
 
@@ -43,21 +42,14 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Folder:
-    """Corners found in the images of a folder.
+    """Corners found in the images of a folder."""
 
-    Args:
-        name: of the folder, and of its camera. board: that was looked for. header: names of the joint columns.
-        images: in the order of the table.
-        size: width and height, pixels.
-        paired: how rows and images were, unless the table names these.
-    """
-
-    name: str
-    board: Board
-    header: list[str]
-    images: list[Seen]
-    size: tuple[int, int]
-    paired: str
+    name: str  # of the folder, and of its camera
+    board: Board  # that was looked for
+    header: list[str]  # names of the joint columns
+    images: list[Seen]  # in the order of the table
+    size: tuple[int, int]  # width and height, pixels
+    paired: str  # how rows and images were, unless the table names these
 
     @property
     def used(self) -> list[Seen]:

@@ -35,22 +35,16 @@ OF_POSES = ("pose_covariance", "pose_shared", "pose_larger")
 
 
 class ImageTable(SocketTable):
-    """Columns of tables of images beside poses.
-
-    Attributes:
-        corners: (N, K, 5), see :meth:`from_images`; None without images. cameras: lens and board that they show, by the
-            names of the cameras. seen_by: (N,) int64, number of the camera of each image.
-        pose_covariance: (N, 6, 6) of the errors of the poses. pose_shared: (N, 6, c) effects of c errors of unit
-            variance that all images share: of lenses and board. pose_larger: (N, 6, 1) effects of a board that is
-            larger than was said, as a share. All in the axes of :func:`pose_jacobian`.
-    """
+    """Columns of tables of images beside poses."""
 
     BY_IMAGE = ("corners", "seen_by", *OF_POSES)
-    corners: Tensor | None = None
-    cameras: Mapping[str, Camera] = MappingProxyType({})
-    seen_by: Tensor | None = None
-    pose_covariance: Tensor | None = None
+    corners: Tensor | None = None  # (N, K, 5), see :meth:`from_images`; None without images
+    cameras: Mapping[str, Camera] = MappingProxyType({})  # lens and board that they show, by the names of the cameras
+    seen_by: Tensor | None = None  # (N,) int64, number of the camera of each image
+    pose_covariance: Tensor | None = None  # (N, 6, 6) of the errors of the poses
+    # (N, 6, c) effects of c errors of unit variance that all images share: of lenses and board
     pose_shared: Tensor | None = None
+    # (N, 6, 1) effects of a board that is larger than was said, as a share. All in the axes of :func:`pose_jacobian`
     pose_larger: Tensor | None = None
 
     @classmethod

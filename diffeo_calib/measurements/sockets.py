@@ -27,7 +27,6 @@ SEPARATOR = "/"
 """Between the name of a place and that of a socket: "front/0"."""
 Distances = Mapping[tuple[str, str], float]
 ONE_SESSION: dict[str, object] = {"session": None, "session_names": (), "remounted": False}
-"""Attributes of rows that were measured in one set-up."""
 BALL = "ball"
 """Name of the last marker, if the other ones have names."""
 FLATTERY = (
@@ -38,18 +37,15 @@ FLATTERY = (
 
 @dataclass(frozen=True)
 class Sockets:
-    """The sockets that hold the ball in some rows of a table.
+    """The sockets that hold the ball in some rows of a table."""
 
-    Args:
-        names: S names, such as "front/0": that of the place, a slash, that of the socket at this place. A name without
-            a slash is a place with one socket.
-        distances: known distances, as numbers of two sockets and their distance [m].
-        distance_std: their standard deviation [m]; None without distances. The distance of two sockets of a block has
-            one error at all places.
-    """
-
+    # S names, such as "front/0": that of the place, a slash, that of the socket at this place. A name without a slash
+    # is a place with one socket
     names: tuple[str, ...]
+    # known distances, as numbers of two sockets and their distance [m]
     distances: tuple[tuple[int, int, float], ...] = ()
+    # their standard deviation [m]; None without distances. The distance of two sockets of a block has one error at all
+    # places
     distance_std: float | None = None
 
     @classmethod

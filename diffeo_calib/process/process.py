@@ -27,19 +27,14 @@ from diffeo_calib.regression.conditional import lower_root
 
 @dataclass(frozen=True)
 class Expected:
-    """Numbers as the rows so far predict them, without noise: mean (M,), covariance F + D D^T.
+    """Numbers as the rows so far predict them, without noise: mean (M,), covariance F + D D^T."""
 
-    Args:
-        numbers: of M. mean: (M,). fields: F (M, M). features: D (M, K). white: V (M', M) L^-1 F(rows so far, numbers).
-        unknowns: (M, K) S P^1/2 - V^T W.
-    """
-
-    numbers: Numbers
-    mean: Tensor
-    fields: Tensor
-    features: Tensor
-    white: Tensor
-    unknowns: Tensor
+    numbers: Numbers  # of M
+    mean: Tensor  # (M,)
+    fields: Tensor  # F (M, M)
+    features: Tensor  # D (M, K)
+    white: Tensor  # V (M', M) L^-1 F(rows so far, numbers)
+    unknowns: Tensor  # (M, K) S P^1/2 - V^T W
 
     @property
     def covariance(self) -> Tensor:
@@ -49,19 +44,14 @@ class Expected:
 
 @dataclass(frozen=True, eq=False)
 class Process:
-    """The posterior of fields and unknowns by the rows given so far.
+    """The posterior of fields and unknowns by the rows given so far."""
 
-    Args:
-        scales: of the fields. space: that of the joints. variance: (K,) prior P of the unknowns.
-        numbers: of the rows so far. factor: their covariance with noise. alpha: (M,) L^-1 target.
-    """
-
-    scales: Hyperparameters
-    space: Space
-    variance: Tensor
-    numbers: Numbers
-    factor: Factor
-    alpha: Tensor
+    scales: Hyperparameters  # of the fields
+    space: Space  # that of the joints
+    variance: Tensor  # (K,) prior P of the unknowns
+    numbers: Numbers  # of the rows so far
+    factor: Factor  # their covariance with noise
+    alpha: Tensor  # (M,) L^-1 target
 
     @classmethod
     def prior(cls, scales: Hyperparameters, space: Space, variance: Tensor, like: Numbers) -> Process:

@@ -51,17 +51,11 @@ DEVIATIONS = (
 
 @dataclass(frozen=True)
 class GearLine:
-    """A periodic error of one joint at one frequency, as reduction gears have at multiples of their ratio.
+    """A periodic error of one joint at one frequency, as reduction gears have at multiples of their ratio."""
 
-    Args:
-        joint: number of the active joint.
-        frequency: w, rad per rad of the joint: periods per turn.
-        amplitude: b, prior standard deviation of its cosine and of its sine, rad.
-    """
-
-    joint: int
-    frequency: float
-    amplitude: float
+    joint: int  # number of the active joint
+    frequency: float  # w, rad per rad of the joint: periods per turn
+    amplitude: float  # b, prior standard deviation of its cosine and of its sine, rad
 
 
 @dataclass(frozen=True)

@@ -36,17 +36,11 @@ FREEDOM_GRID_POINTS = 400
 
 @dataclass(frozen=True)
 class Tails:
-    """How heavy the tails are, and the resulting weight of every measurement.
+    """How heavy the tails are, and the resulting weight of every measurement."""
 
-    Args:
-        freedom: nu, infinite for Gaussian noise.
-        weights: (N, P) expected weight of each marker of each row; about 1 for inliers.
-        gross: whether they are those of good and gross measurements.
-    """
-
-    freedom: float
-    weights: Tensor
-    gross: bool = False
+    freedom: float  # nu, infinite for Gaussian noise
+    weights: Tensor  # (N, P) expected weight of each marker of each row; about 1 for inliers
+    gross: bool = False  # whether they are those of good and gross measurements
 
     @classmethod
     def none(cls, rows: int, markers: int, *, device: torch.device = HOST) -> Tails:

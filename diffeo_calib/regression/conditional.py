@@ -37,14 +37,11 @@ class Features(NamedTuple):
     """Features f of M configurations: what parameters and data add to the covariance of the fields, a column each.
 
     covariance(x, x') = F(x, x') + sum_k sign_k f_k(x) f_k(x')^T, with F that of the fields. Nothing large cancels.
-
-    Args:
-        at: the linearisation, r numbers each. values: (k, M r). signs: (k,) 1 or -1.
     """
 
-    at: Linearisation
-    values: Tensor
-    signs: Tensor
+    at: Linearisation  # the linearisation, r numbers each
+    values: Tensor  # (k, M r)
+    signs: Tensor  # (k,) 1 or -1
 
     @classmethod
     def of(cls, at: Linearisation, *parts: tuple[Tensor, int]) -> Features:
@@ -81,12 +78,9 @@ class Conditional(ABC):
     Shifts that rows of the data share are parameters of unit variance after those of the nominal map, and unknowns
     that were opened later come after these. Of columns that a linearisation has not it does not depend, and a
     conditional leaves those out that it does not know.
-
-    Attributes:
-        size: number of measured coordinates or momenta that are conditioned on.
     """
 
-    size: int
+    size: int  # number of measured coordinates or momenta that are conditioned on
 
     @abstractmethod
     def features(self, at: Linearisation) -> Features:

@@ -35,18 +35,12 @@ FACTORS = 0.01, 1e4  # between which the factor is sought
 
 @dataclass(frozen=True)
 class RegionPrior:
-    """Prior of the scale of errors: log-normal distributions.
+    """Prior of the scale of errors: log-normal distributions."""
 
-    Args:
-        scale_efolds: standard deviation of log s around zero.
-        freedom: centre of nu. freedom_efolds: standard deviation of its logarithm.
-        rows: number of independent errors whose quantile counts as much as the distribution.
-    """
-
-    scale_efolds: float = 0.8
-    freedom: float = 40.0
-    freedom_efolds: float = 0.8
-    rows: float = 60.0
+    scale_efolds: float = 0.8  # standard deviation of log s around zero
+    freedom: float = 40.0  # centre of nu
+    freedom_efolds: float = 0.8  # standard deviation of its logarithm
+    rows: float = 60.0  # number of independent errors whose quantile counts as much as the distribution
 
 
 REGION_PRIOR = RegionPrior()

@@ -72,14 +72,13 @@ def write_report(
     date = "" if made is None else f", fitted {made.date[:10]}"
     note = "" if made is None or not made.note else f". Note: {printable(made.note)}"
     fit, rows = f"{robot.n} joints, {len(model.configurations)} rows in the fit{date}{note}", sentences.rows_of(found)
-    if warnings is None:
-        warnings = (summary.warnings or "").splitlines() if summary else []
+    known = (summary.warnings or "").splitlines() if summary else []
     sha256 = None if data is None or not found.new else data.sha256
     text = page(
         title=printable(title or f"Robot {robot.name}, {robot.base} to {robot.tip}"),
         subtitle=f"{fit}. Errors: {rows}.",
         verdict=sentences.verdict(found, tolerance),
-        warnings=warnings,
+        warnings=known if warnings is None else warnings,
         advice=list(sentences.advice(found)),
         figures=dict(sentences.figures(found)),
         sections=[*sections.sections(found, progress), sections.record(model, sha256)],

@@ -56,7 +56,7 @@ KIND = entries(ANGLES | {"what": ("errors", "spread", "readings"), "unit": str} 
 POSE = entries({"pose_m": [[float]], "position_std_m": [float], "rotation_std_rad": [float]})
 PLACES = dict.fromkeys(("camera_in_tip", "board_in_base", "board_in_tip", "camera_in_base"), POSE)
 HAND_EYE = entries(
-    PLACES,
+    {**PLACES},
     "A camera and its board, one in the frame of the tip, the other in the robot's base, with standard deviations "
     "along the axes of these frames.",
     *PLACES,

@@ -153,9 +153,9 @@ def recorded_flow(
     steps, n = len(stages) // len(weights), stages.shape[-1]
     for config in kernel:
         term, joint = radial_term(config, stages), config["output"]
-        own = joint is not None and _inputs(config, n) == ([], [joint]) and stages.shape[2] <= MOST_TABULATED
+        own: bool = joint is not None and _inputs(config, n) == ([], [joint]) and stages.shape[2] <= MOST_TABULATED
         if term.weights.any():
-            (alone.setdefault(joint, []) if own else rest).append(term)
+            (alone.setdefault(int(joint), []) if own else rest).append(term)
     for joint, terms in sorted(alone.items()):
         if (tables := _joint_tables(terms, stages[:, 0, :, joint], joint)) is None:
             rest += terms

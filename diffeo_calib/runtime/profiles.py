@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-SMALLEST_SQUARE = 1e-14
+LEAST_R2 = 1e-14
 """Added to r^2 where a formula divides by r."""
 NUMPY = SimpleNamespace(
     exp=lambda a: np.exp(a, out=a), sqrt=lambda a: np.sqrt(a, out=a), relu=lambda a: np.maximum(a, 0.0)
@@ -64,7 +64,7 @@ def _safe(r: Any, use: Any) -> Any:
     Below p = 0 the derivative is infinite at r = 0, but every formula multiplies it by |F - F'|^2 or a higher power, so
     that the product vanishes. The floor keeps rounding of coinciding points (r2 = 1e-16, not 0) from blowing up.
     """
-    return use.sqrt(r * r + SMALLEST_SQUARE)
+    return use.sqrt(r * r + LEAST_R2)
 
 
 POLYNOMIALS: dict[int, Callable[[Any, Any], Any]] = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import astuple, dataclass, fields
 
 import torch
@@ -103,12 +103,8 @@ class BoardCameras(Extrinsics):
         return {name: own for name, own in each if own is not None}
 
     def sentences(self) -> list[str]:
-        return list(camera_sentences(self.cameras))
-
-
-def camera_sentences(cameras: Mapping[str, BoardCamera]) -> Iterator[str]:
-    """Lens of each camera, of several with its name, the board that all of them saw, and what explains what."""
-    names = {name: f"{name}: " * (len(cameras) > 1) for name in cameras}
-    yield from (f"{names[name]}{line}" for name, own in cameras.items() for line in own.camera.sentences())
-    yield from (own.camera.board_sentence() for own in [*cameras.values()][:1])
-    yield from (f"{names[name]}{own.explained.sentence()}" for name, own in cameras.items())
+        """Lens of each camera, of several with its name, the board that all of them saw, and what explains what."""
+        each = {f"{name}: " * (len(self.cameras) > 1): own for name, own in self.cameras.items()}
+        lenses = [f"{name}{line}" for name, own in each.items() for line in own.camera.sentences()]
+        board = [own.camera.board_sentence() for own in [*each.values()][:1]]
+        return [*lenses, *board, *(f"{name}{own.explained.sentence()}" for name, own in each.items())]

@@ -40,20 +40,15 @@ LARGEST_MEDIAN_M = 5e-3
 
 @dataclass(frozen=True)
 class Beside:
-    """Kinematics that rows are compared with.
+    """Kinematics that rows are compared with."""
 
-    Args:
-        points: a table -> (N, P, 3) points of the tool under the payloads of its rows, m, the ball last.
-        known: devices whose places are known, by kind. turns: of its tips; None for kinematics that do not tell.
-        unplaced: whether positions are in another frame than that of the kinematics, which no device has seen.
-        every_session: whether the frame of a single set-up is to be found too.
-    """
-
+    # a table -> (N, P, 3) points of the tool under the payloads of its rows, m, the ball last
     points: Callable[[Any], Tensor]
-    known: Mapping[str, Any]
-    turns: Turns | None = None
+    known: Mapping[str, Any]  # devices whose places are known, by kind
+    turns: Turns | None = None  # of its tips; None for kinematics that do not tell
+    # whether positions are in another frame than that of the kinematics, which no device has seen
     unplaced: bool = False
-    every_session: bool = False
+    every_session: bool = False  # whether the frame of a single set-up is to be found too
 
 
 class Sensor(ABC):
@@ -84,13 +79,6 @@ class Sensor(ABC):
     @abstractmethod
     def errors(self, data: Any, points: Tensor, places: Places) -> Evaluation:
         """Measured minus predicted values, for points (N, P, 3) of the tool, m."""
-
-    def set_up(self, data: Any, known: Callable[[Measurements], Measurements]) -> Measurements | None:
-        """The rows of one set-up whose device says where the robot stands; None where none does.
-
-        ``known``: rows whose tool a model knows as those of the model's, see :meth:`SetUps.in_any_frame`.
-        """
-        return None
 
     @abstractmethod
     def settled(self, data: Any, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
@@ -146,10 +134,6 @@ class Positions(Sensor):
     def _errors(self, whole: Evaluation, data: Measurements, points: Tensor) -> Evaluation:
         away = data.points - points
         return replace(whole, errors=away.norm(dim=-1), away=away)
-
-    def set_up(self, data: Measurements, known: Callable[[Measurements], Measurements]) -> Measurements:
-        """Of several set-ups the one with most rows."""
-        return known(data).largest_session()
 
     def settled(self, data: Measurements, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
         """The frames of the set-ups that rows name, or their markers; those of the only one are those of the model."""
@@ -225,7 +209,7 @@ class Contacts(Sensor):
         return Evaluation(size, None, away[:, None], lines, distances, what=SPREAD, kind="socket", devices=names)
 
     def settled(self, data: Measurements, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
-        return (PlacedDevices(SocketPlaces.of(points[:, -1], data)),)
+        return (PlacedDevices(SocketPlaces.around(points[:, -1], data)),)
 
 
 class OtherDevices(Sensor):
@@ -246,15 +230,12 @@ class OtherDevices(Sensor):
         if known is not None and set(data.names) <= set(known.names):
             return Places(joined([known]))
         names = tuple(name for name in data.names if known is None or name not in known.names)
-        new = torch.tensor([name in names for name in data.names], dtype=torch.bool, device=data.device.device)
-        rows = data.rows(new[data.device])
+        rows = of_devices(data, names)
         devices = placed(rows, beside.points(rows))
         free = int((devices.deviations > KNOWN_DEVIATION).sum())
-        if known is not None:
-            devices = known.beside(devices)
-        names = few([f"'{name}'" for name in names])
-        sentence = f"the places of the devices of {data.kind}s were found from these rows: {names}"
-        return Places(joined([devices]), found=(sentence,), numbers=free)
+        words = few([f"'{name}'" for name in names])
+        sentence = f"the places of the devices of {data.kind}s were found from these rows: {words}"
+        return Places(joined([devices] if known is None else [known, devices]), found=(sentence,), numbers=free)
 
     def errors(self, data: Readings, points: Tensor, places: Places) -> Evaluation:
         devices = places.devices.get(data.kind)

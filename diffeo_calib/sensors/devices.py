@@ -51,19 +51,16 @@ length, or a number that differs from row to row."""
 
 
 class Hypothesis(NamedTuple):
-    """Something that may be wrong, or change, of a device, the robot or its tool.
+    """Something that may be wrong, or change, of a device, the robot or its tool."""
 
-    Args:
-        name: in words. effects: (N, r, U) derivatives of N rows by its unknowns, m. unit: of a single unknown, and its
-            size in m, rad or relative; None to report the motion. fix: what to do about it.
-        about: :data:`CHANGE`, :data:`VALUE` or :data:`ROW`.
-    """
-
-    name: str
-    effects: Tensor
+    name: str  # in words
+    effects: Tensor  # (N, r, U) derivatives of N rows by its unknowns, m
+    # of a single unknown, and its size in m, rad or relative; None to report the motion
     unit: tuple[str, float] | None = None
-    fix: str = "name the rows before and after as two devices, or use those before or after it"
-    about: str = CHANGE
+    fix: str = "name the rows before and after as two devices, or use those before or after it"  # what to do about it
+    about: str = CHANGE  # :data:`CHANGE`, :data:`VALUE` or :data:`ROW`
+    # its deviation in right rows, of a ratio that the fit takes up; 0 for what it cannot tell from the robot's size
+    usual: float = 0.0
 
     def amount(self, size: float, sign: str = "") -> str:
         """A size of its unknown, m, rad or relative, with its unit."""
@@ -83,6 +80,10 @@ class Extrinsics(ABC):
     kind: ClassVar[str]
     reads: ClassVar[bool] = False
     """Whether they report readings of a model's points."""
+    set_up: ClassVar[bool] = False
+    """Whether they are set-ups: one alone is that of its model, and every fit finds them anew."""
+    seen_points: ClassVar[int] = 0
+    """Points of the tool that they see."""
 
     names: tuple[str, ...]
     constants: Tensor
@@ -113,16 +114,6 @@ class Extrinsics(ABC):
     def elsewhere(self) -> Tensor:
         """(D,) boolean: set-ups in another frame than the model's, or with other markers."""
         return torch.zeros(len(self.names), dtype=torch.bool, device=self.constants.device)
-
-    @property
-    def of_model(self) -> bool:
-        """Whether this is one set-up alone, whose frame and markers are those of the model."""
-        return False
-
-    @property
-    def fitted_again(self) -> bool:
-        """Whether a fit to rows of known devices finds them anew, as it does set-ups."""
-        return False
 
     @property
     def cameras(self) -> dict[str, Any]:
@@ -162,7 +153,7 @@ class Devices(Extrinsics):
     stated_as: ClassVar[str] = ""
     """How a user writes where a new device is, to plan poses for it: the numbers of :meth:`stated`."""
     seen_points: ClassVar[int] = 1
-    """Points of the tool that it sees: the ball, or three of each measured frame."""
+    """The ball, or three points of each measured frame."""
     increments_each: ClassVar[int]
     """Increments k of a device."""
     numbers_each: ClassVar[int] = 1
@@ -201,6 +192,11 @@ class Devices(Extrinsics):
     def changed(constants: Tensor, increments: Tensor) -> Tensor:
         """Constants (c,) of one device after increments (k,)."""
         return constants + increments
+
+    @staticmethod
+    def turned(values: Tensor, T: Tensor) -> Tensor:
+        """Readings (N, r) in another frame, to which T (4, 4) leads: others only where they are along its axes."""
+        return values
 
     @classmethod
     def check_seen(cls, constants: Tensor, points: Tensor) -> None:
@@ -242,6 +238,11 @@ class Devices(Extrinsics):
     def where(self, number: int) -> str:
         """Where a device is, in words."""
         return ", ".join(f"{value:.3f}" for value in self.constants[number].tolist())
+
+    @property
+    def places(self) -> Tensor | None:
+        """(D, 3) to which the ball must be brought to be seen, m; None if anywhere will do."""
+        return None
 
     def sees(self, points: Tensor, device: Tensor) -> Tensor:
         """(N,) boolean: whether these devices (N,) can measure points (N, 3), m."""
@@ -315,15 +316,15 @@ class Devices(Extrinsics):
         return [self.sentence(number, own, MODEL_FRAME) for number, own in enumerate(self.deviations)]
 
     def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
-        return torch.stack([self.only([name])._carried(before, after) for name in self.names])
+        return torch.stack([self.only([name])._carried(T, before, after) for name in self.names])
 
-    def _carried(self, before: Tensor, after: Tensor) -> Tensor:
+    def _carried(self, T: Tensor, before: Tensor, after: Tensor) -> Tensor:
         """Constants (c,) of the device that reads of points (N, P, 3) what this one reads of others, m."""
         old, new = self.points_of(before), self.points_of(after)
         own = torch.zeros(len(old), dtype=torch.int64, device=old.device)
         sees = self.sees(old, own)
         old, new, own = old[sees], new[sees], own[sees]
-        values = self.observation(own).value(old) / self.metres
+        values = self.turned(self.observation(own).value(old) / self.metres, T)
         start = replace(self, constants=self.start(values, self.bodies(new))[None])
         return start.refined(Readings(self.kind, old[:, :1], values, own, self.names), new).constants[0]
 

@@ -62,14 +62,9 @@ class KnownDrift(Extrinsics):
         return replace(own, joints=joints)
 
     @property
-    def lowest(self) -> Tensor:
-        """(K,) of every column."""
-        return self.constants[:, 0]
-
-    @property
-    def highest(self) -> Tensor:
-        """(K,) of every column."""
-        return self.constants[:, 1]
+    def ends(self) -> dict[str, tuple[float, float]]:
+        """The lowest and the highest value of each column."""
+        return {name: (low, high) for name, (low, high, *_) in zip(self.names, self.constants.tolist(), strict=True)}
 
     @property
     def centre(self) -> Tensor:
@@ -83,9 +78,8 @@ class KnownDrift(Extrinsics):
 
     def ramp(self, data: Any) -> Tensor:
         """From -1/2 at the lowest value of each column to 1/2 at the highest: (N, K); 0 where rows do not tell it."""
-        ends = zip(self.names, self.lowest, self.highest, strict=True)
-        middle = data.q.new_full((len(data),), 0.5)
-        shares = [(data.drifting[k] - low) / (high - low) if k in data.drifting else middle for k, low, high in ends]
+        ends, middle = self.ends.items(), data.q.new_full((len(data),), 0.5)
+        shares = [(data.drifting[k] - low) / (high - low) if k in data.drifting else middle for k, (low, high) in ends]
         return torch.stack(shares, 1).clamp(0.0, 1.0) - 0.5
 
     def points(self, kinematics: Callable[[Tensor], Tensor], data: Any) -> Tensor:
@@ -108,8 +102,7 @@ class KnownDrift(Extrinsics):
 
     def holds(self) -> str:
         """For which values the model itself holds."""
-        middles = (0.5 * (self.lowest + self.highest)).tolist()
-        return " and ".join(f"{name} {middle:g}" for name, middle in zip(self.names, middles, strict=True))
+        return " and ".join(f"{name} {0.5 * (low + high):g}" for name, (low, high) in self.ends.items())
 
     @property
     def of_another_date(self) -> str:
@@ -118,8 +111,7 @@ class KnownDrift(Extrinsics):
 
     def of_joints(self) -> Iterator[str]:
         """How much drifted with each column, of what is known well, and for what the model holds."""
-        for number, name in enumerate(self.names):
-            low, high = float(self.lowest[number]), float(self.highest[number])
+        for number, (name, (low, high)) in enumerate(self.ends.items()):
             what = ", ".join(self._known(number)) or "no single cause stands out"
             yield f"drift with {name} from {low:g} to {high:g}: {what}; the model holds for {0.5 * (low + high):g}"
 
@@ -130,12 +122,12 @@ class KnownDrift(Extrinsics):
             yield f"the drift with {' and '.join(told)} that the fit found is part of the predictions of these rows"
         if len(told) < len(self.names):
             yield f"rows without {' and '.join(self.names)} are judged as if measured at {self.holds()}"
-        for name, low, high in zip(self.names, self.lowest, self.highest, strict=True):
+        for name, (low, high) in self.ends.items():
             values = data.drifting.get(name)
             outside = 0 if values is None else int(((values < low) | (values > high)).sum())
             if outside:
                 yield (
-                    f"{outside} rows have {name} outside of {float(low):g} to {float(high):g}, the rows of the fit: "
+                    f"{outside} rows have {name} outside of {low:g} to {high:g}, the rows of the fit: "
                     "the drift is taken to stay as it was at the nearer end"
                 )
 

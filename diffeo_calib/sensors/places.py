@@ -29,18 +29,13 @@ BALL_IS_THE_MARKER = (
 
 @dataclass(frozen=True)
 class Places:
-    """Devices beside a model.
+    """Devices beside a model."""
 
-    Args:
-        devices: by kind: set-ups of measured positions, where these are in other frames, and devices of readings.
-        ball: whether the last marker is a ball that no device of positions measures.
-        found: what was found from the rows that are judged, in sentences. numbers: how many numbers that took.
-    """
-
+    # by kind: set-ups of measured positions, where these are in other frames, and devices of readings
     devices: Mapping[str, Any] = field(default_factory=dict)
-    ball: bool = False
-    found: tuple[str, ...] = ()
-    numbers: int = 0
+    ball: bool = False  # whether the last marker is a ball that no device of positions measures
+    found: tuple[str, ...] = ()  # what was found from the rows that are judged, in sentences
+    numbers: int = 0  # how many numbers that took
 
     def aligned(self, data: Any) -> Any:
         """Measured positions in the frame of the model."""
@@ -117,18 +112,12 @@ def _nothing() -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class PlacedDevices:
-    """Devices of one kind in the frame of a model, and the rows of its fit that they measured.
+    """Devices of one kind in the frame of a model, and the rows of its fit that they measured."""
 
-    Args:
-        devices: where they are.
-        rows: (M,) int64, rows of the fit that they measured; by default none. device: (M,) int64, which of them did.
-        shown: how their readings are shown; None for other kinds, and in files of old versions.
-    """
-
-    devices: Extrinsics
-    rows: Tensor = field(default_factory=_nothing)
-    device: Tensor = field(default_factory=_nothing)
-    shown: Shown | None = None
+    devices: Extrinsics  # where they are
+    rows: Tensor = field(default_factory=_nothing)  # (M,) int64, rows of the fit that they measured; by default none
+    device: Tensor = field(default_factory=_nothing)  # (M,) int64, which of them did
+    shown: Shown | None = None  # how their readings are shown; None for other kinds, and in files of old versions
 
     @property
     def kind(self) -> str:

@@ -54,6 +54,7 @@ class SetUps(Extrinsics):
         increments_each: numbers of a set-up that a fit leaves open.
     """
 
+    set_up = True
     shape: ClassVar[tuple[int, int]] = (4, 4)
     """Of the constants of one."""
     key: ClassVar[str] = "mountings"
@@ -118,17 +119,9 @@ class SetUps(Extrinsics):
         """(S,) boolean: the set-ups but the model's."""
         return (self.constants != self.same).any(1)
 
-    @property
-    def of_model(self) -> bool:
-        return len(self.names) == 1
-
-    @property
-    def fitted_again(self) -> bool:
-        return True
-
-    def views(self) -> list[View]:
-        """How each set-up sees poses of the model; as the model where markers were mounted anew."""
-        return [lambda poses: poses for _ in self.names]
+    def view(self, number: int, poses: Tensor) -> Tensor:
+        """What a set-up sees of poses (M, 4, 4) of the model, m; the same where markers were mounted anew."""
+        return poses
 
     def moved(self, others: Sequence[int], steps: Tensor, std: Tensor, centre: Tensor, T: Tensor) -> Self:
         """Some set-ups (T,) after increments (T, k), in prior deviations, and with their deviations.
@@ -216,8 +209,8 @@ class MeasuringFrames(SetUps):
     def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
         return (self.constants.unflatten(1, (4, 4)) @ torch.linalg.inv(T)).flatten(1)
 
-    def views(self) -> list[View]:
-        return [lambda poses, T=T: T @ poses for T in self.constants.unflatten(1, (4, 4))]
+    def view(self, number: int, poses: Tensor) -> Tensor:
+        return self.constants[number].view(4, 4) @ poses
 
     def sentence(self, number: int) -> str:
         shift, turn = _size(self.constants[number])
@@ -315,8 +308,8 @@ class MountedFrames(SetUps):
         mean = transforms(nearest_rotations(change[:, :3, :3].mean(0)), change[:, :3, 3].mean(0))
         return (mean @ self.constants.unflatten(1, (4, 4))).flatten(1)
 
-    def views(self) -> list[View]:
-        return [lambda poses, M=M: poses @ M for M in self.constants.unflatten(1, (4, 4))]
+    def view(self, number: int, poses: Tensor) -> Tensor:
+        return poses @ self.constants[number].view(4, 4)
 
     def sentence(self, number: int) -> str:
         shift, turn = _size(self.constants[number])

@@ -11,17 +11,41 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.sockets import NO_SOCKET, Sockets
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.sensors.devices import MODEL_FRAME, Extrinsics, numbers_text
+from diffeo_calib.sensors.devices import Devices, Extrinsics, numbers_text
+
+IN_SOCKET_M = 0.02
+"""Largest distance of the ball from the place of a socket, stated roughly, at which it counts as resting there."""
 
 
 @dataclass(frozen=True, eq=False)
-class SocketPlaces(Extrinsics):
-    """Sockets: constants are their places (3), m."""
+class SocketPlaces(Devices):
+    """Sockets, in which a ball shows nothing but that it is there: constants are their places (3), m."""
 
-    kind = "socket"
+    kind, reads, stated_as = "socket", False, "X,Y,Z"
+    size_fix = "pass a known distance between two sockets"
+    numbers_each, increments_each = 3, 3
 
     @classmethod
-    def of(cls, ball: Tensor, data: Measurements) -> SocketPlaces:
+    def start(cls, values: Tensor, bodies: Tensor) -> Tensor:
+        return (bodies - values).mean(0)
+
+    @staticmethod
+    def read(constants: Tensor, body: Tensor) -> Tensor:
+        return body - constants
+
+    @classmethod
+    def stated(cls, numbers: Tensor) -> Tensor:
+        return numbers
+
+    @property
+    def places(self) -> Tensor:
+        return self.constants
+
+    def sees(self, points: Tensor, device: Tensor) -> Tensor:
+        return (points - self.constants[device]).norm(dim=1) < IN_SOCKET_M
+
+    @classmethod
+    def around(cls, ball: Tensor, data: Measurements) -> SocketPlaces:
         """The middles of balls (N, 3), m; a single row deviates as those of others do."""
         socket, known = sockets_of(data)
         numbers = socket.unique()
@@ -32,12 +56,18 @@ class SocketPlaces(Extrinsics):
         each = [rows.std(0) / len(rows) ** 0.5 if len(rows) > 1 else single for rows in own]
         return cls(tuple(known.names[number] for number in numbers.tolist()), middles, torch.stack(each))
 
+    def same_set(self, other: Extrinsics) -> bool:
+        """All sockets are of one set."""
+        return self.kind == other.kind
+
     def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
         return self.constants @ T[:3, :3].mT + T[:3, 3]
 
-    def sentences(self) -> list[str]:
-        each = zip(self.names, (1e3 * self.constants).tolist(), strict=True)
-        return [f"socket '{name}': {numbers_text(place)} mm in {MODEL_FRAME}" for name, place in each]
+    def where(self, number: int) -> str:
+        return f"{numbers_text((1e3 * self.constants[number]).tolist())} mm"
+
+    def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
+        return f"socket '{self.names[number]}': {self.where(number)} in {frame}"
 
 
 def sockets_of(data: Measurements) -> tuple[Tensor, Sockets]:

@@ -67,6 +67,10 @@ class Contacts(Devices):
     def read(constants: Tensor, body: Tensor) -> Tensor:
         return body[:3, :3] @ constants[3:] + body[:3, 3] - constants[:3]
 
+    @staticmethod
+    def turned(values: Tensor, T: Tensor) -> Tensor:
+        return values @ T[:3, :3].mT
+
     @classmethod
     def start(cls, values: Tensor, bodies: Tensor) -> Tensor:
         eye = torch.eye(3, dtype=values.dtype, device=values.device).expand(len(bodies), 3, 3)

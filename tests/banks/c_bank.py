@@ -11,6 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from diffeo_calib.interop.c_source import c_source
+from diffeo_calib.runtime.program import Program
+
 COMPILER = shutil.which("gcc") or shutil.which("cc")
 CPLUSPLUS = shutil.which("g++") or shutil.which("c++")
 WARNINGS = ("-Wall", "-Wextra", "-pedantic", "-Werror")
@@ -75,6 +78,17 @@ class CModel:
         q, value = np.array(q, float), np.empty(shape)
         getattr(self.library, f"{self.prefix}_{name}")(_pointer(q), _pointer(value), _pointer(jacobian))
         return value
+
+
+def c_model(program: Program, folder: Path, tool: Array, limits: Array | None = None) -> CModel:
+    """The program in C, in the measuring frame; without limits of the joints (n, 2) by default."""
+    n = program.chain.n
+    limits = np.tile([-np.inf, np.inf], (n, 1)) if limits is None else limits
+    texts = {"robot": "robot", "joints": [], "frame_name": "the measuring frame", "remarks": []}
+    made = c_source(program, "generated", "robot", tool=tool, frame=np.eye(4), limits=limits, **texts)
+    for suffix, text in zip((".c", ".h"), made, strict=True):
+        (folder / f"generated{suffix}").write_text(text)
+    return CModel(folder / "generated.c", n, len(program.markers), "robot")
 
 
 def _pointer(values: Array | None) -> object:

@@ -1,27 +1,40 @@
-"""Deformations of robots in general position, without a fit: every kernel, error and parameter differs from zero."""
+"""Robots in general position, without a fit: every kernel, error and parameter differs from zero; large momenta."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import torch
-from robots_bank import draw
+from robots_bank import CHAINS, draw
+from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.kernels.base import SumKernel
 from diffeo_calib.kernels.profiles import PROFILES, Profile
+from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
+from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.robots import Chain, Geometry
 from diffeo_calib.robots.gear_waves import GearWaves
 from diffeo_calib.robots.se3 import twist_transform
+from diffeo_calib.robots.tree import Tree
 
-CONTROLS = 9
+CONTROLS, LARGE_CONTROLS = 9, 12
 RK4_TWICE = dc.RK4(2)
+LEVER = 0.1
+
+
+def geometry_of(chain: Tree, markers: int = 2, size: float = 0.3, *, seed: int = 11, reach: float = 1.0) -> Geometry:
+    """A base, an error before every joint, and markers; of a robot with several tips one marker on each hand."""
+    twists, tool = twist_transform(draw(chain.moving + 1, 6, seed=seed, size=size)), draw(markers, 3, seed=seed + 1)
+    on = chain.tips[:2] if len(chain.tips) > 1 and markers == 2 else ()
+    return replace(Geometry.nominal(chain, markers, on), base=twists[0], joint_errors=twists[1:], tool=reach * tool)
 
 
 def deformation_of(
@@ -33,12 +46,7 @@ def deformation_of(
     integrator: Integrator = RK4_TWICE,
 ) -> GeodesicDeformation:
     """A deformation in general position: every kernel, error and parameter differs from zero."""
-    twists = twist_transform(draw(chain.moving + 1, 6, seed=11, size=0.3))
-    on = chain.tips[:2] if len(chain.tips) > 1 else ()  # a marker on each hand
-    geometry = replace(
-        Geometry.nominal(chain, 2, on), base=twists[0], joint_errors=twists[1:], tool=draw(2, 3, seed=12)
-    )
-    nominal = GeometryMap(geometry, elastic=elastic, waves=waves_of(chain) if waves else GearWaves())
+    nominal = GeometryMap(geometry_of(chain), elastic=elastic, waves=waves_of(chain) if waves else GearWaves())
     space, n = dc.Space(chain.periodic), chain.n
     scales = torch.linspace(0.6, 1.2, n, dtype=torch.float64)
     together = dc.Gaussian(scales, variance=1e-2 * scales, space=space)
@@ -63,3 +71,57 @@ def model_of(chain: Chain, integrator: Integrator = RK4_TWICE, waves: bool = Fal
     return dc.CalibratedKinematics(
         chain, FittedMap(deformation_of(chain, integrator=integrator, waves=waves), Noise(noise))
     )
+
+
+@cache
+def made(
+    name: str, *, profile: str = "matern52", markers: int = 1, elastic: bool = True, steps: int = 1
+) -> dc.CalibratedKinematics:
+    """A model of one of the CHAINS, whose errors are centimetres and hundredths of a radian; poses of three markers."""
+    return made_with(CHAINS[name], dc.RK4(steps), profile, markers, elastic)
+
+
+def made_with(
+    chain: Tree, integrator: Integrator, profile: str = "matern52", markers: int = 1, elastic: bool = False
+) -> dc.CalibratedKinematics:
+    geometry, space = geometry_of(chain, markers, 0.2, seed=31, reach=0.1), dc.Space(chain.periodic)
+    if markers == 3:  # a triangle, whose poses the model has
+        geometry = geometry.with_tool(mark_points(twist_transform(draw(1, 6, seed=30, size=0.2)), LEVER)[0])
+    nominal = GeometryMap(geometry, elastic=elastic)
+    scales, variances = torch.linspace(0.5, 1.0, chain.n), torch.linspace(1e-3, 2e-3, chain.n)
+    own = dc.PerJoint(scales, variances, space, PROFILES[profile])
+    together = RadialKernel(PROFILES["gaussian"], lengthscale=scales + 1.0, variance=variances, periodic=space.periodic)
+    task = RadialKernel(PROFILES[profile], lengthscale=0.7, variance=1e-3)
+    prior = torch.ones(nominal.parameters, dtype=torch.float64)
+    spec = ModelSpec(nominal, own + together, task, prior, 3)
+    momenta = Momenta(
+        draw(LARGE_CONTROLS, chain.n, seed=33, size=2.0),
+        draw(LARGE_CONTROLS * markers, 3, seed=34, size=2.0),
+        draw(nominal.parameters, seed=35, size=0.01),
+    )
+    deformation = GeodesicDeformation(spec, draw(LARGE_CONTROLS, chain.n, seed=36), momenta, integrator)
+    noise = Noise(1e-8 * torch.eye(3 * markers, dtype=torch.float64).repeat(LARGE_CONTROLS, 1, 1))
+    fitted = FittedMap(deformation, noise)
+    return dc.CalibratedKinematics(chain, fitted, lever=LEVER if markers == 3 else None, tool=[0.1, -0.05, 0.2])
+
+
+def queries(model: dc.CalibratedKinematics | FittedMap, rows: int = 5) -> Tensor:
+    """Two control points, where profiles have kinks, and other configurations."""
+    x = (model.map if isinstance(model, dc.CalibratedKinematics) else model).x
+    return torch.cat([x[:2], draw(rows, x.shape[1], seed=37, size=1.5)])
+
+
+@cache
+def fitted_plain(profile: str) -> FittedMap:
+    """A fit of a plain function of two variables, with one time step: compilers unroll all of them."""
+    x = draw(20, 2, seed=38)
+    kernels = [RadialKernel(PROFILES[profile], lengthscale=1.0, variance=0.1) for _ in range(2)]
+    problem = dc.Problem(
+        bend, x, bend(x) + 0.02 * (3.0 * x).sin(), joint_kernel=kernels[0], task_kernel=kernels[1], noise=0.01
+    )
+    return dc.fit(problem, integrator=dc.RK4(1)).model
+
+
+def bend(x: Tensor) -> Tensor:
+    """A smooth map of the plane."""
+    return torch.stack([x[:, 0].cos() + 0.3 * x[:, 1], x[:, 1] - 0.7 * x[:, 0].sin()], -1)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from deformation_bank import geometry_of
 from robots_bank import draw
 from torch import Tensor
 
@@ -17,7 +17,6 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.robots import Chain, Geometry
-from diffeo_calib.robots.se3 import twist_transform
 
 UGLY = """<?xml version='1.0' encoding="utf-8"?>
 <!-- <joint name="pan" type="revolute"><origin xyz="9 9 9" rpy="9 9 9"/></joint> -->
@@ -66,9 +65,7 @@ def write_ugly(path: Path, text: str = UGLY, encoding: str = "utf-8") -> Chain:
 
 def wrong(chain: Chain, size: float = 1e-2, markers: int = 1) -> Geometry:
     """A geometry with an error before every joint."""
-    twists = twist_transform(draw(chain.moving + 1, 6, seed=7, size=size))
-    tool = draw(markers, 3, seed=8, size=0.1)
-    return replace(Geometry.nominal(chain, markers), base=twists[0], joint_errors=twists[1:], tool=tool)
+    return geometry_of(chain, markers, size, seed=7, reach=0.1)
 
 
 def own_poses(geometry: Geometry, q: Tensor) -> Tensor:

@@ -16,7 +16,6 @@ from simulated_camera import BOARD_PRIOR, HEIGHT, WIDTH, CameraArm, camera_arm, 
 from simulated_sockets import rest_in_sockets
 from table_bank import refused
 from torch import Tensor
-from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.placing.place import place
@@ -25,11 +24,9 @@ from diffeo_calib.cameras.images import UNKNOWNS
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.csv.files import read_observations, write_measurements
-from diffeo_calib.measurements.poses import mark_points, poses_from_marks
+from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.measurements.table_format import LEVER, TableFormat
 from diffeo_calib.robots import SimulatedArm
-from diffeo_calib.robots.se3 import rotation, transforms
-from diffeo_calib.sensors.tool_frames import Contacts, Trackers
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 
@@ -159,11 +156,6 @@ def camera() -> Any:
     ).camera
 
 
-def drawn_bodies(rows: int = 12) -> Tensor:
-    draw = torch.randn(rows, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    return transforms(rotation(draw[:, 3:]), 0.4 * draw[:, :3])
-
-
 @cache
 def with_sockets() -> tuple[Any, Any]:
     """Images, then rows in sockets, and the socket of every such row."""
@@ -173,28 +165,6 @@ def with_sockets() -> tuple[Any, Any]:
     resting = rest_in_sockets(arm, places=2, rows=10)
     rows = dc.Measurements.from_sockets(resting.q, resting.names, arm.nominal.joint_names)
     return seen, dc.Observations.joined([seen.images(0.1), rows])  # pyright: ignore
-
-
-def test_a_tracker_is_found_from_poses_of_the_tool() -> None:
-    bodies, B = drawn_bodies(), drawn_bodies(1)[0]
-    B[:3, 3] += 3.0
-    marker = B.new_tensor([0.05, -0.12, 0.1])
-    truth = torch.cat([B[:3].flatten(), marker])
-    values = torch.stack([Trackers.read(truth, body) for body in bodies])
-    assert_close(values, ((bodies[:, :3, :3] @ marker + bodies[:, :3, 3]) @ B[:3, :3].mT) + B[:3, 3])
-    found = Trackers.start(values, bodies)
-    tracker = Trackers(("device",), found[None], found.new_full((1, 9), 0.1))
-    data = dc.Readings.of("marker", torch.zeros(len(values), 6), values, numbers=3, doubt=False)
-    marks = mark_points(bodies, LEVER).flatten(1)
-    assert_close(tracker.refined(data, marks).constants[0], truth, rtol=0, atol=1e-6)
-
-
-def test_socket_and_ball_are_found_from_poses_of_the_tool() -> None:
-    bodies = drawn_bodies()
-    ball, socket = bodies.new_tensor([0.01, 0.02, 0.15]), bodies.new_tensor([0.6, 0.1, 0.3])
-    bodies[:, :3, 3] = socket - bodies[:, :3, :3] @ ball
-    found = Contacts.start(torch.zeros_like(bodies[:, :3, 3]), bodies)
-    assert_close(found, torch.cat([socket, ball]), rtol=0, atol=1e-9)
 
 
 def test_the_size_comes_from_board_and_tracker() -> None:

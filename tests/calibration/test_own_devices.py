@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import inclinometer
-import laser_line
 import pytest
 import reading_bank
 import torch
@@ -22,13 +21,11 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.measurements.csv.files import read_observations, write_measurements
-from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.kinds import KINDS, kind_of, register
-from diffeo_calib.sensors.tool_frames import HeldTools
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 
@@ -54,23 +51,6 @@ def rows(arm: SimulatedArm) -> dc.Observations:
 @pytest.fixture(scope="module")
 def result(arm: SimulatedArm, rows: dc.Observations) -> Any:
     return dc.calibrate(arm.nominal, rows, hyperparameters=reading_bank.scales())  # pyright: ignore
-
-
-def test_slopes_are_derivatives_and_devices_are_found(arm: SimulatedArm) -> None:
-    q = arm.sample(60, seed=6)
-    data, z = readings(arm, q), reading_bank.in_base(arm, q)
-    found = Beams.at(data, z).refined(data, z)
-    assert float(found.errors(data, z).abs().max()) < 1e-4
-    assert_close(found.constants[:, 3:].abs(), laser_line.DIRECTIONS, rtol=0, atol=1e-4)
-    seen = found.observation(found.numbers(data))
-    slope = torch.func.jacrev(lambda p: seen.value(p).sum(0))(z)[0]
-    assert_close(seen.slope(z)[:, 0], slope)
-    slopes = found.by_increments(z, data.device)
-    for increment in range(4):
-        step = torch.zeros(2, 4, dtype=torch.float64)
-        step[:, increment] = 1e-6
-        ahead, behind = (found.moved(s).observation(data.device).value(z) for s in (step, -step))
-        assert_close((ahead - behind) / 2e-6, slopes[..., increment], rtol=0, atol=1e-8)
 
 
 def test_beside_positions_it_makes_the_model_better(arm: SimulatedArm, rows: dc.Observations, result: Any) -> None:
@@ -211,15 +191,6 @@ def relative_errors(model: Any, arms: Any, q: Tensor) -> float:
     """RMS distance of the second hand from where the first has it, against the truth, m."""
     found, true = (torch.linalg.inv(poses[:, 0]) @ poses[:, 1] for poses in (model.poses(q), arms.poses(q)))
     return float((found - true)[:, :3, 3].norm(dim=1).square().mean().sqrt())
-
-
-@pytest.mark.slow
-def test_slopes_are_derivatives(made: Any) -> None:
-    _, arms, X, _, held, _ = made
-    points = torch.cat([mark_points(frame, 0.1) for frame in arms.poses(held.q).unbind(1)], 1)
-    found = HeldTools.at(held, HeldTools.points_of(points))
-    assert_close(found.constants.view(3, 4), X[:3], rtol=0, atol=1e-3)
-    assert float(found.errors(held, HeldTools.points_of(points)).abs().max()) < 1e-3
 
 
 @pytest.mark.slow

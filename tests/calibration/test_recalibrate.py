@@ -14,8 +14,8 @@ import pytest
 import reading_bank
 import torch
 from again_bank import ELSEWHERE, NEW, arm, model, positions
+from deformation_bank import made
 from product_bank import Case, covered, simulated, simulated_poses, ur10_measurements, ur10_scales
-from recorded_bank import made
 from table_bank import refused
 
 import diffeo_calib as dc

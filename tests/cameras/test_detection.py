@@ -243,6 +243,11 @@ def test_images_without_rows_are_refused(folder: Path) -> None:
     table.write_text("image,q1\nmissing.png,2\n")
     with pytest.raises(MeasurementError, match=r"missing\.png"):
         read_folders([folder], table, FOUND)
+    table.write_text("image,camera,q1\n0.png,left,2\n")
+    with pytest.raises(MeasurementError, match=r"no column `camera`.*the folders name the cameras"):
+        read_folders([folder, folder / "right"], table, FOUND)
+    with pytest.raises(MeasurementError, match="different names"):
+        read_folders([folder, folder / "right" / folder.name], table, FOUND)
 
 
 def test_unnamed_images_are_paired_by_the_numbers_in_their_names(tmp_path: Path, command: Command) -> None:

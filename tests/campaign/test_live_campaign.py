@@ -294,10 +294,3 @@ def test_a_row_elsewhere_is_in_the_socket_there() -> None:
     found = placed.measured_at(row, copies, data.q[resting])
     assert found.row_sockets == data.rows(resting).row_sockets
     assert bool(placed.sees(row, data.q[resting]).all())
-
-
-def test_the_expected_error_is_about_the_true_one(running: dc.Campaign) -> None:
-    model, expected = running.result(hyperparameters=usual_scales(ARM.nominal)).model, running.expected_error
-    true = float((model(running.target) - ARM.true_points(running.target)).square().sum(-1).mean().sqrt())
-    assert expected is not None
-    assert 0.3 < true / expected < 2

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from command_bank import Command, Site
-from recorded_bank import made_with
+from deformation_bank import made_with
 from table_bank import held
 from torch import Tensor
 from two_arms_bank import HANDS

@@ -78,6 +78,23 @@ def with_points(site: Site, path: Path, points: Tensor) -> Path:
     return path
 
 
+def test_rows_that_repeat_those_of_the_fit_are_said(
+    fitted: Outcome, site: Site, command: Command, tmp_path: Path
+) -> None:
+    """The table of the fit again, and a copy with fewer digits, but not rows of other poses."""
+    assert fitted.code == 0
+    model, (train, test) = site.folder / "model.safetensors", site.data.split(0.7, seed=0)
+    for data, repeated in (
+        (train, True),
+        (dc.Measurements(train.q.round(decimals=4), train.points), True),
+        (test, False),
+    ):
+        named = dc.Measurements(data.q, data.points, site.data.joint_names, doubt=False)
+        write_measurements(tmp_path / "t.csv", named, FORMAT, position=["mx", "my", "mz"])
+        done = command("evaluate", model, tmp_path / "t.csv", *TABLE)
+        assert ("rows repeat joint values of the fit" in " ".join(done.out.split())) == repeated
+
+
 def test_wrong_rows_are_named(fitted: Outcome, site: Site, command: Command, tmp_path: Path) -> None:
     """One alone, and a block with its cause; the exit code is 0, since most rows are right."""
     assert fitted.code == 0

@@ -200,7 +200,7 @@ def test_other_commands_name_the_ball_and_what_was_measured(
     planned = command("plan", "other.safetensors", "-n", 3, "--draw", 20, *RAD, "-o", "next.csv")
     assert planned.code == 0, planned.err
     assert Path("next.csv").read_text().splitlines()[0].endswith(",rank,device")
-    assert "socket 1: " in planned.out
+    assert "spot 1/a: " in planned.out
     assert "held out" not in planned.out
     corrected = command("correct", "other.safetensors", "p.csv", *RAD, "-o", "c.csv")
     assert corrected.code == 0, corrected.err

@@ -71,8 +71,11 @@ def test_a_header_counts_as_an_output(arm: Case, files: Path, command: Command) 
 
 def test_tools_in_the_wrong_unit(arm: Case, files: Path, command: Command) -> None:
     dc.save(arm.model, files / "model.safetensors")
-    long = command(*arguments(files, "--tool", "0,0,150"))
-    assert any("--tool is 150 m long, more than the robot reaches" in line for line in long.warnings)
+    long = command(*arguments(files, "--tool", "0,0,3"))
+    assert any("--tool is 3 m long, more than the robot reaches" in line for line in long.warnings)
+    wrong = command(*arguments(files, "--tool", "0,0,150"))
+    assert wrong.code == 1
+    assert "--tool is 150 m long, more than the robot reaches" in wrong.err
     absurd = command(*arguments(files, "--tool", "0,0,1e30"))
     assert absurd.code == 1
-    assert "expected at most 1000 m" in absurd.err
+    assert "more than the robot reaches" in absurd.err

@@ -81,23 +81,6 @@ def test_first_gauss_newton_iterate_is_the_tangent_model(problem: Problem) -> No
         torch.testing.assert_close(actual, expected, rtol=1e-8, atol=1e-9)
 
 
-@every_problem
-def test_tangent_solution_minimises_the_quadratic_energy(problem: Problem) -> None:
-    """The gradient of 1/2 b K_V b + 1/2 p K_W p + 1/2 |y - k0 - Dk0 K_V b - K_W p|^2_R vanishes."""
-    none = torch.zeros(0, dtype=torch.float64)
-    k0 = problem.spec.nominal(problem.x, none)
-    dk0 = torch.block_diag(*problem.spec.nominal.jacobian(problem.x, none))
-    z = k0.reshape(-1, problem.spec.task_dim)
-    k_v, k_w = problem.spec.joint_kernel.matrix(problem.x, problem.x), problem.spec.task_kernel.matrix(z, z)
-    momenta = tangent(problem).momenta()
-    b, p = momenta.joint.flatten().requires_grad_(), momenta.task.flatten().requires_grad_()
-    residual = (problem.y - k0).flatten() - dk0 @ (k_v @ b) - k_w @ p
-    precision = torch.linalg.inv(torch.block_diag(*problem.noise.covariance))
-    total = 0.5 * (b @ k_v @ b + p @ k_w @ p + residual @ precision @ residual)
-    for slope in torch.autograd.grad(total, (b, p)):
-        torch.testing.assert_close(slope, torch.zeros_like(slope), rtol=0, atol=1e-7)
-
-
 def test_more_memory_than_is_free_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(choose, "free_memory", lambda: 2**14)
     with pytest.raises(InputError, match=r"32 measured coordinates.*more memory than is free.*controls=500"):

@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from c_bank import CModel, needs_compiler
+from c_bank import CModel, c_model, needs_compiler
 from deformation_bank import deformation_of
 from robots_bank import CHAINS, draw
 from scipy.spatial.transform import Rotation
 
-from diffeo_calib.interop.c_source import c_source
 from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.robots import Chain
 from diffeo_calib.robots.se3 import twist_transform
@@ -24,14 +23,10 @@ HOME = np.array([0.3, -0.8, 1.1, 0.4, 0.9, -0.2])
 LIMIT = 1.2
 
 
-def stepper(chain: Chain, folder: Path, limits: np.ndarray) -> CModel:
+def stepper(chain: Chain, folder: Path, limits: np.ndarray | None = None) -> CModel:
     program = program_of(deformation_of(chain, elastic=False))
     assert program is not None
-    settings = {"tool": TOOL, "frame": np.eye(4), "limits": limits}
-    texts = {"robot": "robot", "joints": [], "frame_name": "the measuring frame", "remarks": []}
-    for suffix, text in zip((".c", ".h"), c_source(program, "step", "step", **settings, **texts), strict=True):
-        (folder / f"step{suffix}").write_text(text)
-    return CModel(folder / "step.c", chain.n, len(program.markers))
+    return c_model(program, folder, TOOL, limits)
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +167,7 @@ def test_near_singularities_steps_stay_small(arm: CModel) -> None:
 def test_robots_of_fewer_joints(name: str, tmp_path: Path) -> None:
     """They reach the poses that they can reach."""
     chain = CHAINS[name]
-    made = stepper(chain, tmp_path, np.tile([-np.inf, np.inf], (chain.n, 1)))
+    made = stepper(chain, tmp_path)
     q, target = 0.1 * np.ones(chain.n), pose_at(made, 0.2 * np.ones(chain.n))
     assert errors_of_steps(made, q, target, 10)[-1] < 1e-13
 

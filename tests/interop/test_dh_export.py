@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from export_bank import configurations, own_poses, wrong
-from product_bank import Case
 from robots_bank import CHAIN, CHAINS, draw
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -128,17 +127,6 @@ def test_files_are_read_back(name: str, units: tuple[str, str], convention: str,
     base, again, tool = read_back(tmp_path / "dh.csv", *units, convention)
     torch.testing.assert_close(base @ again(q) @ tool, own_poses(geometry, q), rtol=0, atol=1e-12)
     assert (again.joint_names, again.moving_names) == (chain.joint_names, chain.moving_names)
-
-
-@pytest.mark.slow
-def test_models_are_exported_by_their_rigid_kinematics(arm: Case, tmp_path: Path) -> None:
-    rigid = dc.interop.rigid_kinematics(arm.model)
-    q = arm.test.q
-    expected = own_poses(rigid.geometry, q)
-    torch.testing.assert_close(dc.interop.dh_table(arm.model).poses(q), expected, rtol=0, atol=1e-12)
-    dc.interop.write_dh(arm.model, tmp_path / "dh.csv")
-    base, again, tool = read_back(tmp_path / "dh.csv", "m", "rad", "standard")
-    torch.testing.assert_close(base @ again(q) @ tool, expected, rtol=0, atol=1e-12)
 
 
 def test_wrong_options(tmp_path: Path) -> None:

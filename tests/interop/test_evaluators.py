@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 import torch
 import two_arms_bank
-from c_bank import CModel, needs_compiler
+from c_bank import CModel, c_model, needs_compiler
 from deformation_bank import deformation_of, model_of
 from robots_bank import CHAINS, draw, every_chain
 
 import diffeo_calib as dc
 from diffeo_calib.interop import write_c
-from diffeo_calib.interop.c_source import c_source
 from diffeo_calib.interop.torch_program import _ConstantPoints
 from diffeo_calib.kernels.profiles import PROFILES
 from diffeo_calib.kinematics.nominal import GeometryMap
@@ -40,16 +39,6 @@ def made(deformation: GeodesicDeformation, tip: str | None = None) -> Program:
     return program if tip is None else program.at(tip)
 
 
-def c_model(program: Program, folder: Path) -> CModel:
-    """The program in C, in the measuring frame."""
-    n = program.chain.n
-    settings = {"tool": TOOL, "frame": np.eye(4), "limits": np.tile([-np.inf, np.inf], (n, 1))}
-    texts = {"robot": "robot", "joints": [], "frame_name": "the measuring frame", "remarks": []}
-    for suffix, text in zip((".c", ".h"), c_source(program, "generated", "robot", **settings, **texts), strict=True):
-        (folder / f"generated{suffix}").write_text(text)
-    return CModel(folder / "generated.c", n, len(program.markers), "robot")
-
-
 def agree(
     by: str, deformation: GeodesicDeformation, folder: Path, tolerance: float = 1e-12, *, tip: str | None = None
 ) -> None:
@@ -60,7 +49,7 @@ def agree(
     if by == "torch":
         near(_ConstantPoints(program)(q).reshape(expected.shape).numpy(), expected.numpy(), tolerance)
         return
-    model = program if by == "numpy" else c_model(program, folder)
+    model = program if by == "numpy" else c_model(program, folder, TOOL)
     points, slopes = model.points_and_jacobian(q.numpy())
     near(points, expected.numpy(), tolerance)
     near(slopes, expected_slopes.numpy(), 1e-9)
@@ -210,7 +199,7 @@ def test_a_branch_that_only_weighs(tmp_path: Path) -> None:
     robot = dc.load_urdf(tmp_path / "two_arms.urdf", "base", "left", load=["right"])
     deformation = deformation_of(robot, integrator=dc.RK4(1))
     agree("c", deformation, tmp_path)
-    slopes = c_model(made(deformation), tmp_path).points_and_jacobian(draw(1, robot.n, seed=5).numpy())[1]
+    slopes = c_model(made(deformation), tmp_path, TOOL).points_and_jacobian(draw(1, robot.n, seed=5).numpy())[1]
     assert np.abs(slopes[..., robot.joint_names.index("right_shoulder")]).max() > 1e-6
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from recorded_bank import bend, fitted_plain, made, made_with, queries
+from deformation_bank import bend, fitted_plain, made, made_with, queries
 from robots_bank import CHAINS, draw
 from torch import Tensor
 from torch.func import jacfwd, jacrev, vmap

@@ -9,8 +9,8 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
+from deformation_bank import made_with
 from product_bank import Case
-from recorded_bank import made_with
 from robots_bank import CHAINS, parallelogram
 from table_bank import held
 from torch import Tensor

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
-from deformation_bank import deformation_of, model_of, waves_of
+from deformation_bank import deformation_of, geometry_of, model_of, waves_of
 from robots_bank import CHAINS, draw, every_chain
 from torch import Tensor
 from torch.testing import assert_close
@@ -14,18 +12,10 @@ from torch.testing import assert_close
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.transmission import gear_lines
-from diffeo_calib.robots import Chain, Geometry
+from diffeo_calib.robots import Chain
 from diffeo_calib.robots.gear_waves import GearWaves
-from diffeo_calib.robots.se3 import twist_transform
 
 N = 4
-
-
-def geometry_of(chain: Chain, markers: int = 2) -> Geometry:
-    """A geometry in general position."""
-    twists = twist_transform(draw(chain.moving + 1, 6, seed=11, size=0.3))
-    bare = Geometry.nominal(chain, markers)
-    return replace(bare, base=twists[0], joint_errors=twists[1:], tool=draw(markers, 3, seed=12))
 
 
 def setting(chain: Chain) -> tuple[GeometryMap, Tensor, Tensor]:

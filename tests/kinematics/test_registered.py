@@ -93,10 +93,17 @@ def test_registration_follows_the_frame(arm: Case, *, learn: bool) -> None:
     torch.testing.assert_close(again.predict(q)[1], S[:3, :3] @ there.predict(q)[1] @ S[:3, :3].mT, rtol=0.05, atol=0)
 
 
-def test_two_formulas_of_what_a_registration_adds(arm: Case) -> None:
+def test_what_a_registration_adds_is_that_written_out(arm: Case) -> None:
     """Covariances of single configurations, and of several together; of a changed robot, whose frame is found."""
     q = arm.test.q[20:24]
     fitted = arm.model.registered(seen(arm, slice(0, 8), transform(3)), learn=False).map
+    found, fit = fitted.registration, fitted.unregistered
+    rows, at = (fitted.geodesic.linearise(each) for each in (found.q, q))
+    S = fitted.linearised_value(q)[1].sensitivity[..., fit.columns :].flatten(0, 1)
+    cross = S @ found.gain @ fit.conditional.covariance_between(rows, at)
+    added = S @ found.covariance @ S.mT - cross - cross.mT
+    expected = fit.conditional.covariance_between(at) + added
+    torch.testing.assert_close(fitted.joint_covariance(q), expected, rtol=1e-6, atol=1e-14)
     single, together = fitted.predict(q, noise=False)[1], fitted.joint_covariance(q).unflatten(0, (4, 3))
     blocks = torch.stack([together[k, :, 3 * k : 3 * k + 3] for k in range(4)])
     torch.testing.assert_close(blocks, single, rtol=1e-9, atol=1e-16)

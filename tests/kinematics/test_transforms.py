@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from recorded_bank import fitted_plain, made, made_with, queries
+from deformation_bank import fitted_plain, made, made_with, queries
 from robots_bank import CHAINS
 from torch import Tensor
 from torch.func import hessian, jacfwd, jacrev, vmap

@@ -44,16 +44,12 @@ RIGHT_ANGLES = {1.0: "+pi/2", -1.0: "-pi/2", 2.0: "+pi"}
 
 @dataclass(frozen=True, eq=False)
 class Convention:
-    """Joint values ``q @ matrix.T + offset`` in the place of those that were read, q (N, n) [rad or m].
+    """Joint values ``q @ matrix.T + offset`` in the place of those that were read, q (N, n) [rad or m]."""
 
-    Args:
-        robot: n joints. matrix: (n, n). offset: (n,) rad or m. left: what they leave, as a share of the spread.
-    """
-
-    robot: Tree
-    matrix: Tensor
-    offset: Tensor
-    left: float
+    robot: Tree  # n joints
+    matrix: Tensor  # (n, n)
+    offset: Tensor  # (n,) rad or m
+    left: float  # what they leave, as a share of the spread
 
     @property
     def cost(self) -> int:

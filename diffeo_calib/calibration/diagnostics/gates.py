@@ -26,13 +26,19 @@ WORTH = 0.97
 SURE = 3.0
 """Standard deviations from which a fall of squared left-out errors is no chance."""
 
+MIXED_ROWS, TWO_TOOLS_LEFT = 40, 0.45
+"""Rows below which tools or payloads of each prove nothing, and the part of the left-out error that may remain with two
+tools in turn: noise that is halved by its sign leaves .8."""
+PAYLOAD_ODDS, PAYLOADS_LEFT = 12.0, 0.75
+"""Log odds of other payloads, beyond those by chance where every row may have any, and the part of the left-out error
+that may remain with them: of right columns 5 at most beyond chance, and .9 or more remain."""
 ROW_ODDS = 6.0
 """Log odds of a number that differs from row to row: clean images have less than zero, focal lengths that differ by
 0.1 % fourteen and more."""
 
 AXIS_WAVES, AXIS_ODDS, AXIS_LEFT = 6, 6.0, 0.9
-"""Half waves of the errors of an axis over its range; log odds from which they are clear, less than two where there are
-none; and the part of the RMS left-out error that remains with them at most."""
+"""Half waves of the errors of an axis over its range; log odds from which they are clear, at most 2.6 in 24 clean
+tables, and 8 in those of four real robots; and the part of the RMS left-out error that remains with them at most."""
 
 # --- rows of a campaign, one by one ---
 
@@ -51,6 +57,11 @@ it is the last number: a model of few rows is overconfident."""
 
 USUAL_SCALES = {"translation_errors": 5e-4, "rotation_errors": 5e-4, "coupled_amplitude": 3e-4, "task_amplitude": 1e-4}
 """Of the errors of links and the amplitudes of the fields, m and rad; what these explain beyond is not the robot's."""
+USUAL_SLIDE = 1e-3
+"""Of the errors of a slide along its stroke, m."""
+USUAL_RATIO, TAKEN_UP = 1e-3, 0.5
+"""Relative error of a slide's scale, and of what a joint is to another one that it follows; from the second on the fit
+does not take it up."""
 LINK_M = 0.05
 """Length of a link from which it is judged by itself."""
 LENGTH_CHANCE = 1e-3

@@ -18,12 +18,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from math import inf
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence, warn_user, with_deviation
 from diffeo_calib.common.quantiles import chi2_above
@@ -98,6 +100,14 @@ def worth_it(before: Tensor, after: Tensor) -> bool:
     return sure and float(second.mean()) < gates.WORTH**2 * float(first.mean())
 
 
+def warn_of_taken_scales(taken: LeaveOneOut, own: LeaveOneOut) -> None:
+    """Warn if left-out errors prove that the scales of other robots are not those of these rows."""
+    if worth_it(taken.errors, own.errors):
+        left = float((own.errors.square().nansum() / taken.errors.square().nansum()).sqrt())
+        got = f"leave-one-out errors that fall to {100 * left:.0f} % with scales of their own"
+        warn_user(sentence("`scales_of` does not suit these rows", got=got, fix="leave it out (--scales-of)"))
+
+
 def left_out_rms(process: Process) -> float:
     """RMS of the errors of rows, m, as all other rows predict them."""
     errors, _ = process.left_out(process.numbers.owner)
@@ -110,6 +120,8 @@ PERCENT = "%", 1e-2
 OF_ROBOT = "check the scale and the unit of the device, known distances, and the robot's variant"
 OF_AXIS = "check the scale of the device along this axis and the columns of the positions"
 OF_LINK = "check the robot's variant and this link in its description"
+OF_SLIDE = "check its unit and its sign"
+OF_MIMIC = "check the multiplier of this joint in the robot's description"
 
 
 class Length(NamedTuple):
@@ -145,12 +157,15 @@ def lengths(data: TangentData, scales: Hyperparameters, devices: Iterable[Hypoth
     """
     rows, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed=0)
     usual = {name: getattr(scales, name).clamp(max=most) for name, most in gates.USUAL_SCALES.items()}
+    most = torch.where(torch.tensor(data.space.periodic), inf, gates.USUAL_SLIDE).to(scales.transmission_amplitude)
+    usual["transmission_amplitude"] = scales.transmission_amplitude.minimum(most)
     process, found = some.process(replace(scales, **usual)), list[Length]()
     for one in (*_lengths_of(some), *(each._replace(effects=each.effects[rows]) for each in devices)):
         evidence = Evidence.of(process.numbers.of_table(some.motions_in_numbers(one.effects)), process)
         if (h := float(evidence.H)) > 0.0:
             motion = float((3 * (one.effects - one.effects.mean(0))[some.visible].square().mean()).sqrt())
-            found.append(Length(one, float(evidence.size), (evidence.excess / h) ** 0.5, motion, 0.0))
+            deviation = (evidence.excess / h + one.usual**2) ** 0.5
+            found.append(Length(one, float(evidence.size), deviation, motion, 0.0))
     allowed = chi2_above(gates.LENGTH_CHANCE / max(len(found), 1), 1) ** 0.5
     return [one._replace(unnoticed=allowed * one.deviation) for one in found]
 
@@ -161,12 +176,13 @@ def warn_of_lengths(found: list[Length]) -> float | None:
     if not wrong:
         return None
     worst = max(wrong, key=lambda one: abs(one.value) / one.deviation)
-    moved = max(abs(one.value) * one.motion for one in wrong)
+    doubted = [one for one in wrong if not one.cause.usual or abs(one.value) > gates.TAKEN_UP]
+    moved = max((abs(one.value) * one.motion for one in doubted), default=None)
     text = sentence(
         f"{worst.cause.name} seems to differ by {worst.cause.amount(worst.value, '+')} from what it is said to be",
         expected=f"at most about {worst.cause.amount(3 * worst.deviation)}: links and devices are seldom that wrong",
-        got=f"absolute positions that may be wrong by {1e3 * moved:.2g} mm RMS",
-        fix=f"{worst.cause.fix}; the expected error does not hold before that is settled",
+        got=None if moved is None else f"absolute positions that may be wrong by {1e3 * moved:.2g} mm RMS",
+        fix=worst.cause.fix + "; the expected error does not hold before that is settled" * (moved is not None),
     )
     warn_user(text)
     return moved
@@ -186,7 +202,19 @@ def _lengths_of(data: TangentData) -> Iterator[Hypothesis]:
         for axis, own in zip("xyz", eye, strict=True):
             yield Hypothesis(f"the scale of the measuring frame along {axis}", seen(away * own), PERCENT, OF_AXIS)
     chain = geometry.chain
+    q = data.x - data.x.mean(0)
+    ratio = {"unit": PERCENT, "usual": gates.USUAL_RATIO}
+    for joint, (name, turns) in enumerate(zip(chain.joint_names, chain.periodic, strict=True)):
+        if not turns and any(chain.periodic):  # a machine of slides alone is judged by the axes of its places
+            along = data.jacobian[..., joint, None] * q[:, joint, None, None]
+            yield Hypothesis(f"the scale of {name}", along, fix=OF_SLIDE, **ratio)
     for joint, name in enumerate(chain.moving_names):
+        if name not in chain.joint_names:
+            place = 6 + 6 * joint + 3 * bool(chain.revolute[joint])
+            moved = data.sensitivities[..., place : place + 3] @ chain.axes[joint].to(q)
+            value = q @ chain.coupling[joint].to(q)
+            along = (moved * value[:, None])[..., None]
+            yield Hypothesis(f"the multiplier of {name}", along, fix=OF_MIMIC, **ratio)
         offset = chain.offsets[joint].to(data.x.device)
         length = float(offset[:3, 3].norm())
         if chain.before[joint] >= 0 and length > gates.LINK_M:  # the first joint's is where the base stands

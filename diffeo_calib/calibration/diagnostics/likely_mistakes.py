@@ -39,7 +39,7 @@ from diffeo_calib.measurements.csv.tables import numeric_table, rereadings, with
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import UNITS_PER_METRE
 from diffeo_calib.robots.cartesian import is_cartesian
-from diffeo_calib.robots.tree import Tree
+from diffeo_calib.robots.tree import Tree, robot_from_config
 from diffeo_calib.robots.urdf import moving_joints_below, read_urdf
 
 GROSS_MEDIANS, KEPT_ROWS, TRIMMINGS = 3.0, 0.75, 2
@@ -55,23 +55,16 @@ NO_MISTAKE_FOUND = (
 
 @dataclass(frozen=True)
 class Reading:
-    """Measurements as they might have been meant.
+    """Measurements as they might have been meant."""
 
-    Args:
-        robot: the chain. q: (N, n) rad or m. points: (N, P, 3) m.
-        words: what was changed.
-        option: the option that reads the table so, where readings differ by one option alone; else empty.
-        partial: whether it explains a part of the measurements only, and is used if nothing else explains them.
-        on: tips of the markers; the robot's first tip by default.
-    """
-
-    robot: Tree
-    q: Tensor
-    points: Tensor
-    words: str = ""
-    option: str = ""
+    robot: Tree  # the chain
+    q: Tensor  # (N, n) rad or m
+    points: Tensor  # (N, P, 3) m
+    words: str = ""  # what was changed
+    option: str = ""  # the option that reads the table so, where readings differ by one option alone; else empty
+    # whether it explains a part of the measurements only, and is used if nothing else explains them
     partial: bool = False
-    on: tuple[str, ...] = ()
+    on: tuple[str, ...] = ()  # tips of the markers; the robot's first tip by default
 
     @classmethod
     def of(cls, robot: Tree, data: Measurements) -> Reading:
@@ -176,8 +169,7 @@ def likely_mistake(
 def other_points(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Points in another unit, of the row before or after, in a frame of the other hand, or of exchanged tips."""
     own, bodies = Reading.of(robot, data), data.points.unflatten(1, (data.origins.shape[1], -1))
-    for factor in sorted({one / other for one, other in permutations(UNITS_PER_METRE.values(), 2)}):
-        times, size = (factor, "small") if factor > 1.0 else (1 / factor, "large")
+    for factor, times, size in _units_of_length():
         points = (bodies + (factor - 1.0) * data.origins[:, :, None]).flatten(1, 2)  # a pose stays as large
         words = f"the positions seem to be {times:.4g} times too {size}: check their unit (`length`)"
         yield replace(own, points=points, words=words)
@@ -203,9 +195,27 @@ def other_units(robot: Tree, data: Measurements, *, slides: bool = True) -> Iter
     own, turning = Reading.of(robot, data), torch.tensor(robot.periodic, dtype=torch.bool, device=data.q.device)
     for factor, words in ANGLE_MISTAKES if any(robot.periodic) else ():
         yield replace(own, q=torch.where(turning, factor * data.q, data.q), words=angle_mistake(words))
-    for factor, words in ((1e-3, "large"), (1e3, "small")) if slides and not all(robot.periodic) else ():
-        text = f"the values of prismatic joints seem to be 1000 times too {words}: check their unit (`joint_length`)"
-        yield replace(own, q=torch.where(turning, data.q, factor * data.q), words=text)
+    for factor, times, words in _units_of_length() if slides and not all(robot.periodic) else ():
+        text = f"the values of prismatic joints seem to be {times:.4g} times too {words}: check their unit"
+        yield replace(own, q=torch.where(turning, data.q, factor * data.q), words=f"{text} (`joint_length`)")
+
+
+def other_mimics(robot: Tree, data: Measurements) -> Iterator[Reading]:
+    """Joints that follow others the other way round, twice or half as far, or not at all."""
+    own, config = Reading.of(robot, data), robot.to_config()
+    for place, joint in enumerate(robot.joints):
+        for factor in (-1.0, 0.5, 2.0, 0.0) if joint.mimic else ():
+            mimic = {name: factor * value for name, value in (joint.mimic or {}).items()}
+            joints = [*robot.joints[:place], replace(joint, mimic=mimic), *robot.joints[place + 1 :]]
+            other = robot_from_config(config | {"joints": [one.to_config() for one in joints]}, robot.source)
+            words = f"joint '{joint.name}' seems to follow with {factor:g} times its multiplier"
+            yield replace(own, robot=other, words=f"{words}: check it in the robot's description")
+
+
+def _units_of_length() -> Iterator[tuple[float, float, str]]:
+    """Factors that turn one unit of length into another, and by how many times values then are too small or large."""
+    for factor in sorted({one / other for one, other in permutations(UNITS_PER_METRE.values(), 2)}):
+        yield (factor, factor, "small") if factor > 1.0 else (factor, 1 / factor, "large")
 
 
 def longer_chains(robot: Tree, data: Measurements) -> Iterator[Reading]:
@@ -287,7 +297,15 @@ def other_conventions(robot: Tree, data: Measurements, judge: Judge = registered
         yield replace(own, q=data.q @ one.matrix.mT + one.offset, words=_convention_words(found, columns))
 
 
-EVERY_GROUP = (other_points, other_rotations, other_units, longer_chains, other_columns, other_conventions)
+EVERY_GROUP = (
+    other_points,
+    other_rotations,
+    other_units,
+    other_mimics,
+    longer_chains,
+    other_columns,
+    other_conventions,
+)
 
 
 def conventions_of(robot: Tree, data: Measurements, angle: str, judge: Judge = registered) -> list[Convention]:

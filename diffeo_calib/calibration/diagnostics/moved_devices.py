@@ -51,19 +51,13 @@ VARIATION_M = torch.logspace(-6, -2, 41, dtype=torch.float64, device="cpu")
 
 
 class Finding(NamedTuple):
-    """A hypothesis that explains errors: from a row on, or drifting over all rows.
+    """A hypothesis that explains errors: from a row on, or drifting over all rows."""
 
-    Args:
-        hypothesis: what, with effects (N, R, U). columns: (N, R, U) its effects in the rows.
-        size: (U,) of a drift between the first row and the last. gain: what it explains.
-        row: the first one after a change, in the order of measurement; None for a drift.
-    """
-
-    hypothesis: Hypothesis
-    columns: Tensor
-    size: Tensor
-    gain: float
-    row: int | None
+    hypothesis: Hypothesis  # what, with effects (N, R, U)
+    columns: Tensor  # (N, R, U) its effects in the rows
+    size: Tensor  # (U,) of a drift between the first row and the last
+    gain: float  # what it explains
+    row: int | None  # the first one after a change, in the order of measurement; None for a drift
 
     @property
     def evidence(self) -> float:

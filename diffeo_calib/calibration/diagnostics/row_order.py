@@ -39,18 +39,13 @@ from diffeo_calib.sensors.tables import Coordinates
 
 
 class Step(NamedTuple):
-    """Consecutive rows whose measured values belong to the joints of other lines.
+    """Consecutive rows whose measured values belong to the joints of other lines."""
 
-    Args:
-        first: line of the first row. last: line of the last row. lag: number of lines to their joints, downwards.
-        to_the_end: whether the table ends with these rows. rows: how many rows are known to fit there.
-    """
-
-    first: int
-    last: int
-    lag: int
-    to_the_end: bool
-    rows: int
+    first: int  # line of the first row
+    last: int  # line of the last row
+    lag: int  # number of lines to their joints, downwards
+    to_the_end: bool  # whether the table ends with these rows
+    rows: int  # how many rows are known to fit there
 
     def sentence(self, before: str = "", after: str = "") -> str:
         """What is wrong, between some words, and what to do: ``from line 32 on the measured values belong to ...``."""

@@ -42,21 +42,13 @@ PRECISE: dict[str, Any] = {"xtol": 1e-12, "ftol": 1e-12, "gtol": 1e-12, "max_nfe
 
 @dataclass(frozen=True)
 class Prior:
-    """Standard deviations of the Gaussian prior; its mean is the geometry that identification starts from.
+    """Standard deviations of the Gaussian prior; its mean is the geometry that identification starts from."""
 
-    Args:
-        translation: of every moving joint's error translation [m].
-        rotation: of every moving joint's error rotation [rad].
-        base_translation: of the base [m].
-        base_rotation: of the base [rad].
-        tool: of the markers [m].
-    """
-
-    translation: float = 1e-3
-    rotation: float = 1e-3
-    base_translation: float = PLACES.sought_base_m_rad
-    base_rotation: float = PLACES.sought_base_m_rad
-    tool: float = PLACES.marker_m
+    translation: float = 1e-3  # of every moving joint's error translation [m]
+    rotation: float = 1e-3  # of every moving joint's error rotation [rad]
+    base_translation: float = PLACES.sought_base_m_rad  # of the base [m]
+    base_rotation: float = PLACES.sought_base_m_rad  # of the base [rad]
+    tool: float = PLACES.marker_m  # of the markers [m]
 
     def root(self, geometry: Geometry, held: Sequence[int] = ()) -> Tensor:
         """Square root (K, f) of the covariance of the parameters of ``geometry``, of which some are held [m or rad]."""
@@ -74,29 +66,20 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """Result of an identification or a registration.
+    """Result of an identification or a registration."""
 
-    Args:
-        geometry: the geometry, with the estimated parameters absorbed.
-        rms: root mean square distance from predicted to measured points [m].
-        noise: standard deviation of one measured coordinate, given or estimated [m]; for Student's t its scale.
-        covariance: (K, K) posterior covariance of the parameters at ``geometry`` [m, rad]; rows of parameters that
-            were held fixed are zero.
-        theta: (K,) estimated parameters of the geometry that the search started from [m, rad].
-        prior: the prior, given or estimated.
-        tails: weights of the measurements (N, P), 1 where they are hidden; all 1 if the noise was given or is Gaussian.
-        devices: those of readings that were found with it, in the order of their tables.
-        left_out: root mean square distance of the measured points, each predicted by the others to first order [m].
-    """
-
-    geometry: Geometry
-    rms: float
-    noise: float
+    geometry: Geometry  # the geometry, with the estimated parameters absorbed
+    rms: float  # root mean square distance from predicted to measured points [m]
+    noise: float  # standard deviation of one measured coordinate, given or estimated [m]; for Student's t its scale
+    # (K, K) posterior covariance of the parameters at ``geometry`` [m, rad]; rows of parameters that were held fixed
+    # are zero
     covariance: Tensor
-    theta: Tensor
-    prior: Prior
+    theta: Tensor  # (K,) estimated parameters of the geometry that the search started from [m, rad]
+    prior: Prior  # the prior, given or estimated
+    # weights of the measurements (N, P), 1 where they are hidden; all 1 if the noise was given or is Gaussian
     tails: Tails
-    devices: tuple[Devices, ...] = ()
+    devices: tuple[Devices, ...] = ()  # those of readings that were found with it, in the order of their tables
+    # root mean square distance of the measured points, each predicted by the others to first order [m]
     left_out: float = nan
 
     @property
@@ -239,16 +222,11 @@ class ReadRows(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Rows of several kinds, and the geometry that explains them.
+    """Rows of several kinds, and the geometry that explains them."""
 
-    Args:
-        geometry: the start. parts: the rows.
-        rigid: whether errors of joints and base stay zero, so that only the markers move on their tips.
-    """
-
-    geometry: Geometry
-    parts: tuple[MeasuredPoints | ReadRows, ...]
-    rigid: bool = False
+    geometry: Geometry  # the start
+    parts: tuple[MeasuredPoints | ReadRows, ...]  # the rows
+    rigid: bool = False  # whether errors of joints and base stay zero, so that only the markers move on their tips
 
     @cached_property
     def tips(self) -> list[Tensor]:

@@ -141,19 +141,14 @@ HALF_WEIGHT_MEDIANS = 2.0
 
 @dataclass(frozen=True, eq=False)
 class SocketRegistration:
-    """Ball and sockets of a robot without errors.
+    """Ball and sockets of a robot without errors."""
 
-    Args:
-        identification: geometry with the ball as its marker; where the base is not known, it is the measuring frame.
-        positions: (S, 3) the sockets in the measuring frame, m.
-        distances: (N,) from the ball to its socket, m.
-        tilt: (3,) root mean square motion of the ball's place, per unit of its offset from the tip, by turns of the
-            tool in the sockets, along three principal directions, largest first: 0 where the tool never turns.
-    """
-
+    # geometry with the ball as its marker; where the base is not known, it is the measuring frame
     identification: Identification
-    positions: Tensor
-    distances: Tensor
+    positions: Tensor  # (S, 3) the sockets in the measuring frame, m
+    distances: Tensor  # (N,) from the ball to its socket, m
+    # (3,) root mean square motion of the ball's place, per unit of its offset from the tip, by turns of the tool in the
+    # sockets, along three principal directions, largest first: 0 where the tool never turns
     tilt: Tensor
 
 

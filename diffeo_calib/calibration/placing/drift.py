@@ -28,16 +28,12 @@ FRAME_M_RAD, GROWTH, OFFSET_RAD_M = 1e-3, 3e-4, 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Drift(DeviceSet):
-    """Drift of N rows with K columns.
+    """Drift of N rows with K columns."""
 
-    Args:
-        devices: what was found, or zero before a fit. ramp: (N, K) from -1/2 to 1/2. q: (N, n) configurations.
-        centre: (3,) about which the frame turns and lengths grow, m; by default the middle of the rows.
-    """
-
-    devices: KnownDrift
-    ramp: Tensor
-    q: Tensor
+    devices: KnownDrift  # what was found, or zero before a fit
+    ramp: Tensor  # (N, K) from -1/2 to 1/2
+    q: Tensor  # (N, n) configurations
+    # (3,) about which the frame turns and lengths grow, m; by default the middle of the rows
     centre: Tensor | None = None
 
     @classmethod

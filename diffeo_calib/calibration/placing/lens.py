@@ -39,13 +39,10 @@ PARTS = slice(0, len(LENS)), slice(len(LENS), None)
 
 @dataclass(frozen=True, eq=False)
 class CameraErrors(DeviceSet):
-    """Errors of lenses, and of the board that all of the cameras saw.
-
-    Args:
-        shared: the cameras as images alone show them, and what their c errors do to the points of the M poses, m.
-    """
+    """Errors of lenses, and of the board that all of the cameras saw."""
 
     devices: BoardCameras
+    # the cameras as images alone show them, and what their c errors do to the points of the M poses, m
     shared: SharedErrors
 
     @classmethod

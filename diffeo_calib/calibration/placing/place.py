@@ -111,19 +111,13 @@ LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """Rows of any kinds beside a geometric calibration, everything in the frame of the model.
+    """Rows of any kinds beside a geometric calibration, everything in the frame of the model."""
 
-    Args:
-        data: the table. coordinates: its rows that tell coordinates, in that frame, sockets at their places.
-        placement: the devices.
-        registration: base and markers, or ball and devices. identification: the geometric calibration. Both have the
-            devices of readings as they were then, in the order of their sets.
-    """
-
-    data: Any
-    coordinates: Coordinates | None
-    placement: Placement
-    registration: Identification
+    data: Any  # the table
+    coordinates: Coordinates | None  # its rows that tell coordinates, in that frame, sockets at their places
+    placement: Placement  # the devices
+    registration: Identification  # base and markers, or ball and devices
+    # the geometric calibration. Both have the devices of readings as they were then, in the order of their sets
     identification: Identification
 
     @property

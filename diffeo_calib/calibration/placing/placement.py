@@ -25,7 +25,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.sensors.devices import Extrinsics, Hypothesis
-from diffeo_calib.sensors.places import PlacedDevices, Shown
+from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import SetUps, View
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings
 
@@ -34,72 +34,49 @@ T = TypeVar("T")
 
 
 class SeenRows(NamedTuple):
-    """N rows around k0, as sets of devices see them; so are those of a tangent model.
+    """N rows around k0, as sets of devices see them; so are those of a tangent model."""
 
-    Args:
-        nominal: k0. y: (N, R) m. points: (N, 3 P) m. slopes: (N, R, 3 P) of what was measured.
-        sensitivities: (N, R, K).
-    """
-
-    nominal: GeometryMap
-    y: Tensor
-    points: Tensor
-    slopes: Tensor
-    sensitivities: Tensor
+    nominal: GeometryMap  # k0
+    y: Tensor  # (N, R) m
+    points: Tensor  # (N, 3 P) m
+    slopes: Tensor  # (N, R, 3 P) of what was measured
+    sensitivities: Tensor  # (N, R, K)
 
 
 Seen = SeenRows | TangentData
 
 
 class OtherRows(NamedTuple):
-    """Rows of devices that are known, as they were measured.
+    """Rows of devices that are known, as they were measured."""
 
-    Args:
-        data: all of them. coordinates: those that tell coordinates. aligned: the same in the frame of the model, a ball
-            in sockets at its places. readings: the others, by kind.
-        centre: (3,) the middle of the rows with which the devices were found, m.
-    """
-
-    data: Any
-    coordinates: Coordinates | None
-    aligned: Coordinates | None
-    readings: list[OtherReadings]
-    centre: Tensor
+    data: Any  # all of them
+    coordinates: Coordinates | None  # those that tell coordinates
+    aligned: Coordinates | None  # the same in the frame of the model, a ball in sockets at its places
+    readings: list[OtherReadings]  # the others, by kind
+    centre: Tensor  # (3,) the middle of the rows with which the devices were found, m
 
 
 class Settled(NamedTuple):
-    """Result of a fit for the shifts of one set of devices.
+    """Result of a fit for the shifts of one set of devices."""
 
-    Args:
-        shifts: (c,) their posterior mean. covariance: (c, c).
-        fitted: the map, its covariances without rigid motions if no device holds the frame.
-        centre: (3,) the middle of the rows, m, in the frame of the devices, from which transform (4, 4) leads to that
-            of the model.
-        chosen: scales, and the rows with their weights; None of a recalibration.
-        known: what the old model knew of the tool in each set-up; None of a calibration.
-    """
-
-    shifts: Tensor
-    covariance: Tensor
-    fitted: FittedMap
+    shifts: Tensor  # (c,) their posterior mean
+    covariance: Tensor  # (c, c)
+    fitted: FittedMap  # the map, its covariances without rigid motions if no device holds the frame
+    # (3,) the middle of the rows, m, in the frame of the devices, from which transform (4, 4) leads to that of the
+    # model
     centre: Tensor
     transform: Tensor
-    chosen: ChosenScales | None = None
-    known: SetUps | None = None
+    chosen: ChosenScales | None = None  # scales, and the rows with their weights; None of a recalibration
+    known: SetUps | None = None  # what the old model knew of the tool in each set-up; None of a calibration
 
 
 @dataclass(frozen=True, eq=False)
 class DeviceSet(ABC):
-    """Devices of one kind and the rows that they measured.
+    """Devices of one kind and the rows that they measured."""
 
-    Args:
-        devices: where they are; before a fit the deviations of their increments are those of the prior.
-        rows: (M,) numbers of the rows that they measured. device: (M,) which of them did.
-    """
-
-    devices: Extrinsics
-    rows: Tensor
-    device: Tensor
+    devices: Extrinsics  # where they are; before a fit the deviations of their increments are those of the prior
+    rows: Tensor  # (M,) numbers of the rows that they measured
+    device: Tensor  # (M,) which of them did
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -137,14 +114,9 @@ class DeviceSet(ABC):
         """Rows that tell coordinates where these devices put them."""
         return table
 
-    @property
-    def shown(self) -> Shown | None:
-        """See :class:`PlacedDevices`."""
-        return None
-
     def placed(self) -> PlacedDevices:
         """Their entries for the model file."""
-        return PlacedDevices(self.devices, self.rows, self.device, self.shown)
+        return PlacedDevices(self.devices, self.rows, self.device)
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:  # noqa: B027
         """Warn (DiffeoCalibWarning) of what these devices leave open in a model, and of what would show it."""
@@ -266,12 +238,8 @@ class Placement(tuple[DeviceSet, ...]):
 
 
 class OtherLabel(NamedTuple):
-    """How M rows would err with another label than theirs.
+    """How M rows would err with another label than theirs."""
 
-    Args:
-        name: in words. applies: (M,) boolean, the rows that do not have it. errors: (M,) m.
-    """
-
-    name: str
-    applies: Tensor
-    errors: Tensor
+    name: str  # in words
+    applies: Tensor  # (M,) boolean, the rows that do not have it
+    errors: Tensor  # (M,) m

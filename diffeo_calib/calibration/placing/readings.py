@@ -37,7 +37,7 @@ from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.devices import Devices, Hypothesis, check_devices
 from diffeo_calib.sensors.kinds import kind_of
-from diffeo_calib.sensors.places import Shown, fitting_devices
+from diffeo_calib.sensors.places import PlacedDevices, fitting_devices
 from diffeo_calib.sensors.tables import OtherReadings, ball_tip
 
 ROUGH_M = 2e-3
@@ -74,9 +74,8 @@ class ReadingDevices(DeviceSet):
         """(r,) where their r numbers stand in these rows."""
         return torch.arange(self.data.values.shape[1], device=self.rows.device)
 
-    @property
-    def shown(self) -> Shown:
-        return self.data.shown
+    def placed(self) -> PlacedDevices:
+        return replace(super().placed(), shown=self.data.shown)
 
     def _seen(self, data: Seen) -> Tensor:
         """(M, 3 k) coordinates of what the devices see, m."""

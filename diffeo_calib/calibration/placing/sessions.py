@@ -12,12 +12,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
 from diffeo_calib.calibration.identification.identification import identify
-from diffeo_calib.calibration.identification.registration import register, register_inliers
+from diffeo_calib.calibration.identification.registration import register, register_inliers, spread
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherLabel, OtherRows, Seen, Settled
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.fitting.result import Progress
@@ -44,18 +47,12 @@ TOLD_APART = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Sessions(DeviceSet):
-    """Difference between sessions: measuring frames, or what is on the tool.
-
-    Args:
-        reference: the one whose frame and markers are those of the model.
-        markers: P that a device saw, the first ones of the geometry.
-        centre: (3,) about which frames turn, m; by default the middle of the rows.
-    """
+    """Difference between sessions: measuring frames, or what is on the tool."""
 
     devices: SetUps
-    reference: int
-    markers: int
-    centre: Tensor | None = None
+    reference: int  # the one whose frame and markers are those of the model
+    markers: int  # P that a device saw, the first ones of the geometry
+    centre: Tensor | None = None  # (3,) about which frames turn, m; by default the middle of the rows
 
     @classmethod
     def of_table(cls, robot: Tree, own: Coordinates, progress: Progress) -> tuple[list[Sessions], Measurements]:
@@ -92,7 +89,16 @@ class Sessions(DeviceSet):
             start = register(robot, data.q, together.points, marker_tips(robot, data)).geometry
             geometry = identify(start, data.q, together.points).geometry
         away = (geometry.points(data.q) - together.points).norm(dim=2)
-        return found, max(float(away[rows].nanmedian()) for _, rows in found.groups())
+        median, rows, name = max(
+            ((float(away[rows].nanmedian()), rows, name) for name, rows in found.groups()), key=lambda one: one[0]
+        )
+        alone = data.rows(rows).with_sessions(None)
+        if median > gates.GEOMETRIC_RESIDUAL * spread(alone.points):
+            try:
+                refuse_mistakes(robot, alone)
+            except MeasurementError as error:
+                raise MeasurementError(f"{name}: {error}") from error
+        return found, median
 
     @classmethod
     def around(cls, data: Measurements, kind: type[SetUps], geometry: Geometry, seen: Tensor) -> Sessions:
@@ -160,7 +166,7 @@ class Sessions(DeviceSet):
         return replace(self, devices=moved if found.known is None else moved.after(found.known))
 
     def views(self) -> dict[str, View]:
-        return dict(zip(self.names, self.devices.views(), strict=True))
+        return {name: partial(self.devices.view, number) for number, name in enumerate(self.names)}
 
     def labels(self, own: Coordinates, seen: Tensor) -> Iterator[OtherLabel]:
         session = self.by_row(int(own.rows.max()) + 1)[own.rows]

@@ -49,7 +49,7 @@ from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import VALUE, Hypothesis
 from diffeo_calib.sensors.set_ups import View, frame_slopes
-from diffeo_calib.sensors.sockets import SocketPlaces, socket_errors
+from diffeo_calib.sensors.sockets import IN_SOCKET_M, SocketPlaces, socket_errors
 from diffeo_calib.sensors.tables import Coordinates
 
 T = TypeVar("T")
@@ -58,48 +58,33 @@ ALIKE = 0.05
 """Deviation of a block's distance from one place to another, relative to that of the distance itself."""
 FEWEST_BESIDE = 2
 """Rows of a socket besides one that are needed to judge it."""
-IN_SOCKET_M = 0.02
-"""Largest distance of the ball from the place of a socket, stated roughly, at which it counts as resting there."""
 ROUNDS = 2
 """Geometric calibrations, after each of which the sockets are placed again."""
 
 
 @dataclass(frozen=True)
 class PlaceErrors:
-    """A place as predicted by the model without its rows, scales kept.
+    """A place as predicted by the model without its rows, scales kept."""
 
-    Args:
-        place: its name. rows: their number.
-        spread: root mean square distance of the ball from the middle of its socket, m: consistency, no accuracy.
-        distance_errors: found minus known distances of its sockets, m.
-    """
-
-    place: str
-    rows: int
-    spread: float
-    distance_errors: tuple[float, ...]
+    place: str  # its name
+    rows: int  # their number
+    spread: float  # root mean square distance of the ball from the middle of its socket, m: consistency, no accuracy
+    distance_errors: tuple[float, ...]  # found minus known distances of its sockets, m
 
 
 @dataclass(frozen=True, eq=False)
 class SocketDevices(DeviceSet):
-    """The sockets of a calibration, in the measuring frame: that of the device, or the robot's base without one.
-
-    Args:
-        sockets: their names and known distances.
-        root: (3 S, 3 S) square root of the covariance of their places before the fit, m.
-        by_device: whether a device measured other rows.
-        covariance: (3 S, 3 S) of the positions, m^2; after a fit without a device without rigid motions of all of them.
-        left_out: every place, predicted by all other rows.
-        workspace_deviation: root mean square distance, m, that the model expects between its positions of the ball and
-            the true ones over the joint ranges of the rows; without a device after the best rigid motion.
-    """
+    """The sockets of a calibration, in the measuring frame: that of the device, or the robot's base without one."""
 
     devices: SocketPlaces
-    sockets: Sockets
-    root: Tensor
-    by_device: bool
+    sockets: Sockets  # their names and known distances
+    root: Tensor  # (3 S, 3 S) square root of the covariance of their places before the fit, m
+    by_device: bool  # whether a device measured other rows
+    # (3 S, 3 S) of the positions, m^2; after a fit without a device without rigid motions of all of them
     covariance: Tensor
-    left_out: tuple[PlaceErrors, ...] = ()
+    left_out: tuple[PlaceErrors, ...] = ()  # every place, predicted by all other rows
+    # root mean square distance, m, that the model expects between its positions of the ball and the true ones over the
+    # joint ranges of the rows; without a device after the best rigid motion
     workspace_deviation: float = 0.0
 
     @classmethod

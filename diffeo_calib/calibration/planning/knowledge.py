@@ -48,7 +48,6 @@ from diffeo_calib.regression.conditional import (
     Opened,
     diagonal_blocks,
     lower_root,
-    without_rigid_motions,
 )
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.geometry import Geometry
@@ -94,7 +93,7 @@ def greedy(
     return order, torch.stack(lowered)
 
 
-def choose(known: Conditional, options: Options, start: Start, targets: Tensor, count: int) -> tuple[list[int], Tensor]:
+def choose(known: Conditional, options: Options, scene: Scene, targets: Tensor, count: int) -> tuple[list[int], Tensor]:
     """Choose ``count`` of the options, at most one at every configuration.
 
     Args:
@@ -104,13 +103,13 @@ def choose(known: Conditional, options: Options, start: Start, targets: Tensor, 
         numbers of the options in the order in which they were taken, and the mean variance (count + 1,) of the targets'
         coordinates after 0, 1, ... of them, m^2.
     """
-    scene, at = start.scene, known.features(start.at.rows(targets))
-    P, base = torch.eye(at.values.shape[1], dtype=at.values.dtype, device=at.values.device), start.base
+    at = known.features(scene.at.rows(targets))
+    P = torch.eye(at.values.shape[1], dtype=at.values.dtype, device=at.values.device)
     if scene.free:
-        B = at.at.sensitivity[..., base].flatten(0, 1)
+        B = at.at.sensitivity[..., scene.motions].flatten(0, 1)
         P = P - B @ torch.linalg.pinv(B)
     own = P @ at.between() @ P
-    seen = known.features(options.linearised(start.at, scene.shifts, start.first))
+    seen = known.features(options.linearised(scene))
 
     def between(number: int) -> Tensor:
         return seen.rows(torch.tensor([number], dtype=torch.int64, device=P.device)).between(seen)
@@ -129,31 +128,9 @@ MARKER = (0.1, 0.0, 0.1)
 FREE = ("base", "marker", "both")
 
 
-class Start(NamedTuple):
-    """What is known before the first measurement, M configurations, and the markers there.
-
-    Args:
-        known: the conditional. at: the configurations. scene: the markers. first: number of the first new column.
-    """
-
-    known: Conditional
-    at: Linearisation
-    scene: Scene
-    first: int
-
-    @property
-    def base(self) -> list[int]:
-        """Numbers of the columns by motions of the base."""
-        return list(self.at.spec.nominal.places[:6])
-
-    def without_motions(self, known: Conditional, targets: Tensor) -> Conditional:
-        """Without the rigid motion that fits the errors at the targets best, where such motions are no errors."""
-        return without_rigid_motions(known, self.at.rows(targets), self.base) if self.scene.free else known
-
-
 def of_robot(
     robot: Tree, tool: Tool, q: Tensor, near: Tensor, scales: Hyperparameters | None, *, adrift: bool
-) -> Start:
+) -> Scene:
     """The tangent model around the nominal robot; base and markers are known to 0.1 m and 0.1 rad.
 
     Args:
@@ -175,8 +152,9 @@ def of_robot(
         scales = defaults(_tangent_data(geometry, lever, near, residual), residual, Prior())
     data = replace(data, held=held_parameters(geometry, adrift=adrift), adrift=adrift)
     deviations, noise = data.prior_variance(scales).sqrt(), data.noise(scales)
-    scene = Scene(data.points, noise, geometry.base, Bodies(lever).averaging(noise), 3 * len(tool.points), free=adrift)
-    return Start(Opened(Fields(), 0, deviations), data.linearisation(scales), scene, len(deviations))
+    known = Opened(Fields(), 0, deviations), data.linearisation(scales), len(deviations)
+    averaged = Bodies(lever).averaging(noise)
+    return Scene(*known, data.points, noise, geometry.base, averaged, 3 * len(tool.points), free=adrift)
 
 
 class Tool(NamedTuple):
@@ -221,7 +199,7 @@ def _tangent_data(geometry: Geometry, lever: float | None, q: Tensor, residual: 
     return TangentData(nominal, theta, q, data.points.flatten(1), sensor, Tails.none(len(q), sensor.bodies))
 
 
-def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Start:
+def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Scene:
     """The posterior of a fitted model.
 
     A ball beside markers stays on its tool: no row of the device would say where it is now.
@@ -249,6 +227,5 @@ def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Start:
     base, averaged = model.geometry.base.to(moved), model.bodies.averaging(fitted.new_noise)
     shifts = 0 if registration is not None else fitted.noise.shared.shape[2]
     noise = fitted.new_noise.expand(len(q), -1, -1)
-    scene = Scene(torch.cat(points), noise, base, averaged, seen, adrift, shifts)
-    known = Opened(fit.with_motions, fit.columns, moved)
-    return Start(known, Linearisation.joined(parts), scene, fit.columns + len(moved))
+    known = Opened(fit.with_motions, fit.columns, moved), Linearisation.joined(parts), fit.columns + len(moved)
+    return Scene(*known, torch.cat(points), noise, base, averaged, seen, adrift, shifts)

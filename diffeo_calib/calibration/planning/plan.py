@@ -15,7 +15,6 @@ from torch import Tensor
 from diffeo_calib.calibration.planning.candidates import Criterion, Tracker, all_of, candidates, check_limits
 from diffeo_calib.calibration.planning.knowledge import (
     FREE,
-    Start,
     choose,
     of_model,
     of_robot,
@@ -256,19 +255,19 @@ def plan(
     known = q[:0] if measured is None else _configurations(robot, measured, "measured")
     sensors = sensors_for(robot_or_model, sensor)
     own = marker, hyperparameters, sensors
-    start, (at_targets, at_known, at_candidates) = _start((robot_or_model, free), (wanted, known, q), own)
-    before, options = _options(start.scene, sensors, (at_known, at_candidates[0], len(known)), count)
-    shifts = start.scene.shifts
-    posterior: Conditional = Opened(start.known, start.first, options.shared.new_ones(options.shared.shape[2] - shifts))
+    scene, (at_targets, at_known, at_candidates) = _start((robot_or_model, free), (wanted, known, q), own)
+    before, options = _options(scene, sensors, (at_known, at_candidates[0], len(known)), count)
+    new = options.shared.new_ones(options.shared.shape[2] - scene.shifts)
+    posterior: Conditional = Opened(scene.known, scene.first, new)
     if len(before.rows):
-        posterior = Given(posterior, before.linearised(start.at, shifts, start.first), before.noise)
-    order, variance = choose(posterior, options, start, at_targets, count)
+        posterior = Given(posterior, before.linearised(scene), before.noise)
+    order, variance = choose(posterior, options, scene, at_targets, count)
     LOG.info("%d poses chosen of %d", count, len(q))
-    kept = start.without_motions(posterior, at_targets)
-    blocks = start.scene.along(kept.covariance(start.at.rows(at_candidates)))
+    kept = scene.without_motions(posterior, at_targets)
+    blocks = scene.along(kept.covariance(scene.at.rows(at_candidates)))
     if isinstance(robot_or_model, CalibratedKinematics):
         blocks = robot_or_model.map.with_second_order(blocks)
-    noise = 3 * start.scene.along(start.scene.noise[at_targets]).diagonal(dim1=1, dim2=2).mean()
+    noise = 3 * scene.along(scene.noise[at_targets]).diagonal(dim1=1, dim2=2).mean()
     stated = next((3 * one.std**2 for one in sensors if one.of_positions and one.std is not None), float(noise))
     return Plan(
         **_in_order(robot, q, options.some(order), int(at_candidates[0])),
@@ -334,15 +333,16 @@ def drawn(
     each: list[tuple[int, Tensor | None, Tensor, Where | None]] = [
         (len(sensors) - len(held) - len(seen), None, markers.mean(0), None),
         *((1, None, markers.mean(0), where) for where in seen),
-        (len(held), torch.cat(held) if held else None, markers[-1], None),
+        (int(bool(held)), torch.cat(held) if held else None, markers[-1], None),  # all sockets are one sensor
     ]
+    whole = sum(number for number, *_ in each)
     for number, places, marker, where in each:
         if number:
             criteria = [one for one in (None if where is None else where.keep, keep) if one is not None]
             found.append(
                 candidates(
                     given.robot if isinstance(given, CalibratedKinematics) else given,
-                    -(-count * number // len(sensors)),
+                    -(-count * number // whole),
                     ranges=({} if where is None else where.ranges) | dict(ranges or {}),
                     keep=all_of(criteria),
                     tracker=None if tracker is None else replace(tracker, marker=marker.tolist()),
@@ -418,7 +418,7 @@ def _start(
     given: tuple[Tree | CalibratedKinematics, str | None],
     groups: tuple[Tensor, Tensor, Tensor],
     own: tuple[Any, Any, tuple[Sensor, ...]],
-) -> tuple[Start, Sequence[Tensor]]:
+) -> tuple[Scene, Sequence[Tensor]]:
     """What is known at targets, measured configurations and candidates, and the row numbers of these.
 
     Args:
@@ -438,7 +438,7 @@ def _start(
         near = near[torch.linspace(0, len(near) - 1, most, dtype=torch.float64, device=q.device).round().long()]
     every = torch.cat([near, known, q])
     if isinstance(robot, Tree):
-        start = of_robot(robot, tool, every, near, own[1], adrift=not any(sensor.of_positions for sensor in own[2]))
+        scene = of_robot(robot, tool, every, near, own[1], adrift=not any(sensor.of_positions for sensor in own[2]))
     else:
-        start = of_model(robot, every, free)
-    return start, torch.arange(len(every), device=q.device).split([len(near), len(known), len(q)])
+        scene = of_model(robot, every, free)
+    return scene, torch.arange(len(every), device=q.device).split([len(near), len(known), len(q)])

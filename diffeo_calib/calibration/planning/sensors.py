@@ -9,44 +9,46 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.placing.sockets import IN_SOCKET_M
 from diffeo_calib.calibration.planning.candidates import Criterion
 from diffeo_calib.common.checks import as_tensor, check_number
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.device_readings import FittedDevice
 from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.regression.conditional import Conditional, without_rigid_motions
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.sensors.devices import Devices, numbers_text
-from diffeo_calib.sensors.kinds import known_kinds
+from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.kinds import WITHOUT_READINGS, known_kinds
 from diffeo_calib.sensors.set_ups import frame_slopes
 
 
 class Scene(NamedTuple):
-    """M configurations as a robot or model has them.
+    """M configurations as a robot or model has them, and what is known there before the first measurement."""
 
-    Args:
-        points: (M, m) coordinates of the markers, m.
-        noise: (M, m, m) covariance of one measurement of them, m^2.
-        base: (4, 4) the robot's base in their frame, m.
-        averaged: (r, m) the markers, or the origins of measured poses. seen: the first coordinates, of points that a
-            device of positions sees.
-        free: whether nothing says where the robot stands in the frame of a measuring device.
-        shifts: number c0 of the shifts that rows of the fit shared.
-    """
+    known: Conditional  # the conditional
+    at: Linearisation  # the configurations
+    first: int  # number of the first new column
+    points: Tensor  # (M, m) coordinates of the markers, m
+    noise: Tensor  # (M, m, m) covariance of one measurement of them, m^2
+    base: Tensor  # (4, 4) the robot's base in their frame, m
+    averaged: Tensor  # (r, m) the markers, or the origins of measured poses
+    seen: int  # the first coordinates, of points that a device of positions sees
+    free: bool = False  # whether nothing says where the robot stands in the frame of a measuring device
+    shifts: int = 0  # number c0 of the shifts that rows of the fit shared
 
-    points: Tensor
-    noise: Tensor
-    base: Tensor
-    averaged: Tensor
-    seen: int
-    free: bool = False
-    shifts: int = 0
+    @property
+    def motions(self) -> list[int]:
+        """Numbers of the columns by motions of the base."""
+        return list(self.at.spec.nominal.places[:6])
+
+    def without_motions(self, known: Conditional, targets: Tensor) -> Conditional:
+        """Without the rigid motion that fits the errors at the targets best, where such motions are no errors."""
+        return without_rigid_motions(known, self.at.rows(targets), self.motions) if self.free else known
 
     def along(self, blocks: Tensor) -> Tensor:
         """Covariances of the markers, or of the origins of poses, from those of the points: (M, m, m) -> (M, r, r)."""
@@ -76,20 +78,14 @@ class Where(NamedTuple):
 
 
 class Options(NamedTuple):
-    """Measurements that can be made: O of them.
+    """Measurements that can be made: O of them."""
 
-    Args:
-        rows: (O,) numbers of the configurations. slopes: (O, r, m) A. shared: (O, r, c) D, the c0 shifts of the fit
-            first. noise: (O, r, r), m^2.
-        device: (O,) numbers of the devices. names: of the devices.
-    """
-
-    rows: Tensor
-    slopes: Tensor
-    shared: Tensor
-    noise: Tensor
-    device: Tensor
-    names: tuple[str, ...]
+    rows: Tensor  # (O,) numbers of the configurations
+    slopes: Tensor  # (O, r, m) A
+    shared: Tensor  # (O, r, c) D, the c0 shifts of the fit first
+    noise: Tensor  # (O, r, r), m^2
+    device: Tensor  # (O,) numbers of the devices
+    names: tuple[str, ...]  # of the devices
 
     @classmethod
     def joined(cls, parts: Sequence[Options], shifts: int) -> Options:
@@ -108,11 +104,11 @@ class Options(NamedTuple):
             before, devices, names = before + own, devices + len(part.names), names + part.names
         return cls._make([*(torch.cat(values) for values in zip(*found, strict=True)), names])
 
-    def linearised(self, at: Linearisation, shifts: int, first: int) -> Linearisation:
-        """What they report, with columns by the ``shifts`` of the fit, and by new ones from number ``first`` on."""
-        told = at.rows(self.rows).projected(self.slopes)
-        told = told.with_columns(self.shared[..., :shifts], len(at.spec.prior_variance))
-        return told.with_columns(self.shared[..., shifts:], first)
+    def linearised(self, scene: Scene) -> Linearisation:
+        """What they report, with columns by the shifts of the fit, and by new ones."""
+        told = scene.at.rows(self.rows).projected(self.slopes)
+        told = told.with_columns(self.shared[..., : scene.shifts], len(scene.at.spec.prior_variance))
+        return told.with_columns(self.shared[..., scene.shifts :], scene.first)
 
     def some(self, index: Tensor) -> Options:
         """Some of them."""
@@ -166,7 +162,7 @@ class Sensor(ABC):
     @staticmethod
     def sockets(places: object, std: float | None = None) -> Sensor:
         """The ball in sockets at places (D, 3), m; only configurations that bring it there can be measured."""
-        return InSockets(std, as_tensor(places, "places", ("D", 3), fix="pass x, y, z of every socket, in m"))
+        return DeviceReadings.of("socket", places, std)
 
     @abstractmethod
     def options(self, scene: Scene) -> Options:
@@ -216,14 +212,10 @@ class Sensor(ABC):
 
 @dataclass(frozen=True)
 class Positions(Sensor):
-    """Positions of the markers, or poses.
+    """Positions of the markers, or poses."""
 
-    Args:
-        whole: whether poses of frames are measured, or their origins. new: whether by a device of no row of the model.
-    """
-
-    whole: bool = False
-    new: bool = False
+    whole: bool = False  # whether poses of frames are measured, or their origins
+    new: bool = False  # whether by a device of no row of the model
     of_positions: ClassVar[bool] = True
 
     def beside_others(self) -> Sensor:
@@ -255,20 +247,17 @@ class Positions(Sensor):
 
 @dataclass(frozen=True)
 class DeviceReadings(Sensor):
-    """Readings of the ball, of one kind.
+    """Readings of the ball, of one kind."""
 
-    Args:
-        devices: where they are, in the robot's base frame.
-        fitted: what a fit knows of the only one, which is in the frame of the model's positions; None for new devices.
-    """
-
+    # where they are, in the robot's base frame
     devices: Devices = None  # pyright: ignore[reportAssignmentType]  # always given
+    # what a fit knows of the only one, which is in the frame of the model's positions; None for new devices
     fitted: FittedDevice | None = None
 
     @classmethod
     def of(cls, kind: str, numbers: object, std: float | None, offset_std: float = 0.0) -> DeviceReadings:
         """Devices that a user describes, see :attr:`Devices.stated_as`."""
-        own = known_kinds()[kind]
+        own: Any = {**known_kinds(), **WITHOUT_READINGS}[kind]
         count = own.stated_as.count(",") + 1
         given = as_tensor(numbers, f"devices of {kind}s", ("D", count), fix=f"pass {own.stated_as} of each, in m")
         constants = own.stated(given)
@@ -282,6 +271,11 @@ class DeviceReadings(Sensor):
     def sentences(self) -> list[str]:
         """One for each."""
         return [f"{name}: {self.devices.where(number)}" for number, name in enumerate(self.devices.names)]
+
+    def places_in(self, base: Tensor) -> Tensor | None:
+        """See :meth:`Sensor.places_in`."""
+        places = self.devices.places
+        return places if places is None or self.fitted is None else (places - base[:3, 3]) @ base[:3, :3]
 
     def options(self, scene: Scene) -> Options:
         """Every device at the configurations in which it sees the tool."""
@@ -308,45 +302,3 @@ class DeviceReadings(Sensor):
         if self.std is None and self.fitted is not None and self.fitted.noise is not None:
             return self.fitted.noise.expand(len(rows), -1, -1)
         return super()._noise(scene, rows, slopes)
-
-
-@dataclass(frozen=True)
-class InSockets(Sensor):
-    """The ball in sockets.
-
-    Args:
-        at: (D, 3) their places in the robot's base frame, m.
-        effects: (D, 3, c0) of the shifts of the fit, whose sockets they are; None for new sockets. The sockets of a fit
-            are in the frame of the model's positions.
-    """
-
-    at: Tensor = None  # pyright: ignore[reportAssignmentType]  # always given
-    effects: Tensor | None = None
-
-    def places_in(self, base: Tensor) -> Tensor | None:
-        """See :meth:`Sensor.places_in`."""
-        return self.at if self.effects is None else (self.at - base[:3, 3]) @ base[:3, :3]
-
-    def sentences(self) -> list[str]:
-        """One for each."""
-        return [
-            f"socket {k}: {numbers_text([1e3 * x for x in place])} mm" for k, place in enumerate(self.at.tolist(), 1)
-        ]
-
-    def options(self, scene: Scene) -> Options:
-        """Every configuration that brings the ball to a socket."""
-        places = self.at.to(scene.points)
-        if self.effects is None:
-            places = places @ scene.base[:3, :3].mT + scene.base[:3, 3]
-        near = torch.cdist(scene.points @ scene.last.mT, places)
-        rows = (near.amin(1) < IN_SOCKET_M).nonzero()[:, 0]
-        device = near[rows].argmin(1)
-        slopes = scene.last.expand(len(rows), -1, -1)
-        if self.effects is None:
-            whose = torch.nn.functional.one_hot(device, len(places)).to(slopes)
-            eye = PLACES.found_m_rad * torch.eye(3, dtype=slopes.dtype, device=slopes.device)
-            shared = self._new(scene, (whose[:, None, :, None] * eye[None, :, None]).flatten(2))
-        else:
-            shared = self.effects[device]
-        names = tuple(f"socket {number}" for number in range(1, len(places) + 1))
-        return Options(rows, slopes, shared, self._noise(scene, rows, slopes), device, names)

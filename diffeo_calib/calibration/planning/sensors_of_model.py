@@ -18,7 +18,6 @@ from torch import Tensor
 from diffeo_calib.calibration.planning.candidates import ranges_around
 from diffeo_calib.calibration.planning.sensors import (
     DeviceReadings,
-    InSockets,
     Options,
     Positions,
     Scene,
@@ -34,28 +33,22 @@ from diffeo_calib.measurements.poses import camera_jacobian, inverse_poses, mark
 from diffeo_calib.sensors.board_camera import BoardCamera
 from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import TRANSFORMS
-from diffeo_calib.sensors.sockets import SocketPlaces
 
 SMALLEST_REST_M = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class BoardImages(Sensor):
-    """Images of the board by one camera of a fit.
+    """Images of the board by one camera of a fit."""
 
-    Args:
-        name: of the camera. seen: lens, board and what its images showed. lever: of the model's poses, m.
-        set_up: where it is.
-        effects: (14, c0) of the shifts of the fit on lens and board; None where these are new shifts, as beside a
-            registration. rest: (9, 9) noise of a pose beyond that of its corners, m^2.
-    """
-
-    name: str = ""
+    name: str = ""  # of the camera
+    # lens, board and what its images showed
     seen: BoardCamera = None  # pyright: ignore[reportAssignmentType]  # always given
-    lever: float = 0.0
-    set_up: SetUp = None  # pyright: ignore[reportAssignmentType]
+    lever: float = 0.0  # of the model's poses, m
+    set_up: SetUp = None  # pyright: ignore[reportAssignmentType]  # where it is
+    # (14, c0) of the shifts of the fit on lens and board; None where these are new shifts, as beside a registration
     effects: Tensor | None = None
-    rest: Tensor | None = None
+    rest: Tensor | None = None  # (9, 9) noise of a pose beyond that of its corners, m^2
 
     @property
     def camera(self) -> Camera:
@@ -154,8 +147,6 @@ def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
     found: list[Sensor] = [] if without_positions(model) else [Positions(whole=model.lever is not None)]
     for own in model.placement:
         found += board_images(model, own)
-        if own.kind == SocketPlaces.kind and len(own.rows):
-            found.append(_sockets(model, own.rows, own.device))
     found += _devices(model)
     if not found:
         fix = "say by `sensor` what will measure"
@@ -173,25 +164,17 @@ def without_positions(model: CalibratedKinematics) -> bool:
     shared = model.map.noise.shared
     other = torch.zeros(len(shared), dtype=torch.bool, device=shared.device)
     for own in model.placement:
-        if own.devices.reads or own.devices.cameras or own.kind == SocketPlaces.kind:
+        if own.devices.seen_points or own.devices.cameras:
             other[own.rows] = True
         if own.devices.cameras:
             other |= (shared != 0).any(1).sum(1) >= len(UNKNOWNS)
     return bool(other.all())
 
 
-def _sockets(model: CalibratedKinematics, rows: Tensor, socket: Tensor) -> InSockets:
-    """Those in which rows (M,) of the fit rested, at the middles of their rows; ``socket`` (M,) of each."""
-    ball, effects = model(model.configurations[rows]).detach()[:, -1], model.map.noise.shared[rows, -3:]
-    each = [socket == number for number in socket.unique()]
-    places = torch.stack([ball[own].mean(0) for own in each])
-    return InSockets(None, places, torch.stack([effects[own][0] for own in each]))
-
-
 def _devices(model: CalibratedKinematics) -> Iterator[DeviceReadings]:
-    """Every device of readings of a model by itself; of one that measured no row only its rough place is known."""
+    """Every device of readings and socket of a model; of one that measured no row only its rough place is known."""
     for one in model.placement:
-        for number, word in enumerate(one.names if one.devices.reads else ()):
+        for number, word in enumerate(one.names if one.devices.seen_points else ()):
             several = sum(word in other.names for other in model.placement) > 1
             fitted = FittedDevice.of(model.map, one, number)
             devices, offset = fitted.devices, float(fitted.devices.deviations[0, -1])

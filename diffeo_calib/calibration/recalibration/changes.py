@@ -66,19 +66,13 @@ class Change:
 
 
 class Offset(NamedTuple):
-    """A change of a joint's offset: the smallest that rows show in nine cases of ten, or one that they cannot exclude.
+    """A change of a joint's offset: the smallest that rows show in nine cases of ten, or one that they may hide."""
 
-    Args:
-        joint: its name. angle: whether the others are in rad, else in m.
-        size: is added to a reading as that of a :class:`Change`; infinite if places hide any.
-        deviation: of the size; zero of the smallest one. instead: what has moved otherwise, in words; empty for those.
-    """
-
-    joint: str
-    angle: bool
-    size: float
-    deviation: float = 0.0
-    instead: str = ""
+    joint: str  # its name
+    angle: bool  # whether the others are in rad, else in m
+    size: float  # is added to a reading as that of a :class:`Change`; infinite if places hide any
+    deviation: float = 0.0  # of the size; zero of the smallest one
+    instead: str = ""  # what has moved otherwise, in words; empty for those
 
     def __str__(self) -> str:
         unit = "mrad" if self.angle else "mm"

@@ -31,7 +31,6 @@ from diffeo_calib.calibration.recalibration.new_rows import (
     OFFSET_DEVIATION_RAD_M,
     OUTLIER_WEIGHT,
     ChangedPart,
-    Drift,
     WeighedRows,
     offsets_of,
     parts_of,
@@ -110,7 +109,7 @@ SOMETHING = "something"
 """A change whose part rows do not tell."""
 
 
-def find_changes(rows: WeighedRows, *, level: float = LEVEL, seed: int = 0) -> tuple[Changes, list[Drift]]:
+def find_changes(rows: WeighedRows, *, level: float = LEVEL, seed: int = 0) -> tuple[Changes, list[ChangedPart]]:
     """Test new rows for changes: all together, and every session and block of rows that do not fit by itself.
 
     Rows that follow one another, or are a session of their own, and deviate together are no outliers.
@@ -162,7 +161,7 @@ def groups_of(rows: WeighedRows) -> dict[str, tuple[Tensor, bool]]:
     return {f"rows {first} to {last}": (block, True)}
 
 
-def _changes_of(rows: WeighedRows, *, level: float, seed: int) -> tuple[Changes, list[Drift]]:
+def _changes_of(rows: WeighedRows, *, level: float, seed: int) -> tuple[Changes, list[ChangedPart]]:
     """Test rows together; arguments as of :func:`find_changes`."""
     low, high = rows.fitted.x.amin(0), rows.fitted.x.amax(0)
     margin = RANGE_MARGIN * (high - low)
@@ -172,7 +171,7 @@ def _changes_of(rows: WeighedRows, *, level: float, seed: int) -> tuple[Changes,
     parts = {part.name: part for part in (*parts_of(rows.fitted), *offsets_of(rows.fitted))}
     roots = {name: part.root(rows.at) for name, part in parts.items()}
     rows = rows.changed(tails=rows.drifting(list(roots.values())).with_weights().tails)
-    drifts, found, first, noise = list[Drift](), list[tuple[float, tuple[str, ...]]](), dict[str, float](), 1.0
+    drifts, found, first, noise = list[ChangedPart](), list[tuple[float, tuple[str, ...]]](), dict[str, float](), 1.0
     while roots:
         ratios, factor = likelihood_ratios(rows, roots, seed)
         # A few outliers look like a change, and a change looks like outliers: it must stand out with either weights.
@@ -187,7 +186,7 @@ def _changes_of(rows: WeighedRows, *, level: float, seed: int) -> tuple[Changes,
         best = ratios.pop(name)
         if best.probability > level:
             break
-        drifts.append(Drift(parts[name], best.variance))
+        drifts.append(replace(parts[name], variance=best.variance))
         rows = rows.drifting([best.variance**0.5 * roots.pop(name)])
         least = best.value - gates.OFFSETS_TOLD_APART if parts[name].offset else inf
         as_good = [each for each, own in ratios.items() if parts[each].offset and own.value > least]
@@ -213,18 +212,18 @@ def _smallest(rows: WeighedRows) -> tuple[Offset, ...]:
     return tuple(found)
 
 
-def _change(rows: WeighedRows, drift: Drift, probability: float, others: tuple[str, ...]) -> Change:
+def _change(rows: WeighedRows, part: ChangedPart, probability: float, others: tuple[str, ...]) -> Change:
     """The change with its expected size."""
-    (part, variance), kinds = drift, rows.points.fitted.geometry.chain.kinds
-    evidence = rows.evidence(part.root(rows.at))
-    moved = part.root(rows.seen[1]) @ (variance * evidence.g)
+    evidence, kinds = rows.evidence(part.root(rows.at)), rows.points.fitted.geometry.chain.kinds
+    moved = part.root(rows.seen[1]) @ evidence.g
     size = displacement = float(moved.unflatten(1, (-1, 3)).square().sum(-1).mean().sqrt())
     deviation = None
     if part.joint is not None:
-        errors = part.shapes(rows.at) @ (variance * evidence.g)
+        shapes = part.shapes(rows.at)
+        errors = shapes @ evidence.g
         size = float(errors[0]) if part.offset else float(errors.square().mean().sqrt())
-    if part.offset:
-        deviation = OFFSET_DEVIATION_RAD_M * (variance * max(1.0 - variance * float(evidence.H), 0.0)) ** 0.5
+        if part.offset:
+            deviation = float(shapes[0, 0]) * max(1.0 - float(evidence.H), 0.0) ** 0.5
     angle = part.joint is not None and kinds[part.joint] != "prismatic"
     return Change(part.name, size, angle, displacement, probability, deviation, others)
 
@@ -236,7 +235,7 @@ LOG_SIZES = torch.linspace(-12.0, 4.0, 65, dtype=torch.float64, device="cpu")
 ROUNDS = 10
 
 
-def usual_drift(rows: WeighedRows, named: Sequence[Drift]) -> list[Drift]:
+def usual_drift(rows: WeighedRows, named: Sequence[ChangedPart]) -> list[ChangedPart]:
     """What may differ between the dates, besides what a test named: temperature, wear and screws change everything.
 
     In each of three groups, the geometry, the load and the transmissions of all joints, errors may differ from the old
@@ -246,7 +245,7 @@ def usual_drift(rows: WeighedRows, named: Sequence[Drift]) -> list[Drift]:
     Args:
         rows: the new rows as the old model sees them. named: parts that have changed, which are free already.
     """
-    free = {each.part.name for each in named}
+    free = {each.name for each in named}
     groups: dict[str, list[ChangedPart]] = {}
     for part in parts_of(rows.fitted):
         if part.name not in free:
@@ -260,7 +259,7 @@ def usual_drift(rows: WeighedRows, named: Sequence[Drift]) -> list[Drift]:
         sizes, odds = _likeliest(rows.changed(tails=weighed.tails).drifting(known), roots)
         if odds < least:
             return []
-    return [Drift(part, size) for parts, size in zip(groups.values(), sizes, strict=True) for part in parts]
+    return [replace(part, variance=size) for parts, size in zip(groups.values(), sizes, strict=True) for part in parts]
 
 
 def _likeliest(rows: WeighedRows, roots: list[Tensor]) -> tuple[list[float], float]:

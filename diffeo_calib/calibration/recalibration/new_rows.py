@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import log
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -30,7 +30,7 @@ from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.re_registration.find_place import MARKER_DEVIATIONS, UNMOVED_LOG_ODDS
 from diffeo_calib.kinematics.re_registration.new_rows import NewRows, larger, noise_of_rows, typical_noise
-from diffeo_calib.kinematics.re_registration.registered_map import robot_map
+from diffeo_calib.kinematics.re_registration.registered_map import fitted_markers, robot_map
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.measurements.table import Measurements
@@ -58,12 +58,14 @@ class ChangedPart:
         joint: the column of the joint whose error or offset it is; None for parameters of the nominal map.
         kernel: that of the joint's error; None for its offset, which all readings lack since then.
         deviations: (K,) prior standard deviations of the parameters, zero of those that it leaves alone.
+        variance: of the change, relative to the old variance of the part.
     """
 
     name: str
     joint: int | None = None
     kernel: RadialKernel | None = None
     deviations: Tensor | None = None
+    variance: float = 1.0
 
     @property
     def offset(self) -> bool:
@@ -71,32 +73,21 @@ class ChangedPart:
         return self.joint is not None and self.kernel is None
 
     def shapes(self, at: Linearisation) -> Tensor:
-        """(M, c) columns whose products are the prior covariance of the joint's errors, rad or m."""
-        points = at.joint[0].points
+        """(M, c) columns whose products are the covariance of the change of the joint's errors, rad or m."""
+        points, size = at.joint[0].points, self.variance**0.5
         if self.kernel is None:
-            return torch.full_like(points[:, :1], OFFSET_DEVIATION_RAD_M)
+            return torch.full_like(points[:, :1], size * OFFSET_DEVIATION_RAD_M)
         one = points.new_zeros(len(points), 1, points.shape[1])
         one[:, 0, self.joint] = 1.0
         values, vectors = torch.linalg.eigh(self.kernel.gram(points, one, points, one))
         kept = values > NEGLIGIBLE_EIGENVALUE_SHARE * values[-1]
-        return vectors[:, kept] * values[kept].sqrt()
-
-    def root(self, at: Linearisation) -> Tensor:
-        """(M, m, c) columns whose products are the part's prior covariance at M configurations, m."""
-        if self.deviations is not None:
-            return (at.sensitivity * self.deviations)[..., self.deviations > 0]
-        return at.joint_to_start[:, :, self.joint, None] * self.shapes(at)[:, None]
-
-
-class Drift(NamedTuple):
-    """A part that has changed, and the variance of its change relative to its old variance."""
-
-    part: ChangedPart
-    variance: float
+        return size * vectors[:, kept] * values[kept].sqrt()
 
     def root(self, at: Linearisation) -> Tensor:
         """(M, m, c) columns whose products are the covariance of the change at M configurations, m."""
-        return self.variance**0.5 * self.part.root(at)
+        if self.deviations is not None:
+            return self.variance**0.5 * (at.sensitivity * self.deviations)[..., self.deviations > 0]
+        return at.joint_to_start[:, :, self.joint, None] * self.shapes(at)[:, None]
 
 
 def offsets_of(fitted: FittedMap) -> list[ChangedPart]:
@@ -293,7 +284,7 @@ def weighed(before: Before, marker: str) -> WeighedRows:
     Args:
         before: the old map, and where devices and markers are. marker: see :func:`diffeo_calib.recalibrate`.
     """
-    own, place, ball = before.own_markers, before.place, None if before.new_ball else before.ball
+    own, place, ball = fitted_markers(before.fitted), before.place, None if before.new_ball else before.ball
     other, known = own.clone(), slice(len(own) - before.new_ball)
     if place is not None:
         other[known] = place.registration.markers[known]

@@ -49,27 +49,18 @@ from diffeo_calib.sensors.tables import (
 
 @dataclass(frozen=True, eq=False)
 class Before:
-    """The old map in its own frame, and the new rows.
+    """The old map in its own frame, and the new rows."""
 
-    Args:
-        fitted: the old map, with the ball of the new rows. nominal: its nominal map.
-        data: the new rows. coordinates: those that tell coordinates, with the markers of the map, in the frame of the
-            largest set-up. readings: the others.
-        place: where device and markers were found; None where no device measured coordinates.
-        sessions: frames of the set-ups, if there are several: a set of devices.
-        ball: (3,) where the new rows by themselves put the ball on its tip, m; None without one.
-        new_ball: whether the old model does not know it.
-    """
-
-    fitted: FittedMap
-    nominal: GeometryMap
-    data: Any
+    fitted: FittedMap  # the old map, with the ball of the new rows
+    nominal: GeometryMap  # its nominal map
+    data: Any  # the new rows
+    # those that tell coordinates, with the markers of the map, in the frame of the largest set-up
     coordinates: Coordinates | None
-    readings: list[OtherReadings]
-    place: FoundPlace | None
-    sessions: list[Sessions]
-    ball: Tensor | None
-    new_ball: bool
+    readings: list[OtherReadings]  # the others
+    place: FoundPlace | None  # where device and markers were found; None where no device measured coordinates
+    sessions: list[Sessions]  # frames of the set-ups, if there are several: a set of devices
+    ball: Tensor | None  # (3,) where the new rows by themselves put the ball on its tip, m; None without one
+    new_ball: bool  # whether the old model does not know it
 
     @property
     def registration(self) -> Registration | None:
@@ -86,12 +77,6 @@ class Before:
     def stands_free(self) -> bool:
         """Whether still no device says where the robot stands."""
         return self.place is None and self.fitted.stands_free
-
-    @property
-    def own_markers(self) -> Tensor:
-        """(P, 3) the markers of the map, in the frames of their tips, m."""
-        theta = self.fitted.deformation.momenta.theta
-        return self.nominal.geometry.tool + theta[self.nominal.geometry.slices["tool"]].view(-1, 3)
 
     @property
     def seen_before(self) -> Tensor:

@@ -40,7 +40,7 @@ from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.provenance import Provenance, check_note
 from diffeo_calib.kinematics.re_registration.register_again import both_dates, carried_devices, devices_beside
-from diffeo_calib.kinematics.re_registration.registered_map import Registration, moved
+from diffeo_calib.kinematics.re_registration.registered_map import Registration, fitted_markers, moved
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.sensors.errors import Evaluations
 from diffeo_calib.sensors.places import PlacedDevices, mounted_of
@@ -204,6 +204,7 @@ def _result(
         again.summary = replace(
             model.summary, **known, **certificates, outliers=int(small.sum()), rows=count, parts=explained
         )
+    away = again.geometry.tool - fitted_markers(place.fitted)
     return Recalibration(
         model=again,
         moved=found,
@@ -217,7 +218,7 @@ def _result(
         left_out=left_out,
         inflation=rows.inflation,
         fit=fitted,
-        shift=None if found is None else (again.geometry.tool - place.own_markers) * place.seen_before[:, None],
+        shift=None if found is None else away * place.seen_before[:, None],
         hidden=hidden_offsets(model.robot, place.place, changes),
     )
 
@@ -233,7 +234,7 @@ def _with_settled(
         for k, other in enumerate(found):
             if not own.devices.same_set(other.devices):
                 continue
-            if own.devices.fitted_again:
+            if own.devices.set_up:
                 found[k] = own.beside(other)
             else:
                 number = torch.tensor([other.names.index(name) for name in own.names], dtype=torch.int64, device=HOST)

@@ -50,19 +50,13 @@ SMALLEST_FREEDOM = 8.0
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """Errors of each configuration's measurement as predicted from all others of its block.
+    """Errors of each configuration's measurement as predicted from all others of its block."""
 
-    Args:
-        errors: (N, m) measured minus predicted, m; NaN where markers are hidden.
-        squares: (N, bodies) squared distances in units of the predicted covariance, tails left out; NaN as well.
-        effective: effective number of parameters, trace of G (G + R)^-1; None with several blocks, since no block
-            is the whole fit.
-        numbers: how many were measured; those of the errors by default. A pose has six, its three points nine errors.
-    """
-
-    errors: Tensor
-    squares: Tensor
+    errors: Tensor  # (N, m) measured minus predicted, m; NaN where markers are hidden
+    squares: Tensor  # (N, bodies) squared distances in units of the predicted covariance, tails left out; NaN as well
+    # effective number of parameters, trace of G (G + R)^-1; None with several blocks, since no block is the whole fit
     effective: float | None
+    # how many were measured; those of the errors by default. A pose has six, its three points nine errors
     numbers: int | None = None
 
     @property
@@ -242,40 +236,23 @@ def cross_validated_inflation(
         squares = left_out_squares(data, scales, torch.where(torch.isin(numbers, numbers[new]), numbers, -1))
         squares[~new] = nan
     else:
-        found = _squares_of_folds(centre, scales, data, numbers, seed=seed, progress=progress)
-        if found is None:
+        search = replace(SEARCH_LIMITS, iterations=ITERATIONS)
+        squares, folds = torch.full_like(data.tails.weights, nan), random_folds(numbers, FOLDS, seed)
+        try:
+            for done, (inside, rows) in enumerate(folds):
+                progress("cross-validation", done, len(folds))
+                again = select(centre, data.rows(inside), start=scales, seed=seed, limits=search)
+                if again.interrupted:
+                    return None
+                part = torch.where(torch.isin(numbers, numbers[rows]), numbers, -1)
+                squares[rows] = left_out_squares(data, again.scales, part)[rows]
+        except KeyboardInterrupt:
             return None
-        squares = found
     squares = squares.masked_fill(data.tails.weights < OUTLIER_WEIGHT, nan)
     seen = (~squares.isnan()).any(1)
     each = torch.bincount(numbers[seen], minlength=int(numbers.max()) + 1)[numbers].clamp(min=1)
     weights = (1.0 / (each * squares.shape[1]))[:, None].expand_as(squares)
     return region_scale(squares, data.noise_model.freedom, weights)
-
-
-def _squares_of_folds(
-    centre: Hyperparameters,
-    scales: Hyperparameters,
-    data: TangentData,
-    numbers: Tensor,
-    *,
-    seed: int,
-    progress: Progress,
-) -> Tensor | None:
-    """Squares (N, bodies) of all rows with scales that were selected without their fold; None after Ctrl-C."""
-    search = replace(SEARCH_LIMITS, iterations=ITERATIONS)
-    squares, folds = torch.full_like(data.tails.weights, nan), random_folds(numbers, FOLDS, seed)
-    try:
-        for done, (inside, rows) in enumerate(folds):
-            progress("cross-validation", done, len(folds))
-            again = select(centre, data.rows(inside), start=scales, seed=seed, limits=search)
-            if again.interrupted:
-                return None
-            part = torch.where(torch.isin(numbers, numbers[rows]), numbers, -1)
-            squares[rows] = left_out_squares(data, again.scales, part)[rows]
-    except KeyboardInterrupt:
-        return None
-    return squares
 
 
 def inflation_by_places(

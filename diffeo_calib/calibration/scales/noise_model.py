@@ -60,25 +60,18 @@ FINEST_SHARE = 0.3
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """How N rows were measured.
+    """How N rows were measured."""
 
-    Args:
-        visible: (N, R) boolean: the numbers that were measured. kinds: (N, B) int64, number of each body's kind of
-            device: 0 errs by ``sensor_noise``, k by the k-th of ``other_noise``. B bodies, such as markers, poses or
-            readings, have independent noise, and F = R / B numbers each.
-        known: (N, R, R) covariance that is known beforehand, m^2.
-        modes: (N, T, F, 6) displacements of the numbers of the first T bodies, poses, by a shift and a turn, zero where
-            one is hidden; each number by itself where a row reports something else. T may be 0.
-        slack: standard deviation of the single points of a pose, m.
-        smallest_noise: standard deviation that is added to every number, m.
-    """
-
-    visible: Tensor
+    visible: Tensor  # (N, R) boolean: the numbers that were measured
+    # (N, B) int64, number of each body's kind of device: 0 errs by ``sensor_noise``, k by the k-th of ``other_noise``.
+    # B bodies, such as markers, poses or readings, have independent noise, and F = R / B numbers each
     kinds: Tensor
-    known: Tensor
+    known: Tensor  # (N, R, R) covariance that is known beforehand, m^2
+    # (N, T, F, 6) displacements of the numbers of the first T bodies, poses, by a shift and a turn, zero where one is
+    # hidden; each number by itself where a row reports something else. T may be 0
     modes: Tensor
-    slack: float = 0.0
-    smallest_noise: float = SMALLEST_NOISE_M
+    slack: float = 0.0  # standard deviation of the single points of a pose, m
+    smallest_noise: float = SMALLEST_NOISE_M  # standard deviation that is added to every number, m
 
     @classmethod
     def alike(cls, rows: int, bodies: int, size: int = 3) -> NoiseModel:

@@ -39,26 +39,18 @@ factor of its own for all unknowns would take half as long again."""
 
 @dataclass(frozen=True)
 class SearchLimits:
-    """Size of the search for scales.
+    """Size of the search for scales."""
 
-    Args:
-        poses: largest number of poses in the likelihood. coordinates: largest number of measured coordinates.
-        iterations: of the optimiser from a given start, at most.
-        fewest_first: iterations from each of several starts, at least. most_first: the same, at most.
-        first: the same with ``first_coordinates`` measured coordinates; fewer coordinates cost less per iteration and
-            have more local optima, and get more iterations.
-        first_coordinates: see ``first``.
-        log_range: bound on the logarithm of a scale relative to its default.
-    """
-
-    poses: int = 150
-    coordinates: int = 900
-    iterations: int = 40
-    fewest_first: int = 15
-    most_first: int = 60
+    poses: int = 150  # largest number of poses in the likelihood
+    coordinates: int = 900  # largest number of measured coordinates
+    iterations: int = 40  # of the optimiser from a given start, at most
+    fewest_first: int = 15  # iterations from each of several starts, at least
+    most_first: int = 60  # the same, at most
+    # the same with ``first_coordinates`` measured coordinates; fewer coordinates cost less per iteration and have more
+    # local optima, and get more iterations
     first: int = 20
-    first_coordinates: int = 450
-    log_range: float = 9.0
+    first_coordinates: int = 450  # see ``first``
+    log_range: float = 9.0  # bound on the logarithm of a scale relative to its default
 
     def first_iterations(self, coordinates: int) -> int:
         """Iterations from each of several starts, for a number of measured coordinates."""
@@ -76,19 +68,12 @@ SHORT = 0.3
 
 @dataclass(frozen=True)
 class Selection:
-    """Scales and how they were chosen.
+    """Scales and how they were chosen."""
 
-    Args:
-        scales: the scales.
-        status: a sentence about the choice.
-        interrupted: whether Ctrl-C ended the search.
-        likelihood: log marginal likelihood of the subset that was used; None if nothing was selected.
-    """
-
-    scales: Hyperparameters
-    status: str
-    interrupted: bool = False
-    likelihood: float | None = None
+    scales: Hyperparameters  # the scales
+    status: str  # a sentence about the choice
+    interrupted: bool = False  # whether Ctrl-C ended the search
+    likelihood: float | None = None  # log marginal likelihood of the subset that was used; None if nothing was selected
 
 
 def select(

@@ -43,34 +43,23 @@ LINEARISED = ("points", "slopes", "values", "jacobian", "sensitivities")
 
 @dataclass(frozen=True, eq=False)
 class TangentData:
-    """Measurements around a geometric calibration. k0 and its derivatives are computed once, when first used.
+    """Measurements around a geometric calibration. k0 and its derivatives are computed once, when first used."""
 
-    Args:
-        nominal: k0.
-        theta: (K,) its parameters, where it is linearised.
-        x: (N, n) configurations. y: (N, m) measured coordinates, m; near k0 where the sensor hides them. With
-            ``observe`` (N, r) what it reports: r stands for m, and h(k0) for k0, in all that follows.
-        noise_model: how they were measured.
-        tails: weights of the measurements.
-        place_deviation: prior standard deviation of base and markers, m and rad.
-        shared: (N, m, c) effects of c shifts of unit variance that rows share, m; none by default.
-        held: numbers of the parameters theta that stay zero.
-        adrift: whether no device says where the robot stands.
-        observe: what was measured of the markers; their coordinates by default.
-        beside: the rows among these that tell coordinates, by themselves; None where all or none do.
-    """
-
-    nominal: GeometryMap
-    theta: Tensor
-    x: Tensor
+    nominal: GeometryMap  # k0
+    theta: Tensor  # (K,) its parameters, where it is linearised
+    x: Tensor  # (N, n) configurations
+    # (N, m) measured coordinates, m; near k0 where the sensor hides them. With ``observe`` (N, r) what it reports: r
+    # stands for m, and h(k0) for k0, in all that follows
     y: Tensor
-    noise_model: NoiseModel
-    tails: Tails
-    place_deviation: float = PLACES.found_m_rad
+    noise_model: NoiseModel  # how they were measured
+    tails: Tails  # weights of the measurements
+    place_deviation: float = PLACES.found_m_rad  # prior standard deviation of base and markers, m and rad
+    # (N, m, c) effects of c shifts of unit variance that rows share, m; none by default
     shared: Tensor = None  # pyright: ignore[reportAssignmentType]  # a tensor once it is made
-    held: tuple[int, ...] = ()
-    adrift: bool = False
-    observe: Observation | None = None
+    held: tuple[int, ...] = ()  # numbers of the parameters theta that stay zero
+    adrift: bool = False  # whether no device says where the robot stands
+    observe: Observation | None = None  # what was measured of the markers; their coordinates by default
+    # the rows among these that tell coordinates, by themselves; None where all or none do
     beside: TangentData | None = None
 
     def __post_init__(self) -> None:

@@ -33,7 +33,6 @@ from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
 from diffeo_calib.reports.live import Page, served, state_of
 
 JOURNAL = ".journal"
-"""Suffix of the journal beside a table."""
 LOOK_SECONDS = 0.1
 LONGEST = 200
 """Characters of an option in a journal; of longer ones it holds a hash."""
@@ -41,31 +40,23 @@ LONGEST = 200
 
 @dataclass
 class Live:
-    """A campaign, the table that it follows and its journal.
-
-    Args:
-        tips: of the markers. table: the file. owner: the line of each row. lines: all that were judged.
-        waiting: those that were there at the start and were not. ids: number of the line of each id.
-        said: whether each row is accepted, and to be repeated. unreadable: lines that are no rows, and why.
-        revised: rows that the last line changed. late: rows that a new model changed, not told yet.
-        ignored: lines after the one with which the target was reached.
-    """
+    """A campaign, the table that it follows and its journal."""
 
     campaign: Campaign
     source: MeasuredTable
-    tips: Sequence[str]
+    tips: Sequence[str]  # of the markers
     journal: Journal
     given: CampaignOptions
-    table: GrowingTable = field(init=False)
-    owner: list[int] = field(default_factory=list)
-    lines: list[bytes] = field(default_factory=list)
-    waiting: list[bytes] = field(default_factory=list)
-    said: list[tuple[bool, bool]] = field(default_factory=list)
-    ids: dict[str, int] = field(default_factory=dict)
-    unreadable: dict[int, str] = field(default_factory=dict)
-    revised: list[int] = field(default_factory=list)
-    late: list[int] = field(default_factory=list)
-    ignored: int = 0
+    table: GrowingTable = field(init=False)  # the file
+    owner: list[int] = field(default_factory=list)  # the line of each row
+    lines: list[bytes] = field(default_factory=list)  # all that were judged
+    waiting: list[bytes] = field(default_factory=list)  # those that were there at the start and were not
+    said: list[tuple[bool, bool]] = field(default_factory=list)  # whether each row is accepted, and to be repeated
+    ids: dict[str, int] = field(default_factory=dict)  # number of the line of each id
+    unreadable: dict[int, str] = field(default_factory=dict)  # lines that are no rows, and why
+    revised: list[int] = field(default_factory=list)  # rows that the last line changed
+    late: list[int] = field(default_factory=list)  # rows that a new model changed, not told yet
+    ignored: int = 0  # lines after the one with which the target was reached
     _found: tuple[object, Next | None] | None = None
 
     def __post_init__(self) -> None:

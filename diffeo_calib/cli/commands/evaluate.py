@@ -34,7 +34,7 @@ from diffeo_calib.kinematics.evaluation import (
     rows_of_other_frames,
     rows_used_in_fit,
 )
-from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, warn_outside_range
+from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, repeated_lines, warn_outside_range
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.files import Predictions, read_configurations, write_predictions
@@ -46,7 +46,6 @@ from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, Evaluation
 from diffeo_calib.sensors.set_ups import SESSION
 
 COLUMNS = ("line", "used_in_fit", "kind", "device", "marker", "dx", "dy", "dz", "size", "unit")
-"""Of the table of residuals."""
 
 
 def run(options: EvaluateOptions) -> None:
@@ -57,6 +56,7 @@ def run(options: EvaluateOptions) -> None:
     models.check_payload_column(model, source.table.payload)
     say(*models.provenance_lines(model))
     data = source.read(model.robot)
+    say(*repeated_lines(model, data.q))
     if options.free is not None:
         return _registered(model, data, options)
     check_rows(model, data)

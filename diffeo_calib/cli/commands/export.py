@@ -191,7 +191,7 @@ def _limits(model: CalibratedKinematics, rigid: Sequence[str]) -> Iterator[str]:
         )
     drift = KnownDrift.of(model)
     if drift is not None:  # which the files do not know
-        yield from drift.sentences()
+        yield from drift.of_joints()
         yield f"no file knows the {' or the '.join(drift.names)}: they hold at {drift.holds()}"
 
 

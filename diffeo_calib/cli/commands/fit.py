@@ -25,11 +25,11 @@ from diffeo_calib.cli.tables import measured_table
 from diffeo_calib.common.errors import PACKAGE, InputError, printable
 from diffeo_calib.common.files import write_figure
 from diffeo_calib.interop.model_file import save
+from diffeo_calib.kinematics.evaluation import unseen
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_entry, hand_eye_sentences
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.reports.analysis.findings import unseen
 from diffeo_calib.reports.html.sentences import advice, verdict
 from diffeo_calib.reports.plots.errors import stages
 from diffeo_calib.reports.report import write_report

@@ -58,7 +58,6 @@ NOT_RAISED = 1.01
 FLANGES = ("flange", "tool0")
 """Ends of the names of links to which tools are screwed."""
 COLUMNS = ("joints", "position", "marker", "socket", "rotation", "std", "reading", "by", *NAMED)
-"""Entries that name columns."""
 
 
 def run(given: InitOptions) -> None:
@@ -205,18 +204,13 @@ def _with_tip(robot: Path, source: Source, arm: Arm) -> Source:
 
 @dataclass(frozen=True)
 class Arm:
-    """The first joints of a robot, one behind the other, that the table has columns of.
+    """The first joints of a robot, one behind the other, that the table has columns of."""
 
-    Args:
-        links: the options that name them. joints: their names. ends: the link behind each. columns: of each.
-        lacking: joints behind them that no column is named after.
-    """
-
-    links: Links
-    joints: list[str]
-    ends: list[str]
-    columns: JointColumns
-    lacking: tuple[str, ...] = ()
+    links: Links  # the options that name them
+    joints: list[str]  # their names
+    ends: list[str]  # the link behind each
+    columns: JointColumns  # of each
+    lacking: tuple[str, ...] = ()  # joints behind them that no column is named after
 
     def first(self, count: int) -> Arm:
         """The first joints of these alone."""

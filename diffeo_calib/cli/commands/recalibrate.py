@@ -20,7 +20,7 @@ from diffeo_calib.cli.printed import frame_lines, motion_lines, placement_lines
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.common.errors import InputError, few
 from diffeo_calib.interop.model_file import save
-from diffeo_calib.kinematics.joint_ranges import warn_outside_range
+from diffeo_calib.kinematics.joint_ranges import repeated_lines, warn_outside_range
 
 
 def run(given: RecalibrateOptions) -> None:
@@ -33,6 +33,7 @@ def run(given: RecalibrateOptions) -> None:
     say(*provenance_lines(model), *another_date_lines(model))
     with progress_bar() as progress:
         data = source.read(model.robot)
+        say(*repeated_lines(model, data.q))
         warn_outside_range(model, data.q)
         result = recalibrate(model, data, progress=progress, **how)
     save(made_by_command(result.model), given.output)  # before anything is printed: output may be cut off

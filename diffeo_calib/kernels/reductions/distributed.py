@@ -49,14 +49,10 @@ class LostRankError(DiffeoCalibError):
 
 @dataclass(frozen=True)
 class Ranks:
-    """The processes of this program.
+    """The processes of this program."""
 
-    Args:
-        own: number of this one, from 0. count: of all.
-    """
-
-    own: int = 0
-    count: int = 1
+    own: int = 0  # number of this one, from 0
+    count: int = 1  # of all
 
     def mine(self, items: Sequence[T]) -> list[T]:
         """The items that this rank works on: dealt there and back, since costs often rise or fall steadily."""

@@ -53,36 +53,22 @@ class Points(NamedTuple):
 
 
 class Term(NamedTuple):
-    """factor sum_j w_ij b_j (M, k), or factor sum_j w_ij b_j (e_i - e_j)^T (M, k, D); (M, D) without b.
+    """factor sum_j w_ij b_j (M, k), or factor sum_j w_ij b_j (e_i - e_j)^T (M, k, D); (M, D) without b."""
 
-    Args:
-        weight: the number of the weight w.
-        vector: the field of :class:`Points` that b is.
-        apart: the field of :class:`Points` that e is.
-        factor: a number.
-    """
-
-    weight: int
-    vector: str | None = None
-    apart: str | None = None
-    factor: float = 1.0
+    weight: int  # the number of the weight w
+    vector: str | None = None  # the field of :class:`Points` that b is
+    apart: str | None = None  # the field of :class:`Points` that e is
+    factor: float = 1.0  # a number
 
 
 @dataclass(frozen=True, eq=False)
 class Formula:
-    """Kernel sums; see the module's docstring.
+    """Kernel sums; see the module's docstring."""
 
-    Args:
-        name: for messages.
-        weigh: the pairwise scalars w_ij from those of :data:`LEAVES` and a profile.
-        results: the terms that every result is the sum of.
-        reads: the fields of :class:`Points` that it needs of the columns.
-    """
-
-    name: str
-    weigh: Callable[[Leaf, Profile], list[Any]]
-    results: tuple[tuple[Term, ...], ...]
-    reads: tuple[str, ...] = ("features", "momenta")
+    name: str  # for messages
+    weigh: Callable[[Leaf, Profile], list[Any]]  # the pairwise scalars w_ij from those of :data:`LEAVES` and a profile
+    results: tuple[tuple[Term, ...], ...]  # the terms that every result is the sum of
+    reads: tuple[str, ...] = ("features", "momenta")  # the fields of :class:`Points` that it needs of the columns
 
     def summands(self, j: Points) -> list[Tensor]:
         """Factors of every weight: (N, k) each, the vectors b_j and products b_j e_j^T of all its terms."""

@@ -129,16 +129,12 @@ compiling takes too long."""
 
 
 class _Lines(NamedTuple):
-    """Points as a program reads them.
+    """Points as a program reads them."""
 
-    Args:
-        values: (inputs, length), a line for each coordinate, zero at the end. Lines of an odd number of cache lines do
-            not compete for the same places in a cache: those of a power of two take three times as long.
-        count: points with those that fill the last group.
-    """
-
+    # (inputs, length), a line for each coordinate, zero at the end. Lines of an odd number of cache lines do not
+    # compete for the same places in a cache: those of a power of two take three times as long
     values: Tensor
-    count: int
+    count: int  # points with those that fill the last group
     length: int
 
     @classmethod

@@ -129,17 +129,13 @@ class Code:
 
 @dataclass(frozen=True)
 class Program:
-    """A kernel sum of points with some numbers of features and outputs.
-
-    Args:
-        inputs: names of the fields of :class:`Points` that are read, and the number of their coordinates.
-        vector: the type of pairwise scalars.
-    """
+    """A kernel sum of points with some numbers of features and outputs."""
 
     formula: Formula
     weights: Weights
+    # names of the fields of :class:`Points` that are read, and the number of their coordinates
     inputs: tuple[tuple[str, int], ...]
-    vector: Vector
+    vector: Vector  # the type of pairwise scalars
 
     @cached_property
     def sizes(self) -> dict[str, int]:

@@ -33,14 +33,10 @@ class Node(NamedTuple):
 
 @dataclass(frozen=True)
 class Weights:
-    """The weights w_ij of a formula with a profile.
+    """The weights w_ij of a formula with a profile."""
 
-    Args:
-        nodes: what is computed, in order.
-        results: for every weight the number of its node, None for the number one, and its scale.
-    """
-
-    nodes: tuple[Node, ...]
+    nodes: tuple[Node, ...]  # what is computed, in order
+    # for every weight the number of its node, None for the number one, and its scale
     results: tuple[tuple[int | None, float], ...]
 
     @cached_property

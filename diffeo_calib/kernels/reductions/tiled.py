@@ -54,13 +54,9 @@ Chosen = Callable[[Sequence[Any]], list[Any]]
 
 @dataclass(frozen=True)
 class Tiled(SumBackend):
-    """Evaluates one tile after the other.
+    """Evaluates one tile after the other."""
 
-    Args:
-        elements: pairs in a tile; by default a number that suits the device.
-    """
-
-    elements: int | None = None
+    elements: int | None = None  # pairs in a tile; by default a number that suits the device
     differentiable: ClassVar[bool] = True
 
     @small_work()

@@ -274,14 +274,10 @@ ROUNDING = 1e-14
 
 @dataclass(frozen=True, eq=False)
 class Pace:
-    """How fast corrections may change.
+    """How fast corrections may change."""
 
-    Args:
-        times: (N,) increasing, s or rows. rate: (n,) rad or m per unit of time.
-    """
-
-    times: Array
-    rate: Array
+    times: Array  # (N,) increasing, s or rows
+    rate: Array  # (n,) rad or m per unit of time
 
     def limited(self, corrections: Array, firm: Array) -> Array:
         """Corrections (N, n), NaN where there are none, at a limited rate; ``firm`` (N,) rows come first."""

@@ -29,19 +29,13 @@ LIMIT_SLACK = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """Limits of the active joints, including those of the mimic joints that one joint drives.
+    """Limits of the active joints, including those of the mimic joints that one joint drives."""
 
-    Args:
-        low: (n,) rad or m. high: (n,).
-        matrix: (k, n) of mimic joints that several joints drive: least <= matrix q <= most.
-        least: (k,). most: (k,).
-    """
-
-    low: Array
-    high: Array
-    matrix: Array
-    least: Array
-    most: Array
+    low: Array  # (n,) rad or m
+    high: Array  # (n,)
+    matrix: Array  # (k, n) of mimic joints that several joints drive: least <= matrix q <= most
+    least: Array  # (k,)
+    most: Array  # (k,)
 
     def within(self, start: Array, q: Array) -> Array:
         """Commands on the way from ``start`` to ``q`` (N, n) where the mimic joints of several joints stay in limits.
@@ -130,22 +124,15 @@ class Solution(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CompensationProblem:
-    """N targets, the boxes of their commands, and the kinematics.
+    """N targets, the boxes of their commands, and the kinematics."""
 
-    Args:
-        tool: the calibrated kinematics. rough: those of its geometry.
-        targets: N targets.
-        start: (N, n) rad or m. limits: of the joints, and of mimic joints.
-        bound: (n,) largest motion. mobility: (N, n) inverse cost of each joint's motion, 0 if it must stay.
-    """
-
-    tool: ToolFunctions
-    rough: ToolFunctions
-    targets: Targets
-    start: Array
-    limits: Limits
-    bound: Array
-    mobility: Array
+    tool: ToolFunctions  # the calibrated kinematics
+    rough: ToolFunctions  # those of its geometry
+    targets: Targets  # N targets
+    start: Array  # (N, n) rad or m
+    limits: Limits  # of the joints, and of mimic joints
+    bound: Array  # (n,) largest motion
+    mobility: Array  # (N, n) inverse cost of each joint's motion, 0 if it must stay
 
     def started(self, rows: Array, start: Array) -> CompensationProblem:
         """Some of the rows (R,) from other starts (R, n)."""

@@ -34,19 +34,12 @@ RELATIVE_RIDGE = 1e-12
 
 @dataclass(eq=False)
 class Box:
-    """Where the joints may be, and what their motion costs.
+    """Where the joints may be, and what their motion costs."""
 
-    Args:
-        start: (N, n) commands before the correction, rad or m.
-        low: (N, n) and
-        high: (N, n) what the joints' limits and the bound of motion leave.
-        mobility: (N, n) motion of a joint where it costs nothing extra; 0 for a joint that must not move.
-    """
-
-    start: Array
-    low: Array
+    start: Array  # (N, n) commands before the correction, rad or m
+    low: Array  # (N, n) what the joints' limits and the bound of motion leave, to high
     high: Array
-    mobility: Array
+    mobility: Array  # (N, n) motion of a joint where it costs nothing extra; 0 for a joint that must not move
 
     def take(self, rows: Array) -> Box:
         """The boxes of some rows."""

@@ -50,22 +50,15 @@ class Targets:
     """N rows with a target for each of T tools: their costs add up, and their errors stand side by side.
 
     An orientation says where A axes of a tool point: three for a pose, one for a direction, none for a position.
-
-    Args:
-        position: (N, T, 3) m.
-        axes: (N, T, 3, A) orthonormal columns, the directions of these axes.
-        tool_axes: (3, A) the axes in the frame of the tool.
-        lever: L in m.
-        free: (N, T) True where a tool may be anywhere; None for targets of the single tool of a model.
-        along: (T, 3, 3) projectors on the directions in which shifts count; None for all.
     """
 
-    position: Array
-    axes: Array
-    tool_axes: Array
-    lever: float = 0.1
+    position: Array  # (N, T, 3) m
+    axes: Array  # (N, T, 3, A) orthonormal columns, the directions of these axes
+    tool_axes: Array  # (3, A) the axes in the frame of the tool
+    lever: float = 0.1  # L in m
+    # (N, T) True where a tool may be anywhere; None for targets of the single tool of a model
     free: Array | None = None
-    along: Array | None = None
+    along: Array | None = None  # (T, 3, 3) projectors on the directions in which shifts count; None for all
 
     def __len__(self) -> int:
         return len(self.position)
@@ -246,19 +239,13 @@ MOST_TOOLS = 16
 
 @dataclass(frozen=True)
 class ToolFunctions:
-    """Kinematics of T tool centre points.
+    """Kinematics of T tool centre points."""
 
-    Args:
-        poses: (N, n) joint values -> (N, T, 4, 4) m.
-        jacobian: (N, n) -> (N, T, 6, n), linear then angular velocity about the axes of the frame.
-        serial: whether every column belongs to one joint, in the order of the chain (no mimic joints).
-        length: m that a turn of one radian counts as where directions are compared: a quarter of the robot's reach.
-    """
-
-    poses: Callable[[Array], Array]
+    poses: Callable[[Array], Array]  # (N, n) joint values -> (N, T, 4, 4) m
+    # (N, n) -> (N, T, 6, n), linear then angular velocity about the axes of the frame
     jacobian: Callable[[Array], Array]
-    serial: bool
-    length: float
+    serial: bool  # whether every column belongs to one joint, in the order of the chain (no mimic joints)
+    length: float  # m that a turn of one radian counts as where directions are compared: a quarter of the robot's reach
 
 
 # the functions know the model's map but not the model, which would otherwise never be forgotten

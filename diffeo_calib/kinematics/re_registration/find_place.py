@@ -26,7 +26,13 @@ from diffeo_calib.common.quantiles import known
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
 from diffeo_calib.kinematics.re_registration.new_rows import NewRows, noise_of_rows
-from diffeo_calib.kinematics.re_registration.registered_map import HARDLY, Registration, turned, undetermined
+from diffeo_calib.kinematics.re_registration.registered_map import (
+    HARDLY,
+    Registration,
+    fitted_markers,
+    turned,
+    undetermined,
+)
 from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_points, tool_transform
 from diffeo_calib.maps.noise import measured_coordinates, without_hidden
 from diffeo_calib.measurements.bodies import Bodies
@@ -140,29 +146,22 @@ def _priors(free: str, marker_std: float | None, *, known: bool) -> tuple[float,
 
 @dataclass(frozen=True, eq=False)
 class SetUp:
-    """What may be open in rows of a new set-up, and where a search for it may begin.
+    """What may be open in rows of a new set-up, and where a search for it may begin."""
 
-    Args:
-        model: the map, placed anew before or not. nominal: that of the fit, under the payloads of the rows.
-        data: M rows that show P points. old: (P, 3) where the model has them, or at the tip, m.
-        known: whether they may be there. free: (6 + 3 P,) boolean, which unknowns of frame and points may have moved.
-    """
-
-    model: FittedMap
-    nominal: GeometryMap
-    data: Measurements
-    old: Tensor
-    known: bool
-    free: Tensor
+    model: FittedMap  # the map, placed anew before or not
+    nominal: GeometryMap  # that of the fit, under the payloads of the rows
+    data: Measurements  # M rows that show P points
+    old: Tensor  # (P, 3) where the model has them, or at the tip, m
+    known: bool  # whether they may be there
+    free: Tensor  # (6 + 3 P,) boolean, which unknowns of frame and points may have moved
 
     @classmethod
     def of(
         cls, model: FittedMap, nominal: GeometryMap, lever: float | None, data: Measurements, free: str, *, ball: bool
     ) -> SetUp:
         """The rows beside a model; arguments and errors as of :func:`find_place`."""
-        before, theta = model.registration, model.unregistered.deformation.momenta.theta
-        markers = nominal.geometry.tool + theta[nominal.geometry.slices["tool"]].view(-1, 3)
-        markers = markers if before is None else before.markers
+        before = model.registration
+        markers = fitted_markers(model.unregistered) if before is None else before.markers
         own, seen = Bodies(lever), data.bodies
         known = own.kind == seen.kind and data.markers == len(markers)
         if known:

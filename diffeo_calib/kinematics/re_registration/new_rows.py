@@ -53,22 +53,16 @@ SETTLED = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class LinearRows:
-    """M rows of R numbers and k unknowns.
+    """M rows of R numbers and k unknowns."""
 
-    Args:
-        residual: (M, R) r, m. S: (M, R, k). C: (M R, M R), m^2. noise: (M, R, R) blocks of R, m^2.
-        visible: (M, R) boolean, the numbers that were measured.
-        prior: (k, k) P. mean: (k,) mu. by_fit: (k, k) B.
-    """
-
-    residual: Tensor
-    S: Tensor
-    C: Tensor
-    noise: Tensor
-    visible: Tensor
-    prior: Tensor
-    mean: Tensor
-    by_fit: Tensor
+    residual: Tensor  # (M, R) r, m
+    S: Tensor  # (M, R, k)
+    C: Tensor  # (M R, M R), m^2
+    noise: Tensor  # (M, R, R) blocks of R, m^2
+    visible: Tensor  # (M, R) boolean, the numbers that were measured
+    prior: Tensor  # (k, k) P
+    mean: Tensor  # (k,) mu
+    by_fit: Tensor  # (k, k) B
 
     @cached_property
     def slopes(self) -> Tensor:
@@ -141,37 +135,25 @@ class LinearRows:
 
 @dataclass(frozen=True, eq=False)
 class NewRows:
-    """M rows of a new set-up in the frame of a fit: frame, markers and devices are open, and parts may have drifted.
+    """M rows of a new set-up in the frame of a fit: frame, markers and devices are open, and parts may have drifted."""
 
-    Args:
-        fitted: the map of the fit. points: k0 of the markers where they are now, under the payloads of the rows.
-        transform: (4, 4) from the frame of the fit to that in which the rows were measured, m.
-        q: (M, n). y: (M, R) measured numbers, m; any where hidden. noise: (M, R, R) m^2.
-        visible: (M, R) boolean, the numbers that were measured.
-        shared: (M, R, c) effects of errors of unit variance that they share, m.
-        deviations: (6 + 3 P,) of the device's frame and of the markers' coordinates before the rows, m and rad; 0 of
-            what has not moved. away: (6 + 3 P,) from here to where they are most probable before the rows.
-        known: (6 + 3 P, 6 + 3 P) their covariance by an earlier registration. by_fit: (3 P, 3 P) B of the markers.
-        centre: (3,) about which the frame turns, m.
-        observe: what was measured of the markers; None for their coordinates.
-        drifts: (M R, c) columns of unit variance of what has changed in the robot since, m.
-    """
-
-    fitted: FittedMap
-    points: FlangePoints
-    transform: Tensor
-    q: Tensor
-    y: Tensor
-    noise: Tensor
-    visible: Tensor
-    shared: Tensor
+    fitted: FittedMap  # the map of the fit
+    points: FlangePoints  # k0 of the markers where they are now, under the payloads of the rows
+    transform: Tensor  # (4, 4) from the frame of the fit to that in which the rows were measured, m
+    q: Tensor  # (M, n)
+    y: Tensor  # (M, R) measured numbers, m; any where hidden
+    noise: Tensor  # (M, R, R) m^2
+    visible: Tensor  # (M, R) boolean, the numbers that were measured
+    shared: Tensor  # (M, R, c) effects of errors of unit variance that they share, m
+    # (6 + 3 P,) of the device's frame and of the markers' coordinates before the rows, m and rad; 0 of what has not
+    # moved
     deviations: Tensor
-    away: Tensor
-    known: Tensor
-    by_fit: Tensor
-    centre: Tensor
-    observe: Observation | None
-    drifts: Tensor
+    away: Tensor  # (6 + 3 P,) from here to where they are most probable before the rows
+    known: Tensor  # (6 + 3 P, 6 + 3 P) their covariance by an earlier registration
+    by_fit: Tensor  # (3 P, 3 P) B of the markers
+    centre: Tensor  # (3,) about which the frame turns, m
+    observe: Observation | None  # what was measured of the markers; None for their coordinates
+    drifts: Tensor  # (M R, c) columns of unit variance of what has changed in the robot since, m
 
     def __len__(self) -> int:
         return len(self.q)

@@ -24,11 +24,12 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap, SessionMarkers
-from diffeo_calib.kinematics.re_registration.find_place import SAME_PLACE, FoundPlace, find_place, warn_about
+from diffeo_calib.kinematics.re_registration.find_place import SAME_PLACE, find_place, warn_about
 from diffeo_calib.kinematics.re_registration.new_rows import NewRows
 from diffeo_calib.kinematics.re_registration.registered_map import (
     RegisteredMap,
     Registration,
+    fitted_markers,
     moved,
     place_slopes,
     robot_map,
@@ -45,7 +46,7 @@ from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import sensor_of
 from diffeo_calib.sensors.known_drift import KnownDrift
 from diffeo_calib.sensors.places import PlacedDevices, mounted_of
-from diffeo_calib.sensors.tables import rows_of_one_kind
+from diffeo_calib.sensors.tables import measured_positions, rows_of_one_kind
 
 LOG = logging.getLogger(__name__)
 LARGEST_M_RAD = 0.03
@@ -68,39 +69,29 @@ def register_again(
 ) -> tuple[FittedMap, Registration]:
     """See :meth:`CalibratedKinematics.registered`; everything on the CPU."""
     found = find_place(model, nominal, lever, data, free=free, marker_std=marker_std, ball=ball)
-    registration, fit = found.registration, model.unregistered
+    registration, fit, new = found.registration, model.unregistered, found.rows
     warn_about(registration)
     LOG.info("registered anew: RMS %.4f mm on %d rows", 1e3 * registration.rms_after, registration.rows)
     open_by = max(float(registration.frame_deviations.max()), registration.known_m)
-    learn = learn and found.rows.points.same and open_by < LARGEST_M_RAD and not registration.doubtful
+    learn = learn and new.points.same and open_by < LARGEST_M_RAD and not registration.doubtful
     learn = learn and (model.registration is None or free == "both")  # what is held must be known
-    if not (learn and joins(fit, len(found.rows))):
-        placed = moved(fit, registration.transform).inflated(found.rows.inflation)
+    N, m = len(fit.x), fit.m  # more new rows than leave a dense matrix dense cannot join, nor rows of no coordinates
+    dense = fit.data is not None or not N * m <= MAX_DENSE < (N + len(new)) * m
+    if not (learn and dense and fit.slopes is None):
+        placed = moved(fit, registration.transform).inflated(new.inflation)
         return RegisteredMap(placed, registration), registration
-    learnt = moved(_learnt(fit, found), registration.transform)
-    own, old = robot_map(learnt), found.rows.old_markers
-    markers = own.geometry.tool + learnt.deformation.momenta.theta[own.geometry.slices["tool"]].view(-1, 3)
-    return learnt, replace(registration, markers=markers, shift=markers - old)
-
-
-def _learnt(fit: FittedMap, found: FoundPlace) -> FittedMap:
-    """The fit conditioned on the rows that took part, too, in its own frame, as if nothing but places had changed."""
-    new, same = found.rows, found.metres == SAME_PLACE
-    known = torch.full_like(new.deviations, PLACES.found_m_rad)
+    same, known = found.metres == SAME_PLACE, torch.full_like(new.deviations, PLACES.found_m_rad)
     known[6:] = PLACES.same_m if same else found.metres
     points = FlangePoints(new.points.fitted, new.old_markers, same=True) if same else new.points
-    new = replace(new, points=points, deviations=known * (new.deviations > 0))
-    problem, start = both_dates(new, found.rows.inflation)
+    together = replace(new, points=points, deviations=known * (new.deviations > 0))
+    problem, start = both_dates(together, new.inflation)  # as if nothing but places had changed
     solution = STEPS.solve(problem, fit.geodesic.integrator, start)
     if solution.interrupted:
         raise KeyboardInterrupt  # half-way the covariance would be that of the optimum
-    return problem.calibrated(problem.deform(solution.momenta, fit.geodesic.integrator))
-
-
-def joins(old: FittedMap, count: int) -> bool:
-    """Whether old rows tell coordinates, and as many new ones leave their matrix dense if it is."""
-    N, m = len(old.x), old.m
-    return old.slopes is None and (old.data is not None or not N * m <= MAX_DENSE < (N + count) * m)
+    learnt = problem.calibrated(problem.deform(solution.momenta, fit.geodesic.integrator))
+    learnt = moved(learnt, registration.transform)
+    markers = fitted_markers(learnt)
+    return learnt, replace(registration, markers=markers, shift=markers - new.old_markers)
 
 
 def both_dates(
@@ -198,9 +189,11 @@ def registration_rows(data: Any, model: Any) -> Measurements | None:
     if not isinstance(data, RowGroups):
         expected, got = "dc.Measurements", type(data).__name__
         raise InputError.of("`measurements`", expected=expected, got=got)
-    known = mounted_of(model).in_any_frame
-    own = [(sensor_of(part), sensor_of(part).set_up(part, known)) for part, _ in rows_of_one_kind(data)]
-    return next((sensor.with_points(rows, model) for sensor, rows in own if rows is not None), None)
+    own = measured_positions(data)
+    if own is None:
+        return None
+    own = mounted_of(model).in_any_frame(own).largest_session()
+    return sensor_of(own).with_points(own, model)
 
 
 def devices_beside(model: Any, data: Any) -> tuple[PlacedDevices, ...]:
@@ -215,7 +208,7 @@ def devices_beside(model: Any, data: Any) -> tuple[PlacedDevices, ...]:
         for own in sensor_of(part).settled(part, points, model.turns):
             alike = [number for number, old in enumerate(found) if own.devices.same_set(old.devices)]
             same = alike[0] if alike else len(found)
-            alone = [] if own.devices.of_model else [own]
+            alone = [] if own.devices.set_up and len(own.names) == 1 else [own]
             found[same : same + 1] = [own.beside(old) for old in found[same : same + 1]] or alone
     return tuple(found)
 

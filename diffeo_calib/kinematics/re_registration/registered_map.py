@@ -233,6 +233,12 @@ def robot_map(fitted: FittedMap) -> GeometryMap:
     return nominal
 
 
+def fitted_markers(fitted: FittedMap) -> Tensor:
+    """(P, 3) the markers of a robot's fitted map, in the frames of their tips, m."""
+    geometry, theta = robot_map(fitted).geometry, fitted.deformation.momenta.theta
+    return geometry.tool + theta[geometry.slices["tool"]].view(-1, 3)
+
+
 def moved(fitted: FittedMap, T: Tensor) -> FittedMap:
     """T o k1.
 

@@ -25,7 +25,6 @@ _MISSING = re.compile(
 )
 _INFINITE = re.compile(r"[+-]?inf(inity)?", re.IGNORECASE)
 _TYPOGRAPHY = str.maketrans("\u2212\u2013\u2019\u00a0\u202f\u2009", "--'   ")
-"""Minus signs, apostrophes and spaces of word processors."""
 
 LARGEST_NUMBER = 1e12
 """Larger numbers, in any unit, are no measurements: marks of missing readings, or damage."""

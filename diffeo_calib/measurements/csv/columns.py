@@ -57,17 +57,12 @@ DEVIATION = Check("a positive standard deviation")
 
 
 class Group(NamedTuple):
-    """Columns of numbers of one quantity.
+    """Columns of numbers of one quantity."""
 
-    Args:
-        names: of the columns. unit: in the file: m, mm, rad, deg, or how many of it are one in SI; None without.
-        check: what the numbers are expected to be. what: name of numbers whose unit is judged by their size.
-    """
-
-    names: tuple[str, ...]
-    unit: str | float | None = None
-    check: Check | None = None
-    what: str = ""
+    names: tuple[str, ...]  # of the columns
+    unit: str | float | None = None  # in the file: m, mm, rad, deg, or how many of it are one in SI; None without
+    check: Check | None = None  # what the numbers are expected to be
+    what: str = ""  # name of numbers whose unit is judged by their size
 
     def to_si(self, values: Tensor) -> Tensor:
         """Numbers in the unit of the file -> rad, m, or as they are."""
@@ -104,24 +99,16 @@ Body = tuple[Sequence[Group], str]
 
 @dataclass(frozen=True)
 class Columns:
-    """The wanted columns of numbers.
+    """The wanted columns of numbers."""
 
-    Args:
-        table: what it holds, and the units.
-        joints: names or expressions of n joints, or the columns of a pose. prismatic: (n,) which of them are prismatic.
-        kinds_known: whether the kinds of the joints were given; otherwise all are taken as revolute.
-        groups: all columns: "q", those beside joints by what they hold, and what was measured by themselves.
-        bodies: that lines may leave empty, markers and frames first.
-        all_hidden: whether rows may show no marker, because they hold something else.
-    """
-
-    table: TableFormat
-    joints: JointExpressions | PoseColumns
-    prismatic: Tensor
-    kinds_known: bool
+    table: TableFormat  # what it holds, and the units
+    joints: JointExpressions | PoseColumns  # names or expressions of n joints, or the columns of a pose
+    prismatic: Tensor  # (n,) which of them are prismatic
+    kinds_known: bool  # whether the kinds of the joints were given; otherwise all are taken as revolute
+    # all columns: "q", those beside joints by what they hold, and what was measured by themselves
     groups: dict[Any, Group]
-    bodies: Sequence[Body] = ()
-    all_hidden: bool = False
+    bodies: Sequence[Body] = ()  # that lines may leave empty, markers and frames first
+    all_hidden: bool = False  # whether rows may show no marker, because they hold something else
 
     @classmethod
     def of(

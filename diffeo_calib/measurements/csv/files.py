@@ -142,10 +142,8 @@ def read_measurements(
         joints: names of the columns in the robot's order, where they are not those of its joints, or expressions of
             columns in the units of the file, such as ``"-{J2}+90"``, ``"{J3}+{J2}"`` or ``"360/4096*{ticks5}-180"``.
         position: names of the x, y and z columns of the marker, or one such triple per marker; None if all rows are in
-            sockets. With ``socket`` every line has a position or a socket, and empty cells for the other; a line with
-            both is two rows.
-        length: unit of the positions in the file, ``"m"``, ``"mm"``, ``"cm"`` or ``"inch"``.
-        angle: unit of the revolute joints in the file, ``"rad"`` or ``"deg"``.
+            sockets. With ``socket`` a line has a position or a socket, and empty cells for the other, or is two rows.
+        length, angle: units in the file, ``"m"``, ``"mm"``, ``"cm"`` or ``"inch"``, and ``"rad"`` or ``"deg"``.
         duplicates: what to do with rows that repeat an earlier row exactly: ``"error"`` refuses them, ``"keep"``
             keeps them, ``"drop"`` drops them with a warning. Real repeats differ by noise.
         columns: all else that the table says, as fields of :class:`TableFormat` (``sep``, ``decimal``, ``rotation``,

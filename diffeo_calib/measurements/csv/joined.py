@@ -215,18 +215,13 @@ FEWEST_CHANGES = 4
 
 @dataclass(frozen=True)
 class StopLimits:
-    """Definition of a stop.
+    """Definition of a stop."""
 
-    Args:
-        joints: largest motion of a joint, rad or m. seen: of what is seen, m, unless its noise is larger.
-        window: within which they hold, s. shortest: stop, s. offset: largest difference of the clocks, s.
-    """
-
-    joints: float = 1e-3
-    seen: float = 1e-4
-    window: float = 0.2
-    shortest: float = 0.5
-    offset: float = 5.0
+    joints: float = 1e-3  # largest motion of a joint, rad or m
+    seen: float = 1e-4  # of what is seen, m, unless its noise is larger
+    window: float = 0.2  # within which they hold, s
+    shortest: float = 0.5  # stop, s
+    offset: float = 5.0  # largest difference of the clocks, s
 
 
 LIMITS = StopLimits()

@@ -27,23 +27,22 @@ Lines = list[tuple[int, list[str]]]
 """Line number in the file and cells of every line that is not blank."""
 
 Cells = Sequence[Sequence[float | str]]
-"""Rows of cells: numbers and texts."""
 Column = Sequence[str] | Sequence[float]
 
 HEAD = 200
 """Lines among which the header is."""
+MOST_COLUMNS = 50_000
+"""Of a table of configurations."""
 AT_ONCE = 1 << 13
 """Bytes by which a file is judged."""
 WIDE = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 COMMENTS = "#", "%", "//"
-"""Marks that begin a comment."""
 DAMAGED = re.compile(r"#[A-Z/0]+[!?]")
 """Cells such as #VALUE! and #DIV/0!, with which spreadsheets say that a formula failed: no comments."""
 LENGTHS = {"m": "m", "mm": "mm", "cm": "cm", "um": "um", "µm": "um", "in": "inch", "inch": "inch"}
 ANGLES = {"rad": "rad", "radians": "rad", "mrad": "mrad", "deg": "deg", "degrees": "deg", "°": "deg"}
 """Units as they are written, and their names."""
 OTHERS = re.compile(r"[mu]?s|sec|min|h|k?g|nm?|°?c|k|v|px|pixels?|%|-|none")
-"""Further units."""
 
 
 class CsvLines:
@@ -69,6 +68,9 @@ class CsvLines:
         self._last, self._extra = 0, 0  # line before the rows, and empty cells at the end of rows
         self._text, notes = _text(path, sep)
         lines = list(islice(self._cells(), HEAD))
+        if (width := max((len(cells) for _, cells in lines), default=0)) > MOST_COLUMNS:
+            what, fix = f"file '{path}'", "check the separator (`sep`); one row is one configuration"
+            raise MeasurementError.of(what, expected=f"at most {MOST_COLUMNS} columns", got=width, fix=fix)
         each = list(zip_longest(*(cells for _, cells in lines), fillvalue=None))
         if sep == " " and any(None in cells or not any(cells) for cells in each):  # columns that spaces align
             self._aligned = True

@@ -81,18 +81,13 @@ MUCH_FARTHER = 3.0
 
 
 class FileRows(NamedTuple):
-    """Rows of a file.
+    """Rows of a file."""
 
-    Args:
-        path: the file. columns: its columns of numbers. values: these in SI. texts: its columns of texts.
-        lines: their numbers in the file.
-    """
-
-    path: Path
-    columns: Columns
-    values: Values
-    texts: Mapping[str, Sequence[str]]
-    lines: Sequence[int]
+    path: Path  # the file
+    columns: Columns  # its columns of numbers
+    values: Values  # these in SI
+    texts: Mapping[str, Sequence[str]]  # its columns of texts
+    lines: Sequence[int]  # their numbers in the file
 
     def of(self, rows: Tensor) -> FileRows:
         """The rows with these numbers (M,), or those that a mask (N,) chooses."""

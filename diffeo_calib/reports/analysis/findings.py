@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import inf
 from typing import Any, NamedTuple
 
 import torch
@@ -26,9 +25,8 @@ from diffeo_calib.kinematics.evaluation import (
     placement_sentences,
     positions_of,
     residuals,
-    rows_used_in_fit,
+    unseen,
 )
-from diffeo_calib.kinematics.joint_ranges import SAME_CONFIGURATION
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
@@ -62,35 +60,25 @@ class RowsOfKind(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Findings:
-    """Numbers of a report.
-
-    Args:
-        model: the model. stages: kinematics to compare: nominal, geometric, calibrated. rows: those of the fit.
-        kinds: the rows that the report shows, by kind; empty without rows. new: whether the model has not seen them.
-        predictions: measured positions among them, predicted by a model that has not seen them; None without any.
-        outliers: rows that look wrong, and ``moved``: what else happened to them.
-        repeats: what repeated configurations show; None if there are none.
-        learning_curve: number of rows -> error of others, m; empty if the rows of the fit are not known.
-        columns: further columns of the table that errors are shown against, by name.
-        expected: stage -> RMS error of positions that the model expects over the joint ranges of its rows, m.
-        deviations: what it expects at random configurations there, and at those of the fit.
-        devices: where devices are, and what was found from the rows shown.
-    """
+    """Numbers of a report."""
 
     model: CalibratedKinematics
-    stages: Mapping[str, Kinematics]
-    rows: FitRows
-    kinds: Mapping[str, RowsOfKind]
-    new: bool
+    stages: Mapping[str, Kinematics]  # kinematics to compare: nominal, geometric, calibrated
+    rows: FitRows  # those of the fit
+    kinds: Mapping[str, RowsOfKind]  # the rows that the report shows, by kind; empty without rows
+    new: bool  # whether the model has not seen them
+    # measured positions among them, predicted by a model that has not seen them; None without any
     predictions: Predictions | None
-    outliers: Sequence[Outlier]
-    moved: Sequence[str]
-    repeats: Repeats | None
+    outliers: Sequence[Outlier]  # rows that look wrong
+    moved: Sequence[str]  # what else happened to the rows
+    repeats: Repeats | None  # what repeated configurations show; None if there are none
+    # number of rows -> error of others, m; empty if the rows of the fit are not known
     learning_curve: Sequence[tuple[int, float]]
-    columns: Mapping[str, Tensor]
+    columns: Mapping[str, Tensor]  # further columns of the table that errors are shown against, by name
+    # stage -> RMS error of positions that the model expects over the joint ranges of its rows, m
     expected: Mapping[str, float]
-    deviations: Deviations
-    devices: Sequence[str]
+    deviations: Deviations  # what it expects at random configurations there, and at those of the fit
+    devices: Sequence[str]  # where devices are, and what was found from the rows shown
 
     @property
     def parts(self) -> Sequence[Part]:
@@ -206,14 +194,6 @@ def find(
 
 NOTHING: dict[str, Any] = {"kinds": {}, "new": False, "predictions": None, "outliers": (), "moved": ()}
 """What a report shows of rows without any; of others with these entries."""
-
-
-def unseen(model: CalibratedKinematics, q: Tensor) -> Tensor:
-    """(N,) which configurations took no part in the fit, nor in a registration."""
-    new = ~rows_used_in_fit(model, q)
-    if model.registration is not None:
-        new &= torch.cdist(q, model.registration.q.to(q), p=inf).amin(1) > SAME_CONFIGURATION
-    return new.to(HOST)
 
 
 def _new_rows(model: CalibratedKinematics, data: Any, rows: FitRows) -> Tensor:

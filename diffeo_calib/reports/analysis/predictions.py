@@ -214,23 +214,14 @@ def forecast(curve: Sequence[tuple[int, float]], limit: float) -> tuple[int, flo
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """N measured rows of B bodies each: markers, or the origins of measured frames.
+    """N measured rows of B bodies each: markers, or the origins of measured frames."""
 
-    Args:
-        data: the rows.
-        measured: (N, B, 3) positions, m, NaN where hidden.
-        predicted: (N, B, 3) of a model that has not seen the row, m.
-        covariance: (N, B, 3, 3) of a new measurement as the model claims it, m^2.
-        errors: distances, and angles where poses were measured.
-        left_out: whether these are rows of the fit, each predicted by all others.
-    """
-
-    data: Measurements
-    measured: Tensor
-    predicted: Tensor
-    covariance: Tensor
-    errors: Evaluation
-    left_out: bool
+    data: Measurements  # the rows
+    measured: Tensor  # (N, B, 3) positions, m, NaN where hidden
+    predicted: Tensor  # (N, B, 3) of a model that has not seen the row, m
+    covariance: Tensor  # (N, B, 3, 3) of a new measurement as the model claims it, m^2
+    errors: Evaluation  # distances, and angles where poses were measured
+    left_out: bool  # whether these are rows of the fit, each predicted by all others
 
     @classmethod
     def of(cls, model: CalibratedKinematics, data: Measurements | None = None) -> Predictions:

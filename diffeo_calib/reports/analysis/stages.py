@@ -61,22 +61,15 @@ CONFIGURATIONS, TARGETS, MEASURED, NEXT = 360, 100, 150, 5
 
 @dataclass(frozen=True, eq=False)
 class Deviations:
-    """Deviations that a model claims over the joint ranges of its fit, without the noise of a measurement.
+    """Deviations that a model claims over the joint ranges of its fit, without the noise of a measurement."""
 
-    Args:
-        q: (M, n) random configurations in these ranges, rad or m.
-        deviation: (M,) RMS distance of the markers that the model claims there, m.
-        measured: (K, n) configurations of the fit, and ``measured_deviation``: (K,) the same there, m.
-        error: what the model expects in all, as every command says it.
-        next: poses that would lower the deviations most, in the order of the moves; None unless they were planned.
-    """
+    q: Tensor  # (M, n) random configurations in these ranges, rad or m
+    deviation: Tensor  # (M,) RMS distance of the markers that the model claims there, m
+    measured: Tensor  # (K, n) configurations of the fit
+    measured_deviation: Tensor  # (K,) the same there, m
+    error: ExpectedError  # what the model expects in all, as every command says it
 
-    q: Tensor
-    deviation: Tensor
-    measured: Tensor
-    measured_deviation: Tensor
-    error: ExpectedError
-
+    # poses that would lower the deviations most, in the order of the moves; None unless they were planned
     next: Plan | None = None
 
     @classmethod
@@ -123,20 +116,13 @@ STANDARD_REPEATS = 30
 
 @dataclass(frozen=True, eq=False)
 class Repeats:
-    """Configurations that were measured several times.
+    """Configurations that were measured several times."""
 
-    Args:
-        lines: (G,) line number of the first measurement of each. counts: (G,) measurements of each.
-        repeatability: (G,) RP of each, the largest of all markers, m.
-        accuracy: name of each stage -> (G,) AP of each configuration, the largest of all markers, m.
-        deviation: pooled RMS distance of a measurement from the mean of its configuration, unbiased, m.
-    """
-
-    lines: Tensor
-    counts: Tensor
-    repeatability: Tensor
-    accuracy: Mapping[str, Tensor]
-    deviation: float
+    lines: Tensor  # (G,) line number of the first measurement of each
+    counts: Tensor  # (G,) measurements of each
+    repeatability: Tensor  # (G,) RP of each, the largest of all markers, m
+    accuracy: Mapping[str, Tensor]  # name of each stage -> (G,) AP of each configuration, the largest of all markers, m
+    deviation: float  # pooled RMS distance of a measurement from the mean of its configuration, unbiased, m
 
     @property
     def telling(self) -> bool:

@@ -37,23 +37,17 @@ class Table(NamedTuple):
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page.
+    """A part of the page."""
 
-    Args:
-        name: its anchor. title: its heading. see: one sentence about what to see here.
-        tables, pictures, notes, text: its contents, in this order; ``scene`` comes before the pictures.
-        scene: points (N, 3) in m, and errors of each stage as arrows there (N, 3) in m, drawn with one scale.
-        text: lines to be shown as they are.
-    """
-
-    name: str
-    title: str
-    see: str
+    name: str  # its anchor
+    title: str  # its heading
+    see: str  # one sentence about what to see here; then follow tables, the scene, pictures, notes and text
     tables: Sequence[Table] = ()
+    # points (N, 3) in m, and errors of each stage as arrows there (N, 3) in m, drawn with one scale
     scene: Mapping[str, Any] | None = None
     pictures: Sequence[Picture] = ()
     notes: Sequence[str] = ()
-    text: Sequence[str] = ()
+    text: Sequence[str] = ()  # lines to be shown as they are
 
 
 def page(**parts: Any) -> str:

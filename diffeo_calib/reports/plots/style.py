@@ -31,15 +31,14 @@ class Look(NamedTuple):
     colour: str
     line: Any
     width: float
-    marker: str
 
 
 LOOKS = (
-    Look(GREY, ":", 1.8, "s"),
-    Look(ORANGE, "--", 1.8, "^"),
-    Look(BLUE, "-", 2.4, "o"),
-    Look(GREEN, "-.", 1.8, "D"),
-    Look(PURPLE, (0, (6, 2, 1, 2, 1, 2)), 1.8, "v"),
+    Look(GREY, ":", 1.8),
+    Look(ORANGE, "--", 1.8),
+    Look(BLUE, "-", 2.4),
+    Look(GREEN, "-.", 1.8),
+    Look(PURPLE, (0, (6, 2, 1, 2, 1, 2)), 1.8),
 )
 """Nominal, geometric and calibrated, then others, in this order."""
 

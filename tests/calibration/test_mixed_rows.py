@@ -1,0 +1,175 @@
+"""Tools that take turns, payloads of other rows, and ratios of slides and mimic joints that a fit would take up."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from math_bank import normal
+from table_bank import refused
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.diagnostics.hypotheses import lengths
+from diffeo_calib.calibration.placing.place import place
+from diffeo_calib.calibration.scales.selection import defaults
+from diffeo_calib.common.errors import DiffeoCalibWarning
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.simulated_arm import URDF_FILE
+
+ARM, ROWS = SimulatedArm(3), 80
+NOISE = 2e-5
+
+
+def warned(data: dc.Measurements) -> list[str]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", DiffeoCalibWarning)
+        dc.calibrate(ARM.nominal, data)
+    return [str(one.message) for one in caught]
+
+
+@pytest.mark.parametrize("every", [2, 5])
+def test_tools_that_take_turns_are_named_with_their_rows(every: int) -> None:
+    q, y = ARM.measure(ROWS, seed=1)
+    y[::every, 0] += ARM.truth.poses(q)[::every, :3, :3] @ torch.tensor([3e-4, 0.0, 4e-4], dtype=torch.float64)
+    (text,) = [one for one in warned(dc.Measurements(q, y)) if "another tool" in one]
+    lines = ", ".join(str(every * k) for k in range(5))
+    assert text.startswith(f"{ROWS // every} of {ROWS} rows seem to have another tool or marker, 0.")
+    assert f"mm away: lines {lines} and" in text
+    assert 0.4 < float(text.split("marker, ")[1].split(" mm")[0]) < 0.6
+
+
+def payloads(change: Any, rows: int = ROWS) -> list[str]:
+    masses = torch.from_numpy(np.random.default_rng(5).choice([0.0, 5.0, 10.0], rows))
+    q = ARM.sample(rows, 2)
+    y = ARM.true_points(q, masses)
+    data = dc.Measurements(q, y + NOISE * normal(*y.shape, seed=3)).with_payload(change(masses.clone()))
+    return [one for one in warned(data) if "payload" in one]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda m: m.roll(2), "the payloads seem to be those 2 lines later"),
+        (lambda m: torch.where(m == 10, 1.0, m), "the payloads seem to be 10 where they are 1"),
+    ],
+)
+def test_payloads_of_other_lines_and_units_are_named(change: Any, words: str) -> None:
+    (text,) = payloads(change)
+    assert words in text
+
+
+def test_shuffled_payloads_are_named() -> None:
+    (text,) = payloads(lambda masses: masses.flip(0), 120)
+    assert "rows seem to have carried payloads of other rows" in text
+
+
+def test_right_payloads_are_not_doubted() -> None:
+    assert payloads(lambda masses: masses) == []
+
+
+@pytest.mark.parametrize(
+    ("q", "y", "words"),
+    [
+        (1.0, 1e3, "the positions seem to be 1000 times too large"),
+        (1.0, 1e-3, "the positions seem to be 1000 times too small"),
+        (180 / np.pi, 1.0, "degrees"),
+    ],
+)
+def test_the_unit_of_one_session_is_named(q: float, y: float, words: str) -> None:
+    values, points = ARM.measure(ROWS, seed=1)
+    values[50:] *= q
+    points[50:] *= y
+    data = dc.Measurements(values, points, doubt=False).with_sessions(["a"] * 50 + ["b"] * 30)
+    refused((f"session 'b': .*{words}", lambda: dc.calibrate(ARM.nominal, data)))
+
+
+def edited(tmp_path: Path, multiplier: float, base: str) -> dc.Tree:
+    """The arm on a rail, with a joint before its forearm that follows the shoulder."""
+    rail = '<link name="floor"/><joint name="rail" type="prismatic"><parent link="floor"/><child link="base_link"/>'
+    rail += '<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
+    follows = '<link name="mid"/><joint name="coupler" type="revolute"><parent link="{}"/><child link="mid"/>'
+    follows += '<axis xyz="0 1 0"/><limit lower="-9" upper="9" effort="1" velocity="1"/>'
+    follows += f'<mimic joint="shoulder_joint" multiplier="{multiplier}"/></joint>'
+    before, joint, after = URDF_FILE.read_text(encoding="utf-8").partition('<joint name="forearm_roll_joint"')
+    parent = after.split('parent link="')[1].split('"')[0]
+    after = after.replace(f'parent link="{parent}"', 'parent link="mid"', 1)
+    before = before.replace('<link name="base_link">', rail + '<link name="base_link">', 1)
+    path = tmp_path / "robot.urdf"
+    path.write_text(before + follows.format(parent) + joint + after, encoding="utf-8")
+    return dc.load_urdf(path, base, "flange")
+
+
+def measured(robot: dc.Tree, stroke: float = 0.0) -> tuple[Tensor, Tensor]:
+    """Joint values (N, n), of a rail first, and places (N, 1, 3) of a point of a robot with usual errors, m."""
+    low, high = robot.limits[-6:].unbind(1)
+    q = low + (high - low) * torch.from_numpy(np.random.default_rng(1).random((ROWS, 6)))
+    if robot.n > 6:
+        q = torch.cat([stroke * torch.from_numpy(np.random.default_rng(2).random((ROWS, 1))), q], 1)
+    T = robot(q + 2e-4 * torch.sin(q))
+    y = T[:, :3, 3] + T[:, :3, :3] @ torch.tensor([0.03, 0.02, 0.1], dtype=torch.float64) + 1.0
+    return q, y[:, None] + NOISE * normal(ROWS, 1, 3, seed=4)
+
+
+def doubted(robot: dc.Tree, q: Tensor, y: Tensor) -> list[tuple[str, float]]:
+    """Names and values of ratios that are too improbable."""
+    placed = place(robot, dc.Measurements(q, y), lambda *_: None)
+    data = placed.tangent_data()
+    found = lengths(data, defaults(data, placed.identification.noise, placed.identification.prior))
+    return [(one.cause.name, one.value) for one in found if one.cause.usual and abs(one.value) > one.unnoticed]
+
+
+def test_the_multiplier_of_a_mimic_joint_is_judged(tmp_path: Path) -> None:
+    robot = edited(tmp_path, 1.0, "base_link")
+    assert doubted(robot, *measured(robot)) == []
+    ((name, value),) = doubted(robot, *measured(edited(tmp_path, 1.02, "base_link")))
+    assert name == "the multiplier of coupler"
+    assert value == pytest.approx(0.02, rel=0.1)
+    other = dc.Measurements(*measured(edited(tmp_path, -1.0, "base_link")))
+    refused(("'coupler' seems to follow with -1 times its multiplier", lambda: dc.calibrate(robot, other)))
+
+
+@pytest.mark.filterwarnings("ignore:rail. hardly moved")
+def test_a_slide_of_short_stroke_that_counts_backwards_is_named(tmp_path: Path) -> None:
+    robot = edited(tmp_path, 0.0, "floor")
+    q, y = measured(robot, stroke=0.02)
+    assert doubted(robot, q, y) == []
+    q[:, 0] *= -1
+    ((name, value),) = doubted(robot, q, y)
+    assert name == "the scale of rail"
+    assert value == pytest.approx(-2.0, rel=0.1)
+
+
+def test_a_slide_in_inch_is_refused_by_name(tmp_path: Path) -> None:
+    robot = edited(tmp_path, 0.0, "floor")
+    q, y = measured(robot, stroke=0.5)
+    q[:, 0] /= 0.0254
+    message = r"prismatic joints seem to be 39.37 times too large.*`joint_length`"
+    refused((message, lambda: dc.calibrate(robot, dc.Measurements(q, y, doubt=False))))
+
+
+def larger(tmp_path: Path, factor: float) -> dc.Tree:
+    """The arm with all lengths multiplied."""
+    text = re.sub(
+        'xyz="([^"]*)" rpy',
+        lambda found: f'xyz="{" ".join(str(factor * float(word)) for word in found[1].split())}" rpy',
+        URDF_FILE.read_text(encoding="utf-8"),
+    )
+    (tmp_path / "larger.urdf").write_text(text, encoding="utf-8")
+    return dc.load_urdf(tmp_path / "larger.urdf", "base_link", "flange")
+
+
+def test_scales_of_robots_that_do_not_suit_are_refused_or_named(tmp_path: Path) -> None:
+    q, y = SimulatedArm(0).measure(60, seed=9)
+    robot, other = larger(tmp_path, 1.4), SimulatedArm(77).measure(60, seed=3)
+    model = dc.calibrate(robot, dc.Measurements(other[0], 1.4 * other[1])).model
+    with pytest.warns(DiffeoCalibWarning, match="`scales_of` does not suit these rows: got leave-one-out errors"):
+        dc.calibrate(ARM.nominal, dc.Measurements(q, y), scales_of=[model])
+    data = dc.Measurements(q, y)
+    message = "`scales_of`, model 1: expected one of about 0.*got a reach of"
+    refused((message, lambda: dc.calibrate(larger(tmp_path, 0.6), data, scales_of=[model])))

@@ -1,0 +1,127 @@
+"""Laws of devices of every kind, those of scripts/examples too: exact readings, two devices, other points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from inclinometer import AXES, Inclinometers
+from laser_line import DIRECTIONS, POINTS, Beams
+from math_bank import normal
+from torch import Tensor
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from diffeo_calib.measurements.poses import mark_points
+from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.table_format import LEVER
+from diffeo_calib.robots.se3 import rotation, transforms
+from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.height import Planes
+from diffeo_calib.sensors.image import Cameras
+from diffeo_calib.sensors.places import PlacedDevices
+from diffeo_calib.sensors.range import FixedPoints
+from diffeo_calib.sensors.sockets import SocketPlaces
+from diffeo_calib.sensors.tool_frames import Contacts, HeldTools, Trackers
+
+ROWS, STEP = 60, 1e-6
+
+
+def frames(count: int, seed: int) -> Tensor:
+    return transforms(rotation(0.4 * normal(count, 3, seed=seed)), 0.4 * normal(count, 3, seed=seed + 1))
+
+
+HELD = frames(2, 21)
+FAR = torch.tensor([[0.1, 0.2, 4.0], [0.3, -0.2, 5.0]], dtype=torch.float64)
+KINDS: dict[type[Devices], Tensor] = {
+    FixedPoints: torch.tensor([[2.0, 0.5, 0.1, 0.0], [-1.0, 2.0, 0.4, 0.0]], dtype=torch.float64),
+    Planes: torch.cat([normalize(normal(2, 3, seed=4), dim=1), normal(2, 1, seed=5)], 1),
+    Cameras: torch.cat([transforms(rotation(0.4 * normal(2, 3, seed=5)), FAR)[:, :3].flatten(1), FAR[:, 2:]], 1),
+    SocketPlaces: normal(2, 3, seed=6),
+    Beams: torch.cat([POINTS, normalize(DIRECTIONS, dim=1)], 1),
+    Trackers: torch.cat([frames(2, 7)[:, :3].flatten(1), 0.1 * normal(2, 3, seed=8)], 1),
+    Contacts: torch.cat([normal(2, 3, seed=9), 0.1 * normal(2, 3, seed=10)], 1),
+    HeldTools: HELD[:, :3].flatten(1),
+    Inclinometers: Inclinometers.stated(torch.cat([AXES.flatten(), torch.tensor([0.1, -0.2, 1.0])]).expand(2, -1)),
+}
+"""Two devices of each kind."""
+TOLD = {Cameras: slice(12), Beams: slice(3, None), Inclinometers: slice(0)}
+"""What readings tell: no mean depth, no point along a beam; axes turned by half a turn may read the same."""
+
+
+def exact(kind: type[Devices]) -> tuple[Devices, Readings, Tensor]:
+    """Two devices, their readings without errors, and the coordinates (N, 3 k) that they saw, m."""
+    names, device = ("left", "right"), torch.arange(ROWS) % 2
+    there = kind(names, KINDS[kind], torch.full((2, kind.increments_each), 0.1, dtype=torch.float64))
+    points = 0.5 * normal(ROWS, 3, seed=2)
+    if kind.seen_points > 1:
+        bodies = frames(ROWS, 11)
+        several = [bodies, bodies @ HELD[device]][: kind.seen_points // 3]
+        points = torch.cat([mark_points(own, LEVER) for own in several], 1).flatten(1)
+    values = there.observation(device).value(points) / there.metres[device][:, None]
+    return there, Readings(kind.kind, normal(ROWS, 2), values, device, names), points
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_exact_readings_find_both_devices(kind: type[Devices]) -> None:
+    there, data, points = exact(kind)
+    found = kind.at(data, points).refined(data, points)
+    assert float(found.errors(data, points).abs().max()) < 1e-9
+    same = TOLD.get(kind, slice(None))
+    assert_close(found.constants[:, same].abs(), there.constants[:, same].abs(), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_slopes_are_derivatives(kind: type[Devices]) -> None:
+    """By points and by increments, which are shared by the rows of a device."""
+    there, data, points = exact(kind)
+    number = data.device
+    step, shift = normal(*there.deviations.shape, seed=12), normal(*points.shape, seed=13)
+    if kind.seen_points > 1:  # frames stay frames
+        shift = torch.linalg.cross(
+            normal(ROWS, 1, 3, seed=14).expand(-1, kind.seen_points, -1), points.view(ROWS, -1, 3)
+        )
+        shift = shift.flatten(1)
+
+    def change(read: Any) -> Tensor:
+        return (read(STEP) - read(-STEP)) / (2 * STEP)
+
+    seen = there.observation(number)
+    expected = change(lambda h: seen.value(points + h * shift))
+    assert_close((seen.slope(points) @ shift[..., None])[..., 0], expected, rtol=1e-6, atol=1e-8)
+    expected = change(lambda h: there.moved(h * step).observation(number).value(points))
+    assert_close(
+        (there.by_increments(points, number) @ step[number][..., None])[..., 0], expected, rtol=1e-6, atol=1e-8
+    )
+    assert_close(there.shared(points, number) @ (step / there.deviations).flatten(), expected, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_carried_devices_read_of_moved_points_what_they_read(kind: type[Devices]) -> None:
+    there, data, points = exact(kind)
+    T = transforms(rotation(normal(3, seed=15)), normal(3, seed=16))
+    before = points.unflatten(1, (-1, 3))
+    after = before @ T[:3, :3].mT + T[:3, 3]
+    other = replace(there, constants=there.carried(T, before, after, torch.zeros(1, 3, dtype=T.dtype)))
+    errors = other.values(data) - other.observation(data.device).value(other.points_of(after))
+    along_axes = kind in (SocketPlaces, Contacts)
+    turned = data.values @ T[:3, :3].mT - data.values if along_axes else 0.0
+    assert_close(errors + turned, torch.zeros_like(errors), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_sets_of_devices_are_taken_apart_joined_and_written(kind: type[Devices]) -> None:
+    there, data, _ = exact(kind)
+    first, second = (there.only([name]) for name in there.names)
+    whole = PlacedDevices(there, torch.arange(ROWS), data.device)
+    rows = [(data.device == number).nonzero()[:, 0] for number in range(2)]
+    sets = [PlacedDevices(own, some, torch.zeros_like(some)) for own, some in zip((first, second), rows, strict=True)]
+    both = sets[0].beside(sets[1])
+    assert both.names == there.names
+    assert torch.equal(both.devices.constants, there.constants)
+    assert torch.equal(both.device[both.rows.argsort()], data.device)
+    assert both.beside(sets[0]).entry() == both.entry()
+    assert PlacedDevices.from_entry(whole.entry(), ROWS).entry() == whole.entry()
+    assert len(there.sentences()) == 2
