@@ -98,19 +98,13 @@ def _distorted(points: Tensor, lens: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Range of views in images of a board, for planning more with the same camera.
+    """Range of views in images of a board, for planning more with the same camera."""
 
-    Args:
-        points: (K, 3) corners of the board as it was meant, m. fewest: corners in an image.
-        near, far: distances of their middle from the camera, m.
-        facing: cosine of the flattest angle between the board's z axis and the line to its middle, negative where the
-            axis looks at the camera.
-    """
-
-    points: Tensor
-    fewest: int
-    near: float
+    points: Tensor  # (K, 3) corners of the board as it was meant, m
+    fewest: int  # corners in an image
+    near: float  # distance of their middle from the camera, m
     far: float
+    # cosine of the flattest angle between the board's z axis and the line to its middle, negative if z looks at us
     facing: float
 
     @classmethod

@@ -49,17 +49,11 @@ DISTORTIONS = (0.5, 1.0, 0.02, 0.02, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class Images:
-    """N images of a board.
+    """N images of a board."""
 
-    Args:
-        points: (N, K, 3) corners of the board as it was meant, m, in its frame; NaN where they were not seen.
-        pixels: (N, K, 2) where they were seen, pixels: column and row, 0 in the middle of the first pixel.
-        width, height: of the images, pixels.
-    """
-
-    points: Tensor
-    pixels: Tensor
-    width: int
+    points: Tensor  # (N, K, 3) corners of the board as it was meant, m, in its frame; NaN where they were not seen
+    pixels: Tensor  # (N, K, 2) where they were seen, pixels: column and row, 0 in the middle of the first pixel
+    width: int  # pixels
     height: int
 
     @property
@@ -76,22 +70,15 @@ class Images:
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Lens and board that images show, with their joint uncertainty.
+    """Lens and board that images show, with their joint uncertainty."""
 
-    Args:
-        width, height: of the images, pixels. half_size: of the board, m.
-        unknowns: (14,) lens and board, see UNKNOWNS. root: (14, c) with root root^T their covariance.
-        noise: standard deviation of a corner's coordinate, pixels.
-        view: what its images showed; None before images.
-    """
-
-    width: int
+    width: int  # of the images, pixels
     height: int
-    half_size: float
-    unknowns: Tensor
-    root: Tensor
-    noise: float = 0.0
-    view: View | None = None
+    half_size: float  # of the board, m
+    unknowns: Tensor  # (14,) lens and board, see UNKNOWNS
+    root: Tensor  # (14, c) with root root^T their covariance
+    noise: float = 0.0  # standard deviation of a corner's coordinate, pixels
+    view: View | None = None  # what its images showed; None before images
 
     @property
     def lens(self) -> Tensor:

@@ -65,15 +65,11 @@ class Column:
 
 
 class Group(NamedTuple):
-    """Columns whose names differ by a label alone.
-
-    Args:
-        before, after: the words that all have in common. names: label -> column.
-    """
+    """Columns whose names differ by a label alone, between the words that all have in common."""
 
     before: tuple[str, ...]
     after: tuple[str, ...]
-    names: dict[str, str]
+    names: dict[str, str]  # label -> column
 
     @property
     def shared(self) -> frozenset[str]:

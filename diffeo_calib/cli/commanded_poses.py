@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.identification.registration import spread
 from diffeo_calib.cli.column_names import WORDS, Group, column, whole
 from diffeo_calib.cli.guesses import Body, Choice, RowColumns, Sheet, bodies_in, entries, matrices_in, rows_in
 from diffeo_calib.cli.proposals import LARGEST_RESIDUAL, Source, percent, ranked
@@ -124,13 +125,25 @@ def source_of(sheet: Sheet) -> Source:
         fix = "check that the rows belong together, or write the campaign file yourself; for joints name the robot"
         raise InputError.of(what, expected="a convention and units that explain the rows", got=got, fix=fix)
     limit = gates.READINGS_TOLD_APART * found[0].left
-    alike, worse = [one for one in found if one.left < limit], [one.left for one in found if one.left >= limit]
+    metres, units = limit * _varied(found[0]), (found[0].table.length, found[0].table.joint_length)
+    alike, worse = list[Source](), list[float]()
+    for one in found:  # who saw whom changes what a residual is a share of
+        same = (one.table.length, one.table.joint_length) == units and one.left <= LARGEST_RESIDUAL
+        if one.left < limit or (same and one.left * _varied(one) < metres):
+            alike.append(one)
+        else:
+            worse.append(one.left)
     why = f"the machine's poses explain the rows but for {percent(found[0].left, 2)} of what they vary"
     why += f", read in any other way {percent(worse[0])}" if worse else ""
     said = [*_entries(alike, _lengths(machine.place, _numbers(sheet, machine.place)), why)]
     if 2 * len(alike) >= len(found) >= MOST_WAYS:
         said = [one._replace(sure=one.sure and one.name not in TURNED) for one in said]
     return alike[0].saying(*said)
+
+
+def _varied(one: Source) -> float:
+    """How far the places spread that are compared with the machine's, m."""
+    return spread(one.data.largest_session().points)
 
 
 def _entries(alike: Sequence[Source], lengths: Sequence[str], why: str) -> Iterator[Choice]:

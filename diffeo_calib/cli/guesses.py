@@ -69,21 +69,15 @@ ENTRIES += [[str(k + first) for k in range(16)] for first in (0, 1)] + [labels[:
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table as it seems to be written.
-
-    Args:
-        path: of the file. sep, decimal: between cells, and in numbers. header: all columns. numbers: those that hold
-            numbers alone.
-        notes: what the reader decided. odd: which cells are no numbers in columns that seem to hold some; or empty.
-    """
+    """A table as it seems to be written."""
 
     path: Path
     sep: str
     decimal: str
-    header: tuple[str, ...]
-    numbers: tuple[str, ...]
-    notes: tuple[str, ...] = ()
-    odd: str = ""
+    header: tuple[str, ...]  # all columns
+    numbers: tuple[str, ...]  # those that hold numbers alone
+    notes: tuple[str, ...] = ()  # what the reader decided
+    odd: str = ""  # which cells are no numbers in columns that seem to hold some
 
     @cached_property
     def cells(self) -> dict[str, list[str]]:
@@ -217,17 +211,12 @@ def _goes_on(columns: Sequence[str], group: Group) -> set[str]:
 
 
 class Body(NamedTuple):
-    """Columns of a place, and of the rotation beside it, if any.
-
-    Args:
-        place, turn: columns. usual: what such names of a rotation usually mean. left: what the place is, if no device
-            measured it.
-    """
+    """Columns of a place, and of the rotation beside it, if any."""
 
     place: list[str]
     turn: list[str]
-    usual: str = ""
-    left: str = ""
+    usual: str = ""  # what such names of a rotation usually mean
+    left: str = ""  # what the place is, if no device measured it
 
     @property
     def words(self) -> set[str]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,17 +22,14 @@ from diffeo_calib.runtime.chain import tip_poses
 from diffeo_calib.runtime.program import FRAMES, Program
 
 
+@dataclass(frozen=True, eq=False)
 class NumpyKinematics:
-    """Calibrated kinematics of a robot, see :class:`diffeo_calib.CalibratedKinematics`; made by :func:`load_numpy`.
+    """Calibrated kinematics of a robot, see :class:`diffeo_calib.CalibratedKinematics`; made by :func:`load_numpy`."""
 
-    Args:
-        program: the model as constants. joint_names: names of the n joints, in the order of the columns of ``q``.
-        limits: (n, 2) their lower and upper limits, rad or m; infinite without one.
-        tool: (4, 4) tool centre point in the tip's frame, m.
-    """
-
-    def __init__(self, program: Program, joint_names: tuple[str, ...], limits: Array, tool: Array) -> None:
-        self.program, self.joint_names, self.limits, self.tool = program, joint_names, limits, tool
+    program: Program  # the model as constants
+    joint_names: tuple[str, ...]  # names of the n joints, in the order of the columns of ``q``
+    limits: Array  # (n, 2) their lower and upper limits, rad or m; infinite without one
+    tool: Array  # (4, 4) tool centre point in the tip's frame, m
 
     def __call__(self, q: object) -> Array:
         """Marker positions in the measuring frame: (N, n) rad or m -> (N, P, 3) m.

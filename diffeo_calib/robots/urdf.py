@@ -139,7 +139,7 @@ def _read(
     above, passed = _parents(urdf), dict[str, _Step]()
     for end in (*tips, *loads):
         for step in _way(urdf, above, base, end):
-            passed.setdefault(step.joint.name, step)
+            passed.setdefault(step.joint.child, step)  # names may be given twice, which the robot refuses
     steps = list(passed.values())
     top = [base, *(step.end for step in steps if step.up)][-1]  # nearest to the root, where gravity is constant
     joints, parents, last = along([(joint_of(step.joint, path), step.start, step.end, step.up) for step in steps], base)

@@ -80,13 +80,6 @@ class Sensor(ABC):
     def errors(self, data: Any, points: Tensor, places: Places) -> Evaluation:
         """Measured minus predicted values, for points (N, P, 3) of the tool, m."""
 
-    def set_up(self, data: Any, known: Callable[[Measurements], Measurements]) -> Measurements | None:
-        """The rows of one set-up whose device says where the robot stands; None where none does.
-
-        ``known``: rows whose tool a model knows as those of the model's, see :meth:`SetUps.in_any_frame`.
-        """
-        return None
-
     @abstractmethod
     def settled(self, data: Any, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
         """The devices around points (N, P, 3) of a model, m, with what these rows leave open about them.
@@ -141,10 +134,6 @@ class Positions(Sensor):
     def _errors(self, whole: Evaluation, data: Measurements, points: Tensor) -> Evaluation:
         away = data.points - points
         return replace(whole, errors=away.norm(dim=-1), away=away)
-
-    def set_up(self, data: Measurements, known: Callable[[Measurements], Measurements]) -> Measurements:
-        """Of several set-ups the one with most rows."""
-        return known(data).largest_session()
 
     def settled(self, data: Measurements, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
         """The frames of the set-ups that rows name, or their markers; those of the only one are those of the model."""

@@ -337,3 +337,8 @@ def test_slides_in_the_wrong_unit_are_refused_with_the_unit_named() -> None:
         MeasurementError, match=r"values of prismatic joints seem to be 1000 times too .*\(`joint_length`\)"
     ):
         dc.calibrate(robot, dc.Measurements(q, data.points, doubt=False))
+
+
+def test_tables_with_too_many_columns_are_refused(read: Any) -> None:
+    with pytest.raises(MeasurementError, match="expected at most 50000 columns, got 60000"):
+        read(",".join(["1"] * 60_000) + "\n")

@@ -253,3 +253,16 @@ def test_a_row_in_a_socket_says_why_it_is_far() -> None:
     assert "'b/0'" in (placed.other_socket(0, predicted, 0.01) or "")
     assert "its socket" in (placed.other_socket(1, predicted, 0.01) or "")
     assert MARKERS.other_socket(0, MARKERS.points, 0.01) is None
+
+
+def test_positions_beside_images_are_readings_with_their_deviations() -> None:
+    """Of every marker; poses stay poses."""
+    data = some(4, markers=2)
+    known = dc.Measurements(data.q, data.points, std=torch.linspace(1e-5, 8e-5, 8, dtype=torch.float64).view(4, 2))
+    found = known.beside_images()
+    assert len(found) == 2
+    for marker, (own, rows) in enumerate(found):
+        assert rows.tolist() == [0, 1, 2, 3]
+        assert_close((own.values, own.std), (known.points[:, marker], held(known.std)[:, marker]), rtol=0, atol=0)
+    ((posed, _),) = dc.Measurements.from_poses(data.q, random_poses(4)).beside_images()
+    assert_close(posed.poses, random_poses(4))

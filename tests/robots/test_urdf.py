@@ -128,6 +128,7 @@ def one(kind: str = "revolute", inside: str = '<axis xyz="0 0 1"/>') -> str:
         (one(inside='<mimic joint="k" offset="much"/>'), "offset of <mimic> of joint 'j' in "),
         (one(inside='<mimic joint="k" multiplier="inf"/>'), "expected a finite number, got 'inf'; correct the file"),
         (robot(LINKS + GOOD + joint("again", "base_link", "tool")), "has two parent joints ('mount' and 'again')"),
+        (robot(LINKS + "<link name='m'/>" + joint("j", "base_link", "m") + joint("j", "m", "tool")), "joint"),
         (one("fixed"), "has no moving joint from 'base_link' to 'tool'"),
         (one("floating"), "the type of joint 'j' in "),
         (one("planar"), "got 'planar'; choose a base and a tip"),

@@ -25,7 +25,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.sensors.devices import Extrinsics, Hypothesis
-from diffeo_calib.sensors.places import PlacedDevices, Shown
+from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import SetUps, View
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings
 
@@ -114,14 +114,9 @@ class DeviceSet(ABC):
         """Rows that tell coordinates where these devices put them."""
         return table
 
-    @property
-    def shown(self) -> Shown | None:
-        """See :class:`PlacedDevices`."""
-        return None
-
     def placed(self) -> PlacedDevices:
         """Their entries for the model file."""
-        return PlacedDevices(self.devices, self.rows, self.device, self.shown)
+        return PlacedDevices(self.devices, self.rows, self.device)
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:  # noqa: B027
         """Warn (DiffeoCalibWarning) of what these devices leave open in a model, and of what would show it."""

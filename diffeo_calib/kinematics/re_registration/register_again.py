@@ -46,7 +46,7 @@ from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import sensor_of
 from diffeo_calib.sensors.known_drift import KnownDrift
 from diffeo_calib.sensors.places import PlacedDevices, mounted_of
-from diffeo_calib.sensors.tables import rows_of_one_kind
+from diffeo_calib.sensors.tables import measured_positions, rows_of_one_kind
 
 LOG = logging.getLogger(__name__)
 LARGEST_M_RAD = 0.03
@@ -189,9 +189,11 @@ def registration_rows(data: Any, model: Any) -> Measurements | None:
     if not isinstance(data, RowGroups):
         expected, got = "dc.Measurements", type(data).__name__
         raise InputError.of("`measurements`", expected=expected, got=got)
-    known = mounted_of(model).in_any_frame
-    own = [(sensor_of(part), sensor_of(part).set_up(part, known)) for part, _ in rows_of_one_kind(data)]
-    return next((sensor.with_points(rows, model) for sensor, rows in own if rows is not None), None)
+    own = measured_positions(data)
+    if own is None:
+        return None
+    own = mounted_of(model).in_any_frame(own).largest_session()
+    return sensor_of(own).with_points(own, model)
 
 
 def devices_beside(model: Any, data: Any) -> tuple[PlacedDevices, ...]:

@@ -41,17 +41,12 @@ WITH_OPERATOR = re.compile(rf"([*/]?)\s*({FACTOR})")
 
 @dataclass(frozen=True)
 class JointExpressions:
-    """The n joint values of a line as ``matrix @ cells + offset``, in the units of the table.
+    """The n joint values of a line as ``matrix @ cells + offset``, in the units of the table."""
 
-    Args:
-        texts: n names or expressions. columns: the c columns that they name, in order of their first appearance.
-        matrix: (n, c). offset: (n,).
-    """
-
-    texts: tuple[str, ...]
-    columns: tuple[str, ...]
-    matrix: Tensor
-    offset: Tensor
+    texts: tuple[str, ...]  # n names or expressions
+    columns: tuple[str, ...]  # the c columns that they name, in order of their first appearance
+    matrix: Tensor  # (n, c)
+    offset: Tensor  # (n,)
 
     @classmethod
     def of(cls, texts: Sequence[str]) -> JointExpressions:
@@ -108,21 +103,14 @@ def _parsed(text: str) -> tuple[dict[str, float], float]:
 
 @dataclass(frozen=True, eq=False)
 class PoseColumns:
-    """The columns of places, or of poses, and the joints of a machine that they tell; see :class:`JointExpressions`.
+    """The columns of places, or of poses, and the joints of a machine that they tell; see :class:`JointExpressions`."""
 
-    Args:
-        columns: x, y, z, and the numbers of a rotation; or one to three coordinates of a place; or what a function
-            makes them of.
-        convention: how the rotation is written; empty for places. Or ``FILE.py:NAME``: a function of the cells (N, c)
-            as they stand in the table, a tensor, that returns places (N, k) or poses (N, 4, 4), in its unit of length.
-        robot: the machine, see :func:`cartesian`; None before the poses are read.
-        angle: unit of Euler angles and rotation vectors.
-    """
-
-    columns: tuple[str, ...]
+    columns: tuple[str, ...]  # x, y, z and the numbers of a rotation; 1 to 3 of a place; or what a function takes
+    # How the rotation is written; empty for places. Or FILE.py:NAME, a function of the cells (N, c) as they stand in
+    # the table, a tensor, that returns places (N, k) or poses (N, 4, 4), in its unit of length.
     convention: str = ""
-    robot: Chain | None = None
-    angle: str = "rad"
+    robot: Chain | None = None  # the machine, see cartesian; None before the poses are read
+    angle: str = "rad"  # unit of Euler angles and rotation vectors
 
     @classmethod
     def of(cls, text: str) -> PoseColumns:

@@ -31,6 +31,8 @@ Column = Sequence[str] | Sequence[float]
 
 HEAD = 200
 """Lines among which the header is."""
+MOST_COLUMNS = 50_000
+"""Of a table of configurations."""
 AT_ONCE = 1 << 13
 """Bytes by which a file is judged."""
 WIDE = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
@@ -66,6 +68,9 @@ class CsvLines:
         self._last, self._extra = 0, 0  # line before the rows, and empty cells at the end of rows
         self._text, notes = _text(path, sep)
         lines = list(islice(self._cells(), HEAD))
+        if (width := max((len(cells) for _, cells in lines), default=0)) > MOST_COLUMNS:
+            what, fix = f"file '{path}'", "check the separator (`sep`); one row is one configuration"
+            raise MeasurementError.of(what, expected=f"at most {MOST_COLUMNS} columns", got=width, fix=fix)
         each = list(zip_longest(*(cells for _, cells in lines), fillvalue=None))
         if sep == " " and any(None in cells or not any(cells) for cells in each):  # columns that spaces align
             self._aligned = True
