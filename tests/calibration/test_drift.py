@@ -147,6 +147,9 @@ def test_beyond_its_rows_a_drift_stays_as_at_the_end(drifted: Any) -> None:
     (line,) = [line for line in known.in_rows(late) if "outside" in line]
     assert re.search(r"\b60\b", line)
     assert dc.evaluate(model, late).placed[-1] == line
+    for end in known.ends["time"]:  # the rows of the fit reach them
+        there = drifted[1].with_covariates(time=torch.full((60,), end, dtype=torch.float64))
+        assert not [line for line in known.in_rows(there) if "outside" in line]
 
 
 def test_columns_are_rows_of_the_table(tmp_path: Path) -> None:

@@ -163,7 +163,8 @@ def test_poses_that_are_wrong_in_position_or_orientation(posed: Case) -> None:
     assert set(found) == {(4, None), (11, None)}
     assert found[11, None].distance == pytest.approx(0.005, rel=0.05)
     kept_all(result, data)
-    errors, before = (dc.evaluate(model, posed.test) for model in (result.model, posed.model))
+    found_by: Any = [dc.evaluate(model, posed.test) for model in (result.model, posed.model)]
+    errors, before = found_by
     assert errors.rms < 2.0 * before.rms
     assert errors.orientation.rms < 1.5 * before.orientation.rms
 

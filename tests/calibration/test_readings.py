@@ -238,3 +238,10 @@ def test_what_is_refused() -> None:
         ("above 0", lambda: dc.Readings.distances(data.q, -data.values)),
         ("60 names", lambda: dc.Readings.heights(data.q, 0.0, ["table"])),
     )
+
+
+def test_a_ball_without_a_start_that_leads_anywhere_is_sought(monkeypatch: pytest.MonkeyPatch) -> None:
+    arm = SimulatedArm(2)
+    data, expected = readings(arm, "distance", 60), identified(arm.nominal, readings(arm, "distance", 60))[1]
+    monkeypatch.setattr("diffeo_calib.calibration.placing.readings._starts", lambda *_: [])
+    assert_close(identified(arm.nominal, data)[1].geometry.tool, expected.geometry.tool, rtol=0, atol=1e-6)

@@ -73,7 +73,7 @@ def test_errors_of_poses_are_distances_of_origins_and_angles(rows: int, lever: f
     poses = random_poses(rng, rows)
     shifts, vectors = 1e-3 * rng.normal(size=(rows, 3)), 1e-2 * rng.normal(size=(rows, 3))
     data = dc.Measurements.from_poses(rng.normal(size=(rows, 2)), poses, lever=lever)
-    found = dc.evaluate(lambda _: mark_points(moved(poses, shifts, vectors), lever), data)
+    found: Any = dc.evaluate(lambda _: mark_points(moved(poses, shifts, vectors), lever), data)
     distances, degrees = np.linalg.norm(shifts, axis=1), np.degrees(np.linalg.norm(vectors, axis=1))
     np.testing.assert_allclose(found.errors.numpy(), distances[:, None], rtol=1e-9)
     assert found.angles is not None
@@ -89,7 +89,7 @@ def test_errors_of_poses_are_distances_of_origins_and_angles(rows: int, lever: f
 def test_tiny_errors_of_poses_are_not_lost() -> None:
     poses, shift, vector = random_poses(np.random.default_rng(0), 1), np.full((1, 3), 1e-9), np.full((1, 3), 1e-9)
     data = dc.Measurements.from_poses([[0.0]], poses)
-    found = dc.evaluate(lambda _: mark_points(moved(poses, shift, vector), 0.1), data)
+    found: Any = dc.evaluate(lambda _: mark_points(moved(poses, shift, vector), 0.1), data)
     assert found.orientation.max == pytest.approx(math.degrees(math.sqrt(3) * 1e-9), rel=1e-4)
     assert found.max == pytest.approx(math.sqrt(3) * 1e-9, rel=1e-4)
 

@@ -167,7 +167,7 @@ def test_poses_after_a_marker_and_a_marker_after_poses(arm: Case, posed: Case) -
     poses = dc.Measurements.from_poses(arm.test.q, poses_from_marks(points, 0.15), lever=0.15)
     found = arm.model.registered(poses.rows(slice(0, 8)))
     assert found.lever == 0.15
-    errors = dc.evaluate(found, poses.rows(slice(8, None)))
+    errors: Any = dc.evaluate(found, poses.rows(slice(8, None)))
     assert errors.rms < 3.0 * rms(arm.model, arm.test)
     assert errors.orientation.rms < 0.06
     single = posed.model.registered(other_marker(NEW_MARKER, posed.test.q[:12], T, posed=True))

@@ -185,6 +185,14 @@ def test_tangent_limit(arm: Arm) -> None:
     torch.testing.assert_close(derivative, first, rtol=1e-8, atol=1e-8)
 
 
+@every_arm
+def test_the_response_elsewhere_is_that_of_the_controls_there(arm: Arm) -> None:
+    deformation = arm.deform()
+    whole = deformation.linear_response(deformation.linearise())
+    some = deformation.linearise(deformation.x[1:4])
+    torch.testing.assert_close(deformation.linear_response(some, elsewhere=True), whole[1:4], rtol=1e-11, atol=1e-12)
+
+
 def perturbed(arm: Arm, x: Tensor, steps: int, eps: float, where: str) -> Tensor:
     """k1(x) along the flows of an :class:`Arm` when one field is changed to v + eps u, u fixed in time."""
     start = arm.deform(0.1, steps)

@@ -28,6 +28,7 @@ from diffeo_calib.calibration.identification.identification import (
     solve,
 )
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
+from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.readings import Readings
@@ -43,6 +44,8 @@ ROUGH_M = 2e-3
 """Errors of a robot before its calibration, to compare starts."""
 STARTS_STEPS = 200
 LONGEST_TOOL_M = 1.0
+BALLS_TRIED, BALL_SPREAD_M = 24, 0.15
+"""Places of the ball on the tool that are tried where no start leads anywhere, and their standard deviation."""
 UNEXPLAINED = "no place of ball and devices explains the readings"
 CHECK = "check the units of the readings (mm or m) and of the joints (deg or rad), the order of the joints, "
 CHECK += "and which device each row names; or measure more rows with each device"
@@ -134,18 +137,25 @@ def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool
     Warns:
         DiffeoCalibWarning: readings that no place of ball and devices explains in either unit.
     """
-    found, most = _rough_fits(_starts(bare, tables)), LARGEST_SHARE * bare.chain.reach
-    if found and min(one.worst for one in found)[0] > most:  # one kind is lost: place it anew
+    most = LARGEST_SHARE * bare.chain.reach
+    found = _rough_fits(_starts(bare, tables))
+    if found and found[0].worst[0] > most:  # one kind is lost: place it anew
         balls = [one.rows.geometry.absorb(one.fit.theta).tool[0] for one in found]
+        found = sorted([*found, *_rough_fits([_around(bare, tables, ball) for ball in balls])], key=_worst)
+    if found and found[0].worst[0] > most:
+        _refuse_another_unit(bare, tables, found[0])
+    if not found or found[0].worst[0] > most:
+        balls = BALL_SPREAD_M * torch.randn(BALLS_TRIED, 3, dtype=torch.float64, generator=seeded(0), device=HOST)
         found += _rough_fits([_around(bare, tables, ball) for ball in balls])
     if not found:
         raise MeasurementError.of(UNEXPLAINED, fix=CHECK)
-    best = min(found, key=lambda one: one.worst)
+    best = min(found, key=_worst)
     fit, geometry = best.fit, best.rows.geometry.absorb(best.fit.theta)
     each = zip(tables, fit.errors, strict=True)
-    doubted = [kind_of(data).doubts_unit(data, own[:, 0]) for data, own in each]
-    if any(doubted) or best.worst[0] > most:
-        _doubt(bare, tables, best.worst)
+    if any(kind_of(data).doubts_unit(data, own[:, 0]) for data, own in each):
+        _refuse_another_unit(bare, tables, best)
+    if best.worst[0] > most:
+        warn_user(sentence(UNEXPLAINED, **best.said(most), fix=CHECK))
     devices, squares = best.rows.devices(fit.shifts), body_squares(fit.errors)
     noise = float((squares.sum() / sum(own.numel() for own in fit.errors)).sqrt())
     nothing, tails = torch.zeros_like(fit.covariance), Tails.none(len(squares), 1)
@@ -165,9 +175,21 @@ class RoughFit(NamedTuple):
     fit: Fit
     rows: Rows
 
+    def said(self, most: float) -> dict[str, str]:
+        """What a message says of it, with the largest median that belongs to a robot, m."""
+        (median, device), expected = (
+            self.worst,
+            f"residuals well below {1e3 * most:.0f} mm with the robot's description",
+        )
+        return {"expected": expected, "got": f"a median of {1e3 * median:.3g} mm at {as_written(device)}"}
+
+
+def _worst(one: RoughFit) -> tuple[float, str]:
+    return one.worst
+
 
 def _rough_fits(starts: Sequence[Rows]) -> list[RoughFit]:
-    """From each start that leads anywhere."""
+    """From each start that leads anywhere, the best first."""
     found = []
     for rows in starts:
         sigma = rows.geometry.tool.new_full((sum(len(own.q) for own in rows.parts), 1), ROUGH_M)
@@ -180,7 +202,7 @@ def _rough_fits(starts: Sequence[Rows]) -> list[RoughFit]:
                 for number, name in enumerate(own.data.names)
             )
             found.append(RoughFit(worst, fit, rows))
-    return found
+    return sorted(found, key=_worst)
 
 
 def ball_of(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Identification | None:
@@ -259,22 +281,12 @@ def _around(bare: Geometry, tables: Sequence[Readings], ball: Tensor) -> Rows:
     return Rows(geometry, tuple(parts), rigid=True)
 
 
-def _doubt(bare: Geometry, tables: Sequence[Readings], worst: tuple[float, str]) -> None:
-    """Raise MeasurementError for readings that fit in mm or m, in place of the other unit; warn if they do not.
-
-    Args:
-        bare, tables: see :func:`identify_readings`. worst: see :class:`RoughFit`.
-    """
-    (median, device), most = worst, LARGEST_SHARE * bare.chain.reach
-    said = {
-        "expected": f"residuals well below {1e3 * most:.0f} mm with the robot's description",
-        "got": f"a median of {1e3 * median:.3g} mm at {as_written(device)}",
-    }
+def _refuse_another_unit(bare: Geometry, tables: Sequence[Readings], best: RoughFit) -> None:
+    """Raise MeasurementError for readings that fit in mm or m, in place of the other unit, far better than ``best``."""
+    most = LARGEST_SHARE * bare.chain.reach
     for factor, words in ((1e3, "small"), (1e-3, "large")):
         other = [replace(own, values=factor * own.values) if own.unit[0] == "mm" else own for own in tables]
         found = _rough_fits(_starts(bare, other))
-        if found and min(one.worst for one in found)[0] < min(most, FAR_BETTER * median):
+        if found and found[0].worst[0] < min(most, FAR_BETTER * best.worst[0]):
             fix = f"they seem to be 1000 times too {words}: check the units of the readings (mm or m)"
-            raise MeasurementError.of(UNEXPLAINED, **said, fix=fix)
-    if median > most:
-        warn_user(sentence(UNEXPLAINED, **said, fix=CHECK))
+            raise MeasurementError.of(UNEXPLAINED, **best.said(most), fix=fix)

@@ -32,6 +32,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import nan
 
 import torch
@@ -140,7 +141,12 @@ class NoiseModel:
         visible = self.seen.repeat_interleave(FREEDOM_OF_POSES, 1)
         return replace(self, modes=modes, known=basis.mT @ self.known @ basis, visible=visible)
 
-    @property
+    @cached_property
+    def all_visible(self) -> bool:
+        """Whether every number was measured."""
+        return bool(self.visible.all())
+
+    @cached_property
     def kind_count(self) -> int:
         """Kinds of devices."""
         return int(self.kinds.max()) + 1
@@ -171,13 +177,13 @@ class NoiseModel:
 
     def covariance(self, scales: Hyperparameters, jacobian: Tensor) -> Tensor:
         """R_i without tails: Jacobian of k0 (N, R, n) -> (N, R, R) in m^2; absent numbers carry no information."""
-        total = self._of_all(scales, jacobian) + self._of_poses(scales) + self.known
-        return without_hidden(total, self.visible)
+        total = self._of_all(scales, jacobian) + self._of_bodies(scales)
+        return total if self.all_visible else without_hidden(total, self.visible)
 
     def mean_covariance(self, scales: Hyperparameters, jacobian: Tensor) -> Tensor:
         """The mean of R_i without tails, everything visible: (R, R) in m^2."""
-        own = self._of_poses(scales) + self.known  # not known of hidden poses
-        return self._of_all(scales, jacobian).mean(0) + mean_block(own, self.visible)
+        own = mean_block(self._of_bodies(scales), self.visible)  # not known of hidden poses
+        return self._of_all(scales, jacobian).mean(0) + own
 
     def typical(self, scales: Hyperparameters, jacobian: Tensor, freedom: float) -> Tensor:
         """The same (R, R), inflated so that its 95 % region holds 95 %: by heavy tails, and where the rows differ."""
@@ -195,12 +201,15 @@ class NoiseModel:
         single = single.repeat_interleave(self.size, 1)
         return jacobian * scales.joint_noise.square() @ jacobian.mT + torch.diag_embed(single)
 
-    def _of_poses(self, scales: Hyperparameters) -> Tensor:
-        """Covariance (N, R, R) of the shifts and turns of poses."""
-        size = torch.cat([scales.sensor_noise.expand(3), scales.rotation_noise.expand(3)])
+    def _of_bodies(self, scales: Hyperparameters) -> Tensor:
+        """Covariance (N, R, R) of the shifts and turns of poses, and what is known beforehand."""
         poses = self.modes.shape[1]
-        own = (self.modes * size.square()) @ self.modes.mT * (self.kinds == 0)[:, :poses, None, None]
-        return torch.nn.functional.pad(block_diagonal(own), (0, self.size * (self.bodies - poses)) * 2)
+        if not poses:
+            return self.known
+        size = torch.cat([scales.sensor_noise.expand(3), scales.rotation_noise.expand(3)])
+        own = (self.modes * size.square()) @ self.modes.mT
+        own = own if self.kind_count == 1 else own * (self.kinds == 0)[:, :poses, None, None]
+        return self.known + torch.nn.functional.pad(block_diagonal(own), (0, self.size * (self.bodies - poses)) * 2)
 
     def weighted(self, covariance: Tensor, tails: Tails) -> Tensor:
         """R_i with every body's noise divided by its weight, 1 where hidden; correlations are kept."""
