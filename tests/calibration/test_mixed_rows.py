@@ -26,7 +26,7 @@ ARM, ROWS = SimulatedArm(3), 80
 NOISE = 2e-5
 
 
-def warned(data: dc.Measurements) -> list[str]:
+def warned(data: Any) -> list[str]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", DiffeoCalibWarning)
         dc.calibrate(ARM.nominal, data)
@@ -42,6 +42,18 @@ def test_tools_that_take_turns_are_named_with_their_rows(every: int) -> None:
     assert text.startswith(f"{ROWS // every} of {ROWS} rows seem to have another tool or marker, 0.")
     assert f"mm away: lines {lines} and" in text
     assert 0.4 < float(text.split("marker, ")[1].split(" mm")[0]) < 0.6
+
+
+def test_balls_that_take_turns_are_named_in_readings() -> None:
+    q = ARM.sample(120, 4)
+    ball = (ARM.true_points(q)[:, 0] - ARM.truth.base[:3, 3]) @ ARM.truth.base[:3, :3]
+    turned = ARM.truth.base[:3, :3].mT @ ARM.truth.poses(q)[::2, :3, :3]
+    ball[::2] += turned @ torch.tensor([3e-3, 0.0, 4e-3], dtype=torch.float64)
+    fixed = torch.tensor([[1.5, 0.0, 0.5], [0.0, 1.6, 0.1], [-1.2, -1.0, 1.4]], dtype=torch.float64)
+    which = torch.arange(120) % 3
+    lengths = (ball - fixed[which]).norm(dim=1) + NOISE * normal(120, seed=6)
+    said = warned(dc.Readings.distances(q, lengths, [f"anchor {k}" for k in which.tolist()]))
+    assert any("another tool or marker" in one for one in said), said
 
 
 def payloads(change: Any, rows: int = ROWS) -> list[str]:

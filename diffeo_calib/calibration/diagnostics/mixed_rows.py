@@ -102,7 +102,9 @@ def two_tools(data: TangentData, scales: Hyperparameters, lines: Tensor) -> str 
     fewer = chosen == (0.5 if float(chosen.mean()) < 0 else -0.5)
     if int(fewer.sum()) < gates.CHANGE_ROWS or (left := mixed.left(chosen)) > gates.TWO_TOOLS_LEFT:
         return None
-    moved = 1e3 * float(some.in_coordinates(E @ u).unflatten(1, (-1, 3)).norm(dim=2).amax(1).median())
+    motion = some.in_coordinates(E @ u)
+    bodies = motion.unflatten(1, (-1, 3 if motion.shape[1] % 3 == 0 else motion.shape[1]))
+    moved = 1e3 * float(bodies.norm(dim=2).amax(1).median())
     where = few(lines[rows.to(lines.device)][fewer.to(lines.device)].tolist(), 5)
     return sentence(
         f"{int(fewer.sum())} of {N} rows seem to have another tool or marker, {moved:.3g} mm away: lines {where}",
