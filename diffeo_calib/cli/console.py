@@ -125,7 +125,7 @@ def _as_options(text: str) -> str:
     """Keywords of Python as options: ``sep=';'`` -> ``--sep ';'``, `rotation_angle` -> --rotation-angle."""
     names = KEYWORDS.replace(" ", "|")
     text = re.sub(rf"\b({names})=('[^']*')", lambda found: f"--{found[1].replace('_', '-')} {found[2]}", text)
-    return re.sub(f"`({names})`", lambda found: f"--{found[1].replace('_', '-')}", text)
+    return re.sub(f"(?<!in Python )`({names})`", lambda found: f"--{found[1].replace('_', '-')}", text)
 
 
 INTERRUPTED = "interrupted before there was a result to keep"

@@ -100,6 +100,11 @@ def test_a_task_without_steps_and_one_that_starts_again_have_no_end(monkeypatch:
     assert "-:--:--" in last_line(monkeypatch, ("rows", 400, 400), ("rows", 0, 400))
 
 
+def test_keywords_are_said_as_options_unless_as_those_of_Python(capsys: pytest.CaptureFixture[str]) -> None:
+    console.show("error", "name the column `rotation_angle`: --marker smr (in Python `marker`), sep=';'")
+    assert "column --rotation-angle: --marker smr (in Python `marker`), --sep ';'" in capsys.readouterr().err
+
+
 def test_every_task_of_a_calibration_has_words() -> None:
     arm, train, _ = simulated(20)
     seen: set[str] = set()
