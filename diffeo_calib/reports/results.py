@@ -180,7 +180,8 @@ SCHEMA = entries(
             patternProperties={"^(rms|limit)_": schema(MAYBE, "evaluate --tolerance: what is compared, in this unit.")},
         ),
     },
-    "Units are in the names (m, rad, deg), or beside the numbers as unit. Numbers that are not finite are null.",
+    "Units are in the names (m, rad, deg), or beside the numbers as unit. Numbers that are not finite are null. "
+    "Entries may be added within a version.",
     **{"$schema": "https://json-schema.org/draft/2020-12/schema"},
     title=f"Results of a diffeo-calib command (--json), format version {VERSION}",
 )
