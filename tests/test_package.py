@@ -10,6 +10,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -63,6 +64,27 @@ def test_every_public_name_is_loaded_and_listed() -> None:
     for name in NAMES:
         assert getattr(dc, name).__module__.startswith("diffeo_calib.")
     assert len(set(NAMES)) == len(NAMES)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "interop.numpy_model.NumpyKinematics",
+        "kinematics.device_readings.PredictedReadings",
+        "kinematics.provenance.Provenance",
+        "kinematics.provenance.Summary",
+        "kinematics.transmission.NamedGearLine",
+        "measurements.csv.sensors.ReadingColumns",
+        "measurements.csv.sensors.SocketColumns",
+        "measurements.sockets.Sockets",
+        "measurements.table_format.TableFormat",
+    ],
+)
+def test_help_and_the_page_say_what_the_fields_of_results_and_tables_are(name: str) -> None:
+    module, _, own = name.rpartition(".")
+    kind = getattr(importlib.import_module(f"diffeo_calib.{module}"), own)
+    text = (kind.__doc__ or "").partition("Args:")[2]
+    assert [field.name for field in fields(kind) if f"{field.name}: " not in text] == []
 
 
 SUBMODULES_FIRST = """

@@ -137,7 +137,8 @@ Json = Annotated[
         "--json",
         metavar="FILE",
         callback=_remember,
-        help="Also write the results to this file, for programs.",
+        help="Also write the results to this file, for programs; `python -m diffeo_calib.reports.results` prints the "
+        "schema.",
     ),
 ]
 
@@ -254,6 +255,8 @@ def _entries(path: Path) -> dict[str, Any]:
         return {name.replace("_", "-"): value for name, value in entries.items()}
     except OSError as error:
         raise InputError.of(f"{path} cannot be read ({error.strerror})", fix="check the path") from error
+    except InputError:
+        raise
     except (ValueError, RecursionError) as error:  # TOML, text or a name that is none, or lists in lists
         fix = 'write one option per line: length = "mm"'
         raise InputError.of(f"{path} is no TOML", got=str(error), fix=fix) from error

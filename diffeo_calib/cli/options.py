@@ -80,7 +80,8 @@ class Option(NamedTuple):
     def of(cls, own: Field[Any], hint: Any) -> Option:
         """That of a field."""
         kind, how = own.metadata["kind"], dict(own.metadata["how"])
-        how["help"] = how["help"] or described().get(own.name, "")
+        if not how["help"]:
+            how["help"] = described().get(own.name, "") + " Repeatable." * has(hint, list)
         long = f"--{own.name.replace('_', '-')}"
         names = tuple(filter(None, (SHORT.get(own.name), long))) if own.metadata["named"] else ()
         return cls(own.name, hint, own.default, names, (*names, how["metavar"])[0], kind, how)

@@ -212,7 +212,7 @@ def parsed_limit(text: str | None) -> Limit | None:
         return None
     units = {kind.unit[0]: (kind.unit[0], 1.0) for kind in known_kinds().values()} | UNITS
     name = max((name for name in units if text.endswith(name)), key=len, default="")
-    value = number(text.removesuffix(name), ".") if name else None
+    value = number(text.removesuffix(name).strip(), ".") if name else None
     if value is None or not 0.0 < value < inf:
         expected = "a length above zero with its unit, such as 0.15mm, or pixels, such as 0.5px"
         raise InputError.of(f"--tolerance {text}", expected=expected)

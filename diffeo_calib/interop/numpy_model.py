@@ -22,14 +22,20 @@ from diffeo_calib.runtime.chain import tip_poses
 from diffeo_calib.runtime.program import FRAMES, Program
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class NumpyKinematics:
-    """Calibrated kinematics of a robot, see :class:`diffeo_calib.CalibratedKinematics`; made by :func:`load_numpy`."""
+    """Calibrated kinematics of a robot, see :class:`diffeo_calib.CalibratedKinematics`; made by :func:`load_numpy`.
 
-    program: Program  # the model as constants
-    joint_names: tuple[str, ...]  # names of the n joints, in the order of the columns of ``q``
-    limits: Array  # (n, 2) their lower and upper limits, rad or m; infinite without one
-    tool: Array  # (4, 4) tool centre point in the tip's frame, m
+    Args:
+        program: the model as constants. joint_names: names of the n joints, in the order of the columns of ``q``.
+        limits: (n, 2) their lower and upper limits, rad or m; infinite without one.
+        tool: (4, 4) tool centre point in the tip's frame, m.
+    """
+
+    program: Program
+    joint_names: tuple[str, ...]
+    limits: Array
+    tool: Array
 
     def __call__(self, q: object) -> Array:
         """Marker positions in the measuring frame: (N, n) rad or m -> (N, P, 3) m.

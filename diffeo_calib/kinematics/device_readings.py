@@ -32,13 +32,19 @@ MOTION_SHARE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class PredictedReadings:
-    """Predicted readings of one device at N configurations."""
+    """Predicted readings of one device at N configurations.
 
-    kind: str  # of its readings; "position" of markers that were mounted anew
-    device: str  # its name, or that of the session
-    unit: str  # of the readings
-    mean: Tensor  # (N, r) readings; NaN where the device cannot see its target
-    covariance: Tensor  # (N, r, r) of these
+    Args:
+        kind: of its readings; "position" of markers that were mounted anew. device: its name, or that of the session.
+        unit: of the readings.
+        mean: (N, r) readings; NaN where the device cannot see its target. covariance: (N, r, r) of these.
+    """
+
+    kind: str
+    device: str
+    unit: str
+    mean: Tensor
+    covariance: Tensor
 
     @property
     def deviations(self) -> Tensor:

@@ -19,15 +19,24 @@ LONGEST_NOTE = 10_000
 
 @dataclass(frozen=True)
 class Provenance:
-    """When a model was fitted, with which version and to which measurements."""
+    """When a model was fitted, with which version and to which measurements.
 
-    date: str  # in UTC, ISO 8601, such as ``"2026-11-22T10:00:00+00:00"``
-    version: str  # of this package
-    # SHA-256 of the file of measurements, or of their arrays if they came from Python; see :attr:`Measurements.sha256`
+    Args:
+        date: in UTC, ISO 8601, such as ``"2026-11-22T10:00:00+00:00"``.
+        version: of this package.
+        table_sha256: SHA-256 of the file of measurements, or of their arrays if they came from Python; see
+            :attr:`Measurements.sha256`.
+        note: text of the user, such as a serial number.
+        command: the command line that made the model; empty if it was made from Python.
+        table: options with which the command line reads the table again; empty where they are not known.
+    """
+
+    date: str
+    version: str
     table_sha256: str
-    note: str = ""  # text of the user, such as a serial number
-    command: str = ""  # the command line that made the model; empty if it was made from Python
-    table: str = ""  # options with which the command line reads the table again; empty where they are not known
+    note: str = ""
+    command: str = ""
+    table: str = ""
 
     @classmethod
     def now(cls, measurements: Any, note: str = "") -> Provenance:
@@ -78,30 +87,44 @@ def _entry(name: str, default: Any = MISSING) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """Results of a calibration, in SI units. Errors are those of measured positions: None where none was measured."""
+    """Results of a calibration, in SI units. Errors are those of measured positions: None where none was measured.
 
-    # RMS distance of the training rows from the nominal robot after registration, m
+    Args:
+        registration_rms: RMS distance of the training rows from the nominal robot after registration, m.
+        geometry_rms: the same after the geometric calibration, m.
+        diffeomorphic_rms: the same of the calibrated model, m.
+        leave_one_out_rms: RMS distance of every marker from its prediction by all other rows, m.
+        outliers: number of measurements flagged as outliers.
+        coupling_residual: certificate of the fit, see :class:`Fit`; dimensionless.
+        end_residual: certificate of the fit, see :class:`Fit`; dimensionless.
+        energy: value of the minimised energy; dimensionless.
+        status: why the fit stopped, in one sentence.
+        scales: how the scales of kernels, priors and noise were chosen, in one sentence.
+        rows: number of training rows.
+        parts: name of each part of the model -> RMS displacement of the markers that it explains, m.
+        noise_degrees_of_freedom: of Student's t; infinite for Gaussian noise, None if unknown.
+        effective_parameters: effective number of parameters of the fit; None if it was not computed.
+        length_in_doubt: RMS distance by which points move with a length of robot or device that is improbable, or with
+            errors of an axis that the model does not know, m; None without one.
+        warnings: what the calibration warned of, one line each; None if it did not.
+    """
+
     registration_rms: float | None = _entry("registration rms [m]", None)
-    geometry_rms: float | None = _entry("geometry rms [m]", None)  # the same after the geometric calibration, m
-    diffeomorphic_rms: float | None = _entry("diffeomorphic rms [m]", None)  # the same of the calibrated model, m
-    # RMS distance of every marker from its prediction by all other rows, m
+    geometry_rms: float | None = _entry("geometry rms [m]", None)
+    diffeomorphic_rms: float | None = _entry("diffeomorphic rms [m]", None)
     leave_one_out_rms: float | None = _entry("leave-one-out rms [m]", None)
-    outliers: int  # number of measurements flagged as outliers
-    # of Student's t; infinite for Gaussian noise, None if unknown
+    outliers: int
     noise_degrees_of_freedom: float | None = _entry("noise degrees of freedom", None)
-    coupling_residual: float = _entry("coupling residual")  # certificate of the fit, see :class:`Fit`; dimensionless
-    end_residual: float = _entry("end residual")  # certificate of the fit, see :class:`Fit`; dimensionless
-    energy: float  # value of the minimised energy; dimensionless
-    status: str  # why the fit stopped, in one sentence
-    scales: str  # how the scales of kernels, priors and noise were chosen, in one sentence
-    rows: int  # number of training rows
-    # effective number of parameters of the fit; None if it was not computed
+    coupling_residual: float = _entry("coupling residual")
+    end_residual: float = _entry("end residual")
+    energy: float
+    status: str
+    scales: str
+    rows: int
     effective_parameters: float | None = _entry("effective parameters", None)
-    # RMS distance by which points move with a length of robot or device that is improbable, or with errors of an axis
-    # that the model does not know, m; None without one
     length_in_doubt: float | None = _entry("length in doubt [m]", None)
-    warnings: str | None = None  # what the calibration warned of, one line each; None if it did not
-    parts: Mapping[str, float]  # name of each part of the model -> RMS displacement of the markers that it explains, m
+    warnings: str | None = None
+    parts: Mapping[str, float]
 
     def to_dict(self) -> dict[str, Any]:
         """Entries named with their units, as model files hold them, of what is known; the parts are the last ones."""

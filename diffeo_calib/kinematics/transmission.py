@@ -55,14 +55,22 @@ MULTIPLES = (2, 3, 4)
 
 @dataclass(frozen=True)
 class NamedGearLine:
-    """amplitude cos(frequency q - phase) of one joint."""
+    """amplitude cos(frequency q - phase) of one joint.
 
-    joint: str  # its name
-    frequency: float  # rad per rad of the joint: periods per turn; the ratio of a gear or a multiple of it
-    amplitude: float  # rad
-    phase: float  # rad
-    multiple: int  # how often the frequency contains that of another line of the robot; 1 if there is none
-    displacement: float  # RMS displacement of the markers by it over the model's configurations, m
+    Args:
+        joint: its name.
+        frequency: rad per rad of the joint: periods per turn; the ratio of a gear or a multiple of it.
+        amplitude: rad. phase: rad.
+        multiple: how often the frequency contains that of another line of the robot; 1 if there is none.
+        displacement: RMS displacement of the markers by it over the model's configurations, m.
+    """
+
+    joint: str
+    frequency: float
+    amplitude: float
+    phase: float
+    multiple: int
+    displacement: float
 
     @property
     def sentence(self) -> str:

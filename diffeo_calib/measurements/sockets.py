@@ -37,15 +37,18 @@ FLATTERY = (
 
 @dataclass(frozen=True)
 class Sockets:
-    """The sockets that hold the ball in some rows of a table."""
+    """The sockets that hold the ball in some rows of a table.
 
-    # S names, such as "front/0": that of the place, a slash, that of the socket at this place. A name without a slash
-    # is a place with one socket
+    Args:
+        names: S names, such as "front/0": that of the place, a slash, that of the socket at this place. A name without
+            a slash is a place with one socket.
+        distances: known distances, as numbers of two sockets and their distance [m].
+        distance_std: their standard deviation [m]; None without distances. The distance of two sockets of a block has
+            one error at all places.
+    """
+
     names: tuple[str, ...]
-    # known distances, as numbers of two sockets and their distance [m]
     distances: tuple[tuple[int, int, float], ...] = ()
-    # their standard deviation [m]; None without distances. The distance of two sockets of a block has one error at all
-    # places
     distance_std: float | None = None
 
     @classmethod

@@ -40,10 +40,10 @@ class TableFormat:
     """What a table of measurements or predictions holds, and how it is written.
 
     Args:
-        length: unit of positions in the table, and of prismatic joints; a model knows that of its own table.
-        angle: unit of revolute joints in the table; likewise.
+        length: unit of positions in the table, and of prismatic joints; needed where no model knows it.
+        angle: unit of revolute joints in the table; needed where no model knows it.
         sep: one character between cells (on the command line also: tab), by default a comma, or that of the model.
-        decimal: decimal mark, by default a point, or that of the model.
+        decimal: decimal mark, a point or a comma; by default a point, or that of the model.
         rotation: columns of the rotation, if poses were measured: 3, 4 or 9, depending on `convention`; for frames on
             several tips, whose origins are the positions, a list for each. Rotation and position map from the tool's
             frame to the measuring frame.
@@ -51,7 +51,7 @@ class TableFormat:
             order of Euler angles, extrinsic (such as xyz) or intrinsic (such as XYZ).
         rotation_angle: unit of Euler angles, rotation vectors and `rotation_std`.
         lever: distance from a pose's origin to the three points that represent the pose: it weighs orientation against
-            position. 0.1 m by default, in Python in m, on the command line in the unit of `length`.
+            position. 0.1 m by default. On the command line it is in the unit of `length`. In Python it is in m.
         std: columns with standard deviations of the positions, in the unit of `length`: one for all, one per marker or
             three per marker.
         rotation_std: columns with standard deviations of the rotation about the measuring frame's axes, which are not
@@ -234,11 +234,15 @@ ALL_CONVENTIONS = (*NUMBERS, *EULER)
 
 @cache
 def described() -> dict[str, str]:
-    """What every field of a table is, by the docstring of :class:`TableFormat`, with keywords as options."""
+    """What every field of a table is, by the docstring of :class:`TableFormat`, with keywords as options.
+
+    Sentences that speak of Python are left out.
+    """
     text = dedent("        " + (TableFormat.__doc__ or "").partition("Args:")[2].partition("Raises:")[0].strip())
     found = re.findall(r"^(\w+): (.*(?:\n +.*)*)", text, re.MULTILINE)
     words = {name: re.sub(r"`(\w+)`", lambda own: f"--{own[1].replace('_', '-')}", said) for name, said in found}
-    return {name: " ".join(f"{said[0].upper()}{said[1:]}".split()) for name, said in words.items()}
+    whole = {name: " ".join(f"{said[0].upper()}{said[1:]}".split()) for name, said in words.items()}
+    return {name: re.sub(r"(?<=\.) [^.]*\bPython\b[^.]*\.", "", said) for name, said in whole.items()}
 
 
 def options_of(table: TableFormat) -> list[str]:

@@ -51,6 +51,8 @@ def test_mistakes_are_named(tmp_path: Path, text: str, message: str) -> None:
         expanded(["fit", campaign(tmp_path, text)])
     with pytest.raises(InputError, match=r"none\.toml"):
         expanded(["fit", str(tmp_path / "none.toml")])
+    with pytest.raises(InputError, match=r"^[^ ]*\.toml: expected a file of options, got more than 1 MiB"):
+        expanded(["fit", campaign(tmp_path, "#" * (1 << 20) + "\n")])
     for name in (campaign(tmp_path, "x=" + "[" * 5000), "a\0.toml"):
         with pytest.raises(InputError, match="is no TOML"):
             expanded(["fit", name])

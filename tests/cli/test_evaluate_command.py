@@ -149,7 +149,7 @@ def test_an_acceptance_limit_has_an_exit_code(fitted: Outcome, site: Site, comma
     assert fitted.code == 0
     arguments = ["evaluate", site.folder / "model.safetensors", site.csv, *TABLE, "--tolerance"]
     rms = command(*arguments, "1m").numbers("12 not used in the fit")[0]
-    done = command(*arguments, f"{1.01 * rms:.6f}mm")
+    done = command(*arguments, f"{1.01 * rms:.6f} mm")
     assert done.code == 0
     assert f"RMS {rms:.4f} mm on 12 rows not used in the fit: within the limit of " in done.out
     done = command(*arguments, f"{990 * rms:.3f}um")

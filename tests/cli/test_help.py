@@ -110,3 +110,13 @@ def test_help_shows_units_defaults_ranges_and_what_is_required(command: Command)
     assert "default: 0.3" in found["--holdout"]
     assert "0.0<=x<=0.9" in found["--holdout"]
     assert "<m|mm|cm|inch>" in command("fit", "--help").out
+
+
+def test_help_of_a_table_speaks_of_the_command_line(command: Command) -> None:
+    """Though the words are those of the class in Python."""
+    text = " ".join(command("fit", "--help").out.split())
+    assert "Python" not in text.partition("Options:")[2]
+    assert text.count("needed where no model knows it") == 2
+    assert "hidden in that row. Repeatable." in text
+    assert "in the unit of --length." in text
+    assert "diffeo_calib.reports.results" in text

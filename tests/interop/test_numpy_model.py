@@ -121,6 +121,7 @@ def test_a_robot(expected: dict[str, Any], tmp_path: Path) -> None:
     dc.save(model, path)
     assert torch.equal(dc.load(path)(q), model(q))
     np.testing.assert_allclose(load_numpy(path)(q), model(q).numpy(), rtol=0, atol=1e-12)
+    assert len(repr(load_numpy(path))) < 200
     assert model.report == said["report"]
     assert model.summary is not None
     assert model.summary.rows == 20

@@ -211,12 +211,18 @@ class PositionColumns(SensorColumns):
 
 @dataclass(frozen=True)
 class SocketColumns(SensorColumns):
-    """How a table names sockets."""
+    """How a table names sockets.
 
-    names: Sequence[str]  # of the columns, such as place and socket; the last one names the socket at its place
-    distances: Distances | None = None  # known, between sockets, m
-    distance_std: float | None = None  # m
-    on: str | None = None  # name of the tip that carries the ball
+    Args:
+        names: of the columns, such as place and socket; the last one names the socket at its place.
+        distances: known distances between sockets, m. distance_std: their standard deviation, m.
+        on: name of the tip that carries the ball.
+    """
+
+    names: Sequence[str]
+    distances: Distances | None = None
+    distance_std: float | None = None
+    on: str | None = None
     word = "a socket"
 
     @property
@@ -243,16 +249,26 @@ class SocketColumns(SensorColumns):
 
 @dataclass(frozen=True)
 class ReadingColumns(SensorColumns):
-    """How a table holds readings; beside other kinds these are the rows that name a device."""
+    """How a table holds readings.
+
+    Args:
+        kind: of the readings. values: name of their column, of two columns for images, or one number for all rows, in
+            the unit of length of the table. Beside other kinds these are the rows that name a device.
+        device: name of the column that names the device of each row; None for one device.
+        offset_std: of the unknown zero of distances, m. intrinsics: fx, fy, cx, cy of the camera in pixels.
+        std: names of columns with standard deviations, one or, of images, two, in the unit of the readings.
+        on: name of the tip that carries the ball.
+        unit: of readings of devices of your own that are no lengths, see :meth:`Readings.of`.
+    """
 
     kind: str
-    values: tuple[str, ...] | float  # their column, two columns of images, or a number for all rows, in its unit
-    device: str | None = None  # column that names the device of each row; None for one device
-    offset_std: float = 0.0  # of the unknown zero of distances, m
-    intrinsics: tuple[float, float, float, float] = (1.0, 1.0, 0.0, 0.0)  # fx, fy, cx, cy of the camera, pixels
-    std: tuple[str, ...] = ()  # columns with standard deviations, one or, of images, two, in the unit of the readings
-    on: str | None = None  # name of the tip that carries the ball
-    unit: tuple[str, float] = MILLIMETRES  # of readings of devices of your own, see Readings.of
+    values: tuple[str, ...] | float
+    device: str | None = None
+    offset_std: float = 0.0
+    intrinsics: tuple[float, float, float, float] = (1.0, 1.0, 0.0, 0.0)
+    std: tuple[str, ...] = ()
+    on: str | None = None
+    unit: tuple[str, float] = MILLIMETRES
 
     @property
     def word(self) -> str:
@@ -304,12 +320,18 @@ class ReadingColumns(SensorColumns):
 
 @dataclass(frozen=True)
 class ImageColumns(SensorColumns):
-    """How a table holds images."""
+    """How a table holds images.
 
-    # width and height of the images, pixels, or what is known of lens and board; or that of each name in column camera
+    Args:
+        camera: width and height of the images, pixels, or what is known of lens and board; of several cameras by the
+            names in the column `camera`.
+        camera_on_tool: whether the camera is on the tool; else the board is.
+        device: column that names the set-up of every image; None for one.
+    """
+
     camera: Known | Mapping[str, Known]
-    camera_on_tool: bool = False  # else the board is
-    device: str | None = None  # column that names the set-up of every image; None for one
+    camera_on_tool: bool = False
+    device: str | None = None
     word = "an image"
 
     @classmethod
