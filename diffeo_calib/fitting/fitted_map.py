@@ -369,7 +369,7 @@ class FittedMap:
     def weighted_residual(self) -> Tensor:
         """R^-1 (y - h(k1)) at the optimum: (N, r), zero where nothing was measured."""
         deformation = self.geodesic
-        if isinstance(self.by_data, ControlPointRegression):
+        if self.data is not None and isinstance(self.by_data, ControlPointRegression):
             return self.by_data.weighted_residual()
         pull = deformation.end_momenta.reshape(deformation.z1.shape)
         return pull if self.slopes is None else (torch.linalg.pinv(self.slopes.mT) @ pull[:, :, None])[:, :, 0]

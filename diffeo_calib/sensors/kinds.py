@@ -80,11 +80,14 @@ class Unregistered(Extrinsics):
 
     def warn_if_unknown(self) -> None:
         what = f"the model has {len(self.names)} devices of the kind {self.kind!r}, which is not registered here"
-        fix = "import the module that registers it (`diffeo_calib.sensors.kinds.register`), or install its package"
+        fix = (
+            "import the module that registers it (`diffeo_calib.sensors.kinds.register`) and load the model again, or "
+        )
+        fix += "install its package"
         warn_user(sentence(f"{what}: their readings are not predicted", fix=fix))
 
     def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
-        fix = "import the module that registers it"
+        fix = "import the module that registers it, and load the model again"
         raise InputError.of(f"devices of the kind {self.kind!r} in a model", got="a kind not registered", fix=fix)
 
 

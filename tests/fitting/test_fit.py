@@ -1,6 +1,7 @@
 """The arguments of `fit`: solvers, integrators, backends, and what it refuses."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from math import nan
 from typing import Any
 
@@ -128,3 +129,10 @@ def test_smaller_noise_needs_more_steps() -> None:
     coarse, fine = (dc.fit(rr_problem(6, noise=sigma)).integrator for sigma in (0.3, 0.003))
     assert isinstance(coarse, dc.RK4)
     assert isinstance(fine, dc.RK8)
+
+
+def test_what_was_measured_follows_without_a_matrix_of_all_rows() -> None:
+    problem = rr_problem(5)
+    model = replace(dc.fit(problem, integrator=dc.RK4(4)).model, y=None)
+    torch.testing.assert_close(model.measured(), problem.y, rtol=0, atol=1e-7)
+    assert "by_data" not in vars(model)

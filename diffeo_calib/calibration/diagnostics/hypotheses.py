@@ -157,7 +157,8 @@ def lengths(data: TangentData, scales: Hyperparameters, devices: Iterable[Hypoth
     """
     rows, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed=0)
     usual = {name: getattr(scales, name).clamp(max=most) for name, most in gates.USUAL_SCALES.items()}
-    most = torch.where(torch.tensor(data.space.periodic), inf, gates.USUAL_SLIDE).to(scales.transmission_amplitude)
+    turning = torch.tensor(data.space.periodic, dtype=torch.bool, device=data.x.device)
+    most = torch.where(turning, inf, gates.USUAL_SLIDE).to(scales.transmission_amplitude)
     usual["transmission_amplitude"] = scales.transmission_amplitude.minimum(most)
     process, found = some.process(replace(scales, **usual)), list[Length]()
     for one in (*_lengths_of(some), *(each._replace(effects=each.effects[rows]) for each in devices)):

@@ -125,7 +125,7 @@ def other_payloads(data: TangentData, scales: Hyperparameters, lines: Tensor) ->
         return None
     rows, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed=0)
     process, part, own = some.process(scales), some.nominal.sag, masses[rows] / unit
-    loaded = torch.arange(part.start, part.stop)[some.nominal.elasticity.loaded]
+    loaded = torch.arange(part.start, part.stop, device=masses.device)[some.nominal.elasticity.loaded]
     full = some.nominal.under(torch.full_like(own, unit))  # the sag of every row under the same mass
     S = full.sensitivities(some.x, some.theta)[..., loaded]
     sizes = some.prior_variance(replace(scales, payload=1.0))[loaded].sqrt()

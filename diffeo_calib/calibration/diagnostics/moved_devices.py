@@ -261,7 +261,7 @@ def crooked_axis(data: TangentData, scales: Hyperparameters) -> float | None:
     u_ak cos(k pi x) / k, u_ak ~ N(0, s^2), with x from 0 to 1 over its range, and turns by rad for m.
     """
     chain = data.nominal.geometry.chain
-    if is_cartesian(chain):  # commanded poses have no axes
+    if is_cartesian(chain) or len(data.x) < gates.AXIS_ROWS:  # commanded poses have no axes
         return None
     _, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed=0)
     process, found = some.process(scales), list[tuple[float, float, Tensor, str]]()
