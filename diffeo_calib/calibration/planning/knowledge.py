@@ -90,7 +90,7 @@ def greedy(
         own, open_ = own - less @ less.mT, open_ & (place != place[best])
         order.append(best)
         lowered.append(by)
-    return order, torch.stack(lowered)
+    return order, torch.stack(lowered) if lowered else each.new_zeros(0, r, len(C))
 
 
 def choose(known: Conditional, options: Options, scene: Scene, targets: Tensor, count: int) -> tuple[list[int], Tensor]:
