@@ -107,6 +107,8 @@ def test_a_row_each_of_the_same_stops_by_two_clocks(second: float, order: list[i
     found = joined(tmp_path, joints, places, "t")
     assert [line for line, _ in read_cells(found, ",")[1]] == order
     assert ("-50.00 added" in found.sentence) == (len(order) == 3)
+    with pytest.raises(MeasurementError, match="values that both files have"):  # pauses of other stops
+        joined(tmp_path, joints, ("t,x", "50,1", "54,2", "61,3"), "t")
 
 
 @pytest.mark.parametrize("offset", [0.0, 1.37, None])  # None: both on the same grid of times

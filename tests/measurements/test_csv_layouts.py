@@ -216,6 +216,9 @@ def test_a_marker_near_the_origin_or_a_single_one_not_clearly_far_away_stays(rea
     first = [[*row[:2], f"{30 * k}", f"{k**2}", "0"] for k, row in enumerate(CELLS) if k != 1]
     assert len(read(separated(",", [NAMES, *first]), NAMES[:2], NAMES[2:], **FORMAT)) == 7
     assert len(read(lost(3, cells="-9999,-9999,-9999"), NAMES[:2], NAMES[2:], **FORMAT)) == 8
+    beside = [[*row[:2], f"{k - 9999}", f"{k * k - 9999}", "-9999"] for k, row in enumerate(CELLS)]
+    beside[5][2:] = ["-9999", "-9999", "-9999"]  # as in line 2: where rows are
+    assert len(read(separated(",", [NAMES, *beside]), NAMES[:2], NAMES[2:], **FORMAT)) == 8
 
 
 def test_marks_of_rows_are_labels_where_all_have_them(read: Reader) -> None:
