@@ -351,12 +351,12 @@ def _by_coordinates(
     sessions, table = Sessions.of_table(robot, own, progress)
     LOG.info("calibrating %s with %r", robot.name, table)
     progress("registration", 0, 1)
-    registration, sockets = register_coordinates(robot, table)
-    table = Placement(sockets).at_places(table)
+    registration, places = register_coordinates(robot, table)
+    table = Placement(places).at_places(table)
     warn_of_joints_below_tip(robot, table)
     warn_of_open_directions(robot, table, registration)
     tables, adrift = [one.table for one in readings], table.without_device
-    if not sockets:
+    if not places:
         tip = ball_tip(None, readings, registration.geometry.on[-1])
         ball = ball_of(tables, registration.geometry, tip)
         registration = registration if ball is None else registration.with_ball(ball)
@@ -364,19 +364,19 @@ def _by_coordinates(
     devices = tuple(fitting_devices(one, geometry.points(one.q)) for one in tables)
     registration = replace(registration, devices=devices)
     progress("geometry", 0, 1)
-    shared = [one.shared(len(table), 3 * table.markers).unflatten(1, (-1, 3)) for one in sockets]
+    shared = [one.shared(len(table), 3 * table.markers).unflatten(1, (-1, 3)) for one in places]
     parts = MeasuredPoints.of(table.q, table.points, *shared), *map(ReadRows, tables, devices)
     found = estimated(Rows(geometry, parts), held_parameters(geometry, adrift=adrift))
-    sockets = [one.found(table, found) for one in sockets]
+    places = [one.found(table, found) for one in places]
     LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", 1e3 * registration.rms, 1e3 * found.rms)
-    table = Placement(sockets).at_places(table)
+    table = Placement(places).at_places(table)
     if not adrift:
         device, seen = table.device_rows(), found.geometry  # without a ball, which a device does not see
         seen = seen.with_tool(seen.tool[: device.markers], seen.on[: device.markers])
         check_identification(device, replace(found, geometry=seen))
     cameras = LensAndBoard.of_table(table, own.rows, registration, sessions)
     sets = reading_sets(readings, found.devices, "the robot's base" if adrift else "the measuring frame")
-    placement = Placement((*sessions, *(one.of_rows(own.rows) for one in sockets), *cameras, *sets))
+    placement = Placement((*sessions, *(one.of_rows(own.rows) for one in places), *cameras, *sets))
     return Placed(data, own._replace(table=table), placement, registration, found)
 
 
