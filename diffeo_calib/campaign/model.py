@@ -16,7 +16,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import VARIANCE_RATIO, choose_scales, noise_of_few, variance_ratio
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.moved_devices import changes_of
+from diffeo_calib.calibration.diagnostics.hypotheses import changes_of
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.planning.candidates import candidates, ranges_around
 from diffeo_calib.calibration.planning.knowledge import greedy
