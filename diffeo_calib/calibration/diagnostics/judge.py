@@ -32,7 +32,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.choose_scales import ChosenScales, variance_ratio
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import (
     MARKERS,
@@ -44,7 +43,7 @@ from diffeo_calib.calibration.diagnostics.hypotheses import (
     lengths_of,
     worth_it,
 )
-from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
+from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, variance_ratio
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import few, sentence, warn_user, with_deviation
@@ -92,7 +91,9 @@ class Finding(NamedTuple):
 
 
 def judge(
-    chosen: ChosenScales,
+    data: TangentData,
+    scales: Hyperparameters,
+    left_out: LeaveOneOut,
     lines: Tensor,
     devices: Iterable[Hypothesis] = (),
     bodies: Mapping[str, str] = MappingProxyType({}),
@@ -100,17 +101,16 @@ def judge(
     """The explanation with which left-out errors fall most, relative to what its kind asks for; None without any.
 
     Args:
-        chosen: the rows of a calibration and its scales. lines: (N,) of the rows in their file: their order is that of
-            the measurements. devices: what may change of devices in unknown places. bodies: better names of the
-            measuring device and of what is on the tool.
+        data, scales, left_out: the rows of a calibration, its scales and left-out errors. lines: (N,) of the rows in
+            their file: their order is that of the measurements. devices: what may change of devices in unknown places.
+            bodies: better names of the measuring device and of what is on the tool.
     """
-    data, lines = chosen.data, lines.to(chosen.data.x.device)
-    rows = JudgedRows.of(data, chosen.selection.scales)
+    rows, lines = JudgedRows.of(data, scales), lines.to(data.x.device)
     if len(rows.index) < 4 * gates.CHANGE_ROWS:
         return None
     changes, own = changes_of(rows.data, devices, rows.index), lines[rows.index]
     named = [one._replace(name=bodies.get(one.name, one.name)) for one in changes]
-    found = [*changed(rows, named, own, excess=max(1.0, variance_ratio(data, chosen.left_out)))]
+    found = [*changed(rows, named, own, excess=max(1.0, variance_ratio(data, left_out)))]
     if len(own) >= gates.MIXED_ROWS:
         found += [own for one in changes if one.name == MARKERS for own in two_tools(rows, one.effects, lines)]
         found += [*other_payloads(rows, data, lines), *crooked_axes(rows)]
