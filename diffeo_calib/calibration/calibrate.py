@@ -231,7 +231,7 @@ def _result(
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
     warn_of_outliers(found, placed.data)
     devices, bodies = placed.placement.hypotheses(data, CHANGE), placed.placement.bodies
-    best = judge(data, scales, chosen.left_out, placed.data.line_numbers, devices, bodies)
+    best = judge(data, scales, chosen.left_out, placed.data.line_numbers, devices=devices, bodies=bodies)
     explained_by = placed.mislabelled(model, found) or (best and best.text)
     warn_of_contradictions(model, placed.coordinates, found, explained_by)
     warn_of_rounding(robot, placed.data, data, chosen.left_out)

@@ -95,6 +95,7 @@ def judge(
     scales: Hyperparameters,
     left_out: LeaveOneOut,
     lines: Tensor,
+    *,
     devices: Iterable[Hypothesis] = (),
     bodies: Mapping[str, str] = MappingProxyType({}),
 ) -> Finding | None:
