@@ -17,8 +17,8 @@ from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.judge import Variation, variation
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
-from diffeo_calib.calibration.diagnostics.moved_devices import Variation, variation
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_open_directions
 from diffeo_calib.calibration.diagnostics.outliers import Outlier
 from diffeo_calib.calibration.diagnostics.plausibility import check_identification, check_readings
