@@ -24,7 +24,6 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
 from diffeo_calib.calibration.diagnostics.row_order import find_block
 from diffeo_calib.calibration.recalibration.changes import LEVEL, Change, Changes, Offset
 from diffeo_calib.calibration.recalibration.new_rows import (
@@ -37,6 +36,7 @@ from diffeo_calib.calibration.recalibration.new_rows import (
 )
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import sentence, warn_user
+from diffeo_calib.process.evidence import Evidence
 
 SIMULATED_DRAWS = 2000
 NOISE_FACTORS = 0.4 * 30.0 ** (torch.arange(12, dtype=torch.float64, device="cpu") / 11)

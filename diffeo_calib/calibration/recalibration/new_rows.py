@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
 from diffeo_calib.calibration.placing.lens import CameraErrors
 from diffeo_calib.calibration.placing.place import Told, stacked
 from diffeo_calib.calibration.placing.placement import DeviceSet, Placement, SeenRows
@@ -34,6 +33,7 @@ from diffeo_calib.kinematics.re_registration.registered_map import fitted_marker
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.tails import Tails, gross_weights, reweight
 from diffeo_calib.regression.regions import OTHER_DATE, region_factor, region_scale
 from diffeo_calib.robots.placement import PLACES
