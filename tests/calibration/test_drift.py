@@ -185,10 +185,10 @@ def test_a_column_on_the_command_line(tmp_path: Path, command: Command) -> None:
     assert done.code == 0
     assert "drift with time" in done.out
     for name, *more in (
-        ("evaluate", tmp_path / "t.csv", "--residuals", tmp_path / "r.csv"),
-        ("report", "-o", tmp_path / "r.html", "--data", tmp_path / "t.csv"),
+        ("evaluate", tmp_path / "t.csv", "-o", tmp_path / "r.csv"),
+        ("evaluate", tmp_path / "t.csv", "--report", tmp_path / "r.html"),
         ("export", "--c", tmp_path / "m.c"),
-        ("compare", tmp_path / "t.csv"),
+        ("recalibrate", tmp_path / "t.csv"),
     ):
         said = command(name, tmp_path / "m.safetensors", *more)
         assert "another set-up" not in said.err

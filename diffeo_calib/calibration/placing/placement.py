@@ -136,7 +136,7 @@ class DeviceSet(ABC):
 
     @property
     def bodies(self) -> Mapping[str, str]:
-        """Better names of what stands, and of what is on the tool, than those of diagnostics/moved_devices.py."""
+        """Better names of what stands, and of what is on the tool, than those of diagnostics/hypotheses.py."""
         return {}
 
     def views(self) -> Mapping[str, View]:

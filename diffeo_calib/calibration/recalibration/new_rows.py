@@ -468,8 +468,8 @@ def noise_of_rows(fitted: FittedMap, new: Measurements, there: Measurements, T: 
         fitted: a fit. new, there: the rows in their own frame and in that of the model.
         T: (4, 4) from the frame of the model to theirs, m. usual: noise of a row.
     """
-    factor, bodies, total = usual.factor, new.bodies, usual.block.expand(len(new), -1, -1)
-    known = factor is not None and fitted.slopes is None and bool(fitted.noise.visible.all())
+    bodies, total = new.bodies, usual.block.expand(len(new), -1, -1)
+    known = usual.factor is not None and fitted.slopes is None and bool(fitted.noise.visible.all())
     own, old = bodies.modes(there), bodies.modes_of(there, fitted.measured().unflatten(1, (-1, 3))) if known else None
     if own is not None and old is not None:
         blocks = own_blocks(fitted.noise.covariance, old.shape[1])  # (N, T, 9, 9)
@@ -479,7 +479,7 @@ def noise_of_rows(fitted: FittedMap, new: Measurements, there: Measurements, T: 
         apart = eye - old @ to_modes
         slack = (apart @ blocks).diagonal(dim1=2, dim2=3).sum(2) / (old.shape[2] - old.shape[3])
         each = (own * sizes[:, None]) @ own.mT + slack.median(0).values[:, None, None] * eye
-        total = factor * block_diagonal(each)
+        total = usual.factor * block_diagonal(each)
     return total if new.covariance is None else larger(total, turned(new.covariance, T[:3, :3].mT))
 
 
