@@ -186,9 +186,9 @@ def test_geometry_does_not_depend_on_where_the_sockets_are_thought(arm: Simulate
         sought = Rows(geometry, (MeasuredPoints.of(placed.q, placed.points, shared),))
         root, noise = (
             Prior().root(geometry, held_parameters(geometry, adrift=True)),
-            shared.new_full((len(data), 1), 1e-4),
+            shared.new_full((len(data),), 1e-4),
         )
-        thetas.append(solve(sought, [noise], root, **PRECISE).theta)
+        thetas.append(solve(sought, noise, root, **PRECISE).theta)
     assert not bool(thetas[0][:12].any())
     torch.testing.assert_close(*thetas, rtol=0, atol=5e-6)
 

@@ -240,9 +240,10 @@ class Rows:
             found.append(torch.cat([slopes[..., :f], torch.nn.functional.pad(slopes[..., f:], around)], 3))
         return found
 
-    def found(self, fit: Fit, noise: float, prior: Prior, bodies: Bodies, tails: Tails) -> Identification:
-        """A fit to some of the rows, with the errors of all of them."""
+    def found(self, fit: Fit, noise: float, prior: Prior, tails: Tails) -> Identification:
+        """A fit to some of the rows, with the errors and weights (M,) of all of them."""
         errors, shifts = self.errors(fit.theta, fit.shifts), fit.shifts.split(self.freedom)
+        weights = tails.weights.split([own[..., 0].numel() for own in errors])
         return Identification(
             geometry=self.geometry.absorb(fit.theta),
             rms=float(body_squares(errors).nanmean().sqrt()),
@@ -250,58 +251,33 @@ class Rows:
             covariance=fit.covariance,
             theta=fit.theta,
             prior=prior,
-            weights=bodies.split(tails.weights),
+            weights=tuple(some.view(own.shape[:2]) for some, own in zip(weights, errors, strict=True)),
             freedom=tails.freedom,
             shifts=shifts,
             devices=tuple(one for own, some in zip(self.parts, shifts, strict=True) for one in own.devices(some)),
         )
 
 
-class Bodies(NamedTuple):
-    """All bodies of rows of several kinds: shapes (N, B) of these, numbers d of each body (M,), and its kind (M,)."""
-
-    shapes: list[torch.Size]
-    dim: Tensor
-    kind: Tensor
-
-    @classmethod
-    def of(cls, errors: Sequence[Tensor]) -> Bodies:
-        """By their numbers (N, B, d)."""
-        own = [(torch.full_like(each[..., 0], each.shape[2]), k) for k, each in enumerate(errors)]
-        kinds = [torch.full_like(each, k, dtype=torch.int64) for each, k in own]
-        return cls([each.shape[:2] for each in errors], _flat([each for each, _ in own]), _flat(kinds))
-
-    def split(self, values: Tensor) -> tuple[Tensor, ...]:
-        """Values (M,) of all bodies as (N, B) of every kind."""
-        sizes = [shape.numel() for shape in self.shapes]
-        return tuple(own.view(shape) for own, shape in zip(values.split(sizes), self.shapes, strict=True))
-
-    def sums(self, values: Tensor) -> Tensor:
-        """Sums of values (M,) of every kind, hidden ones (NaN) left out."""
-        return values.new_zeros(len(self.shapes)).index_add(0, self.kind, values.nan_to_num(0.0))
-
-
-def _flat(values: Sequence[Tensor]) -> Tensor:
-    return torch.cat([own.flatten() for own in values])
-
-
 def body_squares(errors: Sequence[Tensor]) -> Tensor:
     """Squares (M,) of errors (N, B, d) of all bodies of several kinds of rows; NaN where hidden."""
-    return _flat([own.square().sum(2) for own in errors])
+    return torch.cat([own.square().sum(2).flatten() for own in errors])
+
+
+def sizes_and_kinds(errors: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Numbers d (M,) of all bodies, and (M,) of which kind of rows each is."""
+    counts = torch.tensor([own[..., 0].numel() for own in errors], device=errors[0].device)
+    kind = torch.arange(len(errors), device=errors[0].device).repeat_interleave(counts)
+    return errors[0].new_tensor([own.shape[2] for own in errors])[kind], kind
 
 
 def typical_noise(errors: Sequence[Tensor]) -> Tensor:
-    """Noise of every kind of rows by errors (N, B, d), m: the median, so that gross outliers do not set the level.
+    """Noise (M,) of all bodies by the median of their kind of rows, m: gross outliers do not set the level.
 
-    That of chi-squared is by Wilson and Hilferty.
+    The median of chi-squared is by Wilson and Hilferty.
     """
-    medians = [own.square().sum(2).nanmedian() / chi2_typical(own.shape[2]) for own in errors]
-    return torch.stack(medians).sqrt().clamp(min=SMALLEST_NOISE_M)
-
-
-def chi2_typical(freedom: int) -> float:
-    """About the median of chi-squared."""
-    return freedom * (1.0 - 2.0 / (9.0 * freedom)) ** 3
+    dim, kind = sizes_and_kinds(errors)
+    medians = torch.stack([own.square().sum(2).nanmedian() for own in errors])[kind]
+    return (medians / (dim * (1.0 - 2.0 / (9.0 * dim)) ** 3)).sqrt().clamp(min=SMALLEST_NOISE_M)
 
 
 def identify(
@@ -321,9 +297,9 @@ def identify(
     rows, held = Rows(geometry, (MeasuredPoints.of(q, points),)), held_parameters(geometry)
     if noise is None:
         return estimated(rows, held, prior)
-    used, sigma = prior or Prior(), points.new_full(points.shape[:2], noise)
-    fit = solve(rows, [sigma], used.root(geometry, held), **PRECISE)
-    return rows.found(fit, noise, used, Bodies.of(fit.errors), Tails.none(points[..., 0].numel(), 1))
+    used, sigma = prior or Prior(), points.new_full((points[..., 0].numel(),), noise)
+    fit = solve(rows, sigma, used.root(geometry, held), **PRECISE)
+    return rows.found(fit, noise, used, Tails(inf, torch.ones_like(sigma)))
 
 
 def estimated(rows: Rows, held: Sequence[int], prior: Prior | None = None) -> Identification:
@@ -343,29 +319,29 @@ def estimated(rows: Rows, held: Sequence[int], prior: Prior | None = None) -> Id
     used, zero = prior or Prior(), rows.geometry.tool.new_zeros(rows.geometry.size)
     at = zero, zero.new_zeros(sum(rows.freedom))
     errors = some.errors(*at)
-    bodies, levels, noise = Bodies.of(errors), typical_noise(errors), 0.0
-    tails = reweight(body_squares(errors) / levels[bodies.kind].square(), bodies.dim)
+    (dim, kind), sigma, noise = sizes_and_kinds(errors), typical_noise(errors), 0.0
+    tails = reweight(body_squares(errors) / sigma.square(), dim)
     for _ in range(ROUNDS):
         root = used.root(rows.geometry, held)
-        fit = solve(some, bodies.split(levels[bodies.kind] / tails.weights.sqrt()), root, start=at, **PRECISE)
+        fit = solve(some, sigma / tails.weights.sqrt(), root, start=at, **PRECISE)
         at = fit.theta, fit.shifts
         used = used if prior else _scaled(used, root, rows.geometry, fit)
-        squares = body_squares(fit.errors)
-        free = bodies.sums(bodies.dim.masked_fill(squares.isnan(), 0.0) - fit.leverage)  # less what the data determine
-        total = bodies.sums(tails.weights * squares)
+        squares, none = body_squares(fit.errors), dim.new_zeros(len(fit.errors))
+        free = none.index_add(0, kind, dim.masked_fill(squares.isnan(), 0.0) - fit.leverage)  # not determined by rows
+        total = none.index_add(0, kind, (tails.weights * squares).nan_to_num(0.0))
         noise = max(sqrt(float(total.sum()) / max(float(free.sum()), 1.0)), SMALLEST_NOISE_M)
-        before, known = levels, SHARED_NUMBERS * (len(total) > 1)
+        known = SHARED_NUMBERS * (len(none) > 1)
         levels = ((total + known * noise**2) / (free + known).clamp(min=1.0)).sqrt().clamp(min=SMALLEST_NOISE_M)
-        tails = reweight(squares / levels[bodies.kind].square() + fit.leverage / tails.weights, bodies.dim)
-        if bool(((levels - before).abs() < NOISE_CHANGE * levels).all()):
+        before, sigma = sigma, levels[kind]
+        tails = reweight(squares / sigma.square() + fit.leverage / tails.weights, dim)
+        if float(((sigma - before).abs() / sigma).max()) < NOISE_CHANGE:
             break
-    left_out = squares / (1.0 - fit.leverage / bodies.dim).square()
+    left_out = squares / (1.0 - fit.leverage / dim).square()
     if any(own is not whole for own, whole in zip(some.parts, rows.parts, strict=True)):
         errors = rows.errors(*at)
-        bodies = Bodies.of(errors)
-        tails = reweight(body_squares(errors) / levels[bodies.kind].square(), bodies.dim)
-    found = rows.found(fit, noise, used, bodies, tails)
-    return replace(found, left_out=float(left_out.nanmean().sqrt()))
+        (dim, kind) = sizes_and_kinds(errors)
+        tails = reweight(body_squares(errors) / levels[kind].square(), dim)
+    return replace(rows.found(fit, noise, used, tails), left_out=float(left_out.nanmean().sqrt()))
 
 
 def _scaled(prior: Prior, root: Tensor, geometry: Geometry, fit: Fit) -> Prior:
@@ -394,17 +370,12 @@ class Fit(NamedTuple):
 
 
 def solve(
-    rows: Rows,
-    sigma: Sequence[Tensor],
-    root: Tensor,
-    *,
-    start: tuple[Tensor, Tensor] | None = None,
-    **options: Any,
+    rows: Rows, sigma: Tensor, root: Tensor, *, start: tuple[Tensor, Tensor] | None = None, **options: Any
 ) -> Fit:
     """Fit errors theta = root u, and shifts: the prior is then one row of the identity per unknown without units.
 
     Args:
-        rows: see :class:`Rows`. sigma: (N, B) standard deviations of the bodies of every part, m.
+        rows: see :class:`Rows`. sigma: (M,) standard deviations of all bodies, m.
         root: (K, f) square root of the prior covariance of the errors, its columns orthogonal.
         start: theta (K,) and shifts; zero by default.
         options: of scipy.
@@ -419,7 +390,8 @@ def solve(
     if start is not None:
         u0 = torch.cat([(root.mT @ start[0]) / root.square().sum(0), start[1]])
     hidden = [own.isnan() for own in rows.errors(root @ u0[:f], u0[f:])]
-    weights = [1 / own[..., None] for own in sigma]
+    counts = [own[..., 0].numel() for own in hidden]
+    weights = [1 / s.view(own.shape[:2])[..., None] for s, own in zip(sigma.split(counts), hidden, strict=True)]
     size = len(u0) + sum(own.numel() for own in hidden)
 
     def residual(u: np.ndarray) -> np.ndarray:
@@ -443,5 +415,5 @@ def solve(
     u, V = torch.from_numpy(found.x).clone(), torch.from_numpy(Vt.T / s).clone()  # aligned: the same digits every time
     theta, shifts, known = root @ u[:f], u[f:], root @ V[:f]
     leverage = torch.from_numpy(np.square(U[: -len(u)]).sum(1)).split([own.numel() for own in hidden])
-    each = _flat([own.view(h.shape).sum(2) for own, h in zip(leverage, hidden, strict=True)])
-    return Fit(theta, known @ known.mT, shifts, rows.errors(theta, shifts), each)
+    each = [own.view(h.shape).sum(2).flatten() for own, h in zip(leverage, hidden, strict=True)]
+    return Fit(theta, known @ known.mT, shifts, rows.errors(theta, shifts), torch.cat(each))

@@ -229,7 +229,7 @@ def find_joint_offsets(
     places = torch.eye(geometry.size, dtype=twists.dtype, device=twists.device)
     root = torch.cat([deviation * twists, FREE_STD * places[:, parts["base"]], FREE_STD * places[:, parts["tool"]]], 1)
     rows = Rows(geometry, (MeasuredPoints.of(q, points),))
-    fit = solve(rows, [torch.full_like(points[..., 0], noise)], root, **options)
+    fit = solve(rows, points.new_full((points[..., 0].numel(),), noise), root, **options)
     return (twists.mT @ fit.theta) / twists.square().sum(0)
 
 

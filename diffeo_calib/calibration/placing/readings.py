@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from math import inf
 from typing import NamedTuple
 
 import torch
@@ -17,13 +18,11 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_size
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import (
-    Bodies,
     Fit,
     Identification,
     Prior,
     ReadRows,
     Rows,
-    body_squares,
     estimated,
     held_parameters,
     solve,
@@ -157,12 +156,10 @@ def register_readings(bare: Geometry, tables: Sequence[Readings]) -> Identificat
 def _described(best: RoughFit) -> Identification:
     """Ball and devices with the deviations that the noise of every kind of readings leaves."""
     rows, fit = best.rows, best.fit
-    bodies, root = Bodies.of(fit.errors), Prior().root(rows.geometry, _all_but_ball(rows.geometry))
-    sigma, at = bodies.split(typical_noise(fit.errors)[bodies.kind]), (fit.theta, fit.shifts)
-    fit = solve(rows, sigma, root, start=at, max_nfev=STARTS_STEPS, loss="soft_l1")
-    squares, numbers = body_squares(fit.errors), sum(own.numel() for own in fit.errors)
-    noise = float((squares.sum() / numbers).sqrt())
-    return rows.found(fit, noise, Prior(), bodies, Tails.none(len(squares), 1))
+    root, at = Prior().root(rows.geometry, _all_but_ball(rows.geometry)), (fit.theta, fit.shifts)
+    fit = solve(rows, typical_noise(fit.errors), root, start=at, max_nfev=STARTS_STEPS, loss="soft_l1")
+    noise = float(torch.cat([own.flatten() for own in fit.errors]).square().mean().sqrt())
+    return rows.found(fit, noise, Prior(), Tails(inf, torch.ones_like(fit.leverage)))
 
 
 class RoughFit(NamedTuple):
@@ -192,7 +189,7 @@ def _rough_fits(starts: Sequence[Rows]) -> list[RoughFit]:
     """From each start that leads anywhere, the best first."""
     found = []
     for rows in starts:
-        sigma = [own.q.new_full((len(own.q), 1), ROUGH_M) for own in rows.parts]
+        sigma = rows.parts[0].q.new_full((sum(len(own.q) for own in rows.parts),), ROUGH_M)
         root = Prior().root(rows.geometry, _all_but_ball(rows.geometry))
         with suppress(InputError):  # the start has the ball at a fixed point or behind a camera
             fit = solve(rows, sigma, root, max_nfev=STARTS_STEPS, loss="soft_l1")
