@@ -34,7 +34,7 @@ from diffeo_calib.common.threads import large_work
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.re_registration.registered_map import robot_map
+from diffeo_calib.kinematics.registered_map import robot_map
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.poses import mark_points
