@@ -64,7 +64,7 @@ class Live:
 
     def say(self, text: str, entry: Entry) -> None:
         """Print a text, or an entry as a line of JSON."""
-        if self.given.json_lines:
+        if self.given.stdin:
             sys.stdout.write(as_line(entry).decode())
             sys.stdout.flush()
         elif text:
@@ -140,7 +140,7 @@ class Live:
             return False
         self.journal.add(self._revised())
         self.late += self.revised
-        if not self.given.json_lines:  # those who send rows as JSON lines get one answer for each
+        if not self.given.stdin:  # those who send rows get one answer for each
             changed = "\n".join(str(self.campaign.verdicts[row]) for row in self.revised)
             self._say(({"text": changed} if changed else {}) | self.state())
         return True

@@ -167,13 +167,13 @@ def _tools(model: CalibratedKinematics, named: CorrectOptions, table: TableForma
     numbers = named.tool or [None] * max(len(tips), 1)
     if len(tips) < 2:
         tip = checked_tip(robot, model.tool_tip)
-        return [ToolOnTip(tip, tool_in_tip(model, numbers[0], named.tool_from, table))]
+        return [ToolOnTip(tip, tool_in_tip(model, numbers[0], table))]
     found = []
     for k, (tip, text) in enumerate(zip(tips, numbers, strict=True)):
         if tip in tips[:k]:
             raise InputError.of(f"--tip {tip} is named twice", fix="name every tip once")
         own = model.tool if checked_tip(robot, tip) == model.tool_tip else None
-        tool = tool_in_tip(model.with_tool(own, tip), text, named.tool_from, table)
+        tool = tool_in_tip(model.with_tool(own, tip), text, table)
         found.append(ToolOnTip(tip, tool, robot.tips.index(tip)))
     return found
 

@@ -1,4 +1,4 @@
-"""`diffeo-calib evaluate`: errors of a model on a table of any kinds; `predict`: markers or poses for joint values."""
+"""`diffeo-calib evaluate`: errors of a model, as tables or a page; `predict`: markers or poses for joint values."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -33,6 +34,7 @@ from diffeo_calib.kinematics.evaluation import (
     residuals,
     rows_of_other_frames,
     rows_used_in_fit,
+    unseen,
 )
 from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, repeated_lines, warn_outside_range
 from diffeo_calib.measurements.csv.cells import number
@@ -42,6 +44,8 @@ from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import write_rows
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import BESIDE, TableFormat, options_of
+from diffeo_calib.reports.html.sentences import advice, verdict
+from diffeo_calib.reports.report import write_report
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, Evaluations
 from diffeo_calib.sensors.set_ups import SESSION
 
@@ -51,6 +55,11 @@ COLUMNS = ("line", "used_in_fit", "kind", "device", "marker", "dx", "dy", "dz", 
 def run(options: EvaluateOptions) -> None:
     """Run the command."""
     model = models.load_kinematics(options.model)
+    if options.report is not None:
+        return _reported(model, options.report, options)
+    if options.csv is None:
+        fix = "name it, or write a page about the rows of the fit by --report"
+        raise InputError.of("the table of measurements", expected="CSV", got="none", fix=fix)
     source = models.table_of(model, options.csv, options.rows, options.units)
     limit = printed.parsed_limit(options.tolerance)
     models.check_payload_column(model, source.table.payload)
@@ -64,10 +73,10 @@ def run(options: EvaluateOptions) -> None:
     found, used = residuals(model, places, data), rows_used_in_fit(model, data.q)
     judged = judge(model, places, data, found)
     _show(model, found, used, positions_of(model, places, data), options.model.name)
-    if options.residuals is not None:
-        write_rows(options.residuals, COLUMNS, [list(_residuals(found, used, source))], source.table)
-        record.add(files={"residuals": options.residuals})
-        say(f"residuals: {options.residuals}")
+    if options.output is not None:
+        write_rows(options.output, COLUMNS, [list(_residuals(found, used, source))], source.table)
+        record.add(files={"residuals": options.output})
+        say(f"residuals: {options.output}")
     if SESSION in places.devices:
         record.add(session_transforms=places.devices[SESSION].entry())
     if places.numbers:
@@ -151,6 +160,30 @@ def _registered(model: CalibratedKinematics, data: Any, options: EvaluateOptions
     say(*map(plain, (*printed.registration_lines(found), *placement_sentences(found))))
     if output is not None:
         say(f"registered model: {output}")
+
+
+def _reported(model: CalibratedKinematics, page: Path, options: EvaluateOptions) -> None:
+    """Write the page, and say its first line."""
+    data, tolerance = None, printed.parsed_length(options.tolerance)
+    if options.csv is not None:
+        data = models.table_of(model, options.csv, options.rows, options.units).read(model.robot)
+    if tolerance is not None and data is not None and not bool(unseen(model, data.q).any()):
+        expected, fix = "rows that took no part in fit and registration", "measure more rows, or leave the table out"
+        raise InputError.of("rows to hold against --tolerance", expected=expected, got=f"{len(data)} that did", fix=fix)
+    with progress_bar() as progress:
+        against = options.against or []
+        found = write_report(model, page, data, against=against, tolerance=tolerance, progress=progress)
+    say(*models.provenance_lines(model))
+    words, stages = verdict(found, tolerance), dict(found.expected)
+    kinds = {kind: one.stages for kind, one in found.kinds.items()}
+    record.add(**entries_by_kind(kinds), expected_error_by_stage_m=stages, left_out=not found.new)
+    record.add(verdict=words, advice=list(advice(found)), files={"report": page})
+    if found.predictions is not None:
+        record.add(coverage_95=found.predictions.coverage())
+    if data is not None and not found.new:
+        each = "as fitted" if not found.errors else "each predicted by all others"
+        say(f"all rows of the table were used before: the rows of the fit are shown, {each}")
+    say(words, *printed.expectation_lines(model, None, found.deviations.error), f"report: {page}")
 
 
 # --- predictions
