@@ -23,10 +23,11 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.gates import CHANGE_ROWS
-from diffeo_calib.calibration.diagnostics.hypotheses import Evidence, JudgedRows, changes_of
+from diffeo_calib.calibration.diagnostics.hypotheses import JudgedRows, changes_of
 from diffeo_calib.calibration.diagnostics.judge import best_of, chance_of_jump, changes, crooked_axes
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.sensors.devices import Hypothesis
 

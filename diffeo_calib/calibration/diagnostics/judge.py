@@ -35,7 +35,6 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import (
     MARKERS,
-    Evidence,
     JudgedRows,
     axes_of,
     changes_of,
@@ -48,6 +47,7 @@ from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import few, sentence, warn_user, with_deviation
 from diffeo_calib.common.quantiles import chi2_above, chi2_probability
+from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.process import Process
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import FACTORS

@@ -24,7 +24,6 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
 from diffeo_calib.calibration.diagnostics.row_order import find_block
 from diffeo_calib.calibration.recalibration.changes import LEVEL, Change, Changes, Offset
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows
@@ -34,6 +33,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.registered_map import robot_map
 from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.process.evidence import Evidence
 
 SMALLEST_AMPLITUDE_SHARE = 0.5
 """A small transmission error counts with this share of the largest joint's amplitude: it may have grown."""
