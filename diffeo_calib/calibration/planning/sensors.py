@@ -215,10 +215,9 @@ class DeviceReadings(Sensor):
 
     def reached(self, base: Tensor) -> dict[str, Any]:
         """Where the ball must be brought."""
-        held = [one.devices.places for one in self.devices if one.devices.places is not None]
-        if not held:
-            return {}
-        return {"places": torch.cat(held) if self.new else (torch.cat(held) - base[:3, 3]) @ base[:3, :3]}
+        held = torch.cat([one.devices.places for one in self.devices])
+        held = held if self.new else (held - base[:3, 3]) @ base[:3, :3]
+        return {"places": held} if len(held) else {}
 
     def told(self, scene: Scene, among: Tensor) -> Iterator[Told]:
         """Every device at the configurations in which it sees the tool: the ball, or the last measured frames."""
