@@ -21,7 +21,7 @@ from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.measurements.csv.columns import Columns, Joints
+from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.lines import write_rows
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.process.scales import Hyperparameters
@@ -179,9 +179,9 @@ class Plan:
         own = dict(zip(self.joint_names, self.q.T, strict=True)) | {"rank": self.rank}
         return data_frame(own | ({"device": list(self.devices)} if self.devices else {}))
 
-    def write(self, path: str | PathLike[str], table: TableFormat, joints: Joints | None = None) -> None:
-        """The same as :meth:`to_csv` for a format that is given as one object, and other names of the joints."""
-        columns = Columns.of(table.joints_only(joints or self.joint_names, self.kinds))
+    def write(self, path: str | PathLike[str], table: TableFormat) -> None:
+        """The same as :meth:`to_csv` for a format that is given as one object, which may name the joints otherwise."""
+        columns = Columns.of(replace(table.joints_only(), joints=table.joints or self.joint_names, kinds=self.kinds))
         devices = [[name] for name in self.devices] or [[]] * len(self)
         values = columns.joints_from_si(self.q).round(decimals=JOINT_DIGITS).tolist()
         rows = zip(values, self.rank.tolist(), devices, strict=True)
