@@ -358,7 +358,10 @@ class PlanOptions(Command):
     )
     payload: float | None = option(MASS, "MASS")
     needs = (("--payload --free", "MODEL"),)
-    excludes = (("--robot --base --tip --load --dh-convention --marker", "MODEL"),)
+    excludes = (
+        ("--robot --base --tip --load --dh-convention --marker", "MODEL"),
+        ("--draw --range --tracker --floor --column --collisions", "--candidates"),
+    )
 
 
 class RecalibrateOptions(Command):

@@ -51,11 +51,11 @@ def load_robot(path: Path, links: Links) -> Tree:
 
 def robot_of(given: Robot, source: MeasuredTable) -> Tree:
     """The robot of a table: that of a file, or a machine whose commanded poses are in the table."""
-    if isinstance(source.joints, PoseColumns):
+    if isinstance(source.table.joints, PoseColumns):
         if given.robot is not None or any(vars(given.links).values()):
             what, fix = "--robot, --base or --tip beside --robot-pose", "leave them out: poses are those of the flange"
             raise InputError.of(what, expected="joint values, or poses", got="both", fix=fix)
-        return cartesian(read_poses(source.csv, source.joints, source.table))
+        return cartesian(read_poses(source.csv, source.table))
     if given.robot is None:
         expected = "--robot FILE, or --robot-pose COLUMNS where the table has poses in place of joint values"
         fix = "of several lines that a campaign file proposes, uncomment one"
