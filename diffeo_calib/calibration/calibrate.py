@@ -26,14 +26,8 @@ from diffeo_calib.calibration.choose_scales import (
     robot_problem,
 )
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.hypotheses import (
-    lengths,
-    warn_of_lengths,
-    warn_of_taken_scales,
-    worth_it,
-)
-from diffeo_calib.calibration.diagnostics.mixed_rows import other_payloads, two_tools
-from diffeo_calib.calibration.diagnostics.moved_devices import change_during, crooked_axis
+from diffeo_calib.calibration.diagnostics.hypotheses import worth_it
+from diffeo_calib.calibration.diagnostics.judge import judge, lengths, warn_of_lengths, warn_of_taken_scales
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.outliers import (
     outliers,
@@ -236,14 +230,10 @@ def _result(
     explained, found = parts(model), outliers(model, placed, data, chosen.judged, least)
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
     warn_of_outliers(found, placed.data)
-    lines, devices = placed.data.line_numbers, placed.placement.hypotheses(data, CHANGE)
-    changed = (
-        placed.mislabelled(model, found)
-        or other_payloads(data, scales, lines)
-        or change_during(lines, data, scales, chosen.left_out, devices, bodies=placed.placement.bodies)
-        or two_tools(data, scales, lines)
-    )
-    warn_of_contradictions(model, placed.coordinates, found, changed)
+    devices, bodies = placed.placement.hypotheses(data, CHANGE), placed.placement.bodies
+    best = judge(data, scales, chosen.left_out, placed.data.line_numbers, devices=devices, bodies=bodies)
+    explained_by = placed.mislabelled(model, found) or (best and best.text)
+    warn_of_contradictions(model, placed.coordinates, found, explained_by)
     warn_of_rounding(robot, placed.data, data, chosen.left_out)
     found_lengths = lengths(data, scales, placed.placement.hypotheses(data, VALUE))
     summary = Summary(
@@ -256,7 +246,7 @@ def _result(
         rows=len(data.x),
         parts={part.name: part.displacement for part in explained},
         effective_parameters=chosen.left_out.effective,
-        length_in_doubt=max(warn_of_lengths(found_lengths) or 0.0, crooked_axis(data, scales) or 0.0) or None,
+        length_in_doubt=max(warn_of_lengths(found_lengths) or 0.0, best.doubt if best else 0.0) or None,
         warnings="\n".join(warned) or None,
     )
     return CalibrationResult(

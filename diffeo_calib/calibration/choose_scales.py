@@ -33,12 +33,12 @@ from diffeo_calib.calibration.scales.leave_one_out import (
     cross_validated_inflation,
     inflation_by_places,
     leave_one_out,
+    variance_ratio,
     weighed,
 )
 from diffeo_calib.calibration.scales.selection import Selection, defaults, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import InputError, sentence, warn_user
-from diffeo_calib.common.quantiles import chi2_median
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -211,11 +211,6 @@ def _with_gear_lines(
     data, start = data.with_gear_lines(lines), replace(found.scales, lines=lines)
     centre = replace(centre, lines=lines, payload=start.payload)
     return _supported(select(centre, data, start=start, seed=seed, progress=progress), data, seed)
-
-
-def variance_ratio(data: TangentData, left_out: LeaveOneOut) -> float:
-    """Squared leave-one-out errors relative to what the scales predict: medians, since outliers are reported apart."""
-    return float((left_out.squares / data.noise_model.of_freedom(chi2_median, left_out.squares)).nanmedian())
 
 
 def _warn_of_wrong_scales(data: TangentData, left_out: LeaveOneOut) -> None:

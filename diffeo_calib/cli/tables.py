@@ -26,7 +26,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.files import PROGRAM
 from diffeo_calib.measurements.csv.cells import number
-from diffeo_calib.measurements.csv.files import read_joints, read_observations
+from diffeo_calib.measurements.csv.files import read_observations
 from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
@@ -52,8 +52,12 @@ def table_format(units: Units) -> TableFormat:
         fix = "state the units of the table; a model that `fit` made knows those of its own"
         raise InputError.of(f"{missing} missing", fix=fix)
     sep = "," if units.sep is None else "\t" if units.sep in ("\\t", "tab") else units.sep
-    decimal = "." if units.decimal is None else units.decimal
-    return TableFormat(length, angle, sep, decimal, joint_length=units.joint_length)
+    decimal, joints = "." if units.decimal is None else units.decimal, _split_names(units.joints or "")
+    if units.robot_pose is not None and units.joints is not None:
+        fix = "name the columns of the pose, or those of the joints"
+        raise InputError.of("--joints beside --robot-pose", expected="one of them", got="both", fix=fix)
+    own = PoseColumns.of(units.robot_pose) if units.robot_pose is not None else joints if any(joints) else ()
+    return TableFormat(length, angle, sep, decimal, joint_length=units.joint_length, joints=own)
 
 
 def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
@@ -86,7 +90,7 @@ def measured_table(csv: Path, rows: Rows, units: Units, duplicates: str = "keep"
         with suppress(MeasurementError):  # rows may come later
             names = CsvLines(csv, table.sep).header
     readings = readings_columns(rows.reading or (), rows, names)
-    return MeasuredTable(csv, joints_of(units), replace(table, readings=readings), duplicates)
+    return MeasuredTable(csv, replace(table, readings=readings), duplicates)
 
 
 def with_places(csv: Path, rows: Rows, table: TableFormat) -> Path:
@@ -190,10 +194,7 @@ class MeasuredTable:
     """A table of measurements as the options describe it."""
 
     csv: Path
-    # names of the joint columns, separated by commas; None if they are named after the robot's joints; or the columns
-    # of a pose
-    joints: str | PoseColumns | None
-    table: TableFormat  # what it holds, but for the joints
+    table: TableFormat  # what it holds; without joints they are named after the robot's
     duplicates: str = "keep"  # what to do with exactly repeated rows
     growing: bool = False  # whether rows will be added
 
@@ -208,7 +209,7 @@ class MeasuredTable:
             expected, fix = f"{len(triples)}, one for each --position", "repeat a tip that carries several markers"
             raise InputError.of("--tip", expected=expected, got=len(tips), fix=fix)
         session = given.session if triples or not given.readings else None  # of readings it names their devices
-        table = replace(given, joints=joint_columns(self.joints, robot), kinds=robot.kinds, session=session)
+        table = replace(of_robot(given, robot), session=session)
         data = read_observations(self.csv, table, duplicates=self.duplicates, growing=self.growing)
         named: Any = given.marker and data.origin.columns.table.marker
         if given.marker != named:  # later tables have the same order
@@ -230,15 +231,10 @@ class ProgramTable:
     """A robot's program as the options describe it, with the columns of the targets of every tool, if any."""
 
     csv: Path
-    joints: str | PoseColumns | None
-    table: TableFormat
+    table: TableFormat  # with the joints of the robot
     given: Targets
 
-    def commands(self, robot: Tree) -> Tensor:
-        """(N, n) joint values, rad or m."""
-        return read_joints(self.csv, joint_columns(self.joints, robot), self.table, kinds=robot.kinds)
-
-    def targets(self, robot: Tree, tools: int) -> Tensor | None:
+    def targets(self, tools: int) -> Tensor | None:
         """(N, T, 4, 4) poses or (N, T, 3) positions of T tools, m; None if the table has none."""
         given, position, rotation = self.given, self.given.position, self.given.rotation
         if not position:
@@ -249,9 +245,8 @@ class ProgramTable:
             fix = "name the columns of the targets once for every --tip"
             raise InputError.of("--position", expected=f"{tools} of them", got=len(position), fix=fix)
         turned = Rows(rotation=rotation, convention=given.convention, rotation_angle=given.rotation_angle)
-        table = replace(with_rows(self.table, turned) if rotation else self.table, kinds=robot.kinds)
-        names = [_split_names(text) for text in position]
-        table = replace(table, joints=joint_columns(self.joints, robot), position=names)
+        table = with_rows(self.table, turned) if rotation else self.table
+        table = replace(table, position=[_split_names(text) for text in position])
         data = read_observations(self.csv, table, duplicates="keep", growing=True)  # 0, 0, 0 is a target
         lines = [line for line, _ in read_cells(self.csv, table.sep, numeric_columns(table).names)[1]]
         if len(data) < len(lines):
@@ -261,9 +256,9 @@ class ProgramTable:
 
     def written(self) -> TableFormat:
         """The format of the poses that are written: the same convention, by default that of commanded poses."""
-        convention, angle = self.given.convention, self.given.rotation_angle
-        if convention is None and isinstance(self.joints, PoseColumns) and not self.joints.is_program:
-            convention, angle = self.joints.convention or None, angle or self.table.angle
+        convention, angle, joints = self.given.convention, self.given.rotation_angle, self.table.joints
+        if convention is None and isinstance(joints, PoseColumns) and not joints.is_program:
+            convention, angle = joints.convention or None, angle or self.table.angle
         plain = replace(self.table, convention=convention, rotation_angle=angle)
         return plain.for_writing(rotation_std=False)
 
@@ -282,36 +277,30 @@ def tool_frame(text: str, table: TableFormat) -> Tensor:
     return frame
 
 
-def joints_of(units: Units) -> str | PoseColumns | None:
-    """The columns of the joints, or of the pose in their place, as the options name them."""
-    if units.robot_pose is None:
-        return units.joints
-    if units.joints is not None:
-        fix = "name the columns of the pose, or those of the joints"
-        raise InputError.of("--joints beside --robot-pose", expected="one of them", got="both", fix=fix)
-    return PoseColumns.of(units.robot_pose)
-
-
-def joint_columns(joints: str | PoseColumns | None, robot: Tree) -> list[str] | PoseColumns:
-    """Names of the joint columns: those given, or the robot's; or the columns of the pose of a machine."""
+def of_robot(table: TableFormat, robot: Tree) -> TableFormat:
+    """The same format with the joints of a robot, in columns that it names, or else after them; or with its poses."""
+    joints, own = table.joints, list(robot.joint_names)
     if isinstance(joints, PoseColumns):
         count = robot.n if joints.is_program else len(joints.columns) if not joints.convention else POSE_JOINTS
         if not is_cartesian(robot) or robot.n != count:
             expected = f"the {robot.n} joint values of robot '{robot.name}'"
             raise InputError.of(f"--robot-pose {','.join(joints.columns)}", expected=expected, got="other inputs")
-        return replace(joints, robot=robot)
-    if not joints:
-        return list(robot.joint_names)
-    names = _split_names(joints)
-    if names != list(robot.joint_names) and sorted(names) == sorted(robot.joint_names):
+        return replace(table, joints=replace(joints, robot=robot), kinds=robot.kinds)
+    names, order = list(joints) or own, ",".join(own)
+    if names != own and sorted(names) == sorted(own):
         what = "--joints names the robot's joints in another order than the robot's"
         fix = "leave it out: columns that are named after the joints are found wherever they are"
-        expected, got = ",".join(robot.joint_names), ",".join(names)
-        raise InputError.of(what, expected=expected, got=got, fix=fix)
+        raise InputError.of(what, expected=order, got=",".join(names), fix=fix)
     if len(names) != robot.n:
-        order = ", ".join(robot.joint_names)
-        raise InputError.of(f"--joints {joints}", expected=f"{robot.n} columns, in the order {order}", got=len(names))
-    return names
+        expected = f"{robot.n} columns, in the order {order.replace(',', ', ')}"
+        raise InputError.of(f"--joints {','.join(names)}", expected=expected, got=len(names))
+    return replace(table, joints=names, kinds=robot.kinds)
+
+
+def as_written(table: TableFormat) -> TableFormat:
+    """The same format with the columns in which joints, or the poses of a machine, are written."""
+    joints = table.joints
+    return replace(table, joints=joints.written) if isinstance(joints, PoseColumns) else table
 
 
 def _split_names(text: str) -> list[str]:

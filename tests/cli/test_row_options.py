@@ -249,7 +249,7 @@ def test_models_with_payloads_ask_for_them(tmp_path: Path, command: Command) -> 
     without, out = [*options[:at], *options[at + 2 :]], ["-o", tmp_path / "out"]
     for words in (
         ["evaluate", kind.file, table, *without],
-        ["report", kind.file, table, *without, *out],
+        ["evaluate", kind.file, table, *without, "--report", tmp_path / "out"],
         ["recalibrate", kind.file, table, *without, *out],
         ["predict", kind.file, table, *UNITS, *out],
         ["correct", kind.file, table, *UNITS, *out],

@@ -32,7 +32,7 @@ from torch import Tensor
 from diffeo_calib.calibration.scales.selection import SEARCH_LIMITS, select
 from diffeo_calib.calibration.scales.tangent_data import KEPT_COORDINATES, TangentData
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.quantiles import known
+from diffeo_calib.common.quantiles import chi2_median, known
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import Tails, gross_weights, reweight
@@ -145,6 +145,11 @@ def leave_one_out(
         effective.append(part.coordinates - noise)
     errors = data.in_coordinates(errors).masked_fill(~data.visible, nan)
     return LeaveOneOut(errors, squares, effective[0] if len(effective) == 1 else None, told.coordinates)
+
+
+def variance_ratio(data: TangentData, left_out: LeaveOneOut) -> float:
+    """Squared leave-one-out errors relative to what the scales predict: medians, since outliers are reported apart."""
+    return float((left_out.squares / data.noise_model.of_freedom(chi2_median, left_out.squares)).nanmedian())
 
 
 def random_blocks(data: TangentData, seed: int, coordinates: int) -> list[Tensor]:

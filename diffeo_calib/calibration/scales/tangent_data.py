@@ -112,6 +112,11 @@ class TangentData:
         """(N, m, K) S, derivatives by theta."""
         return self.slopes @ self.nominal.sensitivities(self.x, self.theta)
 
+    @property
+    def by_tool(self) -> Tensor:
+        """(N, m, 3 P) derivatives by the places of the points on their tips."""
+        return self.sensitivities[..., self.nominal.geometry.slices["tool"]]
+
     @cached_property
     def target(self) -> Tensor:
         """(N, m) measured minus model at zero fields and zero theta, m."""
