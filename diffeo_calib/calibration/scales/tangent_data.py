@@ -213,7 +213,7 @@ class TangentData:
 
     @property
     def good(self) -> TangentData:
-        """The same without what is more likely gross: weighed by the noise of one search, it would hold it in the next."""
+        """The same without what is more likely gross: by its weights it would hold the noise where it was."""
         if not self.tails.gross:
             return self
         gross = (self.tails.weights < 0.5).repeat_interleave(self.noise_model.size, 1)
