@@ -23,10 +23,11 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.gates import CHANGE_ROWS
-from diffeo_calib.calibration.diagnostics.hypotheses import Evidence, JudgedRows, changes_of
-from diffeo_calib.calibration.diagnostics.judge import best_of, chance_of_jump, changes, crooked_axes
+from diffeo_calib.calibration.diagnostics.hypotheses import JudgedRows, changes_of
+from diffeo_calib.calibration.diagnostics.judge import best_of, changes, crooked_axes
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.sensors.devices import Hypothesis
 
@@ -290,12 +291,6 @@ def test_three_set_ups_are_no_drift() -> None:
     found = re.search(r"moved more than once, near rows (\d+) and (\d+)", text)
     assert found is not None, text
     assert [int(row) for row in found.groups()] == pytest.approx([30, 60], abs=3)
-
-
-@pytest.mark.parametrize(("gain", "unknowns", "level"), [(8.68, 1, 0.05), (12.16, 1, 0.01), (18.3, 5, 0.05)])
-def test_the_chance_of_a_jump_is_a_little_more_than_the_tabulated_one(gain: float, unknowns: int, level: float) -> None:
-    """By table I of Andrews, Econometrica 71 (2003), without 15 % of the rows at both ends."""
-    assert 1.05 < chance_of_jump(gain, unknowns, 0.15) / level < 1.15
 
 
 @pytest.mark.slow

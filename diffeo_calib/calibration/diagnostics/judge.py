@@ -8,13 +8,9 @@ Those that chance does not explain are compared by the left-out errors that rema
 that its kind may leave: the best is named.
 
 Scales that were selected with a change in the rows call it noise; noise that has one sign before a row and the other
-after it is still no chance, since each row adds about one to the gain. Chance makes the largest of the gains of all
-rows exceed t with probability
-
-    t^(U/2) e^(-t/2) / (2^(U/2) Gamma(U/2)) ((1 - U/t) log((1 - e)^2 / e^2) + 4/t),    e: share of the rows left out
-
-(M. Csorgo, L. Horvath, "Limit theorems in change-point analysis", 1997, section 1.3). A drift gains chi-squared. Codes
-of a mixture explain some noise too: what they explain by chance is measured with the effects of other rows.
+after it is still no chance, since each row adds about one to the gain. Gains of changes pay for their unknowns and
+their row by the Bayesian information criterion. Codes of a mixture explain some noise too: what they explain by chance
+is measured with the effects of other rows.
 
 Errors of links and a wrong scale of the device look alike: the fit takes up either without a trace in its residuals.
 What tells them apart is how improbable links are that are wrong by so much: a length of the robot, its links or the
@@ -25,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import exp, inf, lgamma, log
+from math import inf, log
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -35,7 +31,6 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import (
     MARKERS,
-    Evidence,
     JudgedRows,
     axes_of,
     changes_of,
@@ -47,7 +42,8 @@ from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, variance_
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import few, sentence, warn_user, with_deviation
-from diffeo_calib.common.quantiles import chi2_above, chi2_probability
+from diffeo_calib.common.quantiles import chi2_above
+from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.process import Process
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import FACTORS
@@ -153,13 +149,6 @@ class Change(NamedTuple):
         """Gain less the price of the unknowns by the Bayesian information criterion; the row is one more."""
         return self.gain - (len(self.size) + (self.row is not None)) * log(len(self.codes))
 
-    @property
-    def chance(self) -> float:
-        """Probability that chance alone gains as much."""
-        if self.row is None:
-            return chi2_probability(self.gain, len(self.size))
-        return chance_of_jump(self.gain, len(self.size), gates.CHANGE_ROWS / len(self.codes))
-
     def words(self, data: TangentData) -> str:
         """Phrase for the change and its size."""
         name, verb = self.hypothesis.name, "to drift" if self.row is None else "to have moved"
@@ -184,9 +173,9 @@ def changed(
     """The clearest change during the measurements; arguments as of :func:`changes`, and lines (N,) of the rows."""
     process, order = rows.process, lines.argsort()
     found = [*changes(hypotheses, process, order, excess=excess)]
-    if not found or len(found) * min(one.chance for one in found) > gates.CHANGE_CHANCE:
-        return
     best = max(found, key=lambda one: one.evidence)
+    if best.evidence < gates.CHANGE_EVIDENCE:
+        return
     (what, E, _, advice, *_), expected = best.hypothesis, "one set-up for all rows, in the order of their numbers"
     given, fix = "with this change in the model", f"check what happened then; {advice}"
 
@@ -258,14 +247,6 @@ def _likeliest(scan: Evidence) -> int:
 def _from(order: Tensor, row: int) -> Tensor:
     """Codes (N,) of a change from a row of the order on."""
     return (order.argsort() >= row).double()
-
-
-def chance_of_jump(gain: float, unknowns: int, edge: float) -> float:
-    """Probability that chance makes the largest gain of all change points larger; ``edge``: share e left out."""
-    if gain <= unknowns + 1:
-        return 1.0
-    density = exp(0.5 * unknowns * log(0.5 * gain) - 0.5 * gain - lgamma(0.5 * unknowns))
-    return min(1.0, density * ((1 - unknowns / gain) * 2.0 * log((1 - edge) / edge) + 4.0 / gain))
 
 
 # --- rows of several kinds --------------------------------------------------------------------------------------------

@@ -36,11 +36,11 @@ from diffeo_calib.calibration.identification.registration import (
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.re_registration.new_rows import LinearRows
 from diffeo_calib.measurements.checks import numbers_of
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.sockets import SEPARATOR, Sockets
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.regression.linear_rows import LinearRows
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
