@@ -31,7 +31,6 @@ from diffeo_calib.calibration.identification.identification import (
     estimated,
     held_parameters,
 )
-from diffeo_calib.calibration.placing.drift import Drift
 from diffeo_calib.calibration.placing.lens import LensAndBoard
 from diffeo_calib.calibration.placing.placement import OtherLabel, OtherRows, Placement
 from diffeo_calib.calibration.placing.readings import (
@@ -41,7 +40,7 @@ from diffeo_calib.calibration.placing.readings import (
     reading_sets,
     register_readings,
 )
-from diffeo_calib.calibration.placing.sessions import Sessions
+from diffeo_calib.calibration.placing.sessions import Drift, Sessions
 from diffeo_calib.calibration.placing.sockets import SocketDevices, register_coordinates
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -58,7 +57,7 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import errors_of_kinds
-from diffeo_calib.sensors.devices import ROW, Devices
+from diffeo_calib.sensors.devices import ROW
 from diffeo_calib.sensors.errors import Evaluations, shown_unit
 from diffeo_calib.sensors.places import Places, fitting_devices
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings, ball_tip, check_poses, divided, with_markers
@@ -210,12 +209,6 @@ class Placed:
             return [None] * len(kinematics)
         places = Places(ball=self.ball)
         return [residuals(stage, places, self.coordinates.table).positions_rms for stage in kinematics]
-
-    @property
-    def devices_by_stage(self) -> list[tuple[Devices, ...]]:
-        """The devices of readings at the registration, after the geometric calibration, and now."""
-        stages = self.registration.devices, self.identification.devices
-        return [*stages, tuple(own.devices for own in self.readings)]
 
     def tangent_data(self) -> TangentData:
         """The rows around the geometric calibration, weighted by its residuals."""
