@@ -28,8 +28,10 @@ from diffeo_calib.calibration.identification.identification import (
     Prior,
     ReadRows,
     Rows,
+    described,
     estimated,
     held_parameters,
+    with_ball,
 )
 from diffeo_calib.calibration.placing.lens import LensAndBoard
 from diffeo_calib.calibration.placing.placement import OtherLabel, OtherRows, Placement
@@ -349,17 +351,18 @@ def _by_coordinates(
     warn_of_joints_below_tip(robot, table)
     warn_of_open_directions(robot, table, registration)
     tables, adrift = [one.table for one in readings], table.without_device
+    geometry, ball = registration.geometry, None
     if not places:
-        tip = ball_tip(None, readings, registration.geometry.on[-1])
-        ball = ball_of(tables, registration.geometry, tip)
-        registration = registration if ball is None else registration.with_ball(ball)
-    geometry = registration.geometry
+        ball = ball_of(tables, geometry, ball_tip(None, readings, geometry.on[-1]))
+        geometry = geometry if ball is None else with_ball(geometry, ball)
     devices = tuple(fitting_devices(one, geometry.points(one.q)) for one in tables)
+    shared = [one.shared(len(table), 3 * table.markers).unflatten(1, (-1, 3)) for one in places]
+    rows = Rows(geometry, (MeasuredPoints.of(table.q, table.points, *shared), *map(ReadRows, tables, devices)))
+    if ball is not None:
+        registration = described(rows, [registration.noise])
     registration = replace(registration, devices=devices)
     progress("geometry", 0, 1)
-    shared = [one.shared(len(table), 3 * table.markers).unflatten(1, (-1, 3)) for one in places]
-    parts = MeasuredPoints.of(table.q, table.points, *shared), *map(ReadRows, tables, devices)
-    found = estimated(Rows(geometry, parts), held_parameters(geometry, adrift=adrift))
+    found = estimated(rows, held_parameters(geometry, adrift=adrift))
     places = [one.found(table, found) for one in places]
     LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", 1e3 * registration.rms, 1e3 * found.rms)
     table = Placement(places).at_places(table)
