@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from diffeo_calib.calibration.recalibration.find_place import SAME_PLACE, find_place, warn_about
+from diffeo_calib.calibration.recalibration.find_place import find_place, warn_about
 from diffeo_calib.calibration.recalibration.new_rows import NewRows
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
@@ -83,8 +83,7 @@ def _placed(
 ) -> tuple[FittedMap, Registration]:
     """The map in its new place, by rows that say where the robot stands, and the record."""
     model = here.map
-    found = find_place(model, here.lever, data, **asked)
-    registration, fit, new = found.registration, model.unregistered, found.rows
+    (new, registration), fit = find_place(model, here.lever, data, **asked), model.unregistered
     warn_about(registration)
     LOG.info("registered anew: RMS %.4f mm on %d rows", 1e3 * registration.rms_after, registration.rows)
     open_by = max(float(registration.frame_deviations.max()), registration.known_m)
@@ -95,10 +94,11 @@ def _placed(
     if not (learn and dense and new.of_coordinates):
         placed = moved(fit, registration.transform).inflated(new.inflation)
         return RegisteredMap(placed, registration), registration
-    same, known = found.metres == SAME_PLACE, torch.full_like(new.deviations, PLACES.found_m_rad)
-    known[6:] = PLACES.same_m if same else found.metres
-    marks = FlangePoints(new.marks.fitted, new.old_markers, same=True) if same else new.marks
-    together = replace(new, marks=marks, deviations=known * (new.deviations > 0))
+    open_, marks = new.deviations.clone(), new.marks
+    open_[:6] = open_[:6].clamp(max=PLACES.found_m_rad)
+    if new.marker == "same":
+        open_[6:], marks = open_[6:].bool() * PLACES.same_m, FlangePoints(marks.fitted, new.old_markers, same=True)
+    together = replace(new, marks=marks, deviations=open_)
     problem, start = both_dates(together, new.inflation)  # as if nothing but places had changed
     solution = STEPS.solve(problem, fit.geodesic.integrator, start)
     if solution.interrupted:
@@ -211,21 +211,35 @@ def registration_rows(data: Any, model: Any) -> Measurements | None:
     return sensor_of(own).with_points(own, model)
 
 
-def devices_beside(model: Any, data: Any) -> tuple[PlacedDevices, ...]:
+def devices_beside(model: Any, data: Any, fitted: Sequence[PlacedDevices] = ()) -> tuple[PlacedDevices, ...]:
     """The devices of rows of any kinds, placed around a calibrated model that knows the rows' points.
 
     Devices that the model knows and that have no rows stay where they are.
+
+    Args:
+        model, data: the model and the rows.
+        fitted: devices with their rows, if the model was fitted to these: set-ups are where the fit has them.
     """
     found = list(model.placement)
     for part, _ in rows_of_one_kind(data):
         sensor_of(part).check(part, model)
         points = model.at_payloads(part.payload).map(part.q).detach().unflatten(1, (-1, 3))
-        for own in sensor_of(part).settled(part, points, model.turns):
+        for placed in sensor_of(part).settled(part, points, model.turns):
+            own = _with_rows(placed, fitted)
             alike = [number for number, old in enumerate(found) if own.devices.same_set(old.devices)]
             same = alike[0] if alike else len(found)
             alone = [] if own.devices.set_up and len(own.names) == 1 else [own]
             found[same : same + 1] = [own.beside(old) for old in found[same : same + 1]] or alone
     return tuple(found)
+
+
+def _with_rows(own: PlacedDevices, fitted: Sequence[PlacedDevices]) -> PlacedDevices:
+    """Devices with their rows of a fit, if any set of it has them; set-ups are where the fit has them."""
+    for one in fitted:
+        if one.devices.same_set(own.devices):
+            number = torch.tensor([own.names.index(name) for name in one.names], dtype=torch.int64, device=HOST)
+            return one if own.devices.set_up else replace(own, rows=one.rows, device=number[one.device])
+    return own
 
 
 def carried_devices(old: Any, new: Any, T: Tensor) -> tuple[PlacedDevices, ...]:
