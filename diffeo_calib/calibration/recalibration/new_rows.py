@@ -28,7 +28,7 @@ from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
 from diffeo_calib.kinematics.registered_map import Registration, place_slopes, robot_map, turned
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
-from diffeo_calib.maps.observation import Observation
+from diffeo_calib.maps.observation import Stacked
 from diffeo_calib.measurements.poses import block_diagonal, own_blocks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.evidence import Evidence
@@ -150,7 +150,7 @@ class NewSetUp:
 
     def _measured(
         self, T: Tensor, seen: Tensor, usual: UsualNoise
-    ) -> tuple[Tensor, Observation | None, NoiseModel, Tensor, Placement]:
+    ) -> tuple[Tensor, Stacked | None, NoiseModel, Tensor, Placement]:
         """Numbers, what these are of the points (M, 3 P), m, how they were measured, their noise, and the devices."""
         told, of_told, sets = None, seen[:0, :, None], list[DeviceSet]()
         if self.coordinates is not None:
@@ -199,7 +199,7 @@ class NewRows:
     noise: Tensor  # (M, R, R) m^2, with weights of 1
     noise_model: NoiseModel  # how they were measured
     tails: Tails  # their weights
-    observe: Observation | None  # what was measured of the markers; None for their coordinates
+    observe: Stacked | None  # what was measured of the markers; None for their coordinates
     placement: Placement  # devices that stand around the old model; what is not known of them, rows share
     shared: Tensor  # (M, R, c) effects of errors of unit variance that they share, m
     # (6 + 3 P,) of the device's frame and of the markers' coordinates before the rows, m and rad; 0 of what has not

@@ -216,8 +216,7 @@ def with_ball(fitted: FittedMap, ball: Tensor, tip: str, deviation: float) -> Fi
     spec = replace(old.spec, nominal=after, prior_variance=prior, at_controls=_of_rows(old.spec.at_controls, after))
     deformation = GeodesicDeformation(spec, old.x, Momenta(old.momenta.joint, p, theta), old.integrator)
     markers = nominal.geometry.markers
-    slopes = torch.eye(3 * markers, dtype=p.dtype, device=p.device).expand(len(fitted.x), -1, -1)
-    slopes = torch.nn.functional.pad(slopes if fitted.slopes is None else fitted.slopes, (0, 3))
+    slopes = torch.nn.functional.pad(fitted.functionals, (0, 3))
     new_noise = torch.block_diag(fitted.new_noise, own_blocks(fitted.new_noise[None], markers)[0].mean(0))
     parts = fitted.noise, fitted.data, new_noise, fitted.workspace
     return FittedMap(deformation, *parts, slopes=slopes, y=fitted.measured())

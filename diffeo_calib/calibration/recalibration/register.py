@@ -33,7 +33,6 @@ from diffeo_calib.kinematics.registered_map import (
     Registration,
     fitted_markers,
     moved,
-    place_slopes,
     robot_map,
 )
 from diffeo_calib.maps.deformation import Momenta
@@ -48,6 +47,7 @@ from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import sensor_of
 from diffeo_calib.sensors.known_drift import KnownDrift
 from diffeo_calib.sensors.places import PlacedDevices, mounted_of
+from diffeo_calib.sensors.set_ups import frame_slopes
 from diffeo_calib.sensors.tables import measured_positions, rows_of_one_kind
 
 LOG = logging.getLogger(__name__)
@@ -127,7 +127,7 @@ def both_dates(
     if bool(new.deviations[:6].any()):  # a device says where the base is
         prior[geometry.slices["base"]] = prior[geometry.slices["base"]].clamp(min=PLACES.found_m_rad**2)
     y, noise, observe = _together(new)
-    before, rows = _shared(nominal, new, drifts), y.shape[1]
+    before, rows = _shared(new, drifts), y.shape[1]
     before = pad(before, (0, new.shared.shape[2], 0, rows - before.shape[1]))
     since = pad(new.shared, (before.shape[2] - new.shared.shape[2], 0, 0, rows - new.shared.shape[1]))
     problem = Problem(
@@ -161,27 +161,24 @@ def _together(new: NewRows) -> tuple[Tensor, Tensor, Observation | None]:
     (N, r, m), (M, own) = A.shape, new.y.shape
     size, rows = max(r, own), torch.arange(N + M, device=y.device)
     parts = [Part(rows[:N], torch.arange(m, device=y.device), torch.arange(r, device=y.device), LinearFunctionals(A))]
-    if isinstance(new.observe, Stacked):
-        parts += [Part(part.rows + N, part.points, part.numbers, part.observe) for part in new.observe.parts]
-    else:
-        parts.append(Part.of_coordinates(rows[N:], own))
+    theirs = (Part.of_coordinates(rows[:M], own),) if new.observe is None else new.observe.parts
+    parts += [replace(part, rows=part.rows + N) for part in theirs]
     noise = [pad(each, 2 * (0, size - each.shape[1])) for each in (old.noise.covariance, own_noise)]
     seen = torch.cat([pad(each, (0, size - each.shape[1])) for each in (old.noise.visible, new.visible)])
     numbers = torch.cat([pad(values, (0, size - values.shape[1])) for values in (y, new.y)])
     return numbers, without_hidden(torch.cat(noise), seen), Stacked(N + M, size, m, parts)
 
 
-def _shared(nominal: GeometryMap, new: NewRows, drifts: Sequence[Callable[[Linearisation], Tensor]]) -> Tensor:
+def _shared(new: NewRows, drifts: Sequence[Callable[[Linearisation], Tensor]]) -> Tensor:
     """(N, r, c) shifts of the old rows: those they shared already, device and markers since, what has drifted since."""
-    old = new.fitted
-    around = old.geodesic.with_nominal(FlangePoints(nominal, nominal.geometry.tool, same=True))
+    old, tool = new.fitted, new.nominal.geometry.slices["tool"]
+    A, at = old.functionals, old.geodesic.linearise(None if old.data is None else old.x)
+    # about measured points, where the new map is: what rows leave open may be centimetres away in the old one
     places = old.measured() if old.slopes is None else old.fitted_points
-    moved = place_slopes(around, around.linearise(old.x), places, new.centre) * new.deviations
-    at = old.geodesic.linearise(None if old.data is None else old.x) if drifts else None
-    if old.slopes is not None:
-        moved, at = old.slopes @ moved, None if at is None else at.projected(old.slopes)
-    drifted = [] if at is None else [columns(at) for columns in drifts]
-    return torch.cat([old.noise.shared, moved[..., new.free], *drifted], 2)
+    by_frame = frame_slopes(places.unflatten(1, (-1, 3)), new.centre)
+    moved = A @ torch.cat([by_frame, at.sensitivity[..., tool]], 2) * new.deviations
+    at = at.projected(A)
+    return torch.cat([old.noise.shared, moved[..., new.free], *(columns(at) for columns in drifts)], 2)
 
 
 def _sessions(tool: Tensor, new: NewRows, newest: GeometryMap) -> SessionMarkers:
