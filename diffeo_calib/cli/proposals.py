@@ -175,7 +175,7 @@ class Source:
     def within_limits(self) -> bool:
         """Whether the values of the joints lie within the limits, in more than a small part of these."""
         low, high = self.robot.limits.unbind(1)
-        q = read_joints(self.sheet.path, self.joints, self.table, kinds=self.robot.kinds)
+        q = read_joints(self.sheet.path, replace(self.table, joints=self.joints, kinds=self.robot.kinds))
         part = (q.amax(0) - q.amin(0)) / (high - low)
         return bool(((q >= low) & (q <= high)).all()) and float(part.max()) > SMALLEST_PART
 

@@ -23,8 +23,8 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.gates import CHANGE_ROWS
-from diffeo_calib.calibration.diagnostics.hypotheses import JudgedRows, changes_of
-from diffeo_calib.calibration.diagnostics.judge import best_of, chance_of_jump, changes, crooked_axes
+from diffeo_calib.calibration.diagnostics.hypotheses import SampledRows, changes_of
+from diffeo_calib.calibration.diagnostics.judge import best_of, changes, crooked_axes
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.process.evidence import Evidence
@@ -200,11 +200,11 @@ def test_errors_that_depend_on_the_position_of_an_axis_are_named(joint: int) -> 
     arm, measurements, _ = simulated(60)
     setting = Setting(arm.nominal, measurements)
     data = setting.tangent_data
-    assert [*crooked_axes(JudgedRows.of(data, setting.scales))] == []
+    assert [*crooked_axes(SampledRows.of(data, setting.scales))] == []
     x = data.x[:, joint, None]
     shape = torch.cat([(2 * x).sin(), x.cos(), (1.5 * x).sin(), (2 * x).cos(), x.sin(), 0 * x], 1)
     moved = 5e-4 * (data.sensitivities[..., 6 + 6 * joint : 12 + 6 * joint] @ shape[:, :, None])[..., 0]
-    rows = JudgedRows.of(replace(data, y=data.y + moved), setting.scales)
+    rows = SampledRows.of(replace(data, y=data.y + moved), setting.scales)
     found = best_of(crooked_axes(rows), rows)
     assert found is not None
     assert re.search(f"position of {arm.nominal.joint_names[joint]} alone.*fall to", found.text)
@@ -291,12 +291,6 @@ def test_three_set_ups_are_no_drift() -> None:
     found = re.search(r"moved more than once, near rows (\d+) and (\d+)", text)
     assert found is not None, text
     assert [int(row) for row in found.groups()] == pytest.approx([30, 60], abs=3)
-
-
-@pytest.mark.parametrize(("gain", "unknowns", "level"), [(8.68, 1, 0.05), (12.16, 1, 0.01), (18.3, 5, 0.05)])
-def test_the_chance_of_a_jump_is_a_little_more_than_the_tabulated_one(gain: float, unknowns: int, level: float) -> None:
-    """By table I of Andrews, Econometrica 71 (2003), without 15 % of the rows at both ends."""
-    assert 1.05 < chance_of_jump(gain, unknowns, 0.15) / level < 1.15
 
 
 @pytest.mark.slow

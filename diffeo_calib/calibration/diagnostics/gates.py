@@ -13,10 +13,9 @@ JUDGED_COORDINATES = 2000
 
 CHANGE_ROWS = 5
 """Smallest number of rows on either side of a change."""
-CHANGE_CHANCE = 1e-5
-"""Of the largest of all gains."""
-CHANGE_NOISE_SHARE = 0.3
-"""RMS motion by a change, in standard deviations of the noise, below which it does not matter."""
+CHANGE_EVIDENCE = 24.0
+"""Gain less the price of its unknowns: of clean tables of 60 and 150 rows it was at most 5. Chance makes the largest of
+all gains as clear in one of 100,000."""
 OTHER_MARKERS = 0.5
 """A single marker moved if some other marker moved by less than this share of its motion."""
 CHANGES_TOLD_APART = 6.0
@@ -27,8 +26,9 @@ SURE = 3.0
 """Standard deviations from which a fall of squared left-out errors is no chance."""
 
 MIXED_ROWS, TWO_TOOLS_LEFT = 40, 0.45
-"""Rows below which tools or payloads of each prove nothing, and the part of the left-out error that may remain with two
-tools in turn: noise that is halved by its sign leaves .8."""
+"""Rows below which tools or payloads of each, or errors of an axis, prove nothing: clean tables of 10 and 15 rows
+had log odds above 6; and the part of the left-out error that may remain with two tools in turn: noise that is
+halved by its sign leaves .8."""
 PAYLOAD_ODDS, PAYLOADS_LEFT = 12.0, 0.75
 """Log odds of other payloads, beyond those by chance where every row may have any, and the part of the left-out error
 that may remain with them: of right columns 5 at most beyond chance, and .9 or more remain; none of 60 was doubted."""
@@ -36,10 +36,10 @@ ROW_ODDS = 6.0
 """Log odds of a number that differs from row to row: clean images have less than zero, focal lengths that differ by
 0.1 % fourteen and more."""
 
-AXIS_WAVES, AXIS_ROWS, AXIS_ODDS, AXIS_LEFT = 6, 40, 12.0, 0.9
-"""Half waves of the errors of an axis over its range; rows below which they prove nothing, as 10 and 15 of clean tables
-that had log odds above 6; log odds from which they are clear, at most 2.6 in 24 clean tables, and 9.5 in those of real
-robots and of all kinds; and the part of the RMS left-out error that remains with them at most."""
+AXIS_WAVES, AXIS_ODDS, AXIS_LEFT = 6, 12.0, 0.9
+"""Half waves of the errors of an axis over its range; log odds from which they are clear, at most 2.6 in 24 clean
+tables, and 9.5 in those of real robots and of all kinds; and the part of the RMS left-out error that remains with them
+at most."""
 
 # --- rows of a campaign, one by one ---
 

@@ -180,9 +180,9 @@ class NewSetUp:
         new, rows = own
         table = new.in_frames(torch.linalg.inv(T).expand(len(new), -1, -1))
         noise = noise_of_rows(self.fitted, new, table, T, usual)
-        sets, table = SocketDevices.around_model(table, rows, seen)
-        y = table.points.flatten(1)
-        sensor = NoiseModel.of(table, 0.0).without_known
+        sets = SocketDevices.around_model(table, rows, seen)
+        table = Placement(sets).at_places(table)
+        y, sensor = table.points.flatten(1), NoiseModel.of(table, 0.0).without_known
         y, noise = torch.where(y.isnan(), seen[rows], y), without_hidden(noise, sensor.visible)
         return Told(rows, y, sensor), noise, [*sets, *CameraErrors.around(table, rows)]
 

@@ -211,6 +211,14 @@ class TangentData:
         rows = order[:count].sort().values.to(self.x.device)
         return rows, self.rows(rows)
 
+    @property
+    def good(self) -> TangentData:
+        """The same without what is more likely gross: by its weights it would hold the noise where it was."""
+        if not self.tails.gross:
+            return self
+        gross = (self.tails.weights < 0.5).repeat_interleave(self.noise_model.size, 1)
+        return self._variant(noise_model=replace(self.noise_model, visible=self.visible & ~gross))
+
     def with_tails(self, tails: Tails) -> TangentData:
         """The same measurements with other weights."""
         other = self._variant(tails=tails)

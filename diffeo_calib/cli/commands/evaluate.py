@@ -16,9 +16,9 @@ from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge
 from diffeo_calib.cli import models, printed
 from diffeo_calib.cli.console import out, plain, progress_bar, say
 from diffeo_calib.cli.declarations import EvaluateOptions, PredictOptions
-from diffeo_calib.cli.options import Rows
+from diffeo_calib.cli.options import Rows, Units
 from diffeo_calib.cli.record import entries_by_kind, record
-from diffeo_calib.cli.tables import MeasuredTable, joint_columns, joints_of, table_format, with_rows
+from diffeo_calib.cli.tables import MeasuredTable, as_written, of_robot, table_format, with_rows
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, warn_user
 from diffeo_calib.common.quantiles import chi2_above
@@ -40,7 +40,6 @@ from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, repeated_l
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.files import Predictions, read_configurations, write_predictions
-from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import write_rows
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import BESIDE, TableFormat, options_of
@@ -60,7 +59,7 @@ def run(options: EvaluateOptions) -> None:
     if options.csv is None:
         fix = "name it, or write a page about the rows of the fit by --report"
         raise InputError.of("the table of measurements", expected="CSV", got="none", fix=fix)
-    source = models.table_of(model, options.csv, options.rows, options.units)
+    source = models.table_of(model, options.csv, options)
     limit = printed.parsed_limit(options.tolerance)
     models.check_payload_column(model, source.table.payload)
     say(*models.provenance_lines(model))
@@ -166,7 +165,7 @@ def _reported(model: CalibratedKinematics, page: Path, options: EvaluateOptions)
     """Write the page, and say its first line."""
     data, tolerance = None, printed.parsed_length(options.tolerance)
     if options.csv is not None:
-        data = models.table_of(model, options.csv, options.rows, options.units).read(model.robot)
+        data = models.table_of(model, options.csv, options).read(model.robot)
     if tolerance is not None and data is not None and not bool(unseen(model, data.q).any()):
         expected, fix = "rows that took no part in fit and registration", "measure more rows, or leave the table out"
         raise InputError.of("rows to hold against --tolerance", expected=expected, got=f"{len(data)} that did", fix=fix)
@@ -203,24 +202,22 @@ def run_predict(given: PredictOptions) -> None:
     """
     kinematics, output = models.load_kinematics(given.model), given.output
     say(*models.provenance_lines(kinematics))
-    table, joints = _written_as_read(kinematics, given)
-    robot, with_poses = kinematics.robot, kinematics.lever is not None
+    table = of_robot(_written_as_read(kinematics, given), kinematics.robot)
+    with_poses = kinematics.lever is not None
     if not with_poses and (table.convention or table.rotation_angle):
         what = "--convention and --rotation-angle say how orientations are written, but this model has none"
         raise InputError.of(what, fix="leave them out, or calibrate with measured poses")
-    names = joint_columns(joints, robot)
     mass = number(given.payload or "", ".")  # what the model's fit named is a column
     if mass is not None and isfinite(mass):
         kinematics, table = kinematics.with_payload(mass), replace(table, payload=None)
     else:
         models.check_payload_column(kinematics, table.payload)
-    written = names.written if isinstance(names, PoseColumns) else names
-    prefixes, columns = kinematics.bodies.prefixes(kinematics), table.joints_only(written, robot.kinds)
+    prefixes, written = kinematics.bodies.prefixes(kinematics), as_written(table)
     added = {f"{prefix}{axis}" for prefix in prefixes for axis in "xyz"}
-    if added & {*Columns.of(columns).names}:  # commanded places have these names
+    if added & {*Columns.of(written.joints_only()).names}:  # commanded places have these names
         prefixes = tuple(f"predicted_{prefix}" for prefix in prefixes)
     readings = _Readings(table, kinematics.predict_readings(kinematics.configurations[:1]))
-    values = read_configurations(given.csv, names, table, kinds=robot.kinds)
+    values = read_configurations(given.csv, table)
     q, masses = values["q"], values.get("payload")
     refuse_other_angles(kinematics, q)
     warn_outside_range(kinematics, q)
@@ -235,8 +232,7 @@ def run_predict(given: PredictOptions) -> None:
             yield q[own], mean, deviations, readings.cells(model, q[own])
 
     with progress_bar() as progress:
-        how = {"kinds": robot.kinds, "prefixes": prefixes, "more": readings.names, "poses": with_poses}
-        write_predictions(output, blocks(), table, joints=written, **how)
+        write_predictions(output, blocks(), written, prefixes=prefixes, more=readings.names, poses=with_poses)
     record.add(rows=len(q), files={"table": output})
     what = "poses" if with_poses else "positions"
     say(f"{len(q)} predictions written to {output}: joints, {what} and standard deviations of a new measurement")
@@ -247,22 +243,19 @@ def run_predict(given: PredictOptions) -> None:
         say(f"`evaluate` and `fit` read these poses with {reading_options(table, prefixes)}")
 
 
-def _written_as_read(
-    model: CalibratedKinematics, given: PredictOptions
-) -> tuple[TableFormat, str | PoseColumns | None]:
-    """The format of the predictions, and the names of the joint columns, by default those of the fit."""
-    units = given.units
-    rows = Rows(convention=given.convention, rotation_angle=given.rotation_angle, payload=given.payload)
-    read, stated = models.as_fitted(model, rows, units)
-    if units.length is None or units.angle is None:
-        rotation_angle = rows.rotation_angle or read.rotation_angle
-        rows = Rows(convention=rows.convention or read.convention, rotation_angle=rotation_angle, payload=read.payload)
-    return with_rows(table_format(stated), rows), joints_of(stated)
+def _written_as_read(model: CalibratedKinematics, given: PredictOptions) -> TableFormat:
+    """The format of the predictions, by default that of the fit."""
+    units = {name: getattr(given, name) for name in Units.names()}
+    typed = Rows(**units, convention=given.convention, rotation_angle=given.rotation_angle, payload=given.payload)
+    read = models.as_fitted(model, typed)
+    own = typed if given.length and given.angle else read
+    rows = Rows(convention=own.convention, rotation_angle=own.rotation_angle, payload=own.payload)
+    return with_rows(table_format(read), rows)
 
 
 def reading_options(table: TableFormat, prefixes: Sequence[str] = ("",)) -> str:
     """The options with which `evaluate` and `fit` read the poses that `predict` writes in this format."""
-    written, units = table.for_writing(rotation_std=False, prefixes=prefixes), table.joints_only(())
+    written, units = table.for_writing(rotation_std=False, prefixes=prefixes), replace(table.joints_only(), joints=())
     position = [[prefix + axis for axis in "xyz"] for prefix in prefixes]
     turned = {name: getattr(written, name) for name in ("rotation", "convention", "rotation_angle")}
     return shlex.join(options_of(replace(units, position=position, **turned, **dict.fromkeys(BESIDE))))
