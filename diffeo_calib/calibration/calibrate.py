@@ -186,9 +186,9 @@ def calibrate(
             warn_of_taken_scales(chosen.left_out, choose(data, measurements, *stages, models=()).left_out)
         how = chosen.selection
         if not how.interrupted and (widened := placed.widened(chosen.data, how.scales)):
-            placed, found = widened
+            placed, text = widened
             chosen = choose(placed.tangent_data(), measurements, *stages)
-            warn_user(found.sentence)
+            warn_user(text)
         LOG.info("scales: %s", chosen.selection.status)
         fitted = _fit(chosen, controls, backend, progress)
         return _result(robot, placed, chosen, fitted, note=note, warned=warned)
