@@ -140,6 +140,10 @@ class Bodies:
             board = (frames[:, 0, :3, :3].mT @ away[..., None])[..., 0]
         return pose_math.pose_jacobian(frames, self.lever, board)
 
+    def moved_words(self, points: int) -> str:
+        """Name in messages for this number of points of the tool that may have moved."""
+        return f"the {'marker' if self.lever is None else 'tool'}{'s' * (points > self.points)}"
+
     def mirrored(self, data: Any) -> Iterator[Tensor]:
         """Points (N, P, 3) in a frame of the other hand; none where a rotation shows the hand."""
         yield from [] if self.lever is not None else [data.points * data.points.new_tensor([1.0, 1.0, -1.0])]

@@ -84,7 +84,7 @@ def run(options: EvaluateOptions) -> None:
     say(*(line for errors in found.values() for line in printed.socket_lines(errors, "all rows")))
     say(*printed.expectation_lines(model, data))
     warn_outside_range(model, data.q)
-    if source.table.session is None and (count := rows_of_other_frames(model, data.q)):
+    if not source.table.session and (count := rows_of_other_frames(model, data.q)):
         what = f"{count} rows of the fit were measured in another set-up than that of the model, and are judged in its "
         warn_user(sentence(f"{what}frame", fix="name the column of the set-ups (--session), or leave these rows out"))
     if judged.refusal is not None:
