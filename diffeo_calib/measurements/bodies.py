@@ -148,6 +148,10 @@ class Bodies:
         """Points (N, P, 3) in a frame of the other hand; none where a rotation shows the hand."""
         yield from [] if self.lever is not None else [data.points * data.points.new_tensor([1.0, 1.0, -1.0])]
 
+    def exchangeable(self, data: Any) -> range:
+        """Bodies whose numbers may be exchanged in a row: a tip has one frame."""
+        return range(data.markers if self.lever is None else 0)
+
     def labels(self, data: Any, on: Sequence[str] | None = None) -> list[tuple[int | None, str | None]]:
         """Number of each of several markers, tip of each of several frames; ``on``: of points that name none."""
         count = data.markers // self.points
