@@ -186,9 +186,9 @@ def calibrate(
             warn_of_taken_scales(chosen.left_out, choose(data, measurements, *stages, models=()).left_out)
         how = chosen.selection
         if not how.interrupted and (widened := placed.widened(chosen.data, how.scales)):
-            placed, found = widened
+            placed, text = widened
             chosen = choose(placed.tangent_data(), measurements, *stages)
-            warn_user(found.sentence)
+            warn_user(text)
         devices, bodies = placed.placement.hypotheses(chosen.data, CHANGE), placed.placement.bodies
         judged = chosen.data, chosen.selection.scales, chosen.left_out, placed.data.line_numbers
         best = judge(*judged, devices=devices, bodies=bodies)

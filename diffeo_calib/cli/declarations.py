@@ -40,7 +40,7 @@ class Command(Options):
     """The options of a command; its work is ``run`` of the module of its name in ``commands``, which takes them."""
 
 
-class FitOptions(Command):
+class FitOptions(Command, Rows, Robot):
     """Calibrate a robot, test it on held-out rows, save the model.
 
     Rows may hold anything that was measured: positions, poses, a ball in sockets, readings of devices. The model is
@@ -51,10 +51,7 @@ class FitOptions(Command):
     """
 
     csv: Path = argument(CSV, "CSV")
-    robot: Robot
-    units: Units
     output: Path = written("Model file to write.", "MODEL", MISSING)
-    rows: Rows
     holdout: float = option(
         "Fraction of the rows that are not fitted but test the model; 0 for none.", default=0.3, min=0.0, max=0.9
     )
@@ -73,7 +70,7 @@ class FitOptions(Command):
     duplicates: str = option("Exactly repeated rows: error, keep or drop.", default="error")
 
 
-class CampaignOptions(Command):
+class CampaignOptions(Command, Rows, Robot):
     """Judge rows while they are measured.
 
     Follows a table that another program appends to: every row gets a verdict, the expected error of the robot and
@@ -84,9 +81,6 @@ class CampaignOptions(Command):
     """
 
     csv: Path = argument(CSV, "CSV", kind="later")
-    robot: Robot
-    units: Units
-    rows: Rows
     tolerance: str | None = option("End when the error is below this with 95 % probability: 0.15mm.", "LENGTH")
     stdin: bool = option(
         "Append rows from standard input to CSV, one JSON object a line, and print verdicts, expected errors and next "
@@ -122,7 +116,7 @@ class RecordOptions(Command):
     )
 
 
-class EvaluateOptions(Command):
+class EvaluateOptions(Command, Rows):
     """Measure the errors of a model on a table of measurements.
 
     The table is read as that of the model's fit, unless options say otherwise. --free first finds where the
@@ -133,8 +127,6 @@ class EvaluateOptions(Command):
     """
 
     model: Path = argument(MODEL, "MODEL")
-    units: Units
-    rows: Rows
     csv: Path | None = argument(
         f"{CSV} With --report by default the rows of the fit, each predicted by all others.", "CSV", None
     )
@@ -160,7 +152,7 @@ class EvaluateOptions(Command):
     excludes = (("--tolerance", "--free"), ("--report", "--free -o"))
 
 
-class InitOptions(Command):
+class InitOptions(Command, Places):
     """Propose the options of `fit` for a table and a robot.
 
     Without ROBOT the table has commanded poses or places in place of joint values. Looks at names, numbers and
@@ -169,7 +161,6 @@ class InitOptions(Command):
     """
 
     csv: Path = argument(CSV, "CSV")
-    places: Places
     robot: Path | None = argument(ROBOT, "ROBOT", None)
     output: Path = written("Campaign file to write.", "TOML", Path("campaign.toml"))
     force: bool = option("Replace a campaign file that was edited.", default=False)
@@ -204,7 +195,7 @@ class ImagesOptions(Command):
     decimal: str = option("Decimal mark of both tables.", default=".")
 
 
-class PredictOptions(Command):
+class PredictOptions(Command, Units):
     """Predict positions or poses for a table of joint values.
 
     Writes the joints, the positions, and the standard deviations that a new measurement would have. For a model
@@ -213,14 +204,13 @@ class PredictOptions(Command):
 
     model: Path = argument(MODEL, "MODEL")
     csv: Path = argument(CSV, "CSV")
-    units: Units
     output: Path = written("Table of predictions to write.", "CSV", MISSING)
     convention: str | None = option()
     rotation_angle: Angle | None = option()
     payload: str | None = option(metavar="COLUMN")
 
 
-class CorrectOptions(Command):
+class CorrectOptions(Command, Targets, Units):
     """Correct a program, so that the robot goes where it is told.
 
     The target of a row is the pose in which the nominal robot holds the tool at the row's joint values. With
@@ -238,9 +228,7 @@ class CorrectOptions(Command):
 
     model: Path = argument(MODEL, "MODEL")
     program: Path = argument("Table with a header, one command per row; other columns are kept.", "PROGRAM")
-    units: Units
     output: Path = written("Corrected program to write.", "CSV", MISSING)
-    targets: Targets
     tip: list[str] | None = option(
         "Link that carries the tool, for a model with several tips; repeat it where several tools have targets at the "
         "same time, with --tool, --position and --rotation once for each.",
@@ -323,7 +311,7 @@ class ExportOptions(Command):
     )
 
 
-class PlanOptions(Command):
+class PlanOptions(Command, Candidates, Links, Units):
     """Plan which poses to measure, and say how many are needed.
 
     With --robot the first poses of a calibration, with a MODEL the next ones, and with --free those to measure
@@ -332,10 +320,7 @@ class PlanOptions(Command):
     """
 
     count: int = option("Number of poses to plan.", default=MISSING, min=1)
-    units: Units
     output: Path = written("Table of poses to write: the joints, and a rank.", "CSV", MISSING)
-    cell: Candidates
-    links: Links
     model: Path | None = argument(
         "Model file written by `fit`, to plan the next poses; or name a --robot.", "MODEL", None
     )
@@ -364,7 +349,7 @@ class PlanOptions(Command):
     )
 
 
-class RecalibrateOptions(Command):
+class RecalibrateOptions(Command, Rows):
     """Say what has changed since a fit, or calibrate anew.
 
     The measuring device may stand anywhere. Twenty rows do what about a hundred do without the old model. A table is
@@ -379,9 +364,7 @@ class RecalibrateOptions(Command):
 
     old: Path = argument(OLD, "OLD")
     other: Path = argument("Table of new measurements, or another model file of the same robot.", "OTHER")
-    units: Units
     output: Path | None = written("Calibrate anew, and write the model to this file.", "MODEL")
-    rows: Rows
     marker_freedom: Literal["evidence", "same", "moved", "other"] = option(
         "Whether the markers are the same (0.05 mm: nobody touched them), have moved a little (1 mm: remounted) or are "
         "other ones (anywhere); by default the rows decide.",

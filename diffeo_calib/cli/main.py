@@ -157,7 +157,7 @@ Json = Annotated[
 
 def _declare(name: str, options: type[Command]) -> None:
     """Declare a command by the class of its options; every command has --json."""
-    own, parameters = list(options.all()), list[inspect.Parameter]()
+    own, parameters = options.all(), list[inspect.Parameter]()
     named = {one: option.hint for option in own for one in option.names or (option.shown,)} | {"--json": Path}
     DECLARED[name] = {one.removeprefix("--").lower(): hint for one, hint in named.items()}
 
@@ -174,7 +174,7 @@ def _declare(name: str, options: type[Command]) -> None:
         check_outputs(written, read | appended, may_come=appended)
         options.check_together(given)
         module = import_module(f"diffeo_calib.cli.commands.{IN_FILE_OF.get(name, name)}")
-        getattr(module, f"run_{name}" if name in IN_FILE_OF else "run")(options.made(given))
+        getattr(module, f"run_{name}" if name in IN_FILE_OF else "run")(options(**given))
 
     for one in own:
         typed = typer.Option(*one.names, **one.how) if one.names else typer.Argument(**one.how)

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.main import command_line
-from diffeo_calib.cli.options import Links, Robot, Rows, Units
-from diffeo_calib.cli.tables import MeasuredTable, as_at_the_fit, measured_table, rows_in_table, tool_frame
+from diffeo_calib.cli.options import Links, Robot, Rows
+from diffeo_calib.cli.tables import Given, MeasuredTable, as_at_the_fit, measured_table, rows_in_table, tool_frame
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.common.files import read_regular
 from diffeo_calib.interop.model_file import load
@@ -52,7 +52,7 @@ def load_robot(path: Path, links: Links) -> Tree:
 def robot_of(given: Robot, source: MeasuredTable) -> Tree:
     """The robot of a table: that of a file, or a machine whose commanded poses are in the table."""
     if isinstance(source.table.joints, PoseColumns):
-        if given.robot is not None or any(vars(given.links).values()):
+        if given.robot is not None or any(getattr(given, name) for name in Links.names()):
             what, fix = "--robot, --base or --tip beside --robot-pose", "leave them out: poses are those of the flange"
             raise InputError.of(what, expected="joint values, or poses", got="both", fix=fix)
         return cartesian(read_poses(source.csv, source.table))
@@ -60,7 +60,7 @@ def robot_of(given: Robot, source: MeasuredTable) -> Tree:
         expected = "--robot FILE, or --robot-pose COLUMNS where the table has poses in place of joint values"
         fix = "of several lines that a campaign file proposes, uncomment one"
         raise InputError.of("the robot", expected=expected, got="neither", fix=fix)
-    return load_robot(given.robot, given.links)
+    return load_robot(given.robot, given)
 
 
 def is_urdf(path: Path) -> bool:
@@ -100,20 +100,20 @@ def check_payload_column(model: CalibratedKinematics, column: str | None) -> Non
         raise InputError.of("the model was calibrated with payloads", expected="--payload", fix=fix)
 
 
-def as_fitted(model: CalibratedKinematics, rows: Rows | None, units: Units) -> tuple[Rows, Units]:
+def as_fitted(model: CalibratedKinematics, given: Given) -> Given:
     """Options of a command with a model, completed by those of the command that made it."""
     made = model.provenance
-    return as_at_the_fit("" if made is None else made.command or made.table, rows, units)
+    return as_at_the_fit("" if made is None else made.command or made.table, given)
 
 
-def table_of(model: CalibratedKinematics, csv: Path, typed: Rows, typed_units: Units) -> MeasuredTable:
+def table_of(model: CalibratedKinematics, csv: Path, given: Rows) -> MeasuredTable:
     """A table read as that of the model's fit unless options say otherwise, without kinds of rows that it lacks."""
-    rows, units = as_fitted(model, typed, typed_units)
-    if not typed.named:
-        rows, missing = rows_in_table(csv, rows, units)
+    rows = as_fitted(model, given)
+    if not given.named:
+        rows, missing = rows_in_table(csv, rows)
         if missing:
             say(f"the table has no columns of {few(missing)}: it is read without these rows of the fit")
-    return measured_table(csv, rows, units)
+    return measured_table(csv, rows)
 
 
 def made_by_command(model: CalibratedKinematics) -> CalibratedKinematics:

@@ -7,12 +7,12 @@ Imports torch: only commands that run import this.
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import torch
 import typer
@@ -39,6 +39,7 @@ from diffeo_calib.sensors.kinds import known_kinds
 from diffeo_calib.sensors.range import UNKNOWN_ZERO_M
 
 POSE_JOINTS = 6
+Given = TypeVar("Given", bound=Units)
 
 
 def table_format(units: Units) -> TableFormat:
@@ -77,12 +78,12 @@ def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
     )
 
 
-def measured_table(csv: Path, rows: Rows, units: Units, duplicates: str = "keep") -> MeasuredTable:
+def measured_table(csv: Path, rows: Rows, duplicates: str = "keep") -> MeasuredTable:
     """The table that options describe, joined of two files if these do; exact repeats are kept by default."""
     if not rows.named:
         text = "name the position columns, or those of --socket or --reading"
         raise typer.BadParameter(text, param_hint="--position")
-    table = with_rows(table_format(units), rows)
+    table = with_rows(table_format(rows), rows)
     csv, names = with_places(csv, rows, table), list[str]()
     if isinstance(csv, JoinedFile):
         say(csv.sentence)
@@ -103,7 +104,7 @@ def with_places(csv: Path, rows: Rows, table: TableFormat) -> Path:
 # --- as at the fit ------------------------------------------------------------------------------------------------
 
 
-def as_at_the_fit(command: str, rows: Rows | None, units: Units) -> tuple[Rows, Units]:
+def as_at_the_fit(command: str, given: Given) -> Given:
     """Options of a later command, completed by those of the command line that made its model; typed ones win.
 
     Columns are taken over unless --position, --socket or --reading are typed, and units, marks and names of joints
@@ -111,40 +112,34 @@ def as_at_the_fit(command: str, rows: Rows | None, units: Units) -> tuple[Rows, 
 
     Args:
         command: that made the model, or the options of its table alone; empty where neither is known.
-        rows: None for a table of joint values alone.
     """
-    own, words = rows or Rows(), list[str]()
-    groups = [Rows] * (rows is not None and not rows.named) + [Units] * (units.length is None or units.angle is None)
+    wanted, marker = given.left_open(), given.marker if isinstance(given, Rows) else None
+    wanted -= {name for name, value in vars(given).items() if value}
     try:
-        stored = shlex.split(command) if groups or own.marker else []
-        known = {group: _stated(stored, group) for group in groups}
-        typed = {name for name, value in (vars(own) | vars(units)).items() if value}
-        typed |= {"places"} | ({"by"} if own.places is None else set())  # of the file of the fit
-        if own.marker is not None and "=" not in own.marker:
-            order = _stated(stored, Rows).get("marker", ("", []))[0].partition("=")[1:]
-            own = replace(own, marker=own.marker + "".join(order))
-            add_to_command_line(["--marker", str(own.marker)])
-        completed = list[Any]()
-        for group in (own, units):
-            taken = {name: one for name, one in known.get(type(group), {}).items() if name not in typed}
-            completed.append(replace(group, **{name: value for name, (value, _) in taken.items()}))
-            words += [word for _, own_words in taken.values() for word in own_words]
+        stored = shlex.split(command) if wanted or marker else []
+        if marker is not None and "=" not in marker:
+            order = _stated(stored, {"marker"}).get("marker", ("", []))[0].partition("=")[1:]
+            given = replace(given, marker=marker + "".join(order))
+            add_to_command_line(["--marker", marker + "".join(order)])
+        known = _stated(stored, wanted)
     except (ValueError, IndexError) as error:  # of a file that was edited
         fix = "name the columns (--position, --socket, --reading), --length and --angle"
         raise InputError.of("the options that the model was fitted with", got=str(error), fix=fix) from error
-    program = _stated(shlex.split(command), Units).get("robot_pose", ("", []))[0] if PROGRAM in command else ""
-    if PROGRAM in program and units.robot_pose in (None, program.partition("=")[0]):  # of other names: places
+    pose = given.robot_pose
+    program = _stated(shlex.split(command), {"robot_pose"}).get("robot_pose", ("", []))[0] if PROGRAM in command else ""
+    if PROGRAM in program and pose in (None, program.partition("=")[0]):  # of other names: places
         fix = f"type it again, a model file starts no program: --robot-pose {program}"
         raise InputError.of("--robot-pose", expected="the function that the model was fitted with", fix=fix)
-    if words:
+    order = sorted(known, key=lambda name: name in Units.names())
+    if words := [word for name in order for word in known[name][1]]:
         say(f"tables are read as at the fit: {shlex.join(words)}")
     add_to_command_line(words)
-    return completed[0], completed[1]
+    return replace(given, **{name: value for name, (value, _) in known.items()})
 
 
-def rows_in_table(csv: Path, rows: Rows, units: Units) -> tuple[Rows, list[str]]:
+def rows_in_table(csv: Path, rows: Rows) -> tuple[Rows, list[str]]:
     """Options without the kinds of rows that a table has no column of, if it has those of others; and these kinds."""
-    table = table_format(units)
+    table = table_format(rows)
     header = set(read_cells(with_places(csv, rows, table), table.sep)[0])
     kinds = {"--position": rows.position or [], "--socket": [rows.socket] * (rows.socket is not None)}
     kinds |= {f"--reading {text}": [text.partition("=")[2]] for text in rows.reading or () if CORNERS not in text}
@@ -162,13 +157,13 @@ def rows_in_table(csv: Path, rows: Rows, units: Units) -> tuple[Rows, list[str]]
     return replace(rows, reading=kept or None, **changes), missing
 
 
-def _stated(words: Sequence[str], group: type[Units] | type[Rows]) -> dict[str, tuple[Any, list[str]]]:
-    """Field of a group -> its value in a command line, and the words that state it.
+def _stated(words: Sequence[str], wanted: Container[str]) -> dict[str, tuple[Any, list[str]]]:
+    """Name of a wanted option of tables -> its value in a command line, and the words that state it.
 
     ValueError or IndexError for a value that is none.
     """
     found = dict[str, tuple[Any, list[str]]]()
-    for option in group.all():
+    for option in (one for one in Rows.all() if one.field in wanted):
         name, hint, given = option.shown, option.hint, list[list[str]]()
         for place, word in enumerate(words):
             begin, equal, value = word.partition("=")

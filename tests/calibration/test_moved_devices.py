@@ -23,7 +23,7 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.gates import CHANGE_ROWS
-from diffeo_calib.calibration.diagnostics.hypotheses import JudgedRows, changes_of
+from diffeo_calib.calibration.diagnostics.hypotheses import SampledRows, changes_of
 from diffeo_calib.calibration.diagnostics.judge import best_of, changes, crooked_axes
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.rows import with_attributes
@@ -200,11 +200,11 @@ def test_errors_that_depend_on_the_position_of_an_axis_are_named(joint: int) -> 
     arm, measurements, _ = simulated(60)
     setting = Setting(arm.nominal, measurements)
     data = setting.tangent_data
-    assert [*crooked_axes(JudgedRows.of(data, setting.scales))] == []
+    assert [*crooked_axes(SampledRows.of(data, setting.scales))] == []
     x = data.x[:, joint, None]
     shape = torch.cat([(2 * x).sin(), x.cos(), (1.5 * x).sin(), (2 * x).cos(), x.sin(), 0 * x], 1)
     moved = 5e-4 * (data.sensitivities[..., 6 + 6 * joint : 12 + 6 * joint] @ shape[:, :, None])[..., 0]
-    rows = JudgedRows.of(replace(data, y=data.y + moved), setting.scales)
+    rows = SampledRows.of(replace(data, y=data.y + moved), setting.scales)
     found = best_of(crooked_axes(rows), rows)
     assert found is not None
     assert re.search(f"position of {arm.nominal.joint_names[joint]} alone.*fall to", found.text)

@@ -31,7 +31,7 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import (
     MARKERS,
-    JudgedRows,
+    SampledRows,
     axes_of,
     changes_of,
     left_out_rms,
@@ -109,7 +109,7 @@ def judge(
             their file: their order is that of the measurements. devices: what may change of devices in unknown places.
             bodies: better names of the measuring device and of what is on the tool.
     """
-    rows, lines = JudgedRows.of(data, scales), lines.to(data.x.device)
+    rows, lines = SampledRows.of(data, scales), lines.to(data.x.device)
     if len(rows.index) < 4 * gates.CHANGE_ROWS:
         return None
     changes, own = changes_of(rows.data, devices, rows.index), lines[rows.index]
@@ -122,7 +122,7 @@ def judge(
     return best_of([one if whole else one._replace(opens="") for one in found], rows)
 
 
-def best_of(found: Iterable[Candidate], rows: JudgedRows) -> Finding | None:
+def best_of(found: Iterable[Candidate], rows: SampledRows) -> Finding | None:
     """That with which left-out errors fall most, relative to what may remain."""
     shares = ((rows.left(one.columns, one.size) / one.most, one) for one in found)
     share, best = min(shares, key=lambda own: own[0], default=(inf, None))
@@ -163,18 +163,16 @@ class Change(NamedTuple):
         """Gain less the price of the unknowns by the Bayesian information criterion; the row is one more."""
         return self.gain - (len(self.size) + (self.row is not None)) * log(len(self.codes))
 
-    def words(self, data: TangentData) -> str:
+    def words(self, rows: SampledRows) -> str:
         """Phrase for the change and its size."""
         name, verb = self.hypothesis.name, "to drift" if self.row is None else "to have moved"
         if self.hypothesis.unit is not None:
             verb = verb if self.row is None else "to have changed"
             return f"{name} seems {verb} by about {self.hypothesis.amount(float(self.size.abs().max()))}"
-        motion = data.in_coordinates(self.hypothesis.effects @ self.size)
-        size = 3 if motion.shape[1] % 3 == 0 else motion.shape[1]
-        distances = motion.unflatten(1, (-1, size)).norm(dim=-1)  # of every marker
+        distances = rows.distances(self.hypothesis.effects, self.size)
         typical = distances[distances.amax(1) > 0].median(0).values
         distance = float(typical[typical > 0].median())
-        if name == MARKERS and data.basis is None:
+        if name == MARKERS and rows.data.basis is None:
             distance = float(typical.max())
             single = float(typical.min()) < gates.OTHER_MARKERS * distance
             name = f"marker {int(typical.argmax())}" if single else name
@@ -182,7 +180,7 @@ class Change(NamedTuple):
 
 
 def changed(
-    rows: JudgedRows, hypotheses: Sequence[Hypothesis], lines: Tensor, *, excess: float = 1.0
+    rows: SampledRows, hypotheses: Sequence[Hypothesis], lines: Tensor, *, excess: float = 1.0
 ) -> Iterator[Candidate]:
     """The clearest change during the measurements; arguments as of :func:`changes`, and lines (N,) of the rows."""
     process, order = rows.process, lines.argsort()
@@ -199,7 +197,7 @@ def changed(
         return same and one.hypothesis.name != what and apart < gates.CHANGES_TOLD_APART
 
     others = [one for one in found if as_good(one)]
-    words = ", or ".join(dict.fromkeys(one.words(rows.data) for one in (best, *others)))
+    words = ", or ".join(dict.fromkeys(one.words(rows) for one in (best, *others)))
     words += " (these rows do not tell which)" * bool(others)
     columns = rows.columns(E, best.codes)
     if best.row is not None:
@@ -276,7 +274,7 @@ class Mixture:
     rows are all decided.
     """
 
-    rows: JudgedRows
+    rows: SampledRows
     effects: Tensor
     codes: Tensor
 
@@ -312,7 +310,7 @@ class Mixture:
         return chosen, u, odds
 
 
-def two_tools(rows: JudgedRows, effects: Tensor, lines: Tensor) -> Iterator[Candidate]:
+def two_tools(rows: SampledRows, effects: Tensor, lines: Tensor) -> Iterator[Candidate]:
     """Markers or tools that take turns, by the effects (N, R, U) of their shifts; lines of all rows."""
     E, N = effects * rows.data.place_deviation, len(effects)
     mixed = Mixture(rows, E, E.new_tensor([-0.5, 0.5]).expand(N, 2))
@@ -325,9 +323,7 @@ def two_tools(rows: JudgedRows, effects: Tensor, lines: Tensor) -> Iterator[Cand
     chosen, u, _ = mixed.settled(torch.where(along > split, 0.5, -0.5))
     fewer = chosen == (0.5 if float(chosen.mean()) < 0 else -0.5)
     if int(fewer.sum()) >= gates.CHANGE_ROWS:
-        motion = rows.data.in_coordinates(E @ u)
-        bodies = motion.unflatten(1, (-1, 3 if motion.shape[1] % 3 == 0 else motion.shape[1]))
-        moved = 1e3 * float(bodies.norm(dim=2).amax(1).median())
+        moved = 1e3 * float(rows.distances(E, u).amax(1).median())
         what = f"{int(fewer.sum())} of {N} rows seem to have another tool or marker, {moved:.3g} mm away: lines "
         fix = "name the tool of every row in a column (`marker`; or `session` with `remounted`)"
         words = what + few(lines[rows.index][fewer].tolist(), 5), "one tool", "with two", fix
@@ -335,7 +331,7 @@ def two_tools(rows: JudgedRows, effects: Tensor, lines: Tensor) -> Iterator[Cand
         yield Candidate(*words, columns, gates.TWO_TOOLS_LEFT, opens="the other rows")
 
 
-def other_payloads(rows: JudgedRows, data: TangentData, lines: Tensor) -> Iterator[Candidate]:
+def other_payloads(rows: SampledRows, data: TangentData, lines: Tensor) -> Iterator[Candidate]:
     """Payloads that would explain the rows far better than their own.
 
     Args:
@@ -384,7 +380,7 @@ def _other_columns(masses: Tensor, lines: Tensor) -> Iterator[tuple[str, Tensor]
 # --- unknowns of one size: errors of an axis, and numbers that differ from row to row ---------------------------------
 
 
-def crooked_axes(rows: JudgedRows) -> Iterator[Candidate]:
+def crooked_axes(rows: SampledRows) -> Iterator[Candidate]:
     """The axis whose errors depend on its own position alone, if one is clear."""
     clear, expected = gates.AXIS_ODDS, "a straight guide, a bearing without wobble"
     given, found = "with such errors in the model", list[Candidate]()
@@ -397,27 +393,25 @@ def crooked_axes(rows: JudgedRows) -> Iterator[Candidate]:
     yield from found
 
 
-class Variation(NamedTuple):
-    """A number that differs from row to row: its deviation, m, rad or relative, and a sentence about it."""
-
-    size: float
-    sentence: str
-
-
-def variation(data: TangentData, scales: Hyperparameters, hypotheses: Iterable[Hypothesis]) -> Variation | None:
+def variation(data: TangentData, scales: Hyperparameters, hypotheses: Sequence[Hypothesis]) -> tuple[float, str] | None:
     """The likeliest number that differs from row to row, if it is clear: an unknown u_i ~ N(0, s^2) of every row i.
 
     It is clear beside the tails of the noise, but seems small beside those that it makes: s counts all but gross rows.
-    """
-    rows = JudgedRows.of(data, scales)
 
-    def sized(rows: JudgedRows, one: Hypothesis) -> tuple[float, float, Hypothesis]:
+    Returns:
+        s, m, rad or relative, and a sentence about it.
+    """
+    if not hypotheses:
+        return None
+    rows = SampledRows.of(data, scales)
+
+    def sized(rows: SampledRows, one: Hypothesis) -> tuple[float, float, Hypothesis]:
         E = torch.nn.functional.one_hot(rows.process.numbers.owner).to(data.x) * rows.columns(one.effects)
         return (*rows.likeliest_size(E[:, E.any(0)]), one)
 
     found = (sized(rows, rows.of_all(one)) for one in hypotheses)
-    odds, _, best = max(found, key=lambda own: own[0], default=(-inf, 0.0, None))
-    if best is None or odds < gates.ROW_ODDS:
+    odds, _, best = max(found, key=lambda own: own[0])
+    if odds < gates.ROW_ODDS:
         return None
     tails = rows.data.tails
     tails = replace(tails, weights=tails.weights.where(tails.weights < 1.0 / FACTORS[0], 1.0))
@@ -425,7 +419,7 @@ def variation(data: TangentData, scales: Hyperparameters, hypotheses: Iterable[H
     moved = 1e3 * size * float((3 * best.effects[best.effects != 0].square().mean()).sqrt())
     got = f"about {best.amount(size)}, which moves the tool by {moved:.2g} mm"
     what, expected = f"{best.name} seems to differ", "the same for all rows"
-    return Variation(size, sentence(what, expected=expected, got=got, fix=best.fix))
+    return size, sentence(what, expected=expected, got=got, fix=best.fix)
 
 
 def warn_of_taken_scales(taken: LeaveOneOut, own: LeaveOneOut) -> None:
@@ -475,7 +469,7 @@ def lengths(data: TangentData, scales: Hyperparameters, devices: Iterable[Hypoth
     most = torch.where(turning, inf, gates.USUAL_SLIDE).to(scales.transmission_amplitude)
     usual["transmission_amplitude"] = scales.transmission_amplitude.minimum(most)
     known = replace(scales, **usual)
-    rows = JudgedRows.of(data, scales if torch.equal(known.vector, scales.vector) else known)
+    rows = SampledRows.of(data, scales if torch.equal(known.vector, scales.vector) else known)
     causes = [*lengths_of(rows.data), *(one._replace(effects=one.effects[rows.index]) for one in devices)]
     E, process = torch.cat([one.effects for one in causes], 2), rows.process
     columns = rows.columns(rows.data.motions_in_numbers(E))

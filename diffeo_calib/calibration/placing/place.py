@@ -17,7 +17,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.judge import Variation, variation
+from diffeo_calib.calibration.diagnostics.judge import variation
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_open_directions
 from diffeo_calib.calibration.diagnostics.outliers import Outlier
@@ -265,14 +265,14 @@ class Placed:
         drift = Drift.of_table(self.data, self.registration.geometry.chain)
         return replace(self, placement=Placement((*self.placement, *drift))) if drift else None
 
-    def widened(self, data: TangentData, scales: Hyperparameters) -> tuple[Placed, Variation] | None:
-        """The same with what differs from row to row as noise of these; None if nothing clearly does."""
+    def widened(self, data: TangentData, scales: Hyperparameters) -> tuple[Placed, str] | None:
+        """The same with what differs from row to row as noise of these, in a sentence; None if nothing clearly does."""
         found = variation(data, scales, self.placement.hypotheses(data, ROW))
         if found is None or self.coordinates is None:
             return None
-        table = self.coordinates.table.with_own_focal_lengths(found.size)
+        table = self.coordinates.table.with_own_focal_lengths(found[0])
         sets = (one.widened(table) if isinstance(one, LensAndBoard) else one for one in self.placement)
-        return replace(self, coordinates=self.coordinates._replace(table=table), placement=Placement(sets)), found
+        return replace(self, coordinates=self.coordinates._replace(table=table), placement=Placement(sets)), found[1]
 
     def beside(self, data: Any, like: TangentData) -> tuple[Placed, TangentData]:
         """Other rows of the same devices, and around the same linearisation with all weights 1.

@@ -77,44 +77,38 @@ class SocketDevices(DeviceSet):
     # (3 S, 3 S) of the positions, m^2; after a fit without a device without rigid motions of all of them
     covariance: Tensor
     left_out: tuple[PlaceErrors, ...] = ()  # every place, predicted by all other rows
-    # root mean square distance, m, that the model expects between its positions of the ball and the true ones over the
-    # joint ranges of the rows; without a device after the best rigid motion
-    workspace_deviation: float = 0.0
 
     @classmethod
     def around(cls, data: Measurements, positions: Tensor) -> SocketDevices:
         """The sockets of a table, wide around positions (S, 3), and with the known distances linearised there [m]."""
-        eye = torch.eye(positions.numel(), dtype=positions.dtype, device=positions.device)
-        precision, push, sockets = eye / PLACES.found_m_rad**2, positions.new_zeros(len(eye)), data.known_sockets
-        one_hot = torch.eye(len(positions), dtype=positions.dtype, device=positions.device)
+        sockets, S = data.known_sockets, len(positions)
+        wide, one_hot = (torch.eye(size, dtype=positions.dtype, device=positions.device) for size in (3 * S, S))
+        equations = [torch.nn.functional.pad(wide / PLACES.found_m_rad, (0, 1))]
         for known in sockets.blocks:
             first, second, lengths = (list(each) for each in zip(*known, strict=True))
             away = positions[second] - positions[first]
             U = (one_hot[second] - one_hot[first])[:, :, None] * torch.nn.functional.normalize(away)[:, None]
-            errors, U = away.new_tensor(lengths) - away.norm(dim=1), U.flatten(1)
-            own = torch.eye(len(known), dtype=U.dtype, device=U.device) * ALIKE**2
-            weighed = torch.linalg.solve((1.0 + own) * (sockets.distance_std or 1.0) ** 2, U).mT
-            precision, push = precision + weighed @ U, push + weighed @ errors
-        factor = torch.linalg.cholesky(precision)
-        root = torch.linalg.solve_triangular(factor, eye, upper=False).mT
-        places = positions + (root @ (root.mT @ push)).view(-1, 3)
-        covariance, rows = root @ root.mT, (data.socket_numbers != NO_SOCKET).nonzero()[:, 0]
-        devices = SocketPlaces(sockets.names, places, _deviations(covariance))
+            own = torch.cat([U.flatten(1), (away.new_tensor(lengths) - away.norm(dim=1))[:, None]], 1)
+            noise = (1.0 + ALIKE**2 * own.new_ones(len(own)).diag()) * (sockets.distance_std or 1.0) ** 2
+            equations.append(torch.linalg.solve_triangular(torch.linalg.cholesky(noise), own, upper=False))
+        R = torch.linalg.qr(torch.cat(equations), mode="r").R[: 3 * S]
+        root = torch.linalg.solve_triangular(R[:, :-1], wide, upper=True)
+        places, rows = positions + (root @ R[:, -1]).view(-1, 3), (data.socket_numbers != NO_SOCKET).nonzero()[:, 0]
+        devices, covariance = SocketPlaces.known(sockets.names, places, root @ root.mT), root @ root.mT
         return cls(devices, rows, data.socket_numbers[rows], sockets, root, not data.without_device, covariance)
 
     @classmethod
-    def around_model(cls, table: Measurements, rows: Tensor, seen: Tensor) -> tuple[list[DeviceSet], Measurements]:
-        """The sockets around a model that is known, and their rows placed there; nothing without sockets.
+    def around_model(cls, table: Measurements, rows: Tensor, seen: Tensor) -> list[SocketDevices]:
+        """The sockets around a model that is known; nothing without sockets.
 
         Args:
             table: M rows. rows: (M,) their numbers in a table of N. seen: (N, 3 P) points of the model, m.
         """
         if table.sockets is None:
-            return [], table
+            return []
         socket = table.socket_numbers
         resting = socket != NO_SOCKET
-        found = cls.around(table, socket_means(seen[rows][resting, -3:], socket[resting]))
-        return [found.of_rows(rows)], found.at_places(table)
+        return [cls.around(table, socket_means(seen[rows][resting, -3:], socket[resting])).of_rows(rows)]
 
     @property
     def positions(self) -> Tensor:
@@ -185,13 +179,9 @@ class SocketDevices(DeviceSet):
             B = frame_slopes(positions[None], positions.mean(0))[0]  # (3 S, 6)
             root = root - B @ (torch.linalg.pinv(B) @ root)
         covariance = root @ found.covariance @ root.mT
-        return replace(
-            self,
-            devices=SocketPlaces(self.names, positions, _deviations(covariance)),
-            covariance=covariance,
-            left_out=() if found.chosen is None else self._left_out(found.chosen),
-            workspace_deviation=workspace_deviation(found.fitted),
-        )
+        devices = SocketPlaces.known(self.names, positions, covariance)
+        left_out = () if found.chosen is None else self._left_out(found.chosen)
+        return replace(self, devices=devices, covariance=covariance, left_out=left_out)
 
     def with_rows(self, other: OtherRows) -> SocketDevices:
         rows = socket = self.rows[:0]
@@ -234,7 +224,7 @@ class SocketDevices(DeviceSet):
         """Warn of sockets near a plane if one place away from it would make the expected error smaller."""
         place, socket = self.sockets.place, self.by_row(len(model.configurations))
         if model.map.workspace is not None:
-            warn_of_flat_places(model.map, self.positions, socket, place, self.workspace_deviation)
+            warn_of_flat_places(model.map, self.positions, socket, place, workspace_deviation(model.map))
 
     @property
     def left_out_spread(self) -> float:
@@ -251,12 +241,10 @@ class SocketDevices(DeviceSet):
         """Places of the sockets, how well they are predicted, and what that does not show."""
         frame = "the measuring frame" if self.by_device else "the robot's base"
         among = "" if self.by_device else "among the sockets "
+        each = zip(self.names, 1e3 * self.positions, 1e3 * self.devices.deviations, strict=True)
         lines = [
-            f"socket '{name}': {', '.join(f'{1e3 * v:.3f}' for v in place)} mm in {frame}, deviations "
-            f"{among}{', '.join(f'{1e3 * v:.3f}' for v in deviation)} mm"
-            for name, place, deviation in zip(
-                self.names, self.positions.tolist(), self.devices.deviations.tolist(), strict=True
-            )
+            f"socket '{name}': {_listed(place)} mm in {frame}, deviations {among}{_listed(deviation)} mm"
+            for name, place, deviation in each
         ]
         for one in self.left_out:
             errors = ", ".join(f"{1e3 * error:+.3f}" for error in one.distance_errors)
@@ -265,9 +253,8 @@ class SocketDevices(DeviceSet):
         return [*lines, f"spread within sockets, each place left out: {1e3 * self.left_out_spread:.4f} mm"]
 
 
-def _deviations(covariance: Tensor) -> Tensor:
-    """(S, 3) standard deviations of places, m."""
-    return covariance.diagonal().clamp(min=0).sqrt().view(-1, 3)
+def _listed(values: Tensor) -> str:
+    return ", ".join(f"{value:.3f}" for value in values.tolist())
 
 
 def register_coordinates(robot: Tree, data: Measurements) -> tuple[Identification, list[SocketDevices]]:

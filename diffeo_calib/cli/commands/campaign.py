@@ -299,20 +299,20 @@ def expected(campaign: Campaign) -> str:
 
 def run(given: CampaignOptions) -> None:
     """Follow a table until the target is reached or the rows end."""
-    if given.rows.by is not None or given.rows.marker is not None:
+    if given.by is not None or given.marker is not None:
         fix = "give every row in one line of one file, with columns for each marker"
         raise InputError.of("--places or --marker, of a table that grows line by line", fix=fix)
-    source = measured_table(given.csv, given.rows, given.units)
+    source = measured_table(given.csv, given)
     goal = parsed_length(given.tolerance)
     if isinstance(source.table.joints, PoseColumns):
         fix = "measure with --robot and joint values, or fit the table when it is complete"
         raise InputError.of("--robot-pose of a table that grows: the middle of all poses is not known yet", fix=fix)
-    robot = robot_of(given.robot, source)
+    robot = robot_of(given, source)
     candidates = given.candidates and read_joints(given.candidates, of_robot(source.table, robot))
     with ExitStack() as stack:
         journal = stack.enter_context(Journal(source.csv.with_name(source.csv.name + JOURNAL)))
         campaign = Campaign(robot, candidates=candidates, goal=goal)
-        live = Live(campaign, source, given.robot.links.tip or list(robot.tips), journal, given)
+        live = Live(campaign, source, given.tip or list(robot.tips), journal, given)
         live.resume()
         inbox = Inbox()  # a SimpleQueue can wait for ever after a signal
         page = None if given.page is None else stack.enter_context(served(given.page, inbox))

@@ -100,17 +100,17 @@ def run(options: CorrectOptions) -> None:
     """Read a program, correct it, write it and print a summary; units that are not typed are those of the fit."""
     _check(options)
     model = load_laden(options.model, options.payload)
-    stated = as_fitted(model, None, options.units)[1]
-    source = ProgramTable(options.program, of_robot(table_format(stated), model.robot), options.targets)
+    read = of_robot(table_format(as_fitted(model, options)), model.robot)
+    source = ProgramTable(options.program, read, options)
     table, tips = source.written(), options.tip or ()
     if len(tips) == 1:
         model = model.with_tool(model.tool, *tips)
-    turned = {"convention": options.targets.convention, "rotation_angle": options.targets.rotation_angle}
-    robot, tools = model.robot, _tools(model, options, replace(source.table, **turned))
-    read, columns = Columns.of(table.joints_only()), Columns.of(as_written(table).joints_only())
-    sheet = read_cells(options.program, table.sep, read.names)
-    if read.names != columns.names:  # of a function: they would be those of the program before
-        sheet = sheet.without(read.names)
+    turned = replace(source.table, convention=options.convention, rotation_angle=options.rotation_angle)
+    robot, tools = model.robot, _tools(model, options, turned)
+    before, columns = Columns.of(table.joints_only()), Columns.of(as_written(table).joints_only())
+    sheet = read_cells(options.program, table.sep, before.names)
+    if before.names != columns.names:  # of a function: they would be those of the program before
+        sheet = sheet.without(before.names)
         sheet.check_free(columns.names)
     start, targets = read_joints(options.program, table), source.targets(len(tools))
     for tool in tools:
@@ -151,7 +151,7 @@ def _check(options: CorrectOptions) -> None:
     for name, value in (("--limit", options.limit), ("--rate", options.rate)):
         if value is not None:
             check_number(value, name, above=0.0)
-    if options.frame == "measuring" and not options.targets.position:
+    if options.frame == "measuring" and not options.position:
         fix = "leave it out, or name the columns of the targets (--position)"
         raise InputError.of("--frame measuring: the nominal poses of commands are in the robot's base", fix=fix)
 

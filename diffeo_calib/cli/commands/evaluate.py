@@ -16,7 +16,7 @@ from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge
 from diffeo_calib.cli import models, printed
 from diffeo_calib.cli.console import out, plain, progress_bar, say
 from diffeo_calib.cli.declarations import EvaluateOptions, PredictOptions
-from diffeo_calib.cli.options import Rows
+from diffeo_calib.cli.options import Rows, Units
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.tables import MeasuredTable, as_written, of_robot, table_format, with_rows
 from diffeo_calib.common.device import HOST
@@ -59,7 +59,7 @@ def run(options: EvaluateOptions) -> None:
     if options.csv is None:
         fix = "name it, or write a page about the rows of the fit by --report"
         raise InputError.of("the table of measurements", expected="CSV", got="none", fix=fix)
-    source = models.table_of(model, options.csv, options.rows, options.units)
+    source = models.table_of(model, options.csv, options)
     limit = printed.parsed_limit(options.tolerance)
     models.check_payload_column(model, source.table.payload)
     say(*models.provenance_lines(model))
@@ -165,7 +165,7 @@ def _reported(model: CalibratedKinematics, page: Path, options: EvaluateOptions)
     """Write the page, and say its first line."""
     data, tolerance = None, printed.parsed_length(options.tolerance)
     if options.csv is not None:
-        data = models.table_of(model, options.csv, options.rows, options.units).read(model.robot)
+        data = models.table_of(model, options.csv, options).read(model.robot)
     if tolerance is not None and data is not None and not bool(unseen(model, data.q).any()):
         expected, fix = "rows that took no part in fit and registration", "measure more rows, or leave the table out"
         raise InputError.of("rows to hold against --tolerance", expected=expected, got=f"{len(data)} that did", fix=fix)
@@ -245,13 +245,12 @@ def run_predict(given: PredictOptions) -> None:
 
 def _written_as_read(model: CalibratedKinematics, given: PredictOptions) -> TableFormat:
     """The format of the predictions, by default that of the fit."""
-    units = given.units
-    rows = Rows(convention=given.convention, rotation_angle=given.rotation_angle, payload=given.payload)
-    read, stated = models.as_fitted(model, rows, units)
-    if units.length is None or units.angle is None:
-        rotation_angle = rows.rotation_angle or read.rotation_angle
-        rows = Rows(convention=rows.convention or read.convention, rotation_angle=rotation_angle, payload=read.payload)
-    return with_rows(table_format(stated), rows)
+    units = {name: getattr(given, name) for name in Units.names()}
+    typed = Rows(**units, convention=given.convention, rotation_angle=given.rotation_angle, payload=given.payload)
+    read = models.as_fitted(model, typed)
+    own = typed if given.length and given.angle else read
+    rows = Rows(convention=own.convention, rotation_angle=own.rotation_angle, payload=own.payload)
+    return with_rows(table_format(read), rows)
 
 
 def reading_options(table: TableFormat, prefixes: Sequence[str] = ("",)) -> str:

@@ -46,11 +46,11 @@ Errors = dict[str, KindErrors]
 
 def run(given: FitOptions) -> None:
     """Calibrate with the rows that are not held out, write the model, and end with the exit code of the fit."""
-    source = measured_table(given.csv, given.rows, given.units, given.duplicates)
+    source = measured_table(given.csv, given, given.duplicates)
     with progress_bar() as progress:
-        chain = robot_of(given.robot, source)
+        chain = robot_of(given, source)
         others = [load_kinematics(path) for path in given.scales_of or ()]
-        data = source.read(chain, given.robot.links.tip or chain.tips)
+        data = source.read(chain, given.tip or chain.tips)
         train, test = data.split(1.0 - given.holdout, given.seed) if given.holdout else (data, None)
         how = {"controls": given.controls or "auto", "seed": given.seed, "note": given.note, "scales_of": others}
         result = calibrate(chain, train, **how, progress=interrupts.watching(progress, err.print))

@@ -65,7 +65,7 @@ def run(given: InitOptions) -> None:
     output = given.output
     if given.csv.is_dir():
         read_cells(given.csv, ",")  # says why not
-    csv, joined = with_places(given.csv, given.places, output.parent)
+    csv, joined = with_places(given.csv, given, output.parent)
     sheet = guess_sheet(csv)
     try:
         source = _commanded(given.robot, sheet) or _of_robot(given.robot or Path(), output.parent, sheet)

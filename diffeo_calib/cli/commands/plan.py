@@ -60,17 +60,16 @@ def sensors_of(words: list[str] | None, table: TableFormat) -> list[Sensor]:
 
 def run(given: PlanOptions) -> None:
     """Plan, write the poses, and print what to expect of them."""
-    cell, count, output, begin = given.cell, given.count, given.output, given.model or given.robot
+    count, output, begin = given.count, given.output, given.model or given.robot
     if begin is None:
         raise InputError.of("what to plan for", expected="a MODEL, or --robot", got="neither")
     with progress_bar() as progress:
         model = None if given.model is None else load_kinematics(given.model)
-        stated = given.units if model is None else as_fitted(model, None, given.units)[1]
-        table = table_format(stated)
+        table = table_format(given if model is None else as_fitted(model, given))
         numbers = [stated_numbers("--marker", text, (3,)) for text in given.marker or ()]
         markers = torch.tensor(numbers or [MARKER], dtype=torch.float64, device=HOST)
         markers = markers / table.per_metre if numbers else markers
-        source = model or load_robot(begin, given.links)
+        source = model or load_robot(begin, given)
         if model is not None:
             source, markers = planned(model, given.payload)
         robot = source.robot if isinstance(source, CalibratedKinematics) else source
@@ -81,9 +80,9 @@ def run(given: PlanOptions) -> None:
 
         sensors = sensors_of(given.sensor, table) or sensors_for(source)
         progress("candidates", 0, 1)
-        q = configurations(cell.candidates)
+        q = configurations(given.candidates)
         if q is None:
-            q = drawn(source, sensors, max(cell.draw or DRAWN, count), markers, **_cell(cell, robot, table))
+            q = drawn(source, sensors, max(given.draw or DRAWN, count), markers, **_cell(given, robot, table))
         progress("candidates", 1, 1)
         progress("plan", 0, 1)
         framed = model is not None or any(one.of_frames for one in sensors)
@@ -97,7 +96,7 @@ def run(given: PlanOptions) -> None:
     if isinstance(source, CalibratedKinematics):
         say("the table averages over the poses that were drawn or given; they may lie beyond those of the fit")
         say(*expectation_lines(source, None))
-    if isinstance(table.joints, PoseColumns) and cell.candidates is None:
+    if isinstance(table.joints, PoseColumns) and given.candidates is None:
         say("poses are drawn around those of the fit: pass --candidates where the machine, or the view, is smaller")
     say(f"{count} of {len(q)} configurations written to {output}, in an order of short moves")
     say("its column `rank`: the poses of ranks 1 to k are the plan for k poses")
