@@ -127,7 +127,7 @@ class CalibrationResult:
     def places(self, stage: str = STAGES[-1]) -> Places:
         """Where the devices are as of a stage: frames of sessions, devices of readings."""
         now = [own.devices for own in self.readings]
-        devices = dict(zip(STAGES, (self.registration.devices, self.identification.devices, now), strict=True))[stage]
+        devices = (self.registration.devices, self.identification.devices, now)[STAGES.index(stage)]
         others = [own.devices for own in self.placement if not own.devices.reads]
         return Places(joined([*others, *devices]), self.placed.ball)
 

@@ -22,7 +22,7 @@ VARIATION_M = torch.logspace(-6, -2, 41, dtype=torch.float64, device="cpu")
 """RMS motions of the points by unknowns of which the size is sought."""
 
 
-class JudgedRows(NamedTuple):
+class SampledRows(NamedTuple):
     """Rows that stand for all of a calibration, beside a model.
 
     Args:
@@ -34,7 +34,7 @@ class JudgedRows(NamedTuple):
     process: Process
 
     @classmethod
-    def of(cls, data: TangentData, scales: Hyperparameters) -> JudgedRows:
+    def of(cls, data: TangentData, scales: Hyperparameters) -> SampledRows:
         """Those of a calibration with these scales."""
         index, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed=0)
         return cls(some, index, some.process(scales))
@@ -46,6 +46,11 @@ class JudgedRows(NamedTuple):
     def of_all(self, one: Hypothesis) -> Hypothesis:
         """One with effects on the coordinates of all rows of the calibration, as one with those on what these tell."""
         return one._replace(effects=self.data.motions_in_numbers(one.effects[self.index]))
+
+    def distances(self, effects: Tensor, u: Tensor) -> Tensor:
+        """(N, B) motions, m, of the points, or numbers, of each row by unknowns (U,) with effects (N, R, U)."""
+        motion = self.data.in_coordinates(effects @ u)
+        return motion.unflatten(1, (-1, 3 if motion.shape[1] % 3 == 0 else motion.shape[1])).norm(dim=2)
 
     def likeliest_size(self, E: Tensor) -> tuple[float, float]:
         """The log odds of unknowns of one size with effects (M, U), and this size."""

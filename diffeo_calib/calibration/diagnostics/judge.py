@@ -31,7 +31,7 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import (
     MARKERS,
-    JudgedRows,
+    SampledRows,
     axes_of,
     changes_of,
     left_out_rms,
@@ -53,6 +53,8 @@ ROUNDS = 20
 """Of the codes of a mixture."""
 MISTYPED = (10.0, 0.1, 1000.0, 0.001, 1 / 0.45359237, 0.45359237)
 """Factors of one payload in another unit, or with a wrong digit: g, pounds."""
+OPENED_M = 0.01
+"""Prior RMS motion by what is opened in a model: far more than what is found, else it is gross."""
 SLOW = (
     "if it stood in several places, name the set-ups in a column (`session`); else let robot and device warm up, and "
     "measure in random order; or name a column of times or temperatures (`time`, `temperature`), with which the model "
@@ -66,7 +68,7 @@ class Candidate(NamedTuple):
     Args:
         columns: (M, U) effects of the unknowns on the numbers of the rows. size: their standard deviation; any by
             default. most: part of the RMS left-out error that may remain with them. doubt: whether the model does not
-            hold them.
+            hold them. opens: rows for which it holds, those without effects, once they are opened in it; none if not.
     """
 
     what: str
@@ -77,13 +79,18 @@ class Candidate(NamedTuple):
     most: float
     size: float | None = None
     doubt: bool = False
+    opens: str = ""
 
 
 class Finding(NamedTuple):
-    """The best explanation: a sentence, and the RMS motion of a row by errors that the model does not hold, m."""
+    """The best explanation: a sentence, and the RMS motion of a row by errors that the model does not hold, m.
+
+    Columns (N, R, U), m, are the effects of unknowns that the model shall have, with unit variance; None for none.
+    """
 
     text: str
     doubt: float
+    columns: Tensor | None
 
 
 def judge(
@@ -102,7 +109,7 @@ def judge(
             their file: their order is that of the measurements. devices: what may change of devices in unknown places.
             bodies: better names of the measuring device and of what is on the tool.
     """
-    rows, lines = JudgedRows.of(data, scales), lines.to(data.x.device)
+    rows, lines = SampledRows.of(data, scales), lines.to(data.x.device)
     if len(rows.index) < 4 * gates.CHANGE_ROWS:
         return None
     changes, own = changes_of(rows.data, devices, rows.index), lines[rows.index]
@@ -111,10 +118,11 @@ def judge(
     if len(own) >= gates.MIXED_ROWS:
         found += [own for one in changes if one.name == MARKERS for own in two_tools(rows, one.effects, lines)]
         found += [*other_payloads(rows, data, lines), *crooked_axes(rows)]
-    return best_of(found, rows)
+    whole = len(rows.index) == len(data.x)
+    return best_of([one if whole else one._replace(opens="") for one in found], rows)
 
 
-def best_of(found: Iterable[Candidate], rows: JudgedRows) -> Finding | None:
+def best_of(found: Iterable[Candidate], rows: SampledRows) -> Finding | None:
     """That with which left-out errors fall most, relative to what may remain."""
     shares = ((rows.left(one.columns, one.size) / one.most, one) for one in found)
     share, best = min(shares, key=lambda own: own[0], default=(inf, None))
@@ -123,7 +131,13 @@ def best_of(found: Iterable[Candidate], rows: JudgedRows) -> Finding | None:
     left = share * best.most
     moved = left_out_rms(rows.process) * (1.0 - left**2) ** 0.5
     got = f"about {1e3 * moved:.2g} mm of error, and leave-one-out errors that fall to {100 * left:.0f} % {best.given}"
-    return Finding(sentence(best.what, expected=best.expected, got=got, fix=best.fix), moved * best.doubt)
+    fix, columns = best.fix, None
+    if best.opens:
+        fix += f"; the model holds for {best.opens}"
+        numbers = rows.process.numbers.in_table(best.columns).unbind(2)
+        columns = torch.stack([rows.data.in_coordinates(one) for one in numbers], 2)
+        columns = OPENED_M * columns / columns[columns.any(2)].square().sum(1).mean().sqrt()
+    return Finding(sentence(best.what, expected=best.expected, got=got, fix=fix), moved * best.doubt, columns)
 
 
 # --- changes during the measurements ----------------------------------------------------------------------------------
@@ -149,18 +163,16 @@ class Change(NamedTuple):
         """Gain less the price of the unknowns by the Bayesian information criterion; the row is one more."""
         return self.gain - (len(self.size) + (self.row is not None)) * log(len(self.codes))
 
-    def words(self, data: TangentData) -> str:
+    def words(self, rows: SampledRows) -> str:
         """Phrase for the change and its size."""
         name, verb = self.hypothesis.name, "to drift" if self.row is None else "to have moved"
         if self.hypothesis.unit is not None:
             verb = verb if self.row is None else "to have changed"
             return f"{name} seems {verb} by about {self.hypothesis.amount(float(self.size.abs().max()))}"
-        motion = data.in_coordinates(self.hypothesis.effects @ self.size)
-        size = 3 if motion.shape[1] % 3 == 0 else motion.shape[1]
-        distances = motion.unflatten(1, (-1, size)).norm(dim=-1)  # of every marker
+        distances = rows.distances(self.hypothesis.effects, self.size)
         typical = distances[distances.amax(1) > 0].median(0).values
         distance = float(typical[typical > 0].median())
-        if name == MARKERS and data.basis is None:
+        if name == MARKERS and rows.data.basis is None:
             distance = float(typical.max())
             single = float(typical.min()) < gates.OTHER_MARKERS * distance
             name = f"marker {int(typical.argmax())}" if single else name
@@ -168,7 +180,7 @@ class Change(NamedTuple):
 
 
 def changed(
-    rows: JudgedRows, hypotheses: Sequence[Hypothesis], lines: Tensor, *, excess: float = 1.0
+    rows: SampledRows, hypotheses: Sequence[Hypothesis], lines: Tensor, *, excess: float = 1.0
 ) -> Iterator[Candidate]:
     """The clearest change during the measurements; arguments as of :func:`changes`, and lines (N,) of the rows."""
     process, order = rows.process, lines.argsort()
@@ -185,14 +197,15 @@ def changed(
         return same and one.hypothesis.name != what and apart < gates.CHANGES_TOLD_APART
 
     others = [one for one in found if as_good(one)]
-    words = ", or ".join(dict.fromkeys(one.words(rows.data) for one in (best, *others)))
+    words = ", or ".join(dict.fromkeys(one.words(rows) for one in (best, *others)))
     words += " (these rows do not tell which)" * bool(others)
     columns = rows.columns(E, best.codes)
     if best.row is not None:
         words += f" near row {int(lines[order[best.row]])}"
-        yield Candidate(words, expected, given, fix, columns, gates.WORTH)
+        yield Candidate(words, expected, given, fix, columns, gates.WORTH, opens="the rows before it")
         return
-    yield Candidate(f"{words} over the rows", expected, given, SLOW, columns, gates.WORTH)
+    words, middle = f"{words} over the rows", "the middle of the rows"
+    yield Candidate(words, expected, given, SLOW, columns, gates.WORTH, opens=middle)
     # three set-ups look like a drift: the first change is sought once more beside the second one
     first, second = (_likeliest(*scans([E], process, order)), 0)
     for _ in range(2):
@@ -202,7 +215,8 @@ def changed(
         near = " and ".join(str(int(lines[order[row]])) for row in sorted((first, second)))
         columns = torch.cat([rows.columns(E, _from(order, row)) for row in (first, second)], 1)
         words = f"{what} seems to have moved more than once, near rows {near}"
-        yield Candidate(words, expected, "with these changes", fix, columns, gates.WORTH**2)
+        before = "the rows before them"
+        yield Candidate(words, expected, "with these changes", fix, columns, gates.WORTH**2, opens=before)
 
 
 def changes(
@@ -260,7 +274,7 @@ class Mixture:
     rows are all decided.
     """
 
-    rows: JudgedRows
+    rows: SampledRows
     effects: Tensor
     codes: Tensor
 
@@ -296,7 +310,7 @@ class Mixture:
         return chosen, u, odds
 
 
-def two_tools(rows: JudgedRows, effects: Tensor, lines: Tensor) -> Iterator[Candidate]:
+def two_tools(rows: SampledRows, effects: Tensor, lines: Tensor) -> Iterator[Candidate]:
     """Markers or tools that take turns, by the effects (N, R, U) of their shifts; lines of all rows."""
     E, N = effects * rows.data.place_deviation, len(effects)
     mixed = Mixture(rows, E, E.new_tensor([-0.5, 0.5]).expand(N, 2))
@@ -309,16 +323,15 @@ def two_tools(rows: JudgedRows, effects: Tensor, lines: Tensor) -> Iterator[Cand
     chosen, u, _ = mixed.settled(torch.where(along > split, 0.5, -0.5))
     fewer = chosen == (0.5 if float(chosen.mean()) < 0 else -0.5)
     if int(fewer.sum()) >= gates.CHANGE_ROWS:
-        motion = rows.data.in_coordinates(E @ u)
-        bodies = motion.unflatten(1, (-1, 3 if motion.shape[1] % 3 == 0 else motion.shape[1]))
-        moved = 1e3 * float(bodies.norm(dim=2).amax(1).median())
+        moved = 1e3 * float(rows.distances(E, u).amax(1).median())
         what = f"{int(fewer.sum())} of {N} rows seem to have another tool or marker, {moved:.3g} mm away: lines "
         fix = "name the tool of every row in a column (`marker`; or `session` with `remounted`)"
         words = what + few(lines[rows.index][fewer].tolist(), 5), "one tool", "with two", fix
-        yield Candidate(*words, rows.columns(E, chosen), gates.TWO_TOOLS_LEFT)
+        columns = rows.columns(E, fewer.to(E))
+        yield Candidate(*words, columns, gates.TWO_TOOLS_LEFT, opens="the other rows")
 
 
-def other_payloads(rows: JudgedRows, data: TangentData, lines: Tensor) -> Iterator[Candidate]:
+def other_payloads(rows: SampledRows, data: TangentData, lines: Tensor) -> Iterator[Candidate]:
     """Payloads that would explain the rows far better than their own.
 
     Args:
@@ -367,7 +380,7 @@ def _other_columns(masses: Tensor, lines: Tensor) -> Iterator[tuple[str, Tensor]
 # --- unknowns of one size: errors of an axis, and numbers that differ from row to row ---------------------------------
 
 
-def crooked_axes(rows: JudgedRows) -> Iterator[Candidate]:
+def crooked_axes(rows: SampledRows) -> Iterator[Candidate]:
     """The axis whose errors depend on its own position alone, if one is clear."""
     clear, expected = gates.AXIS_ODDS, "a straight guide, a bearing without wobble"
     given, found = "with such errors in the model", list[Candidate]()
@@ -380,27 +393,25 @@ def crooked_axes(rows: JudgedRows) -> Iterator[Candidate]:
     yield from found
 
 
-class Variation(NamedTuple):
-    """A number that differs from row to row: its deviation, m, rad or relative, and a sentence about it."""
-
-    size: float
-    sentence: str
-
-
-def variation(data: TangentData, scales: Hyperparameters, hypotheses: Iterable[Hypothesis]) -> Variation | None:
+def variation(data: TangentData, scales: Hyperparameters, hypotheses: Sequence[Hypothesis]) -> tuple[float, str] | None:
     """The likeliest number that differs from row to row, if it is clear: an unknown u_i ~ N(0, s^2) of every row i.
 
     It is clear beside the tails of the noise, but seems small beside those that it makes: s counts all but gross rows.
-    """
-    rows = JudgedRows.of(data, scales)
 
-    def sized(rows: JudgedRows, one: Hypothesis) -> tuple[float, float, Hypothesis]:
+    Returns:
+        s, m, rad or relative, and a sentence about it.
+    """
+    if not hypotheses:
+        return None
+    rows = SampledRows.of(data, scales)
+
+    def sized(rows: SampledRows, one: Hypothesis) -> tuple[float, float, Hypothesis]:
         E = torch.nn.functional.one_hot(rows.process.numbers.owner).to(data.x) * rows.columns(one.effects)
         return (*rows.likeliest_size(E[:, E.any(0)]), one)
 
     found = (sized(rows, rows.of_all(one)) for one in hypotheses)
-    odds, _, best = max(found, key=lambda own: own[0], default=(-inf, 0.0, None))
-    if best is None or odds < gates.ROW_ODDS:
+    odds, _, best = max(found, key=lambda own: own[0])
+    if odds < gates.ROW_ODDS:
         return None
     tails = rows.data.tails
     tails = replace(tails, weights=tails.weights.where(tails.weights < 1.0 / FACTORS[0], 1.0))
@@ -408,7 +419,7 @@ def variation(data: TangentData, scales: Hyperparameters, hypotheses: Iterable[H
     moved = 1e3 * size * float((3 * best.effects[best.effects != 0].square().mean()).sqrt())
     got = f"about {best.amount(size)}, which moves the tool by {moved:.2g} mm"
     what, expected = f"{best.name} seems to differ", "the same for all rows"
-    return Variation(size, sentence(what, expected=expected, got=got, fix=best.fix))
+    return size, sentence(what, expected=expected, got=got, fix=best.fix)
 
 
 def warn_of_taken_scales(taken: LeaveOneOut, own: LeaveOneOut) -> None:
@@ -458,7 +469,7 @@ def lengths(data: TangentData, scales: Hyperparameters, devices: Iterable[Hypoth
     most = torch.where(turning, inf, gates.USUAL_SLIDE).to(scales.transmission_amplitude)
     usual["transmission_amplitude"] = scales.transmission_amplitude.minimum(most)
     known = replace(scales, **usual)
-    rows = JudgedRows.of(data, scales if torch.equal(known.vector, scales.vector) else known)
+    rows = SampledRows.of(data, scales if torch.equal(known.vector, scales.vector) else known)
     causes = [*lengths_of(rows.data), *(one._replace(effects=one.effects[rows.index]) for one in devices)]
     E, process = torch.cat([one.effects for one in causes], 2), rows.process
     columns = rows.columns(rows.data.motions_in_numbers(E))

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.judge import Variation, variation
+from diffeo_calib.calibration.diagnostics.judge import variation
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_open_directions
 from diffeo_calib.calibration.diagnostics.outliers import Outlier
@@ -212,8 +212,8 @@ class Placed:
         places = Places(ball=self.ball)
         return [residuals(stage, places, self.coordinates.table).positions_rms for stage in kinematics]
 
-    def tangent_data(self) -> TangentData:
-        """The rows around the geometric calibration, weighted by its residuals."""
+    def tangent_data(self, opened: Tensor | None = None) -> TangentData:
+        """The rows around the geometric calibration, weighted by its residuals; with effects (N, R, U) of unknowns."""
         geometry, theta = self.registration.geometry, self.identification.theta
         payload = Payload.of_rows(geometry.chain, self.data.payload, self.data.payload_at)
         elastic = payload is not None or not is_cartesian(geometry.chain)
@@ -221,7 +221,8 @@ class Placed:
         theta = torch.cat([theta, theta.new_zeros(nominal.parameters - geometry.size)])
         data = self._rows(nominal, theta)
         held = held_parameters(geometry, adrift=self.free)
-        return replace(data, shared=self.placement.shared(data), held=held, adrift=self.free)
+        shared = [self.placement.shared(data)] if opened is None else [opened, self.placement.shared(data)]
+        return replace(data, shared=torch.cat(shared, 2), held=held, adrift=self.free)
 
     def mislabelled(self, model: Any, wrong: Sequence[Outlier]) -> str | None:
         """A sentence about wrong rows that fit another session or payload than theirs; None without any."""
@@ -259,14 +260,14 @@ class Placed:
         drift = Drift.of_table(self.data, self.registration.geometry.chain)
         return replace(self, placement=Placement((*self.placement, *drift))) if drift else None
 
-    def widened(self, data: TangentData, scales: Hyperparameters) -> tuple[Placed, Variation] | None:
-        """The same with what differs from row to row as noise of these; None if nothing clearly does."""
+    def widened(self, data: TangentData, scales: Hyperparameters) -> tuple[Placed, str] | None:
+        """The same with what differs from row to row as noise of these, in a sentence; None if nothing clearly does."""
         found = variation(data, scales, self.placement.hypotheses(data, ROW))
         if found is None or self.coordinates is None:
             return None
-        table = self.coordinates.table.with_own_focal_lengths(found.size)
+        table = self.coordinates.table.with_own_focal_lengths(found[0])
         sets = (one.widened(table) if isinstance(one, LensAndBoard) else one for one in self.placement)
-        return replace(self, coordinates=self.coordinates._replace(table=table), placement=Placement(sets)), found
+        return replace(self, coordinates=self.coordinates._replace(table=table), placement=Placement(sets)), found[1]
 
     def beside(self, data: Any, like: TangentData) -> tuple[Placed, TangentData]:
         """Other rows of the same devices, and around the same linearisation with all weights 1.

@@ -32,7 +32,7 @@ from torch import Tensor
 from diffeo_calib.calibration.scales.selection import SEARCH_LIMITS, select
 from diffeo_calib.calibration.scales.tangent_data import KEPT_COORDINATES, TangentData
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.quantiles import chi2_median, known
+from diffeo_calib.common.quantiles import chi2_median
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import Tails, gross_weights, reweight
@@ -56,13 +56,7 @@ class LeaveOneOut:
     squares: Tensor  # (N, bodies) squared distances in units of the predicted covariance, tails left out; NaN as well
     # effective number of parameters, trace of G (G + R)^-1; None with several blocks, since no block is the whole fit
     effective: float | None
-    # how many were measured; those of the errors by default. A pose has six, its three points nine errors
-    numbers: int | None = None
-
-    @property
-    def count(self) -> int:
-        """How many numbers were measured."""
-        return len(known(self.errors)) if self.numbers is None else self.numbers
+    count: int  # how many numbers were measured: of a pose six, its three points have nine errors
 
     def inflation(self, configurations: int) -> float:
         """Factor on all variances that accounts for estimating their scale from few data.
