@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ import pytest
 import torch
 from product_bank import ur10_measurements
 from reading_bank import AXES, POINTS, cameras, in_base, reading_errors, readings, scales
-from table_bank import refused
+from table_bank import refused, warned
 from tangent_bank import built, normal, shaken, tangent_covariance
 from torch import Tensor
 from torch.testing import assert_close
@@ -108,10 +107,8 @@ def errors_after_similarity(found: Tensor, truth: Tensor) -> tuple[float, float]
 
 def calibrated(arm: SimulatedArm, data: dc.Readings) -> tuple[dc.CalibrationResult, str]:
     """The result with given scales, and all warnings."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        result = dc.calibrate(arm.nominal, data, hyperparameters=scales())
-    return result, " ".join(str(one.message) for one in caught)
+    result, texts = warned(dc.calibrate, arm.nominal, data, hyperparameters=scales())
+    return result, " ".join(texts)
 
 
 def test_cameras_find_the_robot_but_for_its_size() -> None:

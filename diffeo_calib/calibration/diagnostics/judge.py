@@ -406,10 +406,10 @@ def variation(data: TangentData, scales: Hyperparameters, hypotheses: Sequence[H
     rows = SampledRows.of(data, scales)
 
     def sized(rows: SampledRows, one: Hypothesis) -> tuple[float, float, Hypothesis]:
-        E = torch.nn.functional.one_hot(rows.process.numbers.owner).to(data.x) * rows.columns(one.effects)
+        E = torch.nn.functional.one_hot(rows.process.numbers.owner).to(data.x) * rows.columns(rows.of_all(one).effects)
         return (*rows.likeliest_size(E[:, E.any(0)]), one)
 
-    found = (sized(rows, rows.of_all(one)) for one in hypotheses)
+    found = (sized(rows, one) for one in hypotheses)
     odds, _, best = max(found, key=lambda own: own[0])
     if odds < gates.ROW_ODDS:
         return None
