@@ -33,7 +33,7 @@ from diffeo_calib.calibration.diagnostics.hypotheses import (
     worth_it,
 )
 from diffeo_calib.calibration.diagnostics.mixed_rows import other_payloads, two_tools
-from diffeo_calib.calibration.diagnostics.moved_devices import change_during, crooked_axis
+from diffeo_calib.calibration.diagnostics.moved_devices import change_during
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.outliers import (
     outliers,
@@ -161,9 +161,9 @@ def calibrate(
             calibration exceeds 5 % of the markers' spread and no other reading explains it; a column holds one value
             although the robot moves; the rows show no errors of the robot; too few poses to
             select scales; leave-one-out errors contradict the scales; during the measurements something moved or
-            drifted, a joint offset or a zero changed; a length of robot or device is not what it is said to be; a
-            guide is not straight or a bearing wobbles; wrong rows follow one another; more than 40 % of the rows are
-            outliers; the joint values are rounded and this limits the accuracy.
+            drifted, a joint offset or a zero changed; a length of robot or device is not what it is said to be; wrong
+            rows follow one another; more than 40 % of the rows are outliers; the joint values are rounded and this
+            limits the accuracy.
     """
     check_arguments(robot, measurements, hyperparameters)
     check_models(scales_of, robot)
@@ -256,7 +256,7 @@ def _result(
         rows=len(data.x),
         parts={part.name: part.displacement for part in explained},
         effective_parameters=chosen.left_out.effective,
-        length_in_doubt=max(warn_of_lengths(found_lengths) or 0.0, crooked_axis(data, scales) or 0.0) or None,
+        length_in_doubt=warn_of_lengths(found_lengths),
         warnings="\n".join(warned) or None,
     )
     return CalibrationResult(

@@ -6,6 +6,7 @@
   payload      the sag under a payload in terms of that under the links' unknown masses: compliances are the same, so
                that one factor scales the prior deviations of all of its coefficients
 4 gear lines   periodic errors of the gears that chance does not explain; the search again if there are any
+  axes         errors that depend on the position of one axis, the same
 5 inflation    of all standard deviations, by rows that took no part in the choice of the scales
 
 Of many rows, a random sample goes through all of this; then all rows get their weights.
@@ -26,6 +27,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.axis_errors import with_axis_errors
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.scales import gear_lines
 from diffeo_calib.calibration.scales.leave_one_out import (
@@ -110,10 +112,10 @@ def choose_scales(
         stages, how = (registration, identification), {"given": given, "models": models}
         chosen = choose_scales(some, measurements[rows], *stages, **how, seed=seed, progress=progress)
         scales = chosen.selection.scales
-        data = weighed(data.with_gear_lines(scales.lines), scales, seed)
+        data = weighed(data.with_position_errors(scales), scales, seed)
         return replace(chosen, data=data, left_out=leave_one_out(data, scales, seed))
     if given is not None:
-        data = weighed(data.with_gear_lines(given.lines), given, seed)
+        data = weighed(data.with_position_errors(given), given, seed)
         left_out = leave_one_out(data, given, seed)
         _warn_of_wrong_scales(data, left_out)
         return ChosenScales(Selection(given, "given"), data, left_out)
@@ -121,8 +123,9 @@ def choose_scales(
     centre = defaults(data, noise_of_few(data, poses, registration, identification), identification.prior)
     if models:
         scales = scales_of_models(models, centre)
-        data = data.with_gear_lines(scales.lines)
-        scales = with_payload_factor(data, scales, seed)
+        data = data.with_position_errors(scales)
+        scales = with_axis_errors(data, with_payload_factor(data, scales, seed))
+        data = data.with_position_errors(scales)
         found = Selection(scales, f"those of {len(models)} other model{'s' * (len(models) > 1)}")
         data = weighed(data, scales, seed)
         return _inflated(found, None, data, measurements, seed=seed, progress=progress)
@@ -136,8 +139,8 @@ def choose_scales(
         found = replace(found, scales=with_payload_factor(data, found.scales, seed))
         if poses >= gear_lines.FEWEST_POSES and not found.interrupted:
             found, data = _with_gear_lines(centre, found, data, seed, progress)
-            centre = replace(centre, lines=found.scales.lines)
-        centre = replace(centre, payload=found.scales.payload)
+        if not found.interrupted:
+            found, data, centre = _with_axes(centre, found, data, seed, progress)
     return _inflated(found, centre, data, measurements, seed=seed, progress=progress)
 
 
@@ -207,9 +210,23 @@ def _with_gear_lines(
     lines = gear_lines.find_gear_lines(data, found.scales, seed)
     if not lines:
         return found, data
-    data, start = data.with_gear_lines(lines), replace(found.scales, lines=lines)
-    centre = replace(centre, lines=lines, payload=start.payload)
+    start = replace(found.scales, lines=lines)
+    data, centre = data.with_position_errors(start), replace(centre, lines=lines, payload=start.payload)
     return _supported(select(centre, data, start=start, seed=seed, progress=progress), data, seed)
+
+
+def _with_axes(
+    centre: Hyperparameters, found: Selection, data: TangentData, seed: int, progress: Progress
+) -> tuple[Selection, TangentData, Hyperparameters]:
+    """The same with the errors of axes that the data show, and the centre with all that was found."""
+    start = with_axis_errors(data, found.scales)
+    own = {"axis_errors": start.axis_errors, "axis_lengthscale": start.axis_lengthscale}
+    centre = replace(centre, lines=start.lines, payload=start.payload, axes=start.axes, **own)
+    if start is found.scales:
+        return found, data, centre
+    data = data.with_position_errors(start)
+    again = select(centre, data, start=start, seed=seed, progress=progress)
+    return *_supported(again, data, seed), centre
 
 
 def variance_ratio(data: TangentData, left_out: LeaveOneOut) -> float:
@@ -330,6 +347,6 @@ def scales_of_models(models: Sequence[CalibratedKinematics], like: Hyperparamete
 
 def _lines(model: CalibratedKinematics) -> list[GearLine]:
     """Gear lines of a model with their prior amplitudes."""
-    waves = model.nominal.waves
-    amplitudes = model.map.unregistered.deformation.spec.prior_variance.sqrt()[-waves.size :: 2] if waves.size else ()
-    return [GearLine(*each) for each in zip(waves.joints, waves.frequencies, map(float, amplitudes), strict=True)]
+    deviations = model.map.unregistered.deformation.spec.prior_variance.sqrt()[model.nominal.parts["waves"]]
+    waves = model.nominal.own.waves
+    return [GearLine(*one, amplitude) for one, amplitude in zip(waves, deviations[::2].tolist(), strict=True)]

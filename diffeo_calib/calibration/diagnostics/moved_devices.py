@@ -26,13 +26,12 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import Evidence, left_out_rms, opened
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.errors import sentence, warn_user
+from diffeo_calib.common.errors import sentence
 from diffeo_calib.common.quantiles import chi2_median, chi2_probability
 from diffeo_calib.kinematics.nominal import rigid_motions
 from diffeo_calib.process.process import Process
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import FACTORS
-from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.sensors.devices import Hypothesis
 from diffeo_calib.sensors.set_ups import frame_slopes
 
@@ -246,43 +245,6 @@ def variation(data: TangentData, scales: Hyperparameters, hypotheses: Iterable[H
         return None
     tails = replace(some.tails, weights=weights.where(weights < 1.0 / FACTORS[0], 1.0))
     return varying(clear.hypothesis, some.with_tails(tails).process(scales))
-
-
-GUIDE = (
-    "the model does not know such errors, which are not in its regions: calibrate the part of the range that is used, "
-    "or, where the axis stops at a few positions, name these as set-ups (`session`)"
-)
-
-
-def crooked_axis(data: TangentData, scales: Hyperparameters) -> float | None:
-    """Warn of the axis whose errors depend on its own position, if one is clear; RMS motion of a row by these, m.
-
-    The straightness, pitch and yaw of a guide, or the wobble of a bearing: errors of all six directions before a joint,
-    u_ak cos(k pi x) / k, u_ak ~ N(0, s^2), with x from 0 to 1 over its range, and turns by rad for m.
-    """
-    chain = data.nominal.geometry.chain
-    if is_cartesian(chain) or len(data.x) < gates.AXIS_ROWS:  # commanded poses have no axes
-        return None
-    _, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed=0)
-    process, found = some.process(scales), list[tuple[float, float, Tensor, str]]()
-    waves = torch.arange(1, gates.AXIS_WAVES + 1, dtype=some.x.dtype, device=some.x.device)
-    for joint, name in enumerate(chain.moving_names):
-        x = chain.moving_values(some.x)[:, joint]
-        shapes = (torch.pi * waves * ((x - x.min()) / (x.max() - x.min()).clamp(min=1e-9))[:, None]).cos() / waves
-        twists = some.sensitivities[..., 6 + 6 * joint : 12 + 6 * joint]
-        effects = (twists[..., None] * shapes[:, None, None]).flatten(2)
-        E = process.numbers.of_table(some.motions_in_numbers(effects))
-        odds = Evidence.of(E, process).log_odds(VARIATION_M.to(E).square())
-        found.append((float(odds.max()), float(VARIATION_M[int(odds.argmax())]), E, name))
-    odds, size, E, name = max(found, key=lambda one: one[0])
-    before, after = left_out_rms(process), left_out_rms(opened(process, E, size)) if odds >= gates.AXIS_ODDS else 0.0
-    if not gates.AXIS_LEFT * before > after > 0.0:
-        return None
-    moved = (before**2 - after**2) ** 0.5
-    what = f"errors of about {1e3 * moved:.2g} mm seem to depend on the position of {name} alone"
-    got = f"leave-one-out errors that fall to {100 * after / before:.0f} % with such errors in the model"
-    warn_user(sentence(what, expected="a straight guide, a bearing without wobble", got=got, fix=GUIDE))
-    return moved
 
 
 def chance_of_jump(gain: float, unknowns: int, edge: float) -> float:
