@@ -26,8 +26,8 @@ FUNCTIONS, MARGIN = 10, 0.125
 and regions widen."""
 LENGTHS = (0.1, 0.2, 0.4, 0.8)
 """Of the grid, as a part of the range."""
-TURNS_PER_SHIFT = (1e-3, 0.1, 0.3, 1.0, 3.0, 1e3)
-"""Of the grid, rad/m: from hardly any turn to hardly any shift."""
+TURNS_PER_SHIFT = (0.1, 0.3, 1.0, 3.0)
+"""Of the grid, rad/m. Either shrinks further in the search, but would hardly grow from zero."""
 SIZES = torch.logspace(-6, -2, 25, dtype=torch.float64, device="cpu")
 """Of the grid, m."""
 PLAUSIBLE = 3.0

@@ -24,7 +24,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.gates import CHANGE_ROWS
 from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
-from diffeo_calib.calibration.diagnostics.moved_devices import chance_of_jump, changes_of, crooked_axis, findings
+from diffeo_calib.calibration.diagnostics.moved_devices import chance_of_jump, changes_of, findings
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm
@@ -191,24 +191,6 @@ def test_errors_that_the_scales_understate_are_no_evidence() -> None:
 
     assert_close(gains(1000.0), gains(100.0), rtol=1e-6, atol=0)
     assert float((gains(1e-2) / gains(100.0)).max()) < 0.1
-
-
-@pytest.mark.parametrize("joint", [0, 3])
-def test_errors_that_depend_on_the_position_of_an_axis_are_named(joint: int) -> None:
-    """Of the axis alone: it is shifted and turned before the joint by smooth functions of its value."""
-    arm, measurements, _ = simulated(60)
-    setting = Setting(arm.nominal, measurements)
-    data = setting.tangent_data
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert crooked_axis(data, setting.scales) is None
-    x = data.x[:, joint, None]
-    shape = torch.cat([(2 * x).sin(), x.cos(), (1.5 * x).sin(), (2 * x).cos(), x.sin(), 0 * x], 1)
-    moved = 5e-4 * (data.sensitivities[..., 6 + 6 * joint : 12 + 6 * joint] @ shape[:, :, None])[..., 0]
-    with pytest.warns(DiffeoCalibWarning, match=f"position of {arm.nominal.joint_names[joint]} alone.*fall to") as said:
-        size = crooked_axis(replace(data, y=data.y + moved), setting.scales)
-    assert len(said) == 1
-    assert size == pytest.approx(float(moved.square().sum(1).mean().sqrt()), rel=0.8)
 
 
 @pytest.mark.slow
