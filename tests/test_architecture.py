@@ -51,7 +51,10 @@ MATHEMATICS = ("kernels", "flows", "maps", "regression", "fitting")
 ROBOTS = ("robots", "cameras", "measurements")
 STRANGERS: dict[str, tuple[str, ...]] = {**dict.fromkeys(MATHEMATICS, ROBOTS), **dict.fromkeys(ROBOTS, MATHEMATICS)}
 """Folders that must not know each other, whatever their order."""
-EXCEPTIONS = {("fitting.fit", "paper.eulerian"): 'fit(formulation="eulerian") reaches up, inside a function'}
+EXCEPTIONS = {
+    ("fitting.fit", "paper.eulerian"): 'fit(formulation="eulerian") reaches up, inside a function',
+    ("kinematics.calibrated", "calibration.recalibration.register"): "so does `model.registered`, a verb of new rows",
+}
 IN_THE_ROOT = {"__init__.py", "__main__.py", "py.typed"}
 
 MOST_PUBLIC_NAMES = 53
@@ -171,6 +174,8 @@ def test_imports_only_from_floors_below() -> None:
 
 def test_no_import_cycles() -> None:
     graph = {module: {other for other, _ in found} for module, found in imports().items()}
+    for module, other in EXCEPTIONS:  # inside functions
+        graph[f"{PACKAGE.name}.{module}"].discard(f"{PACKAGE.name}.{other}")
     assert find_cycle(graph) == []
 
 

@@ -241,7 +241,7 @@ def _(bench: Bench) -> None:
         assert 1e3 * each[0].rms < 2 * kind.source.worst_mm
     enough, too_little = {"images": ("50px", "0.0001px")}.get(kind.name, ("20mm", "0.00001mm"))
     table, options = kind.table("new")
-    found = bench.judged("evaluate", kind.file, table, *options, "--residuals", path, "--tolerance", enough)
+    found = bench.judged("evaluate", kind.file, table, *options, "-o", path, "--tolerance", enough)
     assert found["accepted"]
     for one in each:
         assert 0.0 < one.rms < math.inf
@@ -322,7 +322,7 @@ def _(bench: Bench) -> None:
     kind, path = bench.kind, bench.folder / "report.html"
     leave_undrawn(bench.command.monkeypatch)
     table, options = kind.table()
-    found = bench.json("report", kind.file, table, "-o", path, *options)
+    found = bench.json("evaluate", kind.file, table, "--report", path, *options)
     assert found["left_out"]
     assert tuple(found["errors"]) in ((), STAGES)
     assert "<svg" in path.read_text(encoding="utf-8")

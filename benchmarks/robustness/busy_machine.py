@@ -90,7 +90,7 @@ def commands(rows: int) -> Run:
 def command_line(poses: int) -> Run:
     """A whole command that measures and calibrates a simulated arm, in a process of its own."""
     folder = tempfile.mkdtemp(prefix="diffeo_calib_")
-    words = [sys.executable, "-m", "diffeo_calib", "demo", "--rows", str(poses), "--output", folder]
+    words = [sys.executable, "-m", "diffeo_calib", "demo", "--count", str(poses), "--output", folder]
     return lambda: subprocess.run(words, check=True, capture_output=True)
 
 

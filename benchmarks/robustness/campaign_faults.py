@@ -80,7 +80,7 @@ class Site:
         if limit is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
         (stdin, rows), (answers, stdout) = os.pipe(), os.pipe()
-        self.process = start([*words, "--stdin", "--json-lines"], (stdin, stdout))
+        self.process = start([*words, "--stdin"], (stdin, stdout))
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         os.close(stdin)
         os.close(stdout)

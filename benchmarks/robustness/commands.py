@@ -46,7 +46,7 @@ ROBOT = ("--robot", "arm.urdf", "--base", "base_link", "--tip", "flange")
 COMMANDS = {
     "fit": ("fit", "table.csv", *ROBOT, *PLACES, *UNITS, "-o", "out"),
     "evaluate": ("evaluate", "model", "table.csv", *PLACES, *UNITS),
-    "register": ("evaluate", "model", "table.csv", *PLACES, *UNITS, "--register", "-o", "out"),
+    "register": ("evaluate", "model", "table.csv", *PLACES, *UNITS, "--free", "both", "-o", "out"),
     "predict": ("predict", "model", "table.csv", *UNITS, "-o", "out"),
     "correct": ("correct", "model", "table.csv", *UNITS, "-o", "out"),
     "export": ("export", "model", "--urdf", "out"),
@@ -105,13 +105,13 @@ SOUND = {
     "predict": (*READING, ("-o", "other"), ("-o", "other.csv")),
     "correct": (
         *(*READING, ("--tool", "0,0,150"), ("--frame", "base"), ("--limit", "5")),
-        *(("--tool", "0,0,150", "--tool-from", "tip"), ("-o", "other")),
+        *(("--tool", "0,0,150"), ("-o", "other")),
     ),
     "export": (
         *(("--urdf", "other"), ("--dh", "dh.csv"), ("--dh", "dh.csv", "--dh-convention", "craig"), ("--c", "out.c")),
         *(("--joint-offsets", "o.csv"), ("--correction-tables", "t.csv"), ("--robot", "arm.urdf"), ("--length", "m")),
         *(
-            ("--correction-tables", "t.csv", "--with-tables"),
+            ("--correction-tables", "t.csv"),
             ("--c", "out.c", "--tool", "0,0,0.15"),
             ("--angle", "rad"),
         ),

@@ -26,14 +26,8 @@ from diffeo_calib.calibration.choose_scales import (
     robot_problem,
 )
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.hypotheses import (
-    lengths,
-    warn_of_lengths,
-    warn_of_taken_scales,
-    worth_it,
-)
-from diffeo_calib.calibration.diagnostics.mixed_rows import other_payloads, two_tools
-from diffeo_calib.calibration.diagnostics.moved_devices import change_during
+from diffeo_calib.calibration.diagnostics.hypotheses import worth_it
+from diffeo_calib.calibration.diagnostics.judge import judge, lengths, warn_of_lengths, warn_of_taken_scales
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.outliers import (
     outliers,
@@ -161,9 +155,9 @@ def calibrate(
             calibration exceeds 5 % of the markers' spread and no other reading explains it; a column holds one value
             although the robot moves; the rows show no errors of the robot; too few poses to
             select scales; leave-one-out errors contradict the scales; during the measurements something moved or
-            drifted, a joint offset or a zero changed; a length of robot or device is not what it is said to be; wrong
-            rows follow one another; more than 40 % of the rows are outliers; the joint values are rounded and this
-            limits the accuracy.
+            drifted, a joint offset or a zero changed; a length of robot or device is not what it is said to be; a
+            guide is not straight or a bearing wobbles; wrong rows follow one another; more than 40 % of the rows are
+            outliers; the joint values are rounded and this limits the accuracy.
     """
     check_arguments(robot, measurements, hyperparameters)
     check_models(scales_of, robot)
@@ -192,9 +186,9 @@ def calibrate(
             warn_of_taken_scales(chosen.left_out, choose(data, measurements, *stages, models=()).left_out)
         how = chosen.selection
         if not how.interrupted and (widened := placed.widened(chosen.data, how.scales)):
-            placed, found = widened
+            placed, text = widened
             chosen = choose(placed.tangent_data(), measurements, *stages)
-            warn_user(found.sentence)
+            warn_user(text)
         LOG.info("scales: %s", chosen.selection.status)
         fitted = _fit(chosen, controls, backend, progress)
         return _result(robot, placed, chosen, fitted, note=note, warned=warned)
@@ -236,14 +230,10 @@ def _result(
     explained, found = parts(model), outliers(model, placed, data, chosen.judged, least)
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
     warn_of_outliers(found, placed.data)
-    lines, devices = placed.data.line_numbers, placed.placement.hypotheses(data, CHANGE)
-    changed = (
-        placed.mislabelled(model, found)
-        or other_payloads(data, scales, lines)
-        or change_during(lines, data, scales, chosen.left_out, devices, bodies=placed.placement.bodies)
-        or two_tools(data, scales, lines)
-    )
-    warn_of_contradictions(model, placed.coordinates, found, changed)
+    devices, bodies = placed.placement.hypotheses(data, CHANGE), placed.placement.bodies
+    best = judge(data, scales, chosen.left_out, placed.data.line_numbers, devices=devices, bodies=bodies)
+    explained_by = placed.mislabelled(model, found) or best
+    warn_of_contradictions(model, placed.coordinates, found, explained_by)
     warn_of_rounding(robot, placed.data, data, chosen.left_out)
     found_lengths = lengths(data, scales, placed.placement.hypotheses(data, VALUE))
     summary = Summary(

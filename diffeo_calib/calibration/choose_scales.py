@@ -27,25 +27,25 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.axis_errors import with_axis_errors
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.scales import gear_lines
+from diffeo_calib.calibration.scales.axis_errors import with_axis_errors
 from diffeo_calib.calibration.scales.leave_one_out import (
     LeaveOneOut,
     cross_validated_inflation,
     inflation_by_places,
     leave_one_out,
+    variance_ratio,
     weighed,
 )
 from diffeo_calib.calibration.scales.selection import Selection, defaults, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import InputError, sentence, warn_user
-from diffeo_calib.common.quantiles import chi2_median
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.process.scales import DEVIATIONS, SCALES, GearLine, Hyperparameters
+from diffeo_calib.process.scales import DEVIATIONS, FOUND, SCALES, GearLine, Hyperparameters
 from diffeo_calib.robots.tree import Tree
 
 FEWEST_POSES = 12
@@ -137,10 +137,8 @@ def choose_scales(
     else:
         found, data = _selected(centre, data, seed, progress)
         found = replace(found, scales=with_payload_factor(data, found.scales, seed))
-        if poses >= gear_lines.FEWEST_POSES and not found.interrupted:
-            found, data = _with_gear_lines(centre, found, data, seed, progress)
-        if not found.interrupted:
-            found, data, centre = _with_axes(centre, found, data, seed, progress)
+        how = {"poses": poses, "seed": seed, "progress": progress}
+        centre, found, data = _with_position_errors(centre, found, data, **how)
     return _inflated(found, centre, data, measurements, seed=seed, progress=progress)
 
 
@@ -165,7 +163,8 @@ def _inflated(
         if centre is None or (poses >= FEWEST_POSES and not found.interrupted):
             inflation = cross_validated_inflation(centre, found.scales, data, groups, seed=seed, progress=progress)
             found = replace(found, interrupted=inflation is None)
-        factor = max(inflation or few, measurements.smallest_inflation)
+        least = 1.0 if data.tails.gross else measurements.smallest_inflation
+        factor = max(inflation or few, least)
         row_scales = found.scales if factor < 1.0 else None  # narrow regions make no outliers
     if bool(resting.any()):
         row_scales = found.scales.inflated(max(factor, few) ** 0.5)
@@ -202,36 +201,24 @@ def _supported(found: Selection, data: TangentData, seed: int) -> tuple[Selectio
     return replace(found, scales=scales), weighed(data, scales, seed)
 
 
-def _with_gear_lines(
-    centre: Hyperparameters, found: Selection, data: TangentData, seed: int, progress: Progress
-) -> tuple[Selection, TangentData]:
-    """The same with the gear lines that the data show: the other scales and the weights follow from what is left."""
-    progress("gear lines", 0, 1)
-    lines = gear_lines.find_gear_lines(data, found.scales, seed)
-    if not lines:
-        return found, data
-    start = replace(found.scales, lines=lines)
-    data, centre = data.with_position_errors(start), replace(centre, lines=lines, payload=start.payload)
-    return _supported(select(centre, data, start=start, seed=seed, progress=progress), data, seed)
-
-
-def _with_axes(
-    centre: Hyperparameters, found: Selection, data: TangentData, seed: int, progress: Progress
-) -> tuple[Selection, TangentData, Hyperparameters]:
-    """The same with the errors of axes that the data show, and the centre with all that was found."""
-    start = with_axis_errors(data, found.scales)
-    own = {"axis_errors": start.axis_errors, "axis_lengthscale": start.axis_lengthscale}
-    centre = replace(centre, lines=start.lines, payload=start.payload, axes=start.axes, **own)
-    if start is found.scales:
-        return found, data, centre
-    data = data.with_position_errors(start)
-    again = select(centre, data, start=start, seed=seed, progress=progress)
-    return *_supported(again, data, seed), centre
-
-
-def variance_ratio(data: TangentData, left_out: LeaveOneOut) -> float:
-    """Squared leave-one-out errors relative to what the scales predict: medians, since outliers are reported apart."""
-    return float((left_out.squares / data.noise_model.of_freedom(chi2_median, left_out.squares)).nanmedian())
+def _with_position_errors(
+    centre: Hyperparameters, found: Selection, data: TangentData, *, poses: int, seed: int, progress: Progress
+) -> tuple[Hyperparameters, Selection, TangentData]:
+    """The same with the gear lines, then the axes, that the data show: the rest follows from what is left."""
+    for stage in ("gear lines",) * (poses >= gear_lines.FEWEST_POSES) + ("axes",):
+        if found.interrupted:
+            break
+        progress(stage, 0, 1)
+        if stage == "axes":
+            start = with_axis_errors(data, found.scales)
+        elif lines := gear_lines.find_gear_lines(data, start := found.scales, seed):
+            start = replace(start, lines=lines)
+        if start is not found.scales:
+            data = data.with_position_errors(start)
+            centre = replace(centre, **{name: getattr(start, name) for name in FOUND})
+            again = select(centre, data, start=start, seed=seed, progress=progress)
+            found, data = _supported(again, data, seed)
+    return replace(centre, payload=found.scales.payload), found, data
 
 
 def _warn_of_wrong_scales(data: TangentData, left_out: LeaveOneOut) -> None:

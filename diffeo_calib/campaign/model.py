@@ -14,12 +14,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.choose_scales import VARIANCE_RATIO, choose_scales, noise_of_few, variance_ratio
+from diffeo_calib.calibration.choose_scales import VARIANCE_RATIO, choose_scales, noise_of_few
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.moved_devices import changes_of
+from diffeo_calib.calibration.diagnostics.hypotheses import changes_of
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.planning.candidates import candidates, ranges_around
 from diffeo_calib.calibration.planning.knowledge import greedy
+from diffeo_calib.calibration.scales.leave_one_out import variance_ratio
 from diffeo_calib.calibration.scales.selection import GROWTH, defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.campaign.verdicts import Seen, Verdict, find_change, measure

@@ -190,7 +190,7 @@ def _ways(sheet: Sheet, machine: Body, rows: RowColumns, body: Body, *, lengths:
             unit = measured.angle if len(turn) == 3 else None
             table = replace(table, rotation=turn, convention=measured.convention, rotation_angle=unit)
         with quiet(), suppress(DiffeoCalibError):
-            robot = cartesian(read_poses(sheet.path, pose, table))
+            robot = cartesian(read_poses(sheet.path, replace(table, joints=pose)))
             yield Source(sheet, robot, replace(pose, robot=robot), rows, table)
 
 

@@ -27,13 +27,12 @@ from diffeo_calib.cli.options import (
 )
 
 Frame = Literal["base", "measuring"]
-ToolFrom = Literal["tip", "measured"]
 Free = Literal["both", "base", "marker"]
 """Parts of the set-up that may have moved."""
 CSV = "Table with a header, one configuration per row."
 NOTE = "Text to keep in the model file, such as a serial number."
 MODEL = "Model file written by `fit`."
-TOOL_FROM = "Frame of --tool: the tip of the robot, or the measured frame of a model of poses, which is better known."
+MEASURED_TOOL = "; behind measured: in the measured frame of a model of poses, which is better known"
 OLD = "Model file of an earlier calibration."
 
 
@@ -41,7 +40,7 @@ class Command(Options):
     """The options of a command; its work is ``run`` of the module of its name in ``commands``, which takes them."""
 
 
-class FitOptions(Command):
+class FitOptions(Command, Rows, Robot):
     """Calibrate a robot, test it on held-out rows, save the model.
 
     Rows may hold anything that was measured: positions, poses, a ball in sockets, readings of devices. The model is
@@ -52,10 +51,7 @@ class FitOptions(Command):
     """
 
     csv: Path = argument(CSV, "CSV")
-    robot: Robot
-    units: Units
     output: Path = written("Model file to write.", "MODEL", MISSING)
-    rows: Rows
     holdout: float = option(
         "Fraction of the rows that are not fitted but test the model; 0 for none.", default=0.3, min=0.0, max=0.9
     )
@@ -74,7 +70,7 @@ class FitOptions(Command):
     duplicates: str = option("Exactly repeated rows: error, keep or drop.", default="error")
 
 
-class CampaignOptions(Command):
+class CampaignOptions(Command, Rows, Robot):
     """Judge rows while they are measured.
 
     Follows a table that another program appends to: every row gets a verdict, the expected error of the robot and
@@ -85,15 +81,11 @@ class CampaignOptions(Command):
     """
 
     csv: Path = argument(CSV, "CSV", kind="later")
-    robot: Robot
-    units: Units
-    rows: Rows
     tolerance: str | None = option("End when the error is below this with 95 % probability: 0.15mm.", "LENGTH")
     stdin: bool = option(
-        "Append rows from standard input to CSV, one JSON object a line: see campaign/feeds.py.", default=False
-    )
-    json_lines: bool = option(
-        "Print verdicts, expected errors and next poses as JSON, one object a line.", default=False
+        "Append rows from standard input to CSV, one JSON object a line, and print verdicts, expected errors and next "
+        "poses so: see campaign/feeds.py.",
+        default=False,
     )
     once: bool = option("Judge the rows that are there, and do not wait for more.", default=False)
     candidates: Path | None = option("Table of poses that can be measured; within the joint limits by default.", "CSV")
@@ -124,28 +116,43 @@ class RecordOptions(Command):
     )
 
 
-class EvaluateOptions(Command):
+class EvaluateOptions(Command, Rows):
     """Measure the errors of a model on a table of measurements.
 
     The table is read as that of the model's fit, unless options say otherwise. --free first finds where the
     measuring device and the markers are now, and keeps everything else.
+
+    --report writes one HTML page for a browser or a printer: how good the model is, where, why, whether it can be
+    trusted, and what to do next. Rows that were used in the fit are left out.
     """
 
     model: Path = argument(MODEL, "MODEL")
-    csv: Path = argument(CSV, "CSV")
-    units: Units
-    rows: Rows
-    free: Free | None = option("First find anew what may have moved; base is the device's or the robot's.")
-    output: Path | None = written("With --free: write the registered model to this file.", "MODEL")
-    tolerance: str | None = option(
-        "Exit with code 4 if the RMS error of the rows that were not used in the fit is larger, such as 0.15mm.", "RMS"
+    csv: Path | None = argument(
+        f"{CSV} With --report by default the rows of the fit, each predicted by all others.", "CSV", None
     )
-    residuals: Path | None = written("Write the error of every row to this file: measured minus predicted.", "TABLE")
-    needs = (("-o", "--free"),)
-    excludes = (("--tolerance --residuals", "--free"),)
+    free: Free | None = option("First find anew what may have moved; base is the device's or the robot's.")
+    output: Path | None = written(
+        "Write the error of every row to this file, measured minus predicted; with --free the registered model.", "FILE"
+    )
+    tolerance: str | None = option(
+        "Exit with code 4 if the RMS error of the rows that were not used in the fit is larger, such as 0.15mm. With "
+        "--report the page says whether it is.",
+        "RMS",
+    )
+    report: Path | None = written("Write the page, in place of tables of errors.", "HTML")
+    against: list[str] | None = option(
+        "Further column of the table to show errors against in the page; repeat for more. Time and temperature are "
+        "found by their names.",
+        "COLUMN",
+    )
+    needs = (
+        ("--against", "--report"),
+        ("--position --socket --reading --length --angle --against", "CSV"),
+    )
+    excludes = (("--tolerance", "--free"), ("--report", "--free -o"))
 
 
-class InitOptions(Command):
+class InitOptions(Command, Places):
     """Propose the options of `fit` for a table and a robot.
 
     Without ROBOT the table has commanded poses or places in place of joint values. Looks at names, numbers and
@@ -154,7 +161,6 @@ class InitOptions(Command):
     """
 
     csv: Path = argument(CSV, "CSV")
-    places: Places
     robot: Path | None = argument(ROBOT, "ROBOT", None)
     output: Path = written("Campaign file to write.", "TOML", Path("campaign.toml"))
     force: bool = option("Replace a campaign file that was edited.", default=False)
@@ -189,7 +195,7 @@ class ImagesOptions(Command):
     decimal: str = option("Decimal mark of both tables.", default=".")
 
 
-class PredictOptions(Command):
+class PredictOptions(Command, Units):
     """Predict positions or poses for a table of joint values.
 
     Writes the joints, the positions, and the standard deviations that a new measurement would have. For a model
@@ -198,14 +204,13 @@ class PredictOptions(Command):
 
     model: Path = argument(MODEL, "MODEL")
     csv: Path = argument(CSV, "CSV")
-    units: Units
     output: Path = written("Table of predictions to write.", "CSV", MISSING)
     convention: str | None = option()
     rotation_angle: Angle | None = option()
     payload: str | None = option(metavar="COLUMN")
 
 
-class CorrectOptions(Command):
+class CorrectOptions(Command, Targets, Units):
     """Correct a program, so that the robot goes where it is told.
 
     The target of a row is the pose in which the nominal robot holds the tool at the row's joint values. With
@@ -223,9 +228,7 @@ class CorrectOptions(Command):
 
     model: Path = argument(MODEL, "MODEL")
     program: Path = argument("Table with a header, one command per row; other columns are kept.", "PROGRAM")
-    units: Units
     output: Path = written("Corrected program to write.", "CSV", MISSING)
-    targets: Targets
     tip: list[str] | None = option(
         "Link that carries the tool, for a model with several tips; repeat it where several tools have targets at the "
         "same time, with --tool, --position and --rotation once for each.",
@@ -233,11 +236,10 @@ class CorrectOptions(Command):
     )
     tool: list[str] | None = option(
         "Tool centre point in the frame of the tip, in the unit of --length, and its rotation if the tool is turned: a "
-        "rotation vector in the unit of --angle, or as --convention says. By default the tip itself, or the tool that "
-        "the model was saved with.",
-        "X,Y,Z[,...]",
+        f"rotation vector in the unit of --angle, or as --convention says{MEASURED_TOOL}. By default the tip itself, "
+        "or the tool that the model was saved with.",
+        "[measured:]X,Y,Z[,...]",
     )
-    tool_from: ToolFrom = option(TOOL_FROM, default="tip")
     frame: Frame = option("Frame of the target columns: the robot's base, or the measuring device.", default="base")
     limit: float | None = option(
         "Largest correction of a joint in degrees; 1 by default (prismatic joints: 20 mm).", "DEG"
@@ -261,12 +263,16 @@ class ExportOptions(Command):
     mjcf: Path | None = written("Write the same kinematics for MuJoCo: bodies, joints, inertias, sites at tips.", "XML")
     dh: Path | None = written("Write a Denavit-Hartenberg table, with base and tool.", "CSV")
     dh_convention: Convention = option("Convention of --dh; craig is also called modified.", default="standard")
-    ur_kinematics: Path | None = written("Write the kinematics file of Universal Robots' ROS packages.", "YAML")
-    ur_hash: str | None = option("Entry hash of --ur-kinematics: that of the robot's own calibration file.")
+    ur_kinematics: Path | None = written(
+        "Write the kinematics file of Universal Robots' ROS packages; over a copy of the robot's own calibration file "
+        "it keeps the hash of this.",
+        "YAML",
+    )
     joint_offsets: Path | None = written("Write the best joint offsets, all other geometry nominal.", "CSV")
-    correction_tables: Path | None = written("Write transmission errors and their corrections by joint value.", "CSV")
-    with_tables: bool = option(
-        "Fit --urdf, --mjcf, --dh and --ur-kinematics for use together with --correction-tables.", default=False
+    correction_tables: Path | None = written(
+        "Write transmission errors and their corrections by joint value; --urdf, --mjcf, --dh and --ur-kinematics that "
+        "are written beside them are fitted for use together with them.",
+        "CSV",
     )
     c: Path | None = option(
         "The model as C99 source, and a header beside it; with --tool and --frame.", "C", kind="source"
@@ -286,10 +292,10 @@ class ExportOptions(Command):
     )
     tool: str | None = option(
         "Tool centre point of programs, in the units of --length and --angle: place in the frame of the tip, and a "
-        "rotation vector if it is turned. By default the tip itself, or the tool that the model was saved with.",
-        "X,Y,Z[,...]",
+        f"rotation vector if it is turned{MEASURED_TOOL}. By default the tip itself, or the tool that the model was "
+        "saved with.",
+        "[measured:]X,Y,Z[,...]",
     )
-    tool_from: ToolFrom = option(TOOL_FROM, default="tip")
     frame: Frame | None = option(
         "Frame of the tool's poses in programs, in C of the markers too: the robot's base (default), or the measuring "
         "device."
@@ -301,14 +307,11 @@ class ExportOptions(Command):
     angle: Angle = option("Unit of angles in the CSV files written.", default="rad")
     needs = (
         ("--tool --frame", "--c --torch --onnx"),
-        ("--with-tables", "--urdf --mjcf --dh --ur-kinematics"),
-        ("--with-tables", "--correction-tables"),
-        ("--ur-hash", "--ur-kinematics"),
         ("--tip", "--c --dh"),
     )
 
 
-class PlanOptions(Command):
+class PlanOptions(Command, Candidates, Links, Units):
     """Plan which poses to measure, and say how many are needed.
 
     With --robot the first poses of a calibration, with a MODEL the next ones, and with --free those to measure
@@ -317,10 +320,7 @@ class PlanOptions(Command):
     """
 
     count: int = option("Number of poses to plan.", default=MISSING, min=1)
-    units: Units
     output: Path = written("Table of poses to write: the joints, and a rank.", "CSV", MISSING)
-    cell: Candidates
-    links: Links
     model: Path | None = argument(
         "Model file written by `fit`, to plan the next poses; or name a --robot.", "MODEL", None
     )
@@ -349,7 +349,7 @@ class PlanOptions(Command):
     )
 
 
-class RecalibrateOptions(Command):
+class RecalibrateOptions(Command, Rows):
     """Say what has changed since a fit, or calibrate anew.
 
     The measuring device may stand anywhere. Twenty rows do what about a hundred do without the old model. A table is
@@ -364,9 +364,7 @@ class RecalibrateOptions(Command):
 
     old: Path = argument(OLD, "OLD")
     other: Path = argument("Table of new measurements, or another model file of the same robot.", "OTHER")
-    units: Units
     output: Path | None = written("Calibrate anew, and write the model to this file.", "MODEL")
-    rows: Rows
     marker_freedom: Literal["evidence", "same", "moved", "other"] = option(
         "Whether the markers are the same (0.05 mm: nobody touched them), have moved a little (1 mm: remounted) or are "
         "other ones (anywhere); by default the rows decide.",
@@ -378,31 +376,6 @@ class RecalibrateOptions(Command):
     )
     note: str = option(NOTE, "TEXT", "")
     needs = (("--drift --note", "-o"),)
-
-
-class ReportOptions(Command):
-    """Write a report about a model, for a browser or a printer.
-
-    One HTML file: how good the model is, where, why, whether it can be trusted, and what to do next. Rows that were
-    used in the fit are left out; the table is read as that of the fit, unless options say otherwise.
-    """
-
-    model: Path = argument(MODEL, "MODEL")
-    output: Path = written("Page to write.", "HTML", MISSING)
-    units: Units
-    rows: Rows
-    csv: Path | None = argument(
-        "Measurements to judge the model by; by default the rows of its fit, each predicted by all others.", "CSV", None
-    )
-    against: list[str] | None = option(
-        "Further column of the table to show errors against; repeat for more. Time and temperature are found by their "
-        "names.",
-        "COLUMN",
-    )
-    tolerance: str | None = option(
-        "Largest RMS error that is good enough, such as 0.15mm: the page says whether it is.", "RMS"
-    )
-    needs = (("--position --socket --reading --length --angle --against", "CSV"),)
 
 
 class DemoOptions(Command):

@@ -32,7 +32,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import MISSING
 from importlib import import_module
 from importlib.metadata import version
-from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, TextIO
 
@@ -57,13 +56,24 @@ JOINED = ("rotation-std",)
 """Entries that may be lists of columns although the option can be repeated."""
 LONGEST_FILE = 1 << 20
 """Bytes: a file of options is short."""
-IN_FILE_OF = {"report": "fit", "record": "images", "demo": "fit", "predict": "evaluate"}
+IN_FILE_OF = {"record": "images", "demo": "fit", "predict": "evaluate"}
 """Command -> that whose file holds its work."""
-FORMER = {"compare": "recalibrate"}
-"""Former name of a command -> that which does the same now."""
-RENAMED = {"target": "tolerance", "fail-above": "tolerance", "payload-mass": "payload", "next": "count"}
-RENAMED |= {"rows": "count", "overview": "report", "register": "free=both", "data": ""}
-"""Former name of an option -> the present one, nothing for an argument."""
+GONE = {
+    "compare": "write `recalibrate OLD OTHER` without -o",
+    "report": "write `evaluate MODEL [CSV] --report PAGE`",
+    **dict.fromkeys(("--target", "--fail-above"), "write --tolerance"),
+    **dict.fromkeys(("--next", "--rows"), "write --count"),
+    "--payload-mass": "write --payload",
+    "--overview": "write --report",
+    "--register": "write --free both",
+    "--data": "name the table as an argument behind the model",
+    "--residuals": "write -o",
+    "--json-lines": "leave it out: --stdin answers so",
+    "--tool-from": "write --tool measured:X,Y,Z[,...] for a tool in the measured frame",
+    "--with-tables": "leave it out: what is written beside --correction-tables is for use together with them",
+    "--ur-hash": "write --ur-kinematics over a copy of the robot's own calibration file, whose hash it keeps",
+}
+"""Former name of a command or an option, and what to do now."""
 DECLARED: dict[str, dict[str, Any]] = {}
 """Command -> name of an option or argument, without dashes -> type of its value."""
 _arguments: list[str] = []
@@ -95,7 +105,9 @@ class FlagsOff(TyperGroup):
         running = not (others or options.get("resilient_parsing")) and not {"-h", "--help"} & set(args)
         if running:
             remove_earlier(args)
-        _arguments[:] = expanded(renamed(args))
+        if running:
+            refuse_gone(args)
+        _arguments[:] = expanded(args)
         if running:
             remove_earlier(_arguments)
         return super().make_context(info_name, list(_arguments), *others, **options)
@@ -145,7 +157,7 @@ Json = Annotated[
 
 def _declare(name: str, options: type[Command]) -> None:
     """Declare a command by the class of its options; every command has --json."""
-    own, parameters = list(options.all()), list[inspect.Parameter]()
+    own, parameters = options.all(), list[inspect.Parameter]()
     named = {one: option.hint for option in own for one in option.names or (option.shown,)} | {"--json": Path}
     DECLARED[name] = {one.removeprefix("--").lower(): hint for one, hint in named.items()}
 
@@ -162,7 +174,7 @@ def _declare(name: str, options: type[Command]) -> None:
         check_outputs(written, read | appended, may_come=appended)
         options.check_together(given)
         module = import_module(f"diffeo_calib.cli.commands.{IN_FILE_OF.get(name, name)}")
-        getattr(module, f"run_{name}" if name in IN_FILE_OF else "run")(options.made(given))
+        getattr(module, f"run_{name}" if name in IN_FILE_OF else "run")(options(**given))
 
     for one in own:
         typed = typer.Option(*one.names, **one.how) if one.names else typer.Argument(**one.how)
@@ -206,23 +218,13 @@ def _place_of_command(words: Sequence[str]) -> int:
     return next((place for place, word in enumerate(words) if not word.startswith("-")), len(words))
 
 
-def renamed(words: Sequence[str]) -> list[str]:
-    """The same command line without former names of commands and options."""
+def refuse_gone(words: Sequence[str]) -> None:
+    """Raise InputError for a former name of a command or an option, which says what to do now."""
     at = _place_of_command(words)
-    command, following = [FORMER.get(word, word) for word in words[at : at + 1]], iter(words[at + 1 :])
-    first, rest, last = list[str](), list[str](), list[str]()
-    for word in following:
-        name, equal, value = word.partition("=")
-        now = RENAMED.get(name[2:]) if name.startswith("--") else None
-        if now is None:
-            rest.append(word)
-        elif "=" in now:
-            first.append(f"--{now}")  # before what was typed as well
-        elif now:
-            rest.append(f"--{now}{equal}{value}")
-        else:
-            last += [value] if equal else islice(following, 1)  # the last argument
-    return [*words[:at], *command, *first, *rest, *last]
+    names = [*words[at : at + 1], *(word.partition("=")[0] for word in words[at + 1 :] if word.startswith("--"))]
+    for name in names:
+        if name in GONE:
+            raise InputError.of(f"{name} is gone", fix=GONE[name])
 
 
 def expanded(arguments: Sequence[str]) -> list[str]:
@@ -234,7 +236,8 @@ def expanded(arguments: Sequence[str]) -> list[str]:
     path = Path(words[at + 1])
     options = DECLARED[words[at]]
     of_fit = {*DECLARED[COMMAND]} - {*options}
-    entries = {RENAMED.get(name, name): value for name, value in _entries(path).items() if name not in of_fit}
+    entries = {name: value for name, value in _entries(path).items() if name not in of_fit}
+    refuse_gone(["", *(f"--{name}" for name in entries)])
     if unknown := [name for name in entries if name not in options]:
         expected = f"options of `{words[at]}`: {', '.join(options)}"
         raise InputError.of(f"{path}: {', '.join(unknown)}", expected=expected, fix="correct the names")

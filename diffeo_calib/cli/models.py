@@ -10,8 +10,8 @@ from torch import Tensor
 
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.main import command_line
-from diffeo_calib.cli.options import Links, Robot, Rows, Units
-from diffeo_calib.cli.tables import MeasuredTable, as_at_the_fit, measured_table, rows_in_table, tool_frame
+from diffeo_calib.cli.options import Links, Robot, Rows
+from diffeo_calib.cli.tables import Given, MeasuredTable, as_at_the_fit, measured_table, rows_in_table, tool_frame
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.common.files import read_regular
 from diffeo_calib.interop.model_file import load
@@ -51,16 +51,16 @@ def load_robot(path: Path, links: Links) -> Tree:
 
 def robot_of(given: Robot, source: MeasuredTable) -> Tree:
     """The robot of a table: that of a file, or a machine whose commanded poses are in the table."""
-    if isinstance(source.joints, PoseColumns):
-        if given.robot is not None or any(vars(given.links).values()):
+    if isinstance(source.table.joints, PoseColumns):
+        if given.robot is not None or any(getattr(given, name) for name in Links.names()):
             what, fix = "--robot, --base or --tip beside --robot-pose", "leave them out: poses are those of the flange"
             raise InputError.of(what, expected="joint values, or poses", got="both", fix=fix)
-        return cartesian(read_poses(source.csv, source.joints, source.table))
+        return cartesian(read_poses(source.csv, source.table))
     if given.robot is None:
         expected = "--robot FILE, or --robot-pose COLUMNS where the table has poses in place of joint values"
         fix = "of several lines that a campaign file proposes, uncomment one"
         raise InputError.of("the robot", expected=expected, got="neither", fix=fix)
-    return load_robot(given.robot, given.links)
+    return load_robot(given.robot, given)
 
 
 def is_urdf(path: Path) -> bool:
@@ -100,20 +100,20 @@ def check_payload_column(model: CalibratedKinematics, column: str | None) -> Non
         raise InputError.of("the model was calibrated with payloads", expected="--payload", fix=fix)
 
 
-def as_fitted(model: CalibratedKinematics, rows: Rows | None, units: Units) -> tuple[Rows, Units]:
+def as_fitted(model: CalibratedKinematics, given: Given) -> Given:
     """Options of a command with a model, completed by those of the command that made it."""
     made = model.provenance
-    return as_at_the_fit("" if made is None else made.command or made.table, rows, units)
+    return as_at_the_fit("" if made is None else made.command or made.table, given)
 
 
-def table_of(model: CalibratedKinematics, csv: Path, typed: Rows, typed_units: Units) -> MeasuredTable:
+def table_of(model: CalibratedKinematics, csv: Path, given: Rows) -> MeasuredTable:
     """A table read as that of the model's fit unless options say otherwise, without kinds of rows that it lacks."""
-    rows, units = as_fitted(model, typed, typed_units)
-    if not typed.named:
-        rows, missing = rows_in_table(csv, rows, units)
+    rows = as_fitted(model, given)
+    if not given.named:
+        rows, missing = rows_in_table(csv, rows)
         if missing:
             say(f"the table has no columns of {few(missing)}: it is read without these rows of the fit")
-    return measured_table(csv, rows, units)
+    return measured_table(csv, rows)
 
 
 def made_by_command(model: CalibratedKinematics) -> CalibratedKinematics:
@@ -143,19 +143,21 @@ LONGEST_TOOL_PER_REACH = 5.0
 """From where a tool is refused: its unit is wrong."""
 
 
-def tool_in_tip(model: CalibratedKinematics, text: str | None, tool_from: str, table: TableFormat) -> Tensor:
-    """The tool centre point of --tool and --tool-from in the tip's frame: (4, 4) m; the model's own without a text."""
+MEASURED = "measured:"
+"""Before the numbers of a tool in the measured frame."""
+
+
+def tool_in_tip(model: CalibratedKinematics, text: str | None, table: TableFormat) -> Tensor:
+    """The tool centre point of --tool in the tip's frame: (4, 4) m; the model's own without a text."""
     if text is None:
-        if tool_from != "tip":
-            raise InputError.of(f"--tool-from {tool_from} without --tool", fix="give the tool too, or leave it out")
         return model.tool
-    tool = tool_frame(text, table)
+    tool = tool_frame(text.removeprefix(MEASURED), table)
     if (length := float(tool[:3, 3].norm())) > model.robot.reach:
         what, fix = f"--tool is {length:g} m long, more than the robot reaches", "check the unit (--length)"
         if length > LONGEST_TOOL_PER_REACH * model.robot.reach:
             raise InputError.of(what, expected=f"at most {model.robot.reach:.3g} m", fix=fix)
         warn_user(sentence(what, fix=fix))
-    if tool_from == "tip":
+    if not text.startswith(MEASURED):
         return tool
     tip = model.tool_tip or model.robot.tips[0]
     frames = [] if model.lever is None else list(by_frame(model.measured_frame[None])[0])
@@ -163,7 +165,5 @@ def tool_in_tip(model: CalibratedKinematics, text: str | None, tool_from: str, t
     if len(own) != 1:
         found = f"{len(own)} frames were measured on '{tip}'"
         found = "this model was calibrated with points, which have no measured frame" if not frames else found
-        raise InputError.of(
-            f"--tool-from measured: {found}", fix="give the tool in the frame of the tip (--tool-from tip)"
-        )
+        raise InputError.of(f"--tool {text}: {found}", fix="give the tool in the frame of the tip (--tool X,Y,Z)")
     return own[0] @ tool

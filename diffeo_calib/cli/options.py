@@ -1,11 +1,11 @@
 """What an option is, and the groups of options that several commands share. Imports nothing slow: help appears at once.
 
-A group is a subclass of :class:`Options`: a frozen dataclass whose fields are options, or groups of more of them.
+A group is a subclass of :class:`Options`: a frozen dataclass whose fields are options. Commands inherit groups.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields
 from functools import cache
 from pathlib import Path
@@ -100,23 +100,15 @@ class Options:
 
     @classmethod
     @cache
-    def parts(cls) -> dict[str, Option | type[Options]]:
-        """Field -> the option, or the group of options, that it is."""
+    def all(cls) -> tuple[Option, ...]:
+        """Its options."""
         hints = get_type_hints(cls)
-        return {own.name: Option.of(own, hints[own.name]) if own.metadata else hints[own.name] for own in fields(cls)}
+        return tuple(Option.of(own, hints[own.name]) for own in fields(cls))
 
     @classmethod
-    def all(cls) -> Iterator[Option]:
-        """Its options, and those of the groups in it."""
-        for part in cls.parts().values():
-            yield from [part] if isinstance(part, Option) else part.all()
-
-    @classmethod
-    def made(cls, given: Mapping[str, Any]) -> Any:
-        """The group, and the groups in it, from the values of all options."""
-        made: Any = cls
-        found = cls.parts().items()
-        return made(**{name: given[name] if isinstance(part, Option) else part.made(given) for name, part in found})
+    def names(cls) -> set[str]:
+        """Names of its fields."""
+        return {own.name for own in fields(cls)}
 
     @classmethod
     def check_together(cls, given: Mapping[str, Any]) -> None:
@@ -160,6 +152,10 @@ class Units(Options):
     sep: str | None = option()
     decimal: str | None = option()
 
+    def left_open(self) -> set[str]:
+        """Names of options that are taken from the fit of a model unless they are typed: none beside both units."""
+        return set() if self.length and self.angle else Units.names()
+
 
 class Places(Options):
     """Measured places in a file of their own."""
@@ -175,7 +171,7 @@ class Places(Options):
     )
 
 
-class Rows(Places):
+class Rows(Places, Units):
     """Columns of the measurements in a table, of any kinds."""
 
     position: list[str] | None = option(metavar="X,Y,Z")
@@ -221,6 +217,11 @@ class Rows(Places):
         """Whether columns of some kind of rows are named."""
         return bool(self.position or self.socket or self.reading)
 
+    def left_open(self) -> set[str]:
+        """Columns too, unless some are named; not the file of the places of the fit."""
+        own = {"places", "by"} if self.places is None else {"places"}
+        return super().left_open() | (set() if self.named else Rows.names() - Units.names() - own)
+
     @property
     def images(self) -> bool:
         """Whether rows are images of a printed board."""
@@ -242,10 +243,9 @@ class Links(Options):
     )
 
 
-class Robot(Options):
+class Robot(Links):
     """Which robot was measured; none where --robot-pose names commanded poses."""
 
-    links: Links
     robot: Path | None = option(ROBOT, "FILE")
 
 

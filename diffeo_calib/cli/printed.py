@@ -20,7 +20,7 @@ from diffeo_calib.cli.console import plain, say, text_table
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.re_registration.registered_map import Registration
+from diffeo_calib.kinematics.registered_map import Registration
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.poses import POINTS, rotation_numbers
 from diffeo_calib.robots.geometry import Geometry

@@ -20,7 +20,7 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics import gates, likely_mistakes
 from diffeo_calib.calibration.diagnostics.plausibility import marker_column, unmeasured_markers
 from diffeo_calib.calibration.identification.registration import register, register_sockets, spread
-from diffeo_calib.calibration.placing.readings import identify_readings
+from diffeo_calib.calibration.placing.readings import register_readings
 from diffeo_calib.cli.column_names import column
 from diffeo_calib.cli.guesses import (
     LENS,
@@ -145,7 +145,7 @@ class Source:
         if not lengths:
             return max(_in_images(self.robot, one) for one in tables)
         size = float(torch.cat([one.reported.flatten() for one in lengths]).square().mean().sqrt())
-        rms = identify_readings(Geometry.nominal(self.robot), lengths, rigid=True)[0].noise  # of a number
+        rms = register_readings(Geometry.nominal(self.robot), lengths).noise  # of a number
         return rms / max(size, SMALLEST_SPREAD_M)
 
     def positions(self) -> Iterator[tuple[Source, Measurements]]:
@@ -175,7 +175,7 @@ class Source:
     def within_limits(self) -> bool:
         """Whether the values of the joints lie within the limits, in more than a small part of these."""
         low, high = self.robot.limits.unbind(1)
-        q = read_joints(self.sheet.path, self.joints, self.table, kinds=self.robot.kinds)
+        q = read_joints(self.sheet.path, replace(self.table, joints=self.joints, kinds=self.robot.kinds))
         part = (q.amax(0) - q.amin(0)) / (high - low)
         return bool(((q >= low) & (q <= high)).all()) and float(part.max()) > SMALLEST_PART
 

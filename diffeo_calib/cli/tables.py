@@ -7,12 +7,12 @@ Imports torch: only commands that run import this.
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import torch
 import typer
@@ -26,7 +26,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.files import PROGRAM
 from diffeo_calib.measurements.csv.cells import number
-from diffeo_calib.measurements.csv.files import read_joints, read_observations
+from diffeo_calib.measurements.csv.files import read_observations
 from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
@@ -39,6 +39,7 @@ from diffeo_calib.sensors.kinds import known_kinds
 from diffeo_calib.sensors.range import UNKNOWN_ZERO_M
 
 POSE_JOINTS = 6
+Given = TypeVar("Given", bound=Units)
 
 
 def table_format(units: Units) -> TableFormat:
@@ -52,8 +53,12 @@ def table_format(units: Units) -> TableFormat:
         fix = "state the units of the table; a model that `fit` made knows those of its own"
         raise InputError.of(f"{missing} missing", fix=fix)
     sep = "," if units.sep is None else "\t" if units.sep in ("\\t", "tab") else units.sep
-    decimal = "." if units.decimal is None else units.decimal
-    return TableFormat(length, angle, sep, decimal, joint_length=units.joint_length)
+    decimal, joints = "." if units.decimal is None else units.decimal, _split_names(units.joints or "")
+    if units.robot_pose is not None and units.joints is not None:
+        fix = "name the columns of the pose, or those of the joints"
+        raise InputError.of("--joints beside --robot-pose", expected="one of them", got="both", fix=fix)
+    own = PoseColumns.of(units.robot_pose) if units.robot_pose is not None else joints if any(joints) else ()
+    return TableFormat(length, angle, sep, decimal, joint_length=units.joint_length, joints=own)
 
 
 def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
@@ -73,12 +78,12 @@ def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
     )
 
 
-def measured_table(csv: Path, rows: Rows, units: Units, duplicates: str = "keep") -> MeasuredTable:
+def measured_table(csv: Path, rows: Rows, duplicates: str = "keep") -> MeasuredTable:
     """The table that options describe, joined of two files if these do; exact repeats are kept by default."""
     if not rows.named:
         text = "name the position columns, or those of --socket or --reading"
         raise typer.BadParameter(text, param_hint="--position")
-    table = with_rows(table_format(units), rows)
+    table = with_rows(table_format(rows), rows)
     csv, names = with_places(csv, rows, table), list[str]()
     if isinstance(csv, JoinedFile):
         say(csv.sentence)
@@ -86,7 +91,7 @@ def measured_table(csv: Path, rows: Rows, units: Units, duplicates: str = "keep"
         with suppress(MeasurementError):  # rows may come later
             names = CsvLines(csv, table.sep).header
     readings = readings_columns(rows.reading or (), rows, names)
-    return MeasuredTable(csv, joints_of(units), replace(table, readings=readings), duplicates)
+    return MeasuredTable(csv, replace(table, readings=readings), duplicates)
 
 
 def with_places(csv: Path, rows: Rows, table: TableFormat) -> Path:
@@ -99,7 +104,7 @@ def with_places(csv: Path, rows: Rows, table: TableFormat) -> Path:
 # --- as at the fit ------------------------------------------------------------------------------------------------
 
 
-def as_at_the_fit(command: str, rows: Rows | None, units: Units) -> tuple[Rows, Units]:
+def as_at_the_fit(command: str, given: Given) -> Given:
     """Options of a later command, completed by those of the command line that made its model; typed ones win.
 
     Columns are taken over unless --position, --socket or --reading are typed, and units, marks and names of joints
@@ -107,40 +112,34 @@ def as_at_the_fit(command: str, rows: Rows | None, units: Units) -> tuple[Rows, 
 
     Args:
         command: that made the model, or the options of its table alone; empty where neither is known.
-        rows: None for a table of joint values alone.
     """
-    own, words = rows or Rows(), list[str]()
-    groups = [Rows] * (rows is not None and not rows.named) + [Units] * (units.length is None or units.angle is None)
+    wanted, marker = given.left_open(), given.marker if isinstance(given, Rows) else None
+    wanted -= {name for name, value in vars(given).items() if value}
     try:
-        stored = shlex.split(command) if groups or own.marker else []
-        known = {group: _stated(stored, group) for group in groups}
-        typed = {name for name, value in (vars(own) | vars(units)).items() if value}
-        typed |= {"places"} | ({"by"} if own.places is None else set())  # of the file of the fit
-        if own.marker is not None and "=" not in own.marker:
-            order = _stated(stored, Rows).get("marker", ("", []))[0].partition("=")[1:]
-            own = replace(own, marker=own.marker + "".join(order))
-            add_to_command_line(["--marker", str(own.marker)])
-        completed = list[Any]()
-        for group in (own, units):
-            taken = {name: one for name, one in known.get(type(group), {}).items() if name not in typed}
-            completed.append(replace(group, **{name: value for name, (value, _) in taken.items()}))
-            words += [word for _, own_words in taken.values() for word in own_words]
+        stored = shlex.split(command) if wanted or marker else []
+        if marker is not None and "=" not in marker:
+            order = _stated(stored, {"marker"}).get("marker", ("", []))[0].partition("=")[1:]
+            given = replace(given, marker=marker + "".join(order))
+            add_to_command_line(["--marker", marker + "".join(order)])
+        known = _stated(stored, wanted)
     except (ValueError, IndexError) as error:  # of a file that was edited
         fix = "name the columns (--position, --socket, --reading), --length and --angle"
         raise InputError.of("the options that the model was fitted with", got=str(error), fix=fix) from error
-    program = _stated(shlex.split(command), Units).get("robot_pose", ("", []))[0] if PROGRAM in command else ""
-    if PROGRAM in program and units.robot_pose in (None, program.partition("=")[0]):  # of other names: places
+    pose = given.robot_pose
+    program = _stated(shlex.split(command), {"robot_pose"}).get("robot_pose", ("", []))[0] if PROGRAM in command else ""
+    if PROGRAM in program and pose in (None, program.partition("=")[0]):  # of other names: places
         fix = f"type it again, a model file starts no program: --robot-pose {program}"
         raise InputError.of("--robot-pose", expected="the function that the model was fitted with", fix=fix)
-    if words:
+    order = sorted(known, key=lambda name: name in Units.names())
+    if words := [word for name in order for word in known[name][1]]:
         say(f"tables are read as at the fit: {shlex.join(words)}")
     add_to_command_line(words)
-    return completed[0], completed[1]
+    return replace(given, **{name: value for name, (value, _) in known.items()})
 
 
-def rows_in_table(csv: Path, rows: Rows, units: Units) -> tuple[Rows, list[str]]:
+def rows_in_table(csv: Path, rows: Rows) -> tuple[Rows, list[str]]:
     """Options without the kinds of rows that a table has no column of, if it has those of others; and these kinds."""
-    table = table_format(units)
+    table = table_format(rows)
     header = set(read_cells(with_places(csv, rows, table), table.sep)[0])
     kinds = {"--position": rows.position or [], "--socket": [rows.socket] * (rows.socket is not None)}
     kinds |= {f"--reading {text}": [text.partition("=")[2]] for text in rows.reading or () if CORNERS not in text}
@@ -158,13 +157,13 @@ def rows_in_table(csv: Path, rows: Rows, units: Units) -> tuple[Rows, list[str]]
     return replace(rows, reading=kept or None, **changes), missing
 
 
-def _stated(words: Sequence[str], group: type[Units] | type[Rows]) -> dict[str, tuple[Any, list[str]]]:
-    """Field of a group -> its value in a command line, and the words that state it.
+def _stated(words: Sequence[str], wanted: Container[str]) -> dict[str, tuple[Any, list[str]]]:
+    """Name of a wanted option of tables -> its value in a command line, and the words that state it.
 
     ValueError or IndexError for a value that is none.
     """
     found = dict[str, tuple[Any, list[str]]]()
-    for option in group.all():
+    for option in (one for one in Rows.all() if one.field in wanted):
         name, hint, given = option.shown, option.hint, list[list[str]]()
         for place, word in enumerate(words):
             begin, equal, value = word.partition("=")
@@ -190,10 +189,7 @@ class MeasuredTable:
     """A table of measurements as the options describe it."""
 
     csv: Path
-    # names of the joint columns, separated by commas; None if they are named after the robot's joints; or the columns
-    # of a pose
-    joints: str | PoseColumns | None
-    table: TableFormat  # what it holds, but for the joints
+    table: TableFormat  # what it holds; without joints they are named after the robot's
     duplicates: str = "keep"  # what to do with exactly repeated rows
     growing: bool = False  # whether rows will be added
 
@@ -208,7 +204,7 @@ class MeasuredTable:
             expected, fix = f"{len(triples)}, one for each --position", "repeat a tip that carries several markers"
             raise InputError.of("--tip", expected=expected, got=len(tips), fix=fix)
         session = given.session if triples or not given.readings else None  # of readings it names their devices
-        table = replace(given, joints=joint_columns(self.joints, robot), kinds=robot.kinds, session=session)
+        table = replace(of_robot(given, robot), session=session)
         data = read_observations(self.csv, table, duplicates=self.duplicates, growing=self.growing)
         named: Any = given.marker and data.origin.columns.table.marker
         if given.marker != named:  # later tables have the same order
@@ -230,15 +226,10 @@ class ProgramTable:
     """A robot's program as the options describe it, with the columns of the targets of every tool, if any."""
 
     csv: Path
-    joints: str | PoseColumns | None
-    table: TableFormat
+    table: TableFormat  # with the joints of the robot
     given: Targets
 
-    def commands(self, robot: Tree) -> Tensor:
-        """(N, n) joint values, rad or m."""
-        return read_joints(self.csv, joint_columns(self.joints, robot), self.table, kinds=robot.kinds)
-
-    def targets(self, robot: Tree, tools: int) -> Tensor | None:
+    def targets(self, tools: int) -> Tensor | None:
         """(N, T, 4, 4) poses or (N, T, 3) positions of T tools, m; None if the table has none."""
         given, position, rotation = self.given, self.given.position, self.given.rotation
         if not position:
@@ -249,9 +240,8 @@ class ProgramTable:
             fix = "name the columns of the targets once for every --tip"
             raise InputError.of("--position", expected=f"{tools} of them", got=len(position), fix=fix)
         turned = Rows(rotation=rotation, convention=given.convention, rotation_angle=given.rotation_angle)
-        table = replace(with_rows(self.table, turned) if rotation else self.table, kinds=robot.kinds)
-        names = [_split_names(text) for text in position]
-        table = replace(table, joints=joint_columns(self.joints, robot), position=names)
+        table = with_rows(self.table, turned) if rotation else self.table
+        table = replace(table, position=[_split_names(text) for text in position])
         data = read_observations(self.csv, table, duplicates="keep", growing=True)  # 0, 0, 0 is a target
         lines = [line for line, _ in read_cells(self.csv, table.sep, numeric_columns(table).names)[1]]
         if len(data) < len(lines):
@@ -261,9 +251,9 @@ class ProgramTable:
 
     def written(self) -> TableFormat:
         """The format of the poses that are written: the same convention, by default that of commanded poses."""
-        convention, angle = self.given.convention, self.given.rotation_angle
-        if convention is None and isinstance(self.joints, PoseColumns) and not self.joints.is_program:
-            convention, angle = self.joints.convention or None, angle or self.table.angle
+        convention, angle, joints = self.given.convention, self.given.rotation_angle, self.table.joints
+        if convention is None and isinstance(joints, PoseColumns) and not joints.is_program:
+            convention, angle = joints.convention or None, angle or self.table.angle
         plain = replace(self.table, convention=convention, rotation_angle=angle)
         return plain.for_writing(rotation_std=False)
 
@@ -282,36 +272,30 @@ def tool_frame(text: str, table: TableFormat) -> Tensor:
     return frame
 
 
-def joints_of(units: Units) -> str | PoseColumns | None:
-    """The columns of the joints, or of the pose in their place, as the options name them."""
-    if units.robot_pose is None:
-        return units.joints
-    if units.joints is not None:
-        fix = "name the columns of the pose, or those of the joints"
-        raise InputError.of("--joints beside --robot-pose", expected="one of them", got="both", fix=fix)
-    return PoseColumns.of(units.robot_pose)
-
-
-def joint_columns(joints: str | PoseColumns | None, robot: Tree) -> list[str] | PoseColumns:
-    """Names of the joint columns: those given, or the robot's; or the columns of the pose of a machine."""
+def of_robot(table: TableFormat, robot: Tree) -> TableFormat:
+    """The same format with the joints of a robot, in columns that it names, or else after them; or with its poses."""
+    joints, own = table.joints, list(robot.joint_names)
     if isinstance(joints, PoseColumns):
         count = robot.n if joints.is_program else len(joints.columns) if not joints.convention else POSE_JOINTS
         if not is_cartesian(robot) or robot.n != count:
             expected = f"the {robot.n} joint values of robot '{robot.name}'"
             raise InputError.of(f"--robot-pose {','.join(joints.columns)}", expected=expected, got="other inputs")
-        return replace(joints, robot=robot)
-    if not joints:
-        return list(robot.joint_names)
-    names = _split_names(joints)
-    if names != list(robot.joint_names) and sorted(names) == sorted(robot.joint_names):
+        return replace(table, joints=replace(joints, robot=robot), kinds=robot.kinds)
+    names, order = list(joints) or own, ",".join(own)
+    if names != own and sorted(names) == sorted(own):
         what = "--joints names the robot's joints in another order than the robot's"
         fix = "leave it out: columns that are named after the joints are found wherever they are"
-        expected, got = ",".join(robot.joint_names), ",".join(names)
-        raise InputError.of(what, expected=expected, got=got, fix=fix)
+        raise InputError.of(what, expected=order, got=",".join(names), fix=fix)
     if len(names) != robot.n:
-        order = ", ".join(robot.joint_names)
-        raise InputError.of(f"--joints {joints}", expected=f"{robot.n} columns, in the order {order}", got=len(names))
-    return names
+        expected = f"{robot.n} columns, in the order {order.replace(',', ', ')}"
+        raise InputError.of(f"--joints {','.join(names)}", expected=expected, got=len(names))
+    return replace(table, joints=names, kinds=robot.kinds)
+
+
+def as_written(table: TableFormat) -> TableFormat:
+    """The same format with the columns in which joints, or the poses of a machine, are written."""
+    joints = table.joints
+    return replace(table, joints=joints.written) if isinstance(joints, PoseColumns) else table
 
 
 def _split_names(text: str) -> list[str]:

@@ -30,7 +30,7 @@ from diffeo_calib.kernels.radial import PROBE, RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
 from diffeo_calib.kinematics.provenance import Provenance, Summary, entries_of, record_of
-from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
+from diffeo_calib.kinematics.registered_map import RegisteredMap, Registration
 from diffeo_calib.kinematics.tool import tool_transform
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation

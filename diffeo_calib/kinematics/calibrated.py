@@ -15,17 +15,10 @@ from diffeo_calib.common.device import HOST, methods_outside_inference_mode, usa
 from diffeo_calib.common.errors import InputError, as_written, printable
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.device_readings import PredictedReadings, predicted_readings
-from diffeo_calib.kinematics.joint_ranges import check_same_robot
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.kinematics.provenance import Provenance, Summary
-from diffeo_calib.kinematics.re_registration.register_again import (
-    devices_beside,
-    register_again,
-    registered_devices,
-    registration_rows,
-)
-from diffeo_calib.kinematics.re_registration.registered_map import Registration, robot_map
+from diffeo_calib.kinematics.registered_map import Registration, robot_map
 from diffeo_calib.kinematics.tool import ToolKinematics, checked_tip, tool_transform
 from diffeo_calib.kinematics.transmission import transmission
 from diffeo_calib.measurements.bodies import Bodies
@@ -190,21 +183,9 @@ class CalibratedKinematics:
             DiffeoCalibWarning: outliers, directions that the rows do not determine, errors that remain; devices that
                 read a ball or frame that the rows' markers replace, which the model then no longer knows.
         """
-        rows = registration_rows(measurements, self)
-        check_same_robot(self, measurements)
-        if rows is None:
-            return self._with(placement=devices_beside(self, measurements))
-        model = self.to(HOST)._carrying(self.nominal.load.under(rows.payload).typical)
-        ball = self.ball and bool(rows.points[:, -1].isnan().all())
-        asked = model.map, model.nominal, self.lever, rows
-        placed, found = register_again(*asked, free=free, marker_std=marker_std, ball=ball, learn=learn)
-        learns, before = placed.registration is None, getattr(self.registration, "table_sha256", "")
-        found = replace(found, table_sha256=" ".join([before, measurements.sha256][: 1 + learns]).strip())
-        vars(placed).update({} if learns else {"registration": found})
-        known = {"map": placed.to(self.configurations.device), "lever": found.lever, "placement": (), "ball": ball}
-        seen = self._with(**known, learnt=found if learns else None)._carrying(self.nominal.load)
-        seen = seen._with(placement=registered_devices(self, seen))
-        return seen._with(placement=devices_beside(seen, measurements))
+        from diffeo_calib.calibration.recalibration.register import registered  # noqa: PLC0415  # it reaches up
+
+        return registered(self, measurements, free=free, marker_std=marker_std, learn=learn)
 
     @property
     def registration(self) -> Registration | None:

@@ -20,7 +20,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError, sentence, w
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.joint_ranges import SAME_CONFIGURATION, check_same_robot, fitted_configurations
 from diffeo_calib.kinematics.nominal import FlangePoints
-from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes
+from diffeo_calib.kinematics.registered_map import marker_slopes
 from diffeo_calib.measurements.bodies import Predicted
 from diffeo_calib.measurements.poses import angle_between
 from diffeo_calib.measurements.rows import RowGroups

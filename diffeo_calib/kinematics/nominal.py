@@ -16,6 +16,7 @@ from diffeo_calib.robots.gravity import GravitySag
 from diffeo_calib.robots.payload import NO_PAYLOAD, Payload
 from diffeo_calib.robots.position_errors import PositionErrors
 from diffeo_calib.robots.se3 import skew
+from diffeo_calib.runtime.build import axis_waves, gear_waves
 from diffeo_calib.runtime.chain import Waves, wave_angles, wave_slopes, wave_sums
 
 TURNS_FROM = 3
@@ -49,13 +50,16 @@ class GeometryMap(NominalMap):
         payload: Payload | None = None,
         rigid: bool = False,
     ) -> None:
-        own.check(geometry.chain.n, geometry.chain.moving)
+        n, n_all = geometry.chain.n, geometry.chain.moving
+        own.check(n, n_all)
         load = payload or NO_PAYLOAD
         if load and not elastic:
             raise InputError.of("a payload of a rigid robot", expected="elastic=True", fix="leave the payload out")
         self.geometry = geometry
         self.elasticity = GravitySag(geometry.chain, payload) if elastic else None
         self.own, self.rigid = own, rigid
+        tables = {"waves": gear_waves(own.waves, n), "axes": axis_waves(own.axes, n_all)}
+        self._tables = {name: Waves(*map(torch.from_numpy, table)) for name, table in tables.items()}
         sizes = self.elasticity.size if self.elasticity else 0, *own.sizes
         ends = [geometry.size + sum(sizes[:k]) for k in range(len(sizes) + 1)]
         self.parts = dict(zip(("sag", "waves", "axes"), map(slice, ends, ends[1:]), strict=True))
@@ -124,14 +128,11 @@ class GeometryMap(NominalMap):
         slopes = self._smooth_jacobian(self.turned(x, theta), theta)
         if not self.own.waves:
             return slopes
-        waves = self.own.of_gears(x.shape[1], x).times(theta[self.parts["waves"]])
-        return slopes * (1.0 + wave_slopes(waves, x, torch))[:, None]
+        return slopes * (1.0 + wave_slopes(self._errors_of("waves", x, theta), x, torch))[:, None]
 
     def turned(self, x: Tensor, theta: Tensor) -> Tensor:
         """The joint values with the waves of their gears."""
-        if not self.own.waves:
-            return x
-        return x + wave_sums(self.own.of_gears(x.shape[1], x).times(theta[self.parts["waves"]]), x, torch)
+        return x + wave_sums(self._errors_of("waves", x, theta), x, torch) if self.own.waves else x
 
     def _smooth_jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
         """Derivatives by joint values that include their waves: (N, 3 P, n)."""
@@ -144,7 +145,9 @@ class GeometryMap(NominalMap):
             turning = self.elasticity.twist_slopes(x, self.split(theta)[1])  # (N, joints, 6, n)
             slopes = slopes + torch.einsum("nmjc,njck->nmk", by_twist, turning)
         if self.own.axes:
-            turning = wave_slopes(self._axes(x, theta), chain.moving_values(x), torch).unflatten(1, (-1, 6))
+            turning = wave_slopes(self._errors_of("axes", x, theta), chain.moving_values(x), torch).unflatten(
+                1, (-1, 6)
+            )
             slopes = slopes + chain.by_active((by_twist * turning[:, None]).sum(3))
         return slopes
 
@@ -160,11 +163,11 @@ class GeometryMap(NominalMap):
         if self.elasticity is not None:
             parts.append(self.elasticity.sensitivities(turned, by_twist))
         if self.own.waves:
-            waves = self.own.of_gears(x.shape[1], x)
+            waves = self._errors_of("waves", x)
             slopes = self._smooth_jacobian(turned, theta)[..., waves.joints]
             parts.append(slopes * wave_angles(waves, x, torch).cos()[:, None])
         if self.own.axes:
-            axes = self.own.of_axes(self.geometry.chain.moving, x)
+            axes = self._errors_of("axes", x)
             functions = wave_angles(axes, self.geometry.chain.moving_values(turned), torch).cos()
             parts.append((by_twist[:, :, axes.joints] * functions[:, None, :, None]).flatten(2))
         return torch.cat(parts, dim=2)
@@ -177,16 +180,16 @@ class GeometryMap(NominalMap):
         if self.elasticity is not None and (live or bool(coefficients.any())):
             twists.append(self.elasticity.twists(x, coefficients).flatten(1))
         if self.own.axes and (live or bool(theta[self.parts["axes"]].any())):
-            twists.append(wave_sums(self._axes(x, theta), chain.moving_values(x), torch))
+            twists.append(wave_sums(self._errors_of("axes", x, theta), chain.moving_values(x), torch))
         if not twists:
             return errors
         joints, same = self.geometry.slices["joints"], errors.expand(x.shape[0], -1)
         return torch.cat([same[:, : joints.start], errors[joints] + sum(twists), same[:, joints.stop :]], dim=1)
 
-    def _axes(self, x: Tensor, theta: Tensor) -> Waves:
-        """The errors of axes, on the device of joint values."""
-        axes = self.own.of_axes(self.geometry.chain.moving, x)
-        return axes.times(theta[self.parts["axes"]])
+    def _errors_of(self, name: str, x: Tensor, theta: Tensor | None = None) -> Waves:
+        """The errors of gears or axes, on the device of joint values; with units of their joints without theta."""
+        units = Waves(*(part.to(x.device) for part in self._tables[name]))
+        return units if theta is None else units.times(theta[self.parts[name]])
 
     def _by_twist(self, by_error: Tensor) -> Tensor:
         """The columns of the joints' error twists: (N, P, 3, K) -> (N, 3 P, joints, 6)."""

@@ -22,7 +22,7 @@ from diffeo_calib.common.errors import InputError, as_written, listed
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
-from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes
+from diffeo_calib.kinematics.registered_map import marker_slopes
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.measurements.poses import mark_points, marks, pose_directions, poses_from_marks, rigid_poses
 from diffeo_calib.robots.tree import Tree

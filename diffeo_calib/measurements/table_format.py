@@ -138,10 +138,10 @@ class TableFormat:
         """Units of the prismatic joints per metre."""
         return UNITS_PER_METRE[self.joint_unit]
 
-    def joints_only(self, joints: Any, kinds: Sequence[str] | None = None) -> TableFormat:
-        """The same units, marks and columns beside them, for a table of the values of these joints."""
-        kept = "length", "angle", "sep", "decimal", "joint_length", *BESIDE
-        return TableFormat(**{name: getattr(self, name) for name in kept}, joints=joints, kinds=kinds)
+    def joints_only(self) -> TableFormat:
+        """The same units, marks, joints and columns beside them, without what was measured."""
+        kept = "length", "angle", "sep", "decimal", "joint_length", "joints", "kinds", *BESIDE
+        return TableFormat(**{name: getattr(self, name) for name in kept})
 
     @property
     def triples(self) -> list[tuple[str, ...]]:

@@ -79,6 +79,11 @@ class Process:
         factor = Factor(L, torch.cat([self.factor.W, right[:, 1:]]))
         return replace(self, numbers=new, factor=factor, alpha=torch.cat([self.alpha, right[:, 0]]))
 
+    def opened(self, E: Tensor, size: float | None = None) -> Process:
+        """The same rows beside unknowns of this standard deviation, of any by default, with effects (M, U) on them."""
+        E = E / E.norm(dim=0).clamp(min=torch.finfo(E.dtype).tiny) if size is None else size * E
+        return replace(self, variance=torch.cat([self.variance, E.new_ones(E.shape[1])]), factor=self.factor.beside(E))
+
     def expected(self, new: Numbers, before: Expected | None = None) -> Expected:
         """Numbers as the rows so far predict them; ``before``: the same by the first of these rows alone."""
         L, W = self.factor.L, self.factor.W

@@ -148,8 +148,7 @@ class Hyperparameters:
         deviations = torch.cat([deviations, deviations.new_tensor(lines)])
         if self.axis_errors is not None and self.axis_lengthscale is not None:
             for axis, errors, lengthscale in zip(self.axes, self.axis_errors, self.axis_lengthscale, strict=True):
-                own = axis_spectrum(lengthscale, axis[3])[:, None] * errors.repeat_interleave(3)
-                deviations = torch.cat([deviations, own.flatten()])
+                deviations = torch.cat([deviations, axis_deviations(errors, lengthscale, axis[3])])
         return deviations.square()
 
     def supported(self, jacobian: Tensor, noise: Tensor) -> Hyperparameters:
@@ -206,16 +205,17 @@ class Hyperparameters:
 
 DEVIATIONS_OF_SOME = "axis_errors", "other_noise"
 SCALES_OF_SOME = (*DEVIATIONS_OF_SOME, "axis_lengthscale")
-FOUND = "lines", "payload", "axes"
+FOUND = "lines", "payload", "axes", "axis_errors", "axis_lengthscale"
+"""Names of what is found beside other scales, before these are searched again."""
 SCALES = tuple(one.name for one in fields(Hyperparameters) if one.name not in (*FOUND, *SCALES_OF_SOME))
 """Names of the scales that are tensors and that all measurements have."""
 
 
-def axis_spectrum(lengthscale: Tensor, count: int) -> Tensor:
-    """Deviations (count,) of c_1 ... of a function with RMS 1, for a length scale () as a part of the range."""
+def axis_deviations(errors: Tensor, lengthscale: Tensor, count: int) -> Tensor:
+    """Deviations (6 count,) of c_1 ... of functions with RMS shift and turn (2,), see :class:`Hyperparameters`."""
     rates = torch.pi * torch.arange(1, count + 1, dtype=lengthscale.dtype, device=lengthscale.device)
     deviations = (1.0 + (rates * lengthscale).square() / 5.0) ** -1.5
-    return deviations * (2.0 / deviations.square().sum()).sqrt()
+    return torch.outer(deviations * (2.0 / deviations.square().sum()).sqrt(), errors.repeat_interleave(3)).flatten()
 
 
 class Term(NamedTuple):

@@ -42,6 +42,14 @@ class Factor:
             L = lower_root(F)
             return cls(L, torch.linalg.solve_triangular(L, H, upper=False))
 
+    def beside(self, H: Tensor) -> Factor:
+        """That of K + H H^T for more features (M, k), with its inverse by that of K (M. Woodbury, 1950)."""
+        other, V = Factor(self.L, torch.cat([self.W, self.white(H)], 1)), self.inverse @ H
+        root = torch.linalg.cholesky(torch.eye(H.shape[1], dtype=H.dtype, device=H.device) + H.T @ V)
+        Y = torch.linalg.solve_triangular(root, V.T, upper=False)
+        vars(other)["inverse"] = self.inverse.addmm(Y.T, Y, alpha=-1.0)
+        return other
+
     @property
     def matrix(self) -> Tensor:
         """K (M, M)."""

@@ -15,12 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import isfinite
 
-import torch
-from torch import Tensor
-
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.runtime.build import axis_waves, gear_waves
-from diffeo_calib.runtime.chain import Waves
 
 
 @dataclass(frozen=True)
@@ -53,11 +48,3 @@ class PositionErrors:
         for what, each, most in (("gear waves", self.waves, n), ("axes", self.axes, n_all)):
             if any(one[0] >= most for one in each):
                 raise InputError.of(f"the joints of {what}", expected=f"numbers below {most}", got=list(each))
-
-    def of_gears(self, n: int, like: Tensor) -> Waves:
-        """The waves with units of n active joints, on a device."""
-        return Waves(*(torch.from_numpy(part).to(like.device) for part in gear_waves(self.waves, n)))
-
-    def of_axes(self, n_all: int, like: Tensor) -> Waves:
-        """The errors of axes with units of all moving joints, on a device."""
-        return Waves(*(torch.from_numpy(part).to(like.device) for part in axis_waves(self.axes, n_all)))

@@ -240,9 +240,9 @@ class Devices(Extrinsics):
         return ", ".join(f"{value:.3f}" for value in self.constants[number].tolist())
 
     @property
-    def places(self) -> Tensor | None:
-        """(D, 3) to which the ball must be brought to be seen, m; None if anywhere will do."""
-        return None
+    def places(self) -> Tensor:
+        """(D, 3) to which the ball must be brought to be seen, m; none if anywhere will do."""
+        return self.constants[:0, :3]
 
     def sees(self, points: Tensor, device: Tensor) -> Tensor:
         """(N,) boolean: whether these devices (N,) can measure points (N, 3), m."""

@@ -4,8 +4,8 @@
 
 The arm is simulated, so that its true kinematics are known. On the command line the same is
 
-    diffeo-calib correct model.safetensors program.csv --length m --angle rad --tool 0.1,-0.1,0.2 \\
-        --tool-from measured --position x,y,z --frame measuring -o corrected.csv
+    diffeo-calib correct model.safetensors program.csv --length m --angle rad --tool measured:0.1,-0.1,0.2 \\
+        --position x,y,z --frame measuring -o corrected.csv
 """
 
 from __future__ import annotations

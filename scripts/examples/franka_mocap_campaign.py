@@ -110,7 +110,7 @@ def main() -> None:
     random = np.random.default_rng(0)
     Path("fr3.urdf").write_text(urdf(ORIGINS))
     Path("campaign.toml").write_text(CAMPAIGN)
-    words = ["campaign", "campaign.toml", "--stdin", "--json-lines", "--accepted", "accepted.csv"]
+    words = ["campaign", "campaign.toml", "--stdin", "--accepted", "accepted.csv"]
     command = [sys.executable, "-m", "diffeo_calib", *words]
     robot = Robot(random)
     cameras = Cameras(robot, random)

@@ -95,7 +95,7 @@ def main() -> None:
     arm = SimulatedArm(seed=3)
     arm.write_urdf("robot.urdf")
     Path("campaign.toml").write_text(CAMPAIGN)
-    words = ["campaign", "campaign.toml", "--stdin", "--tolerance", "0.3mm", "--json-lines"]
+    words = ["campaign", "campaign.toml", "--stdin", "--tolerance", "0.3mm"]
     command = [sys.executable, "-m", "diffeo_calib", *words]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as campaign:
         robot, feed = Robot(arm), Feed(campaign)

@@ -24,6 +24,7 @@ from simulated_sockets import rest_in_sockets
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.expected_errors import workspace_deviation
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.process.scales import GearLine
 from diffeo_calib.robots import SimulatedArm
@@ -251,7 +252,7 @@ def devices(result: Any) -> Numbers:
         own = result.sockets
         found |= {"sockets": own.positions, "sockets, covariance": own.covariance}
         found["sockets left out, spread"] = one(*(place.spread for place in own.left_out))
-        found["expected error"] = one(own.workspace_deviation)
+        found["expected error"] = one(workspace_deviation(result.model.map))
     if result.sessions is not None:
         found["frames of sessions"] = result.sessions.transforms
     return found

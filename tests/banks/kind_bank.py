@@ -30,7 +30,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.recalibration.new_set_up import Before, place_again
+from diffeo_calib.calibration.recalibration.new_rows import NewSetUp
+from diffeo_calib.calibration.recalibration.new_set_up import place_again
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.csv.sensors import ImageColumns
 from diffeo_calib.measurements.poses import mark_points
@@ -255,7 +256,7 @@ class Kind:
         return self.model.registered(self.moved)
 
     @cached_property
-    def placed_again(self) -> Before:
+    def placed_again(self) -> NewSetUp:
         """Where a comparison and a recalibration with ``moved`` begin."""
         return place_again(self.model, self.moved)
 
@@ -440,7 +441,7 @@ def check_same_rows(found: Any, rows: Any) -> None:
 def share_places(kind: Kind, module: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Find the places of ``moved`` once for all verbs that begin with them."""
 
-    def place_again(model: dc.CalibratedKinematics, new: Any, marker: str = "evidence") -> Before:
+    def place_again(model: dc.CalibratedKinematics, new: Any, marker: str = "evidence") -> NewSetUp:
         assert (model.map, new, marker) == (kind.model.map, kind.moved, "evidence")
         return kind.placed_again
 

@@ -15,12 +15,13 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.axis_errors import with_axis_errors
-from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.scales import axis_errors
+from diffeo_calib.calibration.scales.axis_errors import with_axis_errors
 from diffeo_calib.interop.numpy_model import load_numpy
-from diffeo_calib.process.scales import axis_spectrum
+from diffeo_calib.process.scales import axis_deviations
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.runtime.chain import wave_angles
+from diffeo_calib.runtime.build import axis_waves
+from diffeo_calib.runtime.chain import Waves, wave_angles
 
 
 @pytest.mark.parametrize("joint", [0, 3])
@@ -51,15 +52,16 @@ def test_the_prior_of_an_axis_is_that_of_functions_with_its_size() -> None:
     assert_close(scales.from_logarithms(scales.logarithms()).axis_errors, errors)
     assert_close(scales.inflated(2.0).axis_errors, 2.0 * errors)
     assert_close(scales.with_vector(setting.scales.vector).axis_lengthscale, length)
-    waves = with_axis.nominal.own.of_axes(6, data.x)
-    functions = wave_angles(waves, data.x, torch).cos() * axis_spectrum(length[0], 10)  # (N, K)
-    twists = data.sensitivities[..., 18:24] * errors[0].repeat_interleave(3)
+    waves = Waves(*map(torch.from_numpy, axis_waves(scales.axes, 6)))
+    deviations = axis_deviations(errors[0], length[0], 10).view(10, 6)
+    functions = wave_angles(waves, data.x, torch).cos() * deviations[:, 0] / deviations[0, 0]  # (N, K)
+    twists = data.sensitivities[..., 18:24] * deviations[0]
     added = torch.einsum("ik,jk,imc,jnc->imjn", functions, functions, twists, twists)
     before, after = data.linearisation(setting.scales).gram(), with_axis.linearisation(scales).gram()
     assert_close(after, before + added.reshape(before.shape), rtol=1e-12, atol=1e-16)
     places = torch.linspace(0.0, torch.pi, 2001, dtype=torch.float64)
-    values = (torch.arange(1, 11) * places[:, None]).cos() * axis_spectrum(length[0], 10)
-    assert float(values.square().sum(1)[:-1].mean()) == pytest.approx(1.0, abs=1e-3)
+    values = (torch.arange(1, 11) * places[:, None]).cos()[..., None] * deviations
+    assert_close(values.square().sum(1)[:-1].mean(0), errors[0].repeat_interleave(3).square(), rtol=1e-3, atol=0)
 
 
 def slid(q: Tensor) -> Tensor:
@@ -101,7 +103,7 @@ def test_a_bent_slide_is_part_of_the_model(tmp_path: Path, monkeypatch: pytest.M
     assert_close(again.predict(far)[1], result.model.predict(far)[1], rtol=1e-9, atol=0)
     found = load_numpy(tmp_path / "model.safetensors")(far)
     np.testing.assert_allclose(found, result.model(far).numpy(), rtol=0, atol=1e-12)
-    monkeypatch.setattr(gates, "AXIS_ODDS", float("inf"))
+    monkeypatch.setattr(axis_errors, "ODDS", float("inf"))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         without = dc.calibrate(robot, data).model.predict(new, noise=False)[0]

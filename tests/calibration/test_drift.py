@@ -6,6 +6,7 @@ import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -21,7 +22,6 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.hypotheses import worth_it
 from diffeo_calib.calibration.placing.drift import FRAME_M_RAD, GROWTH, OFFSET_RAD_M, Drift
-from diffeo_calib.calibration.placing.placement import SeenRows
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.csv.files import read_observations, write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -113,7 +113,7 @@ def test_rows_are_brought_to_the_middle_of_the_column() -> None:
     data = dc.Measurements(q, moved).with_covariates(time=time)
     drift: Any = Drift.of_table(data, ARM.nominal)[0]
     whole = torch.eye(6, dtype=torch.float64).expand(len(plain), 6, 6)
-    effects = drift.effects(SeenRows(nominal, plain, plain, whole, zero))
+    effects = drift.effects(SimpleNamespace(nominal=nominal, y=plain, points=plain, slopes=whole))
     assert_close(effects @ unknowns, moved.flatten(1) - plain, rtol=0, atol=1e-5)
     constants = torch.cat([drift.devices.constants[:, :2], centre[None], size[None]], 1)
     found = replace(drift.devices, constants=constants, deviations=size[None].abs())
@@ -185,10 +185,10 @@ def test_a_column_on_the_command_line(tmp_path: Path, command: Command) -> None:
     assert done.code == 0
     assert "drift with time" in done.out
     for name, *more in (
-        ("evaluate", tmp_path / "t.csv", "--residuals", tmp_path / "r.csv"),
-        ("report", "-o", tmp_path / "r.html", "--data", tmp_path / "t.csv"),
+        ("evaluate", tmp_path / "t.csv", "-o", tmp_path / "r.csv"),
+        ("evaluate", tmp_path / "t.csv", "--report", tmp_path / "r.html"),
         ("export", "--c", tmp_path / "m.c"),
-        ("compare", tmp_path / "t.csv"),
+        ("recalibrate", tmp_path / "t.csv"),
     ):
         said = command(name, tmp_path / "m.safetensors", *more)
         assert "another set-up" not in said.err

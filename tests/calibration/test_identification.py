@@ -155,10 +155,10 @@ def test_a_step_to_where_nothing_can_be_measured_is_shortened() -> None:
     """The first step of Gauss-Newton leads to c = 1."""
     rows: Any = Ahead()
     one, none = torch.ones(1, 1, dtype=torch.float64), torch.zeros(1, 0, dtype=torch.float64)
-    found = solve(rows, one, none)
+    found = solve(rows, one[0], none)
     assert float(found.shifts[0]) == pytest.approx(0.5, abs=1e-4)
     with pytest.raises(InputError, match="behind"):
-        solve(rows, one, none, start=(one[0], one[0]))
+        solve(rows, one[0], none, start=(one[0], one[0]))
 
 
 def test_what_is_given_stays() -> None:

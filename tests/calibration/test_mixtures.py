@@ -18,7 +18,6 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.placing.place import place
-from diffeo_calib.calibration.placing.sockets import stages_by_sockets
 from diffeo_calib.calibration.result import errors_by_kind
 from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places
 from diffeo_calib.calibration.scales.selection import defaults, log_posterior
@@ -231,17 +230,18 @@ def test_rows_in_sockets_join_a_mixture(mixture: dc.Measurements, resting: dc.Me
         dc.Measurements.joined([mixture, other])
 
 
+@pytest.mark.filterwarnings("ignore:the place of marker 1 on 'flange'")
 def test_rows_of_another_robot(arm: SimulatedArm, tracked: dc.Measurements, resting: dc.Measurements) -> None:
     bend = torch.zeros(6, dtype=torch.float64)
     bend[4] = 0.05
     other = with_attributes(resting, q=resting.q + bend, sockets=Sockets(resting.sockets.names))
     with pytest.warns(dc.DiffeoCalibWarning, match="do not fit the robot whose positions were measured"):
-        stages_by_sockets(arm.nominal, dc.Measurements.joined([tracked, other]))
+        place(arm.nominal, dc.Measurements.joined([tracked, other]), silent)
 
 
 def test_refused(arm: SimulatedArm, tracked: Any, resting: Any) -> None:
     def staged(*tables: Any) -> Callable[[], object]:
-        return lambda: stages_by_sockets(arm.nominal, dc.Measurements.joined(tables))
+        return lambda: place(arm.nominal, dc.Measurements.joined(tables), silent)
 
     large, renamed = with_attributes(tracked, points=1e3 * tracked.points), [f"q{k}" for k in range(6)]
     loaded = tracked.with_payload(1.0)

@@ -182,8 +182,8 @@ def test_a_wrong_joint_reading_in_a_row_that_alone_places_the_marker(ur10_150: C
 
 @pytest.mark.parametrize("share", [0.05, 0.2])
 def test_regions_of_the_robot_hold_beside_gross_rows(share: float) -> None:
-    """With Student's t a third of the true places was inside at 5 %."""
-    arm, rng, rows = SimulatedArm(seed=3), np.random.default_rng(3), 120
+    """With Student's t a third of the true places was inside at 5 %; noise chosen beside 20 % was twice as large."""
+    arm, rng, rows = SimulatedArm(seed=1), np.random.default_rng(3), 120
     q = arm.sample(rows + 200, 3)
     true = arm.true_points(q)
     points = true + torch.from_numpy(arm.noise * rng.standard_normal(tuple(true.shape)))
@@ -197,3 +197,4 @@ def test_regions_of_the_robot_hold_beside_gross_rows(share: float) -> None:
     error = (true[rows:] - mean)[..., None]
     inside = (error.mT @ torch.linalg.solve(covariance.view(-1, 1, 3, 3), error)).flatten() < 7.8147
     assert float(inside.double().mean()) >= 0.9
+    assert float(result.selection.scales.sensor_noise) < 1.1 * arm.noise

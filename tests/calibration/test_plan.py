@@ -190,8 +190,8 @@ def test_the_table_is_read_back(tmp_path: Path) -> None:
     q = dc.candidates(robot, 50, ranges={"slide": (0.0, 0.6)})
     plan = dc.plan(robot, q, 5, marker=MARKER)
     plan.to_csv(tmp_path / "poses.csv", length="mm", angle="deg", sep=";", decimal=",")
-    table = TableFormat("mm", "deg", ";", ",")
-    torch.testing.assert_close(read_joints(tmp_path / "poses.csv", robot, table), plan.q, rtol=0, atol=1e-8)
+    table = TableFormat("mm", "deg", ";", ",", joints=robot)
+    torch.testing.assert_close(read_joints(tmp_path / "poses.csv", table), plan.q, rtol=0, atol=1e-8)
     assert (tmp_path / "poses.csv").read_text().splitlines()[0].endswith("turn;rank")
 
 

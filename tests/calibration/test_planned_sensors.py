@@ -20,7 +20,7 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.planning.candidates import candidates
-from diffeo_calib.calibration.planning.sensors_of_model import BoardImages, sensor_of
+from diffeo_calib.calibration.planning.sensors import BoardImages, sensor_of
 from diffeo_calib.cameras.images import Images, sees, shown, sighted
 from diffeo_calib.cameras.images import expected as expected_errors
 from diffeo_calib.measurements.poses import inverse_poses, poses_from_marks
@@ -96,7 +96,8 @@ def test_devices_of_a_fit_against_the_whole_covariance(kind: str) -> None:
     sensors: Any = sensor_of(result.model)
     known = result.placement[0].devices.constants
     told = slice(0, 3 if kind == "height" else None)  # the distance of a plane changes no slope
-    own = {one.devices.names[0]: int((known - one.devices.constants)[:, told].norm(dim=1).argmin()) for one in sensors}
+    found = {one.names[0]: one.devices[0].devices.constants for one in sensors}
+    own = {name: int((known - constants)[:, told].norm(dim=1).argmin()) for name, constants in found.items()}
     order = plan.rank.argsort()
     taken = [(int(plan.rows[k]), own[plan.devices[k]]) for k in order]
     expected = torch.tensor(naive_rms(result, q, taken), dtype=torch.float64)
@@ -149,7 +150,7 @@ def test_expected_errors_of_distances_come_true() -> None:
     plan = dc.plan(result.model, q, 15)
     devices: Any = result.placement[0].devices
     sensors: Any = sensor_of(result.model)
-    where = {one.devices.names[0]: one.devices.constants[0, :3] for one in sensors}
+    where = {one.names[0]: one.devices[0].devices.constants[0, :3] for one in sensors}
     numbers = [int((devices.constants[:, :3] - where[name]).norm(dim=1).argmin()) for name in plan.devices]
     names = [devices.names[number] for number in numbers]
     which = torch.tensor([int(name.split()[1]) for name in names])
@@ -180,7 +181,7 @@ def test_recalibrated_and_registered_models_plan_for_their_devices(name: str) ->
 def test_poses_of_a_ball_in_sockets() -> None:
     kind = kind_named("ball in sockets")
     (placed,), sensors = kind.model.placement, sensor_of(kind.model)
-    places: Any = torch.cat([one.places_in(kind.model.geometry.base) for one in sensors])  # pyright: ignore
+    places: Any = torch.cat([one.reached(kind.model.geometry.base)["places"] for one in sensors])
     ball = kind.model.geometry.tool[-1]
     q = dc.candidates(kind.robot, 40, places=places, ball=ball)
     T = kind.robot(q)
@@ -257,8 +258,7 @@ def drawn(kind: str) -> Tensor:
     """Half of them where a camera sees the board, half anywhere."""
     model, q = kind_named(kind).model, []
     for one in cameras(kind_named(kind)):
-        where = one.where(model)
-        q.append(candidates(model.robot, 40, keep=where.keep, ranges=where.ranges))
+        q.append(candidates(model.robot, 40, **one.reached(model.geometry.base)))
     return torch.cat([*q, candidates(model.robot, 40)])
 
 
@@ -311,7 +311,7 @@ def test_images_of_the_fit_are_what_they_were(kind: str) -> None:
         shared = model.map.noise.shared[rows].clone()
         if one.set_up.columns is not None:
             shared[..., one.set_up.columns] = 0.0
-        assert float((by_lens @ one.effects - shared).norm() / shared.norm()) < 0.02
+        assert float((by_lens @ one.lens[0] - shared).norm() / shared.norm()) < 0.02
         sizes = [each.diagonal(dim1=1, dim2=2).sum(1) for each in (known, model.map.noise.covariance[rows])]
         assert 0.7 < float((sizes[0] / sizes[1]).median()) < 1.0
 

@@ -19,12 +19,15 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.identification.identification import Identification
+from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.placing.placement import Placement
-from diffeo_calib.calibration.placing.readings import Stages, identify_readings, reading_sets
+from diffeo_calib.calibration.placing.readings import reading_sets, register_readings
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.fitting.result import silent
 from diffeo_calib.maps.observation import ReadPoints
 from diffeo_calib.process.scales import SCALES
 from diffeo_calib.robots import Geometry, SimulatedArm
@@ -35,8 +38,8 @@ from diffeo_calib.sensors.range import FixedPoints
 from diffeo_calib.sensors.tables import OtherReadings
 
 
-def identified(robot: Tree, data: dc.Readings) -> Stages:
-    return identify_readings(Geometry.nominal(robot, 1), [data])
+def registered(robot: Tree, data: dc.Readings) -> Identification:
+    return register_readings(Geometry.nominal(robot, 1), [data])
 
 
 def test_devices_of_several_kinds_are_all_written() -> None:
@@ -56,7 +59,7 @@ def test_devices_of_several_kinds_are_all_written() -> None:
 )
 def test_a_perfect_robot_finds_ball_and_devices(kind: str, zero: float) -> None:
     arm = SimulatedArm(2, geometry=0.0, transmission=0.0, gravity=0.0)
-    _, found = identified(arm.nominal, readings(arm, kind, 45, zero))
+    found = place(arm.nominal, readings(arm, kind, 45, zero), silent).identification
     assert found.rms < 2e-6
     assert_close(found.geometry.tool, arm.truth.tool, rtol=0, atol=1e-4)
     expected = {
@@ -192,7 +195,7 @@ def test_readings_in_another_unit_are_refused() -> None:
         (readings(arm, "distance", 51), 1e-3, "1000 times too small: check the units of the readings"),
     ):
         with pytest.raises(MeasurementError, match=said):
-            identified(arm.nominal, replace(data, values=factor * data.values))
+            registered(arm.nominal, replace(data, values=factor * data.values))
 
 
 @pytest.mark.parametrize("kind", ["distance", "height", "image"])
@@ -200,8 +203,8 @@ def test_devices_of_a_real_robot_are_found(kind: str, ur10_folder: Path) -> None
     """60 readings made of measured positions, heights as large as the robot moves."""
     robot, data = ur10_measurements(ur10_folder)
     some = data.split(0.1, seed=0)[0]
-    registration, found = identified(robot, as_readings.readings(kind, as_readings.Devices(some.points[:, 0]), some))
-    assert found.rms < 0.3e-3 < registration.rms < 1e-3
+    placed = place(robot, as_readings.readings(kind, as_readings.Devices(some.points[:, 0]), some), silent)
+    assert placed.identification.rms < 0.3e-3 < placed.registration.rms < 1e-3
 
 
 @pytest.mark.slow
@@ -218,7 +221,7 @@ def test_lengths_from_another_zero_are_refused_or_warned_about() -> None:
 def test_what_is_refused() -> None:
     arm, data = SimulatedArm(2), readings(SimulatedArm(2), "distance", 60)
     with pytest.warns(dc.DiffeoCalibWarning, match="no place of ball and devices explains"):
-        identified(arm.nominal, dc.Readings.distances(data.q, data.values))  # three devices as one
+        registered(arm.nominal, dc.Readings.distances(data.q, data.values))  # three devices as one
     kept = data.rows(data.device != 1)
     assert kept.names == ("device 0", "device 2")
     assert set(kept.device.tolist()) == {0, 1}
@@ -242,6 +245,6 @@ def test_what_is_refused() -> None:
 
 def test_a_ball_without_a_start_that_leads_anywhere_is_sought(monkeypatch: pytest.MonkeyPatch) -> None:
     arm = SimulatedArm(2)
-    data, expected = readings(arm, "distance", 60), identified(arm.nominal, readings(arm, "distance", 60))[1]
+    data, expected = readings(arm, "distance", 60), registered(arm.nominal, readings(arm, "distance", 60))
     monkeypatch.setattr("diffeo_calib.calibration.placing.readings._starts", lambda *_: [])
-    assert_close(identified(arm.nominal, data)[1].geometry.tool, expected.geometry.tool, rtol=0, atol=1e-6)
+    assert_close(registered(arm.nominal, data).geometry.tool, expected.geometry.tool, rtol=0, atol=1e-6)

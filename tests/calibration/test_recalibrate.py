@@ -19,8 +19,7 @@ from product_bank import Case, covered, simulated, simulated_poses, ur10_measure
 from table_bank import refused
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.recalibration.new_rows import weighed
-from diffeo_calib.calibration.recalibration.new_set_up import place_again
+from diffeo_calib.calibration.recalibration.new_set_up import place_again, weighed
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm

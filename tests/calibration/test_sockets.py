@@ -17,11 +17,17 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration, check_sockets
-from diffeo_calib.calibration.identification.identification import Prior, identify
+from diffeo_calib.calibration.identification.identification import (
+    PRECISE,
+    MeasuredPoints,
+    Prior,
+    Rows,
+    held_parameters,
+    solve,
+)
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import Placed, place
-from diffeo_calib.calibration.placing.readings import held_parameters
-from diffeo_calib.calibration.placing.sockets import SocketDevices, stages_by_sockets
+from diffeo_calib.calibration.placing.sockets import SocketDevices
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import silent
@@ -177,9 +183,12 @@ def test_geometry_does_not_depend_on_where_the_sockets_are_thought(arm: Simulate
         away = shift * torch.tensor([1.0, -1.0, 0.5]).double()
         places = SocketDevices.around(with_attributes(data, sockets=bare), found.positions + away)
         placed, shared = places.at_places(data), places.shared(len(data), 3).unflatten(1, (-1, 3))
-        held = held_parameters(geometry, adrift=True)
-        given = 1e-4, Prior()
-        thetas.append(identify(geometry, placed.q, placed.points, *given, shared=shared, held=held).theta)
+        sought = Rows(geometry, (MeasuredPoints.of(placed.q, placed.points, shared),))
+        root, noise = (
+            Prior().root(geometry, held_parameters(geometry, adrift=True)),
+            shared.new_full((len(data),), 1e-4),
+        )
+        thetas.append(solve(sought, noise, root, **PRECISE).theta)
     assert not bool(thetas[0][:12].any())
     torch.testing.assert_close(*thetas, rtol=0, atol=5e-6)
 
@@ -257,7 +266,7 @@ def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows
     bare: Any = {"distances": None, "distance_std": None}
 
     def staged(data: dc.Measurements) -> Callable[[], object]:
-        return lambda: stages_by_sockets(plain.nominal, data)
+        return lambda: place(plain.nominal, data, silent)
 
     refused(
         (r"at least 2 rows in every socket.*, got '2/1' in 1 row", staged(table(some).rows(slice(0, 31)))),
@@ -270,21 +279,21 @@ def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows
         ({"distances": {PAIR: 0.06}}, "check between which sockets it is"),
     ):
         with pytest.warns(dc.DiffeoCalibWarning, match=words):
-            stages_by_sockets(plain.nominal, table(some, **options))
+            place(plain.nominal, table(some, **options), silent)
 
 
 def test_rows_in_a_wrong_socket_are_named(plain: SimulatedArm, some: SocketRows) -> None:
     names = list(some.names)
     names[3], names[20] = "0/1", "0/0"
     with pytest.warns(dc.DiffeoCalibWarning, match=r"2 of 36 rows .* row 3 fits '0/0', row 20 fits '1/1'"):
-        stages_by_sockets(plain.nominal, table(some, tuple(names)))
+        place(plain.nominal, table(some, tuple(names)), silent)
 
 
 @pytest.mark.filterwarnings("ignore:the known distance")
 def test_names_that_say_nothing_are_warned_about(plain: SimulatedArm, some: SocketRows) -> None:
     names = tuple(some.names[(7 * row) % 36] for row in range(36))
     with pytest.warns(dc.DiffeoCalibWarning, match="the ball is in no socket"):
-        stages_by_sockets(plain.nominal, table(some, names))
+        place(plain.nominal, table(some, names), silent)
 
 
 def test_a_tool_that_never_turns_or_tilts(plain: SimulatedArm, some: SocketRows) -> None:

@@ -62,7 +62,7 @@ def test_deviations_hold(body: SimulatedUpperBody, model: dc.CalibratedKinematic
     assert 0.85 < float((squares < 7.815).double().mean()) <= 1.0
 
 
-@pytest.mark.filterwarnings("ignore:errors of about")  # of the chain without the other arm
+@pytest.mark.filterwarnings("ignore:errors seem to depend")  # of the chain without the other arm
 def test_the_weight_of_the_other_arm_counts(body: SimulatedUpperBody, data: dc.Measurements, q: Tensor) -> None:
     """One hand measured: with the other arm as a load, half the error of the serial chain at most."""
     found = []

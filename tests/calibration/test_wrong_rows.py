@@ -26,6 +26,7 @@ from diffeo_calib.calibration.diagnostics.row_order import (
     out_of_step,
     steps_of,
 )
+from diffeo_calib.calibration.expected_errors import workspace_deviation
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
@@ -229,7 +230,7 @@ def test_a_row_in_a_socket_is_judged_as_all_others_predict_it(result: Any) -> No
 
 
 def test_a_plane_is_named_where_it_matters(result: Any) -> None:
-    found = result.sockets
+    found, expected = result.sockets, workspace_deviation(result.model.map)
     flat = found.positions.clone()
     flat[:, 2] = 0.2
 
@@ -239,14 +240,14 @@ def test_a_plane_is_named_where_it_matters(result: Any) -> None:
             warn_of_flat_places(result.model.map, positions, found.device, found.sockets.place, expected_error)
         return [str(text.message) for text in texts]
 
-    assert warned(flat, found.workspace_deviation) == []
-    large = warned(flat, 10 * found.workspace_deviation)
+    assert warned(flat, expected) == []
+    large = warned(flat, 10 * expected)
     assert len(large) == 1
     assert "the sockets lie near a plane" in large[0]
     assert "raise or tilt the block at one place" in large[0]
     tall = flat.clone()
     tall[[0, 3], 2] = 0.9
-    assert warned(tall, 10 * found.workspace_deviation) == []
+    assert warned(tall, 10 * expected) == []
 
 
 # --- rows out of step with their joints -------------------------------------------------------------------------------

@@ -48,7 +48,7 @@ def run(tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> Ca
 
         monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=buffer()))
         robot = ["--robot", tmp_path / "robot.urdf", *WORDS, "--accepted", tmp_path / "accepted.csv"]
-        done = command("campaign", tmp_path / "run.csv", *robot, "--stdin", "--json-lines", *words)
+        done = command("campaign", tmp_path / "run.csv", *robot, "--stdin", *words)
         for error in failed:
             raise error
         return done, [json.loads(line) for line in done.out.splitlines()]

@@ -249,11 +249,11 @@ def test_rows_that_are_there_before_are_judged_as_with_once(
     wrong = ",".join(["1000"] * len(lines[0].split(","))) + "\n"
     (tmp_path / "run.csv").write_text("".join([*lines[:16], wrong, *lines[16:18], "x" + lines[18]]))
     accepted = []
-    for how in ("--once", "--stdin"):
+    for how, known in (("--once", "mm expected"), ("--stdin", '"expected_error_mm": 0.')):  # the latter answers in JSON
         done = command("campaign", tmp_path / "campaign.toml", how, "--accepted", tmp_path / "accepted.csv")
         assert done.code == 0
         assert "row 17 looks wrong" in done.out
-        assert "mm expected" in done.out
+        assert known in done.out
         assert "run.csv', line 20" in done.out
         accepted.append((tmp_path / "accepted.csv").read_text())
         (tmp_path / "run.csv.journal").unlink()
@@ -303,7 +303,7 @@ def test_a_row_rejected_on_the_page_is_rejected_in_the_journal(tmp_path: Path, l
         text=True,
     )
     assert process.stdout is not None
-    address = urlsplit(process.stdout.readline().split()[-1])
+    address = urlsplit(json.loads(process.stdout.readline())["shown"])
     assert any("row 17" in line for line in process.stdout)
     connection = http.client.HTTPConnection(address.hostname or "", address.port, timeout=60)
     connection.request("POST", "/reject?line=7", headers={"X-Campaign": "1"})
@@ -315,5 +315,6 @@ def test_a_row_rejected_on_the_page_is_rejected_in_the_journal(tmp_path: Path, l
             break
         time.sleep(0.1)
     out = process.communicate(timeout=120)[0]
-    assert "15 of 16 rows accepted" in out
+    ended = json.loads(out.splitlines()[-1])
+    assert (ended["accepted_rows"], ended["rows"]) == (15, 16)
     assert json.loads(journal.read_text().splitlines()[-1])["decided"] is True

@@ -50,9 +50,8 @@ def test_the_robots_own_joints_in_another_order_are_a_mistake(
 ) -> None:
     assert fitted.code == 0
     model, names = site.folder / "model.safetensors", list(site.arm.nominal.joint_names)
-    report = ["report", model, "-o", tmp_path / "r.html"]
-    for words in (["evaluate", model], report):
-        done = command(*words, site.csv, *TABLE, "--joints", ",".join(names[::-1]))
+    for words in ([], ["--report", tmp_path / "r.html"]):
+        done = command("evaluate", model, site.csv, *words, *TABLE, "--joints", ",".join(names[::-1]))
         assert done.code == 1
         assert f"in another order than the robot's: expected {','.join(names)}, got wrist_roll_joint," in done.error
         assert "leave it out: columns that are named after the joints are found wherever they are" in done.error
@@ -164,7 +163,7 @@ def test_residuals_of_every_row(
 ) -> None:
     assert fitted.code == 0
     path = tmp_path / "residuals.csv"
-    done = command("evaluate", site.folder / "model.safetensors", site.csv, *TABLE, "--residuals", path)
+    done = command("evaluate", site.folder / "model.safetensors", site.csv, *TABLE, "-o", path)
     assert done.code == 0
     assert f"residuals: {path}" in done.out
     header, *lines = path.read_text().splitlines()
@@ -177,10 +176,10 @@ def test_residuals_of_every_row(
     away = 1e3 * (site.data.points - model(site.data.q)).flatten(1).numpy()
     np.testing.assert_allclose(cells[:, 2:5], away, atol=2e-4)
     np.testing.assert_allclose(cells[:, 5], np.linalg.norm(cells[:, 2:5], axis=1), rtol=1e-12)
-    refused = command(
-        "evaluate", site.folder / "model.safetensors", site.csv, *TABLE, "--free", "both", "--residuals", path
-    )
-    assert "--residuals beside --free" in refused.error
+    refused = command("evaluate", site.folder / "model.safetensors", *TABLE[2:])
+    assert "--length without CSV" in refused.error
+    refused = command("evaluate", site.folder / "model.safetensors")
+    assert "write a page about the rows of the fit by --report" in refused.error
 
 
 NOTE = "arm 7 [left], spring check; serial 4711 é"

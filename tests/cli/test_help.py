@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from command_bank import Command
 
-from diffeo_calib.cli.main import renamed
+from diffeo_calib.cli.declarations import COMMANDS
+from diffeo_calib.cli.main import GONE
 
 UNITS = "--length --angle --joint-length --joints --robot-pose --sep --decimal"
 ROWS = (
@@ -18,22 +21,22 @@ TEXTS = {
         "--duplicates --figure --note --scales-of --report"
     ),
     "campaign": (
-        f"{ROWS} {UNITS} CSV --robot --base --tip --load --dh-convention --tolerance --stdin --json-lines "
+        f"{ROWS} {UNITS} CSV --robot --base --tip --load --dh-convention --tolerance --stdin "
         "--once --candidates --page -n --count --accepted"
     ),
     "record": "BAG --seen -o --output --joints --still --shortest --offset",
-    "evaluate": f"{ROWS} {UNITS} MODEL CSV --free -o --output --tolerance --residuals",
+    "evaluate": f"{ROWS} {UNITS} MODEL CSV --free -o --output --tolerance --report --against",
     "init": "CSV ROBOT --places --by -o --output --force",
     "images": "FOLDER JOINTS --board --length -o --output --board-std --report --sep --decimal",
     "predict": f"{UNITS} MODEL CSV --convention --rotation-angle --payload -o --output",
     "correct": (
         f"{UNITS} MODEL PROGRAM --position --rotation --convention --rotation-angle -o --output --tip --tool "
-        "--tool-from --frame --limit --rate --payload"
+        "--frame --limit --rate --payload"
     ),
     "export": (
-        "MODEL --urdf --mjcf --dh --dh-convention --ur-kinematics --ur-hash --joint-offsets "
-        "--correction-tables --with-tables --robot --length --angle --c --torch --onnx --camera --tool "
-        "--tool-from --frame --payload --tip --field --grid"
+        "MODEL --urdf --mjcf --dh --dh-convention --ur-kinematics --joint-offsets "
+        "--correction-tables --robot --length --angle --c --torch --onnx --camera --tool "
+        "--frame --payload --tip --field --grid"
     ),
     "plan": (
         f"{UNITS} MODEL --robot --base --tip --load --dh-convention --marker -n --count -o --output --free --seed "
@@ -41,7 +44,6 @@ TEXTS = {
         "--sensor --payload"
     ),
     "recalibrate": f"{ROWS} {UNITS} OLD OTHER -o --output --marker-freedom --drift --seed --note",
-    "report": f"{ROWS} {UNITS} MODEL CSV -o --output --against --tolerance",
     "demo": "-o --output -n --count --seed",
 }
 OPTIONS = {name: [*text.split(), "--json"] for name, text in TEXTS.items()}
@@ -86,20 +88,23 @@ def test_help_explains_every_option(name: str, command: Command) -> None:
 
 
 @pytest.mark.parametrize(
-    ("former", "present"),
+    ("former", "advice"),
     [
-        ("compare old new", "recalibrate old new"),
-        ("-v correct --payload-mass 4 m p", "-v correct --payload 4 m p"),
-        ("evaluate m t --fail-above=1mm --register -o x", "evaluate --free=both m t --tolerance=1mm -o x"),
-        ("report --data t m -o p", "report m -o p t"),
-        ("report --data=t m", "report m t"),
-        ("demo --rows 20", "demo --count 20"),
-        ("-h", "-h"),
+        ("compare old new", "compare is gone; write `recalibrate OLD OTHER` without -o."),
+        ("-v correct --payload-mass 4 m p", "--payload-mass is gone; write --payload."),
+        ("evaluate m t --fail-above=1mm", "--fail-above is gone; write --tolerance."),
+        ("export m --ur-kinematics y --ur-hash h", "--ur-hash is gone; write --ur-kinematics over a copy"),
     ],
 )
-def test_former_names_stand_for_present_ones(former: str, present: str) -> None:
-    assert renamed(former.split()) == present.split()
-    assert renamed(present.split()) == present.split()
+def test_former_names_say_what_to_do(former: str, advice: str, command: Command) -> None:
+    assert advice in command(*former.split()).err
+    assert not {name.removeprefix("--") for name in GONE} & {*COMMANDS} - {"report"}
+    assert not {*GONE} & {name for one in COMMANDS.values() for option in one.all() for name in option.names}
+
+
+def test_a_campaign_file_with_a_former_name_says_what_to_do(tmp_path: Path, command: Command) -> None:
+    (tmp_path / "c.toml").write_text('csv = "t.csv"\npayload_mass = 3\n')
+    assert "--payload-mass is gone; write --payload." in command("fit", tmp_path / "c.toml").err
 
 
 def test_help_shows_units_defaults_ranges_and_what_is_required(command: Command) -> None:

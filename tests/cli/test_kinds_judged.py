@@ -57,11 +57,11 @@ def test_commands_expect_the_same_error(name: str, command: Command, tmp_path: P
     kind, out = kind_named(name), tmp_path / "out"
     table, options = kind.table("new")
     found = {
-        verb: command(verb, *given, "--json", tmp_path / verb)
-        for verb, given in {
-            "evaluate": (kind.file, table, *options),
-            "report": (kind.file, "-o", out),
-            "plan": (kind.file, *UNITS, "-n", 3, "--draw", 50, "--sensor", "tracker", "-o", out),
+        name: command(verb, *given, "--json", tmp_path / name)
+        for name, (verb, *given) in {
+            "evaluate": ("evaluate", kind.file, table, *options),
+            "report": ("evaluate", kind.file, "--report", out),
+            "plan": ("plan", kind.file, *UNITS, "-n", 3, "--draw", 50, "--sensor", "tracker", "-o", out),
         }.items()
     }
     expected = kind.result.expected

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,7 +10,7 @@ import pytest
 from command_bank import Command
 
 from diffeo_calib.cli.guesses import with_places
-from diffeo_calib.cli.options import Places, Rows, Units
+from diffeo_calib.cli.options import Places, Rows
 from diffeo_calib.cli.tables import as_at_the_fit
 from diffeo_calib.measurements.csv.lines import read_cells, write_rows
 from diffeo_calib.measurements.table_format import TableFormat
@@ -48,18 +49,18 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
 def test_later_tables_have_the_markers_of_the_model() -> None:
     """The order of the markers is kept with the model, also where the column is typed."""
     command = f"{FIT} --marker smr --marker smr=b,a,c"
-    assert as_at_the_fit(command, Rows(), Units())[0].marker == "smr=b,a,c"
+    assert as_at_the_fit(command, Rows()).marker == "smr=b,a,c"
     for typed, expected in (("ball", "ball=b,a,c"), ("ball=c,a", "ball=c,a")):
-        given = Rows(position=["x,y,z"], marker=typed)
-        assert as_at_the_fit(command, given, Units(length="m", angle="rad"))[0].marker == expected
-    assert as_at_the_fit(FIT, Rows(marker="ball"), Units())[0].marker == "ball"
+        given = Rows(position=["x,y,z"], marker=typed, length="m", angle="rad")
+        assert as_at_the_fit(command, given).marker == expected
+    assert as_at_the_fit(FIT, Rows(marker="ball")).marker == "ball"
 
 
 def test_the_file_of_places_is_that_of_its_table() -> None:
-    rows, _ = as_at_the_fit(FIT, Rows(), Units())
-    assert rows == Rows(position=["x,y,z"])
-    rows, _ = as_at_the_fit(FIT, Rows(places=Path("new.csv")), Units())
-    assert rows == Rows(position=["x,y,z"], places=Path("new.csv"), by="name")
+    units = Rows(length="mm", angle="deg")
+    assert as_at_the_fit(FIT, units) == replace(units, position=["x,y,z"])
+    new = replace(units, places=Path("new.csv"))
+    assert as_at_the_fit(FIT, new) == replace(new, position=["x,y,z"], by="name")
 
 
 def test_init_finds_the_column_of_the_markers(files: Files, init: Any) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,7 @@ def planned(path: Path, robot: dc.Chain) -> tuple[torch.Tensor, list[int]]:
     """Joint values, rad, and ranks."""
     with path.open(newline="") as file:
         ranks = [int(row["rank"]) for row in csv.DictReader(file, delimiter=";")]
-    return read_joints(path, robot, FORMAT), ranks
+    return read_joints(path, replace(FORMAT, joints=robot)), ranks
 
 
 def test_first_poses_of_a_cell(site: Site, command: Command, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from torch.testing import assert_close
 from trackerless_bank import write_socket_table, write_wire_table
 
 import diffeo_calib as dc
-from diffeo_calib.cli.options import Rows, Units
+from diffeo_calib.cli.options import Rows
 from diffeo_calib.cli.tables import measured_table
 from diffeo_calib.measurements.csv.sensors import ReadingColumns
 from diffeo_calib.robots import SimulatedArm
@@ -116,8 +116,8 @@ def wires(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_options_become_columns(text: str, columns: ReadingColumns) -> None:
-    units = Units(length="mm", angle="deg", sep=";", decimal=",")
-    table = measured_table(Path("t.csv"), Rows(reading=[text]), units, "error")
+    rows = Rows(reading=[text], length="mm", angle="deg", sep=";", decimal=",")
+    table = measured_table(Path("t.csv"), rows, "error")
     assert table.table.readings == (columns,)
     assert (table.table.sep, table.table.decimal, table.duplicates) == (";", ",", "error")
 
@@ -125,8 +125,8 @@ def test_options_become_columns(text: str, columns: ReadingColumns) -> None:
 def test_a_number_that_names_a_column_is_that_column(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text("a,b,7\n10,20,100\n20,30,400\n")
     for text, values in {"7": ("7",), "7.0": 7.0}.items():
-        rows, units = Rows(reading=[f"distance={text}"]), Units(length="mm", angle="deg")
-        table = measured_table(tmp_path / "t.csv", rows, units)
+        rows = Rows(reading=[f"distance={text}"], length="mm", angle="deg")
+        table = measured_table(tmp_path / "t.csv", rows)
         assert table.table.readings == (ReadingColumns("distance", values),)
 
 
@@ -249,7 +249,7 @@ def test_models_with_payloads_ask_for_them(tmp_path: Path, command: Command) -> 
     without, out = [*options[:at], *options[at + 2 :]], ["-o", tmp_path / "out"]
     for words in (
         ["evaluate", kind.file, table, *without],
-        ["report", kind.file, table, *without, *out],
+        ["evaluate", kind.file, table, *without, "--report", tmp_path / "out"],
         ["recalibrate", kind.file, table, *without, *out],
         ["predict", kind.file, table, *UNITS, *out],
         ["correct", kind.file, table, *UNITS, *out],

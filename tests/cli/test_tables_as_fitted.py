@@ -28,23 +28,23 @@ FIT = (
 
 
 def test_columns_and_units_of_the_fit() -> None:
-    rows, units = as_at_the_fit(FIT, Rows(), Units())
-    assert rows == Rows(position=["a,b,c", "d,e,f"], std="s", lever=50.0, camera_on_tool=True, session="day")
-    assert (units.length, units.angle, units.sep, units.decimal) == ("mm", "deg", ";", None)
+    units = Rows(length="mm", angle="deg", sep=";")
+    rows = replace(units, position=["a,b,c", "d,e,f"], std="s", lever=50.0, camera_on_tool=True, session="day")
+    assert as_at_the_fit(FIT, Rows()) == rows
+    assert as_at_the_fit(FIT, Units()) == Units(length="mm", angle="deg", sep=";")
 
 
 def test_typed_options_win() -> None:
-    rows, units = as_at_the_fit(FIT, Rows(session="night"), Units(angle="rad"))
-    assert (rows.session, rows.std, units.angle, units.length) == ("night", "s", "rad", "mm")
-    rows, units = as_at_the_fit(FIT, Rows(position=["x,y,z"]), Units(length="m", angle="rad"))
-    assert rows == Rows(position=["x,y,z"])
-    assert units.sep is None, "what states both units describes the whole format"
+    rows = as_at_the_fit(FIT, Rows(session="night", angle="rad"))
+    assert (rows.session, rows.std, rows.angle, rows.length) == ("night", "s", "rad", "mm")
+    whole = Rows(position=["x,y,z"], length="m", angle="rad")
+    assert as_at_the_fit(FIT, whole) == whole, "what states both units describes the whole format"
 
 
 def test_units_are_never_guessed() -> None:
     for command, missing in (("", "--length and --angle missing"), ("diffeo-calib fit --length m", "--angle missing")):
         with pytest.raises(InputError, match=missing):
-            table_format(as_at_the_fit(command, Rows(position=["x,y,z"]), Units())[1])
+            table_format(as_at_the_fit(command, Rows(position=["x,y,z"])))
     with pytest.raises(InputError, match="--angle missing"):
         table_format(Units(length="m"))
 
@@ -56,9 +56,9 @@ def test_options_that_are_none_are_one_error(words: str) -> None:
     """Whoever sends a model file may have edited the line in it."""
     command = f"diffeo-calib fit t.csv --position x,y,z --length mm {words}"
     with pytest.raises(InputError, match=r"the options that the model was fitted with: got .*; name the columns"):
-        as_at_the_fit(command, Rows(), Units())
-    rows, units = as_at_the_fit(command, Rows(position=["a,b,c"]), Units(length="m", angle="rad"))
-    assert (rows.position, units.angle) == (["a,b,c"], "rad")  # nothing of it is needed
+        as_at_the_fit(command, Rows())
+    whole = Rows(position=["a,b,c"], length="m", angle="rad")
+    assert as_at_the_fit(command, whole) == whole  # nothing of it is needed
 
 
 @pytest.mark.parametrize("sep", ["ab", ""])
@@ -66,7 +66,7 @@ def test_a_separator_that_is_none_is_one_error(sep: str, tmp_path: Path) -> None
     (tmp_path / "t.csv").write_text("q1,x,y,z\n")
     command = f"diffeo-calib fit t.csv --position x,y,z --length mm --angle deg --sep '{sep}'"
     with pytest.raises(InputError, match="`sep`: expected one character"):
-        rows_in_table(tmp_path / "t.csv", *as_at_the_fit(command, Rows(), Units()))
+        rows_in_table(tmp_path / "t.csv", as_at_the_fit(command, Rows()))
 
 
 @pytest.mark.parametrize("place", ["/dev/zero", "pipe", "/nowhere.yaml"])
@@ -75,9 +75,9 @@ def test_a_camera_in_the_options_is_a_file(place: str, tmp_path: Path, monkeypat
     monkeypatch.chdir(tmp_path)
     os.mkfifo("pipe")
     command = f"diffeo-calib fit t.csv --reading corners={place} --length mm --angle deg"
-    rows, units = as_at_the_fit(command, Rows(), Units())
+    rows = as_at_the_fit(command, Rows())
     with pytest.raises(InputError, match=r"(is|there is) no file.* check the path of the camera file"):
-        measured_table(tmp_path / "t.csv", rows, units)
+        measured_table(tmp_path / "t.csv", rows)
 
 
 def test_model_and_table_are_enough(
@@ -118,23 +118,23 @@ def test_no_number_is_cut(width: int, tables: int, site: Site) -> None:
     assert text.count("0.0000") == 8
 
 
-UNITS = Units(length="mm", angle="deg")
+UNITS = Rows(length="mm", angle="deg")
 
 
 def test_kinds_without_columns_are_left_out(tmp_path: Any) -> None:
-    rows = Rows(
-        position=["x,y,z"], reading=["distance=wire", "image=u,v,9,9,1,1"], socket="place,socket", session="day"
+    rows = replace(
+        UNITS, position=["x,y,z"], reading=["distance=wire", "image=u,v,9,9,1,1"], socket="place,socket", session="day"
     )
     rows = replace(rows, distance=["0,1=50"], distance_std=0.03)
     path = tmp_path / "t.csv"
     path.write_text("q1,x,y,z\n1,2,3,4\n")
-    found, missing = rows_in_table(path, rows, UNITS)
-    assert found == Rows(position=["x,y,z"])
+    found, missing = rows_in_table(path, rows)
+    assert found == replace(UNITS, position=["x,y,z"])
     assert missing == ["--socket", "--reading distance=wire", "--reading image=u,v,9,9,1,1"]
     path.write_text("q1,u,v,day\n1,2,3,4\n")
-    assert rows_in_table(path, rows, UNITS)[0] == Rows(reading=["image=u,v,9,9,1,1"], session="day")
+    assert rows_in_table(path, rows)[0] == replace(UNITS, reading=["image=u,v,9,9,1,1"], session="day")
     path.write_text("q1,a\n1,2\n")
-    assert rows_in_table(path, rows, UNITS) == (rows, [])  # a table of other columns: the reader says so
+    assert rows_in_table(path, rows) == (rows, [])  # a table of other columns: the reader says so
 
 
 def test_programs_are_read_in_the_units_of_the_fit(command: Command, tmp_path: Any) -> None:

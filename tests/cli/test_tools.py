@@ -33,7 +33,7 @@ def arguments(folder: Path, *more: str) -> list[str]:
 
 def test_from_the_measured_frame(posed: Case, files: Path, command: Command) -> None:
     model, text = posed.model, ",".join(map(str, TOOL))
-    done = command(*arguments(files, "--tool", text, "--tool-from", "measured"))
+    done = command(*arguments(files, "--tool", f"measured:{text}"))
     assert done.code == 0, done.err
     with (files / "corrected.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -48,11 +48,8 @@ def test_from_the_measured_frame(posed: Case, files: Path, command: Command) -> 
 
 
 def test_bad_tools(arm: Case, files: Path, command: Command) -> None:
-    without = command(*arguments(files, "--tool-from", "measured"))
-    assert without.code == 1
-    assert "--tool-from measured without --tool" in without.err
     dc.save(arm.model, files / "model.safetensors")
-    points = command(*arguments(files, "--tool", "0,0,0.1", "--tool-from", "measured"))
+    points = command(*arguments(files, "--tool", "measured:0,0,0.1"))
     assert points.code == 1
     assert "calibrated with points, which have no measured frame" in points.err
     alone = command("export", str(files / "model.safetensors"), "--urdf", str(files / "x.urdf"), "--tool", "0,0,0.1")

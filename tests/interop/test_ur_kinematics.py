@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.cli.commands.export import HASH
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.interop.ur_kinematics import ur_text, write_ur_kinematics
 from diffeo_calib.robots import Chain, Geometry
@@ -133,6 +134,9 @@ def test_the_hash_of_the_robot_s_own_calibration(tmp_path: Path) -> None:
     geometry = Geometry.nominal(load(tmp_path / "ur.urdf", urdf()))
     write_ur_kinematics(geometry, tmp_path / "ur.yaml", hash="calib_4890363623803256388")
     assert read_yaml(tmp_path / "ur.yaml")[1] == "calib_4890363623803256388"
+    assert [own[1] for own in HASH.finditer((tmp_path / "ur.yaml").read_text())] == ["calib_4890363623803256388"]
+    write_ur_kinematics(geometry, tmp_path / "ur.yaml")
+    assert HASH.search((tmp_path / "ur.yaml").read_text()) is None
     for text in ("two words", "a: b", "", "a\nb", "'quoted'", "# none"):
         with pytest.raises(InputError, match=r"`hash`: expected letters, digits and _"):
             write_ur_kinematics(geometry, tmp_path / "ur.yaml", hash=text)

@@ -138,7 +138,7 @@ def test_waves_and_axes_that_cannot_be() -> None:
         with pytest.raises(InputError, match="errors of axes"):
             PositionErrors(axes=(axis,))
     chain = CHAINS["arm"]
-    geometry = deformation_of(chain).spec.nominal.geometry
+    geometry = geometry_of(chain)
     for own, what in ((PositionErrors(((chain.n, 5.0),)), "gear waves"), (PositionErrors((), ((9, 0, 1, 2),)), "axes")):
         with pytest.raises(InputError, match=f"joints of {what}"):
             GeometryMap(geometry, own=own)

@@ -19,9 +19,9 @@ import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.interop.model_header import describe, rebuild_registration
 from diffeo_calib.interop.numpy_model import load_numpy
-from diffeo_calib.kinematics.re_registration.new_rows import LinearRows
-from diffeo_calib.kinematics.re_registration.registered_map import Registration, check_isotropic, moved
+from diffeo_calib.kinematics.registered_map import Registration, check_isotropic, moved
 from diffeo_calib.measurements.poses import mark_points, poses_from_marks
+from diffeo_calib.regression.linear_rows import LinearRows
 from diffeo_calib.robots.se3 import twist_transform
 
 pytestmark = pytest.mark.slow  # several calibrations

@@ -18,8 +18,8 @@ from table_bank import HEADER, JOINTS, POSITION, ROWS, Reader, read_table, says
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.cli.options import Targets, Units
-from diffeo_calib.cli.tables import MeasuredTable, ProgramTable, table_format
+from diffeo_calib.cli.options import Units
+from diffeo_calib.cli.tables import MeasuredTable, of_robot, table_format
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.csv.files import read_joints, read_measurements, write_measurements, write_predictions
 from diffeo_calib.measurements.table_format import TableFormat
@@ -212,21 +212,21 @@ def test_joints_alone(tmp_path: Path) -> None:
     path.write_text("slide;time;turn\n250,5;noon;90\n-100;;-45\n")
     robot: Any = SimpleNamespace(joint_names=("turn", "slide"), kinds=("revolute", "prismatic"))
     expected = torch.tensor([[math.pi / 2, 0.2505], [-math.pi / 4, -0.1]], dtype=torch.float64)
-    q = read_joints(path, robot, TableFormat("mm", "deg", ";", ","))
+    q = read_joints(path, TableFormat("mm", "deg", ";", ",", joints=robot))
     assert_close(q, expected, rtol=1e-15, atol=0)
     with pytest.warns(DiffeoCalibWarning, match=r"prismatic joints reach 250.5 m: they look like millimetres"):
-        metres = read_joints(path, ["slide"], TableFormat("m", "deg", ";", ","), kinds=["prismatic"])
+        metres = read_joints(path, TableFormat("m", "deg", ";", ",", joints=["slide"], kinds=["prismatic"]))
     assert_close(metres, torch.tensor([[250.5], [-100.0]], dtype=torch.float64), rtol=0, atol=0)
 
 
 def test_joints_alone_may_repeat_and_are_those_of_the_measurements(tmp_path: Path, read: Reader) -> None:
     data = read(HEADER + ROWS + ROWS, duplicates="keep")
-    q = read_joints(tmp_path / "table.csv", JOINTS, TableFormat("m", "rad", convention="rotvec"))
+    q = read_joints(tmp_path / "table.csv", TableFormat("m", "rad", convention="rotvec", joints=JOINTS))
     assert q.dtype == torch.float64
     assert_close(q, data.q, rtol=0, atol=0)
 
 
-SI = TableFormat("m", "rad")
+SI = TableFormat("m", "rad", joints=JOINTS)
 COUNT = 25
 
 
@@ -242,7 +242,7 @@ def written(folder: Path, rows: list[str], header: str = HEADER) -> Path:
 def test_units_are_judged_by_all_rows(tmp_path: Path) -> None:
     path = written(tmp_path, [*lines(), "90,0,1,2,3", *lines()])
     with pytest.warns(DiffeoCalibWarning, match="90 rad"):
-        read_joints(path, JOINTS, SI)
+        read_joints(path, SI)
 
 
 def test_a_pipe_is_read_once(tmp_path: Path) -> None:
@@ -250,9 +250,9 @@ def test_a_pipe_is_read_once(tmp_path: Path) -> None:
     os.mkfifo(pipe)
     feeder = threading.Thread(target=lambda: pipe.write_bytes(path.read_bytes()))
     feeder.start()
-    q = read_joints(pipe, JOINTS, SI)
+    q = read_joints(pipe, SI)
     feeder.join()
-    assert_close(q, read_joints(path, JOINTS, SI), rtol=0, atol=0)
+    assert_close(q, read_joints(path, SI), rtol=0, atol=0)
 
 
 def test_a_pipe_that_is_no_text(tmp_path: Path) -> None:
@@ -261,13 +261,13 @@ def test_a_pipe_that_is_no_text(tmp_path: Path) -> None:
     feeder = threading.Thread(target=lambda: pipe.write_bytes(b"PK\x03\x04\xff\xfe"))
     feeder.start()
     with pytest.raises(MeasurementError, match=says("no text", "save it as .xlsx or CSV")):
-        read_joints(pipe, JOINTS, SI)
+        read_joints(pipe, SI)
     feeder.join()
 
 
 def test_a_device_without_an_end_is_refused() -> None:
     with pytest.raises(MeasurementError, match="'/dev/zero' is no text but binary"):
-        read_joints("/dev/zero", JOINTS, SI)
+        read_joints("/dev/zero", SI)
 
 
 ROBOT = SimpleNamespace(joint_names=("q1", "q2"), kinds=("prismatic", "revolute"))
@@ -301,13 +301,12 @@ def test_programs_and_predictions_keep_the_unit(tmp_path: Path) -> None:
     assert table == MIXED
     points = torch.ones(3, 1, 3, dtype=torch.float64)
     write_predictions(path, [(q, points, 1e-3 * points)], table, joints=robot.joint_names, kinds=robot.kinds)
-    source = ProgramTable(path, None, table, Targets())
-    assert_close(source.commands(robot), q, rtol=1e-14, atol=1e-15)
+    assert_close(read_joints(path, of_robot(table, robot)), q, rtol=1e-14, atol=1e-15)
     header, first, *_ = list(csv.reader(path.read_text().splitlines()))
     cells = dict(zip(header, first, strict=True))
     assert float(cells["slide"]) == pytest.approx(float(q[0, 2]))
     assert float(cells["x"]) == 1000.0
-    measured = MeasuredTable(path, None, replace(table, position=[["x", "y", "z"]])).read(robot)
+    measured = MeasuredTable(path, replace(table, position=[["x", "y", "z"]])).read(robot)
     assert_close(measured.q, q, rtol=1e-14, atol=1e-15)
 
 

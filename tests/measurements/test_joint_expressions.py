@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -73,7 +74,7 @@ def test_a_table_is_read_and_written_in_its_own_columns(tmp_path: Path) -> None:
     expected = torch.tensor(
         [[math.radians(90 - a), math.radians(a + b), (s + 5) / 1e3] for a, b, s in cells], dtype=torch.float64
     )
-    assert_close(read_joints(tmp_path / "t.csv", texts, table, kinds=kinds), expected)
+    assert_close(read_joints(tmp_path / "t.csv", replace(table, joints=texts, kinds=kinds)), expected)
     data = dc.read_measurements(
         tmp_path / "t.csv", ["j1", "j2", "j3"], ["x", "y", "z"], joints=texts, kinds=kinds, length="mm", angle="deg"
     )
@@ -83,11 +84,11 @@ def test_a_table_is_read_and_written_in_its_own_columns(tmp_path: Path) -> None:
     assert "--joints '-{A}+90,{B}+{A},{s}+5'" in data.origin.options
     write_measurements(tmp_path / "again.csv", data, table, joints=texts, kinds=kinds)
     assert (tmp_path / "again.csv").read_text().startswith("A,B,s,x,y,z")
-    assert_close(read_joints(tmp_path / "again.csv", texts, table, kinds=kinds), expected)
-    columns = Columns.of(table.joints_only(texts, kinds))
+    assert_close(read_joints(tmp_path / "again.csv", replace(table, joints=texts, kinds=kinds)), expected)
+    columns = Columns.of(replace(table, joints=texts, kinds=kinds).joints_only())
     cells = columns.from_si({"q": expected + 0.01})
     write_columns(tmp_path / "new.csv", read_cells(tmp_path / "t.csv", table.sep), cells, table)
-    assert_close(read_joints(tmp_path / "new.csv", texts, table, kinds=kinds), expected + 0.01)
+    assert_close(read_joints(tmp_path / "new.csv", replace(table, joints=texts, kinds=kinds)), expected + 0.01)
 
 
 @pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("mm", 1e-3), ("cm", 1e-2), ("inch", 0.0254)])
@@ -118,12 +119,13 @@ def test_there_and_back(convention: str, length: str, angle: str, tmp_path: Path
     lines = [",".join(map(repr, row)) for row in cells.tolist()]
     path.write_text("\n".join([",".join(names), *lines, ""]), encoding="utf-8")
     columns, table = PoseColumns.of(f"{','.join(names)}={convention}"), TableFormat(length, angle)
-    assert_close(read_poses(path, columns, table), commanded, rtol=0, atol=1e-12)
+    assert_close(read_poses(path, replace(table, joints=columns)), commanded, rtol=0, atol=1e-12)
     robot = dc.cartesian(commanded)
     own = PoseColumns(columns.columns, convention, robot)
-    q = read_joints(path, own, table)
+    table = replace(table, joints=own)
+    q = read_joints(path, table)
     assert_close(robot(q), commanded, rtol=0, atol=1e-12)
-    again = Columns.of(table.joints_only(own)).joints_from_si(q)
+    again = Columns.of(table.joints_only()).joints_from_si(q)
     back = PoseColumns(columns.columns, convention, angle=angle).poses(again)
     assert_close(back[:, :3, :3], commanded[:, :3, :3], rtol=0, atol=1e-12)
     assert_close(again[:, :3], cells[:, :3], rtol=1e-12, atol=1e-12)

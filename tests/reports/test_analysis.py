@@ -139,7 +139,7 @@ def test_accuracy_and_repeatability_by_the_formulas_of_the_standard(arm: Case) -
 def test_stages_from_a_model_are_those_of_its_calibration(
     name: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
-    """`fit --report` and `report` show the same numbers, the latter from the model file alone."""
+    """`fit --report` and `evaluate --report` show the same numbers, the latter from the model file alone."""
     case: Case = request.getfixturevalue(name)
     dc.save(case.model, tmp_path / "model.safetensors")
     model = dc.load(tmp_path / "model.safetensors")

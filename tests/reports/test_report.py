@@ -147,7 +147,7 @@ def files(arm: Case, tmp_path: Path) -> tuple[Path, Path]:
 def test_the_command(files: tuple[Path, Path], tmp_path: Path, command: Command, arm: Case) -> None:
     model, table = files
     out = tmp_path / "report.html"
-    done = command("report", model, table, "-o", out, *POSITION, "--against", "humidity")
+    done = command("evaluate", model, table, "--report", out, *POSITION, "--against", "humidity")
     assert (done.code, done.err) == (0, "")
     assert f"report: {out}" in done.out
     assert "40 rows that the model has not seen" in done.out.replace("\n", " ")
@@ -155,7 +155,7 @@ def test_the_command(files: tuple[Path, Path], tmp_path: Path, command: Command,
     check_page(text)
     assert "Errors against air_temp" in text
     assert "Errors against humidity" in text
-    alone = command("report", model, "-o", out)
+    alone = command("evaluate", model, "--report", out)
     assert alone.code == 0
     assert "60 rows of the fit" in alone.out.replace("\n", " ")
 
@@ -174,7 +174,7 @@ def test_what_is_refused(files: tuple[Path, Path], tmp_path: Path, command: Comm
         *((["--tolerance", text], f"--tolerance {text}") for text in ("0.5px", "0.15", "-1mm")),
     )
     for words, text in wrong:
-        done = command("report", model, "-o", out, *words)
+        done = command("evaluate", model, "--report", out, *words)
         assert done.code == 1
         assert text in done.err
     eye = torch.eye(4, dtype=torch.float64).expand(60, 4, 4)
@@ -210,7 +210,7 @@ def test_a_tolerance_is_judged(files: tuple[Path, Path], tmp_path: Path, command
     model, table = files
     out = tmp_path / "report.html"
     for tolerance, sentence in (("5mm", "Within the tolerance of 5 mm"), ("10um", "Above the tolerance of 0.01 mm")):
-        done = command("report", model, table, "-o", out, *POSITION, "--tolerance", tolerance)
+        done = command("evaluate", model, table, "--report", out, *POSITION, "--tolerance", tolerance)
         assert done.code == 0, done.err
         assert sentence in done.out
         assert sentence in out.read_text(encoding="utf-8").replace("\u00a0", " ")

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 
 ROWS, ZEROS, KEPT, EXAMINED = 24, 64, 64, 8
@@ -94,34 +95,32 @@ def _term(value: float, name: str, angle: str) -> str:
 
 
 def conventions(
-    robot: Tree,
-    q: Tensor,
-    left: Callable[[Tensor], float],
-    rows: Tensor,
-    projector: Callable[[Tensor], Tensor],
-    *,
-    tip: int = 0,
-    per_rad: float = 1.0,
+    robot: Tree, data: Measurements, left: Callable[[Tensor], float], per_rad: float = 1.0
 ) -> list[Convention]:
     """The plainest conventions that explain rows which the robot does not explain as they were read.
 
     Args:
-        robot: n joints. q: (N, n) joint values as read [rad or m].
-        left: what a rigid registration of joint values (N, n) leaves, as a share of the spread.
-        rows: (R,) those to use. projector: of some of these (M,) -> (M, M). tip: number of the tip that they show.
-        per_rad: how many of the table's angles are one rad.
+        robot: n joints. data: N rows. left: what a rigid registration of joint values (N, n) leaves, as a share of the
+            spread. per_rad: how many of the table's angles are one rad.
 
     Returns:
         none if nothing explains the rows far better; several if the rows do not tell them apart.
     """
-    limit = min(gates.RIGHT_READING, gates.OTHER_READING_LEFT * left(q))
-    chosen = rows[torch.randperm(len(rows), generator=seeded(0), device=HOST)[:ROWS]]
-    if len(chosen) < 2 * (2 + robot.n) or limit < SMALLEST_LIMIT:
+    marker, socket, free = int(data.visible.sum(0).argmax()), data.socket_numbers, data.without_device
+    rows = (socket >= 0 if free else data.visible[:, marker]).nonzero()[:, 0]
+    limit = min(gates.RIGHT_READING, gates.OTHER_READING_LEFT * left(data.q))
+    if min(len(rows), ROWS) < 2 * (2 + robot.n) or limit < SMALLEST_LIMIT:
         return []
-    search = _Search(robot, tip, q[chosen], projector(chosen), per_rad)
+    rows = rows[torch.randperm(len(rows), generator=seeded(0), device=HOST)[:ROWS]]
+    at, own = data.points[rows, marker], socket[rows]
+    affine = torch.cat([torch.ones_like(at[:, :1]), at - at.mean(0)], 1)
+    columns = (own[:, None] == own.unique()).to(at) if free else affine
+    Q = torch.linalg.qr(columns / columns.norm(dim=0).clamp(min=1e-12)).Q
+    projector = torch.eye(len(Q), dtype=Q.dtype, device=Q.device) - Q @ Q.mT
+    search = _Search(robot, robot.tips.index(data.on[marker]) if data.on else 0, data.q[rows], projector, per_rad)
 
     def judged(matrix: Tensor, offset: Tensor) -> Convention:
-        return Convention(robot, matrix, offset, left(q @ matrix.mT + offset))
+        return Convention(robot, matrix, offset, left(data.q @ matrix.mT + offset))
 
     def rigid(starts: _Starts) -> Iterator[_Starts]:
         """Those (1,) that are good in a rigid frame too, one for each pattern of signs."""
@@ -138,12 +137,6 @@ def conventions(
     near = [one for one in good if one.left < min(limit, KEEPS * good[0].left)]
     least = min((one.cost for one in near), default=0)
     return [one for one in near if one.cost == least and least]
-
-
-def without(columns: Tensor) -> Tensor:
-    """(M, M) that removes what columns (M, k) explain: of a frame affine functions, of sockets a place of each."""
-    own = torch.linalg.qr(columns / columns.norm(dim=0).clamp(min=1e-12)).Q
-    return torch.eye(len(own), dtype=own.dtype, device=own.device) - own @ own.mT
 
 
 class _Starts(NamedTuple):

@@ -13,10 +13,9 @@ JUDGED_COORDINATES = 2000
 
 CHANGE_ROWS = 5
 """Smallest number of rows on either side of a change."""
-CHANGE_CHANCE = 1e-5
-"""Of the largest of all gains."""
-CHANGE_NOISE_SHARE = 0.3
-"""RMS motion by a change, in standard deviations of the noise, below which it does not matter."""
+CHANGE_EVIDENCE = 24.0
+"""Gain less the price of its unknowns: of clean tables of 60 and 150 rows it was at most 5. Chance makes the largest of
+all gains as clear in one of 100,000."""
 OTHER_MARKERS = 0.5
 """A single marker moved if some other marker moved by less than this share of its motion."""
 CHANGES_TOLD_APART = 6.0
@@ -35,11 +34,6 @@ that may remain with them: of right columns 5 at most beyond chance, and .9 or m
 ROW_ODDS = 6.0
 """Log odds of a number that differs from row to row: clean images have less than zero, focal lengths that differ by
 0.1 % fourteen and more."""
-
-AXIS_ROWS, AXIS_ODDS = 40, 6.0
-"""Rows below which errors of an axis by its own position prove nothing, as 10 and 15 of clean tables that had log odds
-above 6; log odds from which they are part of the model, at most 2.5 in 36 clean tables of six kinds of arms (30 to 120
-rows), and 5.0 in nine of a UR10 (60 to 400 rows)."""
 
 # --- rows of a campaign, one by one ---
 

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.conventions import Convention, conventions, without
+from diffeo_calib.calibration.diagnostics.conventions import Convention, conventions
 from diffeo_calib.calibration.identification.registration import can_register, register, spread
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import (
@@ -310,22 +310,13 @@ EVERY_GROUP = (
 
 def conventions_of(robot: Tree, data: Measurements, angle: str, judge: Judge = registered) -> list[Convention]:
     """What joint values mean whose rows the robot does not explain, see :func:`conventions`."""
-    own, marker = Reading.of(robot, data), int(data.visible.sum(0).argmax())
-    places, socket, free = data.points[:, marker], data.socket_numbers, data.without_device
-    rows = (socket >= 0 if free else data.visible[:, marker]).nonzero()[:, 0]
+    own = Reading.of(robot, data)
 
     def left(q: Tensor) -> float:
         residual, size = judge(replace(own, q=q))
         return residual / size
 
-    def projector(chosen: Tensor) -> Tensor:
-        own, at = socket[chosen], places[chosen]
-        affine = torch.cat([torch.ones_like(at[:, :1]), at - at.mean(0)], 1)
-        return without((own[:, None] == own.unique()).to(at) if free else affine)
-
-    tip = robot.tips.index(data.on[marker]) if data.on else 0
-    per_rad = degrees(1.0) if angle == "deg" else 1.0
-    return conventions(robot, data.q, left, rows, projector, tip=tip, per_rad=per_rad)
+    return conventions(robot, data, left, degrees(1.0) if angle == "deg" else 1.0)
 
 
 def _convention_words(found: Sequence[Convention], columns: Columns | None) -> str:

@@ -17,7 +17,7 @@ from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import few, sentence, warn_user
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kinematics.re_registration.registered_map import undetermined
+from diffeo_calib.kinematics.registered_map import undetermined
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.placement import PLACES

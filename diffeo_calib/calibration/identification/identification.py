@@ -1,9 +1,10 @@
-"""Find geometric errors from measured points: all parameters of a :class:`Geometry` by maximum a posteriori,
+"""Find geometric errors, devices and what rows share: all parameters of a :class:`Geometry` by maximum a posteriori,
 
-    min over theta   sum_ik |y_k(q_i; theta) - y_ik|^2 / sigma^2 + sum_j (theta_j / s_j)^2,
+    min over theta, c   sum_ib |e_ib(theta, c)|^2 / sigma_k^2 + sum_j (theta_j / s_j)^2 + |c|^2,
 
-sigma the standard deviation of the noise, s_j that of the Gaussian prior of parameter j. The prior makes the
-problem regular whatever the poses are. Rows may share shifts c with the prior N(0, 1): y_i is then y_i + Z_i c.
+e_ib the errors of body b of row i, such as of a marker, whose rows are of kind k with noise sigma_k, s_j the standard
+deviation of the Gaussian prior of parameter j. The prior makes the problem regular whatever the poses are. What rows of
+a kind share has the prior c ~ N(0, 1): effects Z_i c of the places of sockets, or increments of devices of readings.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import nan, sqrt
+from math import inf, nan, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,6 +35,8 @@ ROUNDS, NOISE_CHANGE = 10, 3e-3
 """Most rounds of estimation, and the relative change of the noise at which they have converged."""
 SMALLEST_PRIOR, LARGEST_PRIOR = 1e-5, 0.1
 """Range of estimated prior deviations, m or rad."""
+SHARED_NUMBERS = 3.0
+"""Numbers as which the noise of all kinds counts for that of one: of a few rows nothing may be left."""
 COORDINATES = 8000
 """Measured coordinates of the random rows that stand for all rows where there are more. What a rigid geometry cannot
 explain is larger than the error that noise then leaves in its few parameters."""
@@ -70,22 +73,30 @@ class Identification:
 
     geometry: Geometry  # the geometry, with the estimated parameters absorbed
     rms: float  # root mean square distance from predicted to measured points [m]
-    noise: float  # standard deviation of one measured coordinate, given or estimated [m]; for Student's t its scale
+    noise: float  # standard deviation of one measured number, given or estimated [m]; for Student's t its scale
     # (K, K) posterior covariance of the parameters at ``geometry`` [m, rad]; rows of parameters that were held fixed
     # are zero
     covariance: Tensor
     theta: Tensor  # (K,) estimated parameters of the geometry that the search started from [m, rad]
     prior: Prior  # the prior, given or estimated
-    # weights of the measurements (N, P), 1 where they are hidden; all 1 if the noise was given or is Gaussian
-    tails: Tails
-    devices: tuple[Devices, ...] = ()  # those of readings that were found with it, in the order of their tables
-    # root mean square distance of the measured points, each predicted by the others to first order [m]
+    # weights of the measurements of every kind of rows (N, B), 1 where they are hidden; all 1 if the noise was given
+    # or is Gaussian
+    weights: tuple[Tensor, ...]
+    freedom: float = inf  # of Student's t
+    shifts: tuple[Tensor, ...] = ()  # (c,) what the rows of every kind share
+    devices: tuple[Devices, ...] = ()  # those of readings, in the order of their tables
+    # root mean square distance of the measured bodies, each predicted by the others to first order [m]
     left_out: float = nan
 
     @property
     def deviations(self) -> Tensor:
         """Posterior standard deviation of each of the K parameters [m or rad]."""
         return self.covariance.diagonal().clamp(min=0).sqrt()
+
+    @property
+    def tails(self) -> Tails:
+        """Of the first kind of rows, such as those that tell coordinates."""
+        return Tails(self.freedom, self.weights[0])
 
     def with_ball(self, ball: Identification) -> Identification:
         """The same with a ball, found around the same robot as its only marker, as one more marker."""
@@ -113,45 +124,8 @@ def held_parameters(geometry: Geometry, *, adrift: bool = False) -> tuple[int, .
     return tuple(sorted(held))
 
 
-def identify(
-    geometry: Geometry,
-    q: Tensor,
-    points: Tensor,
-    noise: float | None = None,
-    prior: Prior | None = None,
-    *,
-    shared: Tensor | None = None,
-    held: Sequence[int] | None = None,
-) -> Identification:
-    """Find all 6 + 6 n_all + 3 P parameters of a geometry, starting from the given one (usually from ``register``).
-
-    Without ``noise``, the noise level and its degrees of freedom (Student's t, so that outliers lose their influence)
-    are estimated together with the parameters by expectation maximisation; without ``prior`` also the prior deviations
-    of the joints' errors. Of many rows a random sample of some thousands is used.
-
-    Args:
-        geometry: the start, and the centre of the prior.
-        q: (N, n) joint values [rad or m].
-        points: (N, P, 3) measured markers [m]; NaN where they are hidden.
-        noise: standard deviation of one coordinate [m].
-        prior: see :class:`Prior`; with ``noise`` but without ``prior``, its defaults.
-        shared: (N, P, 3, c) effects Z of shifts of unit variance that rows share [m].
-        held: numbers of parameters that stay zero; see :func:`held_parameters`, by default those with a device.
-
-    Note:
-        Cost: some ten singular value decompositions of a (3 N P + K) x K matrix.
-    """
-    held = held_parameters(geometry) if held is None else held
-    rows = Rows(geometry, (MeasuredPoints.of(q, points, shared),))
-    if noise is None:
-        return estimated(rows, held, prior)
-    sigma, used = rows.parts[0].q.new_full(points.shape[:2], noise), prior or Prior()
-    fit = solve(rows, sigma, used.root(geometry, held), **PRECISE)
-    return _identification(rows, fit, noise, used, Tails.none(*points.shape[:2]))
-
-
 class MeasuredPoints(NamedTuple):
-    """Measured markers (N, P, 3), m, NaN where hidden, with effects (N, P, 3, c) of shifts that rows share."""
+    """Measured markers (N, P, 3), m, NaN where hidden, the first of a geometry, with effects (N, P, 3, c) of shifts."""
 
     q: Tensor
     points: Tensor
@@ -169,12 +143,12 @@ class MeasuredPoints(NamedTuple):
         return self.effects.shape[3]
 
     def errors(self, points: Tensor, shifts: Tensor) -> Tensor:
-        """Predicted minus measured numbers (N, B, d) of B bodies, m, for points (N, P, 3) and shifts (c,)."""
-        return points - self.points - self.effects @ shifts
+        """Predicted minus measured numbers (N, B, d) of B bodies, m, for points (N, P', 3) and shifts (c,)."""
+        return points[:, : self.points.shape[1]] - self.points - self.effects @ shifts
 
     def slopes(self, points: Tensor, by_errors: Tensor, shifts: Tensor) -> Tensor:
-        """Their derivatives (N, B, d, f + c) by f errors that move points by (N, P, 3, f), then by the shifts."""
-        return torch.cat([by_errors, -self.effects], 3)
+        """Their derivatives (N, B, d, f + c) by f errors that move points by (N, P', 3, f), then by the shifts."""
+        return torch.cat([by_errors[:, : self.points.shape[1]], -self.effects], 3)
 
     def sample(self) -> MeasuredPoints:
         """Random rows that stand for all of them, if there are many."""
@@ -190,7 +164,7 @@ class MeasuredPoints(NamedTuple):
 
 
 class ReadRows(NamedTuple):
-    """Readings of one kind of the first marker, a ball, and devices around which their places are sought."""
+    """Readings of one kind of the last points, such as a ball, and devices around which their places are sought."""
 
     data: Readings
     around: Devices
@@ -208,13 +182,13 @@ class ReadRows(NamedTuple):
         return (around.moved(shifts.view(len(around.names), -1) * around.deviations),)
 
     def errors(self, points: Tensor, shifts: Tensor) -> Tensor:
-        return -self.devices(shifts)[0].errors(self.data, points[:, 0])[:, None]
+        return -self.devices(shifts)[0].errors(self.data, self.around.points_of(points))[:, None]
 
     def slopes(self, points: Tensor, by_errors: Tensor, shifts: Tensor) -> Tensor:
-        (devices,), ball = self.devices(shifts), points[:, 0]
+        (devices,), seen = self.devices(shifts), self.around.points_of(points)
         device = devices.numbers(self.data)
-        own = devices.observation(device).slope(ball) @ by_errors[:, 0]
-        return torch.cat([own, devices.shared(ball, device)], 2)[:, None]
+        own = devices.observation(device).slope(seen) @ by_errors[:, -devices.seen_points :].flatten(1, 2)
+        return torch.cat([own, devices.shared(seen, device)], 2)[:, None]
 
     def sample(self) -> ReadRows:
         return self
@@ -225,7 +199,7 @@ class Rows:
     """Rows of several kinds, and the geometry that explains them."""
 
     geometry: Geometry  # the start
-    parts: tuple[MeasuredPoints | ReadRows, ...]  # the rows
+    parts: tuple[MeasuredPoints | ReadRows, ...]  # the rows of every kind
     rigid: bool = False  # whether errors of joints and base stay zero, so that only the markers move on their tips
 
     @cached_property
@@ -241,23 +215,18 @@ class Rows:
         return [(T[..., :3, :3] @ tool[..., None])[..., 0] + T[..., :3, 3] for T in self.tips]
 
     def by_errors(self, theta: Tensor, root: Tensor) -> list[Tensor]:
-        """Derivatives (N, P, 3, f) of these by unknowns u, theta = root u; with known poses of the only marker."""
+        """Derivatives (N, P, 3, f) of these by unknowns u, theta = root u."""
         if not self.rigid:
             return [self.geometry.sensitivities(own.q, theta) @ root for own in self.parts]
-        return [T[..., :3, :3] @ root[self.geometry.slices["tool"]] for T in self.tips]
+        return [T[..., :3, :3] @ root[self.geometry.slices["tool"]].unflatten(0, (-1, 3)) for T in self.tips]
 
     @property
     def freedom(self) -> list[int]:
         """Number of shifts of every part."""
         return [own.freedom for own in self.parts]
 
-    def devices(self, shifts: Tensor) -> tuple[Devices, ...]:
-        """Those of all readings after all shifts."""
-        each = zip(self.parts, shifts.split(self.freedom), strict=True)
-        return tuple(one for own, some in each for one in own.devices(some))
-
     def errors(self, theta: Tensor, shifts: Tensor) -> list[Tensor]:
-        """Predicted minus measured numbers of every part, m."""
+        """Predicted minus measured numbers (N, B, d) of every part, m."""
         each = zip(self.parts, self.points(theta), shifts.split(self.freedom), strict=True)
         return [own.errors(points, own_shifts) for own, points, own_shifts in each]
 
@@ -271,52 +240,108 @@ class Rows:
             found.append(torch.cat([slopes[..., :f], torch.nn.functional.pad(slopes[..., f:], around)], 3))
         return found
 
+    def found(self, fit: Fit, noise: float, prior: Prior, tails: Tails) -> Identification:
+        """A fit to some of the rows, with the errors and weights (M,) of all of them."""
+        errors, shifts = self.errors(fit.theta, fit.shifts), fit.shifts.split(self.freedom)
+        weights = tails.weights.split([own[..., 0].numel() for own in errors])
+        return Identification(
+            geometry=self.geometry.absorb(fit.theta),
+            rms=float(body_squares(errors).nanmean().sqrt()),
+            noise=noise,
+            covariance=fit.covariance,
+            theta=fit.theta,
+            prior=prior,
+            weights=tuple(some.view(own.shape[:2]) for some, own in zip(weights, errors, strict=True)),
+            freedom=tails.freedom,
+            shifts=shifts,
+            devices=tuple(one for own, some in zip(self.parts, shifts, strict=True) for one in own.devices(some)),
+        )
 
-def estimated(rows: Rows, held: Sequence[int], prior: Prior | None = None) -> Identification:
-    """Parameters and devices, with noise level and degrees of freedom of Student's t: expectation maximisation.
+
+def body_squares(errors: Sequence[Tensor]) -> Tensor:
+    """Squares (M,) of errors (N, B, d) of all bodies of several kinds of rows; NaN where hidden."""
+    return torch.cat([own.square().sum(2).flatten() for own in errors])
+
+
+def sizes_and_kinds(errors: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Numbers d (M,) of all bodies, and (M,) of which kind of rows each is."""
+    counts = torch.tensor([own[..., 0].numel() for own in errors], device=errors[0].device)
+    kind = torch.arange(len(errors), device=errors[0].device).repeat_interleave(counts)
+    return errors[0].new_tensor([own.shape[2] for own in errors])[kind], kind
+
+
+def typical_noise(errors: Sequence[Tensor]) -> Tensor:
+    """Noise (M,) of all bodies by the median of their kind of rows, m: gross outliers do not set the level.
+
+    The median of chi-squared is by Wilson and Hilferty.
+    """
+    dim, kind = sizes_and_kinds(errors)
+    medians = torch.stack([own.square().sum(2).nanmedian() for own in errors])[kind]
+    return (medians / (dim * (1.0 - 2.0 / (9.0 * dim)) ** 3)).sqrt().clamp(min=SMALLEST_NOISE_M)
+
+
+def identify(
+    geometry: Geometry, q: Tensor, points: Tensor, noise: float | None = None, prior: Prior | None = None
+) -> Identification:
+    """Find all 6 + 6 n_all + 3 P parameters of a geometry, starting from the given one (usually from ``register``).
+
+    Without ``noise``, it is estimated, see :func:`estimated`.
 
     Args:
-        rows: of any kinds. held: see :func:`identify`. prior: its deviations of the joints' errors are estimated too
-            by default.
+        geometry: the start, and the centre of the prior.
+        q: (N, n) joint values [rad or m].
+        points: (N, P, 3) measured markers [m]; NaN where they are hidden.
+        noise: standard deviation of one coordinate [m].
+        prior: see :class:`Prior`; with ``noise`` but without ``prior``, its defaults.
+    """
+    rows, held = Rows(geometry, (MeasuredPoints.of(q, points),)), held_parameters(geometry)
+    if noise is None:
+        return estimated(rows, held, prior)
+    used, sigma = prior or Prior(), points.new_full((points[..., 0].numel(),), noise)
+    fit = solve(rows, sigma, used.root(geometry, held), **PRECISE)
+    return rows.found(fit, noise, used, Tails(inf, torch.ones_like(sigma)))
+
+
+def estimated(rows: Rows, held: Sequence[int], prior: Prior | None = None) -> Identification:
+    """Parameters and what rows share, with noise levels, by expectation maximisation.
+
+    Noise is that of Student's t, so that outliers lose their influence, of a scale for every kind of rows. Without
+    ``prior`` the prior deviations of the joints' errors are estimated too. Of many rows that tell coordinates a random
+    sample of some thousands is used.
+
+    Args:
+        rows: of any kinds. held: numbers of parameters that stay zero; see :func:`held_parameters`.
+
+    Note:
+        Cost: some ten singular value decompositions of a matrix of as many rows as there are numbers and unknowns.
     """
     some = replace(rows, parts=tuple(own.sample() for own in rows.parts))
     used, zero = prior or Prior(), rows.geometry.tool.new_zeros(rows.geometry.size)
     at = zero, zero.new_zeros(sum(rows.freedom))
     errors = some.errors(*at)
-    dim = torch.cat([torch.full_like(own[..., 0], own.shape[2]) for own in errors])
-    # The median, so that a few gross outliers do not set the level; that of chi-squared by Wilson and Hilferty.
-    typical = (body_squares(errors) / (dim * (1.0 - 2.0 / (9.0 * dim)) ** 3)).nanmedian()
-    level = max(sqrt(float(typical)), SMALLEST_NOISE_M)
-    tails = reweight(body_squares(errors) / level**2, dim)
+    (dim, kind), sigma, noise = sizes_and_kinds(errors), typical_noise(errors), 0.0
+    tails = reweight(body_squares(errors) / sigma.square(), dim)
     for _ in range(ROUNDS):
         root = used.root(rows.geometry, held)
-        fit = solve(some, level / tails.weights.sqrt(), root, start=at, **PRECISE)
+        fit = solve(some, sigma / tails.weights.sqrt(), root, start=at, **PRECISE)
         at = fit.theta, fit.shifts
         used = used if prior else _scaled(used, root, rows.geometry, fit)
-        determined = float(fit.leverage.sum())  # number of parameters that the data determine
-        squares, numbers = body_squares(fit.errors), sum(int((~own.isnan()).sum()) for own in fit.errors)
-        total = float((tails.weights * squares).nansum())
-        before, level = level, max(sqrt(total / max(numbers - determined, 1.0)), SMALLEST_NOISE_M)
-        tails = reweight(squares / level**2 + fit.leverage / tails.weights, dim)
-        if abs(level - before) < NOISE_CHANGE * level:
+        squares, none = body_squares(fit.errors), dim.new_zeros(len(fit.errors))
+        free = none.index_add(0, kind, dim.masked_fill(squares.isnan(), 0.0) - fit.leverage)  # not determined by rows
+        total = none.index_add(0, kind, (tails.weights * squares).nan_to_num(0.0))
+        noise = max(sqrt(float(total.sum()) / max(float(free.sum()), 1.0)), SMALLEST_NOISE_M)
+        known = SHARED_NUMBERS * (len(none) > 1)
+        levels = ((total + known * noise**2) / (free + known).clamp(min=1.0)).sqrt().clamp(min=SMALLEST_NOISE_M)
+        before, sigma = sigma, levels[kind]
+        tails = reweight(squares / sigma.square() + fit.leverage / tails.weights, dim)
+        if float(((sigma - before).abs() / sigma).max()) < NOISE_CHANGE:
             break
-    left_out = body_squares(fit.errors) / (1.0 - fit.leverage / dim).square()
-    fit = fit._replace(errors=rows.errors(*at))
-    if len(tails.weights) < sum(len(own) for own in fit.errors):
-        tails = reweight(body_squares(fit.errors) / level**2, 3)
-    return replace(_identification(rows, fit, level, used, tails), left_out=float(left_out.nanmean().sqrt()))
-
-
-def _identification(rows: Rows, fit: Fit, level: float, prior: Prior, tails: Tails) -> Identification:
-    """A fit, with the errors of all rows."""
-    rms = float(body_squares(fit.errors).nanmean().sqrt())
-    known = fit.covariance, fit.theta, prior, tails, rows.devices(fit.shifts)
-    return Identification(rows.geometry.absorb(fit.theta), rms, level, *known)
-
-
-def body_squares(errors: Sequence[Tensor]) -> Tensor:
-    """Squares (N, B) of errors (N, B, d) of several kinds of rows; NaN where hidden."""
-    return torch.cat([own.square().sum(2) for own in errors])
+    left_out = squares / (1.0 - fit.leverage / dim).square()
+    if any(own is not whole for own, whole in zip(some.parts, rows.parts, strict=True)):
+        errors = rows.errors(*at)
+        (dim, kind) = sizes_and_kinds(errors)
+        tails = reweight(body_squares(errors) / levels[kind].square(), dim)
+    return replace(rows.found(fit, noise, used, tails), left_out=float(left_out.nanmean().sqrt()))
 
 
 def _scaled(prior: Prior, root: Tensor, geometry: Geometry, fit: Fit) -> Prior:
@@ -334,7 +359,7 @@ class Fit(NamedTuple):
 
     Args:
         theta: (K,) errors. covariance: (K, K). shifts: of all parts.
-        errors: (N, B, d) of every part, m. leverage: (N, B) of all rows.
+        errors: (N, B, d) of every part, m. leverage: (M,) of all bodies.
     """
 
     theta: Tensor
@@ -350,7 +375,7 @@ def solve(
     """Fit errors theta = root u, and shifts: the prior is then one row of the identity per unknown without units.
 
     Args:
-        rows: see :class:`Rows`. sigma: (N, B) standard deviations of the bodies of all rows, m.
+        rows: see :class:`Rows`. sigma: (M,) standard deviations of all bodies, m.
         root: (K, f) square root of the prior covariance of the errors, its columns orthogonal.
         start: theta (K,) and shifts; zero by default.
         options: of scipy.
@@ -365,7 +390,8 @@ def solve(
     if start is not None:
         u0 = torch.cat([(root.mT @ start[0]) / root.square().sum(0), start[1]])
     hidden = [own.isnan() for own in rows.errors(root @ u0[:f], u0[f:])]
-    weights = [1 / own[..., None] for own in sigma.split([len(own) for own in hidden])]
+    counts = [own[..., 0].numel() for own in hidden]
+    weights = [1 / s.view(own.shape[:2])[..., None] for s, own in zip(sigma.split(counts), hidden, strict=True)]
     size = len(u0) + sum(own.numel() for own in hidden)
 
     def residual(u: np.ndarray) -> np.ndarray:
@@ -389,5 +415,5 @@ def solve(
     u, V = torch.from_numpy(found.x).clone(), torch.from_numpy(Vt.T / s).clone()  # aligned: the same digits every time
     theta, shifts, known = root @ u[:f], u[f:], root @ V[:f]
     leverage = torch.from_numpy(np.square(U[: -len(u)]).sum(1)).split([own.numel() for own in hidden])
-    each = torch.cat([own.view(h.shape).sum(2) for own, h in zip(leverage, hidden, strict=True)])
-    return Fit(theta, known @ known.mT, shifts, rows.errors(theta, shifts), each)
+    each = [own.view(h.shape).sum(2).flatten() for own, h in zip(leverage, hidden, strict=True)]
+    return Fit(theta, known @ known.mT, shifts, rows.errors(theta, shifts), torch.cat(each))

@@ -42,7 +42,6 @@ from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_use
 from diffeo_calib.common.quantiles import known, largest_known
 from diffeo_calib.measurements.checks import seen_markers
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.cartesian import turns_nowhere
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES, UNDETERMINED_MOTION_M, place
@@ -125,8 +124,8 @@ def _start(
     covariance = slopes.new_zeros(geometry.size, geometry.size)
     numbers = torch.tensor(sought, dtype=torch.int64, device=slopes.device)
     covariance[numbers[:, None], numbers] = root @ root.mT
-    theta, tails = slopes.new_zeros(geometry.size), Tails.none(rows, geometry.markers, device=slopes.device)
-    return Identification(geometry, rms, noise, covariance, theta, Prior(), tails)
+    theta, weights = slopes.new_zeros(geometry.size), slopes.new_ones(rows, geometry.markers)
+    return Identification(geometry, rms, noise, covariance, theta, Prior(), (weights,))
 
 
 ROUNDS = 30
@@ -230,7 +229,7 @@ def find_joint_offsets(
     places = torch.eye(geometry.size, dtype=twists.dtype, device=twists.device)
     root = torch.cat([deviation * twists, FREE_STD * places[:, parts["base"]], FREE_STD * places[:, parts["tool"]]], 1)
     rows = Rows(geometry, (MeasuredPoints.of(q, points),))
-    fit = solve(rows, torch.ones_like(points[..., 0]) * noise, root, **options)
+    fit = solve(rows, points.new_full((points[..., 0].numel(),), noise), root, **options)
     return (twists.mT @ fit.theta) / twists.square().sum(0)
 
 

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.moved_devices import BASE, MARKERS
+from diffeo_calib.calibration.diagnostics.hypotheses import BASE, MARKERS
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
 from diffeo_calib.calibration.placing.sessions import Sessions

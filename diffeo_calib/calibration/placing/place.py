@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from math import inf
 from typing import Any, NamedTuple
 
 import torch
@@ -16,24 +17,32 @@ from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.judge import variation
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
-from diffeo_calib.calibration.diagnostics.moved_devices import Variation, variation
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_open_directions
 from diffeo_calib.calibration.diagnostics.outliers import Outlier
-from diffeo_calib.calibration.diagnostics.plausibility import check_readings
-from diffeo_calib.calibration.identification.identification import Identification, held_parameters
+from diffeo_calib.calibration.diagnostics.plausibility import check_identification, check_readings
+from diffeo_calib.calibration.identification.identification import (
+    Identification,
+    MeasuredPoints,
+    Prior,
+    ReadRows,
+    Rows,
+    estimated,
+    held_parameters,
+)
 from diffeo_calib.calibration.placing.drift import Drift
 from diffeo_calib.calibration.placing.lens import LensAndBoard
 from diffeo_calib.calibration.placing.placement import OtherLabel, OtherRows, Placement
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
-    identify_readings,
+    ball_of,
+    check_known,
     reading_sets,
-    stages_beside,
-    with_freed_devices,
+    register_readings,
 )
 from diffeo_calib.calibration.placing.sessions import Sessions
-from diffeo_calib.calibration.placing.sockets import SocketDevices, coordinate_stages
+from diffeo_calib.calibration.placing.sockets import SocketDevices, register_coordinates
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import few, sentence
@@ -51,8 +60,8 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import errors_of_kinds
 from diffeo_calib.sensors.devices import ROW, Devices
 from diffeo_calib.sensors.errors import Evaluations, shown_unit
-from diffeo_calib.sensors.places import Places
-from diffeo_calib.sensors.tables import Coordinates, OtherReadings, check_poses, divided, with_markers
+from diffeo_calib.sensors.places import Places, fitting_devices
+from diffeo_calib.sensors.tables import Coordinates, OtherReadings, ball_tip, check_poses, divided, with_markers
 
 
 class Told(NamedTuple):
@@ -255,14 +264,14 @@ class Placed:
         drift = Drift.of_table(self.data, self.registration.geometry.chain)
         return replace(self, placement=Placement((*self.placement, *drift))) if drift else None
 
-    def widened(self, data: TangentData, scales: Hyperparameters) -> tuple[Placed, Variation] | None:
-        """The same with what differs from row to row as noise of these; None if nothing clearly does."""
+    def widened(self, data: TangentData, scales: Hyperparameters) -> tuple[Placed, str] | None:
+        """The same with what differs from row to row as noise of these, in a sentence; None if nothing clearly does."""
         found = variation(data, scales, self.placement.hypotheses(data, ROW))
         if found is None or self.coordinates is None:
             return None
-        table = self.coordinates.table.with_own_focal_lengths(found.size)
+        table = self.coordinates.table.with_own_focal_lengths(found[0])
         sets = (one.widened(table) if isinstance(one, LensAndBoard) else one for one in self.placement)
-        return replace(self, coordinates=self.coordinates._replace(table=table), placement=Placement(sets)), found
+        return replace(self, coordinates=self.coordinates._replace(table=table), placement=Placement(sets)), found[1]
 
     def beside(self, data: Any, like: TangentData) -> tuple[Placed, TangentData]:
         """Other rows of the same devices, and around the same linearisation with all weights 1.
@@ -280,8 +289,10 @@ class Placed:
         centre = like.points.unflatten(1, (-1, 3)).mean((0, 1))
         other = OtherRows(data, coordinates, aligned, readings, centre)
         placement = Placement(one.with_rows(other) for one in self.placement)
-        found, count = self.identification, len(data if coordinates is None else coordinates.rows)
-        found = replace(found, tails=Tails.none(count, found.tails.weights.shape[1]))
+        found, counts = self.identification, [len(one.rows) for one in readings]
+        counts = counts if coordinates is None else [len(coordinates.rows), *counts]
+        weights = [w.new_ones(count, w.shape[1]) for w, count in zip(found.weights, counts, strict=True)]
+        found = replace(found, weights=tuple(weights), freedom=inf)
         own = replace(self, data=data, coordinates=aligned, placement=placement, identification=found)
         rows = own._rows(like.nominal.under(data.payload), like.theta)
         rows = replace(rows, held=like.held, adrift=like.adrift)
@@ -290,18 +301,19 @@ class Placed:
     def _rows(self, nominal: GeometryMap, theta: Tensor) -> TangentData:
         """Rows of several kinds, or of readings: the numbers of every row, those of its first body first."""
         own, told, found = None, None, self.identification
-        weights, weighed = found.tails.weights, [one.rows for one in self.readings]
+        weights, weighed = [*found.weights], [one.rows for one in self.readings]
         if self.coordinates is not None:
             own = self._coordinates(nominal, theta, self.coordinates)
             if len(own.x) == len(self.data):
                 return own
-            weights, weighed = own.tails.weights, [self.coordinates.rows]
+            weights[0], weighed = own.tails.weights, [self.coordinates.rows, *weighed]
             told = Told(self.coordinates.rows, own.y, own.noise_model)
         rows = stacked(self.data.q, told, self.readings, 3 * nominal.geometry.markers)
         every = self.data.q.new_ones(len(self.data), rows.noise_model.bodies)
-        every[torch.cat(weighed)] = weights
-        at, tails = (nominal, theta, self.data.q), replace(found.tails, weights=every)
-        return TangentData(*at, rows.y, rows.noise_model, tails, observe=rows.observe, beside=own)
+        for some, each in zip(weighed, weights, strict=True):
+            every[some, : each.shape[1]] = each
+        numbers = rows.y, rows.noise_model, Tails(found.freedom, every)
+        return TangentData(nominal, theta, self.data.q, *numbers, observe=rows.observe, beside=own)
 
     def _coordinates(self, nominal: GeometryMap, theta: Tensor, own: Coordinates) -> TangentData:
         """Rows that tell coordinates, of the markers that they show."""
@@ -334,19 +346,38 @@ def place(robot: Tree, data: Any, progress: Progress) -> Placed:
 def _by_coordinates(
     robot: Tree, data: Any, own: Coordinates, readings: list[OtherReadings], progress: Progress
 ) -> Placed:
-    """Registration and geometric calibration of rows that tell coordinates, and devices of readings around them."""
+    """Rows that tell coordinates find the robot, around it devices of readings are found; then all rows together."""
     own.table.check_every_marker_seen()
     sessions, table = Sessions.of_table(robot, own, progress)
     LOG.info("calibrating %s with %r", robot.name, table)
-    sockets, table, stages = coordinate_stages(robot, own._replace(table=table), progress)
-    LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", *(1e3 * stage.rms for stage in stages))
+    progress("registration", 0, 1)
+    registration, places = register_coordinates(robot, table)
+    table = Placement(places).at_places(table)
     warn_of_joints_below_tip(robot, table)
-    warn_of_open_directions(robot, table, stages[0])
-    stages = stages_beside(stages, readings, table)
-    sets = reading_sets(readings, stages[1].devices, table)
-    cameras = LensAndBoard.of_table(table, own.rows, stages[0], sessions)
-    placement = Placement((*sessions, *sockets, *cameras, *sets))
-    return Placed(data, own._replace(table=table), placement, *stages)
+    warn_of_open_directions(robot, table, registration)
+    tables, adrift = [one.table for one in readings], table.without_device
+    if not places:
+        tip = ball_tip(None, readings, registration.geometry.on[-1])
+        ball = ball_of(tables, registration.geometry, tip)
+        registration = registration if ball is None else registration.with_ball(ball)
+    geometry = registration.geometry
+    devices = tuple(fitting_devices(one, geometry.points(one.q)) for one in tables)
+    registration = replace(registration, devices=devices)
+    progress("geometry", 0, 1)
+    shared = [one.shared(len(table), 3 * table.markers).unflatten(1, (-1, 3)) for one in places]
+    parts = MeasuredPoints.of(table.q, table.points, *shared), *map(ReadRows, tables, devices)
+    found = estimated(Rows(geometry, parts), held_parameters(geometry, adrift=adrift))
+    places = [one.found(table, found) for one in places]
+    LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", 1e3 * registration.rms, 1e3 * found.rms)
+    table = Placement(places).at_places(table)
+    if not adrift:
+        device, seen = table.device_rows(), found.geometry  # without a ball, which a device does not see
+        seen = seen.with_tool(seen.tool[: device.markers], seen.on[: device.markers])
+        check_identification(device, replace(found, geometry=seen))
+    cameras = LensAndBoard.of_table(table, own.rows, registration, sessions)
+    sets = reading_sets(readings, found.devices, "the robot's base" if adrift else "the measuring frame")
+    placement = Placement((*sessions, *(one.of_rows(own.rows) for one in places), *cameras, *sets))
+    return Placed(data, own._replace(table=table), placement, registration, found)
 
 
 def _by_readings(robot: Tree, data: Any, readings: list[OtherReadings], progress: Progress) -> Placed:
@@ -354,11 +385,10 @@ def _by_readings(robot: Tree, data: Any, readings: list[OtherReadings], progress
     progress("geometry", 0, 1)
     LOG.info("calibrating %s with %r", robot.name, data)
     tables = [one.table for one in readings]
-    bare = Geometry.nominal(robot, 1, () if tables[0].on is None else (tables[0].on,))
-    stages = identify_readings(bare, tables)
-    LOG.info("registration RMS %.4f mm, geometry %.4f mm", *(1e3 * stage.rms for stage in stages))
-    freed = with_freed_devices(tables, stages[0])
-    if freed is not None:
-        for devices in freed.devices:
-            devices.check_freed(stages[1].noise, freed.noise)
-    return Placed(data, None, Placement(reading_sets(readings, stages[1].devices)), *stages)
+    tip = () if tables[0].on is None else (tables[0].on,)
+    registration = register_readings(Geometry.nominal(robot, 1, tip), tables)
+    rows = Rows(registration.geometry, tuple(map(ReadRows, tables, registration.devices)))
+    found = estimated(rows, held_parameters(rows.geometry, adrift=True), Prior())
+    LOG.info("registration RMS %.4f mm, geometry %.4f mm", 1e3 * registration.rms, 1e3 * found.rms)
+    check_known(tables, registration, found)
+    return Placed(data, None, Placement(reading_sets(readings, found.devices)), registration, found)

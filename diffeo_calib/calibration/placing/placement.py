@@ -11,13 +11,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
-from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit
@@ -33,17 +32,19 @@ S = TypeVar("S", bound="DeviceSet")
 T = TypeVar("T")
 
 
-class SeenRows(NamedTuple):
-    """N rows around k0, as sets of devices see them; so are those of a tangent model."""
+class Seen(Protocol):
+    """N rows around a map, as sets of devices see them: of a calibration around k0, new ones around an old model."""
 
-    nominal: GeometryMap  # k0
-    y: Tensor  # (N, R) m
-    points: Tensor  # (N, 3 P) m
-    slopes: Tensor  # (N, R, 3 P) of what was measured
-    sensitivities: Tensor  # (N, R, K)
-
-
-Seen = SeenRows | TangentData
+    @property
+    def nominal(self) -> GeometryMap: ...  # k0
+    @property
+    def y(self) -> Tensor: ...  # (N, R) m
+    @property
+    def points(self) -> Tensor: ...  # (N, 3 P) of the map, m
+    @property
+    def slopes(self) -> Tensor: ...  # (N, R, 3 P) of what was measured
+    @property
+    def by_tool(self) -> Tensor: ...  # (N, R, 3 P) derivatives by the places of the points on their tips
 
 
 class OtherRows(NamedTuple):
@@ -135,7 +136,7 @@ class DeviceSet(ABC):
 
     @property
     def bodies(self) -> Mapping[str, str]:
-        """Better names of what stands, and of what is on the tool, than those of diagnostics/moved_devices.py."""
+        """Better names of what stands, and of what is on the tool, than those of diagnostics/hypotheses.py."""
         return {}
 
     def views(self) -> Mapping[str, View]:

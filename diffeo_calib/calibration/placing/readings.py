@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from math import inf
 from typing import NamedTuple
 
 import torch
@@ -22,23 +23,22 @@ from diffeo_calib.calibration.identification.identification import (
     Prior,
     ReadRows,
     Rows,
-    body_squares,
     estimated,
     held_parameters,
     solve,
+    typical_noise,
 )
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.devices import Devices, Hypothesis, check_devices
 from diffeo_calib.sensors.kinds import kind_of
-from diffeo_calib.sensors.places import PlacedDevices, fitting_devices
-from diffeo_calib.sensors.tables import OtherReadings, ball_tip
+from diffeo_calib.sensors.places import PlacedDevices
+from diffeo_calib.sensors.tables import OtherReadings
 
 ROUGH_M = 2e-3
 """Errors of a robot before its calibration, to compare starts."""
@@ -119,16 +119,11 @@ class ReadingDevices(DeviceSet):
         return {"devices": own}
 
 
-Stages = tuple[Identification, Identification]
-"""Ball and devices with errors of joints zero, the ball as marker of the geometry; and with errors of joints."""
-
-
-def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool = False) -> Stages:
-    """Find ball, devices and geometric errors.
+def register_readings(bare: Geometry, tables: Sequence[Readings]) -> Identification:
+    """Find ball and devices with errors of joints zero, the ball as marker of the geometry.
 
     Args:
         bare: the robot with one marker, the ball, which is searched for from there. tables: readings, each of one kind.
-        rigid: whether errors of joints stay zero.
 
     Raises:
         MeasurementError: readings that no place of ball and devices explains but in another unit, or for which none
@@ -150,19 +145,21 @@ def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool
     if not found:
         raise MeasurementError.of(UNEXPLAINED, fix=CHECK)
     best = min(found, key=_worst)
-    fit, geometry = best.fit, best.rows.geometry.absorb(best.fit.theta)
-    each = zip(tables, fit.errors, strict=True)
+    each = zip(tables, best.fit.errors, strict=True)
     if any(kind_of(data).doubts_unit(data, own[:, 0]) for data, own in each):
         _refuse_another_unit(bare, tables, best)
     if best.worst[0] > most:
         warn_user(sentence(UNEXPLAINED, **best.said(most), fix=CHECK))
-    devices, squares = best.rows.devices(fit.shifts), body_squares(fit.errors)
-    noise = float((squares.sum() / sum(own.numel() for own in fit.errors)).sqrt())
-    nothing, tails = torch.zeros_like(fit.covariance), Tails.none(len(squares), 1)
-    known = nothing[0], Prior(), tails, devices
-    registration = Identification(geometry, float(squares.mean().sqrt()), noise, nothing, *known)
-    rows = Rows(geometry, tuple(map(ReadRows, tables, devices)), rigid=rigid)
-    return registration, estimated(rows, _all_but_ball(bare) if rigid else held_parameters(bare, adrift=True), Prior())
+    return _described(best)
+
+
+def _described(best: RoughFit) -> Identification:
+    """Ball and devices with the deviations that the noise of every kind of readings leaves."""
+    rows, fit = best.rows, best.fit
+    root, at = Prior().root(rows.geometry, _all_but_ball(rows.geometry)), (fit.theta, fit.shifts)
+    fit = solve(rows, typical_noise(fit.errors), root, start=at, max_nfev=STARTS_STEPS, loss="soft_l1")
+    noise = float(torch.cat([own.flatten() for own in fit.errors]).square().mean().sqrt())
+    return rows.found(fit, noise, Prior(), Tails(inf, torch.ones_like(fit.leverage)))
 
 
 class RoughFit(NamedTuple):
@@ -192,7 +189,7 @@ def _rough_fits(starts: Sequence[Rows]) -> list[RoughFit]:
     """From each start that leads anywhere, the best first."""
     found = []
     for rows in starts:
-        sigma = rows.geometry.tool.new_full((sum(len(own.q) for own in rows.parts), 1), ROUGH_M)
+        sigma = rows.parts[0].q.new_full((sum(len(own.q) for own in rows.parts),), ROUGH_M)
         root = Prior().root(rows.geometry, _all_but_ball(rows.geometry))
         with suppress(InputError):  # the start has the ball at a fixed point or behind a camera
             fit = solve(rows, sigma, root, max_nfev=STARTS_STEPS, loss="soft_l1")
@@ -212,46 +209,32 @@ def ball_of(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Ident
     readings = [own for own in readings if kind_of(own).seen_points == 1]
     if not readings:
         return None
-    return identify_readings(geometry.with_tool(geometry.tool[-1:], (tip,)), readings, rigid=True)[1]
+    return register_readings(geometry.with_tool(geometry.tool[-1:], (tip,)), readings)
 
 
 def reading_sets(
-    readings: Sequence[OtherReadings], devices: Sequence[Devices], beside: Measurements | None = None
+    readings: Sequence[OtherReadings], devices: Sequence[Devices], frame: str = "the robot's base"
 ) -> tuple[ReadingDevices, ...]:
-    """Sets of devices and the rows that they measured; ``beside``: rows of the same robot that tell coordinates."""
-    frame = "the robot's base" if beside is None or beside.without_device else "the measuring frame"
+    """Sets of devices and the rows that they measured; ``frame``: that of the devices, in words."""
     each = zip(readings, devices, strict=True)
     return tuple(ReadingDevices(own, rows, own.numbers(table), table, frame) for (table, rows), own in each)
 
 
-def stages_beside(stages: Stages, readings: Sequence[OtherReadings], table: Measurements) -> Stages:
-    """Stages of rows that tell coordinates, with the devices of readings around them, and their ball.
-
-    A ball that rested in sockets is known from these.
-    """
-    tables, geometry = [one.table for one in readings], stages[1].geometry
-    ball = None
-    if table.sockets is None:
-        ball = ball_of(tables, geometry, ball_tip(None, readings, geometry.on[-1]))
-    whole = [stage if ball is None else stage.with_ball(ball) for stage in stages]
-    before, after = (
-        replace(own, devices=tuple(fitting_devices(one, own.geometry.points(one.q)) for one in tables)) for own in whole
-    )
-    return before, after
-
-
-def with_freed_devices(tables: Sequence[Readings], found: Identification) -> Identification | None:
-    """A geometric calibration with what was said to be known of devices left open; None if there is nothing.
+def check_known(tables: Sequence[Readings], registration: Identification, found: Identification) -> None:
+    """Test what was said to be known of devices by a geometric calibration that leaves it open.
 
     Args:
-        tables: readings. found: their registration.
+        tables: readings. registration: theirs. found: their geometric calibration.
     """
-    freed = [devices.freed() for devices in found.devices]
+    freed = [devices.freed() for devices in registration.devices]
     if all(devices is None for devices in freed):
-        return None
-    each = zip(tables, found.devices, freed, strict=True)
+        return
+    each = zip(tables, registration.devices, freed, strict=True)
     parts = tuple(ReadRows(data, own if free is None else free) for data, own, free in each)
-    return estimated(Rows(found.geometry, parts), held_parameters(found.geometry, adrift=True), Prior())
+    held = held_parameters(registration.geometry, adrift=True)
+    again = estimated(Rows(registration.geometry, parts), held, Prior())
+    for devices in again.devices:
+        devices.check_freed(found.noise, again.noise)
 
 
 def _all_but_ball(geometry: Geometry) -> range:

@@ -154,8 +154,7 @@ class Sessions(DeviceSet):
         return len(self.others) * self.devices.increments_each
 
     def effects(self, data: Seen) -> Tensor:
-        tool, places = data.nominal.geometry.slices["tool"], data.points.unflatten(1, (-1, 3))
-        by_tool = data.sensitivities[..., tool.start : tool.start + 3 * self.markers]
+        places, by_tool = data.points.unflatten(1, (-1, 3)), data.by_tool[..., : 3 * self.markers]
         centre = places.mean((0, 1)) if self.centre is None else self.centre
         return self.increments(places, by_tool, centre, self.by_row(len(data.y)), data.slopes)
 

@@ -21,7 +21,6 @@ from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_flat_places
 from diffeo_calib.calibration.diagnostics.outliers import Outlier, excluded, found_outliers
 from diffeo_calib.calibration.diagnostics.plausibility import (
-    check_identification,
     check_socket_registration,
     check_sockets,
     registered,
@@ -29,28 +28,25 @@ from diffeo_calib.calibration.diagnostics.plausibility import (
     warn_of_wrong_sockets,
 )
 from diffeo_calib.calibration.expected_errors import workspace_deviation
-from diffeo_calib.calibration.identification.identification import Identification, held_parameters, identify
+from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.identification.registration import (
     register_sockets,
     socket_means,
 )
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
-from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.re_registration.new_rows import LinearRows
 from diffeo_calib.measurements.checks import numbers_of
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.sockets import SEPARATOR, Sockets
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.process.tails import Tails
+from diffeo_calib.regression.linear_rows import LinearRows
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import VALUE, Hypothesis
 from diffeo_calib.sensors.set_ups import View, frame_slopes
 from diffeo_calib.sensors.sockets import IN_SOCKET_M, SocketPlaces, socket_errors
-from diffeo_calib.sensors.tables import Coordinates
 
 T = TypeVar("T")
 
@@ -58,8 +54,6 @@ ALIKE = 0.05
 """Deviation of a block's distance from one place to another, relative to that of the distance itself."""
 FEWEST_BESIDE = 2
 """Rows of a socket besides one that are needed to judge it."""
-ROUNDS = 2
-"""Geometric calibrations, after each of which the sockets are placed again."""
 
 
 @dataclass(frozen=True)
@@ -83,44 +77,38 @@ class SocketDevices(DeviceSet):
     # (3 S, 3 S) of the positions, m^2; after a fit without a device without rigid motions of all of them
     covariance: Tensor
     left_out: tuple[PlaceErrors, ...] = ()  # every place, predicted by all other rows
-    # root mean square distance, m, that the model expects between its positions of the ball and the true ones over the
-    # joint ranges of the rows; without a device after the best rigid motion
-    workspace_deviation: float = 0.0
 
     @classmethod
     def around(cls, data: Measurements, positions: Tensor) -> SocketDevices:
         """The sockets of a table, wide around positions (S, 3), and with the known distances linearised there [m]."""
-        eye = torch.eye(positions.numel(), dtype=positions.dtype, device=positions.device)
-        precision, push, sockets = eye / PLACES.found_m_rad**2, positions.new_zeros(len(eye)), data.known_sockets
-        one_hot = torch.eye(len(positions), dtype=positions.dtype, device=positions.device)
+        sockets, S = data.known_sockets, len(positions)
+        wide, one_hot = (torch.eye(size, dtype=positions.dtype, device=positions.device) for size in (3 * S, S))
+        equations = [torch.nn.functional.pad(wide / PLACES.found_m_rad, (0, 1))]
         for known in sockets.blocks:
             first, second, lengths = (list(each) for each in zip(*known, strict=True))
             away = positions[second] - positions[first]
             U = (one_hot[second] - one_hot[first])[:, :, None] * torch.nn.functional.normalize(away)[:, None]
-            errors, U = away.new_tensor(lengths) - away.norm(dim=1), U.flatten(1)
-            own = torch.eye(len(known), dtype=U.dtype, device=U.device) * ALIKE**2
-            weighed = torch.linalg.solve((1.0 + own) * (sockets.distance_std or 1.0) ** 2, U).mT
-            precision, push = precision + weighed @ U, push + weighed @ errors
-        factor = torch.linalg.cholesky(precision)
-        root = torch.linalg.solve_triangular(factor, eye, upper=False).mT
-        places = positions + (root @ (root.mT @ push)).view(-1, 3)
-        covariance, rows = root @ root.mT, (data.socket_numbers != NO_SOCKET).nonzero()[:, 0]
-        devices = SocketPlaces(sockets.names, places, _deviations(covariance))
+            own = torch.cat([U.flatten(1), (away.new_tensor(lengths) - away.norm(dim=1))[:, None]], 1)
+            noise = (1.0 + ALIKE**2 * own.new_ones(len(own)).diag()) * (sockets.distance_std or 1.0) ** 2
+            equations.append(torch.linalg.solve_triangular(torch.linalg.cholesky(noise), own, upper=False))
+        R = torch.linalg.qr(torch.cat(equations), mode="r").R[: 3 * S]
+        root = torch.linalg.solve_triangular(R[:, :-1], wide, upper=True)
+        places, rows = positions + (root @ R[:, -1]).view(-1, 3), (data.socket_numbers != NO_SOCKET).nonzero()[:, 0]
+        devices, covariance = SocketPlaces.known(sockets.names, places, root @ root.mT), root @ root.mT
         return cls(devices, rows, data.socket_numbers[rows], sockets, root, not data.without_device, covariance)
 
     @classmethod
-    def around_model(cls, table: Measurements, rows: Tensor, seen: Tensor) -> tuple[list[DeviceSet], Measurements]:
-        """The sockets around a model that is known, and their rows placed there; nothing without sockets.
+    def around_model(cls, table: Measurements, rows: Tensor, seen: Tensor) -> list[SocketDevices]:
+        """The sockets around a model that is known; nothing without sockets.
 
         Args:
             table: M rows. rows: (M,) their numbers in a table of N. seen: (N, 3 P) points of the model, m.
         """
         if table.sockets is None:
-            return [], table
+            return []
         socket = table.socket_numbers
         resting = socket != NO_SOCKET
-        found = cls.around(table, socket_means(seen[rows][resting, -3:], socket[resting]))
-        return [found.of_rows(rows)], found.at_places(table)
+        return [cls.around(table, socket_means(seen[rows][resting, -3:], socket[resting])).of_rows(rows)]
 
     @property
     def positions(self) -> Tensor:
@@ -133,6 +121,12 @@ class SocketDevices(DeviceSet):
         effects = own.new_zeros(count, coordinates, own.shape[2])
         effects[self.rows, -3:] = own[self.device]
         return effects
+
+    def found(self, data: Measurements, stage: Identification) -> SocketDevices:
+        """The same around the places that a geometric calibration of rows found, whose first shifts are theirs."""
+        resting = data.socket_rows()
+        warn_of_wrong_sockets(resting, stage.geometry.points(resting.q)[:, -1])
+        return SocketDevices.around(data, self.positions + (self.root @ stage.shifts[0]).view(-1, 3))
 
     def at_places(self, table: Measurements) -> Measurements:
         """The places of their sockets as measured positions of the ball."""
@@ -185,13 +179,9 @@ class SocketDevices(DeviceSet):
             B = frame_slopes(positions[None], positions.mean(0))[0]  # (3 S, 6)
             root = root - B @ (torch.linalg.pinv(B) @ root)
         covariance = root @ found.covariance @ root.mT
-        return replace(
-            self,
-            devices=SocketPlaces(self.names, positions, _deviations(covariance)),
-            covariance=covariance,
-            left_out=() if found.chosen is None else self._left_out(found.chosen),
-            workspace_deviation=workspace_deviation(found.fitted),
-        )
+        devices = SocketPlaces.known(self.names, positions, covariance)
+        left_out = () if found.chosen is None else self._left_out(found.chosen)
+        return replace(self, devices=devices, covariance=covariance, left_out=left_out)
 
     def with_rows(self, other: OtherRows) -> SocketDevices:
         rows = socket = self.rows[:0]
@@ -234,7 +224,7 @@ class SocketDevices(DeviceSet):
         """Warn of sockets near a plane if one place away from it would make the expected error smaller."""
         place, socket = self.sockets.place, self.by_row(len(model.configurations))
         if model.map.workspace is not None:
-            warn_of_flat_places(model.map, self.positions, socket, place, self.workspace_deviation)
+            warn_of_flat_places(model.map, self.positions, socket, place, workspace_deviation(model.map))
 
     @property
     def left_out_spread(self) -> float:
@@ -251,12 +241,10 @@ class SocketDevices(DeviceSet):
         """Places of the sockets, how well they are predicted, and what that does not show."""
         frame = "the measuring frame" if self.by_device else "the robot's base"
         among = "" if self.by_device else "among the sockets "
+        each = zip(self.names, 1e3 * self.positions, 1e3 * self.devices.deviations, strict=True)
         lines = [
-            f"socket '{name}': {', '.join(f'{1e3 * v:.3f}' for v in place)} mm in {frame}, deviations "
-            f"{among}{', '.join(f'{1e3 * v:.3f}' for v in deviation)} mm"
-            for name, place, deviation in zip(
-                self.names, self.positions.tolist(), self.devices.deviations.tolist(), strict=True
-            )
+            f"socket '{name}': {_listed(place)} mm in {frame}, deviations {among}{_listed(deviation)} mm"
+            for name, place, deviation in each
         ]
         for one in self.left_out:
             errors = ", ".join(f"{1e3 * error:+.3f}" for error in one.distance_errors)
@@ -265,73 +253,37 @@ class SocketDevices(DeviceSet):
         return [*lines, f"spread within sockets, each place left out: {1e3 * self.left_out_spread:.4f} mm"]
 
 
-def _deviations(covariance: Tensor) -> Tensor:
-    """(S, 3) standard deviations of places, m."""
-    return covariance.diagonal().clamp(min=0).sqrt().view(-1, 3)
+def _listed(values: Tensor) -> str:
+    return ", ".join(f"{value:.3f}" for value in values.tolist())
 
 
-def coordinate_stages(
-    robot: Tree, own: Coordinates, progress: Progress
-) -> tuple[list[DeviceSet], Measurements, tuple[Identification, Identification]]:
-    """Sockets, the rows placed there, and registration and geometric calibration, of rows that tell coordinates.
-
-    Args:
-        robot: n joints. own: the rows, in one measuring frame.
+def register_coordinates(robot: Tree, data: Measurements) -> tuple[Identification, list[SocketDevices]]:
+    """Base and markers of rows that tell coordinates in one measuring frame, and the sockets.
 
     Raises:
-        MeasurementError: rows that cannot belong to this robot, or too few.
-    """
-    progress("registration", 0, 1)
-    if own.table.sockets is not None:
-        places, table, stages = stages_by_sockets(robot, own.table)
-        return [places.of_rows(own.rows)], table, stages
-    registration = registered(robot, own.table)
-    progress("geometry", 0, 1)
-    identification = identify(registration.geometry, own.table.q, own.table.points)
-    check_identification(own.table, identification)
-    return [], own.table, (registration, identification)
-
-
-def stages_by_sockets(
-    robot: Tree, data: Measurements
-) -> tuple[SocketDevices, Measurements, tuple[Identification, Identification]]:
-    """Where the sockets are, the rows placed there, and registration and geometric calibration.
-
-    Raises:
-        MeasurementError: too few rows, rows that are in no socket, known distances that are not those of the robot.
+        MeasurementError: rows that cannot belong to this robot, too few, or known distances that are not those of the
+            robot.
 
     Warns:
-        DiffeoCalibWarning: a tool that never tilts, rows in a wrong socket, no known distance.
+        DiffeoCalibWarning: a tool that never tilts, no known distance, rows in sockets that are not of the robot that a
+            device measured.
     """
+    if data.sockets is None:
+        return registered(robot, data), []
     data = data.with_sockets_of_rows()
     check_sockets(robot, data)
-    device = None if data.without_device else data.device_rows()
-    if device is None and not data.known_sockets.distances:
+    start = None if data.without_device else registered(robot, data.device_rows())
+    if start is None and not data.known_sockets.distances:
         what = "no distance between sockets is known: the size of the robot rests on its description"
         warn_user(sentence(what, fix="pass one: a printed block with two sockets and a caliper are enough"))
-    start = None if device is None else registered(robot, device)
-    resting = data.socket_rows()
-    found = register_sockets(robot if start is None else start.geometry, resting.q, resting.socket_numbers)
-    check_socket_registration(robot, resting, found, None if start is None else start.geometry)
-    registration = found.identification
-    if start is not None:  # all rows with the weight 1
-        registration = start.with_ball(registration)
-        tails = Tails.none(len(data), registration.geometry.markers, device=registration.theta.device)
-        registration = replace(registration, tails=tails)
-    geometry, places = registration.geometry, SocketDevices.around(data, found.positions)
-    held = held_parameters(geometry, adrift=start is None)
-    for _ in range(ROUNDS):
-        placed, shared = places.at_places(data), places.shared(len(data), 3 * data.markers).unflatten(1, (-1, 3))
-        identification = identify(geometry, placed.q, placed.points, shared=shared, held=held)
-        ball = identification.geometry.points(resting.q)[:, -1]
-        places = SocketDevices.around(data, socket_means(ball, resting.socket_numbers))
-    if device is not None and start is not None:
-        seen = identification.geometry  # without the ball, which a device does not see
-        seen = seen.with_tool(seen.tool[:-1], seen.on[:-1])
-        check_identification(device, replace(identification, geometry=seen))
-        warn_of_other_robot(robot, device, start, found)
-    warn_of_wrong_sockets(resting, ball)
-    return places, places.at_places(data), (registration, identification)
+    around, resting = None if start is None else start.geometry, data.socket_rows()
+    found = register_sockets(around or robot, resting.q, resting.socket_numbers)
+    check_socket_registration(robot, resting, found, around)
+    places = SocketDevices.around(data, found.positions)
+    if start is None:
+        return found.identification, [places]
+    warn_of_other_robot(robot, data.device_rows(), start, found)
+    return start.with_ball(found.identification), [places]
 
 
 def ball_in_sockets(data: Measurements, geometry: Geometry) -> Tensor | None:

@@ -1,9 +1,8 @@
 """Covariance of the markers at many configurations before the next measurement, and the best one to make.
 
-What is known before the first one is that of a robot by its description, or of a fitted model.
-
-What may have moved since, and what is not known about the devices, c ~ N(0, I), are more unknowns of the conditional. A
-measurement reports A z(x) + D c + noise.
+What is known before the first one is that of a robot by its description, or of a fitted model. Both are a conditional
+and a linearisation, whose columns are all that is not known: parameters, shifts that rows of a fit shared, places that
+may have changed since, and then unknowns c ~ N(0, I) of devices. A measurement reports A z(x) + D c + noise.
 
 Measurements are chosen greedily: each is the one that lowers the mean variance over the targets most. With
 C_i = K(targets, measurement i), this lowers their variance by
@@ -24,17 +23,16 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Prior, held_parameters
-from diffeo_calib.calibration.planning.sensors import Options, Scene
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.cameras.images import UNKNOWNS
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.errors import InputError, as_written, few
 from diffeo_calib.common.threads import large_work
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.re_registration.registered_map import robot_map
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.poses import mark_points
@@ -48,6 +46,7 @@ from diffeo_calib.regression.conditional import (
     Opened,
     diagonal_blocks,
     lower_root,
+    without_rigid_motions,
 )
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.geometry import Geometry
@@ -56,6 +55,108 @@ from diffeo_calib.robots.se3 import rigid
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.set_ups import frame_slopes
 from diffeo_calib.sensors.tables import device_coordinates
+
+USUAL_RESIDUAL = 3e-4
+"""Residual of the geometric calibration of an industrial robot per coordinate, relative to the markers' spread."""
+MARKER = (0.1, 0.0, 0.1)
+"""Default marker in the tip's frame, m: off the axis of the last joint, so that this joint moves it."""
+FREE = ("base", "marker", "both")
+
+
+TARGET_COORDINATES = 900
+"""Coordinates of the targets that are followed: more make no difference to the choice."""
+
+
+class Groups(NamedTuple):
+    """Configurations (M, n) of a plan, rad or m."""
+
+    targets: Tensor  # where the robot shall be accurate
+    measured: Tensor  # that one device has measured
+    registration: Tensor  # whose rows say where the device of a registration stands
+    candidates: Tensor  # that can be measured
+
+    def with_few_targets(self, coordinates: int) -> Groups:
+        """With not more targets than are followed, of so many coordinates each."""
+        near, most = self.targets, max(2, TARGET_COORDINATES // coordinates)
+        if len(near) <= most:
+            return self
+        places = torch.linspace(0, len(near) - 1, most, dtype=torch.float64, device=near.device)
+        return self._replace(targets=near[places.round().long()])
+
+    @property
+    def every(self) -> Tensor:
+        """All of them."""
+        return torch.cat(self)
+
+    @property
+    def numbers(self) -> Groups:
+        """The row numbers of each among all."""
+        rows = torch.arange(len(self.every), device=self.candidates.device)
+        return Groups(*rows.split([len(group) for group in self]))
+
+
+class Scene(NamedTuple):
+    """M configurations as a robot or model has them, and what is known there before the first measurement."""
+
+    known: Conditional  # the conditional
+    at: Linearisation  # the configurations
+    columns: int  # what it knows of unknowns: later ones are new
+    points: Tensor  # (M, m) coordinates of the markers, m
+    noise: Tensor  # (M, m, m) covariance of one measurement of them, m^2
+    base: Tensor  # (4, 4) the robot's base in their frame, m
+    averaged: Tensor  # (r, m) the markers, or the origins of measured poses
+    seen: int  # the first coordinates, of points that a device of positions sees
+    free: bool  # whether nothing says where the robot stands in the frame of a measuring device
+    unplaced: bool  # whether a device of positions stands anywhere
+    with_second_order: Callable[[Tensor], Tensor] = lambda covariance: covariance  # see :class:`FittedMap`
+
+    @property
+    def motions(self) -> list[int]:
+        """Numbers of the columns by motions of the base."""
+        return list(self.at.spec.nominal.places[:6])
+
+    def without_motions(self, known: Conditional, targets: Tensor) -> Conditional:
+        """Without the rigid motion that fits the errors at the targets best, where such motions are no errors."""
+        return without_rigid_motions(known, self.at.rows(targets), self.motions) if self.free else known
+
+    def along(self, blocks: Tensor) -> Tensor:
+        """Covariances of the markers, or of the origins of poses, from those of the points: (M, m, m) -> (M, r, r)."""
+        return self.averaged @ blocks @ self.averaged.mT
+
+    @property
+    def framed(self) -> bool:
+        """Whether the points represent frames."""
+        return len(self.averaged) < self.points.shape[1]
+
+    def choose(
+        self, known: Conditional, rows: tuple[Linearisation, Tensor, Tensor], targets: Tensor, count: int
+    ) -> tuple[list[int], Tensor]:
+        """Choose ``count`` of O measurements, at most one at every configuration.
+
+        Args:
+            known: before the first. rows: what they report, its noise (O, r, r), m^2, and their configurations (O,).
+            targets: (T,) numbers of the configurations where the robot shall be known.
+
+        Returns:
+            numbers of the measurements in the order in which they were taken, and the mean variance (count + 1,) of the
+            targets' coordinates after 0, 1, ... of them, m^2.
+        """
+        told, noise, place = rows
+        at, seen = known.features(self.at.rows(targets)), known.features(told)
+        P = torch.eye(at.values.shape[1], dtype=at.values.dtype, device=at.values.device)
+        if self.free:
+            B = at.at.sensitivity[..., self.motions].flatten(0, 1)
+            P = P - B @ torch.linalg.pinv(B)
+        own = diagonal_blocks(P @ at.between() @ P, len(targets))
+
+        def between(number: int) -> Tensor:
+            return seen.rows(torch.tensor([number], dtype=torch.int64, device=P.device)).between(seen)
+
+        how = {"place": place, "open_": torch.ones_like(place, dtype=torch.bool), "count": count}
+        order, by = greedy(P @ at.between(seen), seen.blocks() + noise, between, **how)
+        variance = self.along(own).diagonal(dim1=1, dim2=2).mean()
+        lowered = (by.unflatten(2, (len(targets), -1)) @ self.averaged.mT).square().sum(1).mean((1, 2))
+        return order, torch.cat([variance[None], -lowered]).cumsum(0).clamp(min=0)
 
 
 def greedy(
@@ -93,128 +194,92 @@ def greedy(
     return order, torch.stack(lowered) if lowered else each.new_zeros(0, r, len(C))
 
 
-def choose(known: Conditional, options: Options, scene: Scene, targets: Tensor, count: int) -> tuple[list[int], Tensor]:
-    """Choose ``count`` of the options, at most one at every configuration.
-
-    Args:
-        known: before the first. targets: (T,) numbers of the configurations where the robot shall be known.
-
-    Returns:
-        numbers of the options in the order in which they were taken, and the mean variance (count + 1,) of the targets'
-        coordinates after 0, 1, ... of them, m^2.
-    """
-    at = known.features(scene.at.rows(targets))
-    P = torch.eye(at.values.shape[1], dtype=at.values.dtype, device=at.values.device)
-    if scene.free:
-        B = at.at.sensitivity[..., scene.motions].flatten(0, 1)
-        P = P - B @ torch.linalg.pinv(B)
-    own = P @ at.between() @ P
-    seen = known.features(options.linearised(scene))
-
-    def between(number: int) -> Tensor:
-        return seen.rows(torch.tensor([number], dtype=torch.int64, device=P.device)).between(seen)
-
-    how = {"place": options.rows, "open_": torch.ones_like(options.rows, dtype=torch.bool), "count": count}
-    order, by = greedy(P @ at.between(seen), seen.blocks() + options.noise, between, **how)
-    variance = scene.along(diagonal_blocks(own, len(targets))).diagonal(dim1=1, dim2=2).mean()
-    lowered = (by.unflatten(2, (len(targets), -1)) @ scene.averaged.mT).square().sum(1).mean((1, 2))
-    return order, torch.cat([variance[None], -lowered]).cumsum(0).clamp(min=0)
-
-
-USUAL_RESIDUAL = 3e-4
-"""Residual of the geometric calibration of an industrial robot per coordinate, relative to the markers' spread."""
-MARKER = (0.1, 0.0, 0.1)
-"""Default marker in the tip's frame, m: off the axis of the last joint, so that this joint moves it."""
-FREE = ("base", "marker", "both")
-
-
 def of_robot(
-    robot: Tree, tool: Tool, q: Tensor, near: Tensor, scales: Hyperparameters | None, *, adrift: bool
-) -> Scene:
+    robot: Tree,
+    marker: object,
+    scales: Hyperparameters | None,
+    groups: Groups,
+    *,
+    frames: bool,
+    free: bool,
+) -> tuple[Scene, Groups]:
     """The tangent model around the nominal robot; base and markers are known to 0.1 m and 0.1 rad.
 
     Args:
         robot: nominal chain.
-        tool: what is measured of it.
-        q: (M, n) configurations. near: (T, n) those from which default scales follow.
-        scales: of the errors; defaults for an industrial robot if not given.
-        adrift: whether nothing will say where the robot stands: then its base is where the errors are judged.
+        marker: of every tip: (3,) or (P, 3) markers in its frame, m, or the (4, 4) pose of a measured frame there; or a
+            dictionary tip -> one of these.
+        scales: of the errors; by default those of an industrial robot, which follow from the targets.
+        groups: configurations. frames: whether frames are measured, by default those of the tips.
+        free: whether nothing will say where the robot stands: then its base is where the errors are judged.
     """
-    points, on, lever = tool
-    if float(points.norm(dim=1).max()) > robot.reach:
-        expected, got = f"within the robot's reach of {robot.reach:.3g} m", f"{float(points.norm(dim=1).max()):.3g} m"
-        raise InputError.of("`marker` in the tip's frame", expected=expected, got=got, fix="check the unit, m")
+    points, on, lever = _measured_points(robot, marker, torch.eye(4, dtype=torch.float64) if frames else MARKER)
+    groups = groups.with_few_targets(points.numel())
     geometry = Geometry.nominal(robot).with_tool(points, on)
-    spread = geometry.points(near).reshape(-1, 3)
-    residual = USUAL_RESIDUAL * float(spread.std(0).norm()) if len(near) > 1 else USUAL_RESIDUAL
-    data = _tangent_data(geometry, lever, q, residual)
-    if scales is None:
-        scales = defaults(_tangent_data(geometry, lever, near, residual), residual, Prior())
-    data = replace(data, held=held_parameters(geometry, adrift=adrift), adrift=adrift)
+    near, q, residual = groups.targets, groups.every, USUAL_RESIDUAL
+    if len(near) > 1:
+        residual *= float(geometry.points(near).reshape(-1, 3).std(0).norm())
+
+    def around(configurations: Tensor) -> TangentData:
+        """To be measured with the usual noise."""
+        tips = geometry.on if len(set(geometry.on)) > 1 else None
+        data = Measurements.of_points(configurations, geometry.points(configurations), tips, lever)
+        nominal = GeometryMap(geometry, elastic=not is_cartesian(geometry.chain))
+        how, theta = NoiseModel.of(data, residual), q.new_zeros(nominal.parameters)
+        tails = Tails.none(len(configurations), how.bodies)
+        return TangentData(nominal, theta, configurations, data.points.flatten(1), how, tails)
+
+    scales = defaults(around(near), residual, Prior()) if scales is None else scales
+    data = replace(around(q), held=held_parameters(geometry, adrift=free), adrift=free)
     deviations, noise = data.prior_variance(scales).sqrt(), data.noise(scales)
     known = Opened(Fields(), 0, deviations), data.linearisation(scales), len(deviations)
     averaged = Bodies(lever).averaging(noise)
-    return Scene(*known, data.points, noise, geometry.base, averaged, 3 * len(tool.points), free=adrift)
+    scene = Scene(*known, data.points, noise, geometry.base, averaged, points.numel(), free, unplaced=False)
+    return scene, groups
 
 
-class Tool(NamedTuple):
-    """What is measured of a robot: points (P, 3) in the frames of tips, m, and these; the lever of measured frames."""
-
-    points: Tensor
-    on: tuple[str, ...]
-    lever: float | None
-
-
-def tool_of(robot: Tree, marker: object) -> Tool:
-    """What is measured.
-
-    Args:
-        robot: the chain.
-        marker: of every tip: (3,) or (P, 3) markers in its frame, m, or the (4, 4) pose of a measured frame there; or a
-            dictionary tip -> one of these.
-    """
+def _measured_points(robot: Tree, marker: object, usual: object) -> tuple[Tensor, tuple[str, ...], float | None]:
+    """Points (P, 3) in the frames of tips, m, and these; the lever of measured frames, m. See :func:`of_robot`."""
     by_tip = marker if isinstance(marker, Mapping) else dict.fromkeys(robot.tips, marker)
     if not by_tip or not set(by_tip) <= set(robot.tips):
         raise InputError.of("`marker`", expected=f"markers on {few(robot.tips)}", got=as_written(marker))
-    points, on, levers = list[Tensor](), tuple[str, ...](), set[float | None]()
+    found, on, levers = list[Tensor](), tuple[str, ...](), set[float | None]()
     for tip, given in by_tip.items():
-        value = as_tensor(MARKER if given is None else given, "marker", (3,), also=(("P", 3), (4, 4)))
+        value = as_tensor(usual if given is None else given, "marker", (3,), also=(("P", 3), (4, 4)))
         framed = value.shape == (4, 4)
-        own = mark_points(rigid(value, "marker")[None], LEVER)[0] if framed else value.reshape(-1, 3)
-        points.append(own)
-        on += (tip,) * len(own)
+        found.append(mark_points(rigid(value, "marker")[None], LEVER)[0] if framed else value.reshape(-1, 3))
+        on += (tip,) * len(found[-1])
         levers.add(LEVER if framed else None)
     if len(levers) > 1:
         fix = "give markers on all tips, or frames on all"
         raise InputError.of("`marker` has points and frames", expected="one kind", fix=fix)
-    return Tool(torch.cat(points), on, *levers)
+    points = torch.cat(found)
+    if (away := float(points.norm(dim=1).max())) > robot.reach:
+        expected = f"within the robot's reach of {robot.reach:.3g} m"
+        raise InputError.of(
+            "`marker` in the tip's frame", expected=expected, got=f"{away:.3g} m", fix="check the unit, m"
+        )
+    return points, on, levers.pop()
 
 
-def _tangent_data(geometry: Geometry, lever: float | None, q: Tensor, residual: float) -> TangentData:
-    """Configurations around the nominal geometry, to be measured with the usual noise."""
-    on = geometry.on if len(set(geometry.on)) > 1 else None
-    data = Measurements.of_points(q, geometry.points(q), on, lever)
-    nominal, sensor = GeometryMap(geometry, elastic=not is_cartesian(geometry.chain)), NoiseModel.of(data, residual)
-    theta = q.new_zeros(nominal.parameters)
-    return TangentData(nominal, theta, q, data.points.flatten(1), sensor, Tails.none(len(q), sensor.bodies))
-
-
-def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Scene:
-    """The posterior of a fitted model.
+def of_model(model: CalibratedKinematics, free: str | None, groups: Groups) -> tuple[Scene, Groups]:
+    """The posterior of a fitted model, or of one registered anew, whose rows tell where the device stands.
 
     A ball beside markers stays on its tool: no row of the device would say where it is now.
 
     Args:
-        model: fitted, or registered anew. q: (M, n) configurations.
-        free: what may have moved since the fit, besides what a registration has left free.
+        free: what may have moved since the fit, besides what a registration has left free. groups: configurations.
     """
-    fitted, fit, registration = model.map, model.map.unregistered, model.map.registration
+    fitted, fit, tool = model.map, model.map.unregistered, model.nominal.geometry.slices["tool"]
+    groups, registration = groups.with_few_targets(fitted.m), fitted.registration
+    if registration is not None and free is None:
+        groups = groups._replace(registration=registration.q.to(groups.candidates))
     if registration is not None and free != registration.free:
         free = registration.free if free is None else "both"
-    adrift, tool = fitted.stands_free, robot_map(fit).geometry.slices["tool"]
-    seen, middle = device_coordinates(fitted.m, ball=model.ball, free=adrift), fitted.deformation.z1.view(-1, 3).mean(0)
+    seen = device_coordinates(fitted.m, ball=model.ball, free=fitted.stands_free)
+    middle = fitted.deformation.z1.view(-1, 3).mean(0)
     points, parts = [], []
-    for rows in q.split(PREDICT_ROWS):
+    for rows in groups.every.split(PREDICT_ROWS):
         z, at = fitted.linearised_value(rows)
         if registration is None:
             columns = frame_slopes(z.unflatten(1, (-1, 3)), middle), at.sensitivity[..., tool]
@@ -224,8 +289,25 @@ def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Scene:
     moved = fitted.new_noise.new_zeros(6 + fitted.m)
     moved[:6] = PLACES.found_m_rad * (free in ("base", "both"))
     moved[6 : 6 + seen] = PLACES.found_m_rad * (free in ("marker", "both"))
-    base, averaged = model.geometry.base.to(moved), model.bodies.averaging(fitted.new_noise)
-    shifts = 0 if registration is not None else fitted.noise.shared.shape[2]
-    noise = fitted.new_noise.expand(len(q), -1, -1)
     known = Opened(fit.with_motions, fit.columns, moved), Linearisation.joined(parts), fit.columns + len(moved)
-    return Scene(*known, torch.cat(points), noise, base, averaged, seen, adrift, shifts)
+    noise = fitted.new_noise.expand(len(groups.every), -1, -1)
+    where = torch.cat(points), noise, model.geometry.base.to(moved), model.bodies.averaging(noise), seen
+    scene = Scene(*known, *where, fitted.stands_free, without_positions(model), fitted.with_second_order)
+    return scene, groups
+
+
+def without_positions(model: CalibratedKinematics) -> bool:
+    """Whether no device of positions or poses measured rows of a model, where its devices say which rows they did.
+
+    The device of rows that a recalibration added is not known: images among them share the errors of lens and board.
+    """
+    if model.own_frame:
+        return True
+    shared = model.map.noise.shared
+    other = torch.zeros(len(shared), dtype=torch.bool, device=shared.device)
+    for own in model.placement:
+        if own.devices.seen_points or own.devices.cameras:
+            other[own.rows] = True
+        if own.devices.cameras:
+            other |= (shared != 0).any(1).sum(1) >= len(UNKNOWNS)
+    return bool(other.all())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any
@@ -13,22 +13,15 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.planning.candidates import Criterion, Tracker, all_of, candidates, check_limits
-from diffeo_calib.calibration.planning.knowledge import (
-    FREE,
-    choose,
-    of_model,
-    of_robot,
-    tool_of,
-)
-from diffeo_calib.calibration.planning.sensors import Options, Positions, Scene, Sensor, Where
-from diffeo_calib.calibration.planning.sensors_of_model import sensor_of, without_positions
+from diffeo_calib.calibration.planning.knowledge import FREE, Groups, Scene, of_model, of_robot
+from diffeo_calib.calibration.planning.sensors import Options, Positions, Sensor, Told, sensors_for
 from diffeo_calib.common.checks import check_count
 from diffeo_calib.common.data_frames import data_frame
 from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.measurements.csv.columns import Columns, Joints
+from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.lines import write_rows
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.process.scales import Hyperparameters
@@ -96,8 +89,6 @@ def _nearest_neighbours(D: np.ndarray) -> np.ndarray:
 
 
 LOG = logging.getLogger(__name__)
-TARGET_COORDINATES = 900
-"""Coordinates of the targets that are followed: more make no difference to the choice."""
 COUNTS = (10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 100, 120, 150, 200, 250, 300, 400, 500, 600, 800, 1000)
 """Numbers of poses at which a plan says what it expects."""
 
@@ -188,9 +179,9 @@ class Plan:
         own = dict(zip(self.joint_names, self.q.T, strict=True)) | {"rank": self.rank}
         return data_frame(own | ({"device": list(self.devices)} if self.devices else {}))
 
-    def write(self, path: str | PathLike[str], table: TableFormat, joints: Joints | None = None) -> None:
-        """The same as :meth:`to_csv` for a format that is given as one object, and other names of the joints."""
-        columns = Columns.of(table.joints_only(joints or self.joint_names, self.kinds))
+    def write(self, path: str | PathLike[str], table: TableFormat) -> None:
+        """The same as :meth:`to_csv` for a format that is given as one object, which may name the joints otherwise."""
+        columns = Columns.of(replace(table.joints_only(), joints=table.joints or self.joint_names, kinds=self.kinds))
         devices = [[name] for name in self.devices] or [[]] * len(self)
         values = columns.joints_from_si(self.q).round(decimals=JOINT_DIGITS).tolist()
         rows = zip(values, self.rank.tolist(), devices, strict=True)
@@ -251,26 +242,37 @@ def plan(
     check_limits(robot, q, "candidates")
     check_count(count, "`count`, at most the number of candidates", most=len(q))
     _check_belonging(robot_or_model, {"marker": marker, "hyperparameters": hyperparameters}, free)
-    wanted = q if target is None else _configurations(robot, target, "target")
+    near = q if target is None else _configurations(robot, target, "target")
     known = q[:0] if measured is None else _configurations(robot, measured, "measured")
     sensors = sensors_for(robot_or_model, sensor)
-    own = marker, hyperparameters, sensors
-    scene, (at_targets, at_known, at_candidates) = _start((robot_or_model, free), (wanted, known, q), own)
-    before, options = _options(scene, sensors, (at_known, at_candidates[0], len(known)), count)
-    new = options.shared.new_ones(options.shared.shape[2] - scene.shifts)
-    posterior: Conditional = Opened(scene.known, scene.first, new)
-    if len(before.rows):
-        posterior = Given(posterior, before.linearised(scene), before.noise)
-    order, variance = choose(posterior, options, scene, at_targets, count)
+    groups = Groups(near, known, q[:0], q)
+    if isinstance(robot_or_model, Tree):
+        how = {"frames": any(one.of_frames for one in sensors), "free": not any(one.of_positions for one in sensors)}
+        scene, groups = of_robot(robot_or_model, marker, hyperparameters, groups, **how)
+    else:
+        scene, groups = of_model(robot_or_model, free, groups)
+    at = groups.numbers
+    before = list(_measured(scene, sensors, at))
+    told = [own for one in sensors for own in one.told(scene, at.candidates)]
+    _check_reachable(told, count)
+    options = Options.of(scene, told)
+    new = options.noise.new_ones(options.at.sensitivity.shape[2] - scene.columns)
+    posterior: Conditional = Opened(scene.known, scene.columns, new)
+    for rows in before:
+        posterior = Given(posterior, rows.at, rows.noise)
+    order, variance = scene.choose(posterior, (options.at, options.noise, options.rows), at.targets, count)
     LOG.info("%d poses chosen of %d", count, len(q))
-    kept = scene.without_motions(posterior, at_targets)
-    blocks = scene.along(kept.covariance(scene.at.rows(at_candidates)))
-    if isinstance(robot_or_model, CalibratedKinematics):
-        blocks = robot_or_model.map.with_second_order(blocks)
-    noise = 3 * scene.along(scene.noise[at_targets]).diagonal(dim1=1, dim2=2).mean()
+    blocks = scene.without_motions(posterior, at.targets).covariance(scene.at.rows(at.candidates))
+    blocks = scene.with_second_order(scene.along(blocks))
+    noise = 3 * scene.along(scene.noise[at.targets]).diagonal(dim1=1, dim2=2).mean()
     stated = next((3 * one.std**2 for one in sensors if one.of_positions and one.std is not None), float(noise))
+    rows, names = options.rows[order] - int(at.candidates[0]), [told[k].name for k in options.device[order].tolist()]
+    path = short_path(move_times(q[rows], robot.periodic))
     return Plan(
-        **_in_order(robot, q, options.some(order), int(at_candidates[0])),
+        q=q[rows][path],
+        rank=path + 1,
+        rows=rows[path],
+        devices=tuple(names[k] for k in path.tolist()) if len(told) > 1 else (),
         expected_rms=(3 * variance).sqrt(),
         known_rms=(3 * blocks.diagonal(dim1=1, dim2=2).mean(1)).clamp(min=0.0).sqrt(),
         noise_rms=stated**0.5,
@@ -281,26 +283,27 @@ def plan(
     )
 
 
-def _in_order(robot: Tree, q: Tensor, chosen: Options, first: int) -> dict[str, Any]:
-    """Columns of a plan for each pose, in an order of short moves; ``first``: row number of the first candidate."""
-    rows = chosen.rows - first
-    path = short_path(move_times(q[rows], robot.periodic))
-    names = tuple(chosen.names[number] for number in chosen.device[path].tolist())
-    devices = names if len(chosen.names) > 1 else ()
-    return {"q": q[rows][path], "rank": path + 1, "rows": rows[path], "devices": devices}
+def _check_reachable(told: Sequence[Told], count: int) -> None:
+    """Raise InputError for fewer candidates that can be measured than poses."""
+    reachable = len(torch.cat([one.rows for one in told]).unique())
+    if reachable < count:
+        fix = "pass other candidates: those at which the devices see the tool or its board, or that bring the ball to "
+        fix += "its sockets"
+        what = "candidates that can be measured"
+        raise InputError.of(what, expected=f"at least {count}", got=str(reachable), fix=fix)
 
 
-def sensors_for(given: Tree | CalibratedKinematics, sensor: object = None) -> tuple[Sensor, ...]:
-    """Sensors: the argument of :func:`plan`, or what it stands for."""
-    if sensor is None:
-        return (Positions(),) if isinstance(given, Tree) else sensor_of(given)
-    several: tuple[Any, ...] = tuple(sensor) if isinstance(sensor, Sequence) else (sensor,)
-    if not several or not all(isinstance(one, Sensor) for one in several):
-        fix = "pass dc.Sensor.positions(), dc.Sensor.distances(points), ..."
-        raise InputError.of("`sensor`", expected="a dc.Sensor or several", got=as_written(sensor), fix=fix)
-    if isinstance(given, CalibratedKinematics) and without_positions(given):
-        return tuple(one.beside_others() for one in several)
-    return several
+def _measured(scene: Scene, sensors: Sequence[Sensor], at: Groups) -> Iterator[Options]:
+    """What was measured already: by one device, and by that of a registration, which measured positions or poses."""
+    if len(at.measured):
+        told = [own for one in sensors for own in one.told(scene, at.measured)]
+        if len(told) > 1 or len(told[0].rows) < len(at.measured):
+            fix = "leave `measured` out, and fit the model again with these rows"
+            raise InputError.of("`measured`", expected="configurations that one device has measured", fix=fix)
+        yield Options.of(scene, told)
+    if len(at.registration):
+        told = Positions(whole=scene.framed).told(scene._replace(unplaced=False), at.registration)
+        yield Options.of(scene, list(told))
 
 
 def drawn(
@@ -325,65 +328,24 @@ def drawn(
     Raises:
         InputError: as there.
     """
-    base, wheres = torch.eye(4, dtype=torch.float64, device=HOST), list[Where | None]()
-    if isinstance(given, CalibratedKinematics):
-        base, wheres = given.geometry.base, [one.where(given) for one in sensors]
-    held = [places for places in (one.places_in(base) for one in sensors) if places is not None]
-    seen, found = [where for where in wheres if where is not None], []
-    each: list[tuple[int, Tensor | None, Tensor, Where | None]] = [
-        (len(sensors) - len(held) - len(seen), None, markers.mean(0), None),
-        *((1, None, markers.mean(0), where) for where in seen),
-        (int(bool(held)), torch.cat(held) if held else None, markers[-1], None),  # all sockets are one sensor
+    model = isinstance(given, CalibratedKinematics)
+    base = given.geometry.base if model else torch.eye(4, dtype=torch.float64, device=HOST)
+    reached = [one.reached(base) for one in sensors]
+    held = [one["places"] for one in reached if "places" in one]  # all sockets are one sensor
+    each: list[tuple[int, dict[str, Any], Tensor]] = [
+        (reached.count({}), {}, markers.mean(0)),
+        *((1, one, markers.mean(0)) for one in reached if "keep" in one),
+        (int(bool(held)), {"places": torch.cat(held) if held else None}, markers[-1]),
     ]
-    whole = sum(number for number, *_ in each)
-    for number, places, marker, where in each:
+    whole, found = sum(number for number, *_ in each), []
+    for number, where, marker in each:
         if number:
-            criteria = [one for one in (None if where is None else where.keep, keep) if one is not None]
-            found.append(
-                candidates(
-                    given.robot if isinstance(given, CalibratedKinematics) else given,
-                    -(-count * number // whole),
-                    ranges=({} if where is None else where.ranges) | dict(ranges or {}),
-                    keep=all_of(criteria),
-                    tracker=None if tracker is None else replace(tracker, marker=marker.tolist()),
-                    places=places,
-                    ball=marker,
-                    **cell,
-                )
-            )
+            criteria = [one for one in (where.get("keep"), keep) if one is not None]
+            seen = None if tracker is None else replace(tracker, marker=marker.tolist())
+            how = cell | where | {"ranges": where.get("ranges", {}) | dict(ranges or {}), "keep": all_of(criteria)}
+            robot = given.robot if model else given
+            found.append(candidates(robot, -(-count * number // whole), tracker=seen, ball=marker, **how))
     return torch.cat(found)
-
-
-def _options(
-    scene: Scene, sensors: tuple[Sensor, ...], groups: tuple[Tensor, Tensor, int], count: int
-) -> tuple[Options, Options]:
-    """What was measured already, and what can be measured at candidates.
-
-    Args:
-        scene: the configurations. sensors: what will measure.
-        groups: row numbers of known configurations, of the first candidate, and how many known ones the user gave: the
-            other ones belong to a registration, whose device measured positions or poses.
-        count: poses to choose.
-    """
-    known, first, given = groups
-    every = Options.joined([one.options(scene) for one in sensors], scene.shifts)
-    registration = int(first) - len(known) + given  # its first row
-    by_user = (every.rows >= registration - given) & (every.rows < registration)
-    if given and (len(every.names) > 1 or int(by_user.sum()) < given):
-        fix = "leave `measured` out, and fit the model again with these rows"
-        raise InputError.of("`measured`", expected="configurations that one device has measured", fix=fix)
-    reachable = len(every.rows[every.rows >= first].unique())
-    if reachable < count:
-        fix = "pass other candidates: those at which the devices see the tool or its board, or that bring the ball to "
-        fix += "its sockets"
-        what = "candidates that can be measured"
-        raise InputError.of(what, expected=f"at least {count}", got=str(reachable), fix=fix)
-    whole = every.some(by_user | (every.rows >= first))
-    if len(known) > given:
-        registered = Positions(whole=scene.framed).options(scene)
-        registered = registered.some((registered.rows >= registration) & (registered.rows < first))
-        whole = Options.joined([whole, registered], scene.shifts)._replace(names=every.names)
-    return whole.some(whole.rows < first), whole.some(whole.rows >= first)
 
 
 def _check_belonging(given: Tree | CalibratedKinematics, of_robots: dict[str, object], free: str | None) -> None:
@@ -412,33 +374,3 @@ def _configurations(robot: Tree, values: object, name: str) -> Tensor:
     if not len(q):
         raise InputError.of(f"`{name}` is empty", expected=f"(N, {robot.n}) joint values", fix="pass at least one row")
     return q.detach()
-
-
-def _start(
-    given: tuple[Tree | CalibratedKinematics, str | None],
-    groups: tuple[Tensor, Tensor, Tensor],
-    own: tuple[Any, Any, tuple[Sensor, ...]],
-) -> tuple[Scene, Sequence[Tensor]]:
-    """What is known at targets, measured configurations and candidates, and the row numbers of these.
-
-    Args:
-        given: a robot or a model, and what may have moved since its fit.
-        groups: targets, configurations that are measured already, candidates.
-        own: marker and scales of a robot, and what will measure.
-    """
-    robot, free = given
-    near, known, q = groups
-    if isinstance(robot, Tree):
-        frames = any(sensor.of_frames for sensor in own[2])
-        tool = tool_of(robot, torch.eye(4, dtype=q.dtype, device=q.device) if own[0] is None and frames else own[0])
-    elif robot.map.registration is not None and free is None:  # its rows tell where the device stands
-        known = torch.cat([known, robot.map.registration.q.to(q.device)])
-    most = max(2, TARGET_COORDINATES // (3 * len(tool.points) if isinstance(robot, Tree) else robot.map.m))
-    if len(near) > most:
-        near = near[torch.linspace(0, len(near) - 1, most, dtype=torch.float64, device=q.device).round().long()]
-    every = torch.cat([near, known, q])
-    if isinstance(robot, Tree):
-        scene = of_robot(robot, tool, every, near, own[1], adrift=not any(sensor.of_positions for sensor in own[2]))
-    else:
-        scene = of_model(robot, every, free)
-    return scene, torch.arange(len(every), device=q.device).split([len(near), len(known), len(q)])

@@ -1,118 +1,87 @@
-"""Sensors for planned poses: a tracker, or devices in new places, and what each would show of a model's points.
+"""Sensors for planned poses: a tracker, devices in new places, or those of a model where its fit found them.
 
 A measurement at x shows, to first order, A z(x) + D c + noise: A the slope of what is reported by the coordinates z of
-the model's points, c ~ N(0, I) what is not known about the devices.
+the model's points, c ~ N(0, I) what is not known about the devices: new unknowns, or shifts that rows of a fit share.
+
+An image of a board tells the pose of the board in the camera with an error of its own, far larger along the line of
+sight, and one that all images share, of lens and board (cameras/images.py). Both depend on the pose. The arm is not
+seen: it may hide the board.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from diffeo_calib.calibration.planning.candidates import Criterion
+from diffeo_calib.calibration.planning.candidates import ranges_around
+from diffeo_calib.calibration.planning.knowledge import Scene, without_positions
+from diffeo_calib.cameras.images import Camera, expected, sees
 from diffeo_calib.common.checks import as_tensor, check_number
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.device_readings import FittedDevice
+from diffeo_calib.kinematics.hand_eye import SetUp
 from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.regression.conditional import Conditional, without_rigid_motions
+from diffeo_calib.measurements.poses import camera_jacobian, inverse_poses, mark_jacobian, poses_from_marks
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.board_camera import BoardCamera
 from diffeo_calib.sensors.kinds import WITHOUT_READINGS, known_kinds
-from diffeo_calib.sensors.set_ups import frame_slopes
+from diffeo_calib.sensors.set_ups import TRANSFORMS, frame_slopes
+
+NEW = -1
+"""Number of an unknown that the scene does not have."""
+SMALLEST_REST_M = 1e-6
 
 
-class Scene(NamedTuple):
-    """M configurations as a robot or model has them, and what is known there before the first measurement."""
+class Told(NamedTuple):
+    """Measurements of one device at O configurations of a scene."""
 
-    known: Conditional  # the conditional
-    at: Linearisation  # the configurations
-    first: int  # number of the first new column
-    points: Tensor  # (M, m) coordinates of the markers, m
-    noise: Tensor  # (M, m, m) covariance of one measurement of them, m^2
-    base: Tensor  # (4, 4) the robot's base in their frame, m
-    averaged: Tensor  # (r, m) the markers, or the origins of measured poses
-    seen: int  # the first coordinates, of points that a device of positions sees
-    free: bool = False  # whether nothing says where the robot stands in the frame of a measuring device
-    shifts: int = 0  # number c0 of the shifts that rows of the fit shared
-
-    @property
-    def motions(self) -> list[int]:
-        """Numbers of the columns by motions of the base."""
-        return list(self.at.spec.nominal.places[:6])
-
-    def without_motions(self, known: Conditional, targets: Tensor) -> Conditional:
-        """Without the rigid motion that fits the errors at the targets best, where such motions are no errors."""
-        return without_rigid_motions(known, self.at.rows(targets), self.motions) if self.free else known
-
-    def along(self, blocks: Tensor) -> Tensor:
-        """Covariances of the markers, or of the origins of poses, from those of the points: (M, m, m) -> (M, r, r)."""
-        return self.averaged @ blocks @ self.averaged.mT
-
-    @property
-    def last(self) -> Tensor:
-        """(3, m) the ball: the last marker, or the origin of the last measured pose."""
-        return self.averaged[-3:]
-
-    def seen_by(self, devices: Devices) -> Tensor:
-        """(3 k, m) what devices of readings see: the ball, or the points of the last measured pose."""
-        whole = torch.eye(self.points.shape[1], dtype=self.points.dtype, device=self.points.device)
-        return self.last if devices.seen_points == 1 else whole[-3 * devices.seen_points :]
-
-    @property
-    def framed(self) -> bool:
-        """Whether the points represent frames."""
-        return len(self.averaged) < self.points.shape[1]
-
-
-class Where(NamedTuple):
-    """Configurations that can be measured: arguments of :func:`candidates`."""
-
-    keep: Criterion
-    ranges: dict[str, tuple[float, float]]
+    name: str  # of the device
+    rows: Tensor  # (O,) numbers of the configurations
+    slopes: Tensor  # (O, r, m) A
+    effects: Tensor  # (O, r, k) D
+    columns: Tensor  # (k,) numbers of these unknowns among those of the scene, or NEW
+    noise: Tensor  # (O, r, r) m^2
 
 
 class Options(NamedTuple):
-    """Measurements that can be made: O of them."""
+    """Measurements by several devices: O of them."""
 
     rows: Tensor  # (O,) numbers of the configurations
-    slopes: Tensor  # (O, r, m) A
-    shared: Tensor  # (O, r, c) D, the c0 shifts of the fit first
-    noise: Tensor  # (O, r, r), m^2
+    at: Linearisation  # what they report, with columns by all unknowns
+    noise: Tensor  # (O, r, r) m^2
     device: Tensor  # (O,) numbers of the devices
-    names: tuple[str, ...]  # of the devices
 
     @classmethod
-    def joined(cls, parts: Sequence[Options], shifts: int) -> Options:
-        """All of them; what some do not report is noise of 1 m that nothing moves. ``shifts``: c0."""
-        r, c = max(part.slopes.shape[1] for part in parts), sum(part.shared.shape[2] - shifts for part in parts)
-        found, before, devices, names = [], 0, 0, tuple[str, ...]()
-        for part in parts:
-            rows, (more, own) = len(part.rows), (r - part.slopes.shape[1], part.shared.shape[2] - shifts)
-            added = torch.nn.functional.pad(part.shared[..., shifts:], (before, c - before - own))
-            shared = torch.nn.functional.pad(torch.cat([part.shared[..., :shifts], added], 2), (0, 0, 0, more))
-            noise = torch.nn.functional.pad(part.noise, (0, more, 0, more))
-            absent = torch.arange(r, device=noise.device)[None, r - more :].expand(rows, -1)
-            noise[torch.arange(rows, device=noise.device)[:, None], absent, absent] = 1.0
-            slopes = torch.nn.functional.pad(part.slopes, (0, 0, 0, more))
-            found.append((part.rows, slopes, shared, noise, part.device + devices))
-            before, devices, names = before + own, devices + len(part.names), names + part.names
-        return cls._make([*(torch.cat(values) for values in zip(*found, strict=True)), names])
-
-    def linearised(self, scene: Scene) -> Linearisation:
-        """What they report, with columns by the shifts of the fit, and by new ones."""
-        told = scene.at.rows(self.rows).projected(self.slopes)
-        told = told.with_columns(self.shared[..., : scene.shifts], len(scene.at.spec.prior_variance))
-        return told.with_columns(self.shared[..., scene.shifts :], scene.first)
-
-    def some(self, index: Tensor) -> Options:
-        """Some of them."""
-        return Options._make([*(part[index] for part in self[:5]), self.names])
+    def of(cls, scene: Scene, told: Sequence[Told]) -> Options:
+        """All of them; what some do not report is noise of 1 m that nothing moves."""
+        r, width, found = max(one.slopes.shape[1] for one in told), scene.columns, []
+        for number, one in enumerate(told):
+            new = one.columns == NEW
+            columns, own = torch.where(new, width - 1 + new.cumsum(0), one.columns), one.slopes.shape[1]
+            width += int(new.sum())
+            if len(one.rows):
+                at = scene.at.rows(one.rows).projected(pad(one.slopes, (0, 0, 0, r - own)))
+                noise = torch.eye(r, dtype=one.noise.dtype, device=one.noise.device).repeat(len(one.rows), 1, 1)
+                noise[:, :own, :own] = one.noise
+                found.append((one, columns, at, noise, torch.full_like(one.rows, number)))
+        each = []
+        for one, columns, at, _, _ in found:
+            whole = pad(at.sensitivity, (0, width - at.sensitivity.shape[2]))
+            whole[:, : one.slopes.shape[1]].index_add_(2, columns, one.effects)
+            each.append(replace(at, sensitivity=whole))
+        told, _, _, noise, device = zip(*found, strict=True)
+        return cls(
+            torch.cat([one.rows for one in told]), Linearisation.joined(each), torch.cat(noise), torch.cat(device)
+        )
 
 
 @dataclass(frozen=True)
@@ -165,24 +134,16 @@ class Sensor(ABC):
         return DeviceReadings.of("socket", places, std)
 
     @abstractmethod
-    def options(self, scene: Scene) -> Options:
-        """The measurements that can be made at some configurations."""
+    def told(self, scene: Scene, among: Tensor) -> Iterator[Told]:
+        """What each of its devices can measure among some configurations (M',) of a scene."""
 
-    def places_in(self, base: Tensor) -> Tensor | None:
-        """(D, 3) places in the robot's base to which the ball must be brought, m; None if anywhere will do.
-
-        Args:
-            base: (4, 4) the base in the frame of the model's positions, m.
-        """
-        return None
-
-    def where(self, model: CalibratedKinematics) -> Where | None:
-        """Where it can measure, for :func:`candidates`; None if nothing is known of that before.
+    def reached(self, base: Tensor) -> dict[str, Any]:
+        """Where it can measure, as arguments of :func:`candidates`; none if that is not known before, or anywhere.
 
         Args:
-            model: of the fit that the sensor belongs to.
+            base: (4, 4) the robot's base in the frame of the model's positions, m.
         """
-        return None
+        return {}
 
     def sentences(self) -> list[str]:
         """Where devices with names are, new ones in the robot's base, those of a fit in the frame of its positions."""
@@ -193,21 +154,11 @@ class Sensor(ABC):
         """Whether it measures frames, not markers."""
         return False
 
-    @staticmethod
-    def _new(scene: Scene, shared: Tensor) -> Tensor:
-        """Effects (O, r, c) of new shifts after none of those of the fit: (O, r, c0 + c)."""
-        return torch.nn.functional.pad(shared, (scene.shifts, 0))
-
-    def beside_others(self) -> Sensor:
-        """The same for a model whose rows no device of positions measured, for which it is a new one."""
-        return self
-
-    def _noise(self, scene: Scene, rows: Tensor, slopes: Tensor) -> Tensor:
-        """Covariance (O, r, r) of what rows show, m^2."""
+    def _noise(self, usual: Tensor) -> Tensor:
+        """Covariance (O, r, r) of what rows show, the usual one by default, m^2."""
         if self.std is None:
-            return slopes @ scene.noise[rows] @ slopes.mT
-        eye = torch.eye(slopes.shape[1], dtype=slopes.dtype, device=slopes.device)
-        return (self.std**2 * eye).expand(len(rows), -1, -1)
+            return usual
+        return self.std**2 * torch.eye(usual.shape[1], dtype=usual.dtype, device=usual.device).expand_as(usual)
 
 
 @dataclass(frozen=True)
@@ -215,44 +166,33 @@ class Positions(Sensor):
     """Positions of the markers, or poses."""
 
     whole: bool = False  # whether poses of frames are measured, or their origins
-    new: bool = False  # whether by a device of no row of the model
     of_positions: ClassVar[bool] = True
-
-    def beside_others(self) -> Sensor:
-        """See :meth:`Sensor.beside_others`."""
-        return replace(self, new=True)
 
     @property
     def of_frames(self) -> bool:
         """Poses."""
         return self.whole
 
-    def options(self, scene: Scene) -> Options:
-        """At every configuration. The place of a new device is unknown, and where nothing says where the robot is."""
-        N, m = scene.points.shape
+    def told(self, scene: Scene, among: Tensor) -> Iterator[Told]:
+        """At every configuration. The place of the device is unknown where it is new, or nothing shows the robot's."""
         if self.whole and not scene.framed:
             fix = "mark the tool by three points or a frame: a single point shows no turn about itself"
             raise InputError.of("poses of a robot that is known by markers", expected="measured frames", fix=fix)
-        every = torch.eye(m, dtype=scene.points.dtype, device=scene.points.device)
-        slopes = (every if self.whole else scene.averaged[: scene.seen]).expand(N, -1, -1)
-        shared = slopes.new_zeros(N, m, 0)
-        if scene.free or self.new:
-            points = scene.points.view(N, -1, 3)
-            shared = PLACES.found_m_rad * frame_slopes(points, points.mean((0, 1)))
-        rows = torch.arange(N, device=slopes.device)
-        noise = self._noise(scene, rows, slopes)
-        name = "poses" if self.whole else "positions"
-        return Options(rows, slopes, self._new(scene, slopes @ shared), noise, torch.zeros_like(rows), (name,))
+        every = torch.eye(scene.points.shape[1], dtype=scene.points.dtype, device=scene.points.device)
+        A = (every if self.whole else scene.averaged[: scene.seen]).expand(len(among), -1, -1)
+        points, numbers = scene.points.unflatten(1, (-1, 3)), 6 * (scene.free or scene.unplaced)
+        moved = A @ (PLACES.found_m_rad * frame_slopes(points[among], points.mean((0, 1))))[..., :numbers]
+        noise, columns = self._noise(A @ scene.noise[among] @ A.mT), among.new_full((numbers,), NEW)
+        yield Told("poses" if self.whole else "positions", among, A, moved, columns, noise)
 
 
 @dataclass(frozen=True)
 class DeviceReadings(Sensor):
-    """Readings of the ball, of one kind."""
+    """Readings of the ball, or of a frame, of one kind."""
 
-    # where they are, in the robot's base frame
-    devices: Devices = None  # pyright: ignore[reportAssignmentType]  # always given
-    # what a fit knows of the only one, which is in the frame of the model's positions; None for new devices
-    fitted: FittedDevice | None = None
+    names: tuple[str, ...] = ()
+    devices: tuple[FittedDevice, ...] = ()  # each of them, new ones with the deviations of their prior
+    new: bool = True  # whether they are in the robot's base frame, not in that of the model's positions
 
     @classmethod
     def of(cls, kind: str, numbers: object, std: float | None, offset_std: float = 0.0) -> DeviceReadings:
@@ -265,40 +205,172 @@ class DeviceReadings(Sensor):
             expected = f"{own.stated_as} with a direction"
             raise InputError.of(f"devices of {kind}s", expected=expected, got=as_written(given.tolist()))
         names = tuple(f"{kind} {number}" for number in range(1, len(given) + 1))
-        prior = constants.new_tensor(own.prior(offset_std)).expand(len(names), -1)
-        return cls(std, own(names, constants, prior))
+        prior = constants.new_tensor(own.prior(offset_std))
+        devices = (own((name,), each[None], prior[None]) for name, each in zip(names, constants, strict=True))
+        return cls(std, names, tuple(FittedDevice(one, torch.diag(prior)) for one in devices))
 
     def sentences(self) -> list[str]:
         """One for each."""
-        return [f"{name}: {self.devices.where(number)}" for number, name in enumerate(self.devices.names)]
+        return [f"{name}: {one.devices.where(0)}" for name, one in zip(self.names, self.devices, strict=True)]
 
-    def places_in(self, base: Tensor) -> Tensor | None:
-        """See :meth:`Sensor.places_in`."""
-        places = self.devices.places
-        return places if places is None or self.fitted is None else (places - base[:3, 3]) @ base[:3, :3]
+    def reached(self, base: Tensor) -> dict[str, Any]:
+        """Where the ball must be brought."""
+        held = torch.cat([one.devices.places for one in self.devices])
+        held = held if self.new else (held - base[:3, 3]) @ base[:3, :3]
+        return {"places": held} if len(held) else {}
 
-    def options(self, scene: Scene) -> Options:
-        """Every device at the configurations in which it sees the tool."""
-        columns = None if self.fitted is None else self.fitted.columns
-        base = scene.base if self.fitted is None else torch.eye(4, dtype=scene.base.dtype, device=scene.base.device)
-        last = scene.seen_by(self.devices)
-        points = (scene.points @ last.mT).unflatten(1, (-1, 3)) - base[:3, 3]
-        points, turn = (points @ base[:3, :3]).flatten(1), torch.block_diag(*[base[:3, :3].mT] * points.shape[1])
-        count = len(self.devices.names)
-        rows = torch.arange(len(points), device=points.device).repeat_interleave(count)
-        device = torch.arange(count, device=points.device).repeat(len(points))
-        seen = self.devices.sees(points[rows], device)
-        rows, device = rows[seen], device[seen]
-        slopes = self.devices.observation(device).slope(points[rows]) @ turn @ last
-        if self.fitted is None or columns is None:
-            shared = self._new(scene, self.devices.shared(points[rows], device))
+    def told(self, scene: Scene, among: Tensor) -> Iterator[Told]:
+        """Every device at the configurations in which it sees the tool: the ball, or the last measured frames."""
+        base = scene.base if self.new else torch.eye(4, dtype=scene.base.dtype, device=scene.base.device)
+        whole = torch.eye(scene.points.shape[1], dtype=base.dtype, device=base.device)
+        for name, one in zip(self.names, self.devices, strict=True):
+            count = one.devices.seen_points
+            last = scene.averaged[-3:] if count == 1 else whole[-3 * count :]
+            points = ((scene.points[among] @ last.mT).unflatten(1, (-1, 3)) - base[:3, 3]) @ base[:3, :3]
+            points, device = points.flatten(1), torch.zeros_like(among)
+            there = one.devices.sees(points, device)
+            points, rows = points[there], among[there]
+            to_seen = torch.block_diag(*[base[:3, :3].mT] * count) @ last
+            A, effects = one.devices.observation(device[there]).slope(points) @ to_seen, one.by_increments(points)
+            usual = A @ scene.noise[rows] @ A.mT if one.noise is None else one.noise.expand(len(rows), -1, -1)
+            columns = among.new_full((one.root.shape[1],), NEW)
+            if one.columns is not None:
+                columns = len(scene.at.spec.prior_variance) + one.columns.nonzero()[:, 0]
+            yield Told(name, rows, A, effects @ one.root, columns, self._noise(usual))
+
+
+@dataclass(frozen=True, eq=False)
+class BoardImages(Sensor):
+    """Images of the board by one camera of a fit, where it stood last."""
+
+    model: CalibratedKinematics = None  # pyright: ignore[reportAssignmentType]  # always given
+    name: str = ""  # of the camera
+    # lens, board and what its images showed
+    seen: BoardCamera = None  # pyright: ignore[reportAssignmentType]  # always given
+    rows: Tensor = None  # pyright: ignore[reportAssignmentType]  # (M,) of the fit that it measured
+
+    @property
+    def camera(self) -> Camera:
+        """Lens and board."""
+        return self.seen.camera
+
+    @cached_property
+    def _last(self) -> tuple[SetUp, Tensor]:
+        """The set-up of its last session, and the rows of that.
+
+        Where no row says it, that of its last set-up, by a recalibration; the model's in the place of a registration.
+        """
+        sets = [own for own in self.model.placement if own.kind in TRANSFORMS and self.model.registration is None]
+        for own in sets:
+            here = torch.isin(own.rows, self.rows)
+            if bool(here.any()):
+                number = int(own.device[here][own.rows[here].argmax()])
+                rows = self.rows[torch.isin(self.rows, own.rows[own.device == number])]
+                return SetUp.of(self.model, own.names[number]), rows
+        names = (name for own in sets for name in reversed(own.names) if name.partition("/")[0] == self.name)
+        return SetUp.of(self.model, next(names, None)), self.rows
+
+    @property
+    def set_up(self) -> SetUp:
+        """Where it is."""
+        return self._last[0]
+
+    @cached_property
+    def lens(self) -> tuple[Tensor, Tensor, Tensor]:
+        """What unknowns of unit variance do to lens and board (14, c), their columns (c,), and further noise (9, 9).
+
+        The unknowns are the shifts of the fit; new ones beside a registration, and for images that its poses do not
+        explain. The noise is that of a pose beyond that of its corners, m^2.
+        """
+        fitted, (set_up, rows) = self.model.map, self._last
+        root, little = self.camera.root, SMALLEST_REST_M**2 * torch.eye(9, dtype=self.camera.root.dtype)
+        if self.camera.view is None:  # of earlier versions
+            return root[:, :0], rows[:0], little
+        new = root, torch.full_like(root[0], NEW, dtype=torch.int64), little
+        if self.model.registration is not None or not len(rows):
+            return new
+        known, by_lens = self.tells(self.model(self.model.configurations[rows]).detach().flatten(1))
+        if not bool(by_lens.isfinite().all()):  # it was seen from other places since
+            return new
+        of_fit = fitted.noise.shared[rows][:, :9].clone()
+        if set_up.columns is not None:
+            of_fit[..., set_up.columns] = 0.0
+        effects = torch.linalg.lstsq(by_lens.flatten(0, 1), of_fit.flatten(0, 1), driver="gelsd").solution
+        beyond = (fitted.noise.covariance[rows][:, :9, :9] - known).median(0).values
+        values, axes = torch.linalg.eigh(0.5 * (beyond + beyond.mT))
+        first = len(fitted.geodesic.spec.prior_variance)
+        columns = first + torch.arange(effects.shape[1], device=effects.device)
+        return effects, columns, (axes * values.clamp(min=SMALLEST_REST_M**2)) @ axes.mT
+
+    def boards(self, points: Tensor) -> Tensor:
+        """Poses (M, 4, 4) of the board in the camera's frame by the model's points (M, 9), m."""
+        poses = self.set_up.view(poses_from_marks(points.unflatten(1, (3, 3)), self.model.bodies.pose_lever()))
+        return inverse_poses(poses) if self.seen.on_tool else poses
+
+    def reached(self, base: Tensor) -> dict[str, Any]:
+        """By the rigid kinematics, which is quick, and not far beyond the joints of the fit."""
+        geometry, ranges = self.model.geometry, ranges_around(self.model.robot, self.model.configurations)
+        return {"keep": lambda q: sees(self.camera, self.boards(geometry.points(q).flatten(1))), "ranges": ranges}
+
+    def tells(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Covariances (O, 9, 9), m^2, of images of points (O, 9), m, and effects (O, 9, 14) of lens and board."""
+        boards, lever = self.boards(points), self.model.bodies.pose_lever()
+        covariance, effects = expected(self.camera, boards)
+        if self.seen.on_tool:
+            M = self.set_up.mount
+            tool, seen = inverse_poses(M @ boards), boards[:, :3, 3] @ M[:3, :3].mT + M[:3, 3]
+            slopes = -camera_jacobian(tool, lever, seen) @ torch.block_diag(*[M[:3, :3]] * 2)
         else:
-            shared = slopes.new_zeros(*slopes.shape[:2], scene.shifts)
-            shared[..., columns] = self.fitted.by_increments(points[rows]) @ self.fitted.root
-        return Options(rows, slopes, shared, self._noise(scene, rows, slopes), device, self.devices.names)
+            slopes = mark_jacobian(poses_from_marks(points.unflatten(1, (3, 3)), lever), lever)
+            slopes = slopes @ torch.block_diag(*[self.set_up.transform[:3, :3].mT] * 2)
+        return slopes @ covariance @ slopes.mT, slopes @ effects
 
-    def _noise(self, scene: Scene, rows: Tensor, slopes: Tensor) -> Tensor:
-        """Covariance (O, r, r) of readings, m^2."""
-        if self.std is None and self.fitted is not None and self.fitted.noise is not None:
-            return self.fitted.noise.expand(len(rows), -1, -1)
-        return super()._noise(scene, rows, slopes)
+    def told(self, scene: Scene, among: Tensor) -> Iterator[Told]:
+        """Where the camera sees the board."""
+        rows, (root, columns, rest) = among[sees(self.camera, self.boards(scene.points[among]))], self.lens
+        points, noise, parts = (
+            scene.points[rows],
+            scene.noise[rows],
+            [(columns, scene.noise.new_zeros(len(rows), 9, 0))],
+        )
+        if self.camera.view is not None:
+            noise, by_lens = self.tells(points)
+            noise, parts = noise + rest, [(columns, by_lens @ root)]
+        if self.set_up.columns is not None:
+            first = len(scene.at.spec.prior_variance)
+            parts.append((first + self.set_up.columns.nonzero()[:, 0], self.set_up.shifted(points)))
+        columns, effects = torch.cat([own for own, _ in parts]), torch.cat([own for _, own in parts], 2)
+        every = torch.eye(9, dtype=points.dtype, device=points.device).expand(len(rows), 9, 9)
+        yield Told(self.name, rows, every, effects, columns, self._noise(noise))
+
+
+def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
+    """Sensors that measured the rows of a model, cameras, devices of readings and sockets where the fit found them.
+
+    Raises:
+        InputError: files of early versions, which do not say where devices of readings are.
+    """
+    found: list[Sensor] = [] if without_positions(model) else [Positions(whole=model.lever is not None)]
+    for own in model.placement:
+        for k, (name, seen) in enumerate(own.devices.cameras.items()):
+            found.append(BoardImages(None, model, name, seen, own.rows[own.device == k]))
+    words = [word for own in model.placement for word in own.names]
+    for own in model.placement:
+        for number, word in enumerate(own.names if own.devices.seen_points else ()):
+            name = f"{own.kind} {word}" if words.count(word) > 1 else word
+            found.append(DeviceReadings(None, (name,), (FittedDevice.of(model.map, own, number),), new=False))
+    if not found:
+        fix = "say by `sensor` what will measure"
+        raise InputError.of("the file of this model does not say which devices measured its rows", fix=fix)
+    return tuple(found)
+
+
+def sensors_for(given: Tree | CalibratedKinematics, sensor: object = None) -> tuple[Sensor, ...]:
+    """Sensors: the argument of :func:`plan`, or what it stands for."""
+    if sensor is None:
+        return sensor_of(given) if isinstance(given, CalibratedKinematics) else (Positions(),)
+    several: tuple[Any, ...] = tuple(sensor) if isinstance(sensor, Sequence) else (sensor,)
+    if not several or not all(isinstance(one, Sensor) for one in several):
+        fix = "pass dc.Sensor.positions(), dc.Sensor.distances(points), ..."
+        raise InputError.of("`sensor`", expected="a dc.Sensor or several", got=as_written(sensor), fix=fix)
+    return several

@@ -9,11 +9,11 @@ from typing import NamedTuple
 import torch
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
+from diffeo_calib.calibration.recalibration.new_rows import FoundPlace
 from diffeo_calib.common.errors import with_deviation
 from diffeo_calib.common.quantiles import chi2_above
-from diffeo_calib.kinematics.re_registration.find_place import FoundPlace
 from diffeo_calib.measurements.poses import rotation_numbers
+from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.regression.conditional import roots
 from diffeo_calib.robots.tree import Tree
 

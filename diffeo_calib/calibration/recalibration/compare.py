@@ -15,20 +15,21 @@ from torch import Tensor
 
 from diffeo_calib.calibration.recalibration.changes import LEVEL, Changes, Offset, hidden_offsets
 from diffeo_calib.calibration.recalibration.find_changes import FEWEST_ROWS, find_changes
-from diffeo_calib.calibration.recalibration.new_rows import WeighedRows, weighed
+from diffeo_calib.calibration.recalibration.find_place import find_place
+from diffeo_calib.calibration.recalibration.new_rows import NewRows
 from diffeo_calib.calibration.recalibration.new_set_up import (
     Marker,
     check_arguments,
     place_again,
     warn_of_places,
+    weighed,
 )
 from diffeo_calib.common.checks import check_number, check_seed
 from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.re_registration.find_place import find_place
-from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration, moved
+from diffeo_calib.kinematics.registered_map import RegisteredMap, Registration, moved
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import roots
 from diffeo_calib.robots.cartesian import is_cartesian, pose_inputs, turns_nowhere
@@ -129,24 +130,24 @@ def compare(
         rows = _predicted_rows(model, under_mass(other, payload).to(HOST))
     changes, _ = find_changes(rows, level=level, seed=seed)
     if measured:
-        warn_of_places(rows.before, marker, outliers=not changes.found, excess=not changes.found)
+        warn_of_places(rows.set_up, marker, outliers=not changes.found, excess=not changes.found)
     q = model.configurations  # what is usual is expected at the rows of its fit
     _, covariance = model.predict(q[:: -(-len(q) // MOST_USUAL)], noise=False)
     variance = float(covariance.diagonal(dim1=-2, dim2=-1).mean().clamp(min=0))
     usual = (variance + rows.noise.diagonal(dim1=1, dim2=2)).sqrt()
     usual = usual.masked_fill(~rows.visible, nan)
     return Comparison(
-        moved=rows.before.registration if measured else None,
+        moved=rows.set_up.registration if measured else None,
         changes=changes,
         errors=rows.by_kind(rows.placed_residual),
         expectations=rows.by_kind(rows.expected_residual),
         usual=rows.by_kind(usual),
-        hidden=hidden_offsets(model.robot, rows.before.place, changes) if measured else (),
+        hidden=hidden_offsets(model.robot, rows.set_up.place, changes) if measured else (),
         payload=payload,
     )
 
 
-def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) -> WeighedRows:
+def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) -> NewRows:
     """What another model predicts of the markers of a model, at configurations of both fits that both know."""
     if model.robot.joint_names != other.robot.joint_names:
         expected, got = ", ".join(model.robot.joint_names), ", ".join(other.robot.joint_names)
@@ -172,7 +173,7 @@ def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) ->
         return Measurements.of_points(q, points.detach(), None, model.lever).with_load(own.nominal.load)
 
     fitted = other.map.unregistered
-    found = find_place(fitted, other.nominal, other.lever, measured(other, there, model(q))).registration
+    found = find_place(fitted, other.lever, measured(other, there, model(q))).registration
     placed = RegisteredMap(moved(fitted, found.transform), found)
     new = measured(model, q, placed(there).unflatten(1, (-1, 3)))
     rows = weighed(place_again(model, new, "other"), "other")

@@ -16,7 +16,7 @@ extrapolation, not change.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import inf
 from typing import NamedTuple
 
@@ -24,19 +24,88 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
 from diffeo_calib.calibration.diagnostics.row_order import find_block
 from diffeo_calib.calibration.recalibration.changes import LEVEL, Change, Changes, Offset
-from diffeo_calib.calibration.recalibration.new_rows import (
-    OFFSET_DEVIATION_RAD_M,
-    OUTLIER_WEIGHT,
-    ChangedPart,
-    WeighedRows,
-    offsets_of,
-    parts_of,
-)
+from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import sentence, warn_user
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kernels.radial import RadialKernel
+from diffeo_calib.kinematics.registered_map import robot_map
+from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.process.evidence import Evidence
+
+SMALLEST_AMPLITUDE_SHARE = 0.5
+"""A small transmission error counts with this share of the largest joint's amplitude: it may have grown."""
+OFFSET_DEVIATION_RAD_M = 3e-4
+"""Of a joint offset, to which the sizes of changes are relative: they span 0.05 to 5 mrad."""
+NEGLIGIBLE_EIGENVALUE_SHARE = 1e-6
+"""Eigenvalues of a transmission's covariance below this share of the largest are left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChangedPart:
+    """A part of a model that may have changed.
+
+    Args:
+        name: of the joint, or "gravity" or "geometry".
+        joint: the column of the joint whose error or offset it is; None for parameters of the nominal map.
+        kernel: that of the joint's error; None for its offset, which all readings lack since then.
+        deviations: (K,) prior standard deviations of the parameters, zero of those that it leaves alone.
+        variance: of the change, relative to the old variance of the part.
+    """
+
+    name: str
+    joint: int | None = None
+    kernel: RadialKernel | None = None
+    deviations: Tensor | None = None
+    variance: float = 1.0
+
+    @property
+    def offset(self) -> bool:
+        """Whether it is the offset of a joint."""
+        return self.joint is not None and self.kernel is None
+
+    def shapes(self, at: Linearisation) -> Tensor:
+        """(M, c) columns whose products are the covariance of the change of the joint's errors, rad or m."""
+        points, size = at.joint[0].points, self.variance**0.5
+        if self.kernel is None:
+            return torch.full_like(points[:, :1], size * OFFSET_DEVIATION_RAD_M)
+        one = points.new_zeros(len(points), 1, points.shape[1])
+        one[:, 0, self.joint] = 1.0
+        values, vectors = torch.linalg.eigh(self.kernel.gram(points, one, points, one))
+        kept = values > NEGLIGIBLE_EIGENVALUE_SHARE * values[-1]
+        return size * vectors[:, kept] * values[kept].sqrt()
+
+    def root(self, at: Linearisation) -> Tensor:
+        """(M, m, c) columns whose products are the covariance of the change at M configurations, m."""
+        if self.deviations is not None:
+            return self.variance**0.5 * (at.sensitivity * self.deviations)[..., self.deviations > 0]
+        return at.joint_to_start[:, :, self.joint, None] * self.shapes(at)[:, None]
+
+
+def offsets_of(fitted: FittedMap) -> list[ChangedPart]:
+    """The offsets of all joints, which are tested beside the parts: the geometry has them, among much else."""
+    names = robot_map(fitted).geometry.chain.joint_names
+    return [ChangedPart(f"the offset of {name}", joint) for joint, name in enumerate(names)]
+
+
+def parts_of(fitted: FittedMap) -> list[ChangedPart]:
+    """The parts of a robot's map: every joint with a transmission term, gravity, geometry."""
+    spec, nominal = fitted.geodesic.spec, robot_map(fitted)
+    names = nominal.geometry.chain.joint_names
+    own = {t.output: t for t in spec.joint_kernel.terms if isinstance(t, RadialKernel) and t.output is not None}
+    least = SMALLEST_AMPLITUDE_SHARE**2 * max((float(term.variance) for term in own.values()), default=0.0)
+    found: list[ChangedPart] = []
+    for joint, term in own.items() if least > 0 else ():
+        kernel = RadialKernel.from_config(term.to_config() | {"variance": max(float(term.variance), least)})
+        found.append(ChangedPart(names[joint], joint, kernel))
+    for name, columns in (("gravity", nominal.sag), ("geometry", nominal.geometry.slices["joints"])):
+        deviations = torch.zeros_like(spec.prior_variance)
+        deviations[columns] = spec.prior_variance[columns].sqrt()
+        found += [ChangedPart(name, deviations=deviations)] if bool(deviations.any()) else []
+    return found
+
 
 SIMULATED_DRAWS = 2000
 NOISE_FACTORS = 0.4 * 30.0 ** (torch.arange(12, dtype=torch.float64, device="cpu") / 11)
@@ -58,7 +127,7 @@ class Ratio(NamedTuple):
     variance: float
 
 
-def likelihood_ratios(rows: WeighedRows, roots: dict[str, Tensor], seed: int) -> tuple[dict[str, Ratio], float]:
+def likelihood_ratios(rows: NewRows, roots: dict[str, Tensor], seed: int) -> tuple[dict[str, Ratio], float]:
     """Ratios of all parts.
 
     Args:
@@ -109,7 +178,7 @@ SOMETHING = "something"
 """A change whose part rows do not tell."""
 
 
-def find_changes(rows: WeighedRows, *, level: float = LEVEL, seed: int = 0) -> tuple[Changes, list[ChangedPart]]:
+def find_changes(rows: NewRows, *, level: float = LEVEL, seed: int = 0) -> tuple[Changes, list[ChangedPart]]:
     """Test new rows for changes: all together, and every session and block of rows that do not fit by itself.
 
     Rows that follow one another, or are a session of their own, and deviate together are no outliers.
@@ -141,13 +210,13 @@ def find_changes(rows: WeighedRows, *, level: float = LEVEL, seed: int = 0) -> t
     return replace(changes, found=tuple(found)), []
 
 
-def groups_of(rows: WeighedRows) -> dict[str, tuple[Tensor, bool]]:
+def groups_of(rows: NewRows) -> dict[str, tuple[Tensor, bool]]:
     """Rows that were measured together, by their names: their numbers, and whether hardly any fits the old model.
 
     Sessions, if there are several, and else the block of rows that hardly count.
     """
-    data, flags = rows.before.data, (rows.tails.weights < OUTLIER_WEIGHT).any(1).to(HOST)
-    named = [group for one in rows.before.sessions for group in one.groups()]
+    data, flags = rows.set_up.data, (rows.tails.weights < OUTLIER_WEIGHT).any(1).to(HOST)
+    named = [group for one in rows.set_up.sessions for group in one.groups()]
     if named:
         return {name: (own, float(flags[own].double().mean()) > MOST_OUTLIERS) for name, own in named}
     distinct = len(data.line_numbers.unique()) == len(data)
@@ -161,7 +230,7 @@ def groups_of(rows: WeighedRows) -> dict[str, tuple[Tensor, bool]]:
     return {f"rows {first} to {last}": (block, True)}
 
 
-def _changes_of(rows: WeighedRows, *, level: float, seed: int) -> tuple[Changes, list[ChangedPart]]:
+def _changes_of(rows: NewRows, *, level: float, seed: int) -> tuple[Changes, list[ChangedPart]]:
     """Test rows together; arguments as of :func:`find_changes`."""
     low, high = rows.fitted.x.amin(0), rows.fitted.x.amax(0)
     margin = RANGE_MARGIN * (high - low)
@@ -201,9 +270,9 @@ LARGEST_OFFSET_RAD_M = 5e-3
 """The largest one that is tested, see SIZES."""
 
 
-def _smallest(rows: WeighedRows) -> tuple[Offset, ...]:
+def _smallest(rows: NewRows) -> tuple[Offset, ...]:
     """See :class:`Changes`."""
-    chain, found = rows.points.fitted.geometry.chain, []
+    chain, found = rows.marks.fitted.geometry.chain, []
     for joint, part in enumerate(offsets_of(rows.fitted)):
         evidence = rows.evidence(part.root(rows.at))
         size = SHOWN * OFFSET_DEVIATION_RAD_M / float(evidence.H.sqrt())
@@ -212,9 +281,9 @@ def _smallest(rows: WeighedRows) -> tuple[Offset, ...]:
     return tuple(found)
 
 
-def _change(rows: WeighedRows, part: ChangedPart, probability: float, others: tuple[str, ...]) -> Change:
+def _change(rows: NewRows, part: ChangedPart, probability: float, others: tuple[str, ...]) -> Change:
     """The change with its expected size."""
-    evidence, kinds = rows.evidence(part.root(rows.at)), rows.points.fitted.geometry.chain.kinds
+    evidence, kinds = rows.evidence(part.root(rows.at)), rows.marks.fitted.geometry.chain.kinds
     moved = part.root(rows.seen[1]) @ evidence.g
     size = displacement = float(moved.unflatten(1, (-1, 3)).square().sum(-1).mean().sqrt())
     deviation = None
@@ -235,7 +304,7 @@ LOG_SIZES = torch.linspace(-12.0, 4.0, 65, dtype=torch.float64, device="cpu")
 ROUNDS = 10
 
 
-def usual_drift(rows: WeighedRows, named: Sequence[ChangedPart]) -> list[ChangedPart]:
+def usual_drift(rows: NewRows, named: Sequence[ChangedPart]) -> list[ChangedPart]:
     """What may differ between the dates, besides what a test named: temperature, wear and screws change everything.
 
     In each of three groups, the geometry, the load and the transmissions of all joints, errors may differ from the old
@@ -262,7 +331,7 @@ def usual_drift(rows: WeighedRows, named: Sequence[ChangedPart]) -> list[Changed
     return [replace(part, variance=size) for parts, size in zip(groups.values(), sizes, strict=True) for part in parts]
 
 
-def _likeliest(rows: WeighedRows, roots: list[Tensor]) -> tuple[list[float], float]:
+def _likeliest(rows: NewRows, roots: list[Tensor]) -> tuple[list[float], float]:
     """The sizes s^2 of changes with these columns (M, R, c), each in turn the likeliest beside the others; log odds."""
     sizes, chosen = LOG_SIZES.exp().to(rows.y), [0] * len(roots)
     prior = -0.5 * ((LOG_SIZES.to(rows.y) - USUAL_LOG) / EFOLDS).square()

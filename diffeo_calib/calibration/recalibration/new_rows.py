@@ -1,208 +1,318 @@
-"""New rows as a calibrated model expects them: residuals, and their covariance. Everything is in the model's frame.
+"""New rows beside an old model, linearised where device and markers are: what later verbs condition on.
 
-They are residuals y - h(k1(q; m)) of what was measured, h, from devices and markers that were found before
-(new_set_up.py), and whose places are known by their prior deviations (kinematics/re_registration/new_rows.py).
-
-Parts of a robot that may have changed since its calibration: hypotheses whose priors are those of the old model.
+Everything is in the frame of the old map. Residuals y - h(k1(q; m)) of what was measured, h, are errors of the map,
+places of devices and markers that are open since, and what has drifted: see :class:`LinearRows`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from math import log, nan
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from diffeo_calib.calibration.diagnostics.hypotheses import Evidence
 from diffeo_calib.calibration.placing.lens import CameraErrors
 from diffeo_calib.calibration.placing.place import Told, stacked
-from diffeo_calib.calibration.placing.placement import DeviceSet, Placement, SeenRows
+from diffeo_calib.calibration.placing.placement import DeviceSet, Placement
 from diffeo_calib.calibration.placing.readings import ReadingDevices, reading_sets
+from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.placing.sockets import SocketDevices
-from diffeo_calib.calibration.recalibration.new_set_up import Before
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
+from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kernels.radial import RadialKernel
-from diffeo_calib.kinematics.nominal import FlangePoints
-from diffeo_calib.kinematics.re_registration.find_place import MARKER_DEVIATIONS, UNMOVED_LOG_ODDS
-from diffeo_calib.kinematics.re_registration.new_rows import NewRows, larger, noise_of_rows, typical_noise
-from diffeo_calib.kinematics.re_registration.registered_map import fitted_markers, robot_map
+from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
+from diffeo_calib.kinematics.registered_map import Registration, place_slopes, robot_map, turned
 from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.maps.noise import Noise, without_hidden
+from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
+from diffeo_calib.maps.observation import Observation
+from diffeo_calib.measurements.poses import block_diagonal, own_blocks
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.tails import Tails, gross_weights, reweight
+from diffeo_calib.regression.linear_rows import LinearRows
 from diffeo_calib.regression.regions import OTHER_DATE, region_factor, region_scale
-from diffeo_calib.robots.placement import PLACES
+from diffeo_calib.robots.se3 import rotation, transforms
 from diffeo_calib.sensors.coordinates import errors_of_kinds
 from diffeo_calib.sensors.errors import Evaluations
 from diffeo_calib.sensors.places import fitting_devices
+from diffeo_calib.sensors.tables import Coordinates, OtherReadings
 
-SMALLEST_AMPLITUDE_SHARE = 0.5
-"""A small transmission error counts with this share of the largest joint's amplitude: it may have grown."""
-OFFSET_DEVIATION_RAD_M = 3e-4
-"""Of a joint offset, to which the sizes of changes are relative: they span 0.05 to 5 mrad."""
-NEGLIGIBLE_EIGENVALUE_SHARE = 1e-6
-"""Eigenvalues of a transmission's covariance below this share of the largest are left out."""
-
-
-@dataclass(frozen=True, eq=False)
-class ChangedPart:
-    """A part of a model that may have changed.
-
-    Args:
-        name: of the joint, or "gravity" or "geometry".
-        joint: the column of the joint whose error or offset it is; None for parameters of the nominal map.
-        kernel: that of the joint's error; None for its offset, which all readings lack since then.
-        deviations: (K,) prior standard deviations of the parameters, zero of those that it leaves alone.
-        variance: of the change, relative to the old variance of the part.
-    """
-
-    name: str
-    joint: int | None = None
-    kernel: RadialKernel | None = None
-    deviations: Tensor | None = None
-    variance: float = 1.0
-
-    @property
-    def offset(self) -> bool:
-        """Whether it is the offset of a joint."""
-        return self.joint is not None and self.kernel is None
-
-    def shapes(self, at: Linearisation) -> Tensor:
-        """(M, c) columns whose products are the covariance of the change of the joint's errors, rad or m."""
-        points, size = at.joint[0].points, self.variance**0.5
-        if self.kernel is None:
-            return torch.full_like(points[:, :1], size * OFFSET_DEVIATION_RAD_M)
-        one = points.new_zeros(len(points), 1, points.shape[1])
-        one[:, 0, self.joint] = 1.0
-        values, vectors = torch.linalg.eigh(self.kernel.gram(points, one, points, one))
-        kept = values > NEGLIGIBLE_EIGENVALUE_SHARE * values[-1]
-        return size * vectors[:, kept] * values[kept].sqrt()
-
-    def root(self, at: Linearisation) -> Tensor:
-        """(M, m, c) columns whose products are the covariance of the change at M configurations, m."""
-        if self.deviations is not None:
-            return self.variance**0.5 * (at.sensitivity * self.deviations)[..., self.deviations > 0]
-        return at.joint_to_start[:, :, self.joint, None] * self.shapes(at)[:, None]
-
-
-def offsets_of(fitted: FittedMap) -> list[ChangedPart]:
-    """The offsets of all joints, which are tested beside the parts: the geometry has them, among much else."""
-    names = robot_map(fitted).geometry.chain.joint_names
-    return [ChangedPart(f"the offset of {name}", joint) for joint, name in enumerate(names)]
-
-
-def parts_of(fitted: FittedMap) -> list[ChangedPart]:
-    """The parts of a robot's map: every joint with a transmission term, gravity, geometry."""
-    spec, nominal = fitted.geodesic.spec, robot_map(fitted)
-    names = nominal.geometry.chain.joint_names
-    own = {t.output: t for t in spec.joint_kernel.terms if isinstance(t, RadialKernel) and t.output is not None}
-    least = SMALLEST_AMPLITUDE_SHARE**2 * max((float(term.variance) for term in own.values()), default=0.0)
-    found: list[ChangedPart] = []
-    for joint, term in own.items() if least > 0 else ():
-        kernel = RadialKernel.from_config(term.to_config() | {"variance": max(float(term.variance), least)})
-        found.append(ChangedPart(names[joint], joint, kernel))
-    for name, columns in (("gravity", nominal.sag), ("geometry", nominal.geometry.slices["joints"])):
-        deviations = torch.zeros_like(spec.prior_variance)
-        deviations[columns] = spec.prior_variance[columns].sqrt()
-        found += [ChangedPart(name, deviations=deviations)] if bool(deviations.any()) else []
-    return found
-
-
+MAX_STEPS = 100
+SMALL_STEP = 1e-2
+"""Below such a step of the markers, m, C hardly changes."""
+SETTLED = 1e-9
+"""The search for places ends with a step below this, m and rad."""
 ROUNDS = 20
 WEIGHT_CHANGE = 0.01
 """Largest relative change of a weight at which it has converged."""
 OUTLIER_WEIGHT = 0.2
 """Rows with a smaller weight hardly count."""
-NOISE_LEVELS = 10.0 ** torch.linspace(-2, 2, 17, dtype=torch.float64, device="cpu")
-"""Factors on the variance of the noise of devices that the old fit does not know."""
-NOISE_EFOLDS = 2.0
-"""Prior standard deviation of their logarithm: wide."""
+LINEARISED = "seen", "at", "residual", "by_places", "fit_covariance"
+"""Cached properties that neither noise nor priors change."""
+
+
+class UsualNoise(NamedTuple):
+    """Of a row that tells coordinates."""
+
+    block: Tensor  # (m, m) m^2
+    factor: float | None  # on the variances of poses of the fit; None where the fit or the rows have other bodies
 
 
 @dataclass(frozen=True, eq=False)
-class WeighedRows(NewRows):
-    """Rows of a new set-up of any kinds, brought into the frame of the old model, with their weights.
+class NewSetUp:
+    """New rows of any kinds, and the old map that is to explain them."""
 
-    Args:
-        before: the old map, and where devices and markers are. noise_model: how the rows were measured.
-        marker: which the markers are, see MARKER_DEVIATIONS. tails: weights of the rows.
-        placement: devices that stand around the old model; what is not known of them, rows share.
-    """
+    fitted: FittedMap  # the old map, with the ball of the new rows
+    data: Any  # the new rows
+    # those that tell coordinates, with the markers of the map, in the frame of the largest set-up
+    coordinates: Coordinates | None
+    readings: Sequence[OtherReadings] = ()  # the others
+    sessions: Sequence[Sessions] = ()  # frames of the set-ups, if there are several: a set of devices
+    place: FoundPlace | None = None  # where device and markers were found; None where no device measured coordinates
+    ball: Tensor | None = None  # (3,) where the new rows by themselves put the ball on its tip, m; None without one
+    new_ball: bool = False  # whether the old model does not know it
 
-    before: Before
-    noise_model: NoiseModel
-    marker: str
-    tails: Tails
-    placement: Placement
+    @property
+    def nominal(self) -> GeometryMap:
+        """That of the old map."""
+        return robot_map(self.fitted)
 
-    @classmethod
-    def of(cls, before: Before, markers: Tensor, marker: str) -> WeighedRows:
-        """The rows with the noise of a typical old row, or their own where it is larger, all weights 1.
+    @property
+    def registration(self) -> Registration | None:
+        """Of the device that measured coordinates."""
+        return None if self.place is None else self.place.registration
+
+    @property
+    def transform(self) -> Tensor:
+        """(4, 4) from the frame of the map to that of the new rows, m."""
+        found = self.registration
+        return torch.eye(4, dtype=self.data.q.dtype, device=HOST) if found is None else found.transform
+
+    @property
+    def stands_free(self) -> bool:
+        """Whether still no device says where the robot stands."""
+        return self.place is None and self.fitted.stands_free
+
+    @property
+    def seen_before(self) -> Tensor:
+        """(P,) boolean: the markers that new rows show and that old rows showed."""
+        seen = torch.zeros(self.nominal.geometry.markers, dtype=torch.bool, device=HOST)
+        if self.coordinates is not None:
+            seen |= ~self.coordinates.table.points.isnan().any(2).all(0)
+        seen[-1] |= self.ball is not None
+        seen[-1] &= not self.new_ball
+        return seen
+
+    def rows(
+        self,
+        places: tuple[Tensor, Tensor],
+        usual: UsualNoise,
+        deviations: Tensor,
+        *,
+        same: bool = True,
+        marker: str = "",
+    ) -> NewRows:
+        """The rows around places, which are those where everything was before, all weights 1.
 
         Args:
-            before, marker: see the class. markers: (P, 3) near which they are, in the frames of their tips, m.
+            places: T (4, 4) from the frame of the map to that of the rows, and markers (P, 3) in the frames of their
+                tips, m. usual: noise of rows that tell coordinates.
+            deviations, marker: see :class:`NewRows`. same: whether these are the markers of the map.
         """
-        points = FlangePoints(before.nominal.under(before.data.payload), markers, same=True)
-        seen = before.fitted.geodesic.with_nominal(points)(before.data.q).detach()
-        model, noise, measured = _measured(before, seen)
-        frame = seen.new_full((6,), 0.0 if before.place is None else PLACES.found_m_rad)
-        moved = MARKER_DEVIATIONS[marker][1] * before.seen_before.repeat_interleave(3).to(frame)
-        nothing = torch.diag(0.0 * torch.cat([frame, moved]))
-        rows = cls(
-            fitted=before.fitted,
-            points=points,
-            transform=before.transform,
-            q=before.data.q,
+        (T, markers), q = places, self.data.q
+        marks = FlangePoints(self.nominal.under(self.data.payload), markers, same=same)
+        points, at = self.fitted.geodesic.with_nominal(marks).linearised_value(q)
+        points, nothing = points.detach(), torch.diag(0.0 * deviations)
+        y, observe, sensor, noise, placement = self._measured(T, points, usual)
+        rows = NewRows(
+            set_up=self,
+            marks=marks,
+            transform=T,
+            q=q,
+            y=y,
             noise=noise,
-            visible=model.visible,
+            noise_model=sensor,
+            tails=Tails.none(len(q), sensor.bodies, device=q.device),
+            observe=observe,
+            placement=placement,
             shared=noise[..., :0],
-            deviations=torch.cat([frame, moved]),
+            deviations=deviations,
             away=nothing[0],
             known=nothing,
             by_fit=nothing[6:, 6:],
-            centre=seen.view(-1, 3).mean(0),
+            centre=points.view(-1, 3).mean(0),
             drifts=noise[..., :0].flatten(0, 1),
-            before=before,
-            noise_model=model,
             marker=marker,
-            tails=Tails.none(len(seen), model.bodies, device=seen.device),
-            **measured,
         )
-        by_tool = pad(rows.by_places[..., 6:], (before.nominal.geometry.slices["tool"].start, 0))
-        at = SeenRows(before.nominal, rows.y, rows.seen[0], rows.slopes, by_tool)
-        return rows.changed(shared=rows.placement.shared(at))
+        vars(rows)["seen"] = points, at
+        return rows.changed(shared=placement.shared(rows))
+
+    def _measured(
+        self, T: Tensor, seen: Tensor, usual: UsualNoise
+    ) -> tuple[Tensor, Observation | None, NoiseModel, Tensor, Placement]:
+        """Numbers, what these are of the points (M, 3 P), m, how they were measured, their noise, and the devices."""
+        told, of_told, sets = None, seen[:0, :, None], list[DeviceSet]()
+        if self.coordinates is not None:
+            told, of_told, sets = self._coordinates(self.coordinates, T, seen, usual)
+        sets += self.sessions
+        points = seen.unflatten(1, (-1, 3))
+        devices = [fitting_devices(table, points[own]) for table, own in self.readings]
+        readings = reading_sets(self.readings, devices)
+        if told is not None and len(told.rows) == len(seen):
+            return told.y, None, told.noise_model, of_told, Placement(sets)
+        rows, old = stacked(self.data.q, told, readings, seen.shape[1]), self.fitted.noise
+        variance = old.covariance.diagonal(dim1=1, dim2=2)[old.visible].median()  # of what was measured, m^2
+        total = torch.diag_embed(variance.expand_as(rows.y))
+        if told is not None:
+            own, size = total[told.rows], of_told.shape[1]
+            own[:, :size, :size] = of_told
+            total[told.rows] = own
+        if rows.noise_model.stated:
+            total = larger(total, rows.noise_model.known)
+        sensor = rows.noise_model.without_known
+        return rows.y, rows.observe, sensor, without_hidden(total, sensor.visible), Placement((*sets, *readings))
+
+    def _coordinates(
+        self, own: Coordinates, T: Tensor, seen: Tensor, usual: UsualNoise
+    ) -> tuple[Told, Tensor, list[DeviceSet]]:
+        """Rows that tell coordinates, in the model's frame; their noise, sockets, and errors of cameras."""
+        new, rows = own
+        table = new.in_frames(torch.linalg.inv(T).expand(len(new), -1, -1))
+        noise = noise_of_rows(self.fitted, new, table, T, usual)
+        sets = SocketDevices.around_model(table, rows, seen)
+        table = Placement(sets).at_places(table)
+        y, sensor = table.points.flatten(1), NoiseModel.of(table, 0.0).without_known
+        y, noise = torch.where(y.isnan(), seen[rows], y), without_hidden(noise, sensor.visible)
+        return Told(rows, y, sensor), noise, [*sets, *CameraErrors.around(table, rows)]
+
+
+@dataclass(frozen=True, eq=False)
+class NewRows:
+    """M rows of a new set-up in the frame of a fit: frame, markers and devices are open, and parts may have drifted."""
+
+    set_up: NewSetUp  # the rows as they were measured, and the old map
+    marks: FlangePoints  # k0 of the markers where they are now, under the payloads of the rows
+    transform: Tensor  # (4, 4) from the frame of the fit to that in which the rows were measured, m
+    q: Tensor  # (M, n)
+    y: Tensor  # (M, R) measured numbers, m; any where hidden
+    noise: Tensor  # (M, R, R) m^2, with weights of 1
+    noise_model: NoiseModel  # how they were measured
+    tails: Tails  # their weights
+    observe: Observation | None  # what was measured of the markers; None for their coordinates
+    placement: Placement  # devices that stand around the old model; what is not known of them, rows share
+    shared: Tensor  # (M, R, c) effects of errors of unit variance that they share, m
+    # (6 + 3 P,) of the device's frame and of the markers' coordinates before the rows, m and rad; 0 of what has not
+    # moved
+    deviations: Tensor
+    away: Tensor  # (6 + 3 P,) from here to where they are most probable before the rows
+    known: Tensor  # (6 + 3 P, 6 + 3 P) their covariance by an earlier registration
+    by_fit: Tensor  # (3 P, 3 P) B of the markers
+    centre: Tensor  # (3,) about which the frame turns, m
+    drifts: Tensor  # (M R, c) columns of unit variance of what has changed in the robot since, m
+    marker: str = ""  # which the markers are: "same", "moved" or "other"
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    @property
+    def fitted(self) -> FittedMap:
+        """The old map."""
+        return self.set_up.fitted
+
+    @property
+    def nominal(self) -> GeometryMap:
+        """That of the old map."""
+        return self.set_up.nominal
+
+    @property
+    def visible(self) -> Tensor:
+        """(M, R) boolean, the numbers that were measured."""
+        return self.noise_model.visible
+
+    @property
+    def of_coordinates(self) -> bool:
+        """Whether old and new rows are coordinates of markers alone."""
+        return self.observe is None and self.fitted.slopes is None
+
+    # --- the linearisation ---
+
+    @cached_property
+    def seen(self) -> tuple[Tensor, Linearisation]:
+        """The points (M, 3 P) by the fit, m, and their linearisation."""
+        points, at = self.fitted.geodesic.with_nominal(self.marks).linearised_value(self.q)
+        return points.detach(), at
+
+    @property
+    def points(self) -> Tensor:
+        """(M, 3 P) by the fit, m."""
+        return self.seen[0]
+
+    @property
+    def slopes(self) -> Tensor:
+        """(M, R, 3 P) of what was measured."""
+        m = self.points.shape[1]
+        eye = torch.eye(m, dtype=self.points.dtype, device=self.points.device).expand(len(self), m, m)
+        return eye if self.observe is None else self.observe.slope(self.points).detach()
+
+    @cached_property
+    def at(self) -> Linearisation:
+        """Linearised prediction of the fit for the measured numbers."""
+        return self.seen[1] if self.observe is None else self.seen[1].projected(self.slopes)
+
+    @cached_property
+    def residual(self) -> Tensor:
+        """(M, R) measured minus predicted, m; zero where hidden."""
+        away = self.y - (self.points if self.observe is None else self.observe.value(self.points))
+        return away.masked_fill(~self.visible, 0.0)
+
+    @cached_property
+    def by_places(self) -> Tensor:
+        """(M, R, 6 + 3 P) derivatives by frame and markers."""
+        deformation = self.fitted.geodesic.with_nominal(self.marks)
+        return self.slopes @ place_slopes(deformation, self.seen[1], self.points, self.centre)
+
+    @property
+    def by_tool(self) -> Tensor:
+        """(M, R, 3 P) derivatives by the places of the markers on their tips."""
+        return self.by_places[..., 6:]
+
+    @cached_property
+    def fit_covariance(self) -> Tensor:
+        """(M R, M R) posterior covariance of the fit at the rows, m^2."""
+        return self.fitted.conditional.covariance_between(self.at)
+
+    # --- conditioning ---
 
     @property
     def weighted_noise(self) -> Tensor:
         """(M, R, R) R with the noise of every body divided by its weight, m^2."""
         return self.noise_model.weighted(self.noise, self.tails)
 
-    def with_weights(self) -> WeighedRows:
-        """The same rows with the weights of Student's t, by expectation maximisation."""
-        rows = self
-        for _ in range(ROUNDS):
-            tails = reweight(rows._expected_squares(), rows.noise_model.freedom)
-            change = float((tails.weights / rows.tails.weights - 1.0).abs().max())
-            rows = rows.changed(tails=tails)
-            if change < WEIGHT_CHANGE:
-                break
-        return rows
+    @property
+    def free(self) -> Tensor:
+        """(k,) numbers of what may have moved of frame and markers."""
+        return self.deviations.nonzero()[:, 0]
 
-    def kept(self, index: Tensor) -> WeighedRows:
-        """Some of the rows (k,), with their weights."""
-        if len(index) == len(self):
-            return self
-        own = {"noise_model": self.noise_model.rows(index), "tails": self.tails.rows(index)}
-        return super().kept(index).changed(**own)
-
-    def drifting(self, roots: Sequence[Tensor]) -> WeighedRows:
-        """The rows where parts with these columns (M, R, c) of their covariance drift, m."""
-        return self.changed(drifts=torch.cat([self.drifts, *(root.flatten(0, 1) for root in roots)], 1))
+    @cached_property
+    def given(self) -> LinearRows:
+        """The rows by what may have moved and by the devices; what is held is as an earlier registration knows it."""
+        free, c = self.free, self.shared.shape[2]
+        both, held = (free[:, None], free), self.by_places.flatten(0, 1) * (self.deviations == 0)
+        prior = (self.known + torch.diag(self.deviations.square()))[both]
+        return LinearRows(
+            residual=self.residual,
+            S=torch.cat([self.by_places[..., free], self.shared], 2),
+            C=self.fit_covariance + self.drifts @ self.drifts.T + held @ self.known @ held.T,
+            noise=self.weighted_noise,
+            visible=self.visible,
+            prior=torch.block_diag(prior, torch.eye(c, dtype=prior.dtype, device=prior.device)),
+            mean=pad(self.away[free], (0, c)),
+            by_fit=pad(pad(self.by_fit, (6, 0, 6, 0))[both], (0, c, 0, c)),
+        )
 
     def evidence(self, root: Tensor) -> Evidence:
         """Of unknowns with these effects (M, R, c)."""
@@ -210,16 +320,28 @@ class WeighedRows(NewRows):
         return Evidence(E.T @ self.given.solved.flatten(), E.T @ self.given.factor.solve(E))
 
     @property
+    def old_markers(self) -> Tensor:
+        """(P, 3) where the markers are most probable before the rows, in the frames of their tips, m."""
+        return self.marks.points + self.away[6:].view(-1, 3)
+
+    @property
+    def mean_noise(self) -> Tensor:
+        """(R, R) mean covariance of the rows, m^2: that of the fit for points that no row shows."""
+        found, unseen = mean_block(self.noise, self.visible), ~self.visible.any(0)
+        both = unseen[:, None] & unseen
+        return torch.where(both, self.fitted.new_noise, found) if bool(unseen.any()) else found
+
+    @property
     def new_noise(self) -> Tensor:
         """Covariance (m, m) of a new measurement in the new set-up, m^2, inflated for heavy tails.
 
-        Few rows seldom show the tails: it is no smaller than that of the old set-up.
+        Few rows seldom show the tails: it is no smaller than that of the old set-up, if this had the same markers.
         """
         old = self.fitted.new_noise
-        if self.observe is not None or self.fitted.slopes is not None:
+        if not self.of_coordinates:
             return old
         found = self.mean_noise * region_factor(self.tails.freedom, int(self.noise_model.freedom.max()))
-        return found if float(found.trace()) > float(old.trace()) else old
+        return found if not self.marks.same or float(found.trace()) > float(old.trace()) else old
 
     @property
     def inflation(self) -> float:
@@ -230,19 +352,13 @@ class WeighedRows(NewRows):
         """
         covariance, noise = torch.linalg.inv(self.given.precisions), self.noise
         error = covariance @ self.given.solved[..., None]
-        if self.observe is None and self.fitted.slopes is None:
+        if self.of_coordinates:
             noise = noise * (self.new_noise.trace() / self.mean_noise.trace())
         squares = self.noise_model.squares(covariance - self.weighted_noise + noise, error @ error.mT)
         dim = self.noise_model.freedom
         if (weights := gross_weights(squares, dim)) is not None:  # gross rows are named, and say nothing of the robot
-            squares = squares.masked_fill(weights < OUTLIER_WEIGHT, nan)
+            squares = squares.masked_fill(weights < OUTLIER_WEIGHT, torch.nan)
         return max(1.0, region_scale(squares, dim, prior=OTHER_DATE))
-
-    def _expected_squares(self) -> Tensor:
-        """Expected squared distances of the errors in units of the noise without weights: (M, bodies)."""
-        noise, given = self.weighted_noise, self.given
-        error = noise @ given.solved[..., None]
-        return self.noise_model.squares(self.noise, error @ error.mT + noise - noise @ given.precisions @ noise)
 
     @property
     def placed_residual(self) -> Tensor:
@@ -256,94 +372,136 @@ class WeighedRows(NewRows):
         variances = ((placed @ Noise(self.noise).add_to(self.given.C)) * placed).sum(1).clamp(min=0.0)
         return self.given.shown(variances.sqrt())
 
-    def by_kind(self, errors: Tensor) -> Evaluations:
-        """Errors (M, R) of the numbers of all rows, m, NaN where nothing was measured, in the unit of each kind."""
-        readings = [own for own in self.placement if isinstance(own, ReadingDevices)]
-        return errors_of_kinds(errors, self.before.coordinates, readings)
-
     @property
     def excess(self) -> float:
         """Root mean square of the left-out errors of the better half of the rows in units of the expected ones."""
         squares = (self.given.solved * self.given.left_out).nansum(1) / self.given.visible.sum(1)
         return float(squares.median().sqrt())
 
-    def levelled(self) -> WeighedRows:
-        """The rows with the likeliest noise of every kind of device that the old fit does not know."""
-        kinds, known = self.noise_model.kinds, self.fitted.slopes is None
-        unknown = range(int(known), int(kinds.max()) + 1) if self.observe is not None or not known else ()
-        rows = self.drifting([part.root(self.at) for part in parts_of(self.fitted)] if unknown else [])  # no noise
-        for kind in unknown:
-            own = (kinds == kind).repeat_interleave(self.y.shape[1] // kinds.shape[1], 1) & self.visible
-            levels = [rows.changed(noise=_scaled(rows.noise, own, float(f))) for f in NOISE_LEVELS]
-            prior = [-0.5 * (log(float(f)) / NOISE_EFOLDS) ** 2 for f in NOISE_LEVELS]
-            logs = [each.given.log_evidence() + p for each, p in zip(levels, prior, strict=True)]
-            rows = levels[logs.index(max(logs))]
-        return self.changed(noise=rows.noise)
+    def by_kind(self, errors: Tensor) -> Evaluations:
+        """Errors (M, R) of the numbers of all rows, m, NaN where nothing was measured, in the unit of each kind."""
+        readings = [own for own in self.placement if isinstance(own, ReadingDevices)]
+        return errors_of_kinds(errors, self.set_up.coordinates, readings)
+
+    # --- the same rows otherwise ---
+
+    def changed(self, **changes: object) -> NewRows:
+        """The same rows with another noise or prior; what does not change is kept."""
+        other = replace(self, **changes)
+        vars(other).update({name: vars(self)[name] for name in LINEARISED if name in vars(self)})
+        return other
+
+    def kept(self, index: Tensor) -> NewRows:
+        """Some of the rows (k,), with their weights."""
+        if len(index) == len(self):
+            return self
+        own: dict[str, Any] = {name: getattr(self, name)[index] for name in ("q", "y", "noise", "shared")}
+        own |= {name: getattr(self, name).rows(index) for name in ("marks", "noise_model", "tails")}
+        own["drifts"] = self.drifts.unflatten(0, self.y.shape)[index].flatten(0, 1)
+        other = replace(self, **own, observe=None if self.observe is None else self.observe.rows(index))
+        vars(other).update(seen=(self.points[index], self.seen[1].rows(index)), by_places=self.by_places[index])
+        return other
+
+    def drifting(self, roots: Sequence[Tensor]) -> NewRows:
+        """The rows where parts with these columns (M, R, c) of their covariance drift, m."""
+        return self.changed(drifts=torch.cat([self.drifts, *(root.flatten(0, 1) for root in roots)], 1))
+
+    def with_weights(self) -> NewRows:
+        """The same rows with the weights of Student's t, by expectation maximisation."""
+        rows = self
+        for _ in range(ROUNDS):
+            noise, given = rows.weighted_noise, rows.given
+            error = noise @ given.solved[..., None]
+            moments = error @ error.mT + noise - noise @ given.precisions @ noise  # expected, of the noise
+            tails = reweight(rows.noise_model.squares(rows.noise, moments), rows.noise_model.freedom)
+            change = float((tails.weights / rows.tails.weights - 1.0).abs().max())
+            rows = rows.changed(tails=tails)
+            if change < WEIGHT_CHANGE:
+                break
+        return rows
+
+    def moved(self, step: Tensor) -> NewRows:
+        """The rows of coordinates around other places, after a step (6 + 3 P,) of frame and markers, m and rad."""
+        turn, markers = rotation(step[3:6]), step[6:].view(-1, 3)
+        motion = transforms(turn, self.centre + step[:3] - turn @ self.centre)
+        other = replace(
+            self,
+            marks=FlangePoints(self.marks.fitted, self.marks.points + markers, same=self.marks.same),
+            transform=self.transform @ motion,
+            y=((self.y.unflatten(1, (-1, 3)) - motion[:3, 3]) @ turn).flatten(1),
+            away=self.away - pad(step[6:], (6, 0)),
+        )
+        if "fit_covariance" in vars(self) and float(markers.abs().max()) < SMALL_STEP:
+            vars(other)["fit_covariance"] = self.fit_covariance
+        return other
+
+    def settled(self) -> NewRows:
+        """The rows of coordinates around the best places, by Gauss-Newton."""
+        rows = self
+        for _ in range(MAX_STEPS):
+            step = rows.given.step[: len(rows.free)]
+            if float(step.abs().max()) < SETTLED:
+                break
+            rows = rows.moved(step.new_zeros(len(self.deviations)).index_copy(0, rows.free, step))
+        return rows
 
 
-def weighed(before: Before, marker: str) -> WeighedRows:
-    """The new rows with their weights, and with the markers as free as is asked or as is most probable.
+class FoundPlace(NamedTuple):
+    """Result of a registration: rows around the most probable places, with their prior, and the record.
 
     Args:
-        before: the old map, and where devices and markers are. marker: see :func:`diffeo_calib.recalibrate`.
+        metres: prior deviation of the markers from their old places.
     """
-    own, place, ball = fitted_markers(before.fitted), before.place, None if before.new_ball else before.ball
-    other, known = own.clone(), slice(len(own) - before.new_ball)
-    if place is not None:
-        other[known] = place.registration.markers[known]
-    elif ball is not None:
-        other[-1] = ball
-    places = {"same": own, "moved": own, "other": other}
-    if place is None and ball is None:
-        names = ["same"]
-    elif marker != "evidence":
-        names = [marker]
-    else:
-        names = [name for name, (first, _) in MARKER_DEVIATIONS.items() if place is None or first == place.metres]
-    found = [WeighedRows.of(before, places[name], name).levelled().with_weights() for name in names]
-    return max(found, key=lambda one: one.given.log_evidence() + UNMOVED_LOG_ODDS * (one.marker == "same"))
+
+    rows: NewRows
+    metres: float
+    registration: Registration
 
 
-def _scaled(noise: Tensor, own: Tensor, factor: float) -> Tensor:
-    """Noise (M, R, R) with the variances of some numbers (M, R) multiplied by a factor."""
-    root = torch.where(own, factor**0.5, 1.0)
-    return root[:, :, None] * noise * root[:, None, :]
+def noise_of_rows(fitted: FittedMap, new: Measurements, there: Measurements, T: Tensor, usual: UsualNoise) -> Tensor:
+    """(M, m, m) noise of new rows in the model's frame, m^2: a block, of poses by row; their own where it is larger.
+
+    Poses err by shifts and turns, which displace their points as these stand: their deviations are those of usual rows,
+    each row has modes of its own. A camera's distance from its board makes errors of turns large or small.
+
+    Args:
+        fitted: a fit. new, there: the rows in their own frame and in that of the model.
+        T: (4, 4) from the frame of the model to theirs, m. usual: noise of a row.
+    """
+    bodies, total = new.bodies, usual.block.expand(len(new), -1, -1)
+    known = usual.factor is not None and fitted.slopes is None and bool(fitted.noise.visible.all())
+    own, old = bodies.modes(there), bodies.modes_of(there, fitted.measured().unflatten(1, (-1, 3))) if known else None
+    if own is not None and old is not None:
+        blocks = own_blocks(fitted.noise.covariance, old.shape[1])  # (N, T, 9, 9)
+        to_modes = torch.linalg.pinv(old)
+        sizes = (to_modes @ blocks @ to_modes.mT).diagonal(dim1=2, dim2=3).median(0).values  # (T, 6)
+        eye = torch.eye(old.shape[2], dtype=old.dtype, device=old.device)
+        apart = eye - old @ to_modes
+        slack = (apart @ blocks).diagonal(dim1=2, dim2=3).sum(2) / (old.shape[2] - old.shape[3])
+        each = (own * sizes[:, None]) @ own.mT + slack.median(0).values[:, None, None] * eye
+        total = usual.factor * block_diagonal(each)
+    return total if new.covariance is None else larger(total, turned(new.covariance, T[:3, :3].mT))
 
 
-def _measured(before: Before, seen: Tensor) -> tuple[NoiseModel, Tensor, dict[str, Any]]:
-    """How rows in the model's frame were measured, their noise, and what; the devices around its points (M, 3 P), m."""
-    told, noise, sets = None, None, list[DeviceSet]()
-    if before.coordinates is not None:
-        told, noise, sets = _coordinates(before, *before.coordinates, seen)
-    sets += before.sessions
-    points = seen.unflatten(1, (-1, 3))
-    devices = [fitting_devices(table, points[own]) for table, own in before.readings]
-    readings = reading_sets(before.readings, devices)
-    if told is not None and noise is not None and len(told.rows) == len(seen):
-        return told.noise_model, noise, {"y": told.y, "observe": None, "placement": Placement(sets)}
-    rows = stacked(before.data.q, told, readings, seen.shape[1])
-    old = before.fitted.noise
-    usual = old.covariance.diagonal(dim1=1, dim2=2)[old.visible].median()  # variance of what was measured, m^2
-    total = torch.diag_embed(usual.expand_as(rows.y))
-    if told is not None and noise is not None:
-        own = total[told.rows]
-        own[:, : noise.shape[1], : noise.shape[1]] = noise
-        total[told.rows] = own
-    if rows.noise_model.stated:
-        total = larger(total, rows.noise_model.known)
-    model = rows.noise_model.without_known
-    known = {"y": rows.y, "observe": rows.observe, "placement": Placement((*sets, *readings))}
-    return model, without_hidden(total, model.visible), known
+def typical_noise(noise: Noise) -> Tensor:
+    """The block (m, m) of median size among the rows that show everything: outliers have larger ones.
+
+    If no row does, the blocks of median size of every marker, as if their errors were independent.
+    """
+    whole = noise.visible.all(1)
+    if bool(whole.any()):
+        return _of_median_size(noise.covariance[whole])
+    own, seen = own_blocks(noise.covariance, noise.visible.shape[1] // 3), noise.visible[:, ::3]
+    return torch.block_diag(*[_of_median_size(own[seen[:, k], k]) for k in range(seen.shape[1])])
 
 
-def _coordinates(before: Before, new: Measurements, rows: Tensor, seen: Tensor) -> tuple[Told, Tensor, list[DeviceSet]]:
-    """Rows (M,) that tell coordinates, in the model's frame; their noise, sockets, and errors of cameras."""
-    T, fitted = before.transform, before.fitted
-    table = new.in_frames(torch.linalg.inv(T).expand(len(new), -1, -1))
-    block = typical_noise(fitted.noise) if fitted.slopes is None else fitted.new_noise
-    noise = noise_of_rows(fitted, new, T, block, 1.0)
-    sets, table = SocketDevices.around_model(table, rows, seen)
-    y = table.points.flatten(1)
-    sensor = NoiseModel.of(table, 0.0).without_known
-    y, noise = torch.where(y.isnan(), seen[rows], y), without_hidden(noise, sensor.visible)
-    return Told(rows, y, sensor), noise, [*sets, *CameraErrors.around(table, rows)]
+def _of_median_size(blocks: Tensor) -> Tensor:
+    sizes = blocks.diagonal(dim1=1, dim2=2).sum(1)
+    return blocks[int(sizes.argsort()[(len(sizes) - 1) // 2])]
+
+
+def larger(first: Tensor, second: Tensor) -> Tensor:
+    """A covariance (M, m, m) that is nowhere smaller than either of two."""
+    values, vectors = torch.linalg.eigh(second - first)
+    total = first + (vectors * values.clamp(min=0.0)[:, None]) @ vectors.mT
+    return 0.5 * (total + total.mT)

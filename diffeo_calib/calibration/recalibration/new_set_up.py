@@ -6,8 +6,9 @@ found by a registration. Sockets and the devices of readings stand around the ro
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from math import degrees, nan
+from dataclasses import replace
+from math import degrees, log, nan
+from operator import itemgetter
 from typing import Any, Literal, get_args
 
 import torch
@@ -16,6 +17,14 @@ from torch import Tensor
 from diffeo_calib.calibration.placing.readings import ball_of
 from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.placing.sockets import ball_in_sockets
+from diffeo_calib.calibration.recalibration.find_changes import parts_of
+from diffeo_calib.calibration.recalibration.find_place import (
+    MARKER_DEVIATIONS,
+    UNMOVED_LOG_ODDS,
+    find_place,
+    warn_about,
+)
+from diffeo_calib.calibration.recalibration.new_rows import FoundPlace, NewRows, NewSetUp, UsualNoise, typical_noise
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few, sentence, warn_user
 from diffeo_calib.fitting.fitted_map import FittedMap
@@ -23,8 +32,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import rows_used_in_fit
 from diffeo_calib.kinematics.joint_ranges import check_same_robot
 from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
-from diffeo_calib.kinematics.re_registration.find_place import MARKER_DEVIATIONS, FoundPlace, find_place, warn_about
-from diffeo_calib.kinematics.re_registration.registered_map import Registration, robot_map
+from diffeo_calib.kinematics.registered_map import fitted_markers, robot_map
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.nominal import NominalMap
@@ -47,49 +55,7 @@ from diffeo_calib.sensors.tables import (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Before:
-    """The old map in its own frame, and the new rows."""
-
-    fitted: FittedMap  # the old map, with the ball of the new rows
-    nominal: GeometryMap  # its nominal map
-    data: Any  # the new rows
-    # those that tell coordinates, with the markers of the map, in the frame of the largest set-up
-    coordinates: Coordinates | None
-    readings: list[OtherReadings]  # the others
-    place: FoundPlace | None  # where device and markers were found; None where no device measured coordinates
-    sessions: list[Sessions]  # frames of the set-ups, if there are several: a set of devices
-    ball: Tensor | None  # (3,) where the new rows by themselves put the ball on its tip, m; None without one
-    new_ball: bool  # whether the old model does not know it
-
-    @property
-    def registration(self) -> Registration | None:
-        """Of the device that measured coordinates."""
-        return None if self.place is None else self.place.registration
-
-    @property
-    def transform(self) -> Tensor:
-        """(4, 4) from the frame of the map to that of the new rows, m."""
-        found = self.registration
-        return torch.eye(4, dtype=self.data.q.dtype, device=HOST) if found is None else found.transform
-
-    @property
-    def stands_free(self) -> bool:
-        """Whether still no device says where the robot stands."""
-        return self.place is None and self.fitted.stands_free
-
-    @property
-    def seen_before(self) -> Tensor:
-        """(P,) boolean: the markers that new rows show and that old rows showed."""
-        seen = torch.zeros(self.nominal.geometry.markers, dtype=torch.bool, device=HOST)
-        if self.coordinates is not None:
-            seen |= ~self.coordinates.table.points.isnan().any(2).all(0)
-        seen[-1] |= self.ball is not None
-        seen[-1] &= not self.new_ball
-        return seen
-
-
-def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidence") -> Before:
+def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidence") -> NewSetUp:
     """Find where device and markers are now.
 
     Args:
@@ -114,21 +80,74 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
         ball = None if found is None else found.geometry.tool[0]
     new_ball = ball is not None and not knows_ball(model)
     if ball is not None and new_ball:
-        old = with_ball(old, nominal, ball, ball_tip(own, readings, tip), PLACES.found_m_rad)
+        old = with_ball(old, ball, ball_tip(own, readings, tip), PLACES.found_m_rad)
         nominal = robot_map(old)
-    place, sessions = None, list[Sessions]()
-    if own is not None:
-        table = with_markers(own.table, nominal.geometry.markers, model.lever)
-        own = own._replace(table=mounted_of(model).in_any_frame(table))
-        device = measured_rows(own.table)
-        if device is not None:
-            # the rows judge "same", too
-            stated = MARKER_DEVIATIONS[marker][0] if marker in ("moved", "other") else None
-            place, seen = _place_of_device(old, nominal, model.lever, device.table, stated)
-            geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])
-            geometry = replace(geometry, base=place.registration.transform @ geometry.base)
-            sessions, own = Sessions.beside(own, device, geometry, seen)
-    return Before(old, nominal, new, own, readings, place, sessions, ball, new_ball)
+    set_up = NewSetUp(old, new, own, readings, ball=ball, new_ball=new_ball)
+    if own is None:
+        return set_up
+    table = with_markers(own.table, nominal.geometry.markers, model.lever)
+    own = own._replace(table=mounted_of(model).in_any_frame(table))
+    device, place, sessions = measured_rows(own.table), None, list[Sessions]()
+    if device is not None:
+        # the rows judge "same", too
+        stated = MARKER_DEVIATIONS[marker][0] if marker in ("moved", "other") else None
+        place, seen = _place_of_device(old, model.lever, device.table, stated)
+        geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])
+        geometry = replace(geometry, base=place.registration.transform @ geometry.base)
+        sessions, own = Sessions.beside(own, device, geometry, seen)
+    return replace(set_up, coordinates=own, sessions=sessions, place=place)
+
+
+def weighed(set_up: NewSetUp, marker: str) -> NewRows:
+    """The new rows with their weights, and with the markers as free as is asked or as is most probable.
+
+    Rows have the noise of a typical old row, or their own where it is larger.
+
+    Args:
+        set_up: the rows, and where devices and markers are. marker: see :func:`diffeo_calib.recalibrate`.
+    """
+    fitted, place, ball = set_up.fitted, set_up.place, None if set_up.new_ball else set_up.ball
+    own = fitted_markers(fitted)
+    other, known = own.clone(), slice(len(own) - set_up.new_ball)
+    if place is not None:
+        other[known] = place.registration.markers[known]
+    elif ball is not None:
+        other[-1] = ball
+    names = [name for name, (first, _) in MARKER_DEVIATIONS.items() if place is None or first == place.metres]
+    names = names if marker == "evidence" else [marker]
+    names = ["same"] if place is None and ball is None else names
+    usual = UsualNoise(typical_noise(fitted.noise) if fitted.slopes is None else fitted.new_noise, 1.0)
+    frame, seen = [PLACES.found_m_rad * (place is not None)] * 6, set_up.seen_before.repeat_interleave(3)
+    found = []
+    for name in names:
+        markers = other if name == "other" else own
+        deviations = torch.cat([own.new_tensor(frame), MARKER_DEVIATIONS[name][1] * seen.to(own)])
+        rows = set_up.rows((set_up.transform, markers), usual, deviations, marker=name)
+        found.append(_levelled(rows).with_weights())
+    return max(found, key=lambda one: one.given.log_evidence() + UNMOVED_LOG_ODDS * (one.marker == "same"))
+
+
+NOISE_LEVELS = 10.0 ** torch.linspace(-2, 2, 17, dtype=torch.float64, device="cpu")
+"""Factors on the variance of the noise of devices that the old fit does not know."""
+NOISE_EFOLDS = 2.0
+"""Prior standard deviation of their logarithm: wide."""
+
+
+def _levelled(rows: NewRows) -> NewRows:
+    """The rows with the likeliest noise of every kind of device that the old fit does not know."""
+    if rows.of_coordinates:
+        return rows
+    drifting = rows.drifting([part.root(rows.at) for part in parts_of(rows.fitted)])  # no noise
+    kinds, noise = rows.noise_model.kinds, rows.noise
+    for kind in range(int(rows.fitted.slopes is None), int(kinds.max()) + 1):
+        own = (kinds == kind).repeat_interleave(rows.y.shape[1] // kinds.shape[1], 1) & rows.visible
+        levels = []
+        for factor in NOISE_LEVELS.tolist():
+            root = torch.where(own, factor**0.5, 1.0)
+            level = drifting.changed(noise=root[:, :, None] * noise * root[:, None, :])
+            levels.append((level.given.log_evidence() - 0.5 * (log(factor) / NOISE_EFOLDS) ** 2, level.noise))
+        noise = max(levels, key=itemgetter(0))[1]
+    return rows.changed(noise=noise)
 
 
 def knows_ball(model: CalibratedKinematics) -> bool:
@@ -151,18 +170,18 @@ def _check_robot(model: CalibratedKinematics, new: Any, own: Coordinates | None,
 
 
 def _place_of_device(
-    old: FittedMap, nominal: GeometryMap, lever: float | None, device: Measurements, marker_std: float | None
+    old: FittedMap, lever: float | None, device: Measurements, marker_std: float | None
 ) -> tuple[FoundPlace, Tensor]:
     """Where the device of the largest session is, and the points (M, P, 3) of all rows in its frame, m."""
 
     def predicted(rows: Measurements) -> Tensor:
-        return old.geodesic.with_nominal(nominal.under(rows.payload))(rows.q).detach().unflatten(1, (-1, 3))
+        return old.geodesic.with_nominal(robot_map(old).under(rows.payload))(rows.q).detach().unflatten(1, (-1, 3))
 
     largest = device.largest_session()
     check_size(predicted(largest), largest.points)
-    place = find_place(old, nominal, lever, largest, marker_std=marker_std)
+    place = find_place(old, lever, largest, marker_std=marker_std)
     rows = place.rows
-    ratio = size_ratio(*(each.unflatten(1, (-1, 3)) for each in (rows.seen[0], rows.given.shown(rows.y))))
+    ratio = size_ratio(*(each.unflatten(1, (-1, 3)) for each in (rows.points, rows.given.shown(rows.y))))
     if abs(ratio - 1.0) > USUAL_RATIO:
         what = f"distances between the new rows are {ratio:.4f} times those that the model predicts"
         warn_user(sentence(what, fix="check the scale of the measuring device"))
@@ -177,14 +196,15 @@ def _place_of_device(
     return place, predicted(device) @ T[:3, :3].mT + T[:3, 3]
 
 
-def with_ball(fitted: FittedMap, nominal: GeometryMap, ball: Tensor, tip: str, deviation: float) -> FittedMap:
+def with_ball(fitted: FittedMap, ball: Tensor, tip: str, deviation: float) -> FittedMap:
     """The same map with a ball as its last marker.
 
     Args:
-        fitted: the map. nominal: its nominal map. ball: (3,) where it roughly is in the frame of a tip, m.
+        fitted: the map. ball: (3,) where it roughly is in the frame of a tip, m.
         tip: name of the tip. deviation: of its prior around that place, m.
     """
-    old, end = fitted.geodesic, nominal.geometry.size
+    old, nominal = fitted.geodesic, robot_map(fitted)
+    end = nominal.geometry.size
     tool = torch.cat([nominal.geometry.tool, ball[None]])
     geometry = nominal.geometry.with_tool(tool, (*nominal.geometry.on, tip))
     after = nominal.with_geometry(geometry)
@@ -274,9 +294,9 @@ def size_ratio(predicted: Tensor, measured: Tensor) -> float:
     return float((found[far] / expected[far]).median()) if bool((expected[far] > 0).all()) and len(expected) else 1.0
 
 
-def warn_of_places(before: Before, marker: str, *, outliers: bool, excess: bool) -> None:
+def warn_of_places(set_up: NewSetUp, marker: str, *, outliers: bool, excess: bool) -> None:
     """Warn of what a registration found, see :func:`warn_about`, and of markers that are said to be the same."""
-    found = before.registration
+    found = set_up.registration
     if found is None:
         return
     warn_about(found, outliers=outliers, excess=excess)

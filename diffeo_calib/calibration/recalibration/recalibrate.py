@@ -1,9 +1,9 @@
 """`recalibrate`: a calibrated model and new rows in a new set-up become one model that knows both.
 
-1 place       where the measuring device stands and the markers sit now (kinematics/re_registration)
+1 place       where the measuring device stands and the markers sit now (find_place.py)
 2 rows        weights of the new rows, seen by the old model; whether the markers moved, by their evidence
 3 changes     what else has changed: named parts may drift (changes.py), and everything a little
-4 fit         the exact model of old and new rows, with the old scales (kinematics/re_registration)
+4 fit         the exact model of old and new rows, with the old scales (register.py)
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.placing.placement import Placement
 from diffeo_calib.calibration.recalibration.changes import Changes, Offset, hidden_offsets
 from diffeo_calib.calibration.recalibration.find_changes import find_changes, usual_drift
-from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, WeighedRows, weighed
+from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows, NewSetUp
 from diffeo_calib.calibration.recalibration.new_set_up import (
-    Before,
     Marker,
     check_arguments,
     check_other_table,
     knows_ball,
     place_again,
     warn_of_places,
+    weighed,
 )
+from diffeo_calib.calibration.recalibration.register import both_dates, carried_devices, devices_beside
 from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, as_written, sentence, warn_user
@@ -39,8 +40,7 @@ from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.provenance import Provenance, check_note
-from diffeo_calib.kinematics.re_registration.register_again import both_dates, carried_devices, devices_beside
-from diffeo_calib.kinematics.re_registration.registered_map import Registration, fitted_markers, moved
+from diffeo_calib.kinematics.registered_map import Registration, fitted_markers, moved
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.sensors.errors import Evaluations
 from diffeo_calib.sensors.places import PlacedDevices, mounted_of
@@ -176,7 +176,7 @@ def recalibrate(
 
 
 def _result(
-    model: CalibratedKinematics, place: Before, rows: WeighedRows, changes: Changes, *, fitted: Fit, note: str
+    model: CalibratedKinematics, place: NewSetUp, rows: NewRows, changes: Changes, *, fitted: Fit, note: str
 ) -> Recalibration:
     """The model in the new frame, and everything that was found."""
     found, new = place.registration, place.data
@@ -224,7 +224,7 @@ def _result(
 
 
 def _with_settled(
-    placement: tuple[PlacedDevices, ...], model: CalibratedKinematics, place: Before, rows: WeighedRows, fitted: Fit
+    placement: tuple[PlacedDevices, ...], model: CalibratedKinematics, place: NewSetUp, rows: NewRows, fitted: Fit
 ) -> tuple[PlacedDevices, ...]:
     """The devices with the new rows that each measured, set-ups where the fit puts them."""
     first, found = len(fitted.problem.y) - len(rows), list(placement)
@@ -249,7 +249,7 @@ LARGEST_EXCESS = 10.0
 """Residuals by this factor above the expected ones are not those of a worn joint."""
 
 
-def warn_of_contradictions(rows: WeighedRows, excess: float) -> None:
+def warn_of_contradictions(rows: NewRows, excess: float) -> None:
     """Warn if half of the rows hardly count, and errors are larger than those of worn joints."""
     bad = int((rows.tails.weights < OUTLIER_WEIGHT).any(1).sum())
     if bad >= LARGEST_OUTLIER_PART * len(rows) and excess > LARGEST_EXCESS:

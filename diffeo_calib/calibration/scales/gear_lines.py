@@ -22,7 +22,9 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.numbers import joint_weights
+from diffeo_calib.process.process import Process
 from diffeo_calib.process.scales import GearLine, Hyperparameters
 
 MEDIAN_OF_CHANCE = 2.0 * log(2.0)
@@ -62,7 +64,7 @@ def find_gear_lines(data: TangentData, scales: Hyperparameters, seed: int = 0) -
         return ()
     data = data.sample(len(data.x), MOST_COORDINATES, seed)[1]
     turning = [joint for joint, periodic in enumerate(data.space.periodic) if periodic]
-    scan = _Scan(data, scales)
+    scan = _Scan(data.process(scales))
     found: list[GearLine] = []
     falls = {joint: scan.falls(joint) for joint in turning}
     while falls and len(found) < MOST_LINES:
@@ -98,22 +100,17 @@ def _ambiguous(falls: dict[int, Tensor], after: dict[int, Tensor], joint: int, f
 
 
 class _Scan:
-    """K^-1 and what the scan needs of it; lines that were found are projected out."""
+    """What the scan needs of K^-1; lines that were found are unknowns of the process."""
 
-    def __init__(self, data: TangentData, scales: Hyperparameters, state: tuple[Tensor, Tensor] | None = None) -> None:
-        self.data, self.scales, self.numbers = data, scales, data.numbers
-        if state is None:
-            process = data.process(scales)
-            state = process.inverse, process.mu
-        self.inverse, self.mu = state
-        numbers = self.numbers
+    def __init__(self, process: Process) -> None:
+        self.process, numbers = process, process.numbers
         self.q = numbers.q - numbers.q.mean(0)
-        self.pairs = joint_weights(numbers, numbers, self.inverse).transpose(0, 1)  # (n, N, N) J_l^T K^-1 J_l
-        rows = [(part.J.mT @ self.mu[part.numbers].view(*part.cells.shape, 1))[..., 0] for part in numbers.parts]
+        self.pairs = joint_weights(numbers, numbers, process.inverse).transpose(0, 1)  # (n, N, N) J_l^T K^-1 J_l
+        rows = [(part.J.mT @ process.mu[part.numbers].view(*part.cells.shape, 1))[..., 0] for part in numbers.parts]
         self.rows = torch.cat(rows).T  # (n, N) J_l^T K^-1 r
         first, last = (round(w / STEP) for w in (LOWEST, HIGHEST))
         self._steps = slice(first, last + 1)
-        self.frequencies = STEP * torch.arange(first, last + 1, dtype=data.x.dtype, device=data.x.device)
+        self.frequencies = STEP * torch.arange(first, last + 1, dtype=self.q.dtype, device=self.q.device)
 
     def falls(self, joint: int) -> Tensor:
         """T of a joint at all frequencies (F,), relative to what chance gives on average if the scales are too low."""
@@ -139,58 +136,41 @@ class _Scan:
         found = torch.fft.rfft(grid)[self._steps].conj()
         return found / torch.sinc(self.frequencies * spacing / (2.0 * pi)).square()
 
-    def _exact(self, joint: int, frequencies: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """s, A_cc + A_ss and A_cc - A_ss + 2 i A_cs without bins, at a few frequencies (F,)."""
+    def _waves(self, joint: int, frequencies: Tensor) -> Tensor:
+        """Cosines and sines of a joint (N, F, 2)."""
         angles = frequencies * self.q[:, joint, None]
-        waves = torch.complex(angles.cos(), angles.sin())  # (N, F)
-        turned = self.pairs[joint].to(waves.dtype) @ waves
-        return (
-            self.rows[joint].to(waves.dtype) @ waves,
-            (waves.conj() * turned).sum(0).real,
-            (waves * turned).sum(0),
-        )
+        return torch.stack([angles.cos(), angles.sin()], 2)
+
+    def _evidence(self, joint: int, frequencies: Tensor) -> Evidence:
+        """s (F, 2) and A (F, 2, 2) without bins, at a few frequencies."""
+        waves = self._waves(joint, frequencies)
+        turned = (self.pairs[joint] @ waves.flatten(1)).view_as(waves)
+        s = torch.einsum("n,nfa->fa", self.rows[joint], waves)
+        return Evidence(s, torch.einsum("nfa,nfb->fab", waves, turned))
 
     def refined(self, joint: int, frequency: float) -> float:
         """The frequency of the largest T within two steps."""
         for reach in (2.0, 0.2):
-            offsets = torch.linspace(-reach, reach, 41, dtype=self.data.x.dtype, device=self.data.x.device)
-            near = frequency + STEP * offsets
-            frequency = float(near[_fall(*self._exact(joint, near)).argmax()])
+            near = frequency + STEP * torch.linspace(-reach, reach, 41, dtype=self.q.dtype, device=self.q.device)
+            frequency = float(near[self._evidence(joint, near).gain.argmax()])
         return frequency
 
     def line(self, joint: int, frequency: float) -> GearLine | None:
-        """The line with the amplitude b of the largest marginal likelihood; None if that is zero.
-
-        With the eigenvalues a_k of A and s_k = s in its eigenvectors, it is the largest
-        sum_k s_k^2 b^2 / (1 + b^2 a_k) - log(1 + b^2 a_k).
-        """
-        s, A = self._normal_equations(joint, frequency)
-        a, vectors = torch.linalg.eigh(A)
+        """The line with the amplitude b of the largest marginal likelihood; None if that is zero."""
+        found = self._evidence(joint, self.q.new_tensor([frequency]))
+        found = Evidence(found.g[0], found.H[0])
+        a = torch.linalg.eigvalsh(found.H)
         if float(a[0]) < SMALLEST_CORNER * float(a[1]):
             return None
-        along = (vectors.T @ s).square()
-        usual = float((along / a.square()).sum())  # of C^2 + S^2 by least squares
-        b2 = usual * torch.logspace(-3, 1, 401, dtype=a.dtype, device=a.device)[:, None]
-        likelihood = (along * b2 / (1.0 + b2 * a) - (1.0 + b2 * a).log()).sum(1)
-        best = int(likelihood.argmax())
-        return GearLine(joint, frequency, float(b2[best]) ** 0.5) if float(likelihood[best]) > 0 else None
+        b2 = found.size.square().sum() * torch.logspace(-3, 1, 401, dtype=a.dtype, device=a.device)
+        odds = found.log_odds(b2)
+        return GearLine(joint, frequency, float(b2[odds.argmax()]) ** 0.5) if float(odds.max()) > 0 else None
 
     def without(self, joint: int, frequency: float) -> _Scan:
-        """The scan with a line of any amplitude projected out."""
-        U = self.inverse @ self._columns(joint, frequency)
-        _, A = self._normal_equations(joint, frequency)
-        weights = torch.linalg.solve(A, U.T)
-        inverse = self.inverse - U @ weights
-        return _Scan(self.data, self.scales, (inverse, inverse @ self.numbers.target))
-
-    def _columns(self, joint: int, frequency: float) -> Tensor:
-        """X (N m, 2)."""
-        angle = frequency * self.q[:, joint]
-        return self.numbers.J[:, joint, None] * torch.stack([angle.cos(), angle.sin()], -1)[self.numbers.row]
-
-    def _normal_equations(self, joint: int, frequency: float) -> tuple[Tensor, Tensor]:
-        X = self._columns(joint, frequency)
-        return X.T @ self.mu, X.T @ self.inverse @ X
+        """The scan beside a line of any amplitude."""
+        waves = self._waves(joint, self.q.new_tensor([frequency]))[:, 0]
+        numbers = self.process.numbers
+        return _Scan(self.process.opened(numbers.J[:, joint, None] * waves[numbers.row]))
 
     def width(self, joint: int) -> float:
         """Distance from a peak within which its side lobes lie, which predict the same in the joint's range."""

@@ -32,7 +32,7 @@ from torch import Tensor
 from diffeo_calib.calibration.scales.selection import SEARCH_LIMITS, select
 from diffeo_calib.calibration.scales.tangent_data import KEPT_COORDINATES, TangentData
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.quantiles import known
+from diffeo_calib.common.quantiles import chi2_median
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import Tails, gross_weights, reweight
@@ -56,13 +56,7 @@ class LeaveOneOut:
     squares: Tensor  # (N, bodies) squared distances in units of the predicted covariance, tails left out; NaN as well
     # effective number of parameters, trace of G (G + R)^-1; None with several blocks, since no block is the whole fit
     effective: float | None
-    # how many were measured; those of the errors by default. A pose has six, its three points nine errors
-    numbers: int | None = None
-
-    @property
-    def count(self) -> int:
-        """How many numbers were measured."""
-        return len(known(self.errors)) if self.numbers is None else self.numbers
+    count: int  # how many numbers were measured: of a pose six, its three points have nine errors
 
     def inflation(self, configurations: int) -> float:
         """Factor on all variances that accounts for estimating their scale from few data.
@@ -145,6 +139,11 @@ def leave_one_out(
         effective.append(part.coordinates - noise)
     errors = data.in_coordinates(errors).masked_fill(~data.visible, nan)
     return LeaveOneOut(errors, squares, effective[0] if len(effective) == 1 else None, told.coordinates)
+
+
+def variance_ratio(data: TangentData, left_out: LeaveOneOut) -> float:
+    """Squared leave-one-out errors relative to what the scales predict: medians, since outliers are reported apart."""
+    return float((left_out.squares / data.noise_model.of_freedom(chi2_median, left_out.squares)).nanmedian())
 
 
 def random_blocks(data: TangentData, seed: int, coordinates: int) -> list[Tensor]:

@@ -100,6 +100,7 @@ def select(
         the best scales that were evaluated; Ctrl-C ends the search early.
     """
     _, subset = data.sample(limits.poses, limits.coordinates, seed)
+    subset = subset.good
     search = _Search(centre, subset, limits, progress)
     try:
         if start is not None:

@@ -112,6 +112,11 @@ class TangentData:
         """(N, m, K) S, derivatives by theta."""
         return self.slopes @ self.nominal.sensitivities(self.x, self.theta)
 
+    @property
+    def by_tool(self) -> Tensor:
+        """(N, m, 3 P) derivatives by the places of the points on their tips."""
+        return self.sensitivities[..., self.nominal.geometry.slices["tool"]]
+
     @cached_property
     def target(self) -> Tensor:
         """(N, m) measured minus model at zero fields and zero theta, m."""
@@ -205,6 +210,14 @@ class TangentData:
         order = order[turn.argsort(stable=True)]
         rows = order[:count].sort().values.to(self.x.device)
         return rows, self.rows(rows)
+
+    @property
+    def good(self) -> TangentData:
+        """The same without what is more likely gross: by its weights it would hold the noise where it was."""
+        if not self.tails.gross:
+            return self
+        gross = (self.tails.weights < 0.5).repeat_interleave(self.noise_model.size, 1)
+        return self._variant(noise_model=replace(self.noise_model, visible=self.visible & ~gross))
 
     def with_tails(self, tails: Tails) -> TangentData:
         """The same measurements with other weights."""

@@ -24,12 +24,12 @@ from diffeo_calib.cli.declarations import CampaignOptions
 from diffeo_calib.cli.models import robot_of
 from diffeo_calib.cli.printed import EXIT_ABOVE, parsed_length
 from diffeo_calib.cli.record import EXIT_INTERRUPTED, record
-from diffeo_calib.cli.tables import MeasuredTable, joint_columns, measured_table
+from diffeo_calib.cli.tables import MeasuredTable, measured_table, of_robot
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.files import read_joints
-from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
+from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.reports.live import Page, served, state_of
 
 JOURNAL = ".journal"
@@ -48,6 +48,7 @@ class Live:
     journal: Journal
     given: CampaignOptions
     table: GrowingTable = field(init=False)  # the file
+    columns: Columns = field(init=False)  # those of its joints
     owner: list[int] = field(default_factory=list)  # the line of each row
     lines: list[bytes] = field(default_factory=list)  # all that were judged
     waiting: list[bytes] = field(default_factory=list)  # those that were there at the start and were not
@@ -61,10 +62,11 @@ class Live:
 
     def __post_init__(self) -> None:
         self.table = GrowingTable(self.source.csv, self.source.table.sep, self.source.table.decimal)
+        self.columns = Columns.of(of_robot(self.source.table, self.campaign.robot).joints_only())
 
     def say(self, text: str, entry: Entry) -> None:
         """Print a text, or an entry as a line of JSON."""
-        if self.given.json_lines:
+        if self.given.stdin:
             sys.stdout.write(as_line(entry).decode())
             sys.stdout.flush()
         elif text:
@@ -75,9 +77,7 @@ class Live:
         known = [one for one in self.journal.entries if "line" in one]
         lines = self.table.new_lines()
         named = {cell.strip() for cell in self.table.cells(self.table.header)}
-        own = joint_columns(self.source.joints, self.campaign.robot)
-        joints = own.columns if isinstance(own, PoseColumns) else JointExpressions.of(own).columns
-        places = [name for name in joints if name.isdecimal() and name not in named]
+        places = [name for name in self.columns.joints.columns if name.isdecimal() and name not in named]
         if self.table.header and places:  # columns are named by their places, and the first line is a row
             what = f"{self.source.csv} has no column {few(places)}: a table that grows needs a header line"
             got = f"the first line {few(sorted(named))}"
@@ -116,7 +116,7 @@ class Live:
         found = {"robot": (robot.revolute.tolist(), robot.before, numbers), "tip": self.tips}
         found |= vars(source.table) | {"header": self.table.header.decode("latin-1").strip()}
         found["position"] = [",".join(triple) for triple in source.table.position or ()]
-        found["joints"] = joint_columns(source.joints, robot)
+        found["joints"] = self.columns.table.joints
         texts = {name: str(value) for name, value in found.items() if value}
         return {name: text if len(text) < LONGEST else digest(text.encode()) for name, text in texts.items()}
 
@@ -140,7 +140,7 @@ class Live:
             return False
         self.journal.add(self._revised())
         self.late += self.revised
-        if not self.given.json_lines:  # those who send rows as JSON lines get one answer for each
+        if not self.given.stdin:  # those who send rows get one answer for each
             changed = "\n".join(str(self.campaign.verdicts[row]) for row in self.revised)
             self._say(({"text": changed} if changed else {}) | self.state())
         return True
@@ -251,17 +251,15 @@ class Live:
 
     def state(self) -> Entry:
         """The campaign in numbers, with what to measure next: joint values in the unit of the table."""
-        known, found, robot = self.campaign.expected_error, self.found, self.campaign.robot
+        known, found = self.campaign.expected_error, self.found
         entry: Entry = {"rows": len(self.campaign), "accepted_rows": len(self.campaign.accepted)}
         entry["expected_error_mm"] = None if known is None else 1e3 * known
         if self.campaign.goal is not None:
             limit, more = self.campaign.error_limit, None if found is None else found.needed
             entry["error_limit_mm"] = None if limit is None else 1e3 * limit
             entry |= {"more_rows": more, "target_reached": self.campaign.reached}
-        names = joint_columns(self.source.joints, robot)
-        columns = Columns.of(self.source.table.joints_only(names, robot.kinds))
-        poses = [] if found is None else columns.joints_from_si(found.q[: self.given.count]).tolist()
-        return entry | {"next": [dict(zip(columns.joints.columns, q, strict=True)) for q in poses]}
+        poses = [] if found is None else self.columns.joints_from_si(found.q[: self.given.count]).tolist()
+        return entry | {"next": [dict(zip(self.columns.joints.columns, q, strict=True)) for q in poses]}
 
     @property
     def found(self) -> Next | None:
@@ -301,21 +299,20 @@ def expected(campaign: Campaign) -> str:
 
 def run(given: CampaignOptions) -> None:
     """Follow a table until the target is reached or the rows end."""
-    if given.rows.by is not None or given.rows.marker is not None:
+    if given.by is not None or given.marker is not None:
         fix = "give every row in one line of one file, with columns for each marker"
         raise InputError.of("--places or --marker, of a table that grows line by line", fix=fix)
-    source = measured_table(given.csv, given.rows, given.units)
+    source = measured_table(given.csv, given)
     goal = parsed_length(given.tolerance)
-    if isinstance(source.joints, PoseColumns):
+    if isinstance(source.table.joints, PoseColumns):
         fix = "measure with --robot and joint values, or fit the table when it is complete"
         raise InputError.of("--robot-pose of a table that grows: the middle of all poses is not known yet", fix=fix)
-    robot = robot_of(given.robot, source)
-    names = joint_columns(source.joints, robot)
-    candidates = given.candidates and read_joints(given.candidates, names, source.table, kinds=robot.kinds)
+    robot = robot_of(given, source)
+    candidates = given.candidates and read_joints(given.candidates, of_robot(source.table, robot))
     with ExitStack() as stack:
         journal = stack.enter_context(Journal(source.csv.with_name(source.csv.name + JOURNAL)))
         campaign = Campaign(robot, candidates=candidates, goal=goal)
-        live = Live(campaign, source, given.robot.links.tip or list(robot.tips), journal, given)
+        live = Live(campaign, source, given.tip or list(robot.tips), journal, given)
         live.resume()
         inbox = Inbox()  # a SimpleQueue can wait for ever after a signal
         page = None if given.page is None else stack.enter_context(served(given.page, inbox))

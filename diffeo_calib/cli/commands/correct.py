@@ -14,7 +14,7 @@ from diffeo_calib.cli.console import out, plain, progress_bar, say, text_table
 from diffeo_calib.cli.declarations import CorrectOptions
 from diffeo_calib.cli.models import as_fitted, load_laden, tool_in_tip
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import ProgramTable, joint_columns, joints_of, table_format
+from diffeo_calib.cli.tables import ProgramTable, as_written, of_robot, table_format
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -22,7 +22,7 @@ from diffeo_calib.kinematics.compensation.compensate import Compensation, compen
 from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, warn_outside_range
 from diffeo_calib.kinematics.tool import checked_tip, covariance_without_placement, tool_transform
 from diffeo_calib.measurements.csv.columns import Columns
-from diffeo_calib.measurements.csv.joints import PoseColumns
+from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.csv.lines import Column, read_cells, write_columns
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
@@ -100,21 +100,19 @@ def run(options: CorrectOptions) -> None:
     """Read a program, correct it, write it and print a summary; units that are not typed are those of the fit."""
     _check(options)
     model = load_laden(options.model, options.payload)
-    stated = as_fitted(model, None, options.units)[1]
-    source = ProgramTable(options.program, joints_of(stated), table_format(stated), options.targets)
+    read = of_robot(table_format(as_fitted(model, options)), model.robot)
+    source = ProgramTable(options.program, read, options)
     table, tips = source.written(), options.tip or ()
     if len(tips) == 1:
         model = model.with_tool(model.tool, *tips)
-    turned = {"convention": options.targets.convention, "rotation_angle": options.targets.rotation_angle}
-    robot, tools = model.robot, _tools(model, options, replace(source.table, **turned))
-    names = joint_columns(source.joints, robot)
-    columns = Columns.of(table.joints_only(names, robot.kinds))
-    sheet = read_cells(options.program, table.sep, columns.names)
-    if isinstance(names, PoseColumns) and names.is_program:
-        columns = Columns.of(table.joints_only(names.written, robot.kinds))
-        sheet = sheet.without(names.columns)  # they would be those of the program before
+    turned = replace(source.table, convention=options.convention, rotation_angle=options.rotation_angle)
+    robot, tools = model.robot, _tools(model, options, turned)
+    before, columns = Columns.of(table.joints_only()), Columns.of(as_written(table).joints_only())
+    sheet = read_cells(options.program, table.sep, before.names)
+    if before.names != columns.names:  # of a function: they would be those of the program before
+        sheet = sheet.without(before.names)
         sheet.check_free(columns.names)
-    start, targets = source.commands(robot), source.targets(robot, len(tools))
+    start, targets = read_joints(options.program, table), source.targets(len(tools))
     for tool in tools:
         misses = [tool.name("angle_miss", table.angle)] if targets is None or targets.ndim == 4 else []
         misses += ["status", tool.name("miss", table.length), tool.name("std", table.length)]
@@ -153,7 +151,7 @@ def _check(options: CorrectOptions) -> None:
     for name, value in (("--limit", options.limit), ("--rate", options.rate)):
         if value is not None:
             check_number(value, name, above=0.0)
-    if options.frame == "measuring" and not options.targets.position:
+    if options.frame == "measuring" and not options.position:
         fix = "leave it out, or name the columns of the targets (--position)"
         raise InputError.of("--frame measuring: the nominal poses of commands are in the robot's base", fix=fix)
 
@@ -167,13 +165,13 @@ def _tools(model: CalibratedKinematics, named: CorrectOptions, table: TableForma
     numbers = named.tool or [None] * max(len(tips), 1)
     if len(tips) < 2:
         tip = checked_tip(robot, model.tool_tip)
-        return [ToolOnTip(tip, tool_in_tip(model, numbers[0], named.tool_from, table))]
+        return [ToolOnTip(tip, tool_in_tip(model, numbers[0], table))]
     found = []
     for k, (tip, text) in enumerate(zip(tips, numbers, strict=True)):
         if tip in tips[:k]:
             raise InputError.of(f"--tip {tip} is named twice", fix="name every tip once")
         own = model.tool if checked_tip(robot, tip) == model.tool_tip else None
-        tool = tool_in_tip(model.with_tool(own, tip), text, named.tool_from, table)
+        tool = tool_in_tip(model.with_tool(own, tip), text, table)
         found.append(ToolOnTip(tip, tool, robot.tips.index(tip)))
     return found
 

@@ -1,4 +1,4 @@
-"""`diffeo-calib evaluate`: errors of a model on a table of any kinds; `predict`: markers or poses for joint values."""
+"""`diffeo-calib evaluate`: errors of a model, as tables or a page; `predict`: markers or poses for joint values."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -15,9 +16,9 @@ from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge
 from diffeo_calib.cli import models, printed
 from diffeo_calib.cli.console import out, plain, progress_bar, say
 from diffeo_calib.cli.declarations import EvaluateOptions, PredictOptions
-from diffeo_calib.cli.options import Rows
+from diffeo_calib.cli.options import Rows, Units
 from diffeo_calib.cli.record import entries_by_kind, record
-from diffeo_calib.cli.tables import MeasuredTable, joint_columns, joints_of, table_format, with_rows
+from diffeo_calib.cli.tables import MeasuredTable, as_written, of_robot, table_format, with_rows
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, warn_user
 from diffeo_calib.common.quantiles import chi2_above
@@ -33,15 +34,17 @@ from diffeo_calib.kinematics.evaluation import (
     residuals,
     rows_of_other_frames,
     rows_used_in_fit,
+    unseen,
 )
 from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, repeated_lines, warn_outside_range
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.files import Predictions, read_configurations, write_predictions
-from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import write_rows
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import BESIDE, TableFormat, options_of
+from diffeo_calib.reports.html.sentences import advice, verdict
+from diffeo_calib.reports.report import write_report
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, Evaluations
 from diffeo_calib.sensors.set_ups import SESSION
 
@@ -51,7 +54,12 @@ COLUMNS = ("line", "used_in_fit", "kind", "device", "marker", "dx", "dy", "dz", 
 def run(options: EvaluateOptions) -> None:
     """Run the command."""
     model = models.load_kinematics(options.model)
-    source = models.table_of(model, options.csv, options.rows, options.units)
+    if options.report is not None:
+        return _reported(model, options.report, options)
+    if options.csv is None:
+        fix = "name it, or write a page about the rows of the fit by --report"
+        raise InputError.of("the table of measurements", expected="CSV", got="none", fix=fix)
+    source = models.table_of(model, options.csv, options)
     limit = printed.parsed_limit(options.tolerance)
     models.check_payload_column(model, source.table.payload)
     say(*models.provenance_lines(model))
@@ -64,10 +72,10 @@ def run(options: EvaluateOptions) -> None:
     found, used = residuals(model, places, data), rows_used_in_fit(model, data.q)
     judged = judge(model, places, data, found)
     _show(model, found, used, positions_of(model, places, data), options.model.name)
-    if options.residuals is not None:
-        write_rows(options.residuals, COLUMNS, [list(_residuals(found, used, source))], source.table)
-        record.add(files={"residuals": options.residuals})
-        say(f"residuals: {options.residuals}")
+    if options.output is not None:
+        write_rows(options.output, COLUMNS, [list(_residuals(found, used, source))], source.table)
+        record.add(files={"residuals": options.output})
+        say(f"residuals: {options.output}")
     if SESSION in places.devices:
         record.add(session_transforms=places.devices[SESSION].entry())
     if places.numbers:
@@ -153,6 +161,30 @@ def _registered(model: CalibratedKinematics, data: Any, options: EvaluateOptions
         say(f"registered model: {output}")
 
 
+def _reported(model: CalibratedKinematics, page: Path, options: EvaluateOptions) -> None:
+    """Write the page, and say its first line."""
+    data, tolerance = None, printed.parsed_length(options.tolerance)
+    if options.csv is not None:
+        data = models.table_of(model, options.csv, options).read(model.robot)
+    if tolerance is not None and data is not None and not bool(unseen(model, data.q).any()):
+        expected, fix = "rows that took no part in fit and registration", "measure more rows, or leave the table out"
+        raise InputError.of("rows to hold against --tolerance", expected=expected, got=f"{len(data)} that did", fix=fix)
+    with progress_bar() as progress:
+        against = options.against or []
+        found = write_report(model, page, data, against=against, tolerance=tolerance, progress=progress)
+    say(*models.provenance_lines(model))
+    words, stages = verdict(found, tolerance), dict(found.expected)
+    kinds = {kind: one.stages for kind, one in found.kinds.items()}
+    record.add(**entries_by_kind(kinds), expected_error_by_stage_m=stages, left_out=not found.new)
+    record.add(verdict=words, advice=list(advice(found)), files={"report": page})
+    if found.predictions is not None:
+        record.add(coverage_95=found.predictions.coverage())
+    if data is not None and not found.new:
+        each = "as fitted" if not found.errors else "each predicted by all others"
+        say(f"all rows of the table were used before: the rows of the fit are shown, {each}")
+    say(words, *printed.expectation_lines(model, None, found.deviations.error), f"report: {page}")
+
+
 # --- predictions
 
 ROWS_AT_ONCE = 2048
@@ -170,24 +202,22 @@ def run_predict(given: PredictOptions) -> None:
     """
     kinematics, output = models.load_kinematics(given.model), given.output
     say(*models.provenance_lines(kinematics))
-    table, joints = _written_as_read(kinematics, given)
-    robot, with_poses = kinematics.robot, kinematics.lever is not None
+    table = of_robot(_written_as_read(kinematics, given), kinematics.robot)
+    with_poses = kinematics.lever is not None
     if not with_poses and (table.convention or table.rotation_angle):
         what = "--convention and --rotation-angle say how orientations are written, but this model has none"
         raise InputError.of(what, fix="leave them out, or calibrate with measured poses")
-    names = joint_columns(joints, robot)
     mass = number(given.payload or "", ".")  # what the model's fit named is a column
     if mass is not None and isfinite(mass):
         kinematics, table = kinematics.with_payload(mass), replace(table, payload=None)
     else:
         models.check_payload_column(kinematics, table.payload)
-    written = names.written if isinstance(names, PoseColumns) else names
-    prefixes, columns = kinematics.bodies.prefixes(kinematics), table.joints_only(written, robot.kinds)
+    prefixes, written = kinematics.bodies.prefixes(kinematics), as_written(table)
     added = {f"{prefix}{axis}" for prefix in prefixes for axis in "xyz"}
-    if added & {*Columns.of(columns).names}:  # commanded places have these names
+    if added & {*Columns.of(written.joints_only()).names}:  # commanded places have these names
         prefixes = tuple(f"predicted_{prefix}" for prefix in prefixes)
     readings = _Readings(table, kinematics.predict_readings(kinematics.configurations[:1]))
-    values = read_configurations(given.csv, names, table, kinds=robot.kinds)
+    values = read_configurations(given.csv, table)
     q, masses = values["q"], values.get("payload")
     refuse_other_angles(kinematics, q)
     warn_outside_range(kinematics, q)
@@ -202,8 +232,7 @@ def run_predict(given: PredictOptions) -> None:
             yield q[own], mean, deviations, readings.cells(model, q[own])
 
     with progress_bar() as progress:
-        how = {"kinds": robot.kinds, "prefixes": prefixes, "more": readings.names, "poses": with_poses}
-        write_predictions(output, blocks(), table, joints=written, **how)
+        write_predictions(output, blocks(), written, prefixes=prefixes, more=readings.names, poses=with_poses)
     record.add(rows=len(q), files={"table": output})
     what = "poses" if with_poses else "positions"
     say(f"{len(q)} predictions written to {output}: joints, {what} and standard deviations of a new measurement")
@@ -214,22 +243,19 @@ def run_predict(given: PredictOptions) -> None:
         say(f"`evaluate` and `fit` read these poses with {reading_options(table, prefixes)}")
 
 
-def _written_as_read(
-    model: CalibratedKinematics, given: PredictOptions
-) -> tuple[TableFormat, str | PoseColumns | None]:
-    """The format of the predictions, and the names of the joint columns, by default those of the fit."""
-    units = given.units
-    rows = Rows(convention=given.convention, rotation_angle=given.rotation_angle, payload=given.payload)
-    read, stated = models.as_fitted(model, rows, units)
-    if units.length is None or units.angle is None:
-        rotation_angle = rows.rotation_angle or read.rotation_angle
-        rows = Rows(convention=rows.convention or read.convention, rotation_angle=rotation_angle, payload=read.payload)
-    return with_rows(table_format(stated), rows), joints_of(stated)
+def _written_as_read(model: CalibratedKinematics, given: PredictOptions) -> TableFormat:
+    """The format of the predictions, by default that of the fit."""
+    units = {name: getattr(given, name) for name in Units.names()}
+    typed = Rows(**units, convention=given.convention, rotation_angle=given.rotation_angle, payload=given.payload)
+    read = models.as_fitted(model, typed)
+    own = typed if given.length and given.angle else read
+    rows = Rows(convention=own.convention, rotation_angle=own.rotation_angle, payload=own.payload)
+    return with_rows(table_format(read), rows)
 
 
 def reading_options(table: TableFormat, prefixes: Sequence[str] = ("",)) -> str:
     """The options with which `evaluate` and `fit` read the poses that `predict` writes in this format."""
-    written, units = table.for_writing(rotation_std=False, prefixes=prefixes), table.joints_only(())
+    written, units = table.for_writing(rotation_std=False, prefixes=prefixes), replace(table.joints_only(), joints=())
     position = [[prefix + axis for axis in "xyz"] for prefix in prefixes]
     turned = {name: getattr(written, name) for name in ("rotation", "convention", "rotation_angle")}
     return shlex.join(options_of(replace(units, position=position, **turned, **dict.fromkeys(BESIDE))))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from math import hypot
@@ -54,9 +55,12 @@ FIELD = (
     "field: a controller adds add_x, ... to the place that it is to reach; std_x, ... say how well",
     "  each is known; between the points interpolate linearly",
 )
+TOGETHER = "they are for use together with the correction tables: write files that are used alone without these"
+HASH = re.compile(r"^ *hash: *((?!diffeo_calib_)[A-Za-z]\w*)", re.ASCII | re.MULTILINE)
+"""That of a robot, rather than of a file that was written before."""
 UR_HASH = (
     "the UR driver compares the entry hash with the controller's and will report another calibration: "
-    "pass the hash of the robot's own calibration file (--ur-hash)"
+    "write --ur-kinematics over a copy of the robot's own calibration file, whose hash it keeps"
 )
 
 
@@ -78,16 +82,11 @@ class _Export:
     def rigid(self, options: list[str], *, tables: bool) -> None:
         """URDF, DH table and UR kinematics: three forms of the same rigid kinematics."""
         urdf = urdf_of(self.model.robot, self.given.robot) if {"--urdf", "--ur-kinematics"} & {*options} else b""
-        found = rigid_kinematics(self.model, transmission=self.given.with_tables)
+        found = rigid_kinematics(self.model, transmission=tables)
         self.geometry, name = found.geometry, ", ".join(options)
-        together = f"{name} and --correction-tables"
-        if self.given.with_tables:
-            self.rows |= {together: found, f"{name} alone": applied_with_tables(self.model, found, applied=False)}
-        else:
-            self.rows[name] = found
-            if tables:
-                self.rows[together] = applied_with_tables(self.model, found, applied=True)
-                self.lines.append("to use them together with the tables, fit them for that: --with-tables")
+        alone = {f"{name} alone": applied_with_tables(self.model, found, applied=False)} if tables else {}
+        self.rows |= {f"{name} and --correction-tables" if tables else name: found} | alone
+        self.lines += [TOGETHER] * tables
         said = ", ".join(f"{name} {1e3 * rms:.4f} mm" for name, rms in found.validated.items())
         self.lines.append(f"rigid kinematics from the {found.how} (cross-validated: {said})")
         self.lines.append("rigid kinematics hold no gravity sag, no transmission errors and no other deformations")
@@ -107,8 +106,11 @@ class _Export:
             return mjcf_text(geometry)
         if option == "--urdf":
             return corrected_urdf(geometry, urdf).decode("utf-8", "surrogateescape")
-        self.lines += [UR_HASH] * (self.given.ur_hash is None)
-        return ur_text(ur_transforms(geometry, urdf), self.given.ur_hash)
+        before, known = self.given.ur_kinematics, None
+        if before is not None and before.is_file():
+            known = HASH.search(before.read_bytes().decode(errors="replace"))
+        self.lines += [UR_HASH] * (known is None)
+        return ur_text(ur_transforms(geometry, urdf), known and known[1])
 
     def tables(self, wanted: Mapping[str, Path]) -> None:
         """Joint offsets alone, correction tables for the nominal robot, corrections on a grid."""
@@ -145,7 +147,7 @@ def run(given: ExportOptions) -> None:
     if not wanted:
         raise typer.BadParameter(f"name at least one file to write: {', '.join(files)}")
     model = load_laden(given.model, given.payload)
-    own = tool_in_tip(model, given.tool, given.tool_from, TableFormat(given.length, given.angle))
+    own = tool_in_tip(model, given.tool, TableFormat(given.length, given.angle))
     tool = None if given.tool is None else own
     source = None if given.c is None else c_files(model, given.c, tool, given.frame or "base", tip=given.tip)
     export, rigid = _Export(model, given), [option for option in wanted if option in RIGID]

@@ -1,4 +1,4 @@
-"""`diffeo-calib fit`: calibrate, show errors, write the model; `report`: a page about one; `demo`: an arm for it."""
+"""`diffeo-calib fit`: calibrate, show errors, write the model; `demo`: an arm for it."""
 
 from __future__ import annotations
 
@@ -17,20 +17,18 @@ from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, KindErrors, errors_by_kind
 from diffeo_calib.cli import printed
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, out, progress_bar, say
-from diffeo_calib.cli.declarations import DemoOptions, FitOptions, ReportOptions
+from diffeo_calib.cli.declarations import DemoOptions, FitOptions
 from diffeo_calib.cli.main import app
-from diffeo_calib.cli.models import load_kinematics, made_by_command, provenance_lines, robot_of, table_of
+from diffeo_calib.cli.models import load_kinematics, made_by_command, robot_of
 from diffeo_calib.cli.record import entries_by_kind, kind_entry, make_folder, record
 from diffeo_calib.cli.tables import measured_table
-from diffeo_calib.common.errors import PACKAGE, InputError, printable
+from diffeo_calib.common.errors import PACKAGE, printable
 from diffeo_calib.common.files import write_figure
 from diffeo_calib.interop.model_file import save
-from diffeo_calib.kinematics.evaluation import unseen
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_entry, hand_eye_sentences
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.reports.html.sentences import advice, verdict
 from diffeo_calib.reports.plots.errors import stages
 from diffeo_calib.reports.report import write_report
 from diffeo_calib.robots.cartesian import is_cartesian, turns_nowhere
@@ -48,11 +46,11 @@ Errors = dict[str, KindErrors]
 
 def run(given: FitOptions) -> None:
     """Calibrate with the rows that are not held out, write the model, and end with the exit code of the fit."""
-    source = measured_table(given.csv, given.rows, given.units, given.duplicates)
+    source = measured_table(given.csv, given, given.duplicates)
     with progress_bar() as progress:
-        chain = robot_of(given.robot, source)
+        chain = robot_of(given, source)
         others = [load_kinematics(path) for path in given.scales_of or ()]
-        data = source.read(chain, given.robot.links.tip or chain.tips)
+        data = source.read(chain, given.tip or chain.tips)
         train, test = data.split(1.0 - given.holdout, given.seed) if given.holdout else (data, None)
         how = {"controls": given.controls or "auto", "seed": given.seed, "note": given.note, "scales_of": others}
         result = calibrate(chain, train, **how, progress=interrupts.watching(progress, err.print))
@@ -207,31 +205,6 @@ def _show_findings(result: CalibrationResult, rows: int) -> None:
             f"coupling residual {fitted.coupling_residual:.1e}, end residual {fitted.end_residual:.1e}, "
             f"time-stepping error {1e3 * fitted.step_error:.1e} mm with {fitted.integrator.intervals} step(s)"
         )
-
-
-def run_report(wanted: ReportOptions) -> None:
-    """Write the page, and say its first line."""
-    model, data = load_kinematics(wanted.model), None
-    if wanted.csv is not None:
-        data = table_of(model, wanted.csv, wanted.rows, wanted.units).read(model.robot)
-    tolerance = printed.parsed_length(wanted.tolerance)
-    if tolerance is not None and data is not None and not bool(unseen(model, data.q).any()):
-        expected, fix = "rows that took no part in fit and registration", "measure more rows, or leave the table out"
-        raise InputError.of("rows to hold against --tolerance", expected=expected, got=f"{len(data)} that did", fix=fix)
-    how = {"against": wanted.against or [], "tolerance": tolerance}
-    with progress_bar() as progress:
-        found = write_report(model, wanted.output, data, **how, progress=progress)
-    say(*provenance_lines(model))
-    words, stages = verdict(found, tolerance), dict(found.expected)
-    kinds = {kind: one.stages for kind, one in found.kinds.items()}
-    record.add(**entries_by_kind(kinds), expected_error_by_stage_m=stages, left_out=not found.new)
-    record.add(verdict=words, advice=list(advice(found)), files={"report": wanted.output})
-    if found.predictions is not None:
-        record.add(coverage_95=found.predictions.coverage())
-    if data is not None and not found.new:
-        each = "as fitted" if not found.errors else "each predicted by all others"
-        say(f"all rows of the table were used before: the rows of the fit are shown, {each}")
-    say(words, *printed.expectation_lines(model, None, found.deviations.error), f"report: {wanted.output}")
 
 
 POSITION = ("measurement_x", "measurement_y", "measurement_z")

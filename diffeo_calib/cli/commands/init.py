@@ -65,7 +65,7 @@ def run(given: InitOptions) -> None:
     output = given.output
     if given.csv.is_dir():
         read_cells(given.csv, ",")  # says why not
-    csv, joined = with_places(given.csv, given.places, output.parent)
+    csv, joined = with_places(given.csv, given, output.parent)
     sheet = guess_sheet(csv)
     try:
         source = _commanded(given.robot, sheet) or _of_robot(given.robot or Path(), output.parent, sheet)
@@ -178,7 +178,7 @@ def _read(robot: Path, sheet: Sheet, arm: Arm) -> Source:
 def _with_tip(robot: Path, source: Source, arm: Arm) -> Source:
     """The same without joints at the end that no marker follows, and why the tip is there."""
     left_out = list[str]()
-    q = read_joints(source.sheet.path, source.joints, source.table, kinds=source.robot.kinds)
+    q = read_joints(source.sheet.path, replace(source.table, joints=source.joints, kinds=source.robot.kinds))
     moved = (q.amax(0) - q.amin(0)).tolist()
     while len(arm.joints) > 1 and source.value("joints"):
         count = len(arm.joints) - 1

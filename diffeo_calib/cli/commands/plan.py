@@ -12,15 +12,15 @@ from torch import Tensor
 
 from diffeo_calib.calibration.planning.candidates import Tracker, collision_free
 from diffeo_calib.calibration.planning.knowledge import MARKER
-from diffeo_calib.calibration.planning.plan import Plan, drawn, plan, sensors_for
-from diffeo_calib.calibration.planning.sensors import Sensor
+from diffeo_calib.calibration.planning.plan import Plan, drawn, plan
+from diffeo_calib.calibration.planning.sensors import Sensor, sensors_for
 from diffeo_calib.cli.console import out, progress_bar, say, text_table
 from diffeo_calib.cli.declarations import PlanOptions
 from diffeo_calib.cli.models import as_fitted, load_kinematics, load_robot, planned
 from diffeo_calib.cli.options import DRAWN, Candidates
 from diffeo_calib.cli.printed import expectation_lines
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import joint_columns, joints_of, stated_numbers, table_format
+from diffeo_calib.cli.tables import as_written, of_robot, stated_numbers, table_format
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -60,44 +60,43 @@ def sensors_of(words: list[str] | None, table: TableFormat) -> list[Sensor]:
 
 def run(given: PlanOptions) -> None:
     """Plan, write the poses, and print what to expect of them."""
-    cell, count, output, begin = given.cell, given.count, given.output, given.model or given.robot
+    count, output, begin = given.count, given.output, given.model or given.robot
     if begin is None:
         raise InputError.of("what to plan for", expected="a MODEL, or --robot", got="neither")
     with progress_bar() as progress:
         model = None if given.model is None else load_kinematics(given.model)
-        stated = given.units if model is None else as_fitted(model, None, given.units)[1]
-        table = table_format(stated)
+        table = table_format(given if model is None else as_fitted(model, given))
         numbers = [stated_numbers("--marker", text, (3,)) for text in given.marker or ()]
         markers = torch.tensor(numbers or [MARKER], dtype=torch.float64, device=HOST)
         markers = markers / table.per_metre if numbers else markers
-        source = model or load_robot(begin, given.links)
+        source = model or load_robot(begin, given)
         if model is not None:
             source, markers = planned(model, given.payload)
         robot = source.robot if isinstance(source, CalibratedKinematics) else source
-        names = joint_columns(joints_of(stated), robot)
+        table = of_robot(table, robot)
 
         def configurations(table_of: Path | None) -> Tensor | None:
-            return None if table_of is None else read_joints(table_of, names, table, kinds=robot.kinds)
+            return None if table_of is None else read_joints(table_of, table)
 
         sensors = sensors_of(given.sensor, table) or sensors_for(source)
         progress("candidates", 0, 1)
-        q = configurations(cell.candidates)
+        q = configurations(given.candidates)
         if q is None:
-            q = drawn(source, sensors, max(cell.draw or DRAWN, count), markers, **_cell(cell, robot, table))
+            q = drawn(source, sensors, max(given.draw or DRAWN, count), markers, **_cell(given, robot, table))
         progress("candidates", 1, 1)
         progress("plan", 0, 1)
         framed = model is not None or any(one.of_frames for one in sensors)
         target, measured = configurations(given.target_poses), configurations(given.measured)
         how: dict[str, Any] = {"marker": None if framed else markers, "free": given.free, "sensor": sensors}
         found = plan(source, q, count, target=target, measured=measured, **how)
-    found.write(output, table, names.written if isinstance(names, PoseColumns) else names)
+    found.write(output, as_written(table))
     entries = {"expected_rms_m": found.expected_rms, "noise_rms_m": found.noise_rms, "assumed": found.assumed}
     record.add(rows=count, **entries, files={"poses": output})
     _show(found, of_positions=all(one.of_positions for one in sensors), free=MOVED.get(given.free or ""))
     if isinstance(source, CalibratedKinematics):
         say("the table averages over the poses that were drawn or given; they may lie beyond those of the fit")
         say(*expectation_lines(source, None))
-    if isinstance(names, PoseColumns) and cell.candidates is None:
+    if isinstance(table.joints, PoseColumns) and given.candidates is None:
         say("poses are drawn around those of the fit: pass --candidates where the machine, or the view, is smaller")
     say(f"{count} of {len(q)} configurations written to {output}, in an order of short moves")
     say("its column `rank`: the poses of ranks 1 to k are the plan for k poses")

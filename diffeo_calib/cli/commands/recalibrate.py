@@ -28,7 +28,7 @@ def run(given: RecalibrateOptions) -> None:
     if given.output is None:
         return _compare(given)
     model = load_kinematics(given.old)
-    source = table_of(model, given.other, given.rows, given.units)
+    source = table_of(model, given.other, given)
     how: Any = {"marker": given.marker_freedom, "seed": given.seed, "drift": given.drift, "note": given.note}
     say(*provenance_lines(model), *another_date_lines(model))
     with progress_bar() as progress:
@@ -100,13 +100,13 @@ def _compare(given: RecalibrateOptions) -> None:
     """Compare a model with new measurements, or with another model."""
     model, other = load_kinematics(given.old), given.other
     if _is_model(other):
-        if given.rows.named or given.units.length or given.units.angle:
+        if given.named or given.length or given.angle:
             fix = "leave out the options of tables, or name a table"
             raise InputError.of(f"{other} is a model, beside options of a table", fix=fix)
         rows: Any = load_kinematics(other)
         say(*provenance_lines(model), *provenance_lines(rows))
     else:
-        source = table_of(model, other, given.rows, given.units)
+        source = table_of(model, other, given)
         say(*provenance_lines(model), *another_date_lines(model))
         rows = source.read(model.robot)
     found = compare(model, rows, marker=given.marker_freedom, seed=given.seed)

@@ -21,7 +21,7 @@ from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, as_written, few, listed, shown, warn_user
 from diffeo_calib.measurements.checks import file_sha256, quiet
 from diffeo_calib.measurements.csv.cells import repeated
-from diffeo_calib.measurements.csv.columns import ChainLike, Columns, Joints, Values, check_count
+from diffeo_calib.measurements.csv.columns import ChainLike, Columns, Values, check_count
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import Cells, write_rows
 from diffeo_calib.measurements.csv.sensors import (
@@ -220,28 +220,26 @@ def read_readings(
     return _read(path, TableFormat(**columns, joints=robot, readings=(own,)), duplicates, joints)
 
 
-def read_joints(
-    path: str | PathLike[str], joints: Joints, table: TableFormat, *, kinds: Sequence[str] | None = None
-) -> Tensor:
+def read_joints(path: str | PathLike[str], table: TableFormat) -> Tensor:
     """Joint configurations (N, n), rad (revolute) and m (prismatic), from a CSV file, rows in the order of the file.
 
-    Arguments, errors and warnings are those of :func:`read_measurements`. Of the format only units, separator and
-    decimal mark matter.
+    Errors and warnings are those of :func:`read_measurements`. Of the format only units, separator, decimal mark and
+    joints matter.
     """
-    return read_configurations(path, joints, table, kinds=kinds)["q"]
+    return read_configurations(path, table)["q"]
 
 
-def read_configurations(
-    path: str | PathLike[str], joints: Joints, table: TableFormat, *, kinds: Sequence[str] | None = None
-) -> Values:
+def read_configurations(path: str | PathLike[str], table: TableFormat) -> Values:
     """Joint values "q" as of :func:`read_joints`, with the "payload" (N,), "time" and "temperature" that are named."""
-    return read_table(Path(path), Columns.of(table.joints_only(joints, kinds))).values
+    return read_table(Path(path), Columns.of(table.joints_only())).values
 
 
-def read_poses(path: Path, columns: PoseColumns, table: TableFormat) -> Tensor:
-    """The poses (N, 4, 4), or places (N, k), m, to which a machine was commanded."""
+def read_poses(path: Path, table: TableFormat) -> Tensor:
+    """The poses (N, 4, 4), or places (N, k), m, to which a machine was commanded, in the columns ``table.joints``."""
+    columns: PoseColumns = table.joints
+    plain = replace(table, joints=replace(columns, robot=None), angle="rad", joint_length=None, kinds=None)
     with quiet():  # numbers of rotations are read as angles
-        cells = read_joints(path, replace(columns, robot=None), replace(table, angle="rad", joint_length=None))
+        cells = read_joints(path, plain)
     try:
         poses = replace(columns, angle=table.angle).poses(cells)
     except MeasurementError as error:

@@ -21,7 +21,7 @@ from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register_robustly
 from diffeo_calib.calibration.planning.plan import Plan, drawn, plan
-from diffeo_calib.calibration.planning.sensors_of_model import sensor_of
+from diffeo_calib.calibration.planning.sensors import sensor_of
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, NOMINAL
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError
@@ -93,7 +93,7 @@ class Deviations:
             return self
         options = [self.q]
         for sensor in sensors:
-            if sensor.where(model) is not None or sensor.places_in(model.geometry.base) is not None:
+            if sensor.reached(model.geometry.base):
                 try:
                     options.append(drawn(model, [sensor], CONFIGURATIONS, model.geometry.tool, seed=seed))
                 except InputError:

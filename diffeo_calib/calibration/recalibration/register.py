@@ -17,16 +17,18 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from diffeo_calib.calibration.recalibration.find_place import SAME_PLACE, find_place, warn_about
+from diffeo_calib.calibration.recalibration.new_rows import NewRows
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.joint_ranges import check_same_robot
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap, SessionMarkers
-from diffeo_calib.kinematics.re_registration.find_place import SAME_PLACE, find_place, warn_about
-from diffeo_calib.kinematics.re_registration.new_rows import NewRows
-from diffeo_calib.kinematics.re_registration.registered_map import (
+from diffeo_calib.kinematics.registered_map import (
     RegisteredMap,
     Registration,
     fitted_markers,
@@ -55,35 +57,48 @@ STEPS = GaussNewton(max_iterations=2, tolerance=0.0)
 """The first one is within 2 % of the optimum, the second within 0.1 %."""
 
 
-@small_work()
-def register_again(
-    model: FittedMap,
-    nominal: GeometryMap,
-    lever: float | None,
-    data: Measurements,
-    *,
-    free: str,
-    marker_std: float | None,
-    ball: bool = False,
-    learn: bool = True,
-) -> tuple[FittedMap, Registration]:
+def registered(
+    model: CalibratedKinematics, new: Any, *, free: str, marker_std: float | None, learn: bool
+) -> CalibratedKinematics:
     """See :meth:`CalibratedKinematics.registered`; everything on the CPU."""
-    found = find_place(model, nominal, lever, data, free=free, marker_std=marker_std, ball=ball)
+    rows = registration_rows(new, model)
+    check_same_robot(model, new)
+    if rows is None:
+        return model._with(placement=devices_beside(model, new))
+    here = model.to(HOST)._carrying(model.nominal.load.under(rows.payload).typical)
+    ball = model.ball and bool(rows.points[:, -1].isnan().all())
+    placed, found = _placed(here, rows, free=free, marker_std=marker_std, ball=ball, learn=learn)
+    learns, before = placed.registration is None, getattr(model.registration, "table_sha256", "")
+    found = replace(found, table_sha256=" ".join([before, new.sha256][: 1 + learns]).strip())
+    vars(placed).update({} if learns else {"registration": found})
+    known = {"map": placed.to(model.configurations.device), "lever": found.lever, "placement": (), "ball": ball}
+    seen = model._with(**known, learnt=found if learns else None)._carrying(model.nominal.load)
+    seen = seen._with(placement=registered_devices(model, seen))
+    return seen._with(placement=devices_beside(seen, new))
+
+
+@small_work()
+def _placed(
+    here: CalibratedKinematics, data: Measurements, *, learn: bool, **asked: Any
+) -> tuple[FittedMap, Registration]:
+    """The map in its new place, by rows that say where the robot stands, and the record."""
+    model = here.map
+    found = find_place(model, here.lever, data, **asked)
     registration, fit, new = found.registration, model.unregistered, found.rows
     warn_about(registration)
     LOG.info("registered anew: RMS %.4f mm on %d rows", 1e3 * registration.rms_after, registration.rows)
     open_by = max(float(registration.frame_deviations.max()), registration.known_m)
-    learn = learn and new.points.same and open_by < LARGEST_M_RAD and not registration.doubtful
-    learn = learn and (model.registration is None or free == "both")  # what is held must be known
+    learn = learn and new.marks.same and open_by < LARGEST_M_RAD and not registration.doubtful
+    learn = learn and (model.registration is None or registration.free == "both")  # what is held must be known
     N, m = len(fit.x), fit.m  # more new rows than leave a dense matrix dense cannot join, nor rows of no coordinates
     dense = fit.data is not None or not N * m <= MAX_DENSE < (N + len(new)) * m
-    if not (learn and dense and fit.slopes is None):
+    if not (learn and dense and new.of_coordinates):
         placed = moved(fit, registration.transform).inflated(new.inflation)
         return RegisteredMap(placed, registration), registration
     same, known = found.metres == SAME_PLACE, torch.full_like(new.deviations, PLACES.found_m_rad)
     known[6:] = PLACES.same_m if same else found.metres
-    points = FlangePoints(new.points.fitted, new.old_markers, same=True) if same else new.points
-    together = replace(new, points=points, deviations=known * (new.deviations > 0))
+    marks = FlangePoints(new.marks.fitted, new.old_markers, same=True) if same else new.marks
+    together = replace(new, marks=marks, deviations=known * (new.deviations > 0))
     problem, start = both_dates(together, new.inflation)  # as if nothing but places had changed
     solution = STEPS.solve(problem, fit.geodesic.integrator, start)
     if solution.interrupted:
@@ -107,7 +122,7 @@ def both_dates(
     spec, (b, p, theta), x = old.geodesic.spec, old.deformation.momenta.tensors, old.deformation.x
     nominal = robot_map(old).typical
     geometry = nominal.geometry
-    newest = nominal.with_geometry(geometry.with_tool(new.points.points - theta[geometry.slices["tool"]].view(-1, 3)))
+    newest = nominal.with_geometry(geometry.with_tool(new.marks.points - theta[geometry.slices["tool"]].view(-1, 3)))
     prior = spec.prior_variance.clone()
     if bool(new.deviations[:6].any()):  # a device says where the base is
         prior[geometry.slices["base"]] = prior[geometry.slices["base"]].clamp(min=PLACES.found_m_rad**2)
@@ -140,7 +155,7 @@ def _together(new: NewRows) -> tuple[Tensor, Tensor, Observation | None]:
     Old rows are what was measured of k1 to first order around the fit; the old fit's own numbers if it knows.
     """
     old, own_noise = new.fitted, new.weighted_noise
-    if old.slopes is None and new.observe is None:
+    if new.of_coordinates:
         return torch.cat([old.measured(), new.y]), torch.cat([old.noise.covariance, own_noise]), None
     A, y = old.linearised_rows()
     (N, r, m), (M, own) = A.shape, new.y.shape
@@ -177,7 +192,7 @@ def _sessions(tool: Tensor, new: NewRows, newest: GeometryMap) -> SessionMarkers
         session, tools, by_row = by_row.session, by_row.tools, by_row.nominal
     latest = torch.full((len(new.q),), len(tools), dtype=torch.int64, device=x.device)
     if isinstance(by_row, GeometryMap):
-        newest = newest.under(joined_masses(by_row.payload, new.points.fitted.payload))
+        newest = newest.under(joined_masses(by_row.payload, new.marks.fitted.payload))
     return SessionMarkers(newest, torch.cat([session, latest]), torch.cat([tools, newest.geometry.tool[None]]))
 
 

@@ -13,34 +13,34 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import exp, log
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.recalibration.new_rows import FoundPlace, NewRows, NewSetUp, UsualNoise
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few, sentence, warn_user
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
-from diffeo_calib.kinematics.re_registration.new_rows import NewRows, noise_of_rows
-from diffeo_calib.kinematics.re_registration.registered_map import (
+from diffeo_calib.kinematics.nominal import FlangePoints
+from diffeo_calib.kinematics.registered_map import (
     HARDLY,
     Registration,
     fitted_markers,
+    robot_map,
     turned,
     undetermined,
 )
 from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_points, tool_transform
-from diffeo_calib.maps.noise import measured_coordinates, without_hidden
 from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.poses import kind_of_points, own_blocks, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES, place, rigid_fit
 from diffeo_calib.robots.se3 import skew
 from diffeo_calib.sensors.coordinates import check_joint_order
+from diffeo_calib.sensors.tables import Coordinates
 
 FREE = ("both", "base", "marker")
 MARKER_DEVIATIONS = {
@@ -62,21 +62,8 @@ LEAST_POINTS = 3
 """Points that determine where a frame is."""
 
 
-class FoundPlace(NamedTuple):
-    """Result of a registration: rows around the most probable places, with their prior, and the record.
-
-    Args:
-        metres: prior deviation of the markers from their old places.
-    """
-
-    rows: NewRows
-    metres: float
-    registration: Registration
-
-
 def find_place(
     model: FittedMap,
-    nominal: GeometryMap,
     lever: float | None,
     data: Measurements,
     *,
@@ -87,7 +74,7 @@ def find_place(
     """Find where the device stands and where the markers sit.
 
     Args:
-        model: the map, placed anew before or not. nominal: that of the fit. lever: of its frames, m; None for markers.
+        model: the map, placed anew before or not. lever: of its frames, m; None for markers.
         data: the rows. free, marker_std: see :meth:`CalibratedKinematics.registered`.
         ball: whether the last marker is a ball that no row shows, and that stays where it was on the tool.
 
@@ -95,16 +82,22 @@ def find_place(
         InputError: arguments of another kind, or markers that are to stay, but other ones were measured.
         MeasurementError: no more coordinates than unknowns without a prior.
     """
-    _check_arguments(nominal, data, free, marker_std)
+    if free not in FREE:
+        raise InputError.of("`free`", expected=" or ".join(map(repr, FREE)), got=as_written(free))
+    chain = robot_map(model.unregistered).geometry.chain
+    check_joint_order(chain, data)
     data = data.to(HOST)
+    chain.joint_values(data.q)
+    if marker_std is not None:
+        check_number(marker_std, "`marker_std`, in m", above=0.0)
     evenly = [round(k * (len(data) - 1) / (MOST_ROWS - 1)) for k in range(MOST_ROWS)]
     some = data if len(data) <= MOST_ROWS else data.rows(evenly)
-    nominal = nominal.under(some.payload)
-    model = model.with_nominal(nominal)
-    set_up = SetUp.of(model, nominal, lever, some, free, ball=ball)
-    priors = _priors(free, marker_std, known=set_up.known)
-    starts = set_up.starts(max(priors))
-    found = {metres: _likeliest(starts, set_up.deviations(metres), metres) for metres in priors}
+    search = Search.of(model, lever, some, free, ball=ball)
+    priors = tuple(first for first, _ in MARKER_DEVIATIONS.values()) if search.known else (OTHER_MARKER,)
+    priors = priors if marker_std is None else (marker_std,)
+    priors = (SAME_PLACE,) if free == "base" else priors  # not used: the markers stay
+    starts = search.starts(max(priors))
+    found = {metres: _likeliest(starts, search.deviations(metres), metres) for metres in priors}
     kept, outliers = torch.arange(len(some), device=some.q.device), list[int]()
     while True:
         odds = _odds(found)
@@ -116,52 +109,30 @@ def find_place(
         stay = kept.new_tensor([row for row in range(len(kept)) if row not in worst])
         kept, found = kept[stay], {one: rows.kept(stay).settled() for one, rows in found.items()}
     said = {
-        "lever": set_up.data.lever,
+        "lever": search.data.lever,
         "free": free,
         "outliers": tuple(some.line_numbers[sorted(outliers)].tolist()) if outliers else (),
-        "rms_before": _rms(model(some.q).unflatten(1, (-1, 3)) - some.points) if set_up.known else None,
+        "rms_before": _rms(model(some.q).unflatten(1, (-1, 3)) - some.points) if search.known else None,
         "same_place": odds.get(SAME_PLACE, 0.0) if len(priors) > 1 else None,
     }
-    return FoundPlace(found[metres], metres, _record(found[metres], said, known=set_up.known))
-
-
-def _check_arguments(nominal: GeometryMap, data: Measurements, free: str, marker_std: float | None) -> None:
-    if free not in FREE:
-        raise InputError.of("`free`", expected=" or ".join(map(repr, FREE)), got=as_written(free))
-    chain = nominal.geometry.chain
-    check_joint_order(chain, data)
-    chain.joint_values(data.to(HOST).q)
-    if marker_std is not None:
-        check_number(marker_std, "`marker_std`, in m", above=0.0)
-
-
-def _priors(free: str, marker_std: float | None, *, known: bool) -> tuple[float, ...]:
-    """Prior standard deviations of the markers to try, m."""
-    if free == "base":
-        return (SAME_PLACE,)  # not used: the markers stay
-    if marker_std is not None:
-        return (marker_std,)
-    return tuple(first for first, _ in MARKER_DEVIATIONS.values()) if known else (OTHER_MARKER,)
+    return FoundPlace(found[metres], metres, _record(found[metres], said, known=search.known))
 
 
 @dataclass(frozen=True, eq=False)
-class SetUp:
+class Search:
     """What may be open in rows of a new set-up, and where a search for it may begin."""
 
-    model: FittedMap  # the map, placed anew before or not
-    nominal: GeometryMap  # that of the fit, under the payloads of the rows
+    model: FittedMap  # the map, placed anew before or not, under the payloads of the rows
     data: Measurements  # M rows that show P points
     old: Tensor  # (P, 3) where the model has them, or at the tip, m
     known: bool  # whether they may be there
     free: Tensor  # (6 + 3 P,) boolean, which unknowns of frame and points may have moved
 
     @classmethod
-    def of(
-        cls, model: FittedMap, nominal: GeometryMap, lever: float | None, data: Measurements, free: str, *, ball: bool
-    ) -> SetUp:
+    def of(cls, model: FittedMap, lever: float | None, data: Measurements, free: str, *, ball: bool) -> Search:
         """The rows beside a model; arguments and errors as of :func:`find_place`."""
-        before = model.registration
-        markers = fitted_markers(model.unregistered) if before is None else before.markers
+        before, fit = model.registration, model.unregistered
+        markers = fitted_markers(fit) if before is None else before.markers
         own, seen = Bodies(lever), data.bodies
         known = own.kind == seen.kind and data.markers == len(markers)
         if known:
@@ -174,7 +145,12 @@ class SetUp:
         numbers = torch.arange(6 + old.numel(), device=data.q.device)
         may = torch.where(numbers < 6, free != "marker", free != "base") & (numbers < len(numbers) - 3 * ball)
         _check_enough(data, framed=free != "marker", known=known)
-        return cls(model, nominal, data, old, known, may)
+        return cls(model.with_nominal(robot_map(fit).under(data.payload)), data, old, known, may)
+
+    @property
+    def fit(self) -> FittedMap:
+        """The map of the fit."""
+        return self.model.unregistered
 
     @property
     def same(self) -> bool:
@@ -188,58 +164,29 @@ class SetUp:
         return self.free * self.old.new_tensor(own)
 
     def starts(self, widest: float) -> list[NewRows]:
-        """The rows around each of the places where a search may begin, with the widest prior of the markers, m."""
-        places, fitted = self._places(widest), self.model.unregistered
-        rough = places[0][0]
-        noise, there = self._noise(rough), self.data.in_frames(torch.linalg.inv(rough).expand(len(self.data), -1, -1))
-        centre, nothing = self._seen(rough).flatten(0, 1).nanmean(0), noise.new_zeros(*noise.shape[:2], 0)
-        return [
-            NewRows(
-                fitted=fitted,
-                points=FlangePoints(self.nominal, markers, same=self.same),
-                transform=T,
-                q=self.data.q,
-                y=self._seen(T).flatten(1).nan_to_num(0.0),
-                noise=noise,
-                visible=measured_coordinates(noise),
-                shared=torch.cat([nothing, *(errors.slopes for errors in there.shared_errors())], 2),
-                deviations=self.deviations(widest),
-                away=torch.cat([centre.new_zeros(6), (self.old - markers).flatten()]),
-                known=self._earlier(centre),
-                by_fit=self._by_fit(),
-                centre=centre,
-                observe=None,
-                drifts=nothing.flatten(0, 1),
-            )
-            for T, markers in places
-        ]
+        """The rows around each of the places where a search may begin, with the widest prior of the markers, m.
 
-    def _places(self, widest: float) -> list[tuple[Tensor, Tensor]]:
-        """Frames (4, 4) and markers (P, 3), m: these at their old places, if known; and anywhere, if they may be."""
-        framed, points = bool(self.free[0]), self.data.points
-        if framed and not self.known:
-            return [self.anywhere()]
-        may = self.free[6:].view(points.shape[1], -1).any(1)
-        shown = (~points.isnan()).any(2).any(0) | ~may  # else some marker could be anywhere
-        # as many coordinates as unknowns would fit any place
-        open_ = framed and bool(may.any()) and bool(shown.all()) and len(known(points)) > len(self.free)
-        return [self.at_old_places(), *([self.anywhere()] if open_ and widest >= OTHER_MARKER else [])]
-
-    def _seen(self, T: Tensor) -> Tensor:
-        """The measured points in the frame of the map, T^-1 y, m; NaN where hidden."""
-        return (self.data.points - T[:3, 3]) @ T[:3, :3]
-
-    def _noise(self, rough: Tensor) -> Tensor:
-        """(M, 3 P, 3 P) covariance of the rows, m^2, without information where hidden; ``rough``: where the device is.
-
-        For another number of markers each has the mean covariance of the fitted ones.
+        The first has the markers at their old places, if known; the other, anywhere, if they may be. For another number
+        of markers each has the mean noise of the fitted ones.
         """
-        block, fit, size = self.model.new_noise, self.model.unregistered, 3 * self.data.markers
-        factor = float(block.trace() / fit.new_noise.trace()) if self.known else None
-        if len(block) != size:
-            block = torch.block_diag(*[own_blocks(block[None], len(block) // 3)[0].mean(0)] * self.data.markers)
-        total = noise_of_rows(fit, self.data, rough, block, factor)
-        return without_hidden(total, self.data.visible.repeat_interleave(3, 1))
+        data, framed, block = self.data, bool(self.free[0]), self.model.new_noise
+        set_up = NewSetUp(self.fit, data, Coordinates(data, torch.arange(len(data), device=data.q.device)))
+        factor = float(block.trace() / self.fit.new_noise.trace()) if self.known else None
+        if len(block) != 3 * data.markers:
+            block = torch.block_diag(*[own_blocks(block[None], len(block) // 3)[0].mean(0)] * data.markers)
+        places = [] if framed and not self.known else [self.at_old_places()]
+        may = self.free[6:].view(data.markers, -1).any(1)
+        shown = (~data.points.isnan()).any(2).any(0) | ~may  # else some marker could be anywhere
+        # as many coordinates as unknowns would fit any place
+        open_ = framed and bool(may.any()) and bool(shown.all()) and len(known(data.points)) > len(self.free)
+        if not places or (open_ and widest >= OTHER_MARKER):
+            places.append(self.anywhere())
+        found, by_fit = [], self._by_fit()
+        for T, markers in places:
+            rows = set_up.rows((T, markers), UsualNoise(block, factor), self.deviations(widest), same=self.same)
+            away = torch.cat([self.old.new_zeros(6), (self.old - markers).flatten()])
+            found.append(rows.changed(away=away, known=self._earlier(rows.centre), by_fit=by_fit))
+        return found
 
     def _earlier(self, centre: Tensor) -> Tensor:
         """(6 + 3 P, 6 + 3 P) covariance of frame and points by an earlier registration; zero without one."""
@@ -256,27 +203,28 @@ class SetUp:
         """(3 P, 3 P) covariance of the points' old places by the fit where it hardly knew them; a part of C."""
         if not self.same:
             return self.old.new_zeros(self.old.numel(), self.old.numel())
-        fitted, part = self.model.unregistered, self.nominal.geometry.slices["tool"]
+        nominal = robot_map(self.fit)
+        part = nominal.geometry.slices["tool"]
         numbers = torch.arange(part.start, part.stop, device=self.old.device)
-        variances, Q = torch.linalg.eigh(fitted.with_nominal(self.nominal.typical).parameter_covariance(numbers))
-        return (Q * (variances * (variances > HARDLY**2 * fitted.new_noise.diagonal().mean()))) @ Q.mT
+        variances, Q = torch.linalg.eigh(self.fit.with_nominal(nominal.typical).parameter_covariance(numbers))
+        return (Q * (variances * (variances > HARDLY**2 * self.fit.new_noise.diagonal().mean()))) @ Q.mT
 
     def at_old_places(self) -> tuple[Tensor, Tensor]:
         """Frame (4, 4) in closed form, m, and the points where they were."""
         T = torch.eye(4, dtype=self.data.q.dtype, device=self.data.q.device)
         if bool(self.free[0]):
-            points = FlangePoints(self.nominal, self.old, same=self.same)
-            model = self.model.unregistered.geodesic.with_nominal(points)
-            T = rigid_fit(model(self.data.q).view(-1, 3), self.data.points.flatten(0, 1))
+            marks = FlangePoints(robot_map(self.fit), self.old, same=self.same)
+            points = self.fit.geodesic.with_nominal(marks)(self.data.q)
+            T = rigid_fit(points.view(-1, 3), self.data.points.flatten(0, 1))
         return T, self.old
 
     def anywhere(self) -> tuple[Tensor, Tensor]:
         """Frame (4, 4) and points in closed form, m; what never moves stays."""
-        own, points = self.nominal.geometry, self.data.points
+        own, points = robot_map(self.fit).geometry, self.data.points
         tips = list(dict.fromkeys(own.on)) if len(own.on) == points.shape[1] else [own.on[0]]
         corners = tool_points(tool_transform(None).to(points.device)).repeat(len(tips), 1)
-        marks = FlangePoints(self.nominal, corners, on=tuple(tip for tip in tips for _ in range(3)))
-        seen = self.model.unregistered.geodesic.with_nominal(marks)(self.data.q)
+        marks = FlangePoints(robot_map(self.fit), corners, on=tuple(tip for tip in tips for _ in range(3)))
+        seen = self.fit.geodesic.with_nominal(marks)(self.data.q)
         poses = poses_from_marks(seen.view(-1, 3, 3), TOOL_LEVER)
         carrying = [tips.index(tip) for tip in own.on] if len(tips) > 1 else [0] * points.shape[1]
         found = place(poses.view(-1, len(tips), 4, 4)[:, carrying], points)
@@ -357,7 +305,7 @@ def worst_rows(rows: NewRows) -> list[int]:
 
 def _record(best: NewRows, said: dict[str, object], *, known: bool) -> Registration:
     """Everything in the new measuring frame; ``known``: whether the markers may be where they were."""
-    given, markers, free, T = best.given, best.points.points, best.free, best.transform
+    given, markers, free, T = best.given, best.marks.points, best.free, best.transform
     R, k = T[:3, :3], len(best.free)
     whole, gain = best.known.clone(), given.gain.new_zeros(len(best.known), given.gain.shape[1])
     whole[free], whole[:, free], gain[free] = 0.0, 0.0, given.gain[:k]
@@ -367,12 +315,12 @@ def _record(best: NewRows, said: dict[str, object], *, known: bool) -> Registrat
     covariance = 0.5 * (covariance + covariance.mT)
     usual = float((best.inflation * given.V.diagonal()[given.visible.flatten()].median()).sqrt())
     arm = float((given.shown(best.y).unflatten(1, (-1, 3)) - best.centre).square().sum(-1).nanmean().sqrt())
-    geometry, count, rigid = best.points.fitted.geometry, len(markers), said["lever"] is not None
+    geometry, count, rigid = best.marks.fitted.geometry, len(markers), said["lever"] is not None
     tips = geometry.on if len(geometry.on) == count else (geometry.chain.tip,) * count
     values = {
         "transform": T,
         "markers": markers,
-        "same": best.points.same,
+        "same": best.marks.same,
         "shift": -best.away[6:].view(-1, 3) if known else None,
         "covariance": covariance,
         "centre": R @ best.centre + T[:3, 3],

@@ -1,0 +1,459 @@
+"""Which hypothesis explains the errors of a calibration best? All of them open unknowns u with effects E_i on row i.
+
+    changes    c_i E_i u, with codes c_i that are zero before a row and one from it on, or that grow with the row number
+    mixtures   c_i E_i u, with codes of each row's own, of a few: two tools in turn, payloads of other rows
+
+Those that chance does not explain are compared by the left-out errors that remain with them, each relative to the most
+that its kind may leave: the best is named.
+
+Scales that were selected with a change in the rows call it noise; noise that has one sign before a row and the other
+after it is still no chance, since each row adds about one to the gain. Gains of changes pay for their unknowns and
+their row by the Bayesian information criterion. Codes of a mixture explain some noise too: what they explain by chance
+is measured with the effects of other rows.
+
+Errors of links and a wrong scale of the device look alike: the fit takes up either without a trace in its residuals.
+What tells them apart is how improbable links are that are wrong by so much: a length of the robot, its links or the
+device is a hypothesis beside the errors of a robot with usual errors of its links.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import inf, log
+from types import MappingProxyType
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.hypotheses import (
+    MARKERS,
+    SampledRows,
+    changes_of,
+    left_out_rms,
+    lengths_of,
+    worth_it,
+)
+from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, variance_ratio
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.common.errors import few, sentence, warn_user, with_deviation
+from diffeo_calib.common.quantiles import chi2_above
+from diffeo_calib.process.evidence import Evidence
+from diffeo_calib.process.process import Process
+from diffeo_calib.process.scales import Hyperparameters
+from diffeo_calib.process.tails import FACTORS
+from diffeo_calib.sensors.devices import MILLIMETRE, Hypothesis
+
+ROUNDS = 20
+"""Of the codes of a mixture."""
+MISTYPED = (10.0, 0.1, 1000.0, 0.001, 1 / 0.45359237, 0.45359237)
+"""Factors of one payload in another unit, or with a wrong digit: g, pounds."""
+SLOW = (
+    "if it stood in several places, name the set-ups in a column (`session`); else let robot and device warm up, and "
+    "measure in random order; or name a column of times or temperatures (`time`, `temperature`), with which the model "
+    "then drifts"
+)
+
+
+class Candidate(NamedTuple):
+    """An explanation that chance does not explain, in words, and the unknowns that it opens.
+
+    Args:
+        columns: (M, U) effects of the unknowns, of any size, on the numbers of the rows. most: part of the RMS left-out
+            error that may remain with them.
+    """
+
+    what: str
+    expected: str
+    given: str
+    fix: str
+    columns: Tensor
+    most: float
+
+
+def judge(
+    data: TangentData,
+    scales: Hyperparameters,
+    left_out: LeaveOneOut,
+    lines: Tensor,
+    *,
+    devices: Iterable[Hypothesis] = (),
+    bodies: Mapping[str, str] = MappingProxyType({}),
+) -> str | None:
+    """The explanation with which left-out errors fall most, relative to what its kind asks for; None without any.
+
+    Args:
+        data, scales, left_out: the rows of a calibration, its scales and left-out errors. lines: (N,) of the rows in
+            their file: their order is that of the measurements. devices: what may change of devices in unknown places.
+            bodies: better names of the measuring device and of what is on the tool.
+    """
+    rows, lines = SampledRows.of(data, scales), lines.to(data.x.device)
+    if len(rows.index) < 4 * gates.CHANGE_ROWS:
+        return None
+    changes, own = changes_of(rows.data, devices, rows.index), lines[rows.index]
+    named = [one._replace(name=bodies.get(one.name, one.name)) for one in changes]
+    found = [*changed(rows, named, own, excess=max(1.0, variance_ratio(data, left_out)))]
+    if len(own) >= gates.MIXED_ROWS:
+        found += [own for one in changes if one.name == MARKERS for own in two_tools(rows, one.effects, lines)]
+        found += other_payloads(rows, data, lines)
+    return best_of(found, rows)
+
+
+def best_of(found: Iterable[Candidate], rows: SampledRows) -> str | None:
+    """That with which left-out errors fall most, relative to what may remain."""
+    shares = ((rows.left(one.columns) / one.most, one) for one in found)
+    share, best = min(shares, key=lambda own: own[0], default=(inf, None))
+    if best is None or share > 1.0:
+        return None
+    left = share * best.most
+    moved = left_out_rms(rows.process) * (1.0 - left**2) ** 0.5
+    got = f"about {1e3 * moved:.2g} mm of error, and leave-one-out errors that fall to {100 * left:.0f} % {best.given}"
+    return sentence(best.what, expected=best.expected, got=got, fix=best.fix)
+
+
+# --- changes during the measurements ----------------------------------------------------------------------------------
+
+
+class Change(NamedTuple):
+    """A hypothesis from a row on, or drifting over all rows.
+
+    Args:
+        hypothesis: with effects (N, R, U). codes: (N,) of the rows, see above. size: (U,) unknowns, of a drift between
+            the first row and the last. gain: what it explains. row: the first one after a change, in the order of
+            measurement; None for a drift.
+    """
+
+    hypothesis: Hypothesis
+    codes: Tensor
+    size: Tensor
+    gain: float
+    row: int | None
+
+    @property
+    def evidence(self) -> float:
+        """Gain less the price of the unknowns by the Bayesian information criterion; the row is one more."""
+        return self.gain - (len(self.size) + (self.row is not None)) * log(len(self.codes))
+
+    def words(self, rows: SampledRows) -> str:
+        """Phrase for the change and its size."""
+        name, verb = self.hypothesis.name, "to drift" if self.row is None else "to have moved"
+        if self.hypothesis.unit is not None:
+            verb = verb if self.row is None else "to have changed"
+            return f"{name} seems {verb} by about {self.hypothesis.amount(float(self.size.abs().max()))}"
+        distances = rows.distances(self.hypothesis.effects, self.size)
+        typical = distances[distances.amax(1) > 0].median(0).values
+        distance = float(typical[typical > 0].median())
+        if name == MARKERS and rows.data.basis is None:
+            distance = float(typical.max())
+            single = float(typical.min()) < gates.OTHER_MARKERS * distance
+            name = f"marker {int(typical.argmax())}" if single else name
+        return f"{name} seems {verb} by about {self.hypothesis.amount(distance)}"
+
+
+def changed(
+    rows: SampledRows, hypotheses: Sequence[Hypothesis], lines: Tensor, *, excess: float = 1.0
+) -> Iterator[Candidate]:
+    """The clearest change during the measurements; arguments as of :func:`changes`, and lines (N,) of the rows."""
+    process, order = rows.process, lines.argsort()
+    found = [*changes(hypotheses, process, order, excess=excess)]
+    best = max(found, key=lambda one: one.evidence)
+    if best.evidence < gates.CHANGE_EVIDENCE:
+        return
+    (what, E, _, advice, *_), expected = best.hypothesis, "one set-up for all rows, in the order of their numbers"
+    given, fix = "with this change in the model", f"check what happened then; {advice}"
+
+    def as_good(one: Change) -> bool:
+        apart = min(best.gain - one.gain, best.evidence - one.evidence)
+        same = (one.row is None) == (best.row is None)
+        return same and one.hypothesis.name != what and apart < gates.CHANGES_TOLD_APART
+
+    others = [one for one in found if as_good(one)]
+    words = ", or ".join(dict.fromkeys(one.words(rows) for one in (best, *others)))
+    words += " (these rows do not tell which)" * bool(others)
+    columns = rows.columns(E, best.codes)
+    if best.row is not None:
+        words += f" near row {int(lines[order[best.row]])}"
+        yield Candidate(words, expected, given, fix, columns, gates.WORTH)
+        return
+    yield Candidate(f"{words} over the rows", expected, given, SLOW, columns, gates.WORTH)
+    # three set-ups look like a drift: the first change is sought once more beside the second one
+    first, second = (_likeliest(*scans([E], process, order)), 0)
+    for _ in range(2):
+        beside = process.opened(rows.columns(E, _from(order, first)))
+        first, second = _likeliest(*scans([E], beside, order)), first
+    if abs(first - second) >= gates.CHANGE_ROWS:
+        near = " and ".join(str(int(lines[order[row]])) for row in sorted((first, second)))
+        columns = torch.cat([rows.columns(E, _from(order, row)) for row in (first, second)], 1)
+        words = f"{what} seems to have moved more than once, near rows {near}"
+        yield Candidate(words, expected, "with these changes", fix, columns, gates.WORTH**2)
+
+
+def changes(
+    hypotheses: Sequence[Hypothesis], process: Process, order: Tensor, *, excess: float = 1.0
+) -> Iterator[Change]:
+    """Every hypothesis from its most likely row on, and drifting.
+
+    Gains are divided by ``excess``, or by the mean square of what is left unexplained where that is larger.
+    ``order``: (N,) row numbers in the order of measurement.
+    """
+    ramp = order.argsort().to(process.mu) / (len(order) - 1) - 0.5
+    for one, scan in zip(hypotheses, scans([one.effects for one in hypotheses], process, order), strict=True):
+        row = _likeliest(scan)
+        jump = scan._replace(g=scan.g[row], H=scan.H[row])
+        drift = Evidence.of(process.numbers.of_table(ramp[:, None, None] * one.effects), process)
+        for found, codes, first in ((jump, _from(order, row), row), (drift, ramp, None)):
+            gain = float(found.gain) / max(excess, float(found.excess))
+            yield Change(one, codes, found.size, gain, first)
+
+
+def scans(effects: Sequence[Tensor], process: Process, order: Tensor) -> Iterator[Evidence]:
+    """For each of some effects (N, R, U) the evidence of changes from every row of the order on, (N, U) and (N, U, U).
+
+    H of the rows from k on is that of the rows from k + 1 on, and what row k adds with itself and with these.
+    """
+    numbers, place = process.numbers, order.argsort().to(process.mu)[process.numbers.owner]
+    later = process.inverse * (0.5 + 0.5 * (place - place[:, None]).sign())  # half of that of a row with itself
+    total, count = float(numbers.target @ process.mu), len(place)
+    for E in effects:
+        g = (E * numbers.in_table(process.mu)[..., None]).sum(1)
+        H = E.mT @ numbers.in_table(later @ numbers.of_table(E))
+        g, H = (each[order].flip(0).cumsum(0).flip(0) for each in (g, H + H.mT))
+        yield Evidence(g, H, total, count)
+
+
+def _likeliest(scan: Evidence) -> int:
+    """Place in the order of the row from which a change explains most, some rows on either side."""
+    fewest = gates.CHANGE_ROWS
+    return fewest + int(scan.gain[fewest : len(scan.g) - fewest + 1].argmax())
+
+
+def _from(order: Tensor, row: int) -> Tensor:
+    """Codes (N,) of a change from a row of the order on."""
+    return (order.argsort() >= row).double()
+
+
+# --- rows of several kinds --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Rows with effects (N, R, U) of unknowns ~ N(0, 1), each with one of K codes (N, K) that no column tells.
+
+    By turns the unknowns follow from the codes, and each code from these and the other rows, as in a mixture whose
+    rows are all decided.
+    """
+
+    rows: SampledRows
+    effects: Tensor
+    codes: Tensor
+
+    def evidence(self, chosen: Tensor) -> tuple[Tensor, float]:
+        """The unknowns (U,) with these codes (N,), and by how much the log evidence grows."""
+        found = Evidence.of(self.rows.columns(self.effects, chosen), self.rows.process)
+        eye = torch.eye(len(found.g), dtype=found.g.dtype, device=found.g.device)
+        return torch.linalg.solve(found.H + eye, found.g), float(found.log_odds(found.g.new_ones(1)))
+
+    def pulls(self, chosen: Tensor, u: Tensor) -> Evidence:
+        """What each row alone says of unknowns of its own beside the codes: g (N, U) and H (N, U, U)."""
+        process, numbers = self.rows.process, self.rows.process.numbers
+        left = process.mu - process.inverse @ (self.rows.columns(self.effects, chosen) @ u)
+        own = numbers.blocks_in_table(numbers.diagonal_blocks(process.inverse))
+        g = (self.effects * numbers.in_table(left)[..., None]).sum(1)
+        return Evidence(g, self.effects.mT @ own @ self.effects)
+
+    def decided(self, chosen: Tensor, u: Tensor) -> Tensor:
+        """(N,) the likeliest code of each row while the others keep theirs."""
+        own, step = self.pulls(chosen, u), self.codes - chosen[:, None]
+        best = 2 * step * (own.g @ u)[:, None] - step.square() * (own.H @ u @ u)[:, None]
+        return self.codes.gather(1, best.argmax(1, keepdim=True))[:, 0]
+
+    def settled(self, chosen: Tensor) -> tuple[Tensor, Tensor, float]:
+        """Codes, unknowns and log evidence from these codes on."""
+        u, odds = self.evidence(chosen)
+        for _ in range(ROUNDS):
+            other = self.decided(chosen, u)
+            better = self.evidence(other)
+            if better[1] <= odds:
+                break
+            chosen, (u, odds) = other, better
+        return chosen, u, odds
+
+
+def two_tools(rows: SampledRows, effects: Tensor, lines: Tensor) -> Iterator[Candidate]:
+    """Markers or tools that take turns, by the effects (N, R, U) of their shifts; lines of all rows."""
+    E, N = effects * rows.data.place_deviation, len(effects)
+    mixed = Mixture(rows, E, E.new_tensor([-0.5, 0.5]).expand(N, 2))
+    own = mixed.pulls(E.new_zeros(N), E.new_zeros(E.shape[2]))
+    size = own.H.diagonal(dim1=1, dim2=2).sum(1, keepdim=True)
+    away = own.g / size.clamp(min=torch.finfo(size.dtype).tiny)  # of each row, whatever it weighs
+    along = away @ torch.linalg.svd(away - away.mean(0), full_matrices=False).Vh[0]
+    k, sums = torch.arange(1, N, device=E.device), (along.sort().values - along.mean()).cumsum(0)[:-1]
+    split = along.sort().values[(sums.square() / (k * (N - k))).argmax()]  # N. Otsu, 1979
+    chosen, u, _ = mixed.settled(torch.where(along > split, 0.5, -0.5))
+    fewer = chosen == (0.5 if float(chosen.mean()) < 0 else -0.5)
+    if int(fewer.sum()) >= gates.CHANGE_ROWS:
+        moved = 1e3 * float(rows.distances(E, u).amax(1).median())
+        what = f"{int(fewer.sum())} of {N} rows seem to have another tool or marker, {moved:.3g} mm away: lines "
+        fix = "name the tool of every row in a column (`marker`; or `session` with `remounted`)"
+        words = what + few(lines[rows.index][fewer].tolist(), 5), "one tool", "with two", fix
+        yield Candidate(*words, rows.columns(E, chosen), gates.TWO_TOOLS_LEFT)
+
+
+def other_payloads(rows: SampledRows, data: TangentData, lines: Tensor) -> Iterator[Candidate]:
+    """Payloads that would explain the rows far better than their own.
+
+    Args:
+        rows: those that are judged. data: all rows. lines: (N,) of all rows in their file.
+    """
+    load, some = data.nominal.load, rows.data
+    masses = load.masses.to(data.x)
+    if not load.by_row or len(masses.unique()) > gates.MOST_MASSES:
+        return
+    part, own = some.nominal.sag, masses[rows.index] / load.unit
+    loaded = torch.arange(part.start, part.stop, device=masses.device)[some.nominal.elasticity.loaded]
+    full = some.nominal.under(torch.full_like(own, load.unit))  # the sag of every row under the same mass
+    S = full.sensitivities(some.x, some.theta)[..., loaded]
+    sizes = some.prior_variance(replace(rows.process.scales, payload=1.0))[loaded].sqrt()
+    E = some.motions_in_numbers(S if some.slopes is None else some.slopes @ S) * sizes
+    mixed = Mixture(rows, E, masses.unique() / load.unit - own[:, None])
+    others = {words: other[rows.index] / load.unit - own for words, other in _other_columns(masses, lines)}
+    odds = {words: mixed.evidence(codes)[1] for words, codes in others.items()}
+    best, expected = max(odds, key=lambda words: odds[words]), "every payload in the row that carried it"
+    if odds[best] > gates.PAYLOAD_ODDS:
+        words = f"the payloads seem to be {best}", expected, "so", "check the column: its order, unit and digits"
+        yield Candidate(*words, rows.columns(E, others[best]), gates.WORTH)
+        return
+    u, shuffled = rows.process.estimate[loaded] / sizes, torch.randperm(len(own), generator=seeded(0), device=HOST)
+    chance = Mixture(rows, E[shuffled.to(E.device)], mixed.codes)
+    (chosen, _, found), by_chance = (each.settled(each.decided(0 * own, u)) for each in (mixed, chance))
+    if found - by_chance[2] >= gates.PAYLOAD_ODDS:
+        wrong = chosen != 0
+        what = f"{int(wrong.sum())} of {len(own)} rows seem to have carried payloads of other rows, such as lines "
+        fix = "check that the column belongs to these rows; else leave it out"
+        words = what + few(lines[rows.index][wrong].tolist(), 5), expected, "so", fix
+        yield Candidate(*words, rows.columns(E, chosen), gates.PAYLOADS_LEFT)
+
+
+def _other_columns(masses: Tensor, lines: Tensor) -> Iterator[tuple[str, Tensor]]:
+    """Payloads (N,) as they may have been meant, in words: of other lines, or one of them in another unit."""
+    order = lines.argsort()
+    for lag in range(1, gates.LARGEST_LAG + 1):
+        for way, step in (("later", -lag), ("earlier", lag)):
+            yield f"those {lag} line{'s' * (lag > 1)} {way}", masses[order].roll(step)[order.argsort()]
+    for mass in masses.unique().tolist():
+        for factor in MISTYPED:
+            yield f"{factor * mass:.4g} where they are {mass:g}", torch.where(masses == mass, factor * mass, masses)
+
+
+# --- unknowns of one size: numbers that differ from row to row --------------------------------------------------------
+
+
+def variation(data: TangentData, scales: Hyperparameters, hypotheses: Sequence[Hypothesis]) -> tuple[float, str] | None:
+    """The likeliest number that differs from row to row, if it is clear: an unknown u_i ~ N(0, s^2) of every row i.
+
+    It is clear beside the tails of the noise, but seems small beside those that it makes: s counts all but gross rows.
+
+    Returns:
+        s, m, rad or relative, and a sentence about it.
+    """
+    if not hypotheses:
+        return None
+    rows = SampledRows.of(data, scales)
+
+    def sized(rows: SampledRows, one: Hypothesis) -> tuple[float, float, Hypothesis]:
+        E = torch.nn.functional.one_hot(rows.process.numbers.owner).to(data.x) * rows.columns(one.effects)
+        return (*rows.likeliest_size(E[:, E.any(0)]), one)
+
+    found = (sized(rows, rows.of_all(one)) for one in hypotheses)
+    odds, _, best = max(found, key=lambda own: own[0])
+    if odds < gates.ROW_ODDS:
+        return None
+    tails = rows.data.tails
+    tails = replace(tails, weights=tails.weights.where(tails.weights < 1.0 / FACTORS[0], 1.0))
+    _, size, _ = sized(rows._replace(process=rows.data.with_tails(tails).process(scales)), best)
+    moved = 1e3 * size * float((3 * best.effects[best.effects != 0].square().mean()).sqrt())
+    got = f"about {best.amount(size)}, which moves the tool by {moved:.2g} mm"
+    what, expected = f"{best.name} seems to differ", "the same for all rows"
+    return size, sentence(what, expected=expected, got=got, fix=best.fix)
+
+
+def warn_of_taken_scales(taken: LeaveOneOut, own: LeaveOneOut) -> None:
+    """Warn if left-out errors prove that the scales of other robots are not those of these rows."""
+    if worth_it(taken.errors, own.errors):
+        left = float((own.errors.square().nansum() / taken.errors.square().nansum()).sqrt())
+        got = f"leave-one-out errors that fall to {100 * left:.0f} % with scales of their own"
+        warn_user(sentence("`scales_of` does not suit these rows", got=got, fix="leave it out (--scales-of)"))
+
+
+# --- lengths against what they are said to be -------------------------------------------------------------------------
+
+
+class Length(NamedTuple):
+    """A length against what it is said to be.
+
+    Args:
+        cause: what. value, deviation: how much it differs, in m or relative. motion: RMS motion of a point by a unit of
+            it, m. unnoticed: largest value that a usual robot shows by chance, and that passes without a warning.
+    """
+
+    cause: Hypothesis
+    value: float
+    deviation: float
+    motion: float
+    unnoticed: float
+
+    def __str__(self) -> str:
+        unit, size = self.cause.unit or MILLIMETRE
+        found = with_deviation(self.value / size, self.deviation / size)
+        return (
+            f"{self.cause.name} against its description: {found} {unit}, which moves points by "
+            f"{1e3 * abs(self.value) * self.motion:.2g} mm; up to {self.cause.amount(self.unnoticed)} "
+            f"({1e3 * self.unnoticed * self.motion:.2g} mm) may be wrong without a warning"
+        )
+
+
+def lengths(data: TangentData, scales: Hyperparameters, devices: Iterable[Hypothesis] = ()) -> list[Length]:
+    """Lengths against what they are said to be, that of the whole robot first, beside errors of usual size.
+
+    Args:
+        data: the measurements. scales: those of the model. devices: what devices are said to hold, such as a focal
+            length.
+    """
+    usual = {name: getattr(scales, name).clamp(max=most) for name, most in gates.USUAL_SCALES.items()}
+    turning = torch.tensor(data.space.periodic, dtype=torch.bool, device=data.x.device)
+    most = torch.where(turning, inf, gates.USUAL_SLIDE).to(scales.transmission_amplitude)
+    usual["transmission_amplitude"] = scales.transmission_amplitude.minimum(most)
+    known = replace(scales, **usual)
+    rows = SampledRows.of(data, scales if torch.equal(known.vector, scales.vector) else known)
+    causes = [*lengths_of(rows.data), *(one._replace(effects=one.effects[rows.index]) for one in devices)]
+    E, process = torch.cat([one.effects for one in causes], 2), rows.process
+    columns = rows.columns(rows.data.motions_in_numbers(E))
+    H, total = (columns * process.factor.solve(columns)).sum(0), float(process.numbers.target @ process.mu)
+    each = Evidence((columns.T @ process.mu)[:, None], H[:, None, None], total, len(columns))
+    deviations = (each.excess / H + H.new_tensor([one.usual for one in causes]).square()).sqrt()
+    motions = (3 * (E - E.mean(0))[rows.data.visible].square().mean(0)).sqrt()
+    seen = [number for number, own in enumerate(H.tolist()) if own > 0.0]
+    allowed = chi2_above(gates.LENGTH_CHANCE / max(len(seen), 1), 1) ** 0.5
+    sizes, sd, moved = (values.flatten().tolist() for values in (each.size, deviations, motions))
+    return [Length(causes[k], sizes[k], sd[k], moved[k], allowed * sd[k]) for k in seen]
+
+
+def warn_of_lengths(found: list[Length]) -> float | None:
+    """Warn of the least probable length, if it is too improbable; by how much any such length moves points, m."""
+    wrong = [one for one in found if abs(one.value) > one.unnoticed]
+    if not wrong:
+        return None
+    worst = max(wrong, key=lambda one: abs(one.value) / one.deviation)
+    doubted = [one for one in wrong if not one.cause.usual or abs(one.value) > gates.TAKEN_UP]
+    moved = max((abs(one.value) * one.motion for one in doubted), default=None)
+    text = sentence(
+        f"{worst.cause.name} seems to differ by {worst.cause.amount(worst.value, '+')} from what it is said to be",
+        expected=f"at most about {worst.cause.amount(3 * worst.deviation)}: links and devices are seldom that wrong",
+        got=None if moved is None else f"absolute positions that may be wrong by {1e3 * moved:.2g} mm RMS",
+        fix=worst.cause.fix + "; the expected error does not hold before that is settled" * (moved is not None),
+    )
+    warn_user(text)
+    return moved

@@ -1,1 +1,0 @@
-"""A model after the measuring device, a marker or the tool has moved: found anew from a few rows."""
