@@ -62,7 +62,7 @@ class GeometryMap(NominalMap):
         self._tables = {name: Waves(*map(torch.from_numpy, table)) for name, table in tables.items()}
         sizes = self.elasticity.size if self.elasticity else 0, *own.sizes
         ends = [geometry.size + sum(sizes[:k]) for k in range(len(sizes) + 1)]
-        self.parts = dict(zip(("sag", "waves", "axes"), map(slice, ends, ends[1:]), strict=True))
+        self.parts: dict[str, slice] = dict(zip(("sag", "waves", "axes"), map(slice, ends, ends[1:]), strict=True))
         self.sag, self.parameters = self.parts["sag"], ends[-1]
         entries, parts = range(geometry.size), geometry.slices
         self.places = (*entries[parts["base"]], *entries[parts["tool"]])
