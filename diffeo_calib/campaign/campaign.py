@@ -19,7 +19,7 @@ from torch import Tensor
 from diffeo_calib.calibration.calibrate import Table, calibrate, check_arguments
 from diffeo_calib.calibration.planning.candidates import candidates as drawn
 from diffeo_calib.calibration.result import CalibrationResult
-from diffeo_calib.campaign.model import CampaignModel
+from diffeo_calib.campaign.model import Around, CampaignModel
 from diffeo_calib.campaign.verdicts import Verdict
 from diffeo_calib.common.checks import check_number, check_seed
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
@@ -221,7 +221,7 @@ class Campaign:
         if self._model is not None:
             rows, expected = self._model.next(count if goal is None else max(count, MOST_STEPS))
             needed = None if goal is None else _needed(expected, goal, self._model.count)
-            found = Next(self._model.asked[0][rows[:count]], rows[:count], expected, needed)
+            found = Next(self._model.around.candidates[rows[:count]], rows[:count], expected, needed)
         if not again:
             return None if self._model is None else found
         q = torch.cat([self.table.q[again], found.q])[:count]
@@ -288,24 +288,26 @@ class Campaign:
     @small_work()
     def _make(self, table: Any, verdicts: Sequence[Verdict]) -> None:
         """A new model from accepted rows; without one if they do not allow it yet."""
-        count, old = sum(one.accepted for one in verdicts), self._model
-        scales = None if old is None or count >= self._next_scales(old) else old.scales
-        first = count < FIRST_SCALES
+        numbers, old = [one.row for one in verdicts if one.accepted], self._model
+        count, first = len(numbers), len(numbers) < FIRST_SCALES
+        same = old is not None and count < self._next_scales(old)
         asked = self.candidates, self.target[:: -(-len(self.target) // TARGETS)]
         try:
-            choice, certain = (scales, first, self.seed), self.goal is not None
-            made = CampaignModel.of(self.robot, table, verdicts, asked, choice, certain=certain)
+            scales = old.around.scales if same else None
+            around = Around.of(self.robot, table.rows(numbers), asked, scales, first=first, seed=self.seed)
+            around = around.with_open_candidates(CANDIDATES, self.seed) if self._draws else around
+            known: Any = {"selected": 0 if first else count}
+            if same:
+                known = {name: getattr(old, name) for name in ("selected", "deviation", "ratios")}
+            elif self.goal is not None and not first:
+                known["deviation"] = around.deviation()
+            made = CampaignModel(around, table, verdicts, count=count, **known)
             if old is None:
                 made.check_placed()
         except DiffeoCalibError as error:
             self._obstacle = str(error)
             return
-        if self._draws:
-            made = made.with_open_candidates(CANDIDATES, self.seed, table, verdicts)
-            self.candidates = made.asked[0]
-        if old is not None and scales is not None:
-            made.ratios = list(old.ratios)  # else new scales have yet to show how good they are
-            made.selected, made.deviation = old.selected, old.deviation
+        self.candidates = around.candidates
         self.models += 1
         self._made.append(made)
 

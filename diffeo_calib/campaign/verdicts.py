@@ -24,6 +24,7 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.common.quantiles import chi2_above, chi2_probability
 from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.numbers import Numbers
+from diffeo_calib.process.process import Expected
 from diffeo_calib.sensors.devices import Hypothesis
 
 
@@ -99,24 +100,6 @@ class Verdict:
         return same | sizes | {"change": change, "text": str(self)}
 
 
-class Seen(NamedTuple):
-    """Rows as the accepted ones before them predict them.
-
-    Args:
-        numbers: R of them. error: (R,) measured minus predicted, m. covariance: (R, R) with noise, m^2.
-    """
-
-    numbers: Numbers
-    error: Tensor
-    covariance: Tensor
-
-    def given(self, wanted: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
-        """Errors, m, and covariance, m^2, of some numbers given others: masks (R,) of both."""
-        cross = self.covariance[wanted][:, known]
-        gain = torch.linalg.solve(self.covariance[known][:, known], cross.T).T
-        return self.error[wanted] - gain @ self.error[known], self.covariance[wanted][:, wanted] - gain @ cross.T
-
-
 class Measure(NamedTuple):
     """The distance of a row: d^2, its degrees of freedom, and the RMS of its error and of the expected one, m."""
 
@@ -130,19 +113,38 @@ class Measure(NamedTuple):
         return self.square <= typical * chi2_above(chance, self.freedom)
 
 
-def measure(seen: Seen, row: int, known: Tensor, freedom: int, some: Tensor | None = None) -> Measure:
-    """The distance of a row from what accepted rows and some others say.
+class Seen(NamedTuple):
+    """Rows as accepted ones before them predict them.
 
     Args:
-        seen: rows in order. row: its place. known: (N,) boolean: the rows that count as right. freedom: of the row.
-        some: (R,) boolean: which of all numbers count; all of the row by default.
+        numbers: of the rows. error: (R,) of R of them, measured minus predicted, m. covariance: (R, R) with noise, m^2.
     """
-    owner = seen.numbers.owner
-    wanted = (owner == row) if some is None else some & (owner == row)
-    error, covariance = seen.given(wanted, known[owner] & (owner != row))
-    square = float(error @ torch.linalg.solve(covariance, error))
-    expected = float(covariance.diagonal().mean().clamp(min=0).sqrt())
-    return Measure(square, freedom, float(error.square().mean().sqrt()), expected)
+
+    numbers: Numbers
+    error: Tensor
+    covariance: Tensor
+
+    @classmethod
+    def of(cls, at: Expected, noise: Tensor) -> Seen:
+        """All numbers; ``noise``: (N, r, r) of the rows, m^2."""
+        covariance = at.numbers.add_blocks(at.covariance, at.numbers.blocks_of_table(noise))
+        return cls(at.numbers, at.numbers.target - at.mean, covariance)
+
+    def some(self, wanted: Tensor) -> Seen:
+        """Some of them, (R,) boolean."""
+        return Seen(self.numbers, self.error[wanted], self.covariance[wanted][:, wanted])
+
+    def given(self, wanted: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+        """Errors, m, and covariance, m^2, of some numbers given others: masks (R,) of both."""
+        cross = self.covariance[wanted][:, known]
+        gain = torch.linalg.solve(self.covariance[known][:, known], cross.T).T
+        return self.error[wanted] - gain @ self.error[known], self.covariance[wanted][:, wanted] - gain @ cross.T
+
+    def measure(self, freedom: int) -> Measure:
+        """Their distance, with so many degrees of freedom."""
+        square = float(self.error @ torch.linalg.solve(self.covariance, self.error))
+        expected = float(self.covariance.diagonal().mean().clamp(min=0).sqrt())
+        return Measure(square, freedom, float(self.error.square().mean().sqrt()), expected)
 
 
 def find_change(

@@ -242,7 +242,7 @@ class Devices(Extrinsics):
     @property
     def places(self) -> Tensor:
         """(D, 3) to which the ball must be brought to be seen, m; none if anywhere will do."""
-        return self.constants[:0, :3]
+        return self.constants.new_zeros(0, 3)
 
     def sees(self, points: Tensor, device: Tensor) -> Tensor:
         """(N,) boolean: whether these devices (N,) can measure points (N, 3), m."""

@@ -238,6 +238,21 @@ def test_a_joint_that_jumps_is_named_with_row_and_size(joint: int, size: float) 
     assert ("these rows do not tell which" in text) == (joint in (0, 5))
 
 
+@pytest.mark.filterwarnings("ignore:leave-one-out errors contradict")
+def test_a_model_holds_for_the_rows_before_a_slip() -> None:
+    """Its error was half of the slip, with a quarter of the true places outside of the regions."""
+    arm = SimulatedArm(3)
+    q, points = arm.measure(80, seed=1)
+    points[50:, 0] += arm.truth.poses(q)[50:, :3, 1] * 1e-3
+    with pytest.warns(DiffeoCalibWarning, match="near row 50.* the model holds for the rows before it"):
+        model = dc.calibrate(arm.nominal, dc.Measurements(q, points), hyperparameters=scales()).model
+    new = arm.sample(200, seed=2)
+    mean, covariance = model.predict(new, noise=False)
+    errors = arm.true_points(new) - mean
+    assert errors.norm(dim=-1).square().mean().sqrt() < 1e-4
+    assert covariance.diagonal(dim1=-2, dim2=-1).sum() < 4 * errors.square().sum()
+
+
 def test_a_slow_drift_is_told_from_a_jump() -> None:
     arm = SimulatedArm(3)
     q, points = arm.measure(80, seed=1)

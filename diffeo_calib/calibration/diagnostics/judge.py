@@ -51,6 +51,8 @@ ROUNDS = 20
 """Of the codes of a mixture."""
 MISTYPED = (10.0, 0.1, 1000.0, 0.001, 1 / 0.45359237, 0.45359237)
 """Factors of one payload in another unit, or with a wrong digit: g, pounds."""
+OPENED_M = 0.01
+"""Prior RMS motion by what is opened in a model: far more than what is found, else it is gross."""
 SLOW = (
     "if it stood in several places, name the set-ups in a column (`session`); else let robot and device warm up, and "
     "measure in random order; or name a column of times or temperatures (`time`, `temperature`), with which the model "
@@ -63,7 +65,8 @@ class Candidate(NamedTuple):
 
     Args:
         columns: (M, U) effects of the unknowns, of any size, on the numbers of the rows. most: part of the RMS left-out
-            error that may remain with them.
+            error that may remain with them. opens: rows for which the model holds, those without effects, once they are
+            opened in it; none if not.
     """
 
     what: str
@@ -72,6 +75,17 @@ class Candidate(NamedTuple):
     fix: str
     columns: Tensor
     most: float
+    opens: str = ""
+
+
+class Finding(NamedTuple):
+    """The best explanation in a sentence.
+
+    Columns (N, R, U), m, are the effects of unknowns that the model shall have, with unit variance; None for none.
+    """
+
+    text: str
+    columns: Tensor | None
 
 
 def judge(
@@ -82,7 +96,7 @@ def judge(
     *,
     devices: Iterable[Hypothesis] = (),
     bodies: Mapping[str, str] = MappingProxyType({}),
-) -> str | None:
+) -> Finding | None:
     """The explanation with which left-out errors fall most, relative to what its kind asks for; None without any.
 
     Args:
@@ -99,10 +113,11 @@ def judge(
     if len(own) >= gates.MIXED_ROWS:
         found += [own for one in changes if one.name == MARKERS for own in two_tools(rows, one.effects, lines)]
         found += other_payloads(rows, data, lines)
-    return best_of(found, rows)
+    whole = len(rows.index) == len(data.x)
+    return best_of([one if whole else one._replace(opens="") for one in found], rows)
 
 
-def best_of(found: Iterable[Candidate], rows: SampledRows) -> str | None:
+def best_of(found: Iterable[Candidate], rows: SampledRows) -> Finding | None:
     """That with which left-out errors fall most, relative to what may remain."""
     shares = ((rows.left(one.columns) / one.most, one) for one in found)
     share, best = min(shares, key=lambda own: own[0], default=(inf, None))
@@ -111,7 +126,13 @@ def best_of(found: Iterable[Candidate], rows: SampledRows) -> str | None:
     left = share * best.most
     moved = left_out_rms(rows.process) * (1.0 - left**2) ** 0.5
     got = f"about {1e3 * moved:.2g} mm of error, and leave-one-out errors that fall to {100 * left:.0f} % {best.given}"
-    return sentence(best.what, expected=best.expected, got=got, fix=best.fix)
+    fix, columns = best.fix, None
+    if best.opens:
+        fix += f"; the model holds for {best.opens}"
+        numbers = rows.process.numbers.in_table(best.columns).unbind(2)
+        columns = torch.stack([rows.data.in_coordinates(one) for one in numbers], 2)
+        columns = OPENED_M * columns / columns[columns.any(2)].square().sum(1).mean().sqrt()
+    return Finding(sentence(best.what, expected=best.expected, got=got, fix=fix), columns)
 
 
 # --- changes during the measurements ----------------------------------------------------------------------------------
@@ -176,9 +197,10 @@ def changed(
     columns = rows.columns(E, best.codes)
     if best.row is not None:
         words += f" near row {int(lines[order[best.row]])}"
-        yield Candidate(words, expected, given, fix, columns, gates.WORTH)
+        yield Candidate(words, expected, given, fix, columns, gates.WORTH, opens="the rows before it")
         return
-    yield Candidate(f"{words} over the rows", expected, given, SLOW, columns, gates.WORTH)
+    words, middle = f"{words} over the rows", "the middle of the rows"
+    yield Candidate(words, expected, given, SLOW, columns, gates.WORTH, opens=middle)
     # three set-ups look like a drift: the first change is sought once more beside the second one
     first, second = (_likeliest(*scans([E], process, order)), 0)
     for _ in range(2):
@@ -188,7 +210,8 @@ def changed(
         near = " and ".join(str(int(lines[order[row]])) for row in sorted((first, second)))
         columns = torch.cat([rows.columns(E, _from(order, row)) for row in (first, second)], 1)
         words = f"{what} seems to have moved more than once, near rows {near}"
-        yield Candidate(words, expected, "with these changes", fix, columns, gates.WORTH**2)
+        before = "the rows before them"
+        yield Candidate(words, expected, "with these changes", fix, columns, gates.WORTH**2, opens=before)
 
 
 def changes(
@@ -299,7 +322,8 @@ def two_tools(rows: SampledRows, effects: Tensor, lines: Tensor) -> Iterator[Can
         what = f"{int(fewer.sum())} of {N} rows seem to have another tool or marker, {moved:.3g} mm away: lines "
         fix = "name the tool of every row in a column (`marker`; or `session` with `remounted`)"
         words = what + few(lines[rows.index][fewer].tolist(), 5), "one tool", "with two", fix
-        yield Candidate(*words, rows.columns(E, chosen), gates.TWO_TOOLS_LEFT)
+        columns = rows.columns(E, fewer.to(E))
+        yield Candidate(*words, columns, gates.TWO_TOOLS_LEFT, opens="the other rows")
 
 
 def other_payloads(rows: SampledRows, data: TangentData, lines: Tensor) -> Iterator[Candidate]:

@@ -217,8 +217,8 @@ class Placed:
         stages = self.registration.devices, self.identification.devices
         return [*stages, tuple(own.devices for own in self.readings)]
 
-    def tangent_data(self) -> TangentData:
-        """The rows around the geometric calibration, weighted by its residuals."""
+    def tangent_data(self, opened: Tensor | None = None) -> TangentData:
+        """The rows around the geometric calibration, weighted by its residuals; with effects (N, R, U) of unknowns."""
         geometry, theta = self.registration.geometry, self.identification.theta
         payload = Payload.of_rows(geometry.chain, self.data.payload, self.data.payload_at)
         elastic = payload is not None or not is_cartesian(geometry.chain)
@@ -226,7 +226,8 @@ class Placed:
         theta = torch.cat([theta, theta.new_zeros(nominal.parameters - geometry.size)])
         data = self._rows(nominal, theta)
         held = held_parameters(geometry, adrift=self.free)
-        return replace(data, shared=self.placement.shared(data), held=held, adrift=self.free)
+        shared = [self.placement.shared(data)] if opened is None else [opened, self.placement.shared(data)]
+        return replace(data, shared=torch.cat(shared, 2), held=held, adrift=self.free)
 
     def mislabelled(self, model: Any, wrong: Sequence[Outlier]) -> str | None:
         """A sentence about wrong rows that fit another session or payload than theirs; None without any."""
