@@ -15,8 +15,8 @@ random errors within 0.2 m. Measured places have 0.05 mm of noise a coordinate; 
 Fields of a record: `machine`, `rows`, `arm_mm`, `corner_px`, `seed`; `before_mm` of the machine as it is, `after_mm` of
 the model at new places, `inside` share of these in 95 % regions; `camera_mm` of the hand-eye transform, `sigmas` the
 largest of its errors in standard deviations, `inside_camera` share of its six numbers within 1.96; `peer_mm`,
-`peer_after_mm` of least squares; `opencv_mm` of the best of the five methods in this case, None without OpenCV 4;
-`bound_mm`.
+`peer_after_mm` of least squares; `opencv_mm` and `opencv_after_mm` of the best of the five methods in this case, None
+without OpenCV 4; `bound_mm`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ import diffeo_calib as dc
 from diffeo_calib.kinematics.hand_eye import HandEye
 
 COLUMNS = ("machine", "rows", "arm_mm", "corner_px", "seed", "before_mm", "after_mm", "inside", "camera_mm", "sigmas")
-COLUMNS = (*COLUMNS, "inside_camera", "peer_mm", "peer_after_mm", "opencv_mm", "bound_mm")
+COLUMNS = (*COLUMNS, "inside_camera", "peer_mm", "peer_after_mm", "opencv_mm", "opencv_after_mm", "bound_mm")
 SHIFT_NOISE_M, TURN_NOISE_RAD, PLACE_NOISE_M = 1e-4, 3e-4, 5e-5
 NEW_POSES, NEW_PLACES = 200, 500
 WAVES_PER_UNIT, TURN_PER_SHIFT = 2.0, 2.0
@@ -127,7 +127,7 @@ def hand_eye(rows: int, arm_mm: float, seed: int, corner_px: float | None = None
         "inside_camera": float((sigmas < 1.96).mean()),
         "peer_mm": 1e3 * float(np.linalg.norm(peer[:3, 3] - CAMERA[:3, 3])),
         "peer_after_mm": 1e3 * rms(nominal),
-        "opencv_mm": None if seen is None else best_of_opencv(commanded, seen),
+        **dict(zip(("opencv_mm", "opencv_after_mm"), best_of_opencv(commanded, seen, new, there), strict=True)),
         "bound_mm": None if corner_px is not None else bound_mm(commanded, 1e-3 * arm_mm),
     }
 
@@ -239,14 +239,26 @@ def opencv() -> Any:
     return found if hasattr(found, "calibrateHandEye") else None
 
 
-def best_of_opencv(commanded: Poses, seen: Poses) -> float | None:
-    """Error of the best of OpenCV 4's methods, mm; None without it."""
-    cv2 = opencv()
-    if cv2 is None:
-        return None
+def best_of_opencv(
+    commanded: Poses, seen: Poses | None, new: Poses, there: Poses
+) -> tuple[float, float] | tuple[None, None]:
+    """Least error, mm, of OpenCV 4's methods: of the camera in the flange, and of its place at new poses; or nothing.
+
+    The board is where it is on average, in the middle of the poses.
+    """
+    cv2, found = opencv(), list[tuple[float, float]]()
+    if cv2 is None or seen is None:
+        return None, None
     split = [list(each) for own in (commanded, seen) for each in (own[:, :3, :3], own[:, :3, 3])]
-    found = [cv2.calibrateHandEye(*split, method=method)[1][:, 0] for method in range(5)]
-    return 1e3 * min(float(np.linalg.norm(place - CAMERA[:3, 3])) for place in found)
+    for method in range(5):
+        camera = np.eye(4)
+        camera[:3, :3], place = cv2.calibrateHandEye(*split, method=method)
+        camera[:3, 3] = place[:, 0]
+        boards = commanded @ camera @ seen
+        board = transform(turns_of(boards).mean().as_rotvec(), boards[:, :3, 3].mean(0))
+        away = (np.linalg.inv(board) @ new @ camera)[:, :3, 3] - there[:, :3, 3]
+        found.append((1e3 * float(np.linalg.norm(camera[:3, 3] - CAMERA[:3, 3])), 1e3 * rms(away)))
+    return min(one for one, _ in found), min(one for _, one in found)
 
 
 def rms(errors: Poses) -> float:

@@ -39,6 +39,8 @@ SENSOR_SHARE = 0.2
 NEGLIGIBLE_DISPLACEMENT = 3e-3
 """Prior displacement, relative to the standard deviation of the noise, that no amount of data would reveal."""
 FIELD_AMPLITUDES = ("transmission_amplitude", "coupled_amplitude", "joint_noise", "task_amplitude")
+JOINT_SCALES = ("transmission_lengthscale", "coupled_lengthscale", *FIELD_AMPLITUDES[:3])
+"""Of the fields of every active joint."""
 ELASTIC_AMPLITUDES = ("compliance", "lateral_compliance")
 AMPLITUDES = frozenset((*FIELD_AMPLITUDES, *ELASTIC_AMPLITUDES, "gravity"))
 """Scales that may shrink to zero, when the data do not support the part of the model that they scale."""

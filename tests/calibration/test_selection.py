@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from product_bank import Case, noise_blocks
+from table_bank import held
 from tangent_bank import (
     Setting,
     built,
@@ -25,6 +26,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.identification.identification import Prior
+from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.scales import selection
 from diffeo_calib.calibration.scales.selection import (
     LARGEST_AMPLITUDE_RATIO,
@@ -35,6 +38,7 @@ from diffeo_calib.calibration.scales.selection import (
     log_posterior,
     select,
 )
+from diffeo_calib.fitting.result import silent
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.process.scales import AMPLITUDES, SCALES
 from diffeo_calib.robots import Chain, Geometry, Joint, SimulatedArm
@@ -192,6 +196,25 @@ def test_gradient_against_central_differences(setting: Setting) -> None:
         start += size
         expected, scale = (8 * change(step) - change(2 * step)) / 12, float(found.gradient.abs().max())
         assert float(found.gradient @ step) == pytest.approx(expected, rel=1e-4, abs=1e-6 * scale)
+
+
+def test_axes_of_a_commanded_frame_have_like_scales() -> None:
+    """Three slides whose scales change together count once; one alone hardly may."""
+    commanded = 0.1 * normal(20, 3, seed=1)
+    machine = dc.cartesian(commanded)
+    data = place(machine, dc.Measurements(commanded, commanded + 1e-3 * normal(20, 3, seed=2)), silent).tangent_data()
+    centre = defaults(data, 1e-3, Prior())
+    whole, one = (centre.logarithms() for _ in range(2))
+    first, change = 2 * machine.n, 0.2  # of the coupled length scales
+    whole[first : first + 3] += change
+    one[first] += change
+    found = [held(log_posterior(each, centre, data)) for each in (whole, one)]
+    expected = -0.5 * change**2, -0.5 * change**2 * (1 / 9 + 6 / 9 / selection.AXES**2)
+    assert [each.prior for each in found] == pytest.approx(expected)
+    step = torch.zeros_like(one)
+    step[first : first + 2] = 1e-4
+    sides = [sum(held(log_posterior(one + sign * step, centre, data))[:2]) for sign in (1, -1)]
+    assert float(found[1].gradient @ step) == pytest.approx((sides[0] - sides[1]) / 2, rel=1e-4)
 
 
 def test_a_singular_covariance_has_no_posterior() -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -18,10 +19,11 @@ from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.fitting.result import Progress, silent
-from diffeo_calib.process.scales import SENSOR_SHARE, Hyperparameters
+from diffeo_calib.process.scales import JOINT_SCALES, SENSOR_SHARE, Hyperparameters
 from diffeo_calib.regression.cholesky import Factor
 from diffeo_calib.robots.cartesian import is_cartesian
 
@@ -61,6 +63,10 @@ class SearchLimits:
 LENGTH, GROWTH, SHRINKAGE = 1.0, 1.0, 2.0
 """Log-normal prior of the scales around their defaults, standard deviations in e-folds: of length scales and noise, of
 amplitudes above their defaults, and of those below."""
+AXES = 0.3
+"""The same of each axis of commanded poses or places around the mean of the slides, or of the turns. The axes of such a
+frame are a choice: fields look alike along all of them unless the rows say otherwise. Scales that were free for each
+axis would fit 20 poses too well, and the regions of a hand-eye transform would hold 0.90 for 0.95."""
 SEARCH_LIMITS = SearchLimits()
 SHORT = 0.3
 """Of the default length scales and noise."""
@@ -159,11 +165,27 @@ def log_posterior(logarithms: Tensor, centre: Hyperparameters, data: TangentData
         explained = (root * (S.T @ mu)).square() - 1.0 + torch.cholesky_inverse(factor.B).diagonal()
         by_unknowns = 0.5 * explained @ variance[wide].log() + ((slope @ narrow) * narrow).sum(0) @ variance[~wide]
         away, amplitudes = point - centre.logarithms(), centre.amplitudes()
-        widths = torch.where(amplitudes, torch.where(away.detach() > 0, GROWTH, SHRINKAGE), LENGTH)
-        density = -0.5 * (away / widths).square().sum()
+        means = _means(centre, data)
+        mean = means @ away
+        widths = torch.where(amplitudes, torch.where(mean.detach() > 0, GROWTH, SHRINKAGE), LENGTH)
+        density = -0.5 * (means.diagonal() @ (mean / widths).square() + ((away - mean) / AXES).square().sum())
         (data.pairs.inner(values, slope) + by_noise + by_unknowns + density).backward()
     gradient = torch.zeros_like(point) if point.grad is None else point.grad
     return LogPosterior(factor.log_density(numbers.target, mu), float(density.detach()), gradient)
+
+
+def _means(centre: Hyperparameters, data: TangentData) -> Tensor:
+    """(S, S) matrix of the means over scales that are alike: of slides, or turns, of commanded poses; else each."""
+    chain = data.nominal.geometry.chain
+    kinds = chain.periodic if is_cartesian(chain) else range(chain.n)
+    return _means_of(tuple(kinds), tuple((name, getattr(centre, name).numel()) for name in centre.searched))
+
+
+@cache
+def _means_of(kinds: tuple[int, ...], sizes: tuple[tuple[str, int], ...]) -> Tensor:
+    keys = [(name, kinds[k] if name in JOINT_SCALES else k) for name, size in sizes for k in range(size)]
+    same = torch.tensor([[one == other for other in keys] for one in keys], dtype=torch.float64, device=HOST)
+    return same / same.sum(1)
 
 
 class _Search:
