@@ -53,6 +53,8 @@ ROUNDS = 20
 """Of the codes of a mixture."""
 MISTYPED = (10.0, 0.1, 1000.0, 0.001, 1 / 0.45359237, 0.45359237)
 """Factors of one payload in another unit, or with a wrong digit: g, pounds."""
+OPENED_M = 0.01
+"""Prior RMS motion by what is opened in a model: far more than what is found, else it is gross."""
 SLOW = (
     "if it stood in several places, name the set-ups in a column (`session`); else let robot and device warm up, and "
     "measure in random order; or name a column of times or temperatures (`time`, `temperature`), with which the model "
@@ -66,7 +68,7 @@ class Candidate(NamedTuple):
     Args:
         columns: (M, U) effects of the unknowns on the numbers of the rows. size: their standard deviation; any by
             default. most: part of the RMS left-out error that may remain with them. doubt: whether the model does not
-            hold them.
+            hold them. opens: rows for which it holds, those without effects, once they are opened in it; none if not.
     """
 
     what: str
@@ -77,13 +79,18 @@ class Candidate(NamedTuple):
     most: float
     size: float | None = None
     doubt: bool = False
+    opens: str = ""
 
 
 class Finding(NamedTuple):
-    """The best explanation: a sentence, and the RMS motion of a row by errors that the model does not hold, m."""
+    """The best explanation: a sentence, and the RMS motion of a row by errors that the model does not hold, m.
+
+    Columns (N, R, U), m, are the effects of unknowns that the model shall have, with unit variance; None for none.
+    """
 
     text: str
     doubt: float
+    columns: Tensor | None
 
 
 def judge(
@@ -111,7 +118,8 @@ def judge(
     if len(own) >= gates.MIXED_ROWS:
         found += [own for one in changes if one.name == MARKERS for own in two_tools(rows, one.effects, lines)]
         found += [*other_payloads(rows, data, lines), *crooked_axes(rows)]
-    return best_of(found, rows)
+    whole = len(rows.index) == len(data.x)
+    return best_of([one if whole else one._replace(opens="") for one in found], rows)
 
 
 def best_of(found: Iterable[Candidate], rows: SampledRows) -> Finding | None:
@@ -123,7 +131,13 @@ def best_of(found: Iterable[Candidate], rows: SampledRows) -> Finding | None:
     left = share * best.most
     moved = left_out_rms(rows.process) * (1.0 - left**2) ** 0.5
     got = f"about {1e3 * moved:.2g} mm of error, and leave-one-out errors that fall to {100 * left:.0f} % {best.given}"
-    return Finding(sentence(best.what, expected=best.expected, got=got, fix=best.fix), moved * best.doubt)
+    fix, columns = best.fix, None
+    if best.opens:
+        fix += f"; the model holds for {best.opens}"
+        numbers = rows.process.numbers.in_table(best.columns).unbind(2)
+        columns = torch.stack([rows.data.in_coordinates(one) for one in numbers], 2)
+        columns = OPENED_M * columns / columns[columns.any(2)].square().sum(1).mean().sqrt()
+    return Finding(sentence(best.what, expected=best.expected, got=got, fix=fix), moved * best.doubt, columns)
 
 
 # --- changes during the measurements ----------------------------------------------------------------------------------
@@ -188,9 +202,10 @@ def changed(
     columns = rows.columns(E, best.codes)
     if best.row is not None:
         words += f" near row {int(lines[order[best.row]])}"
-        yield Candidate(words, expected, given, fix, columns, gates.WORTH)
+        yield Candidate(words, expected, given, fix, columns, gates.WORTH, opens="the rows before it")
         return
-    yield Candidate(f"{words} over the rows", expected, given, SLOW, columns, gates.WORTH)
+    words, middle = f"{words} over the rows", "the middle of the rows"
+    yield Candidate(words, expected, given, SLOW, columns, gates.WORTH, opens=middle)
     # three set-ups look like a drift: the first change is sought once more beside the second one
     first, second = (_likeliest(*scans([E], process, order)), 0)
     for _ in range(2):
@@ -200,7 +215,8 @@ def changed(
         near = " and ".join(str(int(lines[order[row]])) for row in sorted((first, second)))
         columns = torch.cat([rows.columns(E, _from(order, row)) for row in (first, second)], 1)
         words = f"{what} seems to have moved more than once, near rows {near}"
-        yield Candidate(words, expected, "with these changes", fix, columns, gates.WORTH**2)
+        before = "the rows before them"
+        yield Candidate(words, expected, "with these changes", fix, columns, gates.WORTH**2, opens=before)
 
 
 def changes(
@@ -311,7 +327,8 @@ def two_tools(rows: SampledRows, effects: Tensor, lines: Tensor) -> Iterator[Can
         what = f"{int(fewer.sum())} of {N} rows seem to have another tool or marker, {moved:.3g} mm away: lines "
         fix = "name the tool of every row in a column (`marker`; or `session` with `remounted`)"
         words = what + few(lines[rows.index][fewer].tolist(), 5), "one tool", "with two", fix
-        yield Candidate(*words, rows.columns(E, chosen), gates.TWO_TOOLS_LEFT)
+        columns = rows.columns(E, fewer.to(E))
+        yield Candidate(*words, columns, gates.TWO_TOOLS_LEFT, opens="the other rows")
 
 
 def other_payloads(rows: SampledRows, data: TangentData, lines: Tensor) -> Iterator[Candidate]:
@@ -389,10 +406,10 @@ def variation(data: TangentData, scales: Hyperparameters, hypotheses: Sequence[H
     rows = SampledRows.of(data, scales)
 
     def sized(rows: SampledRows, one: Hypothesis) -> tuple[float, float, Hypothesis]:
-        E = torch.nn.functional.one_hot(rows.process.numbers.owner).to(data.x) * rows.columns(one.effects)
+        E = torch.nn.functional.one_hot(rows.process.numbers.owner).to(data.x) * rows.columns(rows.of_all(one).effects)
         return (*rows.likeliest_size(E[:, E.any(0)]), one)
 
-    found = (sized(rows, rows.of_all(one)) for one in hypotheses)
+    found = (sized(rows, one) for one in hypotheses)
     odds, _, best = max(found, key=lambda own: own[0])
     if odds < gates.ROW_ODDS:
         return None
