@@ -71,7 +71,6 @@ class Candidate(NamedTuple):
 
     what: str
     expected: str
-    given: str
     fix: str
     columns: Tensor
     most: float
@@ -125,7 +124,7 @@ def best_of(found: Iterable[Candidate], rows: SampledRows) -> Finding | None:
         return None
     left = share * best.most
     moved = left_out_rms(rows.process) * (1.0 - left**2) ** 0.5
-    got = f"about {1e3 * moved:.2g} mm of error, and leave-one-out errors that fall to {100 * left:.0f} % {best.given}"
+    got = f"about {1e3 * moved:.2g} mm of error, and leave-one-out errors that fall to {100 * left:.0f} % beside it"
     fix, columns = best.fix, None
     if best.opens:
         fix += f"; the model holds for {best.opens}"
@@ -183,24 +182,22 @@ def changed(
     best = max(found, key=lambda one: one.evidence)
     if best.evidence < gates.CHANGE_EVIDENCE:
         return
-    (what, E, _, advice, *_), expected = best.hypothesis, "one set-up for all rows, in the order of their numbers"
-    given, fix = "with this change in the model", f"check what happened then; {advice}"
-
-    def as_good(one: Change) -> bool:
-        apart = min(best.gain - one.gain, best.evidence - one.evidence)
-        same = (one.row is None) == (best.row is None)
-        return same and one.hypothesis.name != what and apart < gates.CHANGES_TOLD_APART
-
-    others = [one for one in found if as_good(one)]
+    (what, E, _, advice, *_), sudden = best.hypothesis, best.row is not None
+    expected, fix = "one set-up for all rows, in the order of their numbers", f"check what happened then; {advice}"
+    others = [
+        one
+        for one in found
+        if (one.row is not None) == sudden
+        and one.hypothesis.name != what
+        and min(best.gain - one.gain, best.evidence - one.evidence) < gates.CHANGES_TOLD_APART
+    ]
     words = ", or ".join(dict.fromkeys(one.words(rows) for one in (best, *others)))
     words += " (these rows do not tell which)" * bool(others)
-    columns = rows.columns(E, best.codes)
-    if best.row is not None:
-        words += f" near row {int(lines[order[best.row]])}"
-        yield Candidate(words, expected, given, fix, columns, gates.WORTH, opens="the rows before it")
+    words += " over the rows" if best.row is None else f" near row {int(lines[order[best.row]])}"
+    kept, advice = ("the rows before it", fix) if sudden else ("the middle of the rows", SLOW)
+    yield Candidate(words, expected, advice, rows.columns(E, best.codes), gates.WORTH, opens=kept)
+    if sudden:
         return
-    words, middle = f"{words} over the rows", "the middle of the rows"
-    yield Candidate(words, expected, given, SLOW, columns, gates.WORTH, opens=middle)
     # three set-ups look like a drift: the first change is sought once more beside the second one
     first, second = (_likeliest(*scans([E], process, order)), 0)
     for _ in range(2):
@@ -210,8 +207,7 @@ def changed(
         near = " and ".join(str(int(lines[order[row]])) for row in sorted((first, second)))
         columns = torch.cat([rows.columns(E, _from(order, row)) for row in (first, second)], 1)
         words = f"{what} seems to have moved more than once, near rows {near}"
-        before = "the rows before them"
-        yield Candidate(words, expected, "with these changes", fix, columns, gates.WORTH**2, opens=before)
+        yield Candidate(words, expected, fix, columns, gates.WORTH**2, opens="the rows before them")
 
 
 def changes(
@@ -321,9 +317,9 @@ def two_tools(rows: SampledRows, effects: Tensor, lines: Tensor) -> Iterator[Can
         moved = 1e3 * float(rows.distances(E, u).amax(1).median())
         what = f"{int(fewer.sum())} of {N} rows seem to have another tool or marker, {moved:.3g} mm away: lines "
         fix = "name the tool of every row in a column (`marker`; or `session` with `remounted`)"
-        words = what + few(lines[rows.index][fewer].tolist(), 5), "one tool", "with two", fix
+        what += few(lines[rows.index][fewer].tolist(), 5)
         columns = rows.columns(E, fewer.to(E))
-        yield Candidate(*words, columns, gates.TWO_TOOLS_LEFT, opens="the other rows")
+        yield Candidate(what, "one tool", fix, columns, gates.TWO_TOOLS_LEFT, opens="the other rows")
 
 
 def other_payloads(rows: SampledRows, data: TangentData, lines: Tensor) -> Iterator[Candidate]:
@@ -347,8 +343,8 @@ def other_payloads(rows: SampledRows, data: TangentData, lines: Tensor) -> Itera
     odds = {words: mixed.evidence(codes)[1] for words, codes in others.items()}
     best, expected = max(odds, key=lambda words: odds[words]), "every payload in the row that carried it"
     if odds[best] > gates.PAYLOAD_ODDS:
-        words = f"the payloads seem to be {best}", expected, "so", "check the column: its order, unit and digits"
-        yield Candidate(*words, rows.columns(E, others[best]), gates.WORTH)
+        what, fix = f"the payloads seem to be {best}", "check the column: its order, unit and digits"
+        yield Candidate(what, expected, fix, rows.columns(E, others[best]), gates.WORTH)
         return
     u, shuffled = rows.process.estimate[loaded] / sizes, torch.randperm(len(own), generator=seeded(0), device=HOST)
     chance = Mixture(rows, E[shuffled.to(E.device)], mixed.codes)
@@ -357,8 +353,8 @@ def other_payloads(rows: SampledRows, data: TangentData, lines: Tensor) -> Itera
         wrong = chosen != 0
         what = f"{int(wrong.sum())} of {len(own)} rows seem to have carried payloads of other rows, such as lines "
         fix = "check that the column belongs to these rows; else leave it out"
-        words = what + few(lines[rows.index][wrong].tolist(), 5), expected, "so", fix
-        yield Candidate(*words, rows.columns(E, chosen), gates.PAYLOADS_LEFT)
+        what += few(lines[rows.index][wrong].tolist(), 5)
+        yield Candidate(what, expected, fix, rows.columns(E, chosen), gates.PAYLOADS_LEFT)
 
 
 def _other_columns(masses: Tensor, lines: Tensor) -> Iterator[tuple[str, Tensor]]:
@@ -388,10 +384,10 @@ def variation(data: TangentData, scales: Hyperparameters, hypotheses: Sequence[H
     rows = SampledRows.of(data, scales)
 
     def sized(rows: SampledRows, one: Hypothesis) -> tuple[float, float, Hypothesis]:
-        E = torch.nn.functional.one_hot(rows.process.numbers.owner).to(data.x) * rows.columns(one.effects)
+        E = torch.nn.functional.one_hot(rows.process.numbers.owner).to(data.x) * rows.columns(rows.of_all(one).effects)
         return (*rows.likeliest_size(E[:, E.any(0)]), one)
 
-    found = (sized(rows, rows.of_all(one)) for one in hypotheses)
+    found = (sized(rows, one) for one in hypotheses)
     odds, _, best = max(found, key=lambda own: own[0])
     if odds < gates.ROW_ODDS:
         return None
