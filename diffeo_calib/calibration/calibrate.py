@@ -27,7 +27,7 @@ from diffeo_calib.calibration.choose_scales import (
 )
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import worth_it
-from diffeo_calib.calibration.diagnostics.judge import judge, lengths, warn_of_lengths, warn_of_taken_scales
+from diffeo_calib.calibration.diagnostics.judge import Finding, judge, lengths, warn_of_lengths, warn_of_taken_scales
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.outliers import (
     outliers,
@@ -189,9 +189,14 @@ def calibrate(
             placed, text = widened
             chosen = choose(placed.tangent_data(), measurements, *stages)
             warn_user(text)
+        devices, bodies = placed.placement.hypotheses(chosen.data, CHANGE), placed.placement.bodies
+        judged = chosen.data, chosen.selection.scales, chosen.left_out, placed.data.line_numbers
+        best = judge(*judged, devices=devices, bodies=bodies)
+        if not chosen.selection.interrupted and best and best.columns is not None:
+            chosen = choose(placed.tangent_data(best.columns), measurements, *stages)
         LOG.info("scales: %s", chosen.selection.status)
         fitted = _fit(chosen, controls, backend, progress)
-        return _result(robot, placed, chosen, fitted, note=note, warned=warned)
+        return _result(robot, placed, chosen, fitted, best, note=note, warned=warned)
 
 
 def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: Progress) -> Fit:
@@ -215,7 +220,14 @@ def _count(controls: Controls, data: TangentData) -> int | None:
 
 
 def _result(
-    robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, *, note: str, warned: list[str]
+    robot: Tree,
+    placed: Placed,
+    chosen: ChosenScales,
+    fitted: Fit,
+    best: Finding | None,
+    *,
+    note: str,
+    warned: list[str],
 ) -> CalibrationResult:
     """Findings about model and rows, and everything together."""
     data, scales, fitted_map = chosen.data, chosen.selection.scales, fitted.model
@@ -230,8 +242,6 @@ def _result(
     explained, found = parts(model), outliers(model, placed, data, chosen.judged, least)
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
     warn_of_outliers(found, placed.data)
-    devices, bodies = placed.placement.hypotheses(data, CHANGE), placed.placement.bodies
-    best = judge(data, scales, chosen.left_out, placed.data.line_numbers, devices=devices, bodies=bodies)
     explained_by = placed.mislabelled(model, found) or (best and best.text)
     warn_of_contradictions(model, placed.coordinates, found, explained_by)
     warn_of_rounding(robot, placed.data, data, chosen.left_out)
@@ -246,7 +256,7 @@ def _result(
         rows=len(data.x),
         parts={part.name: part.displacement for part in explained},
         effective_parameters=chosen.left_out.effective,
-        length_in_doubt=max(warn_of_lengths(found_lengths) or 0.0, best.doubt if best else 0.0) or None,
+        length_in_doubt=warn_of_lengths(found_lengths),
         warnings="\n".join(warned) or None,
     )
     return CalibrationResult(

@@ -246,8 +246,7 @@ def _places(model_map: FittedMap) -> tuple[Tensor, Tensor, Tensor]:
     if registration is not None:  # its rows may show what those of the fit left open
         return root, anywhere, nominal.sensitivities(registration.q.to(q), theta)[..., own].flatten(0, 1)
     some = _some_rows(fitted.x)
-    rows = nominal.sensitivities(fitted.x[some], theta)[..., own]
-    rows = rows if fitted.slopes is None else fitted.slopes[some] @ rows
+    rows = fitted.functionals[some] @ nominal.sensitivities(fitted.x[some], theta)[..., own]
     rows, shared = (
         (each * fitted.noise.visible[some, :, None]).flatten(0, 1) for each in (rows, fitted.noise.shared[some])
     )

@@ -19,6 +19,8 @@ import numpy as np
 
 from diffeo_calib.common.errors import InputError, few
 
+MOST_SQUARES = 10_000
+"""Of a board."""
 FORMS = {"charuco": (5,), "chessboard": (3,), "aruco": (5, 6, 7), "tag": (4,)}
 """Kinds of boards, and words of their texts."""
 FEWEST_CORNERS = 8
@@ -195,6 +197,8 @@ def edge_widths(grey: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 def _size(word: str) -> tuple[int, int]:
     across, _, down = word.partition("x")
+    if int(across) * int(down) > MOST_SQUARES:
+        raise ValueError(f"{word}, more than {MOST_SQUARES} squares")
     return int(across), int(down)
 
 

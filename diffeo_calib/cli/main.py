@@ -42,8 +42,8 @@ from diffeo_calib.cli.console import INTERRUPTED, interrupts, log_lines, show
 from diffeo_calib.cli.declarations import COMMANDS, Command
 from diffeo_calib.cli.options import CORNERS, has
 from diffeo_calib.cli.record import EXIT_ERROR, EXIT_INTERRUPTED, check_outputs, record, remove_earlier
-from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning, InputError, as_written, printable
-from diffeo_calib.common.files import PROGRAM
+from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning, InputError, as_written, printable, sentence
+from diffeo_calib.common.files import PROGRAM, read_regular
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -252,12 +252,8 @@ def expanded(arguments: Sequence[str]) -> list[str]:
 
 def _entries(path: Path) -> dict[str, Any]:
     try:
-        if path.stat().st_size > LONGEST_FILE:
-            raise InputError.of(f"{path}", expected="a file of options", got="more than 1 MiB")
-        entries = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        entries = tomllib.loads(read_regular(path, "campaign file", LONGEST_FILE).decode("utf-8-sig"))
         return {name.replace("_", "-"): value for name, value in entries.items()}
-    except OSError as error:
-        raise InputError.of(f"{path} cannot be read ({error.strerror})", fix="check the path") from error
     except InputError:
         raise
     except (ValueError, RecursionError) as error:  # TOML, text or a name that is none, or lists in lists
@@ -294,18 +290,17 @@ def main() -> None:
     interrupts.install()
     with forgiving_streams(), warnings.catch_warnings():
         warnings.simplefilter("always", DiffeoCalibWarning)
-        warnings.showwarning = _show_warning
+        warnings.showwarning = lambda message, *_, **__: show("warning", record.warned(message))
         try:
             app()
         except DiffeoCalibError as error:
             show("error", error)
             sys.exit(EXIT_ERROR)
-
-
-def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    """Takes the place of :func:`warnings.showwarning`."""
-    record.warnings.append(str(message))
-    show("warning", message)
+        except OSError as error:  # a name that no file system takes, or a file that went away
+            if error.filename is None:
+                raise
+            show("error", sentence(f"{as_written(str(error.filename))}: {error.strerror}", fix="check the path"))
+            sys.exit(EXIT_ERROR)
 
 
 class ForgivingStream:

@@ -112,6 +112,13 @@ class FittedMap:
         """Number of task coordinates."""
         return self.new_noise.shape[0]
 
+    @property
+    def functionals(self) -> Tensor:
+        """(N, r, m) linear functionals of k1 that were measured; of coordinates the identity."""
+        if self.slopes is not None:
+            return self.slopes
+        return torch.eye(self.m, dtype=self.x.dtype, device=self.x.device).expand(len(self.x), -1, -1)
+
     def with_nominal(self, nominal: NominalMap) -> FittedMap:
         """The same map around another nominal map with the same parameters, with what it knows of its covariances."""
         other = copy(self)
@@ -261,7 +268,7 @@ class FittedMap:
             return root
         deviations = spec.prior_variance[places].sqrt()
         every, seen = spec.nominal.sensitivities(self.x, torch.zeros_like(spec.prior_variance)), self.noise.visible
-        every = every if self.slopes is None else self.slopes @ every
+        every = self.functionals @ every
         slopes = every[seen] if every.shape[:2] == seen.shape else every.flatten(0, 1)  # registered: other points
         white = slopes[:, places] * deviations / len(slopes) ** 0.5
         _, s, Vt = torch.linalg.svd(torch.cat([white, white.new_zeros(len(places), len(places))]), full_matrices=False)
@@ -362,7 +369,7 @@ class FittedMap:
         """A (N, r, m) and what was measured of A k1 (N, r), around the fit; of coordinates A is the identity."""
         y = self.measured()
         if self.slopes is None:
-            return torch.eye(self.m, dtype=y.dtype, device=y.device).expand(len(y), -1, -1), y
+            return self.functionals, y
         residual = self.noise.multiply(self.weighted_residual()[:, :, None])[:, :, 0]
         return self.slopes, (self.slopes @ self.fitted_points[:, :, None])[:, :, 0] + residual
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.recalibration.new_rows import FoundPlace
+from diffeo_calib.calibration.recalibration.new_rows import NewSetUp
 from diffeo_calib.common.errors import with_deviation
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.measurements.poses import rotation_numbers
@@ -124,15 +124,15 @@ class Changes:
         return "; ".join(map(str, self.found))
 
 
-def hidden_offsets(robot: Tree, place: FoundPlace | None, changes: Changes) -> tuple[Offset, ...]:
+def hidden_offsets(robot: Tree, set_up: NewSetUp, changes: Changes) -> tuple[Offset, ...]:
     """Offsets that explain where a registration found device or markers; none where a change of the robot is named.
 
     Args:
-        robot: with n joints. place: of device and markers, None without a device. changes: as the rows show them.
+        robot: with n joints. set_up: where device and markers are. changes: as the rows show them.
     """
-    if place is None or changes.found:
+    rows, found = set_up.registered, set_up.registration
+    if rows is None or found is None or changes.found:
         return ()
-    rows, found = place.rows, place.registration
     S, J = rows.by_places.flatten(0, 1), rows.at.joint_to_start.flatten(0, 1)  # (M m, 6 + 3 P), (M m, n)
     covariance, noise = rows.inflation * rows.given.covariance, float(found.noise.diagonal().mean().sqrt())
     T, centre = rows.transform, rows.centre

@@ -142,7 +142,7 @@ def compare(
         errors=rows.by_kind(rows.placed_residual),
         expectations=rows.by_kind(rows.expected_residual),
         usual=rows.by_kind(usual),
-        hidden=hidden_offsets(model.robot, rows.set_up.place, changes) if measured else (),
+        hidden=hidden_offsets(model.robot, rows.set_up, changes) if measured else (),
         payload=payload,
     )
 
@@ -173,7 +173,7 @@ def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) ->
         return Measurements.of_points(q, points.detach(), None, model.lever).with_load(own.nominal.load)
 
     fitted = other.map.unregistered
-    found = find_place(fitted, other.lever, measured(other, there, model(q))).registration
+    found = find_place(fitted, other.lever, measured(other, there, model(q)))[1]
     placed = RegisteredMap(moved(fitted, found.transform), found)
     new = measured(model, q, placed(there).unflatten(1, (-1, 3)))
     rows = weighed(place_again(model, new, "other"), "other")

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.recalibration.new_rows import FoundPlace, NewRows, NewSetUp, UsualNoise
+from diffeo_calib.calibration.recalibration.new_rows import NewRows, NewSetUp, UsualNoise
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few, sentence, warn_user
@@ -49,7 +49,7 @@ MARKER_DEVIATIONS = {
     "other": (PLACES.other_registered_m, PLACES.other_m),
 }
 """Prior standard deviations, m, of markers from where they were, in a registration, and from where it found them."""
-SAME_PLACE, OTHER_MARKER = MARKER_DEVIATIONS["same"][0], MARKER_DEVIATIONS["other"][0]
+OTHER_MARKER = MARKER_DEVIATIONS["other"][0]
 UNMOVED_LOG_ODDS = log(10.0)
 """Before the rows are seen: markers that nobody names as moved have not been touched."""
 MOST_ROWS = 200
@@ -70,13 +70,16 @@ def find_place(
     free: str = "both",
     marker_std: float | None = None,
     ball: bool = False,
-) -> FoundPlace:
+) -> tuple[NewRows, Registration]:
     """Find where the device stands and where the markers sit.
 
     Args:
         model: the map, placed anew before or not. lever: of its frames, m; None for markers.
         data: the rows. free, marker_std: see :meth:`CalibratedKinematics.registered`.
         ball: whether the last marker is a ball that no row shows, and that stays where it was on the tool.
+
+    Returns:
+        the rows around the most probable places, with their prior, and the record.
 
     Raises:
         InputError: arguments of another kind, or markers that are to stay, but other ones were measured.
@@ -93,29 +96,29 @@ def find_place(
     evenly = [round(k * (len(data) - 1) / (MOST_ROWS - 1)) for k in range(MOST_ROWS)]
     some = data if len(data) <= MOST_ROWS else data.rows(evenly)
     search = Search.of(model, lever, some, free, ball=ball)
-    priors = tuple(first for first, _ in MARKER_DEVIATIONS.values()) if search.known else (OTHER_MARKER,)
-    priors = priors if marker_std is None else (marker_std,)
-    priors = (SAME_PLACE,) if free == "base" else priors  # not used: the markers stay
-    starts = search.starts(max(priors))
-    found = {metres: _likeliest(starts, search.deviations(metres), metres) for metres in priors}
+    priors = {name: first for name, (first, _) in MARKER_DEVIATIONS.items() if search.known or name == "other"}
+    priors = priors if marker_std is None else {"stated": marker_std}
+    priors = {"same": 0.0} if free == "base" else priors
+    starts = search.starts(max(priors.values()))
+    found = {name: _likeliest(starts, search.deviations(metres), name, metres) for name, metres in priors.items()}
     kept, outliers = torch.arange(len(some), device=some.q.device), list[int]()
     while True:
         odds = _odds(found)
-        metres = max(odds, key=odds.__getitem__)
-        worst = worst_rows(found[metres])
+        best = found[max(odds, key=odds.__getitem__)]
+        worst = worst_rows(best)
         if not worst or len(outliers) + len(worst) > LARGEST_OUTLIER_PART * len(some):
             break
         outliers += kept[worst].tolist()
         stay = kept.new_tensor([row for row in range(len(kept)) if row not in worst])
-        kept, found = kept[stay], {one: rows.kept(stay).settled() for one, rows in found.items()}
+        kept, found = kept[stay], {name: rows.kept(stay).settled() for name, rows in found.items()}
     said = {
         "lever": search.data.lever,
         "free": free,
         "outliers": tuple(some.line_numbers[sorted(outliers)].tolist()) if outliers else (),
         "rms_before": _rms(model(some.q).unflatten(1, (-1, 3)) - some.points) if search.known else None,
-        "same_place": odds.get(SAME_PLACE, 0.0) if len(priors) > 1 else None,
+        "same_place": odds.get("same", 0.0) if len(priors) > 1 else None,
     }
-    return FoundPlace(found[metres], metres, _record(found[metres], said, known=search.known))
+    return best, _record(best, said, known=search.known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +174,7 @@ class Search:
         """
         data, framed, block = self.data, bool(self.free[0]), self.model.new_noise
         set_up = NewSetUp(self.fit, data, Coordinates(data, torch.arange(len(data), device=data.q.device)))
-        factor = float(block.trace() / self.fit.new_noise.trace()) if self.known else None
+        factor = float(block.trace() / self.fit.new_noise.trace()) if self.known else 0.0
         if len(block) != 3 * data.markers:
             block = torch.block_diag(*[own_blocks(block[None], len(block) // 3)[0].mean(0)] * data.markers)
         places = [] if framed and not self.known else [self.at_old_places()]
@@ -244,21 +247,20 @@ def _check_enough(data: Measurements, *, framed: bool, known: bool) -> None:
         raise MeasurementError.of(what, expected=f"at least {least} rows", got=len(data), fix=fix)
 
 
-def _likeliest(starts: list[NewRows], deviations: Tensor, metres: float) -> NewRows:
+def _likeliest(starts: list[NewRows], deviations: Tensor, marker: str, metres: float) -> NewRows:
     """The likeliest places under a prior."""
     usable = starts if metres >= OTHER_MARKER else starts[:1]
-    found = [start.changed(deviations=deviations).settled() for start in usable]
+    found = [start.changed(deviations=deviations, marker=marker).settled() for start in usable]
     return max(found, key=lambda each: each.given.log_evidence())
 
 
-def _odds(found: dict[float, NewRows]) -> dict[float, float]:
+def _odds(found: dict[str, NewRows]) -> dict[str, float]:
     """Probabilities of the priors that count. Errors as large as those under the widest prior are no evidence."""
-    scale = max(1.0, float(scale_of(found[max(found)])[0]))
-    logs = {metres: each.given.log_evidence(scale) for metres, each in found.items()}
-    logs |= {SAME_PLACE: logs[SAME_PLACE] + UNMOVED_LOG_ODDS} if SAME_PLACE in logs else {}
-    odds = {metres: exp(each - max(logs.values())) for metres, each in logs.items()}
-    likely = {metres: each for metres, each in odds.items() if each > NEGLIGIBLE_PROBABILITY * sum(odds.values())}
-    return {metres: each / sum(likely.values()) for metres, each in likely.items()}
+    scale = max(1.0, float(scale_of([*found.values()][-1])[0]))
+    logs = {name: each.given.log_evidence(scale) + UNMOVED_LOG_ODDS * (name == "same") for name, each in found.items()}
+    odds = {name: exp(each - max(logs.values())) for name, each in logs.items()}
+    likely = {name: each for name, each in odds.items() if each > NEGLIGIBLE_PROBABILITY * sum(odds.values())}
+    return {name: each / sum(likely.values()) for name, each in likely.items()}
 
 
 PRIOR_FREEDOM = 10.0

@@ -28,7 +28,7 @@ from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
 from diffeo_calib.kinematics.registered_map import Registration, place_slopes, robot_map, turned
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
-from diffeo_calib.maps.observation import Observation
+from diffeo_calib.maps.observation import Stacked
 from diffeo_calib.measurements.poses import block_diagonal, own_blocks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.evidence import Evidence
@@ -59,7 +59,7 @@ class UsualNoise(NamedTuple):
     """Of a row that tells coordinates."""
 
     block: Tensor  # (m, m) m^2
-    factor: float | None  # on the variances of poses of the fit; None where the fit or the rows have other bodies
+    factor: float  # on the variances of poses of the fit; 0 where the fit or the rows have other bodies
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,9 @@ class NewSetUp:
     coordinates: Coordinates | None
     readings: Sequence[OtherReadings] = ()  # the others
     sessions: Sequence[Sessions] = ()  # frames of the set-ups, if there are several: a set of devices
-    place: FoundPlace | None = None  # where device and markers were found; None where no device measured coordinates
+    # of the device that measured coordinates: the record, and its rows around the places; None without such a device
+    registration: Registration | None = None
+    registered: NewRows | None = None
     ball: Tensor | None = None  # (3,) where the new rows by themselves put the ball on its tip, m; None without one
     new_ball: bool = False  # whether the old model does not know it
 
@@ -82,20 +84,10 @@ class NewSetUp:
         return robot_map(self.fitted)
 
     @property
-    def registration(self) -> Registration | None:
-        """Of the device that measured coordinates."""
-        return None if self.place is None else self.place.registration
-
-    @property
     def transform(self) -> Tensor:
         """(4, 4) from the frame of the map to that of the new rows, m."""
         found = self.registration
         return torch.eye(4, dtype=self.data.q.dtype, device=HOST) if found is None else found.transform
-
-    @property
-    def stands_free(self) -> bool:
-        """Whether still no device says where the robot stands."""
-        return self.place is None and self.fitted.stands_free
 
     @property
     def seen_before(self) -> Tensor:
@@ -114,7 +106,7 @@ class NewSetUp:
         deviations: Tensor,
         *,
         same: bool = True,
-        marker: str = "",
+        marker: str = "other",
     ) -> NewRows:
         """The rows around places, which are those where everything was before, all weights 1.
 
@@ -153,7 +145,7 @@ class NewSetUp:
 
     def _measured(
         self, T: Tensor, seen: Tensor, usual: UsualNoise
-    ) -> tuple[Tensor, Observation | None, NoiseModel, Tensor, Placement]:
+    ) -> tuple[Tensor, Stacked | None, NoiseModel, Tensor, Placement]:
         """Numbers, what these are of the points (M, 3 P), m, how they were measured, their noise, and the devices."""
         told, of_told, sets = None, seen[:0, :, None], list[DeviceSet]()
         if self.coordinates is not None:
@@ -202,7 +194,7 @@ class NewRows:
     noise: Tensor  # (M, R, R) m^2, with weights of 1
     noise_model: NoiseModel  # how they were measured
     tails: Tails  # their weights
-    observe: Observation | None  # what was measured of the markers; None for their coordinates
+    observe: Stacked | None  # what was measured of the markers; None for their coordinates
     placement: Placement  # devices that stand around the old model; what is not known of them, rows share
     shared: Tensor  # (M, R, c) effects of errors of unit variance that they share, m
     # (6 + 3 P,) of the device's frame and of the markers' coordinates before the rows, m and rad; 0 of what has not
@@ -213,7 +205,7 @@ class NewRows:
     by_fit: Tensor  # (3 P, 3 P) B of the markers
     centre: Tensor  # (3,) about which the frame turns, m
     drifts: Tensor  # (M R, c) columns of unit variance of what has changed in the robot since, m
-    marker: str = ""  # which the markers are: "same", "moved" or "other"
+    marker: str  # which the markers are: "same", "moved", "other", or "stated" for a prior of a user
 
     def __len__(self) -> int:
         return len(self.q)
@@ -446,18 +438,6 @@ class NewRows:
         return rows
 
 
-class FoundPlace(NamedTuple):
-    """Result of a registration: rows around the most probable places, with their prior, and the record.
-
-    Args:
-        metres: prior deviation of the markers from their old places.
-    """
-
-    rows: NewRows
-    metres: float
-    registration: Registration
-
-
 def noise_of_rows(fitted: FittedMap, new: Measurements, there: Measurements, T: Tensor, usual: UsualNoise) -> Tensor:
     """(M, m, m) noise of new rows in the model's frame, m^2: a block, of poses by row; their own where it is larger.
 
@@ -469,7 +449,7 @@ def noise_of_rows(fitted: FittedMap, new: Measurements, there: Measurements, T: 
         T: (4, 4) from the frame of the model to theirs, m. usual: noise of a row.
     """
     bodies, total = new.bodies, usual.block.expand(len(new), -1, -1)
-    known = usual.factor is not None and fitted.slopes is None and bool(fitted.noise.visible.all())
+    known = usual.factor > 0.0 and fitted.slopes is None and bool(fitted.noise.visible.all())
     own, old = bodies.modes(there), bodies.modes_of(there, fitted.measured().unflatten(1, (-1, 3))) if known else None
     if own is not None and old is not None:
         blocks = own_blocks(fitted.noise.covariance, old.shape[1])  # (N, T, 9, 9)

@@ -24,7 +24,7 @@ from diffeo_calib.calibration.recalibration.find_place import (
     find_place,
     warn_about,
 )
-from diffeo_calib.calibration.recalibration.new_rows import FoundPlace, NewRows, NewSetUp, UsualNoise, typical_noise
+from diffeo_calib.calibration.recalibration.new_rows import NewRows, NewSetUp, UsualNoise, typical_noise
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few, sentence, warn_user
 from diffeo_calib.fitting.fitted_map import FittedMap
@@ -32,7 +32,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import rows_used_in_fit
 from diffeo_calib.kinematics.joint_ranges import check_same_robot
 from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
-from diffeo_calib.kinematics.registered_map import fitted_markers, robot_map
+from diffeo_calib.kinematics.registered_map import Registration, fitted_markers, robot_map
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.nominal import NominalMap
@@ -77,7 +77,7 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
     ball, tip = None if own is None else ball_in_sockets(own.table, geometry), nominal.geometry.on[-1]
     if ball is None:
         found = ball_of([one.table for one in readings], geometry, ball_tip(own, readings, tip))
-        ball = None if found is None else found.geometry.tool[0]
+        ball = None if found is None else found.tool[0]
     new_ball = ball is not None and not knows_ball(model)
     if ball is not None and new_ball:
         old = with_ball(old, ball, ball_tip(own, readings, tip), PLACES.found_m_rad)
@@ -87,15 +87,16 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
         return set_up
     table = with_markers(own.table, nominal.geometry.markers, model.lever)
     own = own._replace(table=mounted_of(model).in_any_frame(table))
-    device, place, sessions = measured_rows(own.table), None, list[Sessions]()
-    if device is not None:
-        # the rows judge "same", too
-        stated = MARKER_DEVIATIONS[marker][0] if marker in ("moved", "other") else None
-        place, seen = _place_of_device(old, model.lever, device.table, stated)
-        geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])
-        geometry = replace(geometry, base=place.registration.transform @ geometry.base)
-        sessions, own = Sessions.beside(own, device, geometry, seen)
-    return replace(set_up, coordinates=own, sessions=sessions, place=place)
+    device = measured_rows(own.table)
+    if device is None:
+        return replace(set_up, coordinates=own)
+    # the rows judge "same", too
+    stated = MARKER_DEVIATIONS[marker][0] if marker in ("moved", "other") else None
+    rows, found, seen = _place_of_device(old, model.lever, device.table, stated)
+    geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])
+    geometry = replace(geometry, base=found.transform @ geometry.base)
+    sessions, own = Sessions.beside(own, device, geometry, seen)
+    return replace(set_up, coordinates=own, sessions=sessions, registration=found, registered=rows)
 
 
 def weighed(set_up: NewSetUp, marker: str) -> NewRows:
@@ -106,25 +107,25 @@ def weighed(set_up: NewSetUp, marker: str) -> NewRows:
     Args:
         set_up: the rows, and where devices and markers are. marker: see :func:`diffeo_calib.recalibrate`.
     """
-    fitted, place, ball = set_up.fitted, set_up.place, None if set_up.new_ball else set_up.ball
+    fitted, found, ball = set_up.fitted, set_up.registration, None if set_up.new_ball else set_up.ball
     own = fitted_markers(fitted)
     other, known = own.clone(), slice(len(own) - set_up.new_ball)
-    if place is not None:
-        other[known] = place.registration.markers[known]
+    if found is not None:
+        other[known] = found.markers[known]
     elif ball is not None:
         other[-1] = ball
-    names = [name for name, (first, _) in MARKER_DEVIATIONS.items() if place is None or first == place.metres]
+    names = [*MARKER_DEVIATIONS] if set_up.registered is None else [set_up.registered.marker]
     names = names if marker == "evidence" else [marker]
-    names = ["same"] if place is None and ball is None else names
+    names = ["same"] if found is None and ball is None else names
     usual = UsualNoise(typical_noise(fitted.noise) if fitted.slopes is None else fitted.new_noise, 1.0)
-    frame, seen = [PLACES.found_m_rad * (place is not None)] * 6, set_up.seen_before.repeat_interleave(3)
-    found = []
+    frame, seen = [PLACES.found_m_rad * (found is not None)] * 6, set_up.seen_before.repeat_interleave(3)
+    likely = []
     for name in names:
         markers = other if name == "other" else own
         deviations = torch.cat([own.new_tensor(frame), MARKER_DEVIATIONS[name][1] * seen.to(own)])
         rows = set_up.rows((set_up.transform, markers), usual, deviations, marker=name)
-        found.append(_levelled(rows).with_weights())
-    return max(found, key=lambda one: one.given.log_evidence() + UNMOVED_LOG_ODDS * (one.marker == "same"))
+        likely.append(_levelled(rows).with_weights())
+    return max(likely, key=lambda one: one.given.log_evidence() + UNMOVED_LOG_ODDS * (one.marker == "same"))
 
 
 NOISE_LEVELS = 10.0 ** torch.linspace(-2, 2, 17, dtype=torch.float64, device="cpu")
@@ -171,7 +172,7 @@ def _check_robot(model: CalibratedKinematics, new: Any, own: Coordinates | None,
 
 def _place_of_device(
     old: FittedMap, lever: float | None, device: Measurements, marker_std: float | None
-) -> tuple[FoundPlace, Tensor]:
+) -> tuple[NewRows, Registration, Tensor]:
     """Where the device of the largest session is, and the points (M, P, 3) of all rows in its frame, m."""
 
     def predicted(rows: Measurements) -> Tensor:
@@ -179,13 +180,12 @@ def _place_of_device(
 
     largest = device.largest_session()
     check_size(predicted(largest), largest.points)
-    place = find_place(old, lever, largest, marker_std=marker_std)
-    rows = place.rows
+    rows, found = find_place(old, lever, largest, marker_std=marker_std)
     ratio = size_ratio(*(each.unflatten(1, (-1, 3)) for each in (rows.points, rows.given.shown(rows.y))))
     if abs(ratio - 1.0) > USUAL_RATIO:
         what = f"distances between the new rows are {ratio:.4f} times those that the model predicts"
         warn_user(sentence(what, fix="check the scale of the measuring device"))
-    turn, T = float(place.registration.frame_deviations[3:].max()), place.registration.transform
+    turn, T = float(found.frame_deviations[3:].max()), found.transform
     if turn > LARGEST_TURN_RAD:
         raise MeasurementError.of(
             "the new rows do not tell where the measuring device stands",
@@ -193,7 +193,7 @@ def _place_of_device(
             got=f"its turn is known to {degrees(turn):.2g} degrees only",
             fix="measure poses in which several joints move",
         )
-    return place, predicted(device) @ T[:3, :3].mT + T[:3, 3]
+    return rows, found, predicted(device) @ T[:3, :3].mT + T[:3, 3]
 
 
 def with_ball(fitted: FittedMap, ball: Tensor, tip: str, deviation: float) -> FittedMap:
@@ -216,8 +216,7 @@ def with_ball(fitted: FittedMap, ball: Tensor, tip: str, deviation: float) -> Fi
     spec = replace(old.spec, nominal=after, prior_variance=prior, at_controls=_of_rows(old.spec.at_controls, after))
     deformation = GeodesicDeformation(spec, old.x, Momenta(old.momenta.joint, p, theta), old.integrator)
     markers = nominal.geometry.markers
-    slopes = torch.eye(3 * markers, dtype=p.dtype, device=p.device).expand(len(fitted.x), -1, -1)
-    slopes = torch.nn.functional.pad(slopes if fitted.slopes is None else fitted.slopes, (0, 3))
+    slopes = torch.nn.functional.pad(fitted.functionals, (0, 3))
     new_noise = torch.block_diag(fitted.new_noise, own_blocks(fitted.new_noise[None], markers)[0].mean(0))
     parts = fitted.noise, fitted.data, new_noise, fitted.workspace
     return FittedMap(deformation, *parts, slopes=slopes, y=fitted.measured())

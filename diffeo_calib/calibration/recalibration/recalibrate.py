@@ -12,7 +12,6 @@ import logging
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE
@@ -43,7 +42,7 @@ from diffeo_calib.kinematics.provenance import Provenance, check_note
 from diffeo_calib.kinematics.registered_map import Registration, fitted_markers, moved
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.sensors.errors import Evaluations
-from diffeo_calib.sensors.places import PlacedDevices, mounted_of
+from diffeo_calib.sensors.places import mounted_of
 
 LOG = logging.getLogger(__name__)
 CERTIFICATES = "coupling_residual", "end_residual", "energy", "status"
@@ -181,10 +180,10 @@ def _result(
     """The model in the new frame, and everything that was found."""
     found, new = place.registration, place.data
     fitted_map = fitted.model
-    if place.stands_free:
-        fitted_map = fitted_map.without_rigid_motions()
     if found is not None:
         fitted_map = moved(fitted_map, found.transform)
+    elif place.fitted.stands_free:  # still no device says where the robot stands
+        fitted_map = fitted_map.without_rigid_motions()
     own, shared = place.coordinates, fitted.problem.noise.shared[-len(rows) :]
     # a ball that a device measured is none in an unknown place any more
     measured = place.ball is None and own is not None and not bool(own.table.points[:, -1].isnan().all())
@@ -192,7 +191,9 @@ def _result(
     again = model.with_fit(fitted_map, Provenance.now(new, note), ball=ball)
     small = (rows.tails.weights < OUTLIER_WEIGHT).any(1)
     again.placement = carried_devices(model, again, place.transform)
-    again.placement = _with_settled(devices_beside(again, new), model, place, rows, fitted)
+    settled = rows.placement.settled(fitted, fitted.model, rows.centre, place.transform, known=mounted_of(model))
+    first = len(fitted.problem.y) - len(rows)
+    again.placement = devices_beside(again, new, [replace(one, rows=one.rows + first) for one in settled.placed()])
     left = (fitted.residual[-len(rows) :] - shared @ fitted.shifts)[:, : rows.y.shape[1]]  # devices where it puts them
     left = rows.given.shown(left)
     before, after, left_out = map(rows.by_kind, (rows.placed_residual, left, rows.given.left_out))
@@ -219,28 +220,8 @@ def _result(
         inflation=rows.inflation,
         fit=fitted,
         shift=None if found is None else away * place.seen_before[:, None],
-        hidden=hidden_offsets(model.robot, place.place, changes),
+        hidden=hidden_offsets(model.robot, place, changes),
     )
-
-
-def _with_settled(
-    placement: tuple[PlacedDevices, ...], model: CalibratedKinematics, place: NewSetUp, rows: NewRows, fitted: Fit
-) -> tuple[PlacedDevices, ...]:
-    """The devices with the new rows that each measured, set-ups where the fit puts them."""
-    first, found = len(fitted.problem.y) - len(rows), list(placement)
-    at = fitted.model, rows.centre, place.transform
-    for one in rows.placement.settled(fitted, *at, known=mounted_of(model)).placed():
-        own = replace(one, rows=one.rows + first)
-        for k, other in enumerate(found):
-            if not own.devices.same_set(other.devices):
-                continue
-            if own.devices.set_up:
-                found[k] = own.beside(other)
-            else:
-                number = torch.tensor([other.names.index(name) for name in own.names], dtype=torch.int64, device=HOST)
-                device = torch.cat([other.device, number[own.device]])
-                found[k] = replace(other, rows=torch.cat([other.rows, own.rows]), device=device)
-    return tuple(found)
 
 
 LARGEST_OUTLIER_PART = 0.5

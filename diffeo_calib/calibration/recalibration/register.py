@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from diffeo_calib.calibration.recalibration.find_place import SAME_PLACE, find_place, warn_about
+from diffeo_calib.calibration.recalibration.find_place import find_place, warn_about
 from diffeo_calib.calibration.recalibration.new_rows import NewRows
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
@@ -33,7 +33,6 @@ from diffeo_calib.kinematics.registered_map import (
     Registration,
     fitted_markers,
     moved,
-    place_slopes,
     robot_map,
 )
 from diffeo_calib.maps.deformation import Momenta
@@ -48,6 +47,7 @@ from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import sensor_of
 from diffeo_calib.sensors.known_drift import KnownDrift
 from diffeo_calib.sensors.places import PlacedDevices, mounted_of
+from diffeo_calib.sensors.set_ups import frame_slopes
 from diffeo_calib.sensors.tables import measured_positions, rows_of_one_kind
 
 LOG = logging.getLogger(__name__)
@@ -61,10 +61,14 @@ def registered(
     model: CalibratedKinematics, new: Any, *, free: str, marker_std: float | None, learn: bool
 ) -> CalibratedKinematics:
     """See :meth:`CalibratedKinematics.registered`; everything on the CPU."""
-    rows = registration_rows(new, model)
+    if not issubclass(type(new), RowGroups):
+        raise InputError.of("`measurements`", expected="dc.Measurements", got=type(new).__name__)
+    rows = measured_positions(new)
     check_same_robot(model, new)
     if rows is None:
         return model._with(placement=devices_beside(model, new))
+    rows = mounted_of(model).in_any_frame(rows).largest_session()
+    rows = sensor_of(rows).with_points(rows, model)
     here = model.to(HOST)._carrying(model.nominal.load.under(rows.payload).typical)
     ball = model.ball and bool(rows.points[:, -1].isnan().all())
     placed, found = _placed(here, rows, free=free, marker_std=marker_std, ball=ball, learn=learn)
@@ -73,7 +77,14 @@ def registered(
     vars(placed).update({} if learns else {"registration": found})
     known = {"map": placed.to(model.configurations.device), "lever": found.lever, "placement": (), "ball": ball}
     seen = model._with(**known, learnt=found if learns else None)._carrying(model.nominal.load)
-    seen = seen._with(placement=registered_devices(model, seen))
+    same = found.same and ball == model.ball
+    lost = [own for own in model.placement if own.devices.reads and not same]
+    if lost:
+        names = few([f"'{name}'" for own in lost for name in own.names])
+        what = f"the model no longer knows the devices {names}: these rows show other markers than what they read"
+        warn_user(sentence(what, fix="pass rows of the fit's markers, or rows of these devices, to keep them"))
+    kept = model._with(placement=tuple(own for own in model.placement if own not in lost))
+    seen = seen._with(placement=carried_devices(kept, seen, found.transform))
     return seen._with(placement=devices_beside(seen, new))
 
 
@@ -83,8 +94,7 @@ def _placed(
 ) -> tuple[FittedMap, Registration]:
     """The map in its new place, by rows that say where the robot stands, and the record."""
     model = here.map
-    found = find_place(model, here.lever, data, **asked)
-    registration, fit, new = found.registration, model.unregistered, found.rows
+    (new, registration), fit = find_place(model, here.lever, data, **asked), model.unregistered
     warn_about(registration)
     LOG.info("registered anew: RMS %.4f mm on %d rows", 1e3 * registration.rms_after, registration.rows)
     open_by = max(float(registration.frame_deviations.max()), registration.known_m)
@@ -95,10 +105,11 @@ def _placed(
     if not (learn and dense and new.of_coordinates):
         placed = moved(fit, registration.transform).inflated(new.inflation)
         return RegisteredMap(placed, registration), registration
-    same, known = found.metres == SAME_PLACE, torch.full_like(new.deviations, PLACES.found_m_rad)
-    known[6:] = PLACES.same_m if same else found.metres
-    marks = FlangePoints(new.marks.fitted, new.old_markers, same=True) if same else new.marks
-    together = replace(new, marks=marks, deviations=known * (new.deviations > 0))
+    open_, marks = new.deviations.clone(), new.marks
+    open_[:6] = open_[:6].clamp(max=PLACES.found_m_rad)
+    if new.marker == "same":
+        open_[6:], marks = open_[6:].bool() * PLACES.same_m, FlangePoints(marks.fitted, new.old_markers, same=True)
+    together = replace(new, marks=marks, deviations=open_)
     problem, start = both_dates(together, new.inflation)  # as if nothing but places had changed
     solution = STEPS.solve(problem, fit.geodesic.integrator, start)
     if solution.interrupted:
@@ -127,7 +138,7 @@ def both_dates(
     if bool(new.deviations[:6].any()):  # a device says where the base is
         prior[geometry.slices["base"]] = prior[geometry.slices["base"]].clamp(min=PLACES.found_m_rad**2)
     y, noise, observe = _together(new)
-    before, rows = _shared(nominal, new, drifts), y.shape[1]
+    before, rows = _shared(new, drifts), y.shape[1]
     before = pad(before, (0, new.shared.shape[2], 0, rows - before.shape[1]))
     since = pad(new.shared, (before.shape[2] - new.shared.shape[2], 0, 0, rows - new.shared.shape[1]))
     problem = Problem(
@@ -161,27 +172,24 @@ def _together(new: NewRows) -> tuple[Tensor, Tensor, Observation | None]:
     (N, r, m), (M, own) = A.shape, new.y.shape
     size, rows = max(r, own), torch.arange(N + M, device=y.device)
     parts = [Part(rows[:N], torch.arange(m, device=y.device), torch.arange(r, device=y.device), LinearFunctionals(A))]
-    if isinstance(new.observe, Stacked):
-        parts += [Part(part.rows + N, part.points, part.numbers, part.observe) for part in new.observe.parts]
-    else:
-        parts.append(Part.of_coordinates(rows[N:], own))
+    theirs = (Part.of_coordinates(rows[:M], own),) if new.observe is None else new.observe.parts
+    parts += [replace(part, rows=part.rows + N) for part in theirs]
     noise = [pad(each, 2 * (0, size - each.shape[1])) for each in (old.noise.covariance, own_noise)]
     seen = torch.cat([pad(each, (0, size - each.shape[1])) for each in (old.noise.visible, new.visible)])
     numbers = torch.cat([pad(values, (0, size - values.shape[1])) for values in (y, new.y)])
     return numbers, without_hidden(torch.cat(noise), seen), Stacked(N + M, size, m, parts)
 
 
-def _shared(nominal: GeometryMap, new: NewRows, drifts: Sequence[Callable[[Linearisation], Tensor]]) -> Tensor:
+def _shared(new: NewRows, drifts: Sequence[Callable[[Linearisation], Tensor]]) -> Tensor:
     """(N, r, c) shifts of the old rows: those they shared already, device and markers since, what has drifted since."""
-    old = new.fitted
-    around = old.geodesic.with_nominal(FlangePoints(nominal, nominal.geometry.tool, same=True))
+    old, tool = new.fitted, new.nominal.geometry.slices["tool"]
+    A, at = old.functionals, old.geodesic.linearise(None if old.data is None else old.x)
+    # about measured points, where the new map is: what rows leave open may be centimetres away in the old one
     places = old.measured() if old.slopes is None else old.fitted_points
-    moved = place_slopes(around, around.linearise(old.x), places, new.centre) * new.deviations
-    at = old.geodesic.linearise(None if old.data is None else old.x) if drifts else None
-    if old.slopes is not None:
-        moved, at = old.slopes @ moved, None if at is None else at.projected(old.slopes)
-    drifted = [] if at is None else [columns(at) for columns in drifts]
-    return torch.cat([old.noise.shared, moved[..., new.free], *drifted], 2)
+    by_frame = frame_slopes(places.unflatten(1, (-1, 3)), new.centre)
+    moved = A @ torch.cat([by_frame, at.sensitivity[..., tool]], 2) * new.deviations
+    at = at.projected(A)
+    return torch.cat([old.noise.shared, moved[..., new.free], *(columns(at) for columns in drifts)], 2)
 
 
 def _sessions(tool: Tensor, new: NewRows, newest: GeometryMap) -> SessionMarkers:
@@ -196,36 +204,35 @@ def _sessions(tool: Tensor, new: NewRows, newest: GeometryMap) -> SessionMarkers
     return SessionMarkers(newest, torch.cat([session, latest]), torch.cat([tools, newest.geometry.tool[None]]))
 
 
-def registration_rows(data: Any, model: Any) -> Measurements | None:
-    """The rows of one set-up that say where the robot stands, with a hidden ball where a model has one.
-
-    None where no device measured positions. InputError for something else than rows.
-    """
-    if not isinstance(data, RowGroups):
-        expected, got = "dc.Measurements", type(data).__name__
-        raise InputError.of("`measurements`", expected=expected, got=got)
-    own = measured_positions(data)
-    if own is None:
-        return None
-    own = mounted_of(model).in_any_frame(own).largest_session()
-    return sensor_of(own).with_points(own, model)
-
-
-def devices_beside(model: Any, data: Any) -> tuple[PlacedDevices, ...]:
+def devices_beside(model: Any, data: Any, fitted: Sequence[PlacedDevices] = ()) -> tuple[PlacedDevices, ...]:
     """The devices of rows of any kinds, placed around a calibrated model that knows the rows' points.
 
     Devices that the model knows and that have no rows stay where they are.
+
+    Args:
+        model, data: the model and the rows.
+        fitted: devices with their rows, if the model was fitted to these: set-ups are where the fit has them.
     """
     found = list(model.placement)
     for part, _ in rows_of_one_kind(data):
         sensor_of(part).check(part, model)
         points = model.at_payloads(part.payload).map(part.q).detach().unflatten(1, (-1, 3))
-        for own in sensor_of(part).settled(part, points, model.turns):
+        for placed in sensor_of(part).settled(part, points, model.turns):
+            own = _with_rows(placed, fitted)
             alike = [number for number, old in enumerate(found) if own.devices.same_set(old.devices)]
             same = alike[0] if alike else len(found)
             alone = [] if own.devices.set_up and len(own.names) == 1 else [own]
             found[same : same + 1] = [own.beside(old) for old in found[same : same + 1]] or alone
     return tuple(found)
+
+
+def _with_rows(own: PlacedDevices, fitted: Sequence[PlacedDevices]) -> PlacedDevices:
+    """Devices with their rows of a fit, if any set of it has them; set-ups are where the fit has them."""
+    for one in fitted:
+        if one.devices.same_set(own.devices):
+            number = torch.tensor([own.names.index(name) for name in one.names], dtype=torch.int64, device=HOST)
+            return one if own.devices.set_up else replace(own, rows=one.rows, device=number[one.device])
+    return own
 
 
 def carried_devices(old: Any, new: Any, T: Tensor) -> tuple[PlacedDevices, ...]:
@@ -249,19 +256,3 @@ def carried_devices(old: Any, new: Any, T: Tensor) -> tuple[PlacedDevices, ...]:
         for own in old.placement
         if own.kind != KnownDrift.kind
     )
-
-
-def registered_devices(old: Any, new: Any) -> tuple[PlacedDevices, ...]:
-    """The devices of a model beside the same one registered anew; those that saw what it no longer knows are left out.
-
-    Warns:
-        DiffeoCalibWarning: devices that are left out.
-    """
-    same = new.registration.same and old.ball == new.ball
-    lost = [own for own in old.placement if own.devices.reads and not same]
-    if lost:
-        names = few([f"'{name}'" for own in lost for name in own.names])
-        what = f"the model no longer knows the devices {names}: these rows show other markers than what they read"
-        warn_user(sentence(what, fix="pass rows of the fit's markers, or rows of these devices, to keep them"))
-    kept = tuple(own for own in old.placement if own not in lost)
-    return carried_devices(old._with(placement=kept), new, new.registration.transform)

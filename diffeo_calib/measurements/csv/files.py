@@ -21,7 +21,7 @@ from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, as_written, few, listed, shown, warn_user
 from diffeo_calib.measurements.checks import file_sha256, quiet
 from diffeo_calib.measurements.csv.cells import repeated
-from diffeo_calib.measurements.csv.columns import ChainLike, Columns, Values, check_count
+from diffeo_calib.measurements.csv.columns import Columns, Values, check_count
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import Cells, write_rows
 from diffeo_calib.measurements.csv.sensors import (
@@ -32,9 +32,7 @@ from diffeo_calib.measurements.csv.sensors import (
     ReadingColumns,
     SensorColumns,
     SocketColumns,
-    numeric_columns,
-    sensors_of,
-    text_columns,
+    columns_of,
 )
 from diffeo_calib.measurements.csv.tables import FileRows, TableOrigin, read_table
 from diffeo_calib.measurements.observations import Observations, joined_tables
@@ -44,6 +42,7 @@ from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice, column_names, flat_names
 from diffeo_calib.robots.se3 import transforms
+from diffeo_calib.robots.tree import Tree
 
 LOG = logging.getLogger(__name__)
 Rows = TypeVar("Rows", bound=RowGroups)
@@ -68,10 +67,10 @@ def read_observations(
     """
     check_choice("duplicates", duplicates, ("error", "keep", "drop"))
     file = path if isinstance(path, Path) else Path(path)
-    sensors, numbers = sensors_of(table), numeric_columns(table)
-    rows, alone = read_table(file, numbers, text_columns(table), zeros=not growing), len(sensors) == 1
+    columns = columns_of(table)
+    rows, alone = read_table(file, columns, zeros=not growing), len(columns.sensors) == 1
     tables = []
-    for sensor, here in _divided(rows, sensors):
+    for sensor, here in _divided(rows):
         found, own = sensor.table(here)
         found = found.with_line_numbers(own.lines).with_payload(own.values.get("payload"))
         tables.append(found.with_covariates(**{name: own.values.get(name) for name in ("time", "temperature")}))
@@ -79,14 +78,15 @@ def read_observations(
     data = (data if alone else data.rows(data.line_numbers.argsort(stable=True))).with_columns(file_sha256=sha256)
     if alone and table.position is not None:
         marker = table.marker and f"{table.marker.partition('=')[0]}={','.join(data.marker_names)}"
-        numbers = replace(numbers, table=replace(numbers.table, marker=marker))
-        data = data.with_columns(origin=TableOrigin(file, numbers, sha256))
+        columns = replace(columns, table=replace(table, marker=marker))
+        data = data.with_columns(origin=TableOrigin(file, columns, sha256))
     LOG.info("read %d rows of %s", len(data), shown(path))
     return data if duplicates == "keep" else _without_copies(file, data, drop=duplicates == "drop")
 
 
-def _divided(rows: FileRows, sensors: Sequence[SensorColumns]) -> list[tuple[SensorColumns, FileRows]]:
+def _divided(rows: FileRows) -> list[tuple[SensorColumns, FileRows]]:
     """Each kind and the lines that hold it; MeasurementError for lines without any."""
+    sensors = rows.columns.sensors
     if len(sensors) == 1:
         return [(sensors[0], rows)]
     filled = [sensor.filled(rows) for sensor in sensors]
@@ -120,7 +120,7 @@ def _without_copies(path: Path, data: Rows, drop: bool) -> Rows:
 @outside_inference_mode
 def read_measurements(
     path: str | PathLike[str],
-    robot: Sequence[str] | ChainLike,
+    robot: Sequence[str] | Tree,
     position: Names | None = None,
     *,
     joints: Sequence[str] | None = None,
@@ -177,7 +177,7 @@ def _read(path: str | PathLike[str], table: TableFormat, duplicates: str, joints
     robot = table.joints
     if joints is None:
         return read_observations(path, table, duplicates=duplicates)
-    names, kinds = (robot.joint_names, robot.kinds) if isinstance(robot, ChainLike) else (robot, None)
+    names, kinds = getattr(robot, "joint_names", robot), getattr(robot, "kinds", None)
     check_count("`joints`", joints, len(names), "joint of the robot, in its order")
     table = replace(table, joints=joints, kinds=table.kinds or kinds)
     return read_observations(path, table, duplicates=duplicates).with_joint_names(names)
@@ -186,7 +186,7 @@ def _read(path: str | PathLike[str], table: TableFormat, duplicates: str, joints
 @outside_inference_mode
 def read_readings(
     path: str | PathLike[str],
-    robot: Sequence[str] | ChainLike,
+    robot: Sequence[str] | Tree,
     values: Sequence[str] | str | float,
     kind: str = "distance",
     *,
@@ -282,7 +282,8 @@ def write_predictions(
     table = replace(table, **columns, position=[[f"{prefix}{axis}" for axis in "xyz"] for prefix in prefixes])
     table = replace(table, std=[f"{prefix}std_{axis}" for prefix in prefixes for axis in "xyz"])
     table = table.for_writing(rotation_std=True, prefixes=prefixes) if poses else table
-    numeric, own = numeric_columns(table), PositionColumns(table.for_reading())
+    numeric = columns_of(table)
+    own: PositionColumns = numeric.sensors[0]
     of_bodies = [name for body in own.each for k in (0, 2, 1, 3) for name in body[k].names]
     names = [*numeric.joints.columns, *of_bodies]
 
@@ -334,7 +335,7 @@ def write_measurements(path: str | PathLike[str], data: Any, table: TableFormat,
     whole, table = Observations.joined([data]), replace(table, **columns)
     names = table.joints or whole.joint_names or [f"q{i + 1}" for i in range(whole.n)]
     table, kinds = _sheet(whole, replace(table, joints=names))
-    numeric = numeric_columns(table)
+    numeric = columns_of(table)
     check_count("joint columns", numeric.joints.texts, whole.n, "joint")
     sockets = () if table.sockets is None else table.sockets.names
     images = [IMAGE, CAMERA] * any(isinstance(one, ImageColumns) for one in table.readings)
@@ -355,7 +356,7 @@ def write_measurements(path: str | PathLike[str], data: Any, table: TableFormat,
     if empty := [name for name in numeric.names if name not in there]:
         what, got = f"the column(s) {listed(empty)}", "measurements without these values"
         raise MeasurementError.of(what, got=got, fix="leave the names out")
-    header = [name for name in (*numeric.names, *text_columns(table)) if name in there]
+    header = [name for name in (*numeric.names, *numeric.texts) if name in there]
     in_order = sorted(found, key=lambda line: line[0])
     write_rows(path, header, [[[cells.get(name, "") for name in header] for _, cells in in_order]], table)
     return table

@@ -395,40 +395,21 @@ class ImageColumns(SensorColumns):
         return {points: seen[:, :2], pixels: seen[:, 3:]}, texts, number
 
 
-def sensors_of(table: TableFormat) -> list[SensorColumns]:
-    """The columns of each kind of rows of a table; MeasurementError for options of rotations that do not match."""
-    positions = [] if table.position is None else [PositionColumns(table.for_reading())]
-    return [*positions, *([] if table.sockets is None else [table.sockets]), *table.readings]
-
-
-def text_columns(table: TableFormat) -> dict[str, bool]:
-    """The columns of texts, and whether a table must have them."""
-    pairs = [pair for sensor in sensors_of(table) for pair in sensor.texts.items()]
-    return {name: any(needed for other, needed in pairs if other == name) for name, _ in pairs}
-
-
-def numeric_columns(table: TableFormat) -> Columns:
-    """The columns of numbers.
+def columns_of(table: TableFormat) -> Columns:
+    """The columns of a table, by the kinds of its rows.
 
     Raises:
-        MeasurementError: no kind of rows, or options for something that is not measured.
+        MeasurementError: no kind of rows, options of rotations that do not match, or options for something that is not
+            measured.
     """
-    sensors, groups = sensors_of(table), list[Group]()
-    several = len(sensors) > 1
-    _check_options(table, alone=len(sensors) == 1)
-    for sensor in sensors:
-        groups += [group for group in sensor.groups(table) if group not in groups]  # kinds may share deviations
-    bodies = [body for sensor in sensors if several or sensor.hidden for body in sensor.bodies(table)]
-    return Columns.of(table, groups, bodies, all_hidden=several)
-
-
-def _check_options(table: TableFormat, *, alone: bool) -> None:
-    if not sensors_of(table):
+    sensors = [] if table.position is None else [PositionColumns(table.for_reading())]
+    sensors = [*sensors, *([] if table.sockets is None else [table.sockets]), *table.readings]
+    if not sensors:
         fix = "name the columns of the marker, or those of `socket`"
         raise MeasurementError.of("`position` is missing", fix=fix)
     if table.remounted and table.session is None:
         raise MeasurementError.of("`remounted` without `session`", fix="name the column of the set-ups too")
-    if table.marker is not None and (not alone or len(table.triples) != 1 or table.rotation is not None):
+    if table.marker is not None and (len(sensors) > 1 or len(table.triples) != 1 or table.rotation is not None):
         expected = "one position (x, y, z) in every line, and neither rotations, sockets nor readings"
         raise MeasurementError.of(f"`marker` ({shown(table.marker)})", expected=expected, fix="leave it out")
     options = "rotation", "rotation_std", "std", "camera_on_tool", "remounted", "session"
@@ -437,3 +418,4 @@ def _check_options(table: TableFormat, *, alone: bool) -> None:
         beside = "socket" if table.sockets is not None else "readings"
         fix = "leave it out: no position was measured; sockets of another set-up are other places"
         raise MeasurementError.of(f"{' and '.join(names)} beside `{beside}`", fix=fix)
+    return Columns.of(table, sensors)
