@@ -129,9 +129,14 @@ class Around:
     def process(self, table: Any, accepted: Sequence[int]) -> Process:
         """What is known by rows of the campaign."""
         place_of = {row: number for number, row in enumerate(self.placed.data.line_numbers.tolist())}
-        mine = torch.tensor([place_of[row] for row in accepted if row in place_of], dtype=torch.int64, device=HOST)
-        found = self.data.rows(mine).sample(len(mine), MOST_COORDINATES, 0)[1].process(self.scales)
-        later = [row for row in accepted if row not in place_of]
+        mine, later = (
+            [place_of[row] for row in accepted if row in place_of],
+            [row for row in accepted if row not in place_of],
+        )
+        found = self.data.prior(self.scales)
+        if mine:
+            own = self.data.rows(torch.tensor(mine, dtype=torch.int64, device=HOST))
+            found = own.sample(len(mine), MOST_COORDINATES, 0)[1].process(self.scales)
         return self.given(found, self.rows(table.rows(later))[0]) if later else found
 
     @cached_property

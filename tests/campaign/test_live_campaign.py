@@ -87,6 +87,9 @@ def test_the_result_is_that_of_the_accepted_rows(running: dc.Campaign, measured:
     q = ARM.sample(20, seed=1)
     assert torch.equal(found.model(q), alone.model(q))
     assert torch.equal(found.model.predict(q)[1], alone.model.predict(q)[1])
+    for row in rows:
+        campaign.reject(row)
+    assert (campaign.accepted, campaign.expected_error, campaign.next(1)) == ([], None, None)
 
 
 def test_mistakes_of_one_row_are_named_and_left_out(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
