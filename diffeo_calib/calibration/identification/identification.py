@@ -36,7 +36,7 @@ ROUNDS, NOISE_CHANGE = 10, 3e-3
 SMALLEST_PRIOR, LARGEST_PRIOR = 1e-5, 0.1
 """Range of estimated prior deviations, m or rad."""
 SHARED_NUMBERS = 3.0
-"""Numbers as which the noise of all kinds counts for the logarithm of that of one: of a few rows nothing may be left."""
+"""Numbers as which the noise of all kinds counts for that of one, in logarithms: of a few rows nothing may be left."""
 COORDINATES = 8000
 """Measured coordinates of the random rows that stand for all rows where there are more. What a rigid geometry cannot
 explain is larger than the error that noise then leaves in its few parameters."""
