@@ -22,6 +22,7 @@ from diffeo_calib.measurements.csv.joined import joined_file
 from diffeo_calib.measurements.csv.lines import HEAD, CsvLines, read_cells
 from diffeo_calib.measurements.csv.sensors import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.readings import MILLIMETRES
+from diffeo_calib.measurements.table_format import ZERO
 from diffeo_calib.sensors.kinds import known_kinds
 
 SEPARATORS = (",", ";", "\t", "|", " ")
@@ -394,6 +395,9 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
     nameless = all(name.isdecimal() for name in sheet.header) and len(others) > 2
     bodies = [Body(others[:3], [])] if nameless else [own for own in found if not own.left]
     bodies = bodies or matrices_in(sheet, others)[:1]
+    if not bodies and len(joints) == 2:  # a machine in a plane, and what was measured in it
+        flat = [own for own in whole(others, "xy") if not (own.wished or own.says("rate", "deviation"))]
+        bodies = [Body([*own.names.values(), ZERO], []) for own in flat]
     readings = _readings_in(sheet, others, alone=not bodies and not sockets)
     if not bodies and not sockets and not readings:
         expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"

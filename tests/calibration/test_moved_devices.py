@@ -23,8 +23,8 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.gates import CHANGE_ROWS
-from diffeo_calib.calibration.diagnostics.hypotheses import SampledRows, changes_of
-from diffeo_calib.calibration.diagnostics.judge import best_of, changes, crooked_axes
+from diffeo_calib.calibration.diagnostics.hypotheses import changes_of
+from diffeo_calib.calibration.diagnostics.judge import changes
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.process.evidence import Evidence
@@ -187,23 +187,6 @@ def test_errors_that_the_scales_understate_are_no_evidence() -> None:
 
     assert_close(gains(1000.0), gains(100.0), rtol=1e-6, atol=0)
     assert float((gains(1e-2) / gains(100.0)).max()) < 0.1
-
-
-@pytest.mark.parametrize("joint", [0, 3])
-def test_errors_that_depend_on_the_position_of_an_axis_are_named(joint: int) -> None:
-    """Of the axis alone: it is shifted and turned before the joint by smooth functions of its value."""
-    arm, measurements, _ = simulated(60)
-    setting = Setting(arm.nominal, measurements)
-    data = setting.tangent_data
-    assert [*crooked_axes(SampledRows.of(data, setting.scales))] == []
-    x = data.x[:, joint, None]
-    shape = torch.cat([(2 * x).sin(), x.cos(), (1.5 * x).sin(), (2 * x).cos(), x.sin(), 0 * x], 1)
-    moved = 5e-4 * (data.sensitivities[..., 6 + 6 * joint : 12 + 6 * joint] @ shape[:, :, None])[..., 0]
-    rows = SampledRows.of(replace(data, y=data.y + moved), setting.scales)
-    found = best_of(crooked_axes(rows), rows)
-    assert found is not None
-    assert re.search(f"position of {arm.nominal.joint_names[joint]} alone.*fall to", found.text)
-    assert found.doubt == pytest.approx(float(moved.square().sum(1).mean().sqrt()), rel=0.8)
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 
     changes    c_i E_i u, with codes c_i that are zero before a row and one from it on, or that grow with the row number
     mixtures   c_i E_i u, with codes of each row's own, of a few: two tools in turn, payloads of other rows
-    axes       u ~ N(0, s^2) of many smooth shapes
 
 Those that chance does not explain are compared by the left-out errors that remain with them, each relative to the most
 that its kind may leave: the best is named.
@@ -32,7 +31,6 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import (
     MARKERS,
     SampledRows,
-    axes_of,
     changes_of,
     left_out_rms,
     lengths_of,
@@ -66,9 +64,9 @@ class Candidate(NamedTuple):
     """An explanation that chance does not explain, in words, and the unknowns that it opens.
 
     Args:
-        columns: (M, U) effects of the unknowns on the numbers of the rows. size: their standard deviation; any by
-            default. most: part of the RMS left-out error that may remain with them. doubt: whether the model does not
-            hold them. opens: rows for which it holds, those without effects, once they are opened in it; none if not.
+        columns: (M, U) effects of the unknowns, of any size, on the numbers of the rows. most: part of the RMS left-out
+            error that may remain with them. opens: rows for which the model holds, those without effects, once they are
+            opened in it; none if not.
     """
 
     what: str
@@ -76,19 +74,16 @@ class Candidate(NamedTuple):
     fix: str
     columns: Tensor
     most: float
-    size: float | None = None
-    doubt: bool = False
     opens: str = ""
 
 
 class Finding(NamedTuple):
-    """The best explanation: a sentence, and the RMS motion of a row by errors that the model does not hold, m.
+    """The best explanation in a sentence.
 
     Columns (N, R, U), m, are the effects of unknowns that the model shall have, with unit variance; None for none.
     """
 
     text: str
-    doubt: float
     columns: Tensor | None
 
 
@@ -116,14 +111,14 @@ def judge(
     found = [*changed(rows, named, own, excess=max(1.0, variance_ratio(data, left_out)))]
     if len(own) >= gates.MIXED_ROWS:
         found += [own for one in changes if one.name == MARKERS for own in two_tools(rows, one.effects, lines)]
-        found += [*other_payloads(rows, data, lines), *crooked_axes(rows)]
+        found += other_payloads(rows, data, lines)
     whole = len(rows.index) == len(data.x)
     return best_of([one if whole else one._replace(opens="") for one in found], rows)
 
 
 def best_of(found: Iterable[Candidate], rows: SampledRows) -> Finding | None:
     """That with which left-out errors fall most, relative to what may remain."""
-    shares = ((rows.left(one.columns, one.size) / one.most, one) for one in found)
+    shares = ((rows.left(one.columns) / one.most, one) for one in found)
     share, best = min(shares, key=lambda own: own[0], default=(inf, None))
     if best is None or share > 1.0:
         return None
@@ -136,7 +131,7 @@ def best_of(found: Iterable[Candidate], rows: SampledRows) -> Finding | None:
         numbers = rows.process.numbers.in_table(best.columns).unbind(2)
         columns = torch.stack([rows.data.in_coordinates(one) for one in numbers], 2)
         columns = OPENED_M * columns / columns[columns.any(2)].square().sum(1).mean().sqrt()
-    return Finding(sentence(best.what, expected=best.expected, got=got, fix=fix), moved * best.doubt, columns)
+    return Finding(sentence(best.what, expected=best.expected, got=got, fix=fix), columns)
 
 
 # --- changes during the measurements ----------------------------------------------------------------------------------
@@ -373,17 +368,7 @@ def _other_columns(masses: Tensor, lines: Tensor) -> Iterator[tuple[str, Tensor]
             yield f"{factor * mass:.4g} where they are {mass:g}", torch.where(masses == mass, factor * mass, masses)
 
 
-# --- unknowns of one size: errors of an axis, and numbers that differ from row to row ---------------------------------
-
-
-def crooked_axes(rows: SampledRows) -> Iterator[Candidate]:
-    """The axis whose errors depend on its own position alone, if one is clear."""
-    sized = [(*rows.likeliest_size(rows.columns(one.effects)), one) for one in axes_of(rows.data)]
-    odds, size, best = max(sized, key=lambda one: one[0], default=(0.0, 0.0, None))
-    if best is not None and odds >= gates.AXIS_ODDS:
-        what = f"errors seem to depend on the position of {best.name} alone"
-        expected, columns = "a straight guide, a bearing without wobble", rows.columns(best.effects)
-        yield Candidate(what, expected, best.fix, columns, gates.AXIS_LEFT, size, doubt=True)
+# --- unknowns of one size: numbers that differ from row to row --------------------------------------------------------
 
 
 def variation(data: TangentData, scales: Hyperparameters, hypotheses: Sequence[Hypothesis]) -> tuple[float, str] | None:
