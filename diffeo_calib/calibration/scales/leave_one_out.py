@@ -40,6 +40,8 @@ from diffeo_calib.regression.regions import region_factor, region_scale
 
 BLOCK_COORDINATES = KEPT_COORDINATES
 """Measured coordinates of one block: a few hundred poses predict another pose nearly as well as thousands do."""
+KEPT_BLOCKS = 4 * BLOCK_COORDINATES
+"""Measured coordinates up to which blocks are kept with their covariances, which all weights have in common."""
 ROUNDS = 8
 """Largest number of steps of expectation maximisation."""
 WEIGHT_CHANGE = 0.01
@@ -143,14 +145,21 @@ def variance_ratio(data: TangentData, left_out: LeaveOneOut) -> float:
 def _parts(data: TangentData, seed: int, coordinates: int) -> Iterator[tuple[Tensor, TangentData]]:
     """Row numbers and data of random blocks of about equal size, each with about so many coordinates at most.
 
-    A single one is the data themselves, with the matrices that they keep.
+    A single one is the data themselves, with the matrices that they keep; a few are kept with the data.
     """
     count, every = -(-data.y.numel() // coordinates), torch.arange(len(data.x), device=data.x.device)
     if count == 1:
         yield every, data
         return
-    order = torch.randperm(len(data.x), generator=seeded(seed), device=HOST)
-    yield from ((rows, data.rows(rows)) for rows in order.to(every.device).tensor_split(count))
+    parts, key = vars(data).setdefault("blocks", {}), (seed, coordinates)
+    if key not in parts:
+        order = torch.randperm(len(data.x), generator=seeded(seed), device=HOST)
+        found = ((rows, data.rows(rows)) for rows in order.to(every.device).tensor_split(count))
+        if data.y.numel() > KEPT_BLOCKS:
+            yield from found
+            return
+        parts[key] = list(found)
+    yield from parts[key]
 
 
 def _expected_squares(part: TangentData, scales: Hyperparameters, tails: Tails) -> Tensor:
