@@ -122,8 +122,10 @@ def _compare(given: RecalibrateOptions) -> None:
 
 def _is_model(path: Path) -> bool:
     """Whether a file is a model rather than a table: its header is JSON after eight bytes."""
+    if path.exists() and not path.is_file():  # a pipe can be read only once
+        return False
     try:
         with path.open("rb") as file:
-            return path.is_file() and file.read(9)[8:] == b"{"
+            return file.read(9)[8:] == b"{"
     except OSError:
         return path.suffix.lower() not in (".csv", ".txt")
