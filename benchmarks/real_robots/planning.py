@@ -44,7 +44,7 @@ from robot_data import data_folder, find, read
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.planning.knowledge import Groups, of_model
+from diffeo_calib.calibration.planning.knowledge import of_model
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
@@ -190,7 +190,7 @@ def carried_over(model: dc.CalibratedKinematics, new: dc.Measurements, test: dc.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", dc.DiffeoCalibWarning)
         placed = model.registered(new, free="base", learn=False)
-    start = of_model(placed, "base", Groups(new.q[:0], new.q, new.q[:0], test.q))[0]
+    start = of_model(placed, "base", (new.q[:0], new.q, test.q))[0]
     measured, tested = (start.at.rows(own) for own in torch.arange(len(start.at.xi)).split([len(new), len(test)]))
     inner = start.known.covariance_between(measured) + torch.block_diag(*start.noise[: len(new)])
     residual = torch.linalg.solve(inner, (new.points - placed(new.q)).flatten())

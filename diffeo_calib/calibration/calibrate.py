@@ -256,7 +256,7 @@ def _result(
         rows=len(data.x),
         parts={part.name: part.displacement for part in explained},
         effective_parameters=chosen.left_out.effective,
-        length_in_doubt=max(warn_of_lengths(found_lengths) or 0.0, best.doubt if best else 0.0) or None,
+        length_in_doubt=warn_of_lengths(found_lengths),
         warnings="\n".join(warned) or None,
     )
     return CalibrationResult(

@@ -6,6 +6,7 @@
   payload      the sag under a payload in terms of that under the links' unknown masses: compliances are the same, so
                that one factor scales the prior deviations of all of its coefficients
 4 gear lines   periodic errors of the gears that chance does not explain; the search again if there are any
+  axes         errors that depend on the position of one axis, the same
 5 inflation    of all standard deviations, by rows that took no part in the choice of the scales
 
 Of many rows, a random sample goes through all of this; then all rows get their weights.
@@ -28,6 +29,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.scales import gear_lines
+from diffeo_calib.calibration.scales.axis_errors import with_axis_errors
 from diffeo_calib.calibration.scales.leave_one_out import (
     LeaveOneOut,
     cross_validated_inflation,
@@ -43,7 +45,7 @@ from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.process.scales import DEVIATIONS, SCALES, GearLine, Hyperparameters
+from diffeo_calib.process.scales import DEVIATIONS, FOUND, SCALES, GearLine, Hyperparameters
 from diffeo_calib.robots.tree import Tree
 
 FEWEST_POSES = 12
@@ -110,10 +112,10 @@ def choose_scales(
         stages, how = (registration, identification), {"given": given, "models": models}
         chosen = choose_scales(some, measurements[rows], *stages, **how, seed=seed, progress=progress)
         scales = chosen.selection.scales
-        data = weighed(data.with_gear_lines(scales.lines), scales, seed)
+        data = weighed(data.with_position_errors(scales), scales, seed)
         return replace(chosen, data=data, left_out=leave_one_out(data, scales, seed))
     if given is not None:
-        data = weighed(data.with_gear_lines(given.lines), given, seed)
+        data = weighed(data.with_position_errors(given), given, seed)
         left_out = leave_one_out(data, given, seed)
         _warn_of_wrong_scales(data, left_out)
         return ChosenScales(Selection(given, "given"), data, left_out)
@@ -121,8 +123,9 @@ def choose_scales(
     centre = defaults(data, noise_of_few(data, poses, registration, identification), identification.prior)
     if models:
         scales = scales_of_models(models, centre)
-        data = data.with_gear_lines(scales.lines)
-        scales = with_payload_factor(data, scales, seed)
+        data = data.with_position_errors(scales)
+        scales = with_axis_errors(data, with_payload_factor(data, scales, seed))
+        data = data.with_position_errors(scales)
         found = Selection(scales, f"those of {len(models)} other model{'s' * (len(models) > 1)}")
         data = weighed(data, scales, seed)
         return _inflated(found, None, data, measurements, seed=seed, progress=progress)
@@ -134,10 +137,8 @@ def choose_scales(
     else:
         found, data = _selected(centre, data, seed, progress)
         found = replace(found, scales=with_payload_factor(data, found.scales, seed))
-        if poses >= gear_lines.FEWEST_POSES and not found.interrupted:
-            found, data = _with_gear_lines(centre, found, data, seed, progress)
-            centre = replace(centre, lines=found.scales.lines)
-        centre = replace(centre, payload=found.scales.payload)
+        how = {"poses": poses, "seed": seed, "progress": progress}
+        centre, found, data = _with_position_errors(centre, found, data, **how)
     return _inflated(found, centre, data, measurements, seed=seed, progress=progress)
 
 
@@ -200,17 +201,24 @@ def _supported(found: Selection, data: TangentData, seed: int) -> tuple[Selectio
     return replace(found, scales=scales), weighed(data, scales, seed)
 
 
-def _with_gear_lines(
-    centre: Hyperparameters, found: Selection, data: TangentData, seed: int, progress: Progress
-) -> tuple[Selection, TangentData]:
-    """The same with the gear lines that the data show: the other scales and the weights follow from what is left."""
-    progress("gear lines", 0, 1)
-    lines = gear_lines.find_gear_lines(data, found.scales, seed)
-    if not lines:
-        return found, data
-    data, start = data.with_gear_lines(lines), replace(found.scales, lines=lines)
-    centre = replace(centre, lines=lines, payload=start.payload)
-    return _supported(select(centre, data, start=start, seed=seed, progress=progress), data, seed)
+def _with_position_errors(
+    centre: Hyperparameters, found: Selection, data: TangentData, *, poses: int, seed: int, progress: Progress
+) -> tuple[Hyperparameters, Selection, TangentData]:
+    """The same with the gear lines, then the axes, that the data show: the rest follows from what is left."""
+    for stage in ("gear lines",) * (poses >= gear_lines.FEWEST_POSES) + ("axes",):
+        if found.interrupted:
+            break
+        progress(stage, 0, 1)
+        if stage == "axes":
+            start = with_axis_errors(data, found.scales)
+        elif lines := gear_lines.find_gear_lines(data, start := found.scales, seed):
+            start = replace(start, lines=lines)
+        if start is not found.scales:
+            data = data.with_position_errors(start)
+            centre = replace(centre, **{name: getattr(start, name) for name in FOUND})
+            again = select(centre, data, start=start, seed=seed, progress=progress)
+            found, data = _supported(again, data, seed)
+    return replace(centre, payload=found.scales.payload), found, data
 
 
 def _warn_of_wrong_scales(data: TangentData, left_out: LeaveOneOut) -> None:
@@ -326,6 +334,6 @@ def scales_of_models(models: Sequence[CalibratedKinematics], like: Hyperparamete
 
 def _lines(model: CalibratedKinematics) -> list[GearLine]:
     """Gear lines of a model with their prior amplitudes."""
-    waves = model.nominal.waves
-    amplitudes = model.map.unregistered.deformation.spec.prior_variance.sqrt()[-waves.size :: 2] if waves.size else ()
-    return [GearLine(*each) for each in zip(waves.joints, waves.frequencies, map(float, amplitudes), strict=True)]
+    deviations = model.map.unregistered.deformation.spec.prior_variance.sqrt()[model.nominal.parts["waves"]]
+    waves = model.nominal.own.waves
+    return [GearLine(*one, amplitude) for one, amplitude in zip(waves, deviations[::2].tolist(), strict=True)]

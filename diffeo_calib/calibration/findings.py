@@ -45,14 +45,18 @@ def parts(model: CalibratedKinematics) -> list[Part]:
     x, theta = model.configurations, deformation.momenta.theta
     rows = torch.arange(0, len(x), -(-len(x) // MOST_CONFIGURATIONS), device=x.device)
     nominal, x = nominal.rows(rows), x[rows]
-    errors, coefficients = nominal.split(theta)
+    errors, _ = nominal.split(theta)
     jacobian = nominal.jacobian(x, theta)
     joints, offsets = _joint_parts(model, x, jacobian)
     registered, refined = nominal.geometry.points(x), nominal.geometry.points(x, errors)
     found = [Part("geometry", _rms((refined - registered).flatten(1) + jacobian @ offsets))]
+    effects = nominal.sensitivities(x, theta) * theta
     if nominal.elasticity is not None:
-        effects = nominal.sensitivities(x, theta)[..., nominal.sag] * coefficients
-        found += [Part(name, _rms(effects[..., own].sum(-1))) for name, own in nominal.elasticity.parts.items()]
+        sag = effects[..., nominal.sag]
+        found += [Part(name, _rms(sag[..., own].sum(-1))) for name, own in nominal.elasticity.parts.items()]
+    crooked = effects[..., nominal.parts["axes"]].split([6 * count for *_, count in nominal.own.axes], -1)
+    for (axis, *_), moved in zip(nominal.own.axes, crooked, strict=False):
+        found.append(Part(f"the axis of {model.robot.moving_names[axis]}", _rms(moved.sum(-1))))
     joints += [Part(f"gear line {line.frequency:.1f} of {line.joint}", line.displacement) for line in gear_lines(model)]
     points = deformation.spec.nominal(x, theta).reshape(-1, deformation.spec.task_dim)
     bent = deformation.spec.task_kernel.field(points, deformation.task_controls, deformation.momenta.task)

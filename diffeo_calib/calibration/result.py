@@ -126,7 +126,8 @@ class CalibrationResult:
 
     def places(self, stage: str = STAGES[-1]) -> Places:
         """Where the devices are as of a stage: frames of sessions, devices of readings."""
-        devices = self.placed.devices_by_stage[STAGES.index(stage)]
+        now = [own.devices for own in self.readings]
+        devices = (self.registration.devices, self.identification.devices, now)[STAGES.index(stage)]
         others = [own.devices for own in self.placement if not own.devices.reads]
         return Places(joined([*others, *devices]), self.placed.ball)
 

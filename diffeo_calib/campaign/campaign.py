@@ -263,7 +263,8 @@ class Campaign:
         if before.accepted != accepted:
             self.wait()
             if self._model is not None:
-                self._model = self._model.rebuilt(self.table, self.verdicts)
+                some = len(self.accepted) > 1  # which a model holds at least
+                self._model = self._model.rebuilt(self.table, self.verdicts) if some else None
 
     def _renew(self) -> None:
         """Make a new model if it is due."""

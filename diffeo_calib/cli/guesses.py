@@ -22,6 +22,7 @@ from diffeo_calib.measurements.csv.joined import joined_file
 from diffeo_calib.measurements.csv.lines import HEAD, CsvLines, read_cells
 from diffeo_calib.measurements.csv.sensors import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.readings import MILLIMETRES
+from diffeo_calib.measurements.table_format import ZERO
 from diffeo_calib.sensors.kinds import known_kinds
 
 SEPARATORS = (",", ";", "\t", "|", " ")
@@ -102,10 +103,17 @@ def guess_sheet(path: Path) -> Sheet:
         nameless = file.header == [str(k + 1) for k in range(len(columns))]
         held = {name: texts for name, texts in columns.items() if not (nameless and _counts(texts))}
         for decimal in (mark for mark in DECIMALS if mark != sep):
-            numbers = tuple(name for name, texts in held.items() if _readable(texts, decimal))
-            odd = [cell for name in held if name not in numbers for cell in _odd(name, lines, held[name], decimal)]
+            numbers, odd = list[str](), list[tuple[int, str, str]]()
+            for name, texts in held.items():
+                each = list(zip(lines, texts, numbers_in(texts, decimal), strict=True))
+                wrong = [(line, name, text) for line, text, value in each if value is None]
+                large = sum(value is not None and abs(value) >= LARGEST_NUMBER for *_, value in each)
+                if not wrong and 2 * large <= len(each):  # of lost ones; dates such as 20210313... are too
+                    numbers.append(name)
+                elif 2 * len(wrong) < len(each) or number(wrong[0][2], decimal, grouped=True) is not None:
+                    odd += wrong  # most are numbers, or they look like numbers
             why = str(bad_cells(path, odd, "a number", number_hint(odd[0][2], decimal))) if odd else ""
-            found.append(Sheet(path, sep, decimal, tuple(columns), numbers, tuple(file.notes), why))
+            found.append(Sheet(path, sep, decimal, tuple(columns), tuple(numbers), tuple(file.notes), why))
     best = max(found, key=lambda sheet: len(sheet.numbers), default=None)
     width, reason = max(reasons, key=lambda one: one[0], default=(0, None))
     if reason is not None and (best is None or not best.numbers or width > 2 * len(best.numbers)):
@@ -120,21 +128,6 @@ def _counts(texts: Sequence[str]) -> bool:
     """Whether a column numbers the rows, from any number on."""
     first, *others = numbers_in(texts, ".")
     return first is not None and first.is_integer() and others == [first + k for k in range(1, len(others) + 1)] != []
-
-
-def _readable(texts: Sequence[str], decimal: str) -> bool:
-    """Whether `fit` reads the cells: numbers, or marks of lost ones; dates such as 20210313... are all too large."""
-    values = numbers_in(texts, decimal)
-    large = [value for value in values if value is not None and abs(value) >= LARGEST_NUMBER]  # not NaN
-    return None not in values and 2 * len(large) <= len(values)
-
-
-def _odd(name: str, lines: Sequence[int], texts: Sequence[str], decimal: str) -> list[tuple[int, str, str]]:
-    """Line, column and text of the cells that are no numbers, if most are, or if they look like numbers."""
-    values = numbers_in(texts, decimal)
-    found = [(line, name, text) for line, text, value in zip(lines, texts, values, strict=True) if value is None]
-    seem = bool(found) and number(found[0][2], decimal, grouped=True) is not None
-    return found if seem or 2 * len(found) < len(texts) else []
 
 
 class JointColumns(NamedTuple):
@@ -402,6 +395,9 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
     nameless = all(name.isdecimal() for name in sheet.header) and len(others) > 2
     bodies = [Body(others[:3], [])] if nameless else [own for own in found if not own.left]
     bodies = bodies or matrices_in(sheet, others)[:1]
+    if not bodies and len(joints) == 2:  # a machine in a plane, and what was measured in it
+        flat = [own for own in whole(others, "xy") if not (own.wished or own.says("rate", "deviation"))]
+        bodies = [Body([*own.names.values(), ZERO], []) for own in flat]
     readings = _readings_in(sheet, others, alone=not bodies and not sockets)
     if not bodies and not sockets and not readings:
         expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"

@@ -290,7 +290,7 @@ def main() -> None:
     interrupts.install()
     with forgiving_streams(), warnings.catch_warnings():
         warnings.simplefilter("always", DiffeoCalibWarning)
-        warnings.showwarning = _show_warning
+        warnings.showwarning = lambda message, *_, **__: show("warning", record.warned(message))
         try:
             app()
         except DiffeoCalibError as error:
@@ -301,12 +301,6 @@ def main() -> None:
                 raise
             show("error", sentence(f"{as_written(str(error.filename))}: {error.strerror}", fix="check the path"))
             sys.exit(EXIT_ERROR)
-
-
-def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    """Takes the place of :func:`warnings.showwarning`."""
-    record.warnings.append(str(message))
-    show("warning", message)
 
 
 class ForgivingStream:

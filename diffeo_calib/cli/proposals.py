@@ -172,10 +172,14 @@ class Source:
         pairs = *product(turning, (self.table.angle,)), *product(places, (self.table.length,))
         return [name for name, unit in pairs if column(name).unit not in ("", unit)]
 
+    @property
+    def q(self) -> Tensor:
+        """(N, n) joint values, rad or m."""
+        return read_joints(self.sheet.path, replace(self.table, joints=self.joints, kinds=self.robot.kinds))
+
     def within_limits(self) -> bool:
         """Whether the values of the joints lie within the limits, in more than a small part of these."""
-        low, high = self.robot.limits.unbind(1)
-        q = read_joints(self.sheet.path, replace(self.table, joints=self.joints, kinds=self.robot.kinds))
+        (low, high), q = self.robot.limits.unbind(1), self.q
         part = (q.amax(0) - q.amin(0)) / (high - low)
         return bool(((q >= low) & (q <= high)).all()) and float(part.max()) > SMALLEST_PART
 
@@ -306,20 +310,18 @@ def with_units(source: Source) -> Source:
         return meant
     if not clear:
         raise _unclear(found, excluded=excluded)
-    why = _units_words(best, found[1].left if len(found) > 1 else inf) + why
+    what = "the nominal robot leaves, of what the rows vary,"
+    if source.rows.without_length and source.rows.readings:
+        what = "images of the nominal robot differ, relative to all rows, by"
+    elif source.rows.without_length:
+        what = "the nominal robot spreads the ball in a socket, relative to all rows, by"
+    others = found[1].left if len(found) > 1 else inf
+    than = f"in other units at least {percent(others)}" if others < inf else "the table contradicts other units"
+    why = f"{what} {percent(best.left, 2)}, {than}{why}"
     no_length = source.rows.without_length and all(periodic)
     length, angle = ("of lengths that you add: the table holds none", why) if no_length else (why, "the same")
     camera, slides = "the same; else the board is on the tool", "the same: the slides are in another unit"
     return best.saying(*entries([best.table], length=length, angle=angle, joint_length=slides, camera_on_tool=camera))
-
-
-def _units_words(best: Source, others: float) -> str:
-    """What the best units leave, and the least of other units."""
-    what = "the nominal robot spreads the ball in a socket, relative to all rows, by"
-    what = "images of the nominal robot differ, relative to all rows, by" if best.rows.readings else what
-    what = what if best.rows.without_length else "the nominal robot leaves, of what the rows vary,"
-    than = f"in other units at least {percent(others)}" if others < inf else "the table contradicts other units"
-    return f"{what} {percent(best.left, 2)}, {than}"
 
 
 def _unclear(found: Sequence[Source], *, excluded: bool) -> InputError:

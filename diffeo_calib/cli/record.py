@@ -14,6 +14,7 @@ import math
 import os
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,6 +44,11 @@ class Record:
     def add(self, **results: Any) -> None:
         """Add results, or replace those of the same name."""
         self._results |= results
+
+    def warned(self, message: Warning | str) -> str:
+        """The text of a warning, which is kept."""
+        self.warnings.append(str(message))
+        return self.warnings[-1]
 
     @property
     def files(self) -> list[str]:
@@ -103,17 +109,11 @@ ERRORS = "errors"
 """As in sensors/errors.py, which loads torch."""
 
 
-def errors_entry(errors: Evaluation) -> dict[str, object]:
-    """Errors of measured positions in m, and of orientations in degrees (null without), over some rows."""
-    entry: dict[str, object] = {"rows": errors.count} | {f"{name}_m": getattr(errors, name) for name in SIZES}
-    return entry | {f"angle_{name}_deg": getattr(errors.orientation, name, None) for name in SIZES}
-
-
-def kind_entry(errors: Evaluation) -> dict[str, object]:
-    """Errors of rows of any kind in the unit in which they are shown, and of orientations in degrees."""
-    unit, per_unit = errors.shown
-    entry: dict[str, object] = {"rows": errors.count, "what": errors.what, "unit": unit}
-    entry |= {name: per_unit * getattr(errors, name) for name in SIZES}
+def kind_entry(errors: Evaluation, *, metres: bool = False) -> dict[str, object]:
+    """Errors of some rows in the unit in which they are shown, or in m; of orientations in degrees (null without)."""
+    unit, per_unit = ("m", 1.0) if metres else errors.shown
+    entry: dict[str, object] = {"rows": errors.count} | ({} if metres else {"what": errors.what, "unit": unit})
+    entry |= {f"{name}{'_m' * metres}": per_unit * getattr(errors, name) for name in SIZES}
     return entry | {f"angle_{name}_deg": getattr(errors.orientation, name, None) for name in SIZES}
 
 
@@ -129,7 +129,7 @@ def entries_by_kind(found: Mapping[str, Any]) -> dict[str, Any]:
         while isinstance(one, Mapping):
             one = next(iter(one.values()))
         if one.what == ERRORS:
-            entries["errors"] = _each(own, errors_entry)
+            entries["errors"] = _each(own, partial(kind_entry, metres=True))
     return entries
 
 

@@ -30,7 +30,7 @@ from diffeo_calib.measurements.csv.files import read_observations
 from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
-from diffeo_calib.measurements.csv.sensors import ImageColumns, ReadingColumns, SocketColumns, numeric_columns
+from diffeo_calib.measurements.csv.sensors import ImageColumns, ReadingColumns, SocketColumns, columns_of
 from diffeo_calib.measurements.poses import by_frame, rotation_matrices
 from diffeo_calib.measurements.table_format import LEVER, TableFormat, numbers_of
 from diffeo_calib.robots.cartesian import is_cartesian
@@ -221,41 +221,25 @@ class MeasuredTable:
             warn_user(sentence(f"{what}its frame", fix=fix))
 
 
-@dataclass(frozen=True)
-class ProgramTable:
-    """A robot's program as the options describe it, with the columns of the targets of every tool, if any."""
-
-    csv: Path
-    table: TableFormat  # with the joints of the robot
-    given: Targets
-
-    def targets(self, tools: int) -> Tensor | None:
-        """(N, T, 4, 4) poses or (N, T, 3) positions of T tools, m; None if the table has none."""
-        given, position, rotation = self.given, self.given.position, self.given.rotation
-        if not position:
-            if rotation:
-                raise InputError.of("--rotation without --position", fix="name the columns of the position too")
-            return None
-        if len(position) != tools:
-            fix = "name the columns of the targets once for every --tip"
-            raise InputError.of("--position", expected=f"{tools} of them", got=len(position), fix=fix)
-        turned = Rows(rotation=rotation, convention=given.convention, rotation_angle=given.rotation_angle)
-        table = with_rows(self.table, turned) if rotation else self.table
-        table = replace(table, position=[_split_names(text) for text in position])
-        data = read_observations(self.csv, table, duplicates="keep", growing=True)  # 0, 0, 0 is a target
-        lines = [line for line, _ in read_cells(self.csv, table.sep, numeric_columns(table).names)[1]]
-        if len(data) < len(lines):
-            what = f"file '{self.csv}', line {few(sorted({*lines} - {*data.line_numbers.tolist()}))}"
-            raise InputError.of(what, expected="a target", got="empty cells", fix="fill them in, or remove the lines")
-        return data.points if data.poses is None else by_frame(data.poses)
-
-    def written(self) -> TableFormat:
-        """The format of the poses that are written: the same convention, by default that of commanded poses."""
-        convention, angle, joints = self.given.convention, self.given.rotation_angle, self.table.joints
-        if convention is None and isinstance(joints, PoseColumns) and not joints.is_program:
-            convention, angle = joints.convention or None, angle or self.table.angle
-        plain = replace(self.table, convention=convention, rotation_angle=angle)
-        return plain.for_writing(rotation_std=False)
+def targets_of(path: Path, table: TableFormat, given: Targets, tools: int) -> Tensor | None:
+    """(N, T, 4, 4) poses or (N, T, 3) positions of T tools, m, in a program; None if its columns hold none."""
+    position, rotation = given.position, given.rotation
+    if not position:
+        if rotation:
+            raise InputError.of("--rotation without --position", fix="name the columns of the position too")
+        return None
+    if len(position) != tools:
+        fix = "name the columns of the targets once for every --tip"
+        raise InputError.of("--position", expected=f"{tools} of them", got=len(position), fix=fix)
+    turned = Rows(rotation=rotation, convention=given.convention, rotation_angle=given.rotation_angle)
+    table = with_rows(table, turned) if rotation else table
+    table = replace(table, position=[_split_names(text) for text in position])
+    data = read_observations(path, table, duplicates="keep", growing=True)  # 0, 0, 0 is a target
+    lines = [line for line, _ in read_cells(path, table.sep, columns_of(table).names)[1]]
+    if len(data) < len(lines):
+        what = f"file '{path}', line {few(sorted({*lines} - {*data.line_numbers.tolist()}))}"
+        raise InputError.of(what, expected="a target", got="empty cells", fix="fill them in, or remove the lines")
+    return data.points if data.poses is None else by_frame(data.poses)
 
 
 def tool_frame(text: str, table: TableFormat) -> Tensor:
@@ -296,6 +280,14 @@ def as_written(table: TableFormat) -> TableFormat:
     """The same format with the columns in which joints, or the poses of a machine, are written."""
     joints = table.joints
     return replace(table, joints=joints.written) if isinstance(joints, PoseColumns) else table
+
+
+def with_rotation(table: TableFormat, given: Targets) -> TableFormat:
+    """The format of poses that are written: as targets are, by default as commanded poses, else a rotation vector."""
+    convention, angle, joints = given.convention, given.rotation_angle, table.joints
+    if convention is None and isinstance(joints, PoseColumns) and not joints.is_program:
+        convention, angle = joints.convention or None, angle or table.angle
+    return replace(table, convention=convention, rotation_angle=angle).for_writing(rotation_std=False)
 
 
 def _split_names(text: str) -> list[str]:

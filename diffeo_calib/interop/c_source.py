@@ -26,7 +26,7 @@ from diffeo_calib.kinematics.provenance import package_version
 from diffeo_calib.kinematics.tool import checked_tip, tool_transform
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.arrays import Array
-from diffeo_calib.runtime.chain import NominalChain, Sag
+from diffeo_calib.runtime.chain import NominalChain, Sag, Waves
 from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow
 from diffeo_calib.runtime.program import TOOL_LEVER, Program, inverse, tool_points
 
@@ -211,6 +211,7 @@ def c_source(
             "chain": chain,
             "nominal": nominal,
             "waves": chain.waves,
+            "axis_waves": chain.axes,
             "moving": joints,
             "slides": not nominal.revolute.all(),
             "coupled": not np.array_equal(nominal.coupling, np.eye(joints)) or bool(nominal.coupling_offset.any()),
@@ -294,6 +295,11 @@ def _sag_constants(nominal: NominalChain, sag: Sag) -> dict[str, Any]:
     }
 
 
+def own(waves: Waves, r: int) -> Array:
+    """(K, r) effects of errors on the r components of their own joints."""
+    return waves.effects.reshape(len(waves.joints), -1, r)[np.arange(len(waves.joints)), waves.joints]
+
+
 def number(value: float) -> str:
     """The shortest decimal text that a compiler reads back as the same number; integers stay integers."""
     return ("-" * (value < 0) + "HUGE_VAL") if isinf(value) else repr(value)
@@ -331,4 +337,4 @@ _ENVIRONMENT = Environment(
     keep_trailing_newline=True,
     autoescape=False,
 )
-_ENVIRONMENT.globals.update(array=array, number=number, pose=pose, poses=poses)
+_ENVIRONMENT.globals.update(array=array, number=number, own=own, pose=pose, poses=poses)

@@ -10,7 +10,7 @@ model.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from math import inf
 from typing import Any, get_args, get_type_hints
@@ -36,9 +36,9 @@ from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap, SmoothMap
-from diffeo_calib.robots.gear_waves import GearWaves
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import NO_PAYLOAD, Payload
+from diffeo_calib.robots.position_errors import PositionErrors
 from diffeo_calib.robots.se3 import rigid
 from diffeo_calib.robots.tree import robot_from_config
 from diffeo_calib.sensors.places import PlacedDevices
@@ -144,8 +144,7 @@ def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:
     robot: Header = {"kind": "robot", **chain.to_config(), "elastic": nominal.elasticity is not None}
     if len(set(geometry.on)) > 1 or geometry.on[0] != chain.tips[0]:
         robot["on"] = list(geometry.on)
-    if nominal.waves.size:
-        robot["waves"] = nominal.waves.to_config()
+    robot |= {name: list(map(list, given)) for name, given in asdict(nominal.own).items() if given}
     if nominal.payload is not None:
         carried = nominal.payload
         robot["payload"] = {"link": carried.link, "mass": float(carried.masses), "unit": carried.unit}
@@ -297,8 +296,9 @@ def _rebuild_nominal(
         if not 0 <= mass < inf or not isinstance(carried["link"], str):
             raise InputError.of("the entry payload", expected="a link and a mass of 0 or more", got=dict(carried))
         payload = Payload(carried["link"], torch.tensor(mass, dtype=torch.float64, device=HOST), unit)
-    waves = GearWaves.from_config(description.get("waves", ()))
-    return GeometryMap(geometry, elastic=description["elastic"], waves=waves, payload=payload)
+    waves = tuple((int(joint), float(frequency)) for joint, frequency in description.get("waves", ()))
+    axes = tuple((int(axis), float(low), float(high), int(K)) for axis, low, high, K in description.get("axes", ()))
+    return GeometryMap(geometry, elastic=description["elastic"], own=PositionErrors(waves, axes), payload=payload)
 
 
 def _rebuild_kernel(terms: list[Header], classes: KernelClasses) -> Kernel:

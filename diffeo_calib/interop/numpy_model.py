@@ -144,10 +144,15 @@ def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
             raise InputError.of(what, expected=expected, got=got, fix="use `dc.load`")
     chain, tool = nominal_chain(nominal), arrays["tool"]
     on = [chain.tips.index(tip) for tip in nominal.get("on", ())] or [0] * len(tool)
-    waves, theta, size = nominal.get("waves", []), arrays.get("unladen_theta", arrays["theta"]), 6 + 6 * len(chain.axes)
-    shifts, last = theta[size : size + tool.size].reshape(-1, 3), len(theta) - 2 * len(waves)
-    sag = theta[size + tool.size : last] if nominal["elastic"] else None
-    k0 = calibrated_chain(chain, arrays["base"], arrays["joint_errors"], theta, sag, waves=(waves, theta[last:]))
+    waves, axes, size = nominal.get("waves", []), nominal.get("axes", []), 6 + 6 * len(chain.axes)
+    theta = arrays.get("unladen_theta", arrays["theta"])
+    shifts, last = theta[size : size + tool.size].reshape(-1, 3), len(theta) - sum(6 * int(axis[3]) for axis in axes)
+    ends = [size + tool.size, last - 2 * len(waves), last]
+    sag, periodic, crooked = np.split(theta, ends)[1:]
+    errors = {"waves": (waves, periodic), "axes": (axes, crooked)}
+    k0 = calibrated_chain(
+        chain, arrays["base"], arrays["joint_errors"], theta, sag if nominal["elastic"] else None, **errors
+    )
     tableau, steps = TABLEAUS[integrator["kind"]](), integrator["steps"]
     if not isinstance(steps, int) or isinstance(steps, bool) or not 1 <= steps <= MOST_STEPS:
         expected = f"an integer of at least 1 and at most {MOST_STEPS}"

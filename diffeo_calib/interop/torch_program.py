@@ -94,6 +94,7 @@ def _combined(x: Tensor, coefficients: Tensor, slopes: Sequence[Tensor]) -> Tens
 TORCH = SimpleNamespace(
     sin=torch.sin,
     cos=torch.cos,
+    clip=torch.clamp,
     within_turn=lambda x: x - TURN * torch.floor(x * (1.0 / TURN)),
     stack=torch.stack,
     concatenate=torch.cat,

@@ -1,4 +1,4 @@
-"""The nominal kinematics of a robot as a map with parameters: geometric errors, gravity sag, waves of gears."""
+"""The nominal kinematics of a robot as a map with parameters: errors of its geometry, gears and axes, gravity sag."""
 
 from __future__ import annotations
 
@@ -11,32 +11,34 @@ from torch import Tensor
 from diffeo_calib.common.checks import wrapped
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.nominal import NominalMap
-from diffeo_calib.robots.gear_waves import GearWaves
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.gravity import GravitySag
 from diffeo_calib.robots.payload import NO_PAYLOAD, Payload
+from diffeo_calib.robots.position_errors import PositionErrors
 from diffeo_calib.robots.se3 import skew
+from diffeo_calib.runtime.build import axis_waves, gear_waves
+from diffeo_calib.runtime.chain import Waves, wave_angles, wave_slopes, wave_sums
 
 TURNS_FROM = 3
 """Place of the first rotation in a twist; the translations are before it."""
-NO_WAVES = GearWaves()
+NO_ERRORS = PositionErrors()
 
 
 class GeometryMap(NominalMap):
     """Marker positions of a robot with geometric errors and elastic deflections: m = 3 P.
 
     theta holds the error parameters of the geometry, then the coefficients of the elasticity, whose error twists
-    depend on the configuration, then those of the gears' waves, which turn the joints before all else.
+    depend on the configuration, then those of the gears' waves, which turn the joints before all else, and of the axes.
 
     Args:
         geometry: the geometry at theta = 0.
         elastic: whether theta includes coefficients of elasticity.
-        waves: periodic errors of joints.
+        own: errors of joints that depend on their own position.
         payload: known masses that the robot carries, for an elastic one.
         rigid: whether markers are points of frames, three each, which move as a whole: what bends them has no effect.
 
     Raises:
-        InputError: waves of joints that are not there, or a payload of a robot that does not bend.
+        InputError: errors of joints that are not there, or a payload of a robot that does not bend.
     """
 
     def __init__(
@@ -44,18 +46,24 @@ class GeometryMap(NominalMap):
         geometry: Geometry,
         *,
         elastic: bool = False,
-        waves: GearWaves = NO_WAVES,
+        own: PositionErrors = NO_ERRORS,
         payload: Payload | None = None,
         rigid: bool = False,
     ) -> None:
-        waves.check(geometry.chain.n)
+        n, n_all = geometry.chain.n, geometry.chain.moving
+        own.check(n, n_all)
         load = payload or NO_PAYLOAD
         if load and not elastic:
             raise InputError.of("a payload of a rigid robot", expected="elastic=True", fix="leave the payload out")
         self.geometry = geometry
         self.elasticity = GravitySag(geometry.chain, payload) if elastic else None
-        self.waves, self.rigid = waves, rigid
-        self.parameters = geometry.size + (self.elasticity.size if self.elasticity else 0) + waves.size
+        self.own, self.rigid = own, rigid
+        tables = {"waves": gear_waves(own.waves, n), "axes": axis_waves(own.axes, n_all)}
+        self._tables = {name: Waves(*map(torch.from_numpy, table)) for name, table in tables.items()}
+        sizes = self.elasticity.size if self.elasticity else 0, *own.sizes
+        ends = [geometry.size + sum(sizes[:k]) for k in range(len(sizes) + 1)]
+        self.parts: dict[str, slice] = dict(zip(("sag", "waves", "axes"), map(slice, ends, ends[1:]), strict=True))
+        self.sag, self.parameters = self.parts["sag"], ends[-1]
         entries, parts = range(geometry.size), geometry.slices
         self.places = (*entries[parts["base"]], *entries[parts["tool"]])
         base, joints = entries[parts["base"]], entries[parts["joints"]]
@@ -64,15 +72,6 @@ class GeometryMap(NominalMap):
     def split(self, theta: Tensor) -> tuple[Tensor, Tensor]:
         """Split theta into parameters of the geometry and coefficients of the elasticity (empty without elasticity)."""
         return theta[: self.geometry.size], theta[self.sag]
-
-    @property
-    def sag(self) -> slice:
-        """Where theta holds the coefficients of the elasticity."""
-        return slice(self.geometry.size, self.parameters - self.waves.size)
-
-    def wave_coefficients(self, theta: Tensor) -> Tensor:
-        """Those of the gears' waves: (2 K,), rad or m."""
-        return theta[self.parameters - self.waves.size :]
 
     def with_geometry(self, geometry: Geometry) -> GeometryMap:
         """The same parameters around another geometry of the same chain."""
@@ -84,7 +83,7 @@ class GeometryMap(NominalMap):
 
     def changed(self, **changes: Any) -> GeometryMap:
         """The same map with other arguments."""
-        own = {"geometry": self.geometry, "waves": self.waves, "payload": self.payload, "rigid": self.rigid}
+        own = {"geometry": self.geometry, "own": self.own, "payload": self.payload, "rigid": self.rigid}
         return GeometryMap(elastic=self.elasticity is not None, **own | changes)
 
     def around(self, nominal: GeometryMap) -> GeometryMap:
@@ -127,48 +126,70 @@ class GeometryMap(NominalMap):
     def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
         """Dk0 in m/rad or m/m: (N, 3 P, n)."""
         slopes = self._smooth_jacobian(self.turned(x, theta), theta)
-        return slopes * self.waves.slopes(x, self.wave_coefficients(theta))[:, None] if self.waves.size else slopes
+        if not self.own.waves:
+            return slopes
+        return slopes * (1.0 + wave_slopes(self._errors_of("waves", x, theta), x, torch))[:, None]
 
     def turned(self, x: Tensor, theta: Tensor) -> Tensor:
         """The joint values with the waves of their gears."""
-        return self.waves.turned(x, self.wave_coefficients(theta)) if self.waves.size else x
+        return x + wave_sums(self._errors_of("waves", x, theta), x, torch) if self.own.waves else x
 
     def _smooth_jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
         """Derivatives by joint values that include their waves: (N, 3 P, n)."""
-        errors = self._errors(x, theta)
+        errors, chain = self._errors(x, theta), self.geometry.chain
         slopes = self.geometry.jacobian(x, errors).flatten(1, 2)
-        if errors.ndim == 1 or self.elasticity is None:
+        if errors.ndim == 1:
             return slopes
-        turning = self.elasticity.twist_slopes(x, self.split(theta)[1])  # (N, joints, 6, n)
         by_twist = self._by_twist(self.geometry.sensitivities(x, errors))
-        return slopes + torch.einsum("nmjc,njck->nmk", by_twist, turning)
+        if self.elasticity is not None:
+            turning = self.elasticity.twist_slopes(x, self.split(theta)[1])  # (N, joints, 6, n)
+            slopes = slopes + torch.einsum("nmjc,njck->nmk", by_twist, turning)
+        if self.own.axes:
+            turning = wave_slopes(self._errors_of("axes", x, theta), chain.moving_values(x), torch).unflatten(
+                1, (-1, 6)
+            )
+            slopes = slopes + chain.by_active((by_twist * turning[:, None]).sum(3))
+        return slopes
 
     def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
         """d k0 / d theta in m/m or m/rad: (N, 3 P, K)."""
         turned = self.turned(x, theta)
         by_error = self.geometry.sensitivities(turned, self._errors(turned, theta))
-        parts = [by_error.flatten(1, 2)]
+        parts, by_twist = [by_error.flatten(1, 2)], self._by_twist(by_error)
         if self.rigid:
             tool, moves = self.geometry.slices["tool"], rigid_motions(self.geometry.tool.flatten())
             kept = torch.block_diag(*(moves @ moves.mT)).to(x.device)  # (3 P, 3 P) what moves every frame as a whole
             parts = [parts[0][..., : tool.start], parts[0][..., tool] @ kept]
         if self.elasticity is not None:
-            parts.append(self.elasticity.sensitivities(turned, self._by_twist(by_error)))
-        if self.waves.size:
-            joints = [joint for joint in self.waves.joints for _ in range(2)]
-            parts.append(self._smooth_jacobian(turned, theta)[..., joints] * self.waves.columns(x)[:, None])
+            parts.append(self.elasticity.sensitivities(turned, by_twist))
+        if self.own.waves:
+            waves = self._errors_of("waves", x)
+            slopes = self._smooth_jacobian(turned, theta)[..., waves.joints]
+            parts.append(slopes * wave_angles(waves, x, torch).cos()[:, None])
+        if self.own.axes:
+            axes = self._errors_of("axes", x)
+            functions = wave_angles(axes, self.geometry.chain.moving_values(turned), torch).cos()
+            parts.append((by_twist[:, :, axes.joints] * functions[:, None, :, None]).flatten(2))
         return torch.cat(parts, dim=2)
 
     def _errors(self, x: Tensor, theta: Tensor) -> Tensor:
-        """Error parameters of the geometry: (K,), or (N, K) where the robot deflects."""
-        errors, coefficients = self.split(theta)
-        live = wrapped(coefficients) or coefficients.requires_grad or bool(coefficients.any())
-        if self.elasticity is None or not live:  # sag that vanishes, in value and derivatives, need not be computed
+        """Error parameters of the geometry: (K,), or (N, K) where the robot deflects or an axis is crooked."""
+        (errors, coefficients), chain = self.split(theta), self.geometry.chain
+        live = wrapped(theta) or theta.requires_grad  # what vanishes, in value and derivatives, need not be computed
+        twists = list[Tensor]()
+        if self.elasticity is not None and (live or bool(coefficients.any())):
+            twists.append(self.elasticity.twists(x, coefficients).flatten(1))
+        if self.own.axes and (live or bool(theta[self.parts["axes"]].any())):
+            twists.append(wave_sums(self._errors_of("axes", x, theta), chain.moving_values(x), torch))
+        if not twists:
             return errors
-        joints = self.geometry.slices["joints"]
-        deflected = errors[joints] + self.elasticity.twists(x, coefficients).flatten(1)
-        same = errors.expand(x.shape[0], -1)
-        return torch.cat([same[:, : joints.start], deflected, same[:, joints.stop :]], dim=1)
+        joints, same = self.geometry.slices["joints"], errors.expand(x.shape[0], -1)
+        return torch.cat([same[:, : joints.start], errors[joints] + sum(twists), same[:, joints.stop :]], dim=1)
+
+    def _errors_of(self, name: str, x: Tensor, theta: Tensor | None = None) -> Waves:
+        """The errors of gears or axes, on the device of joint values; with units of their joints without theta."""
+        units = Waves(*(part.to(x.device) for part in self._tables[name]))
+        return units if theta is None else units.times(theta[self.parts[name]])
 
     def _by_twist(self, by_error: Tensor) -> Tensor:
         """The columns of the joints' error twists: (N, P, 3, K) -> (N, 3 P, joints, 6)."""

@@ -60,7 +60,8 @@ def _program(deformation: Deformation) -> Program | None:
         _array(geometry.joint_errors),
         _array(errors),
         None if nominal.elasticity is None else _array(nominal.elasticity.folded(coefficients)),
-        waves=(nominal.waves.to_config(), _array(nominal.wave_coefficients(theta))),
+        waves=(nominal.own.waves, _array(theta[nominal.parts["waves"]])),
+        axes=(nominal.own.axes, _array(theta[nominal.parts["axes"]])),
     )
     joint, task = (_recorded(flow, deformation.integrator) for flow in flows)
     points = geometry.absorb(errors.detach().cpu()).tool if other is None else other.points

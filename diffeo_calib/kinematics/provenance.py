@@ -104,8 +104,8 @@ class Summary:
         parts: name of each part of the model -> RMS displacement of the markers that it explains, m.
         noise_degrees_of_freedom: of Student's t; infinite for Gaussian noise, None if unknown.
         effective_parameters: effective number of parameters of the fit; None if it was not computed.
-        length_in_doubt: RMS distance by which points move with a length of robot or device that is improbable, or with
-            errors of an axis that the model does not know, m; None without one.
+        length_in_doubt: RMS distance by which points move with a length of robot or device that is improbable, m; None
+            without one.
         warnings: what the calibration warned of, one line each; None if it did not.
     """
 

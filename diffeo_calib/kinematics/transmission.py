@@ -82,16 +82,16 @@ class NamedGearLine:
 def gear_lines(model: Any) -> tuple[NamedGearLine, ...]:
     """The gear lines of a model, the largest displacement first; empty where no line was found."""
     nominal, theta = model.nominal, model.map.deformation.momenta.theta
-    waves, coefficients = nominal.waves, nominal.wave_coefficients(theta).view(-1, 2)
-    if not waves.size:
+    waves, part = nominal.own.waves, nominal.parts["waves"]
+    if not waves:
         return ()
-    sensitivities = nominal.sensitivities(model.configurations, theta)[..., nominal.sag.stop :]
+    sensitivities, coefficients = nominal.sensitivities(model.configurations, theta)[..., part], theta[part].view(-1, 2)
     effects = (sensitivities * coefficients.flatten()).unflatten(-1, (-1, 2)).sum(-1)  # (N, 3 P, K)
     moved = effects.unflatten(1, (-1, 3)).square().sum(2).mean((0, 1)).sqrt().tolist()
     found = []
-    for k, (joint, frequency) in enumerate(zip(waves.joints, waves.frequencies, strict=True)):
+    for k, (joint, frequency) in enumerate(waves):
         C, S = coefficients[k].tolist()
-        others = [m for m in MULTIPLES if any(abs(frequency / m - one) <= SAME_RATIO for one in waves.frequencies)]
+        others = [m for m in MULTIPLES if any(abs(frequency / m - one) <= SAME_RATIO for _, one in waves)]
         what = model.robot.joint_names[joint], frequency, hypot(C, S), atan2(S, C), [*others, 1][0]
         found.append(NamedGearLine(*what, moved[k]))
     return tuple(sorted(found, key=lambda line: -line.displacement))

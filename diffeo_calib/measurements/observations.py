@@ -201,19 +201,14 @@ def unmixed(table: Any, rows: Tensor) -> list[tuple[Any, Tensor]]:
 
 
 def _check_joinable(tables: Sequence[Any]) -> None:
-    """Raise MeasurementError for tables that differ in joints or payloads, or whose ball is on several tips."""
+    """MeasurementError for tables that differ in joints, payloads, the ball's tip, or ways in which a device reads."""
     check_alike(tables, ("payload", "covariates"), ("n", "joint_names", "payload_at", "covariate_names"))
     tips = {tip for table in tables if (tip := table.ball_tip) is not None}
     if len(tips) > 1:
         fix = "the ball in sockets and that of readings is one: pass the rows of one ball"
         raise MeasurementError.of("the ball of the tables", expected="one tip", got=few(sorted(tips)), fix=fix)
-    _check_device_names([table for table in tables if table.kind not in WITH_POSITION])
-
-
-def _check_device_names(tables: Sequence[Any]) -> None:
-    """Raise MeasurementError for devices of the same kind and name that read in several ways: which one is meant?"""
-    ways = dict[tuple[str, str], set[object]]()
-    for table in tables:
+    ways = dict[tuple[str, str], set[object]]()  # in which devices of a kind and name read: which one is meant?
+    for table in (one for one in tables if one.kind not in WITH_POSITION):
         for name in set(table.device_names):
             ways.setdefault((table.kind, name), set()).add(table.column_kind)
     found = [f"{kind}s of '{name}'" for (kind, name), own in ways.items() if len(own) > 1]

@@ -355,9 +355,16 @@ class RowGroups:
         Raises:
             MeasurementError: k below 2, or fewer distinct configurations than folds.
         """
+        if not isinstance(k, (int, np.integer)) or isinstance(k, bool) or k < 2:
+            raise MeasurementError.of("`k`", expected="at least 2 folds", got=as_written(k), fix="pass 5 or 10")
         held, units, kind = self._divided
+        sizes, order = _shuffled(units, seed, kind, fewest=k, what=f"cannot make {k} folds")
+        load, fold_of = np.zeros(k, dtype=np.int64), np.zeros(len(sizes), dtype=np.int64)
+        for group in order[np.argsort(-sizes[order], kind="stable")]:  # the largest first
+            fold_of[group] = load.argmin()
+            load[fold_of[group]] += sizes[group]
         fold = np.full(len(self), -1)
-        fold[held] = fold_numbers(units, k, seed, kind)
+        fold[held] = fold_of[units.numpy()]
         return [(self.rows(fold != i), self.rows(fold == i)) for i in range(k)]
 
     @property
@@ -421,18 +428,6 @@ def in_train(labels: Tensor, fraction: float, seed: int, kind: str) -> np.ndarra
         if after < len(labels) and (nearer or not chosen):  # neither part may end up empty
             rows, chosen = after, [*chosen, group]
     return np.isin(labels.numpy(), chosen)
-
-
-def fold_numbers(labels: Tensor, k: int, seed: int, kind: str) -> np.ndarray:
-    """(N,) whole groups of labels (N,) over ``k`` folds of about equal size, see :meth:`RowGroups.folds`."""
-    if not isinstance(k, (int, np.integer)) or isinstance(k, bool) or k < 2:
-        raise MeasurementError.of("`k`", expected="at least 2 folds", got=as_written(k), fix="pass 5 or 10")
-    sizes, order = _shuffled(labels, seed, kind, fewest=k, what=f"cannot make {k} folds")
-    load, fold_of = np.zeros(k, dtype=np.int64), np.zeros(len(sizes), dtype=np.int64)
-    for group in order[np.argsort(-sizes[order], kind="stable")]:  # the largest first
-        fold_of[group] = load.argmin()
-        load[fold_of[group]] += sizes[group]
-    return fold_of[labels.numpy()]
 
 
 def _shuffled(labels: Tensor, seed: int, kind: str, fewest: int, what: str) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
-from diffeo_calib.common.errors import MeasurementError, few
+from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements import checks
 from diffeo_calib.measurements import poses as pose_math
 from diffeo_calib.measurements.bodies import Bodies
@@ -401,12 +401,6 @@ class Measurements(ImageTable):
             what = f"{self.body_names[never[0]]}{more} is hidden in all {len(self)} rows"
             fix = f"leave {'this marker' if self.lever is None else 'it'} out, or use rows that show it"
             raise MeasurementError.of(what, expected="some row that shows it", fix=fix)
-
-    def hidden_lines(self) -> list[str]:
-        """A sentence about hidden markers, or frames; none if all were seen."""
-        hidden = (~self.seen_bodies).sum(0).tolist()
-        counts = [f"{name} in {count}" for name, count in zip(self.body_names, hidden, strict=True) if count]
-        return [f"hidden in some of {len(self)} rows: {few(counts)} of them"] * bool(counts)
 
     @property
     def present_sessions(self) -> tuple[str, ...]:

@@ -6,7 +6,8 @@ The kernel of the joint errors is
 
 k_l (Matern 5/2) depends on joint l only and models its transmission (gear eccentricity, meshing); k_all (Gaussian)
 depends on all joints, with one length scale each, and models load and coupling. K_W is a Gaussian kernel on R^3.
-Geometric errors, the coefficients of the gravity sag and those of gear lines have Gaussian priors. The
+Geometric errors, the coefficients of the gravity sag and those of gear lines have Gaussian priors, and those of errors
+of axes have that of the functions c_k cos(k pi t), 0 < t < 1, with the spectrum of a Matern 5/2 kernel. The
 noise of a configuration is
 
     R_i = sigma^2 I + Dk0(x_i) diag(s^2) Dk0(x_i)^T   (for poses with a term for their rotation)
@@ -42,7 +43,7 @@ FIELD_AMPLITUDES = ("transmission_amplitude", "coupled_amplitude", "joint_noise"
 JOINT_SCALES = ("transmission_lengthscale", "coupled_lengthscale", *FIELD_AMPLITUDES[:3])
 """Of the fields of every active joint."""
 ELASTIC_AMPLITUDES = ("compliance", "lateral_compliance")
-AMPLITUDES = frozenset((*FIELD_AMPLITUDES, *ELASTIC_AMPLITUDES, "gravity"))
+AMPLITUDES = frozenset((*FIELD_AMPLITUDES, *ELASTIC_AMPLITUDES, "gravity", "axis_errors"))
 """Scales that may shrink to zero, when the data do not support the part of the model that they scale."""
 DEVIATIONS = (
     *(*FIELD_AMPLITUDES, *ELASTIC_AMPLITUDES),
@@ -78,6 +79,10 @@ class Hyperparameters:
         gravity: (3,) factors on both by the direction of the load in the robot's base.
         lines: gear lines; found by a scan, they take no part in the search.
         payload: factor on both compliances for the sag under the largest payload; found after the search.
+        axes: axes with errors that depend on their own position, see :class:`PositionErrors`; A of them. Found by their
+            evidence beside scales without them, and then searched with these.
+        axis_errors: (A, 2) their RMS shift in each direction, m, and turn, rad; None without such axes, as below.
+        axis_lengthscale: (A,) as a part of the range.
         other_noise: (K - 1,) m, in place of sensor_noise for rows of the second and further kinds of devices, such as a
             ball in sockets beside measured positions; None if all rows are of one kind, or measured alike.
     """
@@ -98,6 +103,9 @@ class Hyperparameters:
     gravity: Tensor
     lines: tuple[GearLine, ...] = ()
     payload: float = 1.0
+    axes: tuple[tuple[int, float, float, int], ...] = ()
+    axis_errors: Tensor | None = None
+    axis_lengthscale: Tensor | None = None
     other_noise: Tensor | None = None
 
     def joint_kernel(self, space: Space) -> Kernel:
@@ -123,10 +131,10 @@ class Hyperparameters:
         return KernelValues(squared_distances[None], term)
 
     def prior_variance(self, nominal: GeometryMap, place_deviation: float = PLACES.found_m_rad) -> Tensor:
-        """Prior variances of theta: errors of the geometry, then coefficients of the gravity sag and of gear lines.
+        """Prior variances of theta: errors of the geometry, coefficients of gravity sag, gear lines and axes in turn.
 
         Args:
-            nominal: k0, whose waves are those of the gear lines.
+            nominal: k0, with these gear lines and axes.
             place_deviation: standard deviation of base and markers around their registration, m and rad.
         """
         geometry, elasticity = nominal.geometry, nominal.elasticity
@@ -139,7 +147,11 @@ class Hyperparameters:
             elastic = torch.where(elasticity.loaded, self.payload * elastic, elastic)
             deviations = torch.cat([deviations, elastic])
         lines = [line.amplitude for line in self.lines for _ in range(2)]
-        return torch.cat([deviations, deviations.new_tensor(lines)]).square()
+        deviations = torch.cat([deviations, deviations.new_tensor(lines)])
+        if self.axis_errors is not None and self.axis_lengthscale is not None:
+            for axis, errors, lengthscale in zip(self.axes, self.axis_errors, self.axis_lengthscale, strict=True):
+                deviations = torch.cat([deviations, axis_deviations(errors, lengthscale, axis[3])])
+        return deviations.square()
 
     def supported(self, jacobian: Tensor, noise: Tensor) -> Hyperparameters:
         """The same scales, with amplitudes set to zero where the field stays far below the noise.
@@ -159,13 +171,13 @@ class Hyperparameters:
     def inflated(self, factor: float) -> Hyperparameters:
         """All standard deviations times a factor: the same fit (up to known covariances), larger uncertainty."""
         lines = tuple(replace(line, amplitude=factor * line.amplitude) for line in self.lines)
-        names = [name for name in (*DEVIATIONS, OTHER_NOISE) if getattr(self, name) is not None]
+        names = [name for name in (*DEVIATIONS, *DEVIATIONS_OF_SOME) if getattr(self, name) is not None]
         return replace(self, **{name: factor * getattr(self, name) for name in names}, lines=lines)
 
     @property
     def searched(self) -> tuple[str, ...]:
         """Names of the scales that are searched, in the order of the vector of logarithms."""
-        return SCALES if self.other_noise is None else (*SCALES, OTHER_NOISE)
+        return (*SCALES, *(name for name in SCALES_OF_SOME if getattr(self, name) is not None))
 
     def logarithms(self) -> Tensor:
         """All scales, without gear lines, as one vector of logarithms."""
@@ -183,9 +195,9 @@ class Hyperparameters:
         return torch.cat([getattr(self, name).reshape(-1) for name in SCALES])
 
     def with_vector(self, vector: Tensor) -> Hyperparameters:
-        """The inverse of :attr:`vector`, shaped like this object; the noise of further devices is kept."""
-        alone = replace(self, other_noise=None)
-        return replace(alone.from_logarithms(vector.log()), other_noise=self.other_noise)
+        """The inverse of :attr:`vector`, shaped like this object; scales that only some have are kept."""
+        parts = torch.split(vector, [getattr(self, name).numel() for name in SCALES])
+        return replace(self, **{k: v.reshape(getattr(self, k).shape) for k, v in zip(SCALES, parts, strict=True)})
 
     def amplitudes(self) -> Tensor:
         """Which entries of the vector of logarithms may shrink to zero: boolean."""
@@ -193,9 +205,19 @@ class Hyperparameters:
         return torch.cat([torch.full_like(scale, flag, dtype=torch.bool) for flag, scale in scales])
 
 
-OTHER_NOISE = "other_noise"
-SCALES = tuple(field.name for field in fields(Hyperparameters) if field.name not in ("lines", "payload", OTHER_NOISE))
+DEVIATIONS_OF_SOME = "axis_errors", "other_noise"
+SCALES_OF_SOME = (*DEVIATIONS_OF_SOME, "axis_lengthscale")
+FOUND = "lines", "payload", "axes", "axis_errors", "axis_lengthscale"
+"""Names of what is found beside other scales, before these are searched again."""
+SCALES = tuple(one.name for one in fields(Hyperparameters) if one.name not in (*FOUND, *SCALES_OF_SOME))
 """Names of the scales that are tensors and that all measurements have."""
+
+
+def axis_deviations(errors: Tensor, lengthscale: Tensor, count: int) -> Tensor:
+    """Deviations (6 count,) of c_1 ... of functions with RMS shift and turn (2,), see :class:`Hyperparameters`."""
+    rates = torch.pi * torch.arange(1, count + 1, dtype=lengthscale.dtype, device=lengthscale.device)
+    deviations = (1.0 + (rates * lengthscale).square() / 5.0) ** -1.5
+    return torch.outer(deviations * (2.0 / deviations.square().sum()).sqrt(), errors.repeat_interleave(3)).flatten()
 
 
 class Term(NamedTuple):

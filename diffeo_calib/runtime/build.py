@@ -21,6 +21,7 @@ from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow, combined
 from diffeo_calib.runtime.tables import JointTables, PeriodicSum, Table, tabulate
 
 ROTARY = ("revolute", "continuous")
+NOTHING = np.zeros(0)
 MOST_TABULATED = 1500
 """With more controls, tables would take longer to make than they save: the time grows with the square."""
 
@@ -114,7 +115,8 @@ def calibrated_chain(
     theta: Array,
     coefficients: Array | None = None,
     *,
-    waves: tuple[Sequence[Sequence[float]], Array] | None = None,
+    waves: tuple[Sequence[Sequence[float]], Array] = ((), NOTHING),
+    axes: tuple[Sequence[Sequence[float]], Array] = ((), NOTHING),
 ) -> CalibratedChain:
     """A chain with its errors.
 
@@ -122,22 +124,41 @@ def calibrated_chain(
         nominal: the robot. base: (4, 4) [m]. joint_errors: (n_all, 4, 4) [m].
         theta: (6 + 6 n_all,) error twists of base and joints [m, rad].
         coefficients: of the gravity sag (robots/gravity.py); None without it.
-        waves: joint and frequency of each, and coefficients (2 K,).
+        waves, axes: the arguments of :func:`gear_waves` and :func:`axis_waves`, and their coefficients.
     """
     L, T = len(nominal.axes), len(nominal.tips)
-    config, factors = waves or ((), np.zeros(0))
-    joints, frequencies = [int(joint) for joint, _ in config], np.array([frequency for _, frequency in config])
-    units = np.eye(nominal.coupling.shape[1])[joints]
-    periodic = Waves(tuple(joints), units, frequencies, factors.reshape(-1, 2)) if joints else None
+    periodic = gear_waves(waves[0], nominal.coupling.shape[1]).times(waves[1]) if waves[0] else None
+    crooked = axis_waves(axes[0], L).times(axes[1]) if axes[0] else None
     twists = theta[: 6 + 6 * L].reshape(-1, 6)
     offsets = nominal.offsets[:L] @ joint_errors
     sag, constant = None, twists[1:]
     if coefficients is not None and coefficients.any():
         sag = Masses.of(nominal.compliances, nominal).sag(coefficients)
-    else:
+    if sag is None and crooked is None:
         offsets, constant = offsets @ transforms(constant), np.zeros_like(constant)
     start, tips = base @ transforms(twists[0]), nominal.offsets[L : L + T]
-    return CalibratedChain(nominal, start, offsets, constant, tips, sag, periodic)
+    return CalibratedChain(nominal, start, offsets, constant, tips, sag, periodic, crooked)
+
+
+def gear_waves(waves: Sequence[Sequence[float]], n: int) -> Waves:
+    """Cosine and sine of every wave, of which joint and frequency are given, in the value of one of n active joints."""
+    table = np.array([(joint, w, s, -np.inf, np.inf) for joint, w in waves for s in (0.0, 0.5 * np.pi / w)])
+    return _waves(table, n)
+
+
+def axis_waves(axes: Sequence[Sequence[float]], n_all: int) -> Waves:
+    """cos(k pi (x - low) / (high - low)) of the value of every axis, for k from 1 to its count.
+
+    Args:
+        axes: number of one of ``n_all`` moving joints, low, high and count of each.
+    """
+    found = [(a, k * np.pi / (high - low), low, low, high) for a, low, high, K in axes for k in range(1, int(K) + 1)]
+    return _waves(np.array(found), n_all)
+
+
+def _waves(table: Array, size: int) -> Waves:
+    joints, *columns = table.reshape(-1, 5).T.copy()
+    return Waves(joints.astype(np.int64), *columns, np.eye(size)[joints.astype(np.int64)])
 
 
 def recorded_flow(

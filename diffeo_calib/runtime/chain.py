@@ -1,9 +1,10 @@
-"""Forward kinematics of a calibrated robot with gravity sag: poses of its tips and their Jacobians.
+"""Forward kinematics of a calibrated robot with gravity sag and errors of axes: poses of its tips and their Jacobians.
 
     T_tip(q) = B prod_l [ A_l T(tau_l) J_l(q_l) ] O_tip,    T(t, w) = [[exp([w]x), t], [0, 1]],
 
 the product over the joints l on the path to the tip, A_l the constant transform of moving joint l with its geometric
-error, tau_l(q) its error twist: a constant and gravity sag (robots/geometry.py, robots/gravity.py).
+error, tau_l(q) its error twist: a constant, gravity sag and errors of its axis (robots/geometry.py,
+robots/gravity.py, robots/position_errors.py).
 J_l = C + S sin q + D cos q + L q.
 """
 
@@ -27,24 +28,37 @@ SERIES_TERMS = 11
 
 
 class Waves(NamedTuple):
-    """Periodic errors of joints, x_l + C cos(w x_l) + S sin(w x_l) in place of x_l; arrays of any library."""
+    """K errors of joints by their own value x_l, sum_k c_k cos(w_k (x_l - s_k)); arrays of any library.
 
-    joints: tuple[int, ...]  # (K,) numbers l
-    selection: Any  # (K, n) units of these joints: several waves of one joint add up
-    frequencies: Any  # (K,) w, periods per turn
-    coefficients: Any  # (K, 2) C and S, rad or m
+    A value outside of [low, high] counts as its end, where the slope of errors with such ends vanishes.
+    """
+
+    joints: Any  # (K,) numbers l
+    frequencies: Any  # (K,) w, rad per unit of the joint
+    starts: Any  # (K,) s
+    low: Any  # (K,)
+    high: Any  # (K,)
+    effects: Any  # (K, J r) c_k in the r components of its joint l, zero in those of the others
+
+    def times(self, coefficients: Any) -> Waves:
+        """These, with units (K, J) of their joints for effects, with coefficients (K r,)."""
+        each = coefficients.reshape(len(self.joints), 1, -1)
+        return self._replace(effects=(self.effects[:, :, None] * each).reshape(len(self.joints), -1))
 
 
-def turned(waves: Waves, x: Any, use: Any = NUMPY) -> Any:
-    """Joint values with their waves: (N, n) -> (N, n)."""
-    angles, (C, S) = x[:, list(waves.joints)] * waves.frequencies, waves.coefficients.T
-    return x + (use.cos(angles) * C + use.sin(angles) * S) @ waves.selection
+def wave_angles(waves: Waves, x: Any, use: Any = NUMPY) -> Any:
+    """w (x_l - s): (N, J) -> (N, K)."""
+    return (use.clip(x[:, waves.joints], waves.low, waves.high) - waves.starts) * waves.frequencies
+
+
+def wave_sums(waves: Waves, x: Any, use: Any = NUMPY) -> Any:
+    """The errors of all joints: (N, J) -> (N, J r)."""
+    return use.cos(wave_angles(waves, x, use)) @ waves.effects
 
 
 def wave_slopes(waves: Waves, x: Any, use: Any = NUMPY) -> Any:
-    """Derivative of :func:`turned`, which is diagonal: (N, n) -> (N, n)."""
-    angles, (C, S) = x[:, list(waves.joints)] * waves.frequencies, waves.coefficients.T
-    return 1.0 + (waves.frequencies * (use.cos(angles) * S - use.sin(angles) * C)) @ waves.selection
+    """Derivatives of the errors, each by its own joint: (N, J) -> (N, J r)."""
+    return (-waves.frequencies * use.sin(wave_angles(waves, x, use))) @ waves.effects
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +209,8 @@ class CalibratedChain:
     twists: Array  # (n_all, 6) constant error twists tau_l [m, rad]; zero where they are multiplied in
     tips: Array  # (T, 4, 4) O_tip [m]
     sag: Sag | None = None  # gravity sag
-    waves: Waves | None = None  # of the active joints; None without
+    waves: Waves | None = None  # of the active joints, r = 1; None without
+    axes: Waves | None = None  # of the moving joints, r = 6; None without
 
     @property
     def n(self) -> int:
@@ -208,16 +223,16 @@ class CalibratedChain:
         Velocity of the tip's origin [m/rad or m/m], then angular velocity, about the axes of the measuring frame.
         """
         robot, L = self.nominal, len(self.nominal.axes)
-        at = q if self.waves is None else turned(self.waves, q)
-        motions = joint_motions(robot.motions, moving_values(robot, at))
+        x = moving_values(robot, q if self.waves is None else q + wave_sums(self.waves, q))
+        motions, bends = joint_motions(robot.motions, x), self.sag is not None or self.axes is not None
         nominal = None if self.sag is None else nominal_frames(robot, motions)
-        twists = self.twists[None] if nominal is None else error_twists(self, nominal)
-        offsets = self.offsets if nominal is None else self.offsets @ transforms(twists)
+        twists = error_twists(self, nominal, x)
+        offsets = self.offsets @ transforms(twists) if bends else self.offsets
         links = link_frames(self, offsets @ motions)
         links[0] = np.broadcast_to(self.start, (len(q), 4, 4))
         before = np.stack([links[number + 1] for number in robot.before[:L]], axis=1)
         frames = before @ self.offsets  # without and with their error twists: (N, L, 4, 4)
-        bent = frames if nominal is None else before @ offsets
+        bent = before @ offsets if bends else frames
         tips = ends(self, links)
         R, arms = bent[..., :3, :3], tips[:, :, None, :3, 3] - bent[:, None, :, :3, 3]  # (N, L, 3, 3), (N, T, L, 3)
         on_path = robot.ancestors[L:][: len(self.tips), :, None]  # (T, L, 1)
@@ -225,24 +240,28 @@ class CalibratedChain:
         linear = np.where(robot.revolute[:, None], cross(z, arms), z) * on_path
         angular = np.where(robot.revolute[:, None], z, 0.0) * on_path
         by_moving = np.concatenate([linear, angular], axis=-1).swapaxes(2, 3)  # (N, T, 6, L)
-        if self.sag is not None:
-            slopes = (self.sag.directions.T @ load_slopes(robot, self.sag, nominal)).reshape(len(q), L, 6, L)
+        if bends:
+            slopes = np.zeros((len(q), L, 6, L))
+            if self.sag is not None:
+                slopes += (self.sag.directions.T @ load_slopes(robot, self.sag, nominal)).reshape(slopes.shape)
+            if self.axes is not None:
+                slopes[:, range(L), :, range(L)] += wave_slopes(self.axes, x).reshape(-1, L, 6).swapaxes(0, 1)
             shifts = (frames[..., :3, :3] @ slopes[..., :3, :])[:, None]
             turns = (R @ _right_jacobian(twists[..., 3:]) @ slopes[..., 3:, :])[:, None]  # (N, 1, L, 3, L)
             moved = shifts + cross(turns.swapaxes(3, 4), arms[..., None, :]).swapaxes(3, 4)
             sums = [(part * on_path[..., None]).sum(2) for part in (moved, turns)]
             by_moving = by_moving + np.concatenate(sums, axis=2)
         found = by_moving @ robot.coupling
-        return tips, found if self.waves is None else found * wave_slopes(self.waves, q)[:, None, None]
+        return tips, found if self.waves is None else found * (1.0 + wave_slopes(self.waves, q))[:, None, None]
 
 
 def tip_poses(chain: Any, q: Any, use: Any = NUMPY) -> Any:
     """Poses of the tips in the measuring frame, by arrays of a library: q (N, n) -> (N, T, 4, 4) [m]."""
-    at = q if chain.waves is None else turned(chain.waves, q, use)
-    motions = joint_motions(chain.nominal.motions, moving_values(chain.nominal, at), use)
-    offsets = chain.offsets
-    if chain.sag is not None:
-        offsets = offsets @ use.transforms(error_twists(chain, nominal_frames(chain.nominal, motions, use)))
+    x = moving_values(chain.nominal, q if chain.waves is None else q + wave_sums(chain.waves, q, use))
+    motions, offsets = joint_motions(chain.nominal.motions, x, use), chain.offsets
+    if chain.sag is not None or chain.axes is not None:
+        nominal = None if chain.sag is None else nominal_frames(chain.nominal, motions, use)
+        offsets = offsets @ use.transforms(error_twists(chain, nominal, x, use))
     return ends(chain, link_frames(chain, offsets @ motions), use)
 
 
@@ -296,10 +315,13 @@ def nominal_frames(robot: Any, motions: Any, use: Any = NUMPY) -> Any:
     return use.inverse(found[:, -1:]) @ found if robot.grounded else found
 
 
-def error_twists(chain: Any, nominal: Any) -> Any:
-    """tau_l with gravity sag: (N, n_all, 6)."""
-    e, m = loads(chain.sag, nominal)
-    return chain.twists + ((e * m).sum(-1) @ chain.sag.directions).reshape(-1, *chain.twists.shape)
+def error_twists(chain: Any, nominal: Any, x: Any, use: Any = NUMPY) -> Any:
+    """tau_l by the nominal frames, for gravity sag, and the values (N, n_all) of the moving joints: (N, n_all, 6)."""
+    twists = chain.twists[None]
+    if chain.sag is not None:
+        e, m = loads(chain.sag, nominal)
+        twists = twists + ((e * m).sum(-1) @ chain.sag.directions).reshape(-1, *chain.twists.shape)
+    return twists if chain.axes is None else twists + wave_sums(chain.axes, x, use).reshape(-1, *chain.twists.shape)
 
 
 def loads(sag: Any, nominal: Any) -> tuple[Any, Any]:

@@ -136,6 +136,7 @@ def combined(x: Array, coefficients: Iterable[float], slopes: Sequence[Array]) -
 NUMPY = SimpleNamespace(
     sin=np.sin,
     cos=np.cos,
+    clip=np.clip,
     within_turn=within_turn,  # angles in [0, 2 pi)
     stack=np.stack,
     concatenate=np.concatenate,

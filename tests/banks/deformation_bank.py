@@ -21,7 +21,7 @@ from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.robots import Chain, Geometry
-from diffeo_calib.robots.gear_waves import GearWaves
+from diffeo_calib.robots.position_errors import PositionErrors
 from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.robots.tree import Tree
 
@@ -46,7 +46,7 @@ def deformation_of(
     integrator: Integrator = RK4_TWICE,
 ) -> GeodesicDeformation:
     """A deformation in general position: every kernel, error and parameter differs from zero."""
-    nominal = GeometryMap(geometry_of(chain), elastic=elastic, waves=waves_of(chain) if waves else GearWaves())
+    nominal = GeometryMap(geometry_of(chain), elastic=elastic, own=errors_of(chain) if waves else PositionErrors())
     space, n = dc.Space(chain.periodic), chain.n
     scales = torch.linspace(0.6, 1.2, n, dtype=torch.float64)
     together = dc.Gaussian(scales, variance=1e-2 * scales, space=space)
@@ -60,9 +60,11 @@ def deformation_of(
     return GeodesicDeformation(spec, draw(CONTROLS, n, seed=4, size=2.0), momenta, integrator)
 
 
-def waves_of(chain: Chain) -> GearWaves:
-    """Two waves of the last joint and one of the first; no frequency is a whole number."""
-    return GearWaves((chain.n - 1, chain.n - 1, 0), (7.3, 14.7, 5.1))
+def errors_of(chain: Tree) -> PositionErrors:
+    """Two waves of the last joint and one of the first, no frequency a whole number; two axes, beyond whose ranges
+    other values lie."""
+    axes = (0, -0.7, 0.9, 3), (chain.moving - 1, -1.5, -0.1, 2)
+    return PositionErrors(((chain.n - 1, 7.3), (chain.n - 1, 14.7), (0, 5.1)), axes)
 
 
 def model_of(chain: Chain, integrator: Integrator = RK4_TWICE, waves: bool = False) -> dc.CalibratedKinematics:

@@ -26,7 +26,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.expected_errors import workspace_deviation
 from diffeo_calib.measurements.rows import with_attributes
-from diffeo_calib.process.scales import GearLine
+from diffeo_calib.process.scales import SCALES, GearLine
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation, twist_transform
 
@@ -234,9 +234,8 @@ def as_one(result: Any, rows: Any) -> Any:
 
 
 def scales(found: dc.Hyperparameters) -> Numbers:
-    names = [name for name in vars(found) if name not in ("lines", "payload", "other_noise")]
     lines = [number for line in found.lines for number in (line.joint, line.frequency, line.amplitude)]
-    own = {f"scales, {name}": getattr(found, name) for name in names}
+    own = {f"scales, {name}": getattr(found, name) for name in SCALES}
     noise = {} if found.other_noise is None else {"scales, socket_noise": found.other_noise}
     return {**own, **noise, "scales, lines": one(*lines), "scales, payload": one(found.payload)}
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from diffeo_calib.measurements.poses import transforms
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
 
+T = TypeVar("T")
 Reader = Callable[..., Measurements]
 JOINTS, POSITION = ["q1", "q2"], ["x", "y", "z"]
 HEADER = "q1,q2,x,y,z\n"
@@ -60,6 +62,14 @@ def refused(*cases: tuple[str, Callable[[], object]]) -> None:
     for message, call in cases:
         with pytest.raises(DiffeoCalibError, match=message):
             call()
+
+
+def warned(call: Callable[..., T], *arguments: Any, **options: Any) -> tuple[T, list[str]]:
+    """What a call returns, and the warnings on the way."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = call(*arguments, **options)
+    return found, [str(one.message) for one in caught]
 
 
 def says(*parts: str) -> str:

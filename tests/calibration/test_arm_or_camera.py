@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 
 import torch
 from simulated_camera import BOARD_PRIOR, HEIGHT, LENS, WIDTH, CameraArm, camera_arm
+from table_bank import warned
 
 import diffeo_calib as dc
 from diffeo_calib.common.device import seeded
@@ -25,10 +25,7 @@ def calibrated(arm: CameraArm, focus: float = 0.0) -> tuple[dc.CalibrationResult
     outside = (pixels < 0).any(2) | (pixels > torch.tensor([WIDTH - 1, HEIGHT - 1])).any(2)
     corners = torch.cat([corners[..., :3], pixels], 2).masked_fill(outside[..., None], torch.nan)
     data = dc.Measurements.from_images(q, corners, (WIDTH, HEIGHT), arm.arm.nominal.joint_names, board=BOARD_PRIOR)
-    with warnings.catch_warnings(record=True) as found:
-        warnings.simplefilter("always")
-        result = dc.calibrate(arm.arm.nominal, data)
-    return result, [str(one.message) for one in found]
+    return warned(dc.calibrate, arm.arm.nominal, data)
 
 
 def error(result: dc.CalibrationResult) -> float:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import warnings
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -14,14 +13,14 @@ from golden_bank import camera_on_tool
 from kind_bank import kind_named, rigid_rms
 from simulated_camera import BOARD_PRIOR, HEIGHT, WIDTH, CameraArm, camera_arm, true_camera
 from simulated_sockets import rest_in_sockets
-from table_bank import refused
+from table_bank import refused, warned
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.cameras.board import BoardPrior
 from diffeo_calib.cameras.images import UNKNOWNS
-from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.csv.files import read_observations, write_measurements
 from diffeo_calib.measurements.poses import poses_from_marks
@@ -88,10 +87,8 @@ def test_a_board_of_nearly_the_right_size_is_named() -> None:
     corners: Any = data().corners
     wrong = corners.clone()
     wrong[..., :3] *= 0.988
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", DiffeoCalibWarning)
-        found = dc.calibrate(arm().arm.nominal, of_corners(wrong), hyperparameters=SCALES)
-    assert any("size of the board" in str(one.message) for one in caught)
+    found, texts = warned(dc.calibrate, arm().arm.nominal, of_corners(wrong), hyperparameters=SCALES)
+    assert any("size of the board" in one for one in texts)
     assert any(line.startswith("not decided: lengths that differ by 1.") for line in found.placement.sentences())
     assert not any(line.startswith("not decided") for line in calibrated().placement.sentences())
 

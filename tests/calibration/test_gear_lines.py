@@ -119,7 +119,8 @@ def drawn(lines: object = LINES, *, q: Tensor | None = None, seed: int = 0) -> t
 def test_planted_lines_are_found() -> None:
     data, scales = drawn()
     lines = find_gear_lines(data, scales)
-    assert find_gear_lines(data.with_gear_lines(lines), replace(scales, lines=lines)) == ()
+    scales = replace(scales, lines=lines)
+    assert find_gear_lines(data.with_position_errors(scales), scales) == ()
     found = sorted(lines, key=lambda line: -line.frequency)
     assert [line.joint for line in found] == [joint for joint, _, _ in LINES]
     for line, (_, frequency, amplitude) in zip(found, LINES, strict=True):

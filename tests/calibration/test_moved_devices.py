@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -16,6 +15,7 @@ from golden_bank import sockets
 from math_bank import normal
 from product_bank import Case, simulated, simulated_poses, ur10_measurements, ur10_scales
 from reading_bank import readings, scales
+from table_bank import warned
 from tangent_bank import Setting, built, covariance
 from torch import Tensor
 from torch.distributions import MultivariateNormal
@@ -23,8 +23,8 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.gates import CHANGE_ROWS
-from diffeo_calib.calibration.diagnostics.hypotheses import SampledRows, changes_of
-from diffeo_calib.calibration.diagnostics.judge import best_of, changes, crooked_axes
+from diffeo_calib.calibration.diagnostics.hypotheses import changes_of
+from diffeo_calib.calibration.diagnostics.judge import changes
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.process.evidence import Evidence
@@ -35,16 +35,14 @@ ARM = SimulatedArm(2)
 ROWS = 80
 
 
-def warned(data: dc.Measurements | dc.Readings) -> tuple[dc.CalibrationResult, list[str]]:
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", DiffeoCalibWarning)
-        result = dc.calibrate(ARM.nominal, data, hyperparameters=scales())
-    return result, [str(one.message) for one in caught if "seems to differ" in str(one.message)]
+def lengths(data: dc.Measurements | dc.Readings) -> tuple[dc.CalibrationResult, list[str]]:
+    result, texts = warned(dc.calibrate, ARM.nominal, data, hyperparameters=scales())
+    return result, [one for one in texts if "seems to differ" in one]
 
 
 @cache
 def clean() -> tuple[dc.CalibrationResult, list[str]]:
-    return warned(dc.Measurements(*ARM.measure(ROWS, seed=1)))
+    return lengths(dc.Measurements(*ARM.measure(ROWS, seed=1)))
 
 
 @pytest.mark.parametrize(
@@ -53,7 +51,7 @@ def clean() -> tuple[dc.CalibrationResult, list[str]]:
 )
 def test_a_wrong_scale_is_named_with_its_size(factors: tuple[float, ...], name: str, percent: float) -> None:
     q, y = ARM.measure(ROWS, seed=1)
-    result, (text,) = warned(dc.Measurements(q, y * torch.tensor(factors, dtype=torch.float64)))
+    result, (text,) = lengths(dc.Measurements(q, y * torch.tensor(factors, dtype=torch.float64)))
     found = re.match(rf"{name} seems to differ by \+([\d.]+) %", text)
     assert found is not None, text
     assert float(found[1]) == pytest.approx(percent, rel=0.25)
@@ -68,7 +66,7 @@ def test_the_result_tells_which_scales_pass_without_a_warning(share: float, noti
     (right, silent), found = clean(), clean()[0].lengths[0]
     assert silent == []
     assert abs(right.lengths[0].value) < 3 * right.lengths[0].deviation < 0.004
-    wrong, texts = warned(dc.Measurements(q, y * (1 + share * found.unnoticed - found.value)))
+    wrong, texts = lengths(dc.Measurements(q, y * (1 + share * found.unnoticed - found.value)))
     assert bool(texts) == noticed
     moved = (y - y.mean((0, 1))).square().sum(-1).mean().sqrt() * found.unnoticed
     assert found.unnoticed * found.motion == pytest.approx(float(moved), rel=0.15)
@@ -83,11 +81,8 @@ def test_sockets_without_a_known_distance_show_no_size() -> None:
     table: Any = golden.rows
     table = table.rows(slice(0, 48))
     table = with_attributes(table, sockets=replace(table.sockets, distances=(), distance_std=None))
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", DiffeoCalibWarning)
-        result = dc.calibrate(golden.robot, table, hyperparameters=golden.scales)
-    assert len(caught) == 1
-    assert "no distance between sockets is known" in str(caught[0].message)
+    result, (text,) = warned(dc.calibrate, golden.robot, table, hyperparameters=golden.scales)
+    assert "no distance between sockets is known" in text
     size = result.lengths[0]
     assert abs(size.value) < size.deviation
     assert size.deviation > 0.01
@@ -95,11 +90,11 @@ def test_sockets_without_a_known_distance_show_no_size() -> None:
 
 def test_the_scale_of_a_wire_is_checked_in_the_same_way() -> None:
     data = readings(ARM, "distance", ROWS, zero=0.02)
-    _, (text,) = warned(with_attributes(data, values=1.01 * data.values))
+    _, (text,) = lengths(with_attributes(data, values=1.01 * data.values))
     found = re.match(r"the size of the robot seems to differ by \+([\d.]+) %", text)
     assert found is not None, text
     assert float(found[1]) == pytest.approx(1.0, rel=0.2)
-    assert warned(data)[1] == []
+    assert lengths(data)[1] == []
 
 
 @pytest.mark.parametrize("step", [0.0, 1e-4])
@@ -194,23 +189,6 @@ def test_errors_that_the_scales_understate_are_no_evidence() -> None:
     assert float((gains(1e-2) / gains(100.0)).max()) < 0.1
 
 
-@pytest.mark.parametrize("joint", [0, 3])
-def test_errors_that_depend_on_the_position_of_an_axis_are_named(joint: int) -> None:
-    """Of the axis alone: it is shifted and turned before the joint by smooth functions of its value."""
-    arm, measurements, _ = simulated(60)
-    setting = Setting(arm.nominal, measurements)
-    data = setting.tangent_data
-    assert [*crooked_axes(SampledRows.of(data, setting.scales))] == []
-    x = data.x[:, joint, None]
-    shape = torch.cat([(2 * x).sin(), x.cos(), (1.5 * x).sin(), (2 * x).cos(), x.sin(), 0 * x], 1)
-    moved = 5e-4 * (data.sensitivities[..., 6 + 6 * joint : 12 + 6 * joint] @ shape[:, :, None])[..., 0]
-    rows = SampledRows.of(replace(data, y=data.y + moved), setting.scales)
-    found = best_of(crooked_axes(rows), rows)
-    assert found is not None
-    assert re.search(f"position of {arm.nominal.joint_names[joint]} alone.*fall to", found.text)
-    assert found.doubt == pytest.approx(float(moved.square().sum(1).mean().sqrt()), rel=0.8)
-
-
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:wrist_3_joint")
 @pytest.mark.filterwarnings("ignore:the place of the marker on 'ee_link' is known to")
@@ -233,10 +211,7 @@ def told(arm: SimulatedArm, q: Tensor, points: Tensor, *, given: bool = True) ->
 
 def said(robot: dc.Tree, data: dc.Measurements, *, given: bool = True) -> str | None:
     """The same of any rows."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        dc.calibrate(robot, data, hyperparameters=scales() if given else None)
-    texts = [str(one.message) for one in caught]
+    _, texts = warned(dc.calibrate, robot, data, hyperparameters=scales() if given else None)
     return next((text for text in texts if "seems to" in text), None)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ import pytest
 import torch
 from product_bank import ur10_measurements
 from reading_bank import AXES, POINTS, cameras, in_base, reading_errors, readings, scales
-from table_bank import refused
+from table_bank import refused, warned
 from tangent_bank import built, normal, shaken, tangent_covariance
 from torch import Tensor
 from torch.testing import assert_close
@@ -108,10 +107,8 @@ def errors_after_similarity(found: Tensor, truth: Tensor) -> tuple[float, float]
 
 def calibrated(arm: SimulatedArm, data: dc.Readings) -> tuple[dc.CalibrationResult, str]:
     """The result with given scales, and all warnings."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        result = dc.calibrate(arm.nominal, data, hyperparameters=scales())
-    return result, " ".join(str(one.message) for one in caught)
+    result, texts = warned(dc.calibrate, arm.nominal, data, hyperparameters=scales())
+    return result, " ".join(texts)
 
 
 def test_cameras_find_the_robot_but_for_its_size() -> None:
@@ -245,6 +242,7 @@ def test_what_is_refused() -> None:
 
 def test_a_ball_without_a_start_that_leads_anywhere_is_sought(monkeypatch: pytest.MonkeyPatch) -> None:
     arm = SimulatedArm(2)
-    data, expected = readings(arm, "distance", 60), registered(arm.nominal, readings(arm, "distance", 60))
+    data = readings(arm, "distance", 60)
+    expected = place(arm.nominal, data, silent).identification.geometry.tool
     monkeypatch.setattr("diffeo_calib.calibration.placing.readings._starts", lambda *_: [])
-    assert_close(registered(arm.nominal, data).geometry.tool, expected.geometry.tool, rtol=0, atol=1e-6)
+    assert_close(place(arm.nominal, data, silent).identification.geometry.tool, expected, rtol=0, atol=1e-6)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import warnings
 from dataclasses import replace
 from math import pi, radians
 from typing import Any
@@ -14,6 +13,7 @@ import torch
 from campaigns import CAMPAIGNS, box
 from degenerate import arm_of, measured, record
 from robots_bank import draw
+from table_bank import warned
 from torch.testing import assert_close
 
 import diffeo_calib as dc
@@ -214,10 +214,7 @@ NAMED = {
 
 def sentences(robot: dc.Chain, data: dc.Measurements) -> list[str]:
     """What is warned about after registration."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", DiffeoCalibWarning)
-        warn_of_open_directions(robot, data, register(robot, data.q, data.points))
-    return [str(one.message) for one in caught]
+    return warned(warn_of_open_directions, robot, data, register(robot, data.q, data.points))[1]
 
 
 def campaign(name: str, kind: str, rows: int, seed: int = 0) -> tuple[SimulatedArm, dc.Measurements]:

@@ -176,7 +176,7 @@ def test_deviations_grow_where_places_contradict_each_other(data: dc.Measurement
 
 def test_geometry_does_not_depend_on_where_the_sockets_are_thought(arm: SimulatedArm, data: dc.Measurements) -> None:
     found = register_sockets(arm.nominal, data.q, data.socket)  # type: ignore[arg-type]
-    geometry = found.identification.geometry
+    geometry = found.geometry
     bare = replace(data.sockets, distances=(), distance_std=None)  # type: ignore[type-var]
     thetas = []
     for shift in (0.0, 3e-3):

@@ -14,6 +14,7 @@ from math_bank import normal
 from product_bank import Case, simulated
 from reading_bank import scales
 from simulated_sockets import rest_in_sockets
+from table_bank import warned
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -99,10 +100,8 @@ ARM, ROWS = SimulatedArm(seed=0), 60
 
 
 def said(data: dc.Measurements) -> list[str]:
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        dc.calibrate(ARM.nominal, data, hyperparameters=scales())
-    return [str(one.message) for one in caught if "look wrong and fit" in str(one.message)]
+    _, texts = warned(dc.calibrate, ARM.nominal, data, hyperparameters=scales())
+    return [one for one in texts if "look wrong and fit" in one]
 
 
 def measured(payload: Tensor | None = None) -> dc.Measurements:
@@ -234,20 +233,18 @@ def test_a_plane_is_named_where_it_matters(result: Any) -> None:
     flat = found.positions.clone()
     flat[:, 2] = 0.2
 
-    def warned(positions: torch.Tensor, expected_error: float) -> list[str]:
-        with warnings.catch_warnings(record=True) as texts:
-            warnings.simplefilter("always")
-            warn_of_flat_places(result.model.map, positions, found.device, found.sockets.place, expected_error)
-        return [str(text.message) for text in texts]
+    def named(positions: torch.Tensor, expected_error: float) -> list[str]:
+        rows = found.device, found.sockets.place, expected_error
+        return warned(warn_of_flat_places, result.model.map, positions, *rows)[1]
 
-    assert warned(flat, expected) == []
-    large = warned(flat, 10 * expected)
+    assert named(flat, expected) == []
+    large = named(flat, 10 * expected)
     assert len(large) == 1
     assert "the sockets lie near a plane" in large[0]
     assert "raise or tilt the block at one place" in large[0]
     tall = flat.clone()
     tall[[0, 3], 2] = 0.9
-    assert warned(tall, 10 * expected) == []
+    assert named(tall, 10 * expected) == []
 
 
 # --- rows out of step with their joints -------------------------------------------------------------------------------

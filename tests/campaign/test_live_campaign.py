@@ -87,6 +87,9 @@ def test_the_result_is_that_of_the_accepted_rows(running: dc.Campaign, measured:
     q = ARM.sample(20, seed=1)
     assert torch.equal(found.model(q), alone.model(q))
     assert torch.equal(found.model.predict(q)[1], alone.model.predict(q)[1])
+    for row in rows:
+        campaign.reject(row)
+    assert (campaign.accepted, campaign.expected_error, campaign.next(1)) == ([], None, None)
 
 
 def test_mistakes_of_one_row_are_named_and_left_out(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
@@ -106,6 +109,7 @@ def test_mistakes_of_one_row_are_named_and_left_out(running: dc.Campaign, measur
         assert not verdict.accepted, (words, verdict)
         assert words in verdict.cause, (words, verdict)
         assert campaign.accepted == list(range(ROWS))
+        assert campaign.expected_error == pytest.approx(running.expected_error, rel=1e-6)  # it tells nothing
         campaign.accept(ROWS)
         assert campaign.accepted == list(range(ROWS + 1))
 

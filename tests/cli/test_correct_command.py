@@ -20,7 +20,7 @@ from two_arms_bank import robot as two_arms
 
 import diffeo_calib as dc
 from diffeo_calib.cli.options import Targets
-from diffeo_calib.cli.tables import ProgramTable, of_robot
+from diffeo_calib.cli.tables import of_robot, targets_of
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.tool import tool_transform
 from diffeo_calib.measurements.poses import angle_between, rotation_matrices, transforms
@@ -134,14 +134,14 @@ def test_a_program_of_targets(
 @pytest.mark.filterwarnings("ignore::diffeo_calib.common.errors.DiffeoCalibWarning")
 def test_a_target_at_the_origin_stays_and_one_without_numbers_is_named(tmp_path: Path) -> None:
     arm, path = dc.from_dh([dc.DHRow(0.1, 0.2, 0.3, 0.4)] * 2, names=["a", "b"]), tmp_path / "p.csv"
-    source = ProgramTable(path, of_robot(TableFormat("mm", "deg"), arm), Targets(position=["x,y,z"]))
+    read = path, of_robot(TableFormat("mm", "deg"), arm), Targets(position=["x,y,z"]), 1
     path.write_text("a,b,x,y,z\n1,2,0,0,0\n3,4,900,1,2\n5,6,910,1,2\n7,8,920,1,2\n")
-    found = source.targets(1)
+    found = targets_of(*read)
     assert found is not None
     assert found[:2, 0].tolist() == [[0.0, 0.0, 0.0], [0.9, 0.001, 0.002]]
     path.write_text("a,b,x,y,z\n1,2,,,\n3,4,900,1,2\n")
     with pytest.raises(InputError, match="line 2: expected a target, got empty cells"):
-        source.targets(1)
+        targets_of(*read)
 
 
 def test_target_poses_in_another_convention(site: Site, program: Path, tmp_path: Path, command: Command) -> None:

@@ -98,6 +98,7 @@ CASES: dict[str, Callable[[], GeodesicDeformation]] = {
     **{
         f"waves of the {name}": lambda c=CHAINS[name]: deformation_of(c, waves=True) for name in ("arm", "mimic joints")
     },
+    "waves, no sag": lambda: deformation_of(CHAINS["mimic slides"], elastic=False, waves=True),
     "no momenta": lambda: scaled(deformation_of(CHAINS["serial"]), 0, 0),
     "psi alone": lambda: scaled(deformation_of(CHAINS["serial"]), 0, 1),
     "phi alone": lambda: scaled(deformation_of(CHAINS["serial"]), 1, 0),
@@ -107,7 +108,16 @@ CASES: dict[str, Callable[[], GeodesicDeformation]] = {
     "far away": lambda: far_away(CHAINS["serial"]),
 }
 QUICK = ("slides with sag", "mimic joints with sag", "mimic slides, rigid", "matern52 on lines", "matern72 on circles")
-QUICK += ("waves of the arm", "waves alone", "psi alone", "phi alone", "no momenta", "large sag", "far away")
+QUICK += (
+    "waves of the arm",
+    "waves, no sag",
+    "waves alone",
+    "psi alone",
+    "phi alone",
+    "no momenta",
+    "large sag",
+    "far away",
+)
 """Those that are compiled in a default run."""
 
 
@@ -127,7 +137,7 @@ def test_points_slopes_and_poses(by: str, case: str, tmp_path: Path) -> None:
     if by == "c":
         text = (tmp_path / "generated.c").read_text()
         assert [f"{name}_flow" in text for name in ("joint", "task")] == [not flow.vanishes for flow in flows]
-        assert ("add_waves" in text) == ("waves" in case)
+        assert [name in text for name in ("add_gears", "axis_waves")] == ["waves" in case] * 2
 
 
 @needs_compiler

@@ -44,12 +44,12 @@ def test_same_values_as_the_torch_model(chain: Chain, tmp_path: Path) -> None:
         np.testing.assert_allclose(found.tool_jacobian(q, [0.1, 0.2, 0.3], frame), slopes, rtol=0, atol=1e-9)
 
 
-def test_waves_of_gears_come_back(tmp_path: Path) -> None:
+def test_errors_of_gears_and_axes_come_back(tmp_path: Path) -> None:
     model, path = model_of(CHAINS["arm"], waves=True), tmp_path / "model.safetensors"
     dc.save(model, path)
     again, q = dc.load(path), draw(5, model.robot.n, seed=5, size=9.0)
     assert torch.equal(again(q), model(q))
-    assert again.nominal.waves == model.nominal.waves
+    assert again.nominal.own == model.nominal.own
     np.testing.assert_allclose(load_numpy(path)(q), model(q).numpy(), rtol=0, atol=1e-12)
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from math import pi
+
 import pytest
 import torch
-from deformation_bank import deformation_of, geometry_of, model_of, waves_of
+from deformation_bank import deformation_of, errors_of, geometry_of, model_of
 from robots_bank import CHAINS, draw, every_chain
 from torch import Tensor
 from torch.testing import assert_close
@@ -13,7 +15,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.robots import Chain
-from diffeo_calib.robots.gear_waves import GearWaves
+from diffeo_calib.robots.position_errors import PositionErrors
 
 N = 4
 
@@ -85,20 +87,20 @@ def test_sensitivities_per_row_are_derivatives_of_that_row() -> None:
 
 def test_a_wave_turns_its_joint_and_nothing_else() -> None:
     chain = CHAINS["arm"]
-    plain, waves = deformation_of(chain).spec.nominal, waves_of(chain)
+    plain, waves = deformation_of(chain).spec.nominal, errors_of(chain).waves
     assert isinstance(plain, GeometryMap)
-    with_waves = GeometryMap(plain.geometry, elastic=True, waves=waves)
+    with_waves = GeometryMap(plain.geometry, elastic=True, own=PositionErrors(waves))
     x, theta, c = draw(4, chain.n, seed=1, size=2.0), draw(plain.parameters, seed=2, size=0.03), draw(6, seed=3)
     turned = x.clone()
-    for k, (joint, w) in enumerate(waves.to_config()):
-        turned[:, int(joint)] += c[2 * k] * (w * x[:, int(joint)]).cos() + c[2 * k + 1] * (w * x[:, int(joint)]).sin()
+    for k, (joint, w) in enumerate(waves):
+        turned[:, joint] += c[2 * k] * (w * x[:, joint]).cos() + c[2 * k + 1] * (w * x[:, joint]).sin()
     assert_close(with_waves(x, torch.cat([theta, c])), plain(turned, theta), rtol=0, atol=1e-14)
 
 
 def test_lines_have_names() -> None:
     model = model_of(CHAINS["arm"], waves=True)
     found = {line.frequency: line for line in gear_lines(model)}
-    C, S = model.nominal.wave_coefficients(model.map.deformation.momenta.theta)[2:4].tolist()
+    C, S = model.map.deformation.momenta.theta[model.nominal.parts["waves"]][2:4].tolist()
     last, largest = model.robot.joint_names[-1], gear_lines(model)
     assert [line.displacement for line in largest] == sorted((x.displacement for x in largest), reverse=True)
     assert found[14.7].amplitude == pytest.approx((C * C + S * S) ** 0.5)
@@ -112,10 +114,31 @@ def test_lines_have_names() -> None:
     assert gear_lines(plain) == ()
 
 
-def test_waves_that_cannot_be() -> None:
-    for waves in (((-1,), (5.0,)), ((0,), (0.0,)), ((0,), (float("nan"),))):
+def test_an_axis_shifts_and_turns_the_frame_before_its_joint() -> None:
+    """As an error twist of each row, constant beyond the range of the axis, where the slope vanishes."""
+    chain = CHAINS["mimic slides"]
+    geometry, axis = geometry_of(chain), (1, -0.5, 0.7, 3)
+    crooked = GeometryMap(geometry, own=PositionErrors(axes=(axis,)))
+    x, theta, c = draw(9, chain.n, seed=1, size=2.0), draw(geometry.size, seed=2, size=0.03), draw(3, 6, seed=3)
+    held = chain.moving_values(x)[:, 1].clamp(-0.5, 0.7)
+    assert 0 < int(((held > -0.5) & (held < 0.7)).sum()) < 9
+    errors = theta.repeat(9, 1)
+    for k in range(3):
+        errors[:, 12:18] += ((k + 1) * pi * (held + 0.5) / 1.2).cos()[:, None] * c[k]
+    found, theta = crooked(x, torch.cat([theta, c.flatten()])), torch.cat([theta, c.flatten()])
+    assert_close(found, geometry.points(x, errors).flatten(1), rtol=0, atol=1e-13)
+    assert_close(crooked.jacobian(x, theta), by_rows(crooked(x.requires_grad_(), theta), x), rtol=0, atol=1e-12)
+
+
+def test_waves_and_axes_that_cannot_be() -> None:
+    for waves in ((-1, 5.0), (0, 0.0), (0, float("nan"))):
         with pytest.raises(InputError, match="waves of gears"):
-            GearWaves(*waves)
+            PositionErrors((waves,))
+    for axis in ((-1, 0.0, 1.0, 2), (0, 1.0, 1.0, 2), (0, float("nan"), 1.0, 2), (0, 0.0, 1.0, 0)):
+        with pytest.raises(InputError, match="errors of axes"):
+            PositionErrors(axes=(axis,))
     chain = CHAINS["arm"]
-    with pytest.raises(InputError, match="joints of gear waves"):
-        GeometryMap(deformation_of(chain).spec.nominal.geometry, waves=GearWaves((chain.n,), (5.0,)))
+    geometry = geometry_of(chain)
+    for own, what in ((PositionErrors(((chain.n, 5.0),)), "gear waves"), (PositionErrors((), ((9, 0, 1, 2),)), "axes")):
+        with pytest.raises(InputError, match=f"joints of {what}"):
+            GeometryMap(geometry, own=own)

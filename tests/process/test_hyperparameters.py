@@ -99,7 +99,7 @@ def test_gear_lines_are_parameters_of_the_nominal_map(setting: Setting) -> None:
     """Their columns are J_l cos and J_l sin, their prior b^2; they are no scales of the search."""
     lines = (GearLine(0, 101.3, 5e-5), GearLine(setting.data.n - 1, 40.2, 2e-5))
     scales, data = replace(setting.scales, lines=lines), setting.tangent_data
-    with_lines = data.with_gear_lines(lines)
+    with_lines = data.with_position_errors(scales)
     assert torch.equal(scales.logarithms(), setting.scales.logarithms())
     assert scales.from_logarithms(scales.logarithms()).lines == lines
     assert scales.inflated(2.0).lines[1] == GearLine(setting.data.n - 1, 40.2, 4e-5)
@@ -111,5 +111,5 @@ def test_gear_lines_are_parameters_of_the_nominal_map(setting: Setting) -> None:
         expected = expected + added.reshape(expected.shape)
     assert_close(with_lines.linearisation(scales).gram(), expected, rtol=1e-12, atol=1e-16)
     assert torch.equal(with_lines.target, data.target)
-    again = with_lines.with_gear_lines(())
+    again = with_lines.with_position_errors(setting.scales)
     assert_close(again.sensitivities, data.sensitivities, rtol=0, atol=0)

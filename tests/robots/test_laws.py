@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
+from deformation_bank import errors_of
 from robots_bank import CHAIN, CHAINS, CROOKED, LIFT, draw, every_chain
 from simulated_body import HANDS, URDF_FILE
 from torch import Tensor
@@ -23,7 +24,6 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.poses import mark_points, poses_from_marks
 from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.robots import DHRow, Geometry, SimulatedArm, from_dh, load_urdf
-from diffeo_calib.robots.gear_waves import GearWaves
 from diffeo_calib.robots.gravity import GravitySag
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.se3 import skew, twist_transform
@@ -201,15 +201,14 @@ def in_general_position(robot: Tree) -> Geometry:
 
 
 def laden(robot: Tree) -> GeometryMap:
-    """Elastic, with waves, and with a weight at its last end."""
+    """Elastic, with waves and crooked axes, and with a weight at its last end."""
     payload = Payload(list(robot.ends)[-1], torch.tensor(3.0, dtype=torch.float64), 5.0)
-    waves = GearWaves((robot.n - 1, 0), (7.3, 5.1))
-    return GeometryMap(in_general_position(robot), elastic=True, waves=waves, payload=payload)
+    return GeometryMap(in_general_position(robot), elastic=True, own=errors_of(robot), payload=payload)
 
 
 @every_robot
 @pytest.mark.parametrize("size", [0.0, 1e-9, 0.05, 0.5])
-def test_errors_sag_and_waves_have_exact_derivatives(robot: Tree, size: float) -> None:
+def test_errors_sag_waves_and_axes_have_exact_derivatives(robot: Tree, size: float) -> None:
     nominal = laden(robot)
     q, theta = draw(3, robot.n), draw(nominal.parameters, seed=14, size=size)
     by_joint = vmap(jacrev(lambda row: nominal(row[None], theta)[0]))(q)

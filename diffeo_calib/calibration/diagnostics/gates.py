@@ -26,20 +26,14 @@ SURE = 3.0
 """Standard deviations from which a fall of squared left-out errors is no chance."""
 
 MIXED_ROWS, TWO_TOOLS_LEFT = 40, 0.45
-"""Rows below which tools or payloads of each, or errors of an axis, prove nothing: clean tables of 10 and 15 rows
-had log odds above 6; and the part of the left-out error that may remain with two tools in turn: noise that is
-halved by its sign leaves .8."""
+"""Rows below which tools or payloads of each prove nothing, and the part of the left-out error that may remain with two
+tools in turn: noise that is halved by its sign leaves .8."""
 PAYLOAD_ODDS, PAYLOADS_LEFT = 12.0, 0.75
 """Log odds of other payloads, beyond those by chance where every row may have any, and the part of the left-out error
 that may remain with them: of right columns 5 at most beyond chance, and .9 or more remain; none of 60 was doubted."""
 ROW_ODDS = 6.0
 """Log odds of a number that differs from row to row: clean images have less than zero, focal lengths that differ by
 0.1 % fourteen and more."""
-
-AXIS_WAVES, AXIS_ODDS, AXIS_LEFT = 6, 12.0, 0.9
-"""Half waves of the errors of an axis over its range; log odds from which they are clear, at most 2.6 in 24 clean
-tables, and 9.5 in those of real robots and of all kinds; and the part of the RMS left-out error that remains with them
-at most."""
 
 # --- rows of a campaign, one by one ---
 

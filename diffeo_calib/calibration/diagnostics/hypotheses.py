@@ -1,4 +1,4 @@
-"""What may be wrong: unknowns with effects on the rows, of what changes, of the errors of an axis, and of lengths."""
+"""What may be wrong: unknowns with effects on the rows, of what changes, and of lengths."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from diffeo_calib.kinematics.nominal import rigid_motions
 from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.process import Process
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.sensors.devices import Hypothesis
 from diffeo_calib.sensors.set_ups import frame_slopes
 
@@ -58,9 +57,9 @@ class SampledRows(NamedTuple):
         odds = Evidence.of(E, self.process).log_odds(sizes.square())
         return float(odds.max()), float(sizes[odds.argmax()])
 
-    def left(self, E: Tensor, size: float | None = None) -> float:
-        """Part of the RMS left-out error that remains beside unknowns with effects (M, U), see Process.opened."""
-        return left_out_rms(self.process.opened(E, size)) / left_out_rms(self.process)
+    def left(self, E: Tensor) -> float:
+        """Part of the RMS left-out error that remains beside unknowns of any size with effects (M, U)."""
+        return left_out_rms(self.process.opened(E)) / left_out_rms(self.process)
 
 
 def left_out_rms(process: Process) -> float:
@@ -116,34 +115,14 @@ def changes_of(data: TangentData, devices: Iterable[Hypothesis] = (), index: Ten
     return [one._replace(effects=data.motions_in_numbers(one.effects)) for one in every]
 
 
-# --- errors of an axis, and lengths -----------------------------------------------------------------------------------
+# --- lengths ----------------------------------------------------------------------------------------------------------
 
-GUIDE = (
-    "the model does not know such errors, which are not in its regions: calibrate the part of the range that is used, "
-    "or, where the axis stops at a few positions, name these as set-ups (`session`)"
-)
 PERCENT = "%", 1e-2
 OF_ROBOT = "check the scale and the unit of the device, known distances, and the robot's variant"
 OF_AXIS = "check the scale of the device along this axis and the columns of the positions"
 OF_LINK = "check the robot's variant and this link in its description"
 OF_SLIDE = "check its unit and its sign"
 OF_MIMIC = "check the multiplier of this joint in the robot's description"
-
-
-def axes_of(data: TangentData) -> Iterator[Hypothesis]:
-    """Errors of each axis that depend on its own position: straightness, pitch and yaw of a guide, or wobble.
-
-    Errors of all six directions before a joint, u_ak cos(k pi x) / k, with x from 0 to 1 over its range. Commanded
-    poses have no axes.
-    """
-    chain = data.nominal.geometry.chain
-    waves = torch.arange(1, gates.AXIS_WAVES + 1, dtype=data.x.dtype, device=data.x.device)
-    for joint, name in enumerate(() if is_cartesian(chain) else chain.moving_names):
-        x = chain.moving_values(data.x)[:, joint]
-        shapes = (torch.pi * waves * ((x - x.min()) / (x.max() - x.min()).clamp(min=1e-9))[:, None]).cos() / waves
-        twists = data.sensitivities[..., 6 + 6 * joint : 12 + 6 * joint]
-        effects = (twists[..., None] * shapes[:, None, None]).flatten(2)
-        yield Hypothesis(name, data.motions_in_numbers(effects), fix=GUIDE)
 
 
 def lengths_of(data: TangentData) -> Iterator[Hypothesis]:

@@ -2,7 +2,6 @@
 
     changes    c_i E_i u, with codes c_i that are zero before a row and one from it on, or that grow with the row number
     mixtures   c_i E_i u, with codes of each row's own, of a few: two tools in turn, payloads of other rows
-    axes       u ~ N(0, s^2) of many smooth shapes
 
 Those that chance does not explain are compared by the left-out errors that remain with them, each relative to the most
 that its kind may leave: the best is named.
@@ -32,7 +31,6 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import (
     MARKERS,
     SampledRows,
-    axes_of,
     changes_of,
     left_out_rms,
     lengths_of,
@@ -66,30 +64,26 @@ class Candidate(NamedTuple):
     """An explanation that chance does not explain, in words, and the unknowns that it opens.
 
     Args:
-        columns: (M, U) effects of the unknowns on the numbers of the rows. size: their standard deviation; any by
-            default. most: part of the RMS left-out error that may remain with them. doubt: whether the model does not
-            hold them. opens: rows for which it holds, those without effects, once they are opened in it; none if not.
+        columns: (M, U) effects of the unknowns, of any size, on the numbers of the rows. most: part of the RMS left-out
+            error that may remain with them. opens: rows for which the model holds, those without effects, once they are
+            opened in it; none if not.
     """
 
     what: str
     expected: str
-    given: str
     fix: str
     columns: Tensor
     most: float
-    size: float | None = None
-    doubt: bool = False
     opens: str = ""
 
 
 class Finding(NamedTuple):
-    """The best explanation: a sentence, and the RMS motion of a row by errors that the model does not hold, m.
+    """The best explanation in a sentence.
 
     Columns (N, R, U), m, are the effects of unknowns that the model shall have, with unit variance; None for none.
     """
 
     text: str
-    doubt: float
     columns: Tensor | None
 
 
@@ -117,27 +111,27 @@ def judge(
     found = [*changed(rows, named, own, excess=max(1.0, variance_ratio(data, left_out)))]
     if len(own) >= gates.MIXED_ROWS:
         found += [own for one in changes if one.name == MARKERS for own in two_tools(rows, one.effects, lines)]
-        found += [*other_payloads(rows, data, lines), *crooked_axes(rows)]
+        found += other_payloads(rows, data, lines)
     whole = len(rows.index) == len(data.x)
     return best_of([one if whole else one._replace(opens="") for one in found], rows)
 
 
 def best_of(found: Iterable[Candidate], rows: SampledRows) -> Finding | None:
     """That with which left-out errors fall most, relative to what may remain."""
-    shares = ((rows.left(one.columns, one.size) / one.most, one) for one in found)
+    shares = ((rows.left(one.columns) / one.most, one) for one in found)
     share, best = min(shares, key=lambda own: own[0], default=(inf, None))
     if best is None or share > 1.0:
         return None
     left = share * best.most
     moved = left_out_rms(rows.process) * (1.0 - left**2) ** 0.5
-    got = f"about {1e3 * moved:.2g} mm of error, and leave-one-out errors that fall to {100 * left:.0f} % {best.given}"
+    got = f"about {1e3 * moved:.2g} mm of error, and leave-one-out errors that fall to {100 * left:.0f} % beside it"
     fix, columns = best.fix, None
     if best.opens:
         fix += f"; the model holds for {best.opens}"
         numbers = rows.process.numbers.in_table(best.columns).unbind(2)
         columns = torch.stack([rows.data.in_coordinates(one) for one in numbers], 2)
         columns = OPENED_M * columns / columns[columns.any(2)].square().sum(1).mean().sqrt()
-    return Finding(sentence(best.what, expected=best.expected, got=got, fix=fix), moved * best.doubt, columns)
+    return Finding(sentence(best.what, expected=best.expected, got=got, fix=fix), columns)
 
 
 # --- changes during the measurements ----------------------------------------------------------------------------------
@@ -188,24 +182,22 @@ def changed(
     best = max(found, key=lambda one: one.evidence)
     if best.evidence < gates.CHANGE_EVIDENCE:
         return
-    (what, E, _, advice, *_), expected = best.hypothesis, "one set-up for all rows, in the order of their numbers"
-    given, fix = "with this change in the model", f"check what happened then; {advice}"
-
-    def as_good(one: Change) -> bool:
-        apart = min(best.gain - one.gain, best.evidence - one.evidence)
-        same = (one.row is None) == (best.row is None)
-        return same and one.hypothesis.name != what and apart < gates.CHANGES_TOLD_APART
-
-    others = [one for one in found if as_good(one)]
+    (what, E, _, advice, *_), sudden = best.hypothesis, best.row is not None
+    expected, fix = "one set-up for all rows, in the order of their numbers", f"check what happened then; {advice}"
+    others = [
+        one
+        for one in found
+        if (one.row is not None) == sudden
+        and one.hypothesis.name != what
+        and min(best.gain - one.gain, best.evidence - one.evidence) < gates.CHANGES_TOLD_APART
+    ]
     words = ", or ".join(dict.fromkeys(one.words(rows) for one in (best, *others)))
     words += " (these rows do not tell which)" * bool(others)
-    columns = rows.columns(E, best.codes)
-    if best.row is not None:
-        words += f" near row {int(lines[order[best.row]])}"
-        yield Candidate(words, expected, given, fix, columns, gates.WORTH, opens="the rows before it")
+    words += " over the rows" if best.row is None else f" near row {int(lines[order[best.row]])}"
+    kept, advice = ("the rows before it", fix) if sudden else ("the middle of the rows", SLOW)
+    yield Candidate(words, expected, advice, rows.columns(E, best.codes), gates.WORTH, opens=kept)
+    if sudden:
         return
-    words, middle = f"{words} over the rows", "the middle of the rows"
-    yield Candidate(words, expected, given, SLOW, columns, gates.WORTH, opens=middle)
     # three set-ups look like a drift: the first change is sought once more beside the second one
     first, second = (_likeliest(*scans([E], process, order)), 0)
     for _ in range(2):
@@ -215,8 +207,7 @@ def changed(
         near = " and ".join(str(int(lines[order[row]])) for row in sorted((first, second)))
         columns = torch.cat([rows.columns(E, _from(order, row)) for row in (first, second)], 1)
         words = f"{what} seems to have moved more than once, near rows {near}"
-        before = "the rows before them"
-        yield Candidate(words, expected, "with these changes", fix, columns, gates.WORTH**2, opens=before)
+        yield Candidate(words, expected, fix, columns, gates.WORTH**2, opens="the rows before them")
 
 
 def changes(
@@ -326,9 +317,9 @@ def two_tools(rows: SampledRows, effects: Tensor, lines: Tensor) -> Iterator[Can
         moved = 1e3 * float(rows.distances(E, u).amax(1).median())
         what = f"{int(fewer.sum())} of {N} rows seem to have another tool or marker, {moved:.3g} mm away: lines "
         fix = "name the tool of every row in a column (`marker`; or `session` with `remounted`)"
-        words = what + few(lines[rows.index][fewer].tolist(), 5), "one tool", "with two", fix
+        what += few(lines[rows.index][fewer].tolist(), 5)
         columns = rows.columns(E, fewer.to(E))
-        yield Candidate(*words, columns, gates.TWO_TOOLS_LEFT, opens="the other rows")
+        yield Candidate(what, "one tool", fix, columns, gates.TWO_TOOLS_LEFT, opens="the other rows")
 
 
 def other_payloads(rows: SampledRows, data: TangentData, lines: Tensor) -> Iterator[Candidate]:
@@ -352,8 +343,8 @@ def other_payloads(rows: SampledRows, data: TangentData, lines: Tensor) -> Itera
     odds = {words: mixed.evidence(codes)[1] for words, codes in others.items()}
     best, expected = max(odds, key=lambda words: odds[words]), "every payload in the row that carried it"
     if odds[best] > gates.PAYLOAD_ODDS:
-        words = f"the payloads seem to be {best}", expected, "so", "check the column: its order, unit and digits"
-        yield Candidate(*words, rows.columns(E, others[best]), gates.WORTH)
+        what, fix = f"the payloads seem to be {best}", "check the column: its order, unit and digits"
+        yield Candidate(what, expected, fix, rows.columns(E, others[best]), gates.WORTH)
         return
     u, shuffled = rows.process.estimate[loaded] / sizes, torch.randperm(len(own), generator=seeded(0), device=HOST)
     chance = Mixture(rows, E[shuffled.to(E.device)], mixed.codes)
@@ -362,8 +353,8 @@ def other_payloads(rows: SampledRows, data: TangentData, lines: Tensor) -> Itera
         wrong = chosen != 0
         what = f"{int(wrong.sum())} of {len(own)} rows seem to have carried payloads of other rows, such as lines "
         fix = "check that the column belongs to these rows; else leave it out"
-        words = what + few(lines[rows.index][wrong].tolist(), 5), expected, "so", fix
-        yield Candidate(*words, rows.columns(E, chosen), gates.PAYLOADS_LEFT)
+        what += few(lines[rows.index][wrong].tolist(), 5)
+        yield Candidate(what, expected, fix, rows.columns(E, chosen), gates.PAYLOADS_LEFT)
 
 
 def _other_columns(masses: Tensor, lines: Tensor) -> Iterator[tuple[str, Tensor]]:
@@ -377,20 +368,7 @@ def _other_columns(masses: Tensor, lines: Tensor) -> Iterator[tuple[str, Tensor]
             yield f"{factor * mass:.4g} where they are {mass:g}", torch.where(masses == mass, factor * mass, masses)
 
 
-# --- unknowns of one size: errors of an axis, and numbers that differ from row to row ---------------------------------
-
-
-def crooked_axes(rows: SampledRows) -> Iterator[Candidate]:
-    """The axis whose errors depend on its own position alone, if one is clear."""
-    clear, expected = gates.AXIS_ODDS, "a straight guide, a bearing without wobble"
-    given, found = "with such errors in the model", list[Candidate]()
-    for one in axes_of(rows.data):
-        columns = rows.columns(one.effects)
-        odds, size = rows.likeliest_size(columns)
-        if odds >= clear:
-            clear, what = odds, f"errors seem to depend on the position of {one.name} alone"
-            found = [Candidate(what, expected, given, one.fix, columns, gates.AXIS_LEFT, size, doubt=True)]
-    yield from found
+# --- unknowns of one size: numbers that differ from row to row --------------------------------------------------------
 
 
 def variation(data: TangentData, scales: Hyperparameters, hypotheses: Sequence[Hypothesis]) -> tuple[float, str] | None:
@@ -406,10 +384,10 @@ def variation(data: TangentData, scales: Hyperparameters, hypotheses: Sequence[H
     rows = SampledRows.of(data, scales)
 
     def sized(rows: SampledRows, one: Hypothesis) -> tuple[float, float, Hypothesis]:
-        E = torch.nn.functional.one_hot(rows.process.numbers.owner).to(data.x) * rows.columns(one.effects)
+        E = torch.nn.functional.one_hot(rows.process.numbers.owner).to(data.x) * rows.columns(rows.of_all(one).effects)
         return (*rows.likeliest_size(E[:, E.any(0)]), one)
 
-    found = (sized(rows, rows.of_all(one)) for one in hypotheses)
+    found = (sized(rows, one) for one in hypotheses)
     odds, _, best = max(found, key=lambda own: own[0])
     if odds < gates.ROW_ODDS:
         return None

@@ -36,7 +36,7 @@ ROUNDS, NOISE_CHANGE = 10, 3e-3
 SMALLEST_PRIOR, LARGEST_PRIOR = 1e-5, 0.1
 """Range of estimated prior deviations, m or rad."""
 SHARED_NUMBERS = 3.0
-"""Numbers as which the noise of all kinds counts for that of one: of a few rows nothing may be left."""
+"""Numbers as which the noise of all kinds counts for that of one, in logarithms: of a few rows nothing may be left."""
 COORDINATES = 8000
 """Measured coordinates of the random rows that stand for all rows where there are more. What a rigid geometry cannot
 explain is larger than the error that noise then leaves in its few parameters."""
@@ -98,14 +98,10 @@ class Identification:
         """Of the first kind of rows, such as those that tell coordinates."""
         return Tails(self.freedom, self.weights[0])
 
-    def with_ball(self, ball: Identification) -> Identification:
-        """The same with a ball, found around the same robot as its only marker, as one more marker."""
-        geometry, own = self.geometry, ball.geometry
-        whole = geometry.with_tool(torch.cat([geometry.tool, own.tool]), (*geometry.on, *own.on))
-        covariance = geometry.tool.new_zeros(whole.size, whole.size)
-        covariance[:-3, :-3], covariance[-3:, -3:] = self.covariance, ball.covariance[-3:, -3:]
-        theta = torch.cat([self.theta, self.theta.new_zeros(3)])
-        return replace(self, geometry=whole, covariance=covariance, theta=theta)
+
+def with_ball(geometry: Geometry, ball: Geometry) -> Geometry:
+    """The same robot with the marker of another geometry of it, a ball, as one more."""
+    return geometry.with_tool(torch.cat([geometry.tool, ball.tool]), (*geometry.on, *ball.on))
 
 
 def held_parameters(geometry: Geometry, *, adrift: bool = False) -> tuple[int, ...]:
@@ -243,7 +239,6 @@ class Rows:
     def found(self, fit: Fit, noise: float, prior: Prior, tails: Tails) -> Identification:
         """A fit to some of the rows, with the errors and weights (M,) of all of them."""
         errors, shifts = self.errors(fit.theta, fit.shifts), fit.shifts.split(self.freedom)
-        weights = tails.weights.split([own[..., 0].numel() for own in errors])
         return Identification(
             geometry=self.geometry.absorb(fit.theta),
             rms=float(body_squares(errors).nanmean().sqrt()),
@@ -251,7 +246,7 @@ class Rows:
             covariance=fit.covariance,
             theta=fit.theta,
             prior=prior,
-            weights=tuple(some.view(own.shape[:2]) for some, own in zip(weights, errors, strict=True)),
+            weights=tuple(_as_bodies(tails.weights, errors)),
             freedom=tails.freedom,
             shifts=shifts,
             devices=tuple(one for own, some in zip(self.parts, shifts, strict=True) for one in own.devices(some)),
@@ -271,12 +266,12 @@ def sizes_and_kinds(errors: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
 
 
 def typical_noise(errors: Sequence[Tensor]) -> Tensor:
-    """Noise (M,) of all bodies by the median of their kind of rows, m: gross outliers do not set the level.
+    """Noise (k,) of every kind of rows by the median of its errors (N, B, d), m: gross outliers do not set the level.
 
     The median of chi-squared is by Wilson and Hilferty.
     """
-    dim, kind = sizes_and_kinds(errors)
-    medians = torch.stack([own.square().sum(2).nanmedian() for own in errors])[kind]
+    medians = torch.stack([own.square().sum(2).nanmedian() for own in errors])
+    dim = medians.new_tensor([own.shape[2] for own in errors])
     return (medians / (dim * (1.0 - 2.0 / (9.0 * dim)) ** 3)).sqrt().clamp(min=SMALLEST_NOISE_M)
 
 
@@ -319,7 +314,8 @@ def estimated(rows: Rows, held: Sequence[int], prior: Prior | None = None) -> Id
     used, zero = prior or Prior(), rows.geometry.tool.new_zeros(rows.geometry.size)
     at = zero, zero.new_zeros(sum(rows.freedom))
     errors = some.errors(*at)
-    (dim, kind), sigma, noise = sizes_and_kinds(errors), typical_noise(errors), 0.0
+    (dim, kind), noise = sizes_and_kinds(errors), 0.0
+    sigma = typical_noise(errors)[kind]
     tails = reweight(body_squares(errors) / sigma.square(), dim)
     for _ in range(ROUNDS):
         root = used.root(rows.geometry, held)
@@ -330,8 +326,9 @@ def estimated(rows: Rows, held: Sequence[int], prior: Prior | None = None) -> Id
         free = none.index_add(0, kind, dim.masked_fill(squares.isnan(), 0.0) - fit.leverage)  # not determined by rows
         total = none.index_add(0, kind, (tails.weights * squares).nan_to_num(0.0))
         noise = max(sqrt(float(total.sum()) / max(float(free.sum()), 1.0)), SMALLEST_NOISE_M)
-        known = SHARED_NUMBERS * (len(none) > 1)
-        levels = ((total + known * noise**2) / (free + known).clamp(min=1.0)).sqrt().clamp(min=SMALLEST_NOISE_M)
+        free = free.clamp(min=1.0)
+        own, known = (total / free).sqrt().clamp(min=SMALLEST_NOISE_M), SHARED_NUMBERS * (len(none) > 1)
+        levels = own * (noise / own) ** (known / (free + known))
         before, sigma = sigma, levels[kind]
         tails = reweight(squares / sigma.square() + fit.leverage / tails.weights, dim)
         if float(((sigma - before).abs() / sigma).max()) < NOISE_CHANGE:
@@ -390,8 +387,7 @@ def solve(
     if start is not None:
         u0 = torch.cat([(root.mT @ start[0]) / root.square().sum(0), start[1]])
     hidden = [own.isnan() for own in rows.errors(root @ u0[:f], u0[f:])]
-    counts = [own[..., 0].numel() for own in hidden]
-    weights = [1 / s.view(own.shape[:2])[..., None] for s, own in zip(sigma.split(counts), hidden, strict=True)]
+    weights = _as_bodies(1 / sigma, hidden)
     size = len(u0) + sum(own.numel() for own in hidden)
 
     def residual(u: np.ndarray) -> np.ndarray:
@@ -400,20 +396,60 @@ def solve(
             each = zip(weights, rows.errors(root @ at[:f], at[f:]), hidden, strict=True)
         except InputError:  # behind a camera: scipy shortens the step
             return np.full(size, np.inf)
-        return torch.cat([*((w * own).masked_fill(h, 0.0).flatten() for w, own, h in each), at]).numpy()
+        return torch.cat([*((w[..., None] * own).masked_fill(h, 0.0).flatten() for w, own, h in each), at]).numpy()
 
     def jacobian(u: np.ndarray) -> np.ndarray:
         at = torch.from_numpy(u).clone()
-        each = zip(weights, rows.slopes(root @ at[:f], at[f:], root), hidden, strict=True)
-        slopes = [(w[..., None] * own).masked_fill(h[..., None], 0.0).flatten(0, 2) for w, own, h in each]
-        return torch.cat([*slopes, torch.eye(len(u), dtype=at.dtype, device=at.device)]).numpy()
+        return _white_slopes(rows, sigma, root, (root @ at[:f], at[f:])).numpy()
 
     derivatives: Any = jacobian  # scipy's stubs know its names of difference schemes only
     with torch_alone():
         found = least_squares(residual, u0.numpy(), derivatives, **options)
-        U, s, Vt = np.linalg.svd(jacobian(found.x), full_matrices=False)  # s >= 1 by the prior rows
-    u, V = torch.from_numpy(found.x).clone(), torch.from_numpy(Vt.T / s).clone()  # aligned: the same digits every time
-    theta, shifts, known = root @ u[:f], u[f:], root @ V[:f]
-    leverage = torch.from_numpy(np.square(U[: -len(u)]).sum(1)).split([own.numel() for own in hidden])
-    each = [own.view(h.shape).sum(2).flatten() for own, h in zip(leverage, hidden, strict=True)]
-    return Fit(theta, known @ known.mT, shifts, rows.errors(theta, shifts), torch.cat(each))
+    u = torch.from_numpy(found.x).clone()  # aligned: the same digits every time
+    return posterior(rows, sigma, root, (root @ u[:f], u[f:]))
+
+
+def _as_bodies(values: Tensor, errors: Sequence[Tensor]) -> list[Tensor]:
+    """Values (M,) of all bodies as (N, B) of those with errors (N, B, d)."""
+    each = values.split([own[..., 0].numel() for own in errors])
+    return [own.view(like.shape[:2]) for own, like in zip(each, errors, strict=True)]
+
+
+def _white_slopes(rows: Rows, sigma: Tensor, root: Tensor, at: tuple[Tensor, Tensor]) -> Tensor:
+    """Slopes of all numbers in units of their noise by unknowns u and shifts, with the prior's rows; zero if hidden."""
+    errors, slopes = rows.errors(*at), rows.slopes(*at, root)
+    each = zip(_as_bodies(sigma, errors), errors, slopes, strict=True)
+    white = [(own / s[..., None, None]).masked_fill(e.isnan()[..., None], 0.0).flatten(0, 2) for s, e, own in each]
+    return torch.cat([*white, torch.eye(white[0].shape[1], dtype=root.dtype, device=root.device)])
+
+
+def posterior(rows: Rows, sigma: Tensor, root: Tensor, at: tuple[Tensor, Tensor]) -> Fit:
+    """What is known at theta and shifts; arguments as of :func:`solve`."""
+    white, f, errors = _white_slopes(rows, sigma, root, at), root.shape[1], rows.errors(*at)
+    with torch_alone():
+        U, s, Vt = np.linalg.svd(white.numpy(), full_matrices=False)  # s >= 1 by the prior rows
+    known = root @ torch.from_numpy(Vt.T / s).clone()[:f]
+    leverage = torch.from_numpy(np.square(U[: -white.shape[1]]).sum(1)).split([own.numel() for own in errors])
+    each = [own.view(like.shape).sum(2).flatten() for own, like in zip(leverage, errors, strict=True)]
+    return Fit(at[0], known @ known.mT, at[1], errors, torch.cat(each))
+
+
+def described(rows: Rows, noise: Sequence[float] = (), *, adrift: bool = False) -> Identification:
+    """Base, markers and devices that were found in closed form, as a geometric calibration is; all weights are 1.
+
+    Args:
+        rows: around these places. noise: of the first kinds of rows, m; by default the typical one of its errors.
+        adrift: whether the base was not sought.
+    """
+    geometry, zero = rows.geometry, rows.geometry.tool.new_zeros(rows.geometry.size)
+    joints, held = range(geometry.size)[geometry.slices["joints"]], held_parameters(geometry, adrift=adrift)
+    places = {"base_translation": PLACES.open_base_m, "base_rotation": PLACES.open_base_rad}
+    root = Prior(**places, tool=sqrt(geometry.markers) * PLACES.marker_m).root(geometry, [*joints, *held])
+    at = zero, zero.new_zeros(sum(rows.freedom))
+    errors = rows.errors(*at)
+    levels = torch.cat([zero.new_tensor(noise), typical_noise(errors)[len(noise) :]])
+    seen = levels.new_tensor([int((~own.isnan()).all(2).sum()) for own in errors])
+    # The errors of a nominal robot vary slowly with its configuration, so that many rows share them.
+    sigma = (levels.clamp(min=SMALLEST_NOISE_M) * seen.sqrt())[sizes_and_kinds(errors)[1]]
+    fit = posterior(rows, sigma, root, at)
+    return rows.found(fit, float(levels[0]), Prior(), Tails(inf, torch.ones_like(sigma)))

@@ -18,7 +18,6 @@ therefore estimated before it, together with base and markers, as one constant p
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import sqrt
 from typing import Any
@@ -28,12 +27,10 @@ from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import (
     PRECISE,
-    SMALLEST_NOISE_M,
     Identification,
     MeasuredPoints,
-    Prior,
     Rows,
-    held_parameters,
+    described,
     identify,
     solve,
 )
@@ -44,7 +41,7 @@ from diffeo_calib.measurements.checks import seen_markers
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.cartesian import turns_nowhere
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.placement import PLACES, UNDETERMINED_MOTION_M, place
+from diffeo_calib.robots.placement import UNDETERMINED_MOTION_M, place
 from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import marker_tips
@@ -89,14 +86,9 @@ def register(robot: Tree | Geometry, q: Tensor, points: Tensor, on: tuple[str, .
         middle = tool.mean(0)
         base, tool = base @ transforms(torch.eye(3, dtype=tool.dtype, device=tool.device), middle), tool - middle
     geometry = replace(bare, base=base, tool=tool)
-    rms = float((geometry.points(q) - points).square().sum(-1).nanmean().sqrt())
-    parts, held = geometry.slices, held_parameters(geometry)
-    every = [number for name in ("base", "tool") for number in range(geometry.size)[parts[name]]]
-    sought = [number for number in every if number not in held]
-    slopes = geometry.sensitivities(q)[..., sought][seen_markers(points)].flatten(0, 1)  # (3 S, 6 + 3 P)
-    rank = int((torch.linalg.svdvals(slopes) > UNDETERMINED_MOTION_M * sqrt(len(slopes) / 3)).sum())  # of S sightings
-    noise = rms * sqrt(len(slopes) / 3 / max(len(slopes) - rank, 1))
-    return _start(geometry, (rms, noise), slopes, sought, len(q))
+    squares = (geometry.points(q) - points)[seen_markers(points)].square()
+    noise = sqrt(float(squares.sum()) / max(squares.numel() - unknowns, 1))
+    return described(Rows(geometry, (MeasuredPoints.of(q, points),)), [noise])
 
 
 def can_register(points: Tensor) -> bool:
@@ -105,35 +97,10 @@ def can_register(points: Tensor) -> bool:
     return enough and bool(seen_markers(points).any(0).all())
 
 
-def _start(
-    geometry: Geometry, errors: tuple[float, float], slopes: Tensor, sought: Sequence[int], rows: int
-) -> Identification:
-    """Places that were found in closed form, as a geometric calibration is described; all weights are 1.
-
-    Args:
-        errors: RMS distance and noise, m. slopes: (3 S, k) of the coordinates by the parameters that were sought.
-    """
-    rms, noise = errors
-    # The errors of a nominal robot vary slowly with its configuration, so that many rows share them.
-    error = max(noise, SMALLEST_NOISE_M) * sqrt(len(slopes) / 3)
-    places = {"base_translation": PLACES.open_base_m, "base_rotation": PLACES.open_base_rad}
-    prior = Prior(**places, tool=sqrt(geometry.markers) * PLACES.marker_m).deviations(geometry)[sought]
-    white = torch.cat([slopes * prior / error, prior.new_ones(len(prior)).diag()])
-    s, Vt = torch.linalg.svd(white, full_matrices=False)[1:]
-    root = prior[:, None] * Vt.mT / s
-    covariance = slopes.new_zeros(geometry.size, geometry.size)
-    numbers = torch.tensor(sought, dtype=torch.int64, device=slopes.device)
-    covariance[numbers[:, None], numbers] = root @ root.mT
-    theta, weights = slopes.new_zeros(geometry.size), slopes.new_ones(rows, geometry.markers)
-    return Identification(geometry, rms, noise, covariance, theta, Prior(), (weights,))
-
-
 ROUNDS = 30
 """Most rounds of weighing rows."""
 SETTLED = 1e-6
 """Largest change of a weight at which these rounds end."""
-MEDIAN_CHI2_3 = 2.37
-"""Median of chi-squared with 3 degrees of freedom."""
 HALF_WEIGHT_MEDIANS = 2.0
 """Distance, in medians, at which a row has half its weight."""
 
@@ -142,8 +109,7 @@ HALF_WEIGHT_MEDIANS = 2.0
 class SocketRegistration:
     """Ball and sockets of a robot without errors."""
 
-    # geometry with the ball as its marker; where the base is not known, it is the measuring frame
-    identification: Identification
+    geometry: Geometry  # with the ball as its marker; where the base is not known, it is the measuring frame
     positions: Tensor  # (S, 3) the sockets in the measuring frame, m
     distances: Tensor  # (N,) from the ball to its socket, m
     # (3,) root mean square motion of the ball's place, per unit of its offset from the tip, by turns of the tool in the
@@ -174,13 +140,8 @@ def register_sockets(robot: Tree | Geometry, q: Tensor, socket: Tensor) -> Socke
         if float((weights - before).abs().max()) < SETTLED:
             break
     seen = R @ ball + t
-    slopes, geometry = A.flatten(0, 1), bare.with_tool(ball[None])
-    tilt = torch.linalg.svdvals(slopes) / len(A) ** 0.5
-    rms, median = float(distances.square().mean().sqrt()), float(distances.median())
-    errors = rms, max(median / sqrt(MEDIAN_CHI2_3), SMALLEST_NOISE_M)
-    ball = range(geometry.size)[geometry.slices["tool"]]
-    found = _start(geometry, errors, slopes, [*ball], len(A))
-    return SocketRegistration(found, _means(seen, socket, weights), distances, tilt)
+    tilt = torch.linalg.svdvals(A.flatten(0, 1)) / len(A) ** 0.5
+    return SocketRegistration(bare.with_tool(ball[None]), _means(seen, socket, weights), distances, tilt)
 
 
 def socket_means(points: Tensor, socket: Tensor) -> Tensor:

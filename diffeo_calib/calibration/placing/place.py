@@ -28,10 +28,11 @@ from diffeo_calib.calibration.identification.identification import (
     Prior,
     ReadRows,
     Rows,
+    described,
     estimated,
     held_parameters,
+    with_ball,
 )
-from diffeo_calib.calibration.placing.drift import Drift
 from diffeo_calib.calibration.placing.lens import LensAndBoard
 from diffeo_calib.calibration.placing.placement import OtherLabel, OtherRows, Placement
 from diffeo_calib.calibration.placing.readings import (
@@ -41,7 +42,7 @@ from diffeo_calib.calibration.placing.readings import (
     reading_sets,
     register_readings,
 )
-from diffeo_calib.calibration.placing.sessions import Sessions
+from diffeo_calib.calibration.placing.sessions import Drift, Sessions
 from diffeo_calib.calibration.placing.sockets import SocketDevices, register_coordinates
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -58,7 +59,7 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import errors_of_kinds
-from diffeo_calib.sensors.devices import ROW, Devices
+from diffeo_calib.sensors.devices import ROW
 from diffeo_calib.sensors.errors import Evaluations, shown_unit
 from diffeo_calib.sensors.places import Places, fitting_devices
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings, ball_tip, check_poses, divided, with_markers
@@ -211,12 +212,6 @@ class Placed:
         places = Places(ball=self.ball)
         return [residuals(stage, places, self.coordinates.table).positions_rms for stage in kinematics]
 
-    @property
-    def devices_by_stage(self) -> list[tuple[Devices, ...]]:
-        """The devices of readings at the registration, after the geometric calibration, and now."""
-        stages = self.registration.devices, self.identification.devices
-        return [*stages, tuple(own.devices for own in self.readings)]
-
     def tangent_data(self, opened: Tensor | None = None) -> TangentData:
         """The rows around the geometric calibration, weighted by its residuals; with effects (N, R, U) of unknowns."""
         geometry, theta = self.registration.geometry, self.identification.theta
@@ -357,17 +352,18 @@ def _by_coordinates(
     warn_of_joints_below_tip(robot, table)
     warn_of_open_directions(robot, table, registration)
     tables, adrift = [one.table for one in readings], table.without_device
+    geometry, ball = registration.geometry, None
     if not places:
-        tip = ball_tip(None, readings, registration.geometry.on[-1])
-        ball = ball_of(tables, registration.geometry, tip)
-        registration = registration if ball is None else registration.with_ball(ball)
-    geometry = registration.geometry
+        ball = ball_of(tables, geometry, ball_tip(None, readings, geometry.on[-1]))
+        geometry = geometry if ball is None else with_ball(geometry, ball)
     devices = tuple(fitting_devices(one, geometry.points(one.q)) for one in tables)
+    shared = [one.shared(len(table), 3 * table.markers).unflatten(1, (-1, 3)) for one in places]
+    rows = Rows(geometry, (MeasuredPoints.of(table.q, table.points, *shared), *map(ReadRows, tables, devices)))
+    if ball is not None:
+        registration = described(rows, [registration.noise])
     registration = replace(registration, devices=devices)
     progress("geometry", 0, 1)
-    shared = [one.shared(len(table), 3 * table.markers).unflatten(1, (-1, 3)) for one in places]
-    parts = MeasuredPoints.of(table.q, table.points, *shared), *map(ReadRows, tables, devices)
-    found = estimated(Rows(geometry, parts), held_parameters(geometry, adrift=adrift))
+    found = estimated(rows, held_parameters(geometry, adrift=adrift))
     places = [one.found(table, found) for one in places]
     LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", 1e3 * registration.rms, 1e3 * found.rms)
     table = Placement(places).at_places(table)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import inf
 from typing import NamedTuple
 
 import torch
@@ -23,17 +22,16 @@ from diffeo_calib.calibration.identification.identification import (
     Prior,
     ReadRows,
     Rows,
+    described,
     estimated,
     held_parameters,
     solve,
-    typical_noise,
 )
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.devices import Devices, Hypothesis, check_devices
 from diffeo_calib.sensors.kinds import kind_of
@@ -150,16 +148,12 @@ def register_readings(bare: Geometry, tables: Sequence[Readings]) -> Identificat
         _refuse_another_unit(bare, tables, best)
     if best.worst[0] > most:
         warn_user(sentence(UNEXPLAINED, **best.said(most), fix=CHECK))
-    return _described(best)
-
-
-def _described(best: RoughFit) -> Identification:
-    """Ball and devices with the deviations that the noise of every kind of readings leaves."""
-    rows, fit = best.rows, best.fit
-    root, at = Prior().root(rows.geometry, _all_but_ball(rows.geometry)), (fit.theta, fit.shifts)
-    fit = solve(rows, typical_noise(fit.errors), root, start=at, max_nfev=STARTS_STEPS, loss="soft_l1")
+    fit, rows = best.fit, best.rows
+    each = zip(rows.parts, fit.shifts.split(rows.freedom), strict=True)
+    devices = [one for own, shifts in each for one in own.devices(shifts)]
     noise = float(torch.cat([own.flatten() for own in fit.errors]).square().mean().sqrt())
-    return rows.found(fit, noise, Prior(), Tails(inf, torch.ones_like(fit.leverage)))
+    found = Rows(rows.geometry.absorb(fit.theta), tuple(map(ReadRows, tables, devices)), rigid=True)
+    return described(found, [noise] * len(devices), adrift=True)
 
 
 class RoughFit(NamedTuple):
@@ -202,14 +196,14 @@ def _rough_fits(starts: Sequence[Rows]) -> list[RoughFit]:
     return sorted(found, key=_worst)
 
 
-def ball_of(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Identification | None:
-    """The ball of readings on a tip of a known robot, as its only marker; None without readings of a ball."""
+def ball_of(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Geometry | None:
+    """A known robot with the ball of readings on a tip as its only marker; None without readings of a ball."""
     for one in readings:
         check_devices(one)
     readings = [own for own in readings if kind_of(own).seen_points == 1]
     if not readings:
         return None
-    return register_readings(geometry.with_tool(geometry.tool[-1:], (tip,)), readings)
+    return register_readings(geometry.with_tool(geometry.tool[-1:], (tip,)), readings).geometry
 
 
 def reading_sets(

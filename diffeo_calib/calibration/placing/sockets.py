@@ -28,7 +28,13 @@ from diffeo_calib.calibration.diagnostics.plausibility import (
     warn_of_wrong_sockets,
 )
 from diffeo_calib.calibration.expected_errors import workspace_deviation
-from diffeo_calib.calibration.identification.identification import Identification
+from diffeo_calib.calibration.identification.identification import (
+    Identification,
+    MeasuredPoints,
+    Rows,
+    described,
+    with_ball,
+)
 from diffeo_calib.calibration.identification.registration import (
     register_sockets,
     socket_means,
@@ -280,10 +286,14 @@ def register_coordinates(robot: Tree, data: Measurements) -> tuple[Identificatio
     found = register_sockets(around or robot, resting.q, resting.socket_numbers)
     check_socket_registration(robot, resting, found, around)
     places = SocketDevices.around(data, found.positions)
+    placed, shared = places.at_places(data), places.shared(len(data), 3 * data.markers).unflatten(1, (-1, 3))
+    ball = MeasuredPoints.of(*(values[places.rows] for values in (placed.q, placed.points, shared)))
     if start is None:
-        return found.identification, [places]
-    warn_of_other_robot(robot, data.device_rows(), start, found)
-    return start.with_ball(found.identification), [places]
+        return described(Rows(found.geometry, (ball,)), adrift=True), [places]
+    device = data.device_rows()
+    warn_of_other_robot(robot, device, start, found)
+    rows = Rows(with_ball(start.geometry, found.geometry), (MeasuredPoints.of(device.q, device.points), ball))
+    return described(rows, [start.noise]), [places]
 
 
 def ball_in_sockets(data: Measurements, geometry: Geometry) -> Tensor | None:
@@ -291,7 +301,7 @@ def ball_in_sockets(data: Measurements, geometry: Geometry) -> Tensor | None:
     if data.sockets is None:
         return None
     resting = data.with_sockets_of_rows().socket_rows()
-    return register_sockets(geometry, resting.q, resting.socket_numbers).identification.geometry.tool[0]
+    return register_sockets(geometry, resting.q, resting.socket_numbers).geometry.tool[0]
 
 
 def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> list[Outlier]:

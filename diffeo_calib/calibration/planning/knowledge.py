@@ -15,7 +15,7 @@ models", 1996; sequential A-optimal design for predictions). Taking one costs on
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -67,32 +67,16 @@ TARGET_COORDINATES = 900
 """Coordinates of the targets that are followed: more make no difference to the choice."""
 
 
-class Groups(NamedTuple):
-    """Configurations (M, n) of a plan, rad or m."""
+def gathered(groups: Sequence[Tensor], coordinates: int) -> tuple[Tensor, Sequence[Tensor]]:
+    """Configurations (M, n) of several groups, the targets first, and the row numbers of each group.
 
-    targets: Tensor  # where the robot shall be accurate
-    measured: Tensor  # that one device has measured
-    registration: Tensor  # whose rows say where the device of a registration stands
-    candidates: Tensor  # that can be measured
-
-    def with_few_targets(self, coordinates: int) -> Groups:
-        """With not more targets than are followed, of so many coordinates each."""
-        near, most = self.targets, max(2, TARGET_COORDINATES // coordinates)
-        if len(near) <= most:
-            return self
-        places = torch.linspace(0, len(near) - 1, most, dtype=torch.float64, device=near.device)
-        return self._replace(targets=near[places.round().long()])
-
-    @property
-    def every(self) -> Tensor:
-        """All of them."""
-        return torch.cat(self)
-
-    @property
-    def numbers(self) -> Groups:
-        """The row numbers of each among all."""
-        rows = torch.arange(len(self.every), device=self.candidates.device)
-        return Groups(*rows.split([len(group) for group in self]))
+    Of targets, of so many coordinates each, no more are kept than are followed.
+    """
+    near, most = groups[0], max(2, TARGET_COORDINATES // coordinates)
+    if len(near) > most:
+        near = near[torch.linspace(0, len(near) - 1, most, dtype=torch.float64, device=near.device).round().long()]
+    sizes = [len(near), *map(len, groups[1:])]
+    return torch.cat([near, *groups[1:]]), torch.arange(sum(sizes), device=near.device).split(sizes)
 
 
 class Scene(NamedTuple):
@@ -195,28 +179,27 @@ def greedy(
 
 
 def of_robot(
-    robot: Tree,
-    marker: object,
-    scales: Hyperparameters | None,
-    groups: Groups,
-    *,
-    frames: bool,
-    free: bool,
-) -> tuple[Scene, Groups]:
+    robot: Tree, asked: tuple[object, Hyperparameters | None], groups: Sequence[Tensor], *, frames: bool, free: bool
+) -> tuple[Scene, Sequence[Tensor]]:
     """The tangent model around the nominal robot; base and markers are known to 0.1 m and 0.1 rad.
 
     Args:
         robot: nominal chain.
-        marker: of every tip: (3,) or (P, 3) markers in its frame, m, or the (4, 4) pose of a measured frame there; or a
-            dictionary tip -> one of these.
-        scales: of the errors; by default those of an industrial robot, which follow from the targets.
-        groups: configurations. frames: whether frames are measured, by default those of the tips.
+        asked: markers of every tip: (3,) or (P, 3) in its frame, m, or the (4, 4) pose of a measured frame there; or a
+            dictionary tip -> one of these. Scales of the errors; by default those of an industrial robot, which follow
+            from the targets.
+        groups: configurations: targets, those that were measured already, candidates.
+        frames: whether frames are measured, by default those of the tips.
         free: whether nothing will say where the robot stands: then its base is where the errors are judged.
+
+    Returns:
+        the scene, and the row numbers of targets, measured ones, those of a registration, and candidates.
     """
+    marker, scales = asked
     points, on, lever = _measured_points(robot, marker, torch.eye(4, dtype=torch.float64) if frames else MARKER)
-    groups = groups.with_few_targets(points.numel())
-    geometry = Geometry.nominal(robot).with_tool(points, on)
-    near, q, residual = groups.targets, groups.every, USUAL_RESIDUAL
+    near, known, wanted = groups
+    q, numbers = gathered((near, known, known[:0], wanted), points.numel())
+    geometry, near, residual = Geometry.nominal(robot).with_tool(points, on), q[numbers[0]], USUAL_RESIDUAL
     if len(near) > 1:
         residual *= float(geometry.points(near).reshape(-1, 3).std(0).norm())
 
@@ -235,7 +218,7 @@ def of_robot(
     known = Opened(Fields(), 0, deviations), data.linearisation(scales), len(deviations)
     averaged = Bodies(lever).averaging(noise)
     scene = Scene(*known, data.points, noise, geometry.base, averaged, points.numel(), free, unplaced=False)
-    return scene, groups
+    return scene, numbers
 
 
 def _measured_points(robot: Tree, marker: object, usual: object) -> tuple[Tensor, tuple[str, ...], float | None]:
@@ -262,24 +245,25 @@ def _measured_points(robot: Tree, marker: object, usual: object) -> tuple[Tensor
     return points, on, levers.pop()
 
 
-def of_model(model: CalibratedKinematics, free: str | None, groups: Groups) -> tuple[Scene, Groups]:
+def of_model(model: CalibratedKinematics, free: str | None, groups: Sequence[Tensor]) -> tuple[Scene, Sequence[Tensor]]:
     """The posterior of a fitted model, or of one registered anew, whose rows tell where the device stands.
 
     A ball beside markers stays on its tool: no row of the device would say where it is now.
 
     Args:
-        free: what may have moved since the fit, besides what a registration has left free. groups: configurations.
+        free: what may have moved since the fit, besides what a registration has left free.
+        groups: see :func:`of_robot`, so is what is returned.
     """
     fitted, fit, tool = model.map, model.map.unregistered, model.nominal.geometry.slices["tool"]
-    groups, registration = groups.with_few_targets(fitted.m), fitted.registration
-    if registration is not None and free is None:
-        groups = groups._replace(registration=registration.q.to(groups.candidates))
+    (near, known, wanted), registration = groups, fitted.registration
+    told = known[:0] if registration is None or free is not None else registration.q.to(known)
+    q, numbers = gathered((near, known, told, wanted), fitted.m)
     if registration is not None and free != registration.free:
         free = registration.free if free is None else "both"
     seen = device_coordinates(fitted.m, ball=model.ball, free=fitted.stands_free)
     middle = fitted.deformation.z1.view(-1, 3).mean(0)
     points, parts = [], []
-    for rows in groups.every.split(PREDICT_ROWS):
+    for rows in q.split(PREDICT_ROWS):
         z, at = fitted.linearised_value(rows)
         if registration is None:
             columns = frame_slopes(z.unflatten(1, (-1, 3)), middle), at.sensitivity[..., tool]
@@ -290,10 +274,10 @@ def of_model(model: CalibratedKinematics, free: str | None, groups: Groups) -> t
     moved[:6] = PLACES.found_m_rad * (free in ("base", "both"))
     moved[6 : 6 + seen] = PLACES.found_m_rad * (free in ("marker", "both"))
     known = Opened(fit.with_motions, fit.columns, moved), Linearisation.joined(parts), fit.columns + len(moved)
-    noise = fitted.new_noise.expand(len(groups.every), -1, -1)
+    noise = fitted.new_noise.expand(len(q), -1, -1)
     where = torch.cat(points), noise, model.geometry.base.to(moved), model.bodies.averaging(noise), seen
     scene = Scene(*known, *where, fitted.stands_free, without_positions(model), fitted.with_second_order)
-    return scene, groups
+    return scene, numbers
 
 
 def without_positions(model: CalibratedKinematics) -> bool:

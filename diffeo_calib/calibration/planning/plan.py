@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.planning.candidates import Criterion, Tracker, all_of, candidates, check_limits
-from diffeo_calib.calibration.planning.knowledge import FREE, Groups, Scene, of_model, of_robot
+from diffeo_calib.calibration.planning.knowledge import FREE, Scene, of_model, of_robot
 from diffeo_calib.calibration.planning.sensors import Options, Positions, Sensor, Told, sensors_for
 from diffeo_calib.common.checks import check_count
 from diffeo_calib.common.data_frames import data_frame
@@ -245,28 +245,28 @@ def plan(
     near = q if target is None else _configurations(robot, target, "target")
     known = q[:0] if measured is None else _configurations(robot, measured, "measured")
     sensors = sensors_for(robot_or_model, sensor)
-    groups = Groups(near, known, q[:0], q)
+    groups = near, known, q
     if isinstance(robot_or_model, Tree):
         how = {"frames": any(one.of_frames for one in sensors), "free": not any(one.of_positions for one in sensors)}
-        scene, groups = of_robot(robot_or_model, marker, hyperparameters, groups, **how)
+        scene, at = of_robot(robot_or_model, (marker, hyperparameters), groups, **how)
     else:
-        scene, groups = of_model(robot_or_model, free, groups)
-    at = groups.numbers
-    before = list(_measured(scene, sensors, at))
-    told = [own for one in sensors for own in one.told(scene, at.candidates)]
+        scene, at = of_model(robot_or_model, free, groups)
+    targets, *before, wanted = at
+    measured_rows = list(_measured(scene, sensors, *before))
+    told = [own for one in sensors for own in one.told(scene, wanted)]
     _check_reachable(told, count)
     options = Options.of(scene, told)
     new = options.noise.new_ones(options.at.sensitivity.shape[2] - scene.columns)
     posterior: Conditional = Opened(scene.known, scene.columns, new)
-    for rows in before:
+    for rows in measured_rows:
         posterior = Given(posterior, rows.at, rows.noise)
-    order, variance = scene.choose(posterior, (options.at, options.noise, options.rows), at.targets, count)
+    order, variance = scene.choose(posterior, (options.at, options.noise, options.rows), targets, count)
     LOG.info("%d poses chosen of %d", count, len(q))
-    blocks = scene.without_motions(posterior, at.targets).covariance(scene.at.rows(at.candidates))
+    blocks = scene.without_motions(posterior, targets).covariance(scene.at.rows(wanted))
     blocks = scene.with_second_order(scene.along(blocks))
-    noise = 3 * scene.along(scene.noise[at.targets]).diagonal(dim1=1, dim2=2).mean()
+    noise = 3 * scene.along(scene.noise[targets]).diagonal(dim1=1, dim2=2).mean()
     stated = next((3 * one.std**2 for one in sensors if one.of_positions and one.std is not None), float(noise))
-    rows, names = options.rows[order] - int(at.candidates[0]), [told[k].name for k in options.device[order].tolist()]
+    rows, names = options.rows[order] - int(wanted[0]), [told[k].name for k in options.device[order].tolist()]
     path = short_path(move_times(q[rows], robot.periodic))
     return Plan(
         q=q[rows][path],
@@ -293,16 +293,16 @@ def _check_reachable(told: Sequence[Told], count: int) -> None:
         raise InputError.of(what, expected=f"at least {count}", got=str(reachable), fix=fix)
 
 
-def _measured(scene: Scene, sensors: Sequence[Sensor], at: Groups) -> Iterator[Options]:
+def _measured(scene: Scene, sensors: Sequence[Sensor], known: Tensor, registration: Tensor) -> Iterator[Options]:
     """What was measured already: by one device, and by that of a registration, which measured positions or poses."""
-    if len(at.measured):
-        told = [own for one in sensors for own in one.told(scene, at.measured)]
-        if len(told) > 1 or len(told[0].rows) < len(at.measured):
+    if len(known):
+        told = [own for one in sensors for own in one.told(scene, known)]
+        if len(told) > 1 or len(told[0].rows) < len(known):
             fix = "leave `measured` out, and fit the model again with these rows"
             raise InputError.of("`measured`", expected="configurations that one device has measured", fix=fix)
         yield Options.of(scene, told)
-    if len(at.registration):
-        told = Positions(whole=scene.framed).told(scene._replace(unplaced=False), at.registration)
+    if len(registration):
+        told = Positions(of_frames=scene.framed).told(scene._replace(unplaced=False), registration)
         yield Options.of(scene, list(told))
 
 

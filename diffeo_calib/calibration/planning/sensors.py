@@ -29,7 +29,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.device_readings import FittedDevice
 from diffeo_calib.kinematics.hand_eye import SetUp
 from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.measurements.poses import camera_jacobian, inverse_poses, mark_jacobian, poses_from_marks
+from diffeo_calib.measurements.poses import inverse_poses, pose_jacobian, poses_from_marks
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.board_camera import BoardCamera
@@ -96,6 +96,7 @@ class Sensor(ABC):
     """
 
     std: float | None = None
+    of_frames: bool = False  # whether it measures frames, not markers or their origins
     of_positions: ClassVar[bool] = False
     """Whether errors of held-out rows are errors of positions."""
 
@@ -111,7 +112,7 @@ class Sensor(ABC):
     @staticmethod
     def poses(std: float | None = None) -> Sensor:
         """A device that measures poses, for models of poses."""
-        return Positions(std, whole=True)
+        return Positions(std, of_frames=True)
 
     @staticmethod
     def distances(points: object, std: float | None = None, *, offset_std: float = 0.0) -> Sensor:
@@ -149,11 +150,6 @@ class Sensor(ABC):
         """Where devices with names are, new ones in the robot's base, those of a fit in the frame of its positions."""
         return []
 
-    @property
-    def of_frames(self) -> bool:
-        """Whether it measures frames, not markers."""
-        return False
-
     def _noise(self, usual: Tensor) -> Tensor:
         """Covariance (O, r, r) of what rows show, the usual one by default, m^2."""
         if self.std is None:
@@ -165,25 +161,19 @@ class Sensor(ABC):
 class Positions(Sensor):
     """Positions of the markers, or poses."""
 
-    whole: bool = False  # whether poses of frames are measured, or their origins
     of_positions: ClassVar[bool] = True
-
-    @property
-    def of_frames(self) -> bool:
-        """Poses."""
-        return self.whole
 
     def told(self, scene: Scene, among: Tensor) -> Iterator[Told]:
         """At every configuration. The place of the device is unknown where it is new, or nothing shows the robot's."""
-        if self.whole and not scene.framed:
+        if self.of_frames and not scene.framed:
             fix = "mark the tool by three points or a frame: a single point shows no turn about itself"
             raise InputError.of("poses of a robot that is known by markers", expected="measured frames", fix=fix)
         every = torch.eye(scene.points.shape[1], dtype=scene.points.dtype, device=scene.points.device)
-        A = (every if self.whole else scene.averaged[: scene.seen]).expand(len(among), -1, -1)
+        A = (every if self.of_frames else scene.averaged[: scene.seen]).expand(len(among), -1, -1)
         points, numbers = scene.points.unflatten(1, (-1, 3)), 6 * (scene.free or scene.unplaced)
         moved = A @ (PLACES.found_m_rad * frame_slopes(points[among], points.mean((0, 1))))[..., :numbers]
         noise, columns = self._noise(A @ scene.noise[among] @ A.mT), among.new_full((numbers,), NEW)
-        yield Told("poses" if self.whole else "positions", among, A, moved, columns, noise)
+        yield Told("poses" if self.of_frames else "positions", among, A, moved, columns, noise)
 
 
 @dataclass(frozen=True)
@@ -207,7 +197,7 @@ class DeviceReadings(Sensor):
         names = tuple(f"{kind} {number}" for number in range(1, len(given) + 1))
         prior = constants.new_tensor(own.prior(offset_std))
         devices = (own((name,), each[None], prior[None]) for name, each in zip(names, constants, strict=True))
-        return cls(std, names, tuple(FittedDevice(one, torch.diag(prior)) for one in devices))
+        return cls(std, names=names, devices=tuple(FittedDevice(one, torch.diag(prior)) for one in devices))
 
     def sentences(self) -> list[str]:
         """One for each."""
@@ -316,13 +306,12 @@ class BoardImages(Sensor):
         """Covariances (O, 9, 9), m^2, of images of points (O, 9), m, and effects (O, 9, 14) of lens and board."""
         boards, lever = self.boards(points), self.model.bodies.pose_lever()
         covariance, effects = expected(self.camera, boards)
+        tool, turn, seen = poses_from_marks(points.unflatten(1, (3, 3)), lever), self.set_up.transform[:3, :3].mT, None
         if self.seen.on_tool:
             M = self.set_up.mount
-            tool, seen = inverse_poses(M @ boards), boards[:, :3, 3] @ M[:3, :3].mT + M[:3, 3]
-            slopes = -camera_jacobian(tool, lever, seen) @ torch.block_diag(*[M[:3, :3]] * 2)
-        else:
-            slopes = mark_jacobian(poses_from_marks(points.unflatten(1, (3, 3)), lever), lever)
-            slopes = slopes @ torch.block_diag(*[self.set_up.transform[:3, :3].mT] * 2)
+            turn, seen = M[:3, :3], boards[:, :3, 3] @ M[:3, :3].mT + M[:3, 3]
+            tool = inverse_poses(M @ boards)
+        slopes = pose_jacobian(tool[:, None], lever, seen)[:, 0] @ torch.block_diag(turn, turn)
         return slopes @ covariance @ slopes.mT, slopes @ effects
 
     def told(self, scene: Scene, among: Tensor) -> Iterator[Told]:
@@ -350,15 +339,15 @@ def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
     Raises:
         InputError: files of early versions, which do not say where devices of readings are.
     """
-    found: list[Sensor] = [] if without_positions(model) else [Positions(whole=model.lever is not None)]
+    found: list[Sensor] = [] if without_positions(model) else [Positions(of_frames=model.lever is not None)]
     for own in model.placement:
         for k, (name, seen) in enumerate(own.devices.cameras.items()):
-            found.append(BoardImages(None, model, name, seen, own.rows[own.device == k]))
+            found.append(BoardImages(model=model, name=name, seen=seen, rows=own.rows[own.device == k]))
     words = [word for own in model.placement for word in own.names]
     for own in model.placement:
         for number, word in enumerate(own.names if own.devices.seen_points else ()):
             name = f"{own.kind} {word}" if words.count(word) > 1 else word
-            found.append(DeviceReadings(None, (name,), (FittedDevice.of(model.map, own, number),), new=False))
+            found.append(DeviceReadings(names=(name,), devices=(FittedDevice.of(model.map, own, number),), new=False))
     if not found:
         fix = "say by `sensor` what will measure"
         raise InputError.of("the file of this model does not say which devices measured its rows", fix=fix)

@@ -15,8 +15,9 @@ extrapolation, not change.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from math import inf
 from typing import NamedTuple
 
@@ -45,49 +46,32 @@ NEGLIGIBLE_EIGENVALUE_SHARE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class ChangedPart:
-    """A part of a model that may have changed.
+    """A part of a model that may have changed, by columns whose products are the prior covariance of the change."""
 
-    Args:
-        name: of the joint, or "gravity" or "geometry".
-        joint: the column of the joint whose error or offset it is; None for parameters of the nominal map.
-        kernel: that of the joint's error; None for its offset, which all readings lack since then.
-        deviations: (K,) prior standard deviations of the parameters, zero of those that it leaves alone.
-        variance: of the change, relative to the old variance of the part.
-    """
-
-    name: str
-    joint: int | None = None
-    kernel: RadialKernel | None = None
-    deviations: Tensor | None = None
-    variance: float = 1.0
-
-    @property
-    def offset(self) -> bool:
-        """Whether it is the offset of a joint."""
-        return self.joint is not None and self.kernel is None
+    name: str  # of the joint, or "gravity" or "geometry"
+    columns: Callable[[Linearisation], Tensor]  # (M, m, c) at M configurations, m; of a joint's errors (M, c), rad or m
+    joint: int | None = None  # whose errors they are; None for parameters of the nominal map
+    offset: bool = False  # whether it is the offset of the joint, which all readings lack since then
+    variance: float = 1.0  # of the change, relative to the old variance of the part
 
     def shapes(self, at: Linearisation) -> Tensor:
-        """(M, c) columns whose products are the covariance of the change of the joint's errors, rad or m."""
-        points, size = at.joint[0].points, self.variance**0.5
-        if self.kernel is None:
-            return torch.full_like(points[:, :1], size * OFFSET_DEVIATION_RAD_M)
-        one = points.new_zeros(len(points), 1, points.shape[1])
-        one[:, 0, self.joint] = 1.0
-        values, vectors = torch.linalg.eigh(self.kernel.gram(points, one, points, one))
-        kept = values > NEGLIGIBLE_EIGENVALUE_SHARE * values[-1]
-        return size * vectors[:, kept] * values[kept].sqrt()
+        """The columns, with the variance of the change."""
+        return self.variance**0.5 * self.columns(at)
 
     def root(self, at: Linearisation) -> Tensor:
-        """(M, m, c) columns whose products are the covariance of the change at M configurations, m."""
-        if self.deviations is not None:
-            return self.variance**0.5 * (at.sensitivity * self.deviations)[..., self.deviations > 0]
-        return at.joint_to_start[:, :, self.joint, None] * self.shapes(at)[:, None]
+        """(M, m, c) the columns at M configurations, m."""
+        own = self.shapes(at)
+        return own if self.joint is None else at.joint_to_start[:, :, self.joint, None] * own[:, None]
 
 
 def offsets_of(fitted: FittedMap) -> list[ChangedPart]:
     """The offsets of all joints, which are tested beside the parts: the geometry has them, among much else."""
+
+    def same(at: Linearisation) -> Tensor:
+        return torch.full_like(at.joint[0].points[:, :1], OFFSET_DEVIATION_RAD_M)
+
     names = robot_map(fitted).geometry.chain.joint_names
-    return [ChangedPart(f"the offset of {name}", joint) for joint, name in enumerate(names)]
+    return [ChangedPart(f"the offset of {name}", same, joint, offset=True) for joint, name in enumerate(names)]
 
 
 def parts_of(fitted: FittedMap) -> list[ChangedPart]:
@@ -96,15 +80,24 @@ def parts_of(fitted: FittedMap) -> list[ChangedPart]:
     names = nominal.geometry.chain.joint_names
     own = {t.output: t for t in spec.joint_kernel.terms if isinstance(t, RadialKernel) and t.output is not None}
     least = SMALLEST_AMPLITUDE_SHARE**2 * max((float(term.variance) for term in own.values()), default=0.0)
+
+    def of_joint(kernel: RadialKernel, joint: int, at: Linearisation) -> Tensor:
+        points = at.joint[0].points
+        one = points.new_zeros(len(points), 1, points.shape[1])
+        one[:, 0, joint] = 1.0
+        values, vectors = torch.linalg.eigh(kernel.gram(points, one, points, one))
+        kept = values > NEGLIGIBLE_EIGENVALUE_SHARE * values[-1]
+        return vectors[:, kept] * values[kept].sqrt()
+
+    def of_parameters(some: slice, at: Linearisation) -> Tensor:
+        return at.sensitivity[..., some] * spec.prior_variance[some].sqrt()
+
     found: list[ChangedPart] = []
     for joint, term in own.items() if least > 0 else ():
         kernel = RadialKernel.from_config(term.to_config() | {"variance": max(float(term.variance), least)})
-        found.append(ChangedPart(names[joint], joint, kernel))
-    for name, columns in (("gravity", nominal.sag), ("geometry", nominal.geometry.slices["joints"])):
-        deviations = torch.zeros_like(spec.prior_variance)
-        deviations[columns] = spec.prior_variance[columns].sqrt()
-        found += [ChangedPart(name, deviations=deviations)] if bool(deviations.any()) else []
-    return found
+        found.append(ChangedPart(names[joint], partial(of_joint, kernel, joint), joint))
+    parameters = {"gravity": nominal.sag, "geometry": nominal.geometry.slices["joints"]}
+    return found + [ChangedPart(name, partial(of_parameters, s)) for name, s in parameters.items() if s.start < s.stop]
 
 
 SIMULATED_DRAWS = 2000
@@ -115,16 +108,11 @@ SIZES = 0.03 * 1e4 ** (torch.arange(25, dtype=torch.float64, device="cpu") / 24)
 
 
 class Ratio(NamedTuple):
-    """The likelihood ratio of one part.
+    """The likelihood ratio of one part."""
 
-    Args:
-        value: 2 log of the ratio. probability: that chance makes the largest ratio of all parts as large.
-        variance: likeliest variance of the change, relative to the old variance of its part.
-    """
-
-    value: float
-    probability: float
-    variance: float
+    value: float  # 2 log of it
+    probability: float  # that chance makes the largest ratio of all parts as large
+    variance: float  # likeliest variance of the change, relative to the old variance of its part
 
 
 def likelihood_ratios(rows: NewRows, roots: dict[str, Tensor], seed: int) -> tuple[dict[str, Ratio], float]:
@@ -245,10 +233,9 @@ def _changes_of(rows: NewRows, *, level: float, seed: int) -> tuple[Changes, lis
         ratios, factor = likelihood_ratios(rows, roots, seed)
         # A few outliers look like a change, and a change looks like outliers: it must stand out with either weights.
         strict, _ = likelihood_ratios(rows.with_weights(), roots, seed)
-        both = [(name, own, strict[name]) for name, own in ratios.items()]
-        ratios = {
-            name: Ratio(min(a.value, b.value), max(a.probability, b.probability), a.variance) for name, a, b in both
-        }
+        for name, (value, probability, variance) in ratios.items():
+            other = strict[name]
+            ratios[name] = Ratio(min(value, other.value), max(probability, other.probability), variance)
         if not first:
             first, noise = {name: ratio.probability for name, ratio in ratios.items()}, factor
         name = min(ratios, key=lambda each: (ratios[each].probability, -ratios[each].value))

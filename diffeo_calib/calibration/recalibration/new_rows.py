@@ -90,11 +90,6 @@ class NewSetUp:
         return torch.eye(4, dtype=self.data.q.dtype, device=HOST) if found is None else found.transform
 
     @property
-    def stands_free(self) -> bool:
-        """Whether still no device says where the robot stands."""
-        return self.registration is None and self.fitted.stands_free
-
-    @property
     def seen_before(self) -> Tensor:
         """(P,) boolean: the markers that new rows show and that old rows showed."""
         seen = torch.zeros(self.nominal.geometry.markers, dtype=torch.bool, device=HOST)

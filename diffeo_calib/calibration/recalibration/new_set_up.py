@@ -77,7 +77,7 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
     ball, tip = None if own is None else ball_in_sockets(own.table, geometry), nominal.geometry.on[-1]
     if ball is None:
         found = ball_of([one.table for one in readings], geometry, ball_tip(own, readings, tip))
-        ball = None if found is None else found.geometry.tool[0]
+        ball = None if found is None else found.tool[0]
     new_ball = ball is not None and not knows_ball(model)
     if ball is not None and new_ball:
         old = with_ball(old, ball, ball_tip(own, readings, tip), PLACES.found_m_rad)

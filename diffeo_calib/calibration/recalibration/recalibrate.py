@@ -180,10 +180,10 @@ def _result(
     """The model in the new frame, and everything that was found."""
     found, new = place.registration, place.data
     fitted_map = fitted.model
-    if place.stands_free:
-        fitted_map = fitted_map.without_rigid_motions()
     if found is not None:
         fitted_map = moved(fitted_map, found.transform)
+    elif place.fitted.stands_free:  # still no device says where the robot stands
+        fitted_map = fitted_map.without_rigid_motions()
     own, shared = place.coordinates, fitted.problem.noise.shared[-len(rows) :]
     # a ball that a device measured is none in an unknown place any more
     measured = place.ball is None and own is not None and not bool(own.table.points[:, -1].isnan().all())

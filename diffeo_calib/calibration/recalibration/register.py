@@ -61,10 +61,14 @@ def registered(
     model: CalibratedKinematics, new: Any, *, free: str, marker_std: float | None, learn: bool
 ) -> CalibratedKinematics:
     """See :meth:`CalibratedKinematics.registered`; everything on the CPU."""
-    rows = registration_rows(new, model)
+    if not issubclass(type(new), RowGroups):
+        raise InputError.of("`measurements`", expected="dc.Measurements", got=type(new).__name__)
+    rows = measured_positions(new)
     check_same_robot(model, new)
     if rows is None:
         return model._with(placement=devices_beside(model, new))
+    rows = mounted_of(model).in_any_frame(rows).largest_session()
+    rows = sensor_of(rows).with_points(rows, model)
     here = model.to(HOST)._carrying(model.nominal.load.under(rows.payload).typical)
     ball = model.ball and bool(rows.points[:, -1].isnan().all())
     placed, found = _placed(here, rows, free=free, marker_std=marker_std, ball=ball, learn=learn)
@@ -73,7 +77,14 @@ def registered(
     vars(placed).update({} if learns else {"registration": found})
     known = {"map": placed.to(model.configurations.device), "lever": found.lever, "placement": (), "ball": ball}
     seen = model._with(**known, learnt=found if learns else None)._carrying(model.nominal.load)
-    seen = seen._with(placement=registered_devices(model, seen))
+    same = found.same and ball == model.ball
+    lost = [own for own in model.placement if own.devices.reads and not same]
+    if lost:
+        names = few([f"'{name}'" for own in lost for name in own.names])
+        what = f"the model no longer knows the devices {names}: these rows show other markers than what they read"
+        warn_user(sentence(what, fix="pass rows of the fit's markers, or rows of these devices, to keep them"))
+    kept = model._with(placement=tuple(own for own in model.placement if own not in lost))
+    seen = seen._with(placement=carried_devices(kept, seen, found.transform))
     return seen._with(placement=devices_beside(seen, new))
 
 
@@ -193,21 +204,6 @@ def _sessions(tool: Tensor, new: NewRows, newest: GeometryMap) -> SessionMarkers
     return SessionMarkers(newest, torch.cat([session, latest]), torch.cat([tools, newest.geometry.tool[None]]))
 
 
-def registration_rows(data: Any, model: Any) -> Measurements | None:
-    """The rows of one set-up that say where the robot stands, with a hidden ball where a model has one.
-
-    None where no device measured positions. InputError for something else than rows.
-    """
-    if not isinstance(data, RowGroups):
-        expected, got = "dc.Measurements", type(data).__name__
-        raise InputError.of("`measurements`", expected=expected, got=got)
-    own = measured_positions(data)
-    if own is None:
-        return None
-    own = mounted_of(model).in_any_frame(own).largest_session()
-    return sensor_of(own).with_points(own, model)
-
-
 def devices_beside(model: Any, data: Any, fitted: Sequence[PlacedDevices] = ()) -> tuple[PlacedDevices, ...]:
     """The devices of rows of any kinds, placed around a calibrated model that knows the rows' points.
 
@@ -233,9 +229,11 @@ def devices_beside(model: Any, data: Any, fitted: Sequence[PlacedDevices] = ()) 
 def _with_rows(own: PlacedDevices, fitted: Sequence[PlacedDevices]) -> PlacedDevices:
     """Devices with their rows of a fit, if any set of it has them; set-ups are where the fit has them."""
     for one in fitted:
+        if one.devices.same_set(own.devices) and own.devices.set_up:
+            return one
         if one.devices.same_set(own.devices):
             number = torch.tensor([own.names.index(name) for name in one.names], dtype=torch.int64, device=HOST)
-            return one if own.devices.set_up else replace(own, rows=one.rows, device=number[one.device])
+            return replace(own, rows=one.rows, device=number[one.device])
     return own
 
 
@@ -260,19 +258,3 @@ def carried_devices(old: Any, new: Any, T: Tensor) -> tuple[PlacedDevices, ...]:
         for own in old.placement
         if own.kind != KnownDrift.kind
     )
-
-
-def registered_devices(old: Any, new: Any) -> tuple[PlacedDevices, ...]:
-    """The devices of a model beside the same one registered anew; those that saw what it no longer knows are left out.
-
-    Warns:
-        DiffeoCalibWarning: devices that are left out.
-    """
-    same = new.registration.same and old.ball == new.ball
-    lost = [own for own in old.placement if own.devices.reads and not same]
-    if lost:
-        names = few([f"'{name}'" for own in lost for name in own.names])
-        what = f"the model no longer knows the devices {names}: these rows show other markers than what they read"
-        warn_user(sentence(what, fix="pass rows of the fit's markers, or rows of these devices, to keep them"))
-    kept = tuple(own for own in old.placement if own not in lost)
-    return carried_devices(old._with(placement=kept), new, new.registration.transform)

@@ -26,11 +26,11 @@ from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.maps.observation import LinearFunctionals, Observation
 from diffeo_calib.process.numbers import Covariance, Numbers
 from diffeo_calib.process.process import Expected, Process
-from diffeo_calib.process.scales import GearLine, Hyperparameters
+from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.regions import region_factor
-from diffeo_calib.robots.gear_waves import GearWaves
 from diffeo_calib.robots.placement import PLACES
+from diffeo_calib.robots.position_errors import PositionErrors
 
 T = TypeVar("T")
 HELD_VARIANCE = 1e-18
@@ -228,12 +228,12 @@ class TangentData:
             vars(other).update(basis=self.basis, told=told.with_tails(tails))
         return other
 
-    def with_gear_lines(self, lines: tuple[GearLine, ...]) -> TangentData:
-        """The same measurements around a map with these gear lines, which add nothing yet."""
-        waves = GearWaves(tuple(line.joint for line in lines), tuple(line.frequency for line in lines))
-        nominal = self.nominal.changed(waves=waves)
+    def with_position_errors(self, scales: Hyperparameters) -> TangentData:
+        """The same measurements around a map with these gear lines and axes, which add nothing yet."""
+        own = PositionErrors(tuple((line.joint, line.frequency) for line in scales.lines), scales.axes)
+        nominal = self.nominal.changed(own=own)
         smooth = self.theta[: nominal.sag.stop]
-        other = self._variant(nominal=nominal, theta=torch.cat([smooth, smooth.new_zeros(waves.size)]))
+        other = self._variant(nominal=nominal, theta=torch.cat([smooth, smooth.new_zeros(sum(own.sizes))]))
         vars(other).pop("sensitivities", None)
         return other
 

@@ -14,7 +14,7 @@ from diffeo_calib.cli.console import out, plain, progress_bar, say, text_table
 from diffeo_calib.cli.declarations import CorrectOptions
 from diffeo_calib.cli.models import as_fitted, load_laden, tool_in_tip
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import ProgramTable, as_written, of_robot, table_format
+from diffeo_calib.cli.tables import as_written, of_robot, table_format, targets_of, with_rotation
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -101,18 +101,17 @@ def run(options: CorrectOptions) -> None:
     _check(options)
     model = load_laden(options.model, options.payload)
     read = of_robot(table_format(as_fitted(model, options)), model.robot)
-    source = ProgramTable(options.program, read, options)
-    table, tips = source.written(), options.tip or ()
+    table, tips = with_rotation(read, options), options.tip or ()
     if len(tips) == 1:
         model = model.with_tool(model.tool, *tips)
-    turned = replace(source.table, convention=options.convention, rotation_angle=options.rotation_angle)
+    turned = replace(read, convention=options.convention, rotation_angle=options.rotation_angle)
     robot, tools = model.robot, _tools(model, options, turned)
     before, columns = Columns.of(table.joints_only()), Columns.of(as_written(table).joints_only())
     sheet = read_cells(options.program, table.sep, before.names)
     if before.names != columns.names:  # of a function: they would be those of the program before
         sheet = sheet.without(before.names)
         sheet.check_free(columns.names)
-    start, targets = read_joints(options.program, table), source.targets(len(tools))
+    start, targets = read_joints(options.program, table), targets_of(options.program, read, options, len(tools))
     for tool in tools:
         misses = [tool.name("angle_miss", table.angle)] if targets is None or targets.ndim == 4 else []
         misses += ["status", tool.name("miss", table.length), tool.name("std", table.length)]

@@ -22,7 +22,7 @@ from diffeo_calib.cli.main import app
 from diffeo_calib.cli.models import load_kinematics, made_by_command, robot_of
 from diffeo_calib.cli.record import entries_by_kind, kind_entry, make_folder, record
 from diffeo_calib.cli.tables import measured_table
-from diffeo_calib.common.errors import PACKAGE, printable
+from diffeo_calib.common.errors import PACKAGE, few, printable
 from diffeo_calib.common.files import write_figure
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_entry, hand_eye_sentences
@@ -111,7 +111,10 @@ def _lines_about_places(
         yield from printed.socket_lines(one.one, "held out")
     own, _ = divided(data)
     if own is not None and not placed.free:
-        yield from own.table.device_rows().hidden_lines()
+        seen = own.table.device_rows()
+        hidden = zip(seen.body_names, (~seen.seen_bodies).sum(0).tolist(), strict=True)
+        if counts := [f"{name} in {count}" for name, count in hidden if count]:
+            yield f"hidden in some of {len(seen)} rows: {few(counts)} of them"
     yield from (*result.placement.sentences(), *map(str, result.lengths[:1]))
     if any(one.one.what == ERRORS for one in held_out.values()):  # else they are the verdict
         yield printed.stage_line(result.model, result.stages, result.expected)

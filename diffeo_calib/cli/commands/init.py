@@ -45,7 +45,6 @@ from diffeo_calib.cli.proposals import (
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.checks import quiet
-from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.sensors import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.table_format import TableFormat
@@ -178,8 +177,7 @@ def _read(robot: Path, sheet: Sheet, arm: Arm) -> Source:
 def _with_tip(robot: Path, source: Source, arm: Arm) -> Source:
     """The same without joints at the end that no marker follows, and why the tip is there."""
     left_out = list[str]()
-    q = read_joints(source.sheet.path, replace(source.table, joints=source.joints, kinds=source.robot.kinds))
-    moved = (q.amax(0) - q.amin(0)).tolist()
+    moved = (source.q.amax(0) - source.q.amin(0)).tolist()
     while len(arm.joints) > 1 and source.value("joints"):
         count = len(arm.joints) - 1
         shorter, last = arm.first(count), arm.joints[count]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from math import isfinite
-from pathlib import Path
 from typing import Any
 
 import typer
@@ -99,7 +98,12 @@ def change_lines(changes: Changes, none: object = None) -> list[str]:
 def _compare(given: RecalibrateOptions) -> None:
     """Compare a model with new measurements, or with another model."""
     model, other = load_kinematics(given.old), given.other
-    if _is_model(other):
+    try:
+        with other.open("rb") as file:  # the header of a model is JSON after eight bytes
+            is_model = other.is_file() and file.read(9)[8:] == b"{"
+    except OSError:
+        is_model = other.suffix.lower() not in (".csv", ".txt")
+    if is_model:
         if given.named or given.length or given.angle:
             fix = "leave out the options of tables, or name a table"
             raise InputError.of(f"{other} is a model, beside options of a table", fix=fix)
@@ -118,14 +122,3 @@ def _compare(given: RecalibrateOptions) -> None:
         say(*motion_lines(found.moved, model.on, doubt=doubt(found.changes, "in them")))
     say(f"RMS from the model, device and markers found anew: {found.errors.rms_text}")
     say(f"expected of it: {found.expectations.rms_text}", *change_lines(found.changes, found))
-
-
-def _is_model(path: Path) -> bool:
-    """Whether a file is a model rather than a table: its header is JSON after eight bytes."""
-    if path.exists() and not path.is_file():  # a pipe can be read only once
-        return False
-    try:
-        with path.open("rb") as file:
-            return file.read(9)[8:] == b"{"
-    except OSError:
-        return path.suffix.lower() not in (".csv", ".txt")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,24 +18,6 @@ from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
 from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat, check_choice, column_names, flat_names
 from diffeo_calib.robots.joint import KINDS
 
-
-@runtime_checkable
-class ChainLike(Protocol):
-    """Names and kinds of a robot's joints, in order: all that tables need of it."""
-
-    @property
-    def joint_names(self) -> Sequence[str]:
-        """Names of the joints."""
-        ...
-
-    @property
-    def kinds(self) -> Sequence[str]:
-        """``"revolute"``, ``"continuous"`` or ``"prismatic"`` for every joint."""
-        ...
-
-
-Joints = Sequence[str] | ChainLike | PoseColumns
-"""Columns of joint values: their names, a robot whose joints they are named after, or those of a pose."""
 Values = dict[Any, Tensor]
 """Numbers of the rows of a table in SI by the keys of :attr:`Columns.groups`."""
 
@@ -85,13 +67,6 @@ class Hideable(NamedTuple):
     deviations: list[int]
     word: str
 
-    @classmethod
-    def of(cls, groups: Sequence[Group], word: str, names: Sequence[str]) -> Hideable:
-        """The columns of these groups among all names; deviations are values where there are no others."""
-        known = [names.index(name) for group in groups if group.check == DEVIATION for name in group.names]
-        values = [names.index(name) for group in groups if group.check != DEVIATION for name in group.names]
-        return cls(values or known, known if values else [], word)
-
 
 Body = tuple[Sequence[Group], str]
 """The columns of a marker, frame or reading, and what lines do that fill them, such as "holds a distance"."""
@@ -99,22 +74,19 @@ Body = tuple[Sequence[Group], str]
 
 @dataclass(frozen=True)
 class Columns:
-    """The wanted columns of numbers."""
+    """The wanted columns of a table."""
 
     table: TableFormat  # what it holds, and the units
     joints: JointExpressions | PoseColumns  # names or expressions of n joints, or the columns of a pose
     prismatic: Tensor  # (n,) which of them are prismatic
     kinds_known: bool  # whether the kinds of the joints were given; otherwise all are taken as revolute
-    # all columns: "q", those beside joints by what they hold, and what was measured by themselves
+    # of numbers: "q", those beside joints by what they hold, and what was measured by themselves
     groups: dict[Any, Group]
-    bodies: Sequence[Body] = ()  # that lines may leave empty, markers and frames first
-    all_hidden: bool = False  # whether rows may show no marker, because they hold something else
+    sensors: Sequence[Any] = ()  # the columns of each kind of rows, see sensors.py
 
     @classmethod
-    def of(
-        cls, table: TableFormat, groups: Sequence[Group] = (), bodies: Sequence[Body] = (), *, all_hidden: bool = False
-    ) -> Columns:
-        """Check names and kinds of columns; ``groups`` are those of what was measured.
+    def of(cls, table: TableFormat, sensors: Sequence[Any] = ()) -> Columns:
+        """Check names and kinds of columns; ``sensors``: the columns of what was measured.
 
         Raises:
             MeasurementError: not names, another number of kinds than names or unknown ones, a unit of prismatic joints
@@ -126,12 +98,14 @@ class Columns:
             raise MeasurementError.of(what, got="joints that are all taken as revolute", fix=fix)
         for name, column in table.beside.items():
             column_names(name, [column], "the name of a column", (1,))
-        given = table.joints
+        given, groups = table.joints, list[Group]()
+        for sensor in sensors:
+            groups += [group for group in sensor.groups(table) if group not in groups]  # kinds may share deviations
         read = replace(given, angle=table.angle) if isinstance(given, PoseColumns) else JointExpressions.of(names)
         every = {"q": Group(read.columns)} | {group: group for group in groups if group.names}
         for name, column in table.beside.items():
             every[name] = Group((column.strip(),), check=MASS if name == "payload" else None)
-        columns = cls(table, read, prismatic, kinds_known, every, bodies, all_hidden)
+        columns = cls(table, read, prismatic, kinds_known, every, sensors)
         alike = [name for place, group in enumerate(groups) if group in groups[:place] for name in group.names]
         twice = repeated([*columns.names, *alike]) or repeated(names)
         if twice:
@@ -150,9 +124,29 @@ class Columns:
         return [name for group in self.groups.values() for name in group.names]
 
     @property
+    def texts(self) -> dict[str, bool]:
+        """The columns of texts, and whether a table must have them."""
+        pairs = [pair for sensor in self.sensors for pair in sensor.texts.items()]
+        return {name: any(needed for other, needed in pairs if other == name) for name, _ in pairs}
+
+    @property
+    def all_hidden(self) -> bool:
+        """Whether rows may show no marker, because they hold something else."""
+        return len(self.sensors) > 1
+
+    @property
     def hideable(self) -> list[Hideable]:
-        """The columns of every body that lines may leave empty."""
-        return [Hideable.of(groups, word, self.names) for groups, word in self.bodies if any(g.names for g in groups)]
+        """The columns of every body that lines may leave empty, markers and frames first.
+
+        Deviations are values where there are no others.
+        """
+        found, names = list[Hideable](), self.names
+        for sensor in (one for one in self.sensors if self.all_hidden or one.hidden):
+            for groups, word in sensor.bodies(self.table):
+                known = [names.index(name) for group in groups if group.check == DEVIATION for name in group.names]
+                values = [names.index(name) for group in groups if group.check != DEVIATION for name in group.names]
+                found += [Hideable(values or known, known if values else [], word)] if values or known else []
+        return found
 
     def to_si(self, raw: Tensor) -> Values:
         """Rows (N, c) in the units of the file as those of each group (N, columns), or (N,) beside joints."""
@@ -204,13 +198,18 @@ def check_count(what: str, items: Sequence[object], count: int, each: str) -> No
         raise MeasurementError.of(what, expected=count, got=got, fix=f"pass one per {each}")
 
 
-def _joint_columns(joints: Joints, kinds: Sequence[str] | None) -> tuple[tuple[str, ...], Tensor, bool]:
+def _joint_columns(joints: Any, kinds: Sequence[str] | None) -> tuple[tuple[str, ...], Tensor, bool]:
     """Names of the joints, which of them are prismatic, and whether that is known."""
     if isinstance(joints, PoseColumns):
         joints, kinds = joints.texts, kinds if joints.robot is None else joints.robot.kinds
-    if isinstance(joints, ChainLike):
-        joints, kinds = joints.joint_names, joints.kinds if kinds is None else kinds
-    if isinstance(joints, str) or len(joints) == 0 or not all(isinstance(name, str) for name in joints):
+    kinds = getattr(joints, "kinds", None) if kinds is None else kinds
+    joints = getattr(joints, "joint_names", joints)  # a robot
+    if (
+        not isinstance(joints, Sequence)
+        or isinstance(joints, str)
+        or len(joints) == 0
+        or not all(isinstance(name, str) for name in joints)
+    ):
         expected, fix = "names of columns, or a robot", "pass a list such as ['q1', 'q2'], in the robot's order"
         raise MeasurementError.of("`joints`", expected=expected, got=as_written(joints), fix=fix)
     known = kinds is not None

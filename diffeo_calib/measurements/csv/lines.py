@@ -21,7 +21,7 @@ from diffeo_calib.common.errors import MeasurementError, few, listed
 from diffeo_calib.common.files import WholeFile
 from diffeo_calib.measurements.csv.cells import number, repeated
 from diffeo_calib.measurements.csv.sheets import MARKS, as_text
-from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.measurements.table_format import ZERO, TableFormat
 
 Lines = list[tuple[int, list[str]]]
 """Line number in the file and cells of every line that is not blank."""
@@ -79,7 +79,7 @@ class CsvLines:
             what, fix = f"file '{path}' is empty", "check that it was exported completely"
             raise MeasurementError.of(what, expected="a header and rows of numbers", fix=fix)
         self.notes += notes
-        self._find_header(lines, {*wanted})
+        self._find_header(lines, {*wanted} - {ZERO})
 
     def rows(self, most: int | None = None) -> Lines:
         """The lines below the header, of the first ``most`` if given.
@@ -88,7 +88,14 @@ class CsvLines:
             MeasurementError: no row, or lines of different lengths.
         """
         below = list(islice((line for line in self._cells() if line[0] > self._last), most))
-        kept, expected = [(line, cells) for line, cells in below if not self._no_row(cells)], len(self.header)
+        expected, named = len(self.header), self._last > 0  # not where columns are counted
+        kept = [
+            (line, cells)
+            for line, cells in below
+            if any(cells)
+            and not (named and cells[:expected] == self.header)
+            and not (self._commented and _is_comment(cells))
+        ]
         sizes = expected, expected + self._extra
         bad = [(line, len(cells)) for line, cells in kept if len(cells) not in sizes or any(cells[expected:])]
         if bad:
@@ -116,11 +123,6 @@ class CsvLines:
         except csv.Error as error:
             what = f"file '{self.path}', line {line + 1}: not valid CSV ({error})"
             raise MeasurementError.of(what, fix="repair the quotes of this line") from error
-
-    def _no_row(self, cells: Sequence[str]) -> bool:
-        """Whether a line below the header is a comment, empty, or the header again."""
-        again = self._last > 0 and cells[: len(self.header)] == self.header  # not where columns are counted
-        return not any(cells) or again or (self._commented and _is_comment(cells))
 
     def _find_header(self, lines: Lines, wanted: set[str]) -> None:
         """Find the header as most rows of numbers, and the wanted names, among the first lines have it.

@@ -12,6 +12,7 @@ import math
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from io import BytesIO, StringIO
 from itertools import product
@@ -56,23 +57,17 @@ def _table(path: Path, data: bytes) -> tuple[Rows, list[str]]:
     file = BytesIO(data)
     if not data.startswith(ZIP):
         return (_array if data.startswith(NUMPY) else _variables)(path, file)
-    names = _zipped(file)
-    return (_arrays_of_zip if names and all(name.endswith(".npy") for name in names) else _spreadsheet)(path, file)
+    names = list[str]()
+    with suppress(zipfile.BadZipFile), zipfile.ZipFile(file) as archive:
+        names = archive.namelist()
+    file.seek(0)
+    if names and all(name.endswith(".npy") for name in names):
+        return _joined(path, _loaded(path, lambda: dict(np.load(file, allow_pickle=False))))
+    return _spreadsheet(path, file)
 
 
 def _no_table(path: Path, got: str, fix: str) -> MeasurementError:
     return MeasurementError.of(f"file '{path}' is no text but {got}", expected="a table", fix=fix)
-
-
-def _zipped(file: BinaryIO) -> list[str]:
-    """Names of the files in an archive; none if it is damaged."""
-    try:
-        with zipfile.ZipFile(file) as archive:
-            return archive.namelist()
-    except zipfile.BadZipFile:
-        return []
-    finally:
-        file.seek(0)
 
 
 def _spreadsheet(path: Path, file: BinaryIO) -> tuple[Rows, list[str]]:
@@ -114,10 +109,6 @@ def _array(path: Path, file: BinaryIO) -> tuple[Rows, list[str]]:
     if found.ndim != 2 or found.dtype.kind not in "fiu":
         raise _no_table(path, f"an array of shape {found.shape}", "save numbers of shape (N, columns), or with names")
     return _texts(found), []
-
-
-def _arrays_of_zip(path: Path, file: BinaryIO) -> tuple[Rows, list[str]]:
-    return _joined(path, _loaded(path, lambda: dict(np.load(file, allow_pickle=False))))
 
 
 def _variables(path: Path, file: BinaryIO) -> tuple[Rows, list[str]]:

@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
@@ -29,7 +28,7 @@ from diffeo_calib.measurements.poses import (
     rotation_matrices,
     transforms_of_frames,
 )
-from diffeo_calib.measurements.table_format import ANGLE_UNITS, EULER, UNITS_PER_METRE, flat_names, options_of
+from diffeo_calib.measurements.table_format import ANGLE_UNITS, EULER, UNITS_PER_METRE, ZERO, flat_names, options_of
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,7 @@ class FileRows(NamedTuple):
     """Rows of a file."""
 
     path: Path  # the file
-    columns: Columns  # its columns of numbers
+    columns: Columns  # its columns
     values: Values  # these in SI
     texts: Mapping[str, Sequence[str]]  # its columns of texts
     lines: Sequence[int]  # their numbers in the file
@@ -114,14 +113,11 @@ class FileRows(NamedTuple):
         return self.named(column, expected, fix)
 
 
-def read_table(
-    path: Path, columns: Columns, texts: Mapping[str, bool] = MappingProxyType({}), *, zeros: bool = True
-) -> FileRows:
+def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
     """All rows of a file.
 
     Args:
-        columns: which columns of numbers it has, and their units.
-        texts: columns of texts, "nan" being empty, and whether it must have them.
+        columns: which columns it has, and their units; the text "nan" is empty.
         zeros: whether markers that are at 0, 0, 0 far from other rows are hidden there.
 
     Raises:
@@ -131,13 +127,15 @@ def read_table(
         DiffeoCalibWarning: values that look as if they were in another unit; what the file holds beside rows of
             numbers; rows that are left out because no marker was seen.
     """
+    texts = columns.texts
     needed = [name for name, needed in texts.items() if needed]
     file = CsvLines(path, columns.table.sep, [*columns.names, *needed])
     named = [name for name in texts if name in needed or name in file.header]
-    places = find_columns(path, file.header, [*columns.names, *named], file.sep)
+    nothing = [ZERO] * (columns.table.is_flat and ZERO not in file.header)
+    places = find_columns(path, [*file.header, *nothing], [*columns.names, *named], file.sep)
     _check_units(file, columns)
     lines, rows = zip(*file.rows(), strict=True)
-    cells = [[row[place] for row in rows] for place in places]
+    cells = [[[*row, *nothing][place] for row in rows] for place in places]
     words = [["" if text.lower() == "nan" else text for text in own] for own in cells[len(columns.names) :]]
     numbers, notes = _numbers(path, columns, lines, cells[: len(columns.names)])
     for group, values in zip(columns.groups.values(), columns.parts(numbers).values(), strict=True):
