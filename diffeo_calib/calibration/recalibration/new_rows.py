@@ -106,7 +106,7 @@ class NewSetUp:
         deviations: Tensor,
         *,
         same: bool = True,
-        marker: str = "other",
+        marker: str = "",
     ) -> NewRows:
         """The rows around places, which are those where everything was before, all weights 1.
 
