@@ -335,7 +335,7 @@ class NewRows:
         found = self.mean_noise * region_factor(self.tails.freedom, int(self.noise_model.freedom.max()))
         return found if not self.marks.same or float(found.trace()) > float(old.trace()) else old
 
-    @property
+    @cached_property
     def inflation(self) -> float:
         """Factor on all variances with which 95 % regions hold rows that took no part, at least one.
 
