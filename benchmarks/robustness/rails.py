@@ -4,8 +4,8 @@
     python benchmarks/robustness/rails.py --rows 60 120 --shift 0 --turn 0 --out straight.json
 
 The rail's straightness in both directions, and its roll, pitch and yaw, are sums of three waves of 0.5 to 3 periods.
-Fields of a record: `rows`, `seed`; `error_mm`, RMS error of the true places of 300 other poses; `inside`, their share in
-the 95 % regions; `said_mm`, RMS of the predicted deviations; `axes`, the axes whose errors are part of the model.
+Fields of a record: `rows`, `seed`; `error_mm`, RMS error of the true places of 300 other poses; `inside`, their share
+in the 95 % regions; `said_mm`, RMS of the predicted deviations; `axes`, those whose errors are part of the model.
 """
 
 from __future__ import annotations
