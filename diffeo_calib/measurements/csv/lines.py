@@ -173,7 +173,8 @@ def _text(path: Path, sep: str) -> tuple[str, list[str]]:
     try:
         with path.open("rb") as file:
             data = file.read(AT_ONCE)  # tells a device without an end
-            whole = b"\0" not in data or data.startswith((*WIDE, *MARKS)) or path.suffix.lower() == ".mat"
+            variables = path.suffix.lower() == ".mat" and path.is_file()
+            whole = b"\0" not in data or data.startswith((*WIDE, *MARKS)) or variables
             data += file.read() if whole else b""
     except IsADirectoryError as error:
         fix = f"of images of a board run `diffeo-calib images '{path}' JOINTS.csv ...`, and pass its table"
