@@ -39,7 +39,7 @@ from diffeo_calib.calibration import choose_scales
 from diffeo_calib.calibration.diagnostics.plausibility import registered
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.scales.gear_lines import find_gear_lines
-from diffeo_calib.calibration.scales.leave_one_out import estimate_tails
+from diffeo_calib.calibration.scales.leave_one_out import weighed
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import defaults, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -69,10 +69,10 @@ def tangent(robot: Tree, data: dc.Measurements) -> tuple[TangentData, Hyperparam
     model = TangentData(nominal, theta, data.q, data.points.flatten(1), sensor, identification.tails)
     centre = defaults(model, identification.noise, identification.prior)
     first = select(centre, model)
-    model = model.with_tails(estimate_tails(model, first.scales))
+    model = weighed(model, first.scales)
     scales = select(centre, model, start=first.scales).scales
     scales = scales.supported(model.jacobian, model.noise(scales))
-    return model.with_tails(estimate_tails(model, scales)), scales
+    return weighed(model, scales), scales
 
 
 def right(line: GearLine, planted: tuple[int, float]) -> bool:

@@ -314,7 +314,8 @@ def _gauge(arm: SimulatedArm, rng: np.random.Generator, scale: float) -> Campaig
 @mistake("camera: principal point of another image", 1.0, 320.0)
 def _camera(arm: SimulatedArm, rng: np.random.Generator, focal: float, shift: float) -> Campaign:
     q, which = arm.sample(ROWS, int(rng.integers(1 << 30))), torch.arange(ROWS) % 2
-    seen = torch.einsum("nij,nj->ni", cameras()[which][:, :3], torch.nn.functional.pad(ball(arm, q), (0, 1), value=1.0))
+    views = cameras()[which, :12].unflatten(1, (3, 4))
+    seen = torch.einsum("nij,nj->ni", views, torch.nn.functional.pad(ball(arm, q), (0, 1), value=1.0))
     pixels = FOCAL[0] * seen[:, :2] / seen[:, 2:] + 1000.0
     pixels = pixels + noise(rng, pixels, 0.05)
     names = [f"camera {number}" for number in which.tolist()]

@@ -71,7 +71,7 @@ class Around:
         robot: Tree,
         rows: Any,
         asked: tuple[Tensor, Tensor],
-        scales: Hyperparameters | None,
+        known: Hyperparameters | None,
         *,
         first: bool,
         seed: int,
@@ -79,8 +79,8 @@ class Around:
         """Around accepted rows.
 
         Args:
-            asked: candidates and target. scales: to keep; None to select them. first: whether the rows are too few for
-                that.
+            asked: candidates and target. known: scales to keep; None to select them, unless these are the ``first``
+                rows, which are too few for that.
 
         Raises:
             DiffeoCalibError: rows that do not allow a model yet.
@@ -89,10 +89,10 @@ class Around:
             warnings.simplefilter("ignore", DiffeoCalibWarning)  # few rows leave much open
             placed = place(robot, rows, silent)
             data, stages = placed.tangent_data(), (placed.registration, placed.identification)
-            if scales is None and first:
-                scales = defaults(data, noise_of_few(data, len(rows), *stages), placed.identification.prior)
-            known = None if scales is None else replace(scales, lines=())
-            chosen = choose_scales(data, rows, *stages, given=known, seed=seed)
+            if known is None and first:
+                known = defaults(data, noise_of_few(data, len(rows), *stages), placed.identification.prior)
+            scales = None if known is None else replace(known, lines=())
+            chosen = choose_scales(data, rows, *stages, given=scales, seed=seed)
         ratio = variance_ratio(chosen.data, chosen.left_out) if first else 0.0
         if ratio > VARIANCE_RATIO:  # around wrong places all later rows would be wrong
             expected, got = "squared errors of single rows as the others predict them", f"{ratio:.2g} times that"
@@ -129,11 +129,8 @@ class Around:
     def process(self, table: Any, accepted: Sequence[int]) -> Process:
         """What is known by rows of the campaign."""
         place_of = {row: number for number, row in enumerate(self.placed.data.line_numbers.tolist())}
-        mine, later = (
-            [place_of[row] for row in accepted if row in place_of],
-            [row for row in accepted if row not in place_of],
-        )
-        found = self.data.prior(self.scales)
+        mine = [place_of[row] for row in accepted if row in place_of]
+        later, found = [row for row in accepted if row not in place_of], self.data.prior(self.scales)
         if mine:
             own = self.data.rows(torch.tensor(mine, dtype=torch.int64, device=HOST))
             found = own.sample(len(mine), MOST_COORDINATES, 0)[1].process(self.scales)

@@ -23,7 +23,7 @@ from diffeo_calib.measurements.csv.cells import numbers_in
 from diffeo_calib.measurements.csv.files import read_poses
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.poses import rotation_matrices
-from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, UNITS_PER_METRE, TableFormat, numbers_of
+from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, UNITS_PER_METRE, ZERO, TableFormat, numbers_of
 from diffeo_calib.robots.cartesian import cartesian
 
 NUMBERED = "0123456", "1234567", "012345", "123456"
@@ -196,7 +196,8 @@ def _ways(sheet: Sheet, machine: Body, rows: RowColumns, body: Body, *, lengths:
 
 def _numbers(sheet: Sheet, names: Sequence[str]) -> Tensor:
     """Columns as they are (N, c), of the rows without an empty cell among them."""
-    columns = [numbers_in(sheet.cells[name], sheet.decimal) for name in names]
+    flat = [ZERO] * len(sheet.cells[sheet.header[0]])  # places in a plane
+    columns = [numbers_in(sheet.cells.get(name, flat), sheet.decimal) for name in names]
     values = [[nan if value is None else value for value in own] for own in columns]
     found = torch.tensor(values, dtype=torch.float64, device=HOST)
     return found[:, found.isfinite().all(0)].T

@@ -112,7 +112,7 @@ def c_files(
     if source.suffix != ".c":
         raise InputError.of("`path`", expected="the name of a C file, such as model.c", got=as_written(str(source)))
     for file in (source, header := source.with_suffix(".h")):
-        if file.exists() and GENERATED not in file.read_bytes()[:1000].decode("ascii", "replace"):
+        if file.is_file() and GENERATED not in file.read_bytes()[:1000].decode("ascii", "replace"):
             raise InputError.of(f"'{file}' exists and was not generated", fix="name another file, or remove it")
     name = re.sub(r"[^0-9A-Za-z_]", "_", source.stem) if prefix is None else prefix
     if not re.fullmatch(r"[A-Za-z][0-9A-Za-z_]*", name):

@@ -22,6 +22,8 @@ NUMBERS = {"rotvec": 3, "quat_xyzw": 4, "quat_wxyz": 4, "matrix": 9}
 CONVENTIONS = "'rotvec', 'quat_xyzw', 'quat_wxyz', 'matrix', or three letters as 'xyz' (extrinsic) or 'XYZ' (intrinsic)"
 LEVER = 0.1
 """Default distance [m] from a pose's origin to the three points that represent it: the size of usual tools."""
+ZERO = "0"
+"""In place of a column of z: all that was measured is in the plane of x and y."""
 UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0, "cm": 100.0, "inch": 1 / 0.0254}
 """A length in a file is divided by this."""
 ROTATION_NAMES = {
@@ -67,7 +69,7 @@ class TableFormat:
             units of the table, such as -{J2}+90 or {J3}+{J2}. In Python also the robot.
         kinds: of each joint; by default those of the robot, or all revolute.
         position: the three position columns of a marker; several of them for more markers. Empty cells: hidden in that
-            row. None in Python without positions.
+            row. A third name "0" that is no column: all are in the plane of x and y. None in Python without positions.
         sockets: columns of a ball in sockets. readings: of each kind of reading, and of images (csv/sensors.py).
         session: column that names the set-up of the device for every row.
         on: names of the tips that carry the markers or frames, one for each, for a robot with several tips.
@@ -149,6 +151,11 @@ class TableFormat:
         if self.position is None:
             return []
         return list(by_frame("position", self.position, "three names of columns for each marker", 3))
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether the z-coordinate of a marker is 0 in all rows, unless the file has a column of this name."""
+        return any(names[2] == ZERO for names in self.triples)
 
     def for_reading(self) -> TableFormat:
         """The same format with checked options of the rotation.

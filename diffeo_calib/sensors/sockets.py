@@ -26,11 +26,6 @@ class SocketPlaces(Devices):
     numbers_each, increments_each = 3, 3
 
     @classmethod
-    def known(cls, names: tuple[str, ...], places: Tensor, covariance: Tensor) -> SocketPlaces:
-        """Places (S, 3), m, with their covariance (3 S, 3 S)."""
-        return cls(names, places, covariance.diagonal().clamp(min=0).sqrt().view(-1, 3))
-
-    @classmethod
     def start(cls, values: Tensor, bodies: Tensor) -> Tensor:
         return (bodies - values).mean(0)
 

@@ -19,11 +19,9 @@ from diffeo_calib.calibration.scales import leave_one_out as one_out
 from diffeo_calib.calibration.scales.leave_one_out import (
     LeaveOneOut,
     cross_validated_inflation,
-    estimate_tails,
     leave_one_out,
     left_out_squares,
     motions,
-    random_blocks,
     random_folds,
 )
 from diffeo_calib.calibration.scales.selection import SearchLimits, select
@@ -86,7 +84,7 @@ def test_wrong_rows_lose_their_weight(clean: Chosen, by: float) -> None:
     data, bad = clean.data, [7, 20, 21, 55]
     for row, sign in zip(bad, (1, -1, 1, -1), strict=True):
         data = moved(data, row, slice(row % 3, row % 3 + 1), sign * by)
-    tails = estimate_tails(data, clean.scales)
+    tails = one_out.weighed(data, clean.scales).tails
     good = [row for row in range(60) if row not in bad]
     assert tails.gross
     assert float(tails.weights[bad].max()) < 0.1 * (5e-4 / by)
@@ -108,7 +106,7 @@ def test_weights_are_those_of_the_errors_under_the_posterior(name: str, request:
     moments = torch.outer(residual, residual) + (uncertain + uncertain.mT) / 2
     blocks = torch.stack([moments[m * i : m * (i + 1), m * i : m * (i + 1)] for i in range(n)])
     expected = reweight(data.noise_model.squares(data.noise(case.scales), blocks), data.noise_model.freedom)
-    actual = estimate_tails(data, case.scales, rounds=1)
+    actual = one_out.weighed(data, case.scales, rounds=1).tails
     assert actual.freedom == expected.freedom < inf
     assert_close(actual.weights, expected.weights, rtol=1e-6, atol=1e-7)
 
@@ -142,8 +140,8 @@ def test_leave_one_out_is_refitting_without_the_row(name: str, request: pytest.F
 def test_several_blocks_are_predicted_one_by_one(pair: Chosen) -> None:
     whole, data = leave_one_out(pair.data, pair.scales), weighted(pair.data)
     found = leave_one_out(data, pair.scales, seed=3, block_coordinates=130)
-    for rows in random_blocks(data, 3, 130):
-        alone = leave_one_out(data.rows(rows), pair.scales)
+    for rows, part in one_out._parts(data, 3, 130):
+        alone = leave_one_out(part, pair.scales)
         assert_close(found.errors[rows], alone.errors, rtol=0, atol=1e-9)
         assert_close(found.squares[rows], alone.squares, rtol=1e-5, atol=1e-7)
     assert bool(torch.isfinite(found.errors).all())

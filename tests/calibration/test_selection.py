@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from product_bank import Case, noise_blocks
-from table_bank import held
 from tangent_bank import (
     Setting,
     built,
@@ -32,6 +31,7 @@ from diffeo_calib.calibration.scales import selection
 from diffeo_calib.calibration.scales.selection import (
     LARGEST_AMPLITUDE_RATIO,
     SEARCH_LIMITS,
+    LogPosterior,
     SearchLimits,
     Selection,
     defaults,
@@ -208,13 +208,18 @@ def test_axes_of_a_commanded_frame_have_like_scales() -> None:
     first, change = 2 * machine.n, 0.2  # of the coupled length scales
     whole[first : first + 3] += change
     one[first] += change
-    found = [held(log_posterior(each, centre, data)) for each in (whole, one)]
+
+    def posterior(point: Tensor) -> LogPosterior:
+        found = log_posterior(point, centre, data)
+        assert found is not None
+        return found
+
     expected = -0.5 * change**2, -0.5 * change**2 * (1 / 9 + 6 / 9 / selection.AXES**2)
-    assert [each.prior for each in found] == pytest.approx(expected)
+    assert [posterior(each).prior for each in (whole, one)] == pytest.approx(expected)
     step = torch.zeros_like(one)
     step[first : first + 2] = 1e-4
-    sides = [sum(held(log_posterior(one + sign * step, centre, data))[:2]) for sign in (1, -1)]
-    assert float(found[1].gradient @ step) == pytest.approx((sides[0] - sides[1]) / 2, rel=1e-4)
+    above, below = (sum(posterior(one + sign * step)[:2]) for sign in (1, -1))
+    assert float(posterior(one).gradient @ step) == pytest.approx((above - below) / 2, rel=1e-4)
 
 
 def test_a_singular_covariance_has_no_posterior() -> None:

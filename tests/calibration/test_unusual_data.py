@@ -17,7 +17,7 @@ from diffeo_calib.calibration.identification import identification
 from diffeo_calib.calibration.identification.identification import Identification, identify
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.placing.place import place
-from diffeo_calib.calibration.scales.leave_one_out import estimate_tails, random_blocks
+from diffeo_calib.calibration.scales.leave_one_out import leave_one_out, weighed
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import seeded
@@ -217,8 +217,8 @@ def scales(data: dc.Measurements) -> dc.Hyperparameters:
 
 def test_a_wrong_row_of_one_block_among_several_is_weighed(data: dc.Measurements) -> None:
     some, chosen = tangent_data(data), scales(data)
-    assert len(random_blocks(some, 0, 3 * SAMPLED)) == ROWS // SAMPLED
-    found, whole = (estimate_tails(some, chosen, block_coordinates=3 * size) for size in (SAMPLED, ROWS))
+    assert leave_one_out(some, chosen, block_coordinates=3 * SAMPLED).effective is None, "several blocks"
+    found, whole = (weighed(some, chosen, block_coordinates=3 * size).tails for size in (SAMPLED, ROWS))
     assert found.gross
     assert whole.gross
     assert int(found.weights.argmin()) == WRONG

@@ -109,6 +109,7 @@ def test_mistakes_of_one_row_are_named_and_left_out(running: dc.Campaign, measur
         assert not verdict.accepted, (words, verdict)
         assert words in verdict.cause, (words, verdict)
         assert campaign.accepted == list(range(ROWS))
+        assert campaign.expected_error == pytest.approx(running.expected_error, rel=1e-6)  # it tells nothing
         campaign.accept(ROWS)
         assert campaign.accepted == list(range(ROWS + 1))
 

@@ -130,6 +130,21 @@ def test_hand_eye_in_two_commands(tmp_path: Path, command: Command) -> None:
     assert cells(tmp_path / "n.csv")[0] == [*header[:6], "rank"]
 
 
+def test_places_measured_in_a_plane(tmp_path: Path, init: Any) -> None:
+    """The third name is no column but 0; a table that counts its columns from 0 is no such table."""
+    commanded = torch.rand(30, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    measured = commanded + 1e-3 * (4 * commanded.flip(1)).sin() + 2e-5 * drawn(30, 2, seed=2)
+    table = write_columns(tmp_path / "t.csv", **{"cmdx_cmdy": 1e3 * commanded, "measx_measy": 1e3 * measured})
+    found, _ = init(table)
+    assert found["position"] == ["measx,measy,0"]
+    assert (found["robot-pose"], found["length"]) == ("cmdx,cmdy", "mm")
+    machine = PoseColumns(("cmdx", "cmdy"), robot=dc.cartesian(commanded))
+    data = dc.read_measurements(table, machine, ["measx", "measy", "0"], length="mm", angle="deg")
+    assert_close(data.points[:, 0], torch.nn.functional.pad(measured, (0, 1)), rtol=0, atol=1e-8)
+    with pytest.raises(MeasurementError, match=r"no column \['0'\]"):
+        dc.read_measurements(table, machine, ["0", "measx", "measy"], length="mm", angle="deg")
+
+
 @pytest.mark.slow
 def test_the_error_field_of_a_gantry(tmp_path: Path, command: Command, init: Any) -> None:
     commanded = torch.rand(80, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)

@@ -233,28 +233,32 @@ def test_what_cannot_be_written(tmp_path: Path) -> None:
     assert not (tmp_path / "t.csv").exists()
 
 
-def test_read_readings_names_its_columns_and_units(tmp_path: Path) -> None:
+def test_readings_name_their_columns_and_units(tmp_path: Path) -> None:
     path = tmp_path / "t.csv"
     path.write_text("a,b,d,u,v,who,kg\n10,20,400,7,8,A,0\n30,40,500,9,8,B,2\n")
     units: dict[str, Any] = {"length": "mm", "angle": "deg"}
-    near = dc.read_readings(path, NAMES, "d", session="who", payload="kg", on="left", offset_std=0.1, **units)
+
+    def read(*given: Any, own: dict[str, Any] = units, payload: str | None = None, **columns: Any) -> Any:
+        return read_measurements(path, NAMES, readings=(dc.ReadingColumns(*given, **columns),), payload=payload, **own)
+
+    near = read("distance", "d", "who", payload="kg", on="left", offset_std=0.1)
     assert_close(near.values[:, 0].tolist(), [0.4, 0.5])
     assert (near.device_names, near.on, near.offset_std) == (["A", "B"], "left", 0.1)
     assert held(near.payload).tolist() == [0.0, 2.0]
-    seen = dc.read_readings(path, NAMES, ["u", "v"], "image", std="d", intrinsics=(2.0, 4.0, 0.0, 0.0), **units)
+    seen = read("image", ["u", "v"], std="d", intrinsics=(2.0, 4.0, 0.0, 0.0))
     assert held(seen.reported_std).tolist() == [[400.0, 400.0], [500.0, 500.0]]
-    assert dc.read_readings(path, NAMES, 0.0, "height", **units).values.tolist() == [[0.0], [0.0]]
+    assert read("height", 0.0).values.tolist() == [[0.0], [0.0]]
     with pytest.warns(dc.DiffeoCalibWarning, match=r"distances reach 500 m: they look like millimetres"):
-        dc.read_readings(path, NAMES, "d", length="m", angle="deg")
+        read("distance", "d", own={"length": "m", "angle": "deg"})
     wrong: tuple[tuple[Any, Any, dict[str, Any], str], ...] = (
-        (("u",), "image", {}, "2 names of columns for 'image'"),
+        (("u",), "image", {"intrinsics": (1.0, 1.0, 0.0, 0.0)}, "2 names of columns for 'image'"),
         ("d", "pose", {}, "`kind`"),
         ("d", "height", {"intrinsics": (1.0, 1.0, 0.0, 0.0)}, "`intrinsics` of 'height'"),
         (("u", "v"), "image", {}, "`intrinsics` of 'image'"),
     )
     for names, kind, options, said in wrong:
         with pytest.raises(MeasurementError, match=says(said)):
-            dc.read_readings(path, NAMES, names, **{"kind": kind}, **units, **options)
+            dc.ReadingColumns(kind, names, **options)
 
 
 def test_a_socket_that_is_not_a_number_is_none(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ ROUNDS, NOISE_CHANGE = 10, 3e-3
 SMALLEST_PRIOR, LARGEST_PRIOR = 1e-5, 0.1
 """Range of estimated prior deviations, m or rad."""
 SHARED_NUMBERS = 3.0
-"""Numbers as which the noise of all kinds counts for that of one: of a few rows nothing may be left."""
+"""Numbers as which the noise of all kinds counts for that of one, in logarithms: of a few rows nothing may be left."""
 COORDINATES = 8000
 """Measured coordinates of the random rows that stand for all rows where there are more. What a rigid geometry cannot
 explain is larger than the error that noise then leaves in its few parameters."""
@@ -326,8 +326,9 @@ def estimated(rows: Rows, held: Sequence[int], prior: Prior | None = None) -> Id
         free = none.index_add(0, kind, dim.masked_fill(squares.isnan(), 0.0) - fit.leverage)  # not determined by rows
         total = none.index_add(0, kind, (tails.weights * squares).nan_to_num(0.0))
         noise = max(sqrt(float(total.sum()) / max(float(free.sum()), 1.0)), SMALLEST_NOISE_M)
-        known = SHARED_NUMBERS * (len(none) > 1)
-        levels = ((total + known * noise**2) / (free + known).clamp(min=1.0)).sqrt().clamp(min=SMALLEST_NOISE_M)
+        free = free.clamp(min=1.0)
+        own, known = (total / free).sqrt().clamp(min=SMALLEST_NOISE_M), SHARED_NUMBERS * (len(none) > 1)
+        levels = own * (noise / own) ** (known / (free + known))
         before, sigma = sigma, levels[kind]
         tails = reweight(squares / sigma.square() + fit.leverage / tails.weights, dim)
         if float(((sigma - before).abs() / sigma).max()) < NOISE_CHANGE:

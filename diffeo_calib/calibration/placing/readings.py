@@ -6,9 +6,10 @@ twist of the first joint are held, the devices are unknown.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from math import inf
 from typing import NamedTuple
 
 import torch
@@ -17,7 +18,6 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_size
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import (
-    Fit,
     Identification,
     Prior,
     ReadRows,
@@ -32,6 +32,7 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.devices import Devices, Hypothesis, check_devices
 from diffeo_calib.sensors.kinds import kind_of
@@ -130,48 +131,45 @@ def register_readings(bare: Geometry, tables: Sequence[Readings]) -> Identificat
     Warns:
         DiffeoCalibWarning: readings that no place of ball and devices explains in either unit.
     """
-    most = LARGEST_SHARE * bare.chain.reach
-    found = _rough_fits(_starts(bare, tables))
+    most, found = LARGEST_SHARE * bare.chain.reach, _rough_fits(tables, _starts(bare, tables))
+
+    def tried(balls: Iterable[Tensor]) -> list[RoughFit]:
+        return sorted([*found, *_rough_fits(tables, [_around(bare, tables, ball) for ball in balls])], key=_worst)
+
     if found and found[0].worst[0] > most:  # one kind is lost: place it anew
-        balls = [one.rows.geometry.absorb(one.fit.theta).tool[0] for one in found]
-        found = sorted([*found, *_rough_fits([_around(bare, tables, ball) for ball in balls])], key=_worst)
+        found = tried(one.stage.geometry.tool[0] for one in found)
     if found and found[0].worst[0] > most:
         _refuse_another_unit(bare, tables, found[0])
     if not found or found[0].worst[0] > most:
-        balls = BALL_SPREAD_M * torch.randn(BALLS_TRIED, 3, dtype=torch.float64, generator=seeded(0), device=HOST)
-        found += _rough_fits([_around(bare, tables, ball) for ball in balls])
+        found = tried(
+            BALL_SPREAD_M * torch.randn(BALLS_TRIED, 3, dtype=torch.float64, generator=seeded(0), device=HOST)
+        )
     if not found:
         raise MeasurementError.of(UNEXPLAINED, fix=CHECK)
-    best = min(found, key=_worst)
-    each = zip(tables, best.fit.errors, strict=True)
+    best, each = found[0], zip(tables, found[0].errors, strict=True)
     if any(kind_of(data).doubts_unit(data, own[:, 0]) for data, own in each):
         _refuse_another_unit(bare, tables, best)
     if best.worst[0] > most:
         warn_user(sentence(UNEXPLAINED, **best.said(most), fix=CHECK))
-    fit, rows = best.fit, best.rows
-    each = zip(rows.parts, fit.shifts.split(rows.freedom), strict=True)
-    devices = [one for own, shifts in each for one in own.devices(shifts)]
-    noise = float(torch.cat([own.flatten() for own in fit.errors]).square().mean().sqrt())
-    found = Rows(rows.geometry.absorb(fit.theta), tuple(map(ReadRows, tables, devices)), rigid=True)
-    return described(found, [noise] * len(devices), adrift=True)
+    noise = float(torch.cat([own.flatten() for own in best.errors]).square().mean().sqrt())
+    rows = _read(best.stage.geometry, tables, best.stage.devices)
+    return described(rows, [noise] * len(tables), adrift=True)
 
 
 class RoughFit(NamedTuple):
-    """Ball and devices from one start, and the largest median residual of a device, m, with its name.
+    """Ball and devices from one start, with errors (N, 1, r) of all readings, m.
 
-    One wrong plane of three shows in it.
+    The largest median residual of a device, m, with its name: one wrong plane of three shows in it.
     """
 
     worst: tuple[float, str]
-    fit: Fit
-    rows: Rows
+    stage: Identification
+    errors: list[Tensor]
 
     def said(self, most: float) -> dict[str, str]:
         """What a message says of it, with the largest median that belongs to a robot, m."""
-        (median, device), expected = (
-            self.worst,
-            f"residuals well below {1e3 * most:.0f} mm with the robot's description",
-        )
+        median, device = self.worst
+        expected = f"residuals well below {1e3 * most:.0f} mm with the robot's description"
         return {"expected": expected, "got": f"a median of {1e3 * median:.3g} mm at {as_written(device)}"}
 
 
@@ -179,20 +177,21 @@ def _worst(one: RoughFit) -> tuple[float, str]:
     return one.worst
 
 
-def _rough_fits(starts: Sequence[Rows]) -> list[RoughFit]:
+def _rough_fits(tables: Sequence[Readings], starts: Sequence[Rows]) -> list[RoughFit]:
     """From each start that leads anywhere, the best first."""
     found = []
     for rows in starts:
-        sigma = rows.parts[0].q.new_full((sum(len(own.q) for own in rows.parts),), ROUGH_M)
-        root = Prior().root(rows.geometry, _all_but_ball(rows.geometry))
+        sigma = torch.full((sum(map(len, tables)),), ROUGH_M, dtype=torch.float64, device=HOST)
+        root = Prior().root(rows.geometry, range(rows.geometry.slices["tool"].start))
         with suppress(InputError):  # the start has the ball at a fixed point or behind a camera
             fit = solve(rows, sigma, root, max_nfev=STARTS_STEPS, loss="soft_l1")
             worst = max(
-                (float(errors[:, 0].norm(dim=1)[own.data.device == number].median()), name)
-                for own, errors in zip(rows.parts, fit.errors, strict=True)
-                for number, name in enumerate(own.data.names)
+                (float(errors[data.device == number].norm(dim=2).median()), name)
+                for data, errors in zip(tables, fit.errors, strict=True)
+                for number, name in enumerate(data.names)
             )
-            found.append(RoughFit(worst, fit, rows))
+            stage = rows.found(fit, ROUGH_M, Prior(), Tails(inf, torch.ones_like(sigma)))
+            found.append(RoughFit(worst, stage, fit.errors))
     return sorted(found, key=_worst)
 
 
@@ -231,10 +230,6 @@ def check_known(tables: Sequence[Readings], registration: Identification, found:
         devices.check_freed(found.noise, again.noise)
 
 
-def _all_but_ball(geometry: Geometry) -> range:
-    return range(geometry.slices["tool"].start)
-
-
 def _starts(bare: Geometry, tables: Sequence[Readings]) -> list[Rows]:
     """Balls and devices: in closed form by each device, and with the ball where it was."""
     found = [_around(bare, tables, bare.tool[0])]
@@ -254,8 +249,12 @@ def _starts(bare: Geometry, tables: Sequence[Readings]) -> list[Rows]:
 def _around(bare: Geometry, tables: Sequence[Readings], ball: Tensor) -> Rows:
     """The devices in closed form for a ball (3,) in the tip's frame, m."""
     geometry = bare.with_tool(ball[None])
-    parts = [ReadRows(data, kind_of(data).at(data, geometry.points(data.q)[:, 0])) for data in tables]
-    return Rows(geometry, tuple(parts), rigid=True)
+    return _read(geometry, tables, [kind_of(data).at(data, geometry.points(data.q)[:, 0]) for data in tables])
+
+
+def _read(geometry: Geometry, tables: Sequence[Readings], devices: Sequence[Devices]) -> Rows:
+    """Readings of the ball around devices, errors of joints zero."""
+    return Rows(geometry, tuple(map(ReadRows, tables, devices)), rigid=True)
 
 
 def _refuse_another_unit(bare: Geometry, tables: Sequence[Readings], best: RoughFit) -> None:
@@ -263,7 +262,7 @@ def _refuse_another_unit(bare: Geometry, tables: Sequence[Readings], best: Rough
     most = LARGEST_SHARE * bare.chain.reach
     for factor, words in ((1e3, "small"), (1e-3, "large")):
         other = [replace(own, values=factor * own.values) if own.unit[0] == "mm" else own for own in tables]
-        found = _rough_fits(_starts(bare, other))
+        found = _rough_fits(other, _starts(bare, other))
         if found and found[0].worst[0] < min(most, FAR_BETTER * best.worst[0]):
             fix = f"they seem to be 1000 times too {words}: check the units of the readings (mm or m)"
             raise MeasurementError.of(UNEXPLAINED, **best.said(most), fix=fix)

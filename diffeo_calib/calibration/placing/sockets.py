@@ -100,7 +100,8 @@ class SocketDevices(DeviceSet):
         R = torch.linalg.qr(torch.cat(equations), mode="r").R[: 3 * S]
         root = torch.linalg.solve_triangular(R[:, :-1], wide, upper=True)
         places, rows = positions + (root @ R[:, -1]).view(-1, 3), (data.socket_numbers != NO_SOCKET).nonzero()[:, 0]
-        devices, covariance = SocketPlaces.known(sockets.names, places, root @ root.mT), root @ root.mT
+        covariance = root @ root.mT
+        devices = SocketPlaces(sockets.names, places, _deviations(covariance))
         return cls(devices, rows, data.socket_numbers[rows], sockets, root, not data.without_device, covariance)
 
     @classmethod
@@ -185,7 +186,7 @@ class SocketDevices(DeviceSet):
             B = frame_slopes(positions[None], positions.mean(0))[0]  # (3 S, 6)
             root = root - B @ (torch.linalg.pinv(B) @ root)
         covariance = root @ found.covariance @ root.mT
-        devices = SocketPlaces.known(self.names, positions, covariance)
+        devices = SocketPlaces(self.names, positions, _deviations(covariance))
         left_out = () if found.chosen is None else self._left_out(found.chosen)
         return replace(self, devices=devices, covariance=covariance, left_out=left_out)
 
@@ -257,6 +258,10 @@ class SocketDevices(DeviceSet):
             known = f", distance {errors} mm" * bool(errors)
             lines.append(f"place '{one.place}' left out: spread {1e3 * one.spread:.4f} mm{known} ({one.rows} rows)")
         return [*lines, f"spread within sockets, each place left out: {1e3 * self.left_out_spread:.4f} mm"]
+
+
+def _deviations(covariance: Tensor) -> Tensor:
+    return covariance.diagonal().clamp(min=0).sqrt().view(-1, 3)
 
 
 def _listed(values: Tensor) -> str:

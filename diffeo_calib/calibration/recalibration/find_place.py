@@ -100,7 +100,11 @@ def find_place(
     priors = priors if marker_std is None else {"stated": marker_std}
     priors = {"same": 0.0} if free == "base" else priors
     starts = search.starts(max(priors.values()))
-    found = {name: _likeliest(starts, search.deviations(metres), name, metres) for name, metres in priors.items()}
+    found = dict[str, NewRows]()
+    for name, metres in priors.items():
+        own = {"deviations": search.deviations(metres), "marker": name}
+        settled = [start.changed(**own).settled() for start in (starts if metres >= OTHER_MARKER else starts[:1])]
+        found[name] = max(settled, key=lambda each: each.given.log_evidence())
     kept, outliers = torch.arange(len(some), device=some.q.device), list[int]()
     while True:
         odds = _odds(found)
@@ -245,13 +249,6 @@ def _check_enough(data: Measurements, *, framed: bool, known: bool) -> None:
     if len(data) < least:
         what, fix = "these rows do not determine where everything is", "measure 6 to 10 poses"
         raise MeasurementError.of(what, expected=f"at least {least} rows", got=len(data), fix=fix)
-
-
-def _likeliest(starts: list[NewRows], deviations: Tensor, marker: str, metres: float) -> NewRows:
-    """The likeliest places under a prior."""
-    usable = starts if metres >= OTHER_MARKER else starts[:1]
-    found = [start.changed(deviations=deviations, marker=marker).settled() for start in usable]
-    return max(found, key=lambda each: each.given.log_evidence())
 
 
 def _odds(found: dict[str, NewRows]) -> dict[str, float]:

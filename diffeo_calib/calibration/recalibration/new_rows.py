@@ -106,7 +106,7 @@ class NewSetUp:
         deviations: Tensor,
         *,
         same: bool = True,
-        marker: str = "other",
+        marker: str = "",
     ) -> NewRows:
         """The rows around places, which are those where everything was before, all weights 1.
 
@@ -335,7 +335,7 @@ class NewRows:
         found = self.mean_noise * region_factor(self.tails.freedom, int(self.noise_model.freedom.max()))
         return found if not self.marks.same or float(found.trace()) > float(old.trace()) else old
 
-    @property
+    @cached_property
     def inflation(self) -> float:
         """Factor on all variances with which 95 % regions hold rows that took no part, at least one.
 

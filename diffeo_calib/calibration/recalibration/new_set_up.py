@@ -44,8 +44,6 @@ from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import check_shown, sensor_of
 from diffeo_calib.sensors.places import mounted_of
 from diffeo_calib.sensors.tables import (
-    Coordinates,
-    OtherReadings,
     ball_tip,
     check_markers,
     divided,
@@ -70,7 +68,16 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
     new = new.to(HOST)
     check_shown(new)
     own, readings = divided(new)
-    _check_robot(model, new, own, readings)
+    check_same_robot(model, new)
+    rare = [name for table, _ in rows_of_one_kind(new) for name in sensor_of(table).rare(table)]
+    if rare:
+        what = f"rows that say nothing, since they are alone in their socket: {few(rare)}"
+        warn_user(sentence(what, fix="check the names, or measure more rows there"))
+    model.nominal.load.under(new.payload).checked()
+    other = "measure the same kind again, calibrate again with all rows, or register the model (`model.registered`)"
+    if model.registration is not None:  # at other markers than those of the calibration
+        other = "measure the markers of the calibration itself, or calibrate again with all rows"
+    check_markers(model, own, readings, other)
     old = model.map.unregistered.to(HOST)
     nominal = robot_map(old)
     geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])  # without deformation
@@ -154,20 +161,6 @@ def _levelled(rows: NewRows) -> NewRows:
 def knows_ball(model: CalibratedKinematics) -> bool:
     """Whether the last marker of the fit is a ball whose position no device measured."""
     return model.ball or model.map.unregistered.stands_free
-
-
-def _check_robot(model: CalibratedKinematics, new: Any, own: Coordinates | None, readings: list[OtherReadings]) -> None:
-    """Raise InputError for rows of another robot, or that show other markers than those of the calibration."""
-    check_same_robot(model, new)
-    rare = [name for table, _ in rows_of_one_kind(new) for name in sensor_of(table).rare(table)]
-    if rare:
-        what = f"rows that say nothing, since they are alone in their socket: {few(rare)}"
-        warn_user(sentence(what, fix="check the names, or measure more rows there"))
-    model.nominal.load.under(new.payload).checked()
-    other = "measure the same kind again, calibrate again with all rows, or register the model (`model.registered`)"
-    if model.registration is not None:  # at other markers than those of the calibration
-        other = "measure the markers of the calibration itself, or calibrate again with all rows"
-    check_markers(model, own, readings, other)
 
 
 def _place_of_device(

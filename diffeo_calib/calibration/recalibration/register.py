@@ -229,9 +229,11 @@ def devices_beside(model: Any, data: Any, fitted: Sequence[PlacedDevices] = ()) 
 def _with_rows(own: PlacedDevices, fitted: Sequence[PlacedDevices]) -> PlacedDevices:
     """Devices with their rows of a fit, if any set of it has them; set-ups are where the fit has them."""
     for one in fitted:
+        if one.devices.same_set(own.devices) and own.devices.set_up:
+            return one
         if one.devices.same_set(own.devices):
             number = torch.tensor([own.names.index(name) for name in one.names], dtype=torch.int64, device=HOST)
-            return one if own.devices.set_up else replace(own, rows=one.rows, device=number[one.device])
+            return replace(own, rows=one.rows, device=number[one.device])
     return own
 
 

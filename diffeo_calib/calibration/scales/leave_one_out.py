@@ -40,6 +40,8 @@ from diffeo_calib.regression.regions import region_factor, region_scale
 
 BLOCK_COORDINATES = KEPT_COORDINATES
 """Measured coordinates of one block: a few hundred poses predict another pose nearly as well as thousands do."""
+KEPT_BLOCKS = 4 * BLOCK_COORDINATES
+"""Measured coordinates up to which blocks are kept with their covariances, which all weights have in common."""
 ROUNDS = 8
 """Largest number of steps of expectation maximisation."""
 WEIGHT_CHANGE = 0.01
@@ -72,38 +74,32 @@ class LeaveOneOut:
         return region_factor(freedom, 3)
 
 
-def estimate_tails(
+def weighed(
     data: TangentData,
     scales: Hyperparameters,
     seed: int = 0,
     *,
     rounds: int = ROUNDS,
     block_coordinates: int = BLOCK_COORDINATES,
-) -> Tails:
-    """Weights and degrees of freedom for given scales, by expectation maximisation from the weights of the data.
+) -> TangentData:
+    """The measurements with the weights that outliers get with these scales, by expectation maximisation.
 
     Memory does not grow with the number of blocks. An outlier anywhere counts: no sample could stand for all rows.
 
     Args:
-        data: the measurements. scales: held fixed. seed: draws the blocks.
+        data: the measurements, with the weights to begin with. scales: held fixed. seed: draws the blocks.
         rounds: largest number of steps.
         block_coordinates: largest number of measured coordinates of a block.
     """
-    data = data.told
-    tails = data.tails
+    told, tails = data.told, data.tails
     for _ in range(rounds):
         squares = torch.empty_like(tails.weights)
-        for rows, part in _parts(data, seed, block_coordinates):
+        for rows, part in _parts(told, seed, block_coordinates):
             squares[rows] = _expected_squares(part, scales, tails.rows(rows))
-        before, tails = tails, reweight(squares, data.noise_model.freedom)
+        before, tails = tails, reweight(squares, told.noise_model.freedom)
         if _settled(before, tails):
             break
-    return _among_gross(data, scales, tails, seed)
-
-
-def weighed(data: TangentData, scales: Hyperparameters, seed: int) -> TangentData:
-    """The measurements with the weights that outliers get with these scales."""
-    return data.with_tails(estimate_tails(data, scales, seed))
+    return data.with_tails(_among_gross(told, scales, tails, seed))
 
 
 def _among_gross(data: TangentData, scales: Hyperparameters, tails: Tails, seed: int) -> Tails:
@@ -126,7 +122,7 @@ def _settled(before: Tails, after: Tails) -> bool:
 def leave_one_out(
     data: TangentData, scales: Hyperparameters, seed: int = 0, *, block_coordinates: int = BLOCK_COORDINATES
 ) -> LeaveOneOut:
-    """Leave-one-out errors in closed form; arguments as of :func:`estimate_tails`."""
+    """Leave-one-out errors in closed form; arguments as of :func:`weighed`."""
     told = data.told
     errors, squares = torch.empty_like(told.y), torch.empty_like(told.tails.weights)
     effective = []
@@ -146,21 +142,24 @@ def variance_ratio(data: TangentData, left_out: LeaveOneOut) -> float:
     return float((left_out.squares / data.noise_model.of_freedom(chi2_median, left_out.squares)).nanmedian())
 
 
-def random_blocks(data: TangentData, seed: int, coordinates: int) -> list[Tensor]:
-    """Row numbers of random blocks of about equal size, each with about ``coordinates`` coordinates at most."""
-    n, m = data.y.shape
-    count = -(-n * m // coordinates)
-    order = torch.randperm(n, generator=seeded(seed), device=HOST)
-    return list(order.to(data.y.device).tensor_split(count))
-
-
 def _parts(data: TangentData, seed: int, coordinates: int) -> Iterator[tuple[Tensor, TangentData]]:
-    """Row numbers and data of random blocks; a single one is the data themselves, with the matrices that they keep."""
-    blocks = random_blocks(data, seed, coordinates)
-    if len(blocks) == 1:
-        yield torch.arange(len(data.x), device=data.x.device), data
-    else:
-        yield from ((rows, data.rows(rows)) for rows in blocks)
+    """Row numbers and data of random blocks of about equal size, each with about so many coordinates at most.
+
+    A single one is the data themselves, with the matrices that they keep; a few are kept with the data.
+    """
+    count, every = -(-data.y.numel() // coordinates), torch.arange(len(data.x), device=data.x.device)
+    if count == 1:
+        yield every, data
+        return
+    parts, key = vars(data).setdefault("blocks", {}), (seed, coordinates)
+    if key not in parts:
+        order = torch.randperm(len(data.x), generator=seeded(seed), device=HOST)
+        found = ((rows, data.rows(rows)) for rows in order.to(every.device).tensor_split(count))
+        if data.y.numel() > KEPT_BLOCKS:
+            yield from found
+            return
+        parts[key] = list(found)
+    yield from parts[key]
 
 
 def _expected_squares(part: TangentData, scales: Hyperparameters, tails: Tails) -> Tensor:

@@ -223,6 +223,9 @@ class TangentData:
         """The same measurements with other weights."""
         other = self._variant(tails=tails)
         vars(other).update({name: vars(self)[name] for name in ("numbers", "_expected") if name in vars(self)})
+        blocks = vars(self).get("blocks", {})  # of calibration/scales/leave_one_out.py
+        kept = {key: [(rows, own.with_tails(tails.rows(rows))) for rows, own in each] for key, each in blocks.items()}
+        vars(other)["blocks"] = kept
         told = vars(self).get("told")
         if told is not None and told is not self:
             vars(other).update(basis=self.basis, told=told.with_tails(tails))

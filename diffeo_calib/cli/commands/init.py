@@ -88,7 +88,7 @@ def run(given: InitOptions) -> None:
         *([f"# {sheet.odd}"] if sheet.odd else []),
     ]
     content = ("\n".join(lines) + "\n").encode()
-    if output.exists() and not given.force and output.read_bytes() != content:
+    if output.is_file() and not given.force and output.read_bytes() != content:
         fix = "name another file by -o, or add --force to replace it"
         raise InputError.of(f"'{output}' exists and holds other options", expected="a new file", fix=fix)
     write_whole(output, content)

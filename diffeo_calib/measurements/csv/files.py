@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import outside_inference_mode
-from diffeo_calib.common.errors import MeasurementError, as_written, few, listed, shown, warn_user
+from diffeo_calib.common.errors import MeasurementError, few, listed, shown, warn_user
 from diffeo_calib.measurements.checks import file_sha256, quiet
 from diffeo_calib.measurements.csv.cells import repeated
 from diffeo_calib.measurements.csv.columns import Columns, Values, check_count
@@ -37,10 +37,9 @@ from diffeo_calib.measurements.csv.sensors import (
 from diffeo_calib.measurements.csv.tables import FileRows, TableOrigin, read_table
 from diffeo_calib.measurements.observations import Observations, joined_tables
 from diffeo_calib.measurements.poses import by_frame
-from diffeo_calib.measurements.readings import ONE_DEVICE, Readings
+from diffeo_calib.measurements.readings import ONE_DEVICE
 from diffeo_calib.measurements.rows import RowGroups
-from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice, column_names, flat_names
+from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice, flat_names
 from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.robots.tree import Tree
 
@@ -128,7 +127,7 @@ def read_measurements(
     angle: str,
     duplicates: str = "error",
     **columns: Any,
-) -> Measurements:
+) -> Any:
     """Read a table of measurements from a CSV file and convert it to SI.
 
     Only the named columns are read as numbers; other columns may hold anything. Blank lines, comments (#, %, //), lines
@@ -142,16 +141,19 @@ def read_measurements(
         joints: names of the columns in the robot's order, where they are not those of its joints, or expressions of
             columns in the units of the file, such as ``"-{J2}+90"``, ``"{J3}+{J2}"`` or ``"360/4096*{ticks5}-180"``.
         position: names of the x, y and z columns of the marker, or one such triple per marker; None if all rows are in
-            sockets. With ``socket`` a line has a position or a socket, and empty cells for the other, or is two rows.
+            sockets, or read by other devices. With ``socket`` a line has a position or a socket, and empty cells for
+            the other, or is two rows.
         length, angle: units in the file, ``"m"``, ``"mm"``, ``"cm"`` or ``"inch"``, and ``"rad"`` or ``"deg"``.
         duplicates: what to do with rows that repeat an earlier row exactly: ``"error"`` refuses them, ``"keep"``
             keeps them, ``"drop"`` drops them with a warning. Real repeats differ by noise.
         columns: all else that the table says, as fields of :class:`TableFormat` (``sep``, ``decimal``, ``rotation``,
-            ``convention``, ``rotation_angle``, ``std``, ``payload``, ``session``, ``marker``, ``on``, ...); and
-            ``socket``, ``distances`` and ``distance_std``, the fields of :class:`SocketColumns`.
+            ``convention``, ``rotation_angle``, ``std``, ``payload``, ``session``, ``marker``, ``on``, ...), of which
+            ``readings`` are :class:`ReadingColumns`, one for each kind of device; and ``socket``, ``distances`` and
+            ``distance_std``, the fields of :class:`SocketColumns`.
 
     Returns:
-        Measurements in rad and m, rows in the order of the file; of poses beside rows in sockets
+        Measurements in rad and m, rows in the order of the file; of readings of one kind alone :class:`Readings`; of
+        several kinds, and of poses beside rows in sockets,
         :class:`~diffeo_calib.measurements.observations.Observations`.
 
     Raises:
@@ -169,55 +171,13 @@ def read_measurements(
     elif any(value is not None for value in known.values()):
         raise MeasurementError.of("`distances` without `socket`", fix="name the columns of the sockets too")
     table = TableFormat(length, angle, **columns, joints=robot, position=position, sockets=sockets)
-    return _read(path, table, duplicates, joints)
-
-
-def _read(path: str | PathLike[str], table: TableFormat, duplicates: str, joints: Sequence[str] | None) -> Any:
-    """Read a table, whose joints may have other names in the file than in the robot."""
-    robot = table.joints
     if joints is None:
         return read_observations(path, table, duplicates=duplicates)
-    names, kinds = getattr(robot, "joint_names", robot), getattr(robot, "kinds", None)
+    names: Any = getattr(robot, "joint_names", robot)
+    kinds = table.kinds or getattr(robot, "kinds", None)
     check_count("`joints`", joints, len(names), "joint of the robot, in its order")
-    table = replace(table, joints=joints, kinds=table.kinds or kinds)
+    table = replace(table, joints=joints, kinds=kinds)
     return read_observations(path, table, duplicates=duplicates).with_joint_names(names)
-
-
-@outside_inference_mode
-def read_readings(
-    path: str | PathLike[str],
-    robot: Sequence[str] | Tree,
-    values: Sequence[str] | str | float,
-    kind: str = "distance",
-    *,
-    joints: Sequence[str] | None = None,
-    duplicates: str = "error",
-    **columns: Any,
-) -> Readings:
-    """Read a table of distances, heights or places in images from a CSV file, in SI.
-
-    Args:
-        path, robot, joints, duplicates: as in :func:`read_measurements`.
-        values: name of the column of the readings, of the two columns u and v of images, or one number for all rows.
-        kind: "distance", "height" or "image".
-        columns: fields of :class:`ReadingColumns` (``std``, ``offset_std``, ``intrinsics``, ``on``, ``session``, the
-            column of the devices) and of :class:`TableFormat` (``length``, ``angle``, ``payload``, ...).
-
-    Raises, warns: as :func:`read_measurements`; an unknown kind, or a number of columns that does not match it.
-    """
-    check_choice("kind", kind, ("distance", "height", "image"))
-    given = {name: columns.pop(name) for name in ("std", "offset_std", "intrinsics", "on") if name in columns}
-    count, std, lens = 2 if kind == "image" else 1, given.pop("std", None), given.get("intrinsics")
-    if count > 1 or isinstance(values, (bool, str)) or not isinstance(values, (int, float)):
-        names = [values] if isinstance(values, str) else values
-        values = column_names("values", names, f"{count} names of columns for {kind!r}", (count,))
-    if (lens is None) != (kind != "image"):
-        fix = "pass fx, fy, cx, cy in pixels" if kind == "image" else "leave it out"
-        raise MeasurementError.of(f"`intrinsics` of {kind!r}", got=as_written(lens), fix=fix)
-    if std is not None:
-        given["std"] = column_names("std", [std] if isinstance(std, str) else std, "names of columns", (1, count))
-    own = ReadingColumns(kind, values, columns.pop("session", None), **given)
-    return _read(path, TableFormat(**columns, joints=robot, readings=(own,)), duplicates, joints)
 
 
 def read_joints(path: str | PathLike[str], table: TableFormat) -> Tensor:
@@ -420,6 +380,7 @@ def _others(whole: Observations, session: str | None) -> list[Any]:
             number = "" if (count := taken.count(taken[-1])) == 1 else str(count)
             names = tuple(f"{name}{number}" for name in part.value_names)
             std = () if part.std is None else tuple(f"std_{name}" for name in names)
-            given = part.kind, names, session, part.offset_std, part.intrinsics
-            found.append(ReadingColumns(*given, std=std, on=part.on, unit=part.unit))
+            lens = part.intrinsics if part.kind == "image" else None
+            how = {"intrinsics": lens, "std": std, "on": part.on, "unit": part.unit}
+            found.append(ReadingColumns(part.kind, names, session, part.offset_std, **how))
     return found

@@ -21,7 +21,7 @@ from diffeo_calib.common.errors import MeasurementError, few, listed
 from diffeo_calib.common.files import WholeFile
 from diffeo_calib.measurements.csv.cells import number, repeated
 from diffeo_calib.measurements.csv.sheets import MARKS, as_text
-from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.measurements.table_format import ZERO, TableFormat
 
 Lines = list[tuple[int, list[str]]]
 """Line number in the file and cells of every line that is not blank."""
@@ -79,7 +79,7 @@ class CsvLines:
             what, fix = f"file '{path}' is empty", "check that it was exported completely"
             raise MeasurementError.of(what, expected="a header and rows of numbers", fix=fix)
         self.notes += notes
-        self._find_header(lines, {*wanted})
+        self._find_header(lines, {*wanted} - {ZERO})
 
     def rows(self, most: int | None = None) -> Lines:
         """The lines below the header, of the first ``most`` if given.
@@ -173,7 +173,8 @@ def _text(path: Path, sep: str) -> tuple[str, list[str]]:
     try:
         with path.open("rb") as file:
             data = file.read(AT_ONCE)  # tells a device without an end
-            whole = b"\0" not in data or data.startswith((*WIDE, *MARKS)) or path.suffix.lower() == ".mat"
+            variables = path.suffix.lower() == ".mat" and path.is_file()
+            whole = b"\0" not in data or data.startswith((*WIDE, *MARKS)) or variables
             data += file.read() if whole else b""
     except IsADirectoryError as error:
         fix = f"of images of a board run `diffeo-calib images '{path}' JOINTS.csv ...`, and pass its table"

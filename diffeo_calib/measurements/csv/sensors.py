@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
+from diffeo_calib.common.errors import MeasurementError, as_written, few, shown, warn_user
 from diffeo_calib.measurements.checks import of_measurements, unlikely_units
 from diffeo_calib.measurements.csv.cells import bad_cells
 from diffeo_calib.measurements.csv.columns import DEVIATION, Body, Check, Columns, Group
 from diffeo_calib.measurements.csv.tables import FileRows
 from diffeo_calib.measurements.images import Known
+from diffeo_calib.measurements.observations import WITH_POSITION
 from diffeo_calib.measurements.poses import (
     inverse_poses,
     of_frames,
@@ -252,8 +253,9 @@ class ReadingColumns(SensorColumns):
     """How a table holds readings.
 
     Args:
-        kind: of the readings. values: name of their column, of two columns for images, or one number for all rows, in
-            the unit of length of the table. Beside other kinds these are the rows that name a device.
+        kind: of the readings: "distance", "height", "image", or that of devices of your own.
+        values: name of their column, of two columns for images, or one number for all rows, in the unit of length of
+            the table. Beside other kinds these are the rows that name a device.
         device: name of the column that names the device of each row; None for one device.
         offset_std: of the unknown zero of distances, m. intrinsics: fx, fy, cx, cy of the camera in pixels.
         std: names of columns with standard deviations, one or, of images, two, in the unit of the readings.
@@ -262,13 +264,33 @@ class ReadingColumns(SensorColumns):
     """
 
     kind: str
-    values: tuple[str, ...] | float
+    values: tuple[str, ...] | str | float
     device: str | None = None
     offset_std: float = 0.0
-    intrinsics: tuple[float, float, float, float] = (1.0, 1.0, 0.0, 0.0)
-    std: tuple[str, ...] = ()
+    intrinsics: tuple[float, float, float, float] | None = None
+    std: tuple[str, ...] | str = ()
     on: str | None = None
     unit: tuple[str, float] = MILLIMETRES
+
+    def __post_init__(self) -> None:
+        """Raise MeasurementError for a number of columns that does not match the kind, and a lens of no image."""
+        if self.kind in (*WITH_POSITION, "socket"):
+            expected = "a kind of readings, such as 'distance', 'height' or 'image'"
+            raise MeasurementError.of(
+                "`kind`", expected=expected, got=self.kind, fix="name it by `position` or `socket`"
+            )
+        if (self.intrinsics is None) != (self.kind != "image"):
+            fix = "pass fx, fy, cx, cy in pixels" if self.kind == "image" else "leave it out"
+            got = as_written(self.intrinsics)
+            raise MeasurementError.of(f"`intrinsics` of {self.kind!r}", got=got, fix=fix)
+        count = {"distance": 1, "height": 1, "image": 2}.get(self.kind, 0)
+        for name, allowed in (("values", (count,)), ("std", (0, 1, count))):
+            own: Any = getattr(self, name)
+            if isinstance(own, bool) or not isinstance(own, (int, float)):
+                names: Any = (own,) if isinstance(own, str) else own
+                expected = f"{count} names of columns for {self.kind!r}"
+                names = column_names(name, names, expected, allowed) if count else tuple(names)
+                object.__setattr__(self, name, names)
 
     @property
     def word(self) -> str:
@@ -282,7 +304,7 @@ class ReadingColumns(SensorColumns):
         unit = None if self.kind == "image" else table.length if self.unit == MILLIMETRES else self.unit[1]
         check = LENGTH if self.kind == "distance" and not self.offset_std else None
         names = self.values if isinstance(self.values, tuple) else ()
-        return Group(names, unit, check), Group(self.std, unit, DEVIATION)
+        return Group(names, unit, check), Group(tuple(self.std), unit, DEVIATION)
 
     def filled(self, rows: FileRows) -> Tensor:
         if isinstance(self.values, tuple):
@@ -295,15 +317,15 @@ class ReadingColumns(SensorColumns):
     def table(self, rows: FileRows) -> tuple[Readings, FileRows]:
         q, joints, table = rows.values["q"], rows.columns.joints.texts, rows.columns.table
         own, own_std = self.groups(table)
-        if isinstance(self.values, tuple):
+        if own.names:
             seen = rows.values[own]
         else:
-            seen = own.to_si(torch.full((len(q), 1), self.values, dtype=torch.float64, device=HOST))
+            seen = own.to_si(torch.tensor([[self.values]] * len(q), dtype=torch.float64, device=HOST))
         devices = rows.devices(self.device, "the name of the device of this reading", ONE_READING)
         std = rows.values[own_std].expand_as(seen) if self.std else None
         given, known = (q, seen, devices, joints), {"std": std, "doubt": False}
-        if self.kind == "image":
-            data = Readings.images(*given, focal=self.intrinsics[:2], centre=self.intrinsics[2:], **known)
+        if (lens := self.intrinsics) is not None:
+            data = Readings.images(*given, focal=lens[:2], centre=lens[2:], **known)
         elif self.kind == "distance":
             for text in unlikely_units("positions", own.from_si(seen), table.length, "length"):
                 warn_user(f"file '{rows.path}': {text}".replace("positions", "distances"))

@@ -28,7 +28,7 @@ from diffeo_calib.measurements.poses import (
     rotation_matrices,
     transforms_of_frames,
 )
-from diffeo_calib.measurements.table_format import ANGLE_UNITS, EULER, UNITS_PER_METRE, flat_names, options_of
+from diffeo_calib.measurements.table_format import ANGLE_UNITS, EULER, UNITS_PER_METRE, ZERO, flat_names, options_of
 
 
 @dataclass(frozen=True)
@@ -131,10 +131,11 @@ def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
     needed = [name for name, needed in texts.items() if needed]
     file = CsvLines(path, columns.table.sep, [*columns.names, *needed])
     named = [name for name in texts if name in needed or name in file.header]
-    places = find_columns(path, file.header, [*columns.names, *named], file.sep)
+    nothing = [ZERO] * (columns.table.is_flat and ZERO not in file.header)
+    places = find_columns(path, [*file.header, *nothing], [*columns.names, *named], file.sep)
     _check_units(file, columns)
     lines, rows = zip(*file.rows(), strict=True)
-    cells = [[row[place] for row in rows] for place in places]
+    cells = [[[*row, *nothing][place] for row in rows] for place in places]
     words = [["" if text.lower() == "nan" else text for text in own] for own in cells[len(columns.names) :]]
     numbers, notes = _numbers(path, columns, lines, cells[: len(columns.names)])
     for group, values in zip(columns.groups.values(), columns.parts(numbers).values(), strict=True):
