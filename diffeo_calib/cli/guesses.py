@@ -398,7 +398,12 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
     if not bodies and len(joints) == 2:  # a machine in a plane, and what was measured in it
         flat = [own for own in whole(others, "xy") if not (own.wished or own.says("rate", "deviation"))]
         bodies = [Body([*own.names.values(), ZERO], []) for own in flat]
-    readings = _readings_in(sheet, others, alone=not bodies and not sockets)
+    corners = _corners_in(sheet) if {IMAGE, *POINT, *PIXEL} <= {*sheet.cells} else []
+    devices = guess_readings([name for name in others if not corners or name not in (*POINT, *PIXEL)])
+    readings = [*corners, *devices]
+    if bodies or sockets or len(readings) > 1:  # beside other kinds of rows, or one another, some cells are empty
+        there = (text for text, own in devices.items() if all("" in sheet.cells[name] for name in own))
+        readings = [*corners, *there]
     if not bodies and not sockets and not readings:
         expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
         common = next((name for name in sheet.header if name not in joints), "COLUMN")
@@ -428,15 +433,6 @@ def matrices_in(sheet: Sheet, columns: Sequence[str]) -> list[Body]:
         found.append(Body([row[3] for row in entries], turn, "a matrix"))
         columns = [name for name in columns if name not in names]
     return found
-
-
-def _readings_in(sheet: Sheet, columns: Sequence[str], *, alone: bool) -> list[str]:
-    """Texts of `fit --reading`; beside other kinds of rows, or one another, columns that some rows leave empty."""
-    corners = _corners_in(sheet) if {IMAGE, *POINT, *PIXEL} <= {*sheet.cells} else []
-    found = guess_readings([name for name in columns if not corners or name not in (*POINT, *PIXEL)])
-    if alone and len(found) == 1 and not corners:
-        return list(found)
-    return [*corners, *(text for text, own in found.items() if all("" in sheet.cells[name] for name in own))]
 
 
 def _corners_in(sheet: Sheet) -> list[str]:

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.outliers import Outlier
 from diffeo_calib.calibration.expected_errors import ExpectedError, expected_errors
-from diffeo_calib.calibration.findings import Part
 from diffeo_calib.calibration.judgement import Accuracy
 from diffeo_calib.cli.console import plain, say, text_table
 from diffeo_calib.cli.record import record
@@ -73,16 +72,6 @@ class ErrorTable:
         else:
             yield self._table(f"{self.title} {self.of}", 0, 2)
             yield self._table(f"Orientation errors in deg {self.of}", 1)
-
-
-def parts_table(parts: Sequence[Part]) -> Table:
-    """How much each part of a model explains."""
-    rows = [
-        [plain(part.name), f"{1e3 * part.displacement:.4f}", "" if part.angle is None else f"{1e3 * part.angle:.4f}"]
-        for part in parts
-    ]
-    title = "What explains how much (RMS over the training rows; parts may cancel)"
-    return text_table(title, ["part", "displacement, mm", "angle, mrad (prismatic: mm)"], rows)
 
 
 def outlier_lines(outliers: Sequence[Outlier], rows: int, what: str = "training rows") -> Iterator[str]:

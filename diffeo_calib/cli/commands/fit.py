@@ -16,7 +16,7 @@ from diffeo_calib.calibration.judgement import check_errors
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, KindErrors, errors_by_kind
 from diffeo_calib.cli import printed
-from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, out, progress_bar, say
+from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, out, plain, progress_bar, say, text_table
 from diffeo_calib.cli.declarations import DemoOptions, FitOptions
 from diffeo_calib.cli.main import app
 from diffeo_calib.cli.models import load_kinematics, made_by_command, robot_of
@@ -198,7 +198,12 @@ def _show_findings(result: CalibrationResult, rows: int) -> None:
     """Print the rows that look wrong and how the fit ended; with --verbose also what each part explains."""
     detailed = logging.getLogger(PACKAGE).isEnabledFor(logging.INFO)
     if detailed:
-        out.print(printed.parts_table(result.parts))
+        sizes = ((plain(own.name), own.displacement, own.angle) for own in result.parts)
+        cells = [
+            [name, f"{1e3 * shift:.4f}", "" if turn is None else f"{1e3 * turn:.4f}"] for name, shift, turn in sizes
+        ]
+        title = "What explains how much (RMS over the training rows; parts may cancel)"
+        out.print(text_table(title, ["part", "displacement, mm", "angle, mrad (prismatic: mm)"], cells))
     say(*(wave.sentence for wave in result.gear_lines), *printed.outlier_lines(result.outliers, rows), result.status)
     if detailed:
         left_out, fitted = result.leave_one_out, result.fit

@@ -97,7 +97,10 @@ def joined_file(
     times, common = [own.numbers(own.by, decimal) for own in tables], {*table.keys} & {*measured.keys} - {""}
     timed = all(len(own) > 1 and np.isfinite(own).all() for own in times)
     if timed and all((np.diff(own) > 0).all() and np.median(np.diff(own)) < LIMITS.window for own in times):
-        pairs, how = _at_stops(tables, times, decimal)
+        one, other = (_motion(own, at, decimal) for own, at in zip(tables, times, strict=True))  # of two clocks
+        rests, offset = stops(one, Recording(other.times, other.values[:, :3]), StopLimits(joints=1.0, seen=1.0))
+        pairs = [(_nearest(times[0], stop.time), _nearest(times[1], stop.time - offset)) for stop in rests]
+        how = f"at the middle of every stop, {offset:+.2f} s added to the times of {places.name}"
     elif timed and 2 * len(common) < len({*measured.keys}):
         pairs, how = _by_time(*times)
     else:
@@ -140,14 +143,6 @@ def _by_time(joints: Array, places: Array) -> tuple[Pairs, str]:
     apart = {pair: float(abs(joints[pair[0]] - places[pair[1]])) for pair in nearest}
     pairs = [one for one in nearest if apart[one] < 0.5 * step and _nearest(places, joints[one[0]]) == one[1]]
     return pairs, f"by the nearest time, at most {max((apart[pair] for pair in pairs), default=0.0):.3g} apart"
-
-
-def _at_stops(tables: Sequence[_Table], times: Sequence[Array], decimal: str) -> tuple[Pairs, str]:
-    """The lines in the middle of every stop of two recordings, whose clocks may differ; and in words."""
-    joints, seen = (_motion(own, at, decimal) for own, at in zip(tables, times, strict=True))
-    found, offset = stops(joints, Recording(seen.times, seen.values[:, :3]), StopLimits(joints=1.0, seen=1.0))
-    pairs = [(_nearest(times[0], stop.time), _nearest(times[1], stop.time - offset)) for stop in found]
-    return pairs, f"at the middle of every stop, {offset:+.2f} s added to the times of {tables[1].path.name}"
 
 
 def _nearest(times: Array, time: float) -> int:
