@@ -111,11 +111,12 @@ def drawn(poses: int, draws: int) -> Record:
 @contextmanager
 def no_scan() -> Iterator[None]:
     """Calibrations without gear lines."""
-    before, choose_scales.find_gear_lines = choose_scales.find_gear_lines, lambda *_: ()
+    scan = choose_scales.gear_lines
+    before, scan.find_gear_lines = scan.find_gear_lines, lambda *_: ()
     try:
         yield
     finally:
-        choose_scales.find_gear_lines = before
+        scan.find_gear_lines = before
 
 
 def compared(robot: Tree, train: dc.Measurements, error: Callable[[dc.CalibrationResult], float]) -> Record:

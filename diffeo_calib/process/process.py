@@ -57,7 +57,8 @@ class Process:
     def prior(cls, scales: Hyperparameters, space: Space, variance: Tensor, like: Numbers) -> Process:
         """What is known before any row; ``like``: numbers of any rows, for their sizes."""
         none = like.none
-        empty = Factor(variance.new_zeros(0, 0), variance.new_zeros(0, len(variance)))
+        K = len(variance)
+        empty = Factor(*(variance.new_zeros(shape) for shape in ((0, 0), (0, K), (K, K))))
         return cls(scales, space, variance, none, empty, none.target)
 
     def given(self, new: Numbers, noise: Sequence[Tensor], at: Expected | None = None) -> Process:
@@ -72,12 +73,10 @@ class Process:
         at = self.expected(new) if at is None else at
         L = lower_root(new.add_blocks(at.fields.clone(), noise))
         right = torch.cat([(new.target - at.white.T @ self.alpha)[:, None], at.unknowns], 1)
-        right, n = torch.linalg.solve_triangular(L, right, upper=False), len(self.alpha)
-        if n:
-            L, corner, new = L.new_zeros(n + len(L), n + len(L)), L, self.numbers.joined(new)
-            L[:n, :n], L[n:, :n], L[n:, n:] = self.factor.L, at.white.T, corner
-        factor = Factor(L, torch.cat([self.factor.W, right[:, 1:]]))
-        return replace(self, numbers=new, factor=factor, alpha=torch.cat([self.alpha, right[:, 0]]))
+        right = torch.linalg.solve_triangular(L, right, upper=False)
+        numbers = self.numbers.joined(new) if len(self.alpha) else new
+        factor, alpha = self.factor.joined(at.white, L, right[:, 1:]), torch.cat([self.alpha, right[:, 0]])
+        return replace(self, numbers=numbers, factor=factor, alpha=alpha)
 
     def opened(self, E: Tensor, size: float | None = None) -> Process:
         """The same rows beside unknowns of this standard deviation, of any by default, with effects (M, U) on them."""

@@ -21,13 +21,13 @@ class Factor:
     """K = L L^T + H H^T of numbers with features H (M, K), L, W = L^-1 H and B: priors of metres cost no digits.
 
     Args:
-        L: (M, M) lower Cholesky factor. W: (M, K).
+        L: (M, M) lower Cholesky factor. W: (M, K). gram: (K, K) W^T W.
     """
 
-    def __init__(self, L: Tensor, W: Tensor) -> None:
-        self.L, self.W = L, W
+    def __init__(self, L: Tensor, W: Tensor, gram: Tensor) -> None:
+        self.L, self.W, self._gram = L, W, gram
         eye = torch.eye(W.shape[1], dtype=W.dtype, device=W.device)
-        self.B, info = torch.linalg.cholesky_ex(eye + W.T @ W)
+        self.B, info = torch.linalg.cholesky_ex(eye + gram)
         if int(info):
             raise NumericalError.of("the covariance of the unknowns is not positive definite", fix=NOISE_ADVICE)
 
@@ -40,11 +40,24 @@ class Factor:
         """
         with large_work(F.numel()):
             L = lower_root(F)
-            return cls(L, torch.linalg.solve_triangular(L, H, upper=False))
+            W = torch.linalg.solve_triangular(L, H, upper=False)
+            return cls(L, W, W.T @ W)
+
+    def joined(self, cross: Tensor, L: Tensor, W: Tensor) -> Factor:
+        """That of these and m more numbers.
+
+        Args:
+            cross: (M, m) L^-1 times their covariance with these, without H. L: (m, m) of what these leave of theirs.
+            W: (m, K) their rows.
+        """
+        M, whole = len(self.L), L.new_empty(len(self.L) + len(L), len(self.L) + len(L))
+        whole[:M, :M], whole[:M, M:], whole[M:, :M], whole[M:, M:] = self.L, 0.0, cross.T, L
+        return Factor(whole, torch.cat([self.W, W]), self._gram + W.T @ W)
 
     def beside(self, H: Tensor) -> Factor:
         """That of K + H H^T for more features (M, k), with its inverse by that of K (M. Woodbury, 1950)."""
-        other, V = Factor(self.L, torch.cat([self.W, self.white(H)], 1)), self.inverse @ H
+        W, V = torch.cat([self.W, self.white(H)], 1), self.inverse @ H
+        other = Factor(self.L, W, W.T @ W)
         root = torch.linalg.cholesky(torch.eye(H.shape[1], dtype=H.dtype, device=H.device) + H.T @ V)
         Y = torch.linalg.solve_triangular(root, V.T, upper=False)
         vars(other)["inverse"] = self.inverse.addmm(Y.T, Y, alpha=-1.0)

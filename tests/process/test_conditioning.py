@@ -15,6 +15,7 @@ from torch.testing import assert_close
 
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.process.process import Expected, Process
+from diffeo_calib.regression.cholesky import Factor
 
 
 def close(found: Tensor, expected: Tensor, relative: float) -> None:
@@ -158,6 +159,17 @@ def test_left_out_is_conditioning_without(case: Case) -> None:
         expected = gone.numbers.add_blocks(at.covariance, gone.noise)[order][:, order]
         close(errors, (gone.numbers.target - at.mean)[order], 1e-6)
         close(covariance, expected, 1e-6)
+
+
+@pytest.mark.parametrize("size", [2.0, None])
+def test_opened_unknowns_are_those_of_another_factor(case: Case, size: float | None) -> None:
+    E = 1e-4 * normal(len(case.posterior.mu), 3, seed=8)
+    found = case.posterior.opened(E, size)
+    again = Factor(found.factor.L, found.factor.W)
+    more = 2.0 * E if size else E / E.norm(dim=0)
+    close(again.matrix, case.posterior.factor.matrix + more @ more.T, 1e-9)
+    close(found.inverse, again.inverse, 1e-7)
+    close(found.mu, again.solve(found.numbers.target[:, None])[:, 0], 1e-7)
 
 
 def test_rows_without_noise_that_are_there_twice_are_refused() -> None:
