@@ -51,6 +51,9 @@ COLUMNS = ("line", "used_in_fit", "kind", "device", "marker", "dx", "dy", "dz", 
 
 def run(options: EvaluateOptions) -> None:
     """Run the command."""
+    if options.output is not None and options.output.suffix == ".safetensors" and not options.free:
+        fix, got = "name --free too to write the registered model", str(options.output)
+        raise InputError.of("-o without --free", expected="a table of errors", got=got, fix=fix)
     model = models.load_kinematics(options.model)
     if options.report is not None:
         return _reported(model, options.report, options)
