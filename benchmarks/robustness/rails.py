@@ -102,7 +102,11 @@ def main() -> None:
     parser.add_argument("--shift", type=float, default=3e-4, metavar="M", help="straightness")
     parser.add_argument("--turn", type=float, default=1e-4, metavar="RAD", help="roll, pitch and yaw")
     arguments = parser.parse_args()
-    harness.guarded(lambda: harness.report(measure(arguments), arguments.out, COLUMNS))
+    harness.guarded(lambda: _report(arguments))
+
+
+def _report(arguments: argparse.Namespace) -> None:
+    harness.report(measure(arguments), arguments.out, COLUMNS)
 
 
 if __name__ == "__main__":

@@ -32,6 +32,7 @@ WORDS = {
     "registration": "finding base and markers",
     "geometry": "geometric calibration",
     "hyper-parameters": "choosing the scales",
+    "axes": "looking for errors of the axes",
     "cross-validation": "checking the deviations",
     "Gauss-Newton": "fitting",
     "changes": "looking for changes",

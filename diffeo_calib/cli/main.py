@@ -157,7 +157,8 @@ Json = Annotated[
 
 def _declare(name: str, options: type[Command]) -> None:
     """Declare a command by the class of its options; every command has --json."""
-    own, parameters = options.all(), list[inspect.Parameter]()
+    own = sorted(options.all(), key=lambda one: bool(one.names))  # arguments first, in messages too
+    parameters = list[inspect.Parameter]()
     named = {one: option.hint for option in own for one in option.names or (option.shown,)} | {"--json": Path}
     DECLARED[name] = {one.removeprefix("--").lower(): hint for one, hint in named.items()}
 

@@ -79,7 +79,16 @@ def test_other_boards_are_found(text: str, corners: int) -> None:
     assert abs(spans[0] / spans[1] - 1) < 0.02
 
 
-@pytest.mark.parametrize("text", ["charuco:5x7", "chess:7x5:0.03", "charuco:5x7:a:b:DICT_5X5_100", "tag:0.1:DICT_9:3"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "charuco:5000x5000:0.03:0.02:DICT_4X4_50",
+        "charuco:5x7",
+        "chess:7x5:0.03",
+        "charuco:5x7:a:b:DICT_5X5_100",
+        "tag:0.1:DICT_9:3",
+    ],
+)
 def test_other_texts_are_refused(text: str) -> None:
     with pytest.raises(InputError, match="board"):
         Board.of(text)

@@ -72,3 +72,14 @@ def test_a_urdf_in_place_of_a_model(small_site: Site, command: Command) -> None:
     done = command("evaluate", small_site.urdf, small_site.csv, *TABLE)
     assert done.code == 1
     assert "arm.urdf cannot be read as a model file: it is a URDF; pass a file written by" in done.error
+
+
+def test_names_that_no_file_system_takes(command: Command, tmp_path: Path) -> None:
+    joints = ",".join(f"q{number}" for number in range(6))
+    (tmp_path / "joints.csv").write_text(f"{joints},image\n0,0,0,0,0,0,{'x' * 5000}\n", encoding="utf-8")
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.png").write_bytes(b"")
+    given = tmp_path / "images", tmp_path / "joints.csv", "--board", "chessboard:7x5:0.03", "--length", "mm"
+    done = command("images", *given, "-o", tmp_path / "corners.csv")
+    assert done.code == 1
+    assert "File name too long; check the path" in done.error

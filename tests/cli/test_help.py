@@ -122,6 +122,6 @@ def test_help_of_a_table_speaks_of_the_command_line(command: Command) -> None:
     text = " ".join(command("fit", "--help").out.split())
     assert "Python" not in text.partition("Options:")[2]
     assert text.count("needed where no model knows it") == 2
-    assert "hidden in that row. Repeatable." in text
+    assert "all are in the plane of x and y. Repeatable." in text
     assert "in the unit of --length." in text
     assert "diffeo_calib.reports.results" in text

@@ -92,9 +92,9 @@ def test_options_of_the_registration(fitted: Outcome, site: Site, command: Comma
     done = command("evaluate", model, path, *TABLE, "--free", "base")
     assert done.code == 0
     assert "in the frame of 'flange'" not in done.out
-    refused = command("evaluate", model, path, *TABLE, "-o", tmp_path / "m")
+    refused = command("evaluate", model, path, *TABLE, "-o", tmp_path / "m.safetensors")
     assert refused.code == 1
-    assert refused.error.startswith("error: -o without --free; ")
+    assert refused.error.startswith("error: -o without --free: expected a table of errors, got ")
     onto = command("evaluate", model, path, *TABLE, "--free", "both", "-o", model)
     assert onto.error == f"error: -o {model} is the file of MODEL; name another file."
     few = command("evaluate", model, table(site, tmp_path / "two.csv", MOVE, 2), *TABLE, "--free", "both")

@@ -22,7 +22,7 @@ atexit.register(lambda: print("loaded:", *(name for name in {SLOW} if name in sy
 from diffeo_calib.__main__ import main
 main()
 """
-ALL = "fit campaign record evaluate init images predict correct export plan recalibrate report demo"
+ALL = "fit campaign record evaluate init images predict correct export plan recalibrate demo"
 COMMANDS = ("fit", "evaluate", "predict", "correct", "export", "plan", "demo")
 
 

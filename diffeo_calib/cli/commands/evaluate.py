@@ -43,8 +43,6 @@ from diffeo_calib.measurements.csv.files import Predictions, read_configurations
 from diffeo_calib.measurements.csv.lines import write_rows
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import BESIDE, TableFormat, options_of
-from diffeo_calib.reports.html.sentences import advice, verdict
-from diffeo_calib.reports.report import write_report
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, Evaluations
 from diffeo_calib.sensors.set_ups import SESSION
 
@@ -53,6 +51,9 @@ COLUMNS = ("line", "used_in_fit", "kind", "device", "marker", "dx", "dy", "dz", 
 
 def run(options: EvaluateOptions) -> None:
     """Run the command."""
+    if options.output is not None and options.output.suffix == ".safetensors" and not options.free:
+        fix, got = "name --free too to write the registered model", str(options.output)
+        raise InputError.of("-o without --free", expected="a table of errors", got=got, fix=fix)
     model = models.load_kinematics(options.model)
     if options.report is not None:
         return _reported(model, options.report, options)
@@ -163,6 +164,9 @@ def _registered(model: CalibratedKinematics, data: Any, options: EvaluateOptions
 
 def _reported(model: CalibratedKinematics, page: Path, options: EvaluateOptions) -> None:
     """Write the page, and say its first line."""
+    from diffeo_calib.reports.html.sentences import advice, verdict  # noqa: PLC0415  # slow to import, they draw
+    from diffeo_calib.reports.report import write_report  # noqa: PLC0415
+
     data, tolerance = None, printed.parsed_length(options.tolerance)
     if options.csv is not None:
         data = models.table_of(model, options.csv, options).read(model.robot)
