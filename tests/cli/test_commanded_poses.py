@@ -8,6 +8,7 @@ from math import pi
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from command_bank import Command
@@ -143,6 +144,14 @@ def test_places_measured_in_a_plane(tmp_path: Path, init: Any) -> None:
     assert_close(data.points[:, 0], torch.nn.functional.pad(measured, (0, 1)), rtol=0, atol=1e-8)
     with pytest.raises(MeasurementError, match=r"no column \['0'\]"):
         dc.read_measurements(table, machine, ["0", "measx", "measy"], length="mm", angle="deg")
+    table.write_text("q,u,v,x,y\n10,.2,.3,.4,.5\n20,,,.6,.7\n30,.4,.5,,\n")  # hidden where u and v, or x and y, are
+    places = [["u", "v", "0"], ["x", "y", "0"]]
+    seen = dc.read_measurements(table, np.array(["q"]), places, length="m", angle="deg").points
+    assert seen.nan_to_num(-1.0).flatten(1).tolist() == [
+        [0.2, 0.3, 0, 0.4, 0.5, 0],
+        [-1] * 3 + [0.6, 0.7, 0],
+        [0.4, 0.5, 0] + [-1] * 3,
+    ]
 
 
 @pytest.mark.slow

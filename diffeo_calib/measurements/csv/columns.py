@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -15,7 +15,14 @@ from diffeo_calib.common.errors import MeasurementError, as_written, listed
 from diffeo_calib.measurements.checks import unlikely_units
 from diffeo_calib.measurements.csv.cells import repeated
 from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
-from diffeo_calib.measurements.table_format import UNITS_PER_METRE, TableFormat, check_choice, column_names, flat_names
+from diffeo_calib.measurements.table_format import (
+    UNITS_PER_METRE,
+    ZERO,
+    TableFormat,
+    check_choice,
+    column_names,
+    flat_names,
+)
 from diffeo_calib.robots.joint import KINDS
 
 Values = dict[Any, Tensor]
@@ -107,7 +114,10 @@ class Columns:
             every[name] = Group((column.strip(),), check=MASS if name == "payload" else None)
         columns = cls(table, read, prismatic, kinds_known, every, sensors)
         alike = [name for place, group in enumerate(groups) if group in groups[:place] for name in group.names]
-        twice = repeated([*columns.names, *alike]) or repeated(names)
+        named = [*columns.names, *alike]
+        for _ in range(table.in_a_plane - 1):
+            named.remove(ZERO)
+        twice = repeated(named) or repeated(names)
         if twice:
             markers = len(table.triples)
             plain = len(columns.names) + len(alike) == len(names) + 3 * markers
@@ -140,11 +150,12 @@ class Columns:
 
         Deviations are values where there are no others.
         """
-        found, names = list[Hideable](), self.names
+        found, every = list[Hideable](), torch.arange(len(self.names), device=HOST)
+        places = {group: own[0].tolist() for group, own in self.parts(every[None]).items()}
         for sensor in (one for one in self.sensors if self.all_hidden or one.hidden):
             for groups, word in sensor.bodies(self.table):
-                known = [names.index(name) for group in groups if group.check == DEVIATION for name in group.names]
-                values = [names.index(name) for group in groups if group.check != DEVIATION for name in group.names]
+                known = [k for group in groups if group.check == DEVIATION for k in places.get(group, [])]
+                values = [k for group in groups if group.check != DEVIATION for k in places.get(group, [])]
                 found += [Hideable(values or known, known if values else [], word)] if values or known else []
         return found
 
@@ -205,7 +216,7 @@ def _joint_columns(joints: Any, kinds: Sequence[str] | None) -> tuple[tuple[str,
     kinds = getattr(joints, "kinds", None) if kinds is None else kinds
     joints = getattr(joints, "joint_names", joints)  # a robot
     if (
-        not isinstance(joints, Sequence)
+        not isinstance(joints, Collection)
         or isinstance(joints, str)
         or len(joints) == 0
         or not all(isinstance(name, str) for name in joints)

@@ -131,11 +131,17 @@ def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
     needed = [name for name, needed in texts.items() if needed]
     file = CsvLines(path, columns.table.sep, [*columns.names, *needed])
     named = [name for name in texts if name in needed or name in file.header]
-    nothing = [ZERO] * (columns.table.is_flat and ZERO not in file.header)
+    nothing = [ZERO] * (columns.table.in_a_plane > 0 and ZERO not in file.header)
     places = find_columns(path, [*file.header, *nothing], [*columns.names, *named], file.sep)
     _check_units(file, columns)
     lines, rows = zip(*file.rows(), strict=True)
-    cells = [[[*row, *nothing][place] for row in rows] for place in places]
+    cells = list[list[str]]()
+    for place in places:
+        if place < len(file.header):
+            cells.append([row[place] for row in rows])
+        else:  # hidden where y is
+            y = zip(cells[-1], numbers_in(cells[-1], columns.table.decimal), strict=True)
+            cells.append([text if value is None or not abs(value) < LARGEST_NUMBER else ZERO for text, value in y])
     words = [["" if text.lower() == "nan" else text for text in own] for own in cells[len(columns.names) :]]
     numbers, notes = _numbers(path, columns, lines, cells[: len(columns.names)])
     for group, values in zip(columns.groups.values(), columns.parts(numbers).values(), strict=True):
