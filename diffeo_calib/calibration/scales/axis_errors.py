@@ -14,7 +14,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.process.evidence import Evidence
@@ -34,8 +33,9 @@ scales, as a part of the range. First the middle is tried alone."""
 SHIFTS_M = torch.logspace(-6, -2, 25, dtype=torch.float64, device="cpu")
 PLAUSIBLE = 3.0
 """Log odds in the middle of the grid below which the rest is not tried."""
-STILL = 1e-3
-"""Range of a joint, rad or m, below which its axis is not sought."""
+STILL, TOLD_APART = 1e-3, 6.0
+"""Range of a joint, rad or m, below which its axis is not sought. Log odds by which a base that drifts explains the
+rows better than an axis."""
 FEWEST_ROWS, ODDS, MOST_COORDINATES = 40, 6.0, 2000
 """Rows below which such errors prove nothing, as 10 and 15 of clean tables that had log odds above 6. Log odds from
 which they are part of the model: at most 3.8 in 57 clean tables of many kinds (30 to 223 rows), and 5.0 in eleven of a
@@ -68,11 +68,11 @@ def with_axis_errors(data: TangentData, scales: Hyperparameters, lines: Tensor) 
     process, rest = some.process(scales), {*(ranges[1] - ranges[0] > STILL).nonzero()[:, 0].tolist()}
     while rest:
         tried = [_axis(joint, some, process, values[index], ranges[:, joint]) for joint in rest]
-        best = max(tried, key=lambda one: one.odds - gates.CHANGES_TOLD_APART * (one.own[0] == chain.moving))
+        best = max(tried, key=lambda one: one.odds - TOLD_APART * (one.own[0] == chain.moving))
         if best.odds < ODDS:
             break
         drift = max((one.odds for one in tried if one.own[0] == chain.moving), default=0.0)
-        if best.own[0] < chain.moving and drift > max(ODDS, best.odds - gates.CHANGES_TOLD_APART):
+        if best.own[0] < chain.moving and drift > max(ODDS, best.odds - TOLD_APART):
             what = f"errors by the position of {chain.moving_names[best.own[0]]} may be a drift of the device as well"
             fix = "measure some of its positions again at another time"
             warn_user(sentence(what, expected="rows in random order", fix=fix))
