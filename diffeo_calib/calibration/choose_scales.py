@@ -124,7 +124,7 @@ def choose_scales(
     if models:
         scales = scales_of_models(models, centre)
         data = data.with_position_errors(scales)
-        scales = with_axis_errors(data, with_payload_factor(data, scales, seed))
+        scales = with_axis_errors(data, with_payload_factor(data, scales, seed), measurements.line_numbers)
         data = data.with_position_errors(scales)
         found = Selection(scales, f"those of {len(models)} other model{'s' * (len(models) > 1)}")
         data = weighed(data, scales, seed)
@@ -137,7 +137,7 @@ def choose_scales(
     else:
         found, data = _selected(centre, data, seed, progress)
         found = replace(found, scales=with_payload_factor(data, found.scales, seed))
-        how = {"poses": poses, "seed": seed, "progress": progress}
+        how = {"poses": poses, "lines": measurements.line_numbers, "seed": seed, "progress": progress}
         centre, found, data = _with_position_errors(centre, found, data, **how)
     return _inflated(found, centre, data, measurements, seed=seed, progress=progress)
 
@@ -202,7 +202,14 @@ def _supported(found: Selection, data: TangentData, seed: int) -> tuple[Selectio
 
 
 def _with_position_errors(
-    centre: Hyperparameters, found: Selection, data: TangentData, *, poses: int, seed: int, progress: Progress
+    centre: Hyperparameters,
+    found: Selection,
+    data: TangentData,
+    *,
+    poses: int,
+    lines: Tensor,
+    seed: int,
+    progress: Progress,
 ) -> tuple[Hyperparameters, Selection, TangentData]:
     """The same with the gear lines, then the axes, that the data show: the rest follows from what is left."""
     for stage in ("gear lines",) * (poses >= gear_lines.FEWEST_POSES) + ("axes",):
@@ -210,9 +217,9 @@ def _with_position_errors(
             break
         progress(stage, 0, 1)
         if stage == "axes":
-            start = with_axis_errors(data, found.scales)
-        elif lines := gear_lines.find_gear_lines(data, start := found.scales, seed):
-            start = replace(start, lines=lines)
+            start = with_axis_errors(data, found.scales, lines)
+        elif gears := gear_lines.find_gear_lines(data, start := found.scales, seed):
+            start = replace(start, lines=gears)
         if start is not found.scales:
             data = data.with_position_errors(start)
             centre = replace(centre, **{name: getattr(start, name) for name in FOUND})

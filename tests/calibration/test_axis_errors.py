@@ -30,16 +30,33 @@ def test_the_axis_is_found(joint: int) -> None:
     arm, measurements, _ = simulated(60)
     setting = Setting(arm.nominal, measurements)
     data = setting.tangent_data
-    assert with_axis_errors(data, setting.scales) is setting.scales
+    assert with_axis_errors(data, setting.scales, torch.arange(60)) is setting.scales
     x = data.x[:, joint, None]
     shape = torch.cat([(2 * x).sin(), x.cos(), (1.5 * x).sin(), (2 * x).cos(), x.sin(), 0 * x], 1)
     moved = 5e-4 * (data.sensitivities[..., 6 + 6 * joint : 12 + 6 * joint] @ shape[:, :, None])[..., 0]
-    found = with_axis_errors(replace(data, y=data.y + moved), setting.scales)
+    found = with_axis_errors(replace(data, y=data.y + moved), setting.scales, torch.arange(60))
     ((axis, low, high, _),) = found.axes
     assert axis == joint
     assert low < float(x.min()) < float(x.max()) < high
     assert found.axis_errors is not None
     assert_close(found.axis_errors, torch.full_like(found.axis_errors, 4e-4), rtol=2.0, atol=0)
+
+
+def test_a_device_that_drifts_while_rows_follow_an_axis_is_no_axis() -> None:
+    """Where no row can tell the two, as of the first joint, the user is told."""
+    arm, measurements, _ = simulated(60)
+    setting = Setting(arm.nominal, measurements)
+    data, t = setting.tangent_data, torch.linspace(0, 1, 60, dtype=torch.float64)[:, None]
+    shape = torch.cat([(9 * t).sin(), (12 * t).cos(), t, 0 * t, 0 * t, 0 * t], 1)
+    for joint in (3, 0):
+        lines = data.x[:, joint].argsort().argsort()
+        moved = 5e-4 * (data.sensitivities[..., :6] @ shape[lines][:, :, None])[..., 0]
+        drifted = replace(data, y=data.y + moved)
+        if joint:
+            assert with_axis_errors(drifted, setting.scales, lines) is setting.scales
+        else:
+            with pytest.warns(dc.DiffeoCalibWarning, match="may be a drift of the device"):
+                with_axis_errors(drifted, setting.scales, lines)
 
 
 def test_the_prior_of_an_axis_is_that_of_functions_with_its_size() -> None:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.process import Process
 from diffeo_calib.process.scales import Hyperparameters, axis_deviations
@@ -32,6 +33,9 @@ scales, as a part of the range. First the middle is tried alone."""
 SHIFTS_M = torch.logspace(-6, -2, 25, dtype=torch.float64, device="cpu")
 PLAUSIBLE = 3.0
 """Log odds in the middle of the grid below which the rest is not tried."""
+STILL, TOLD_APART = 1e-3, 6.0
+"""Range of a joint, rad or m, below which its axis is not sought. Log odds by which a base that drifts explains the
+rows better than an axis."""
 FEWEST_ROWS, ODDS, MOST_COORDINATES = 40, 6.0, 2000
 """Rows below which such errors prove nothing, as 10 and 15 of clean tables that had log odds above 6. Log odds from
 which they are part of the model: at most 3.8 in 57 clean tables of many kinds (30 to 223 rows), and 5.0 in eleven of a
@@ -49,43 +53,54 @@ class Axis(NamedTuple):
     lengthscale: Tensor  # () as a part of the range
 
 
-def with_axis_errors(data: TangentData, scales: Hyperparameters) -> Hyperparameters:
-    """The scales with the axes whose errors the rows prove, one after the other; the same object without any."""
+def with_axis_errors(data: TangentData, scales: Hyperparameters, lines: Tensor) -> Hyperparameters:
+    """The scales with the axes whose errors the rows prove, one after the other; the same object without any.
+
+    Rows that are measured along an axis, in the order of ``lines`` (N,), take errors of the axis for those of a base
+    that drifts, with the same functions: they are of the base where that explains them clearly better.
+    """
     chain, found = data.nominal.geometry.chain, list[Axis]()
     if is_cartesian(chain) or len(data.x) < FEWEST_ROWS:  # commanded poses have no axes
         return scales
-    some = data.sample(len(data.x), MOST_COORDINATES, seed=0)[1]
-    process, rest = some.process(scales), set(range(chain.moving))
+    index, some = data.sample(len(data.x), MOST_COORDINATES, seed=0)
+    values = torch.cat([chain.moving_values(data.x), lines.argsort().argsort().to(data.x)[:, None]], 1)
+    ranges = torch.stack([values.amin(0), values.amax(0)])
+    process, rest = some.process(scales), {*(ranges[1] - ranges[0] > STILL).nonzero()[:, 0].tolist()}
     while rest:
-        tried = [_axis(joint, some, process, chain.moving_values(data.x)[:, joint]) for joint in rest]
-        best = max(tried, key=lambda one: one.odds)
+        tried = [_axis(joint, some, process, values[index], ranges[:, joint]) for joint in rest]
+        best = max(tried, key=lambda one: one.odds - TOLD_APART * (one.own[0] == chain.moving))
         if best.odds < ODDS:
             break
+        drift = max((one.odds for one in tried if one.own[0] == chain.moving), default=0.0)
+        if best.own[0] < chain.moving and drift > max(ODDS, best.odds - TOLD_APART):
+            what = f"errors by the position of {chain.moving_names[best.own[0]]} may be a drift of the device as well"
+            fix = "measure some of its positions again at another time"
+            warn_user(sentence(what, expected="rows in random order", fix=fix))
         found.append(best)
         rest = {one.own[0] for one in tried if one.odds > PLAUSIBLE} - {best.own[0]}
         process = process.opened(best.effects * axis_deviations(best.errors, best.lengthscale, FUNCTIONS), 1.0)
+    found = [one for one in found if one.own[0] < chain.moving]
     if not found:
         return scales
     errors, lengths = torch.stack([one.errors for one in found]), torch.stack([one.lengthscale for one in found])
     return replace(scales, axes=tuple(one.own for one in found), axis_errors=errors, axis_lengthscale=lengths)
 
 
-def _axis(joint: int, data: TangentData, process: Process, values: Tensor) -> Axis:
-    """The likeliest errors of a moving joint's axis with these values (N,) in all rows."""
-    chain, (low, high) = data.nominal.geometry.chain, (float(values.min()), float(values.max()))
-    margin = max(MARGIN * (high - low), 1e-6)
-    own = joint, low - margin, high + margin, FUNCTIONS
-    waves = Waves(*(torch.from_numpy(part).to(data.x.device) for part in axis_waves([own], chain.moving)))
-    functions = wave_angles(waves, chain.moving_values(data.x), torch).cos()  # (N, K)
-    twists = data.sensitivities[..., 6 + 6 * joint : 12 + 6 * joint]
-    effects = (twists[:, :, None] * functions[:, None, :, None]).flatten(2)
+def _axis(joint: int, data: TangentData, process: Process, values: Tensor, ends: Tensor) -> Axis:
+    """The likeliest errors of the axis of a moving joint, or of the base by the last of the values (N, L + 1)."""
+    low, high = ends.tolist()
+    margin, own = MARGIN * (high - low), 6 * ((joint + 1) % values.shape[1])
+    axis = joint, low - margin, high + margin, FUNCTIONS
+    waves = Waves(*(torch.from_numpy(part).to(values.device) for part in axis_waves([axis], values.shape[1])))
+    functions = wave_angles(waves, values, torch).cos()  # (N, K)
+    effects = (data.sensitivities[:, :, None, own : own + 6] * functions[:, None, :, None]).flatten(2)
     E = process.numbers.of_table(data.motions_in_numbers(effects))
     seen, found = Evidence.of(E, process), list[Axis]()
     for ratio, lengthscale in (MIDDLE, *product(*GRID)):
         errors, length = E.new_tensor([1.0, ratio]), E.new_tensor(lengthscale)
         shape = axis_deviations(errors, length, FUNCTIONS)
         odds = Evidence(shape * seen.g, shape[:, None] * seen.H * shape).log_odds(SHIFTS_M.to(E).square())
-        found.append(Axis(own, E, float(odds.max()), errors * SHIFTS_M[int(odds.argmax())].to(E), length))
+        found.append(Axis(axis, E, float(odds.max()), errors * SHIFTS_M[int(odds.argmax())].to(E), length))
         if found[0].odds < PLAUSIBLE:
             break
     return max(found, key=lambda one: one.odds)
