@@ -72,7 +72,7 @@ class Identification:
     """Result of an identification or a registration."""
 
     geometry: Geometry  # the geometry, with the estimated parameters absorbed
-    rms: float  # root mean square distance from predicted to measured points [m]
+    rms: float  # root mean square error of a body, such as the distance of a marker, over rows of all kinds [m]
     noise: float  # standard deviation of one measured number, given or estimated [m]; for Student's t its scale
     # (K, K) posterior covariance of the parameters at ``geometry`` [m, rad]; rows of parameters that were held fixed
     # are zero
