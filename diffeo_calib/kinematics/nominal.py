@@ -172,6 +172,17 @@ class GeometryMap(NominalMap):
             parts.append((by_twist[:, :, axes.joints] * functions[:, None, :, None]).flatten(2))
         return torch.cat(parts, dim=2)
 
+    def along_axis(self, x: Tensor, joint: int) -> Tensor:
+        """By theta, what errors of its axis add to the value of an active joint that moves alone, rad or m: (N, K)."""
+        chain, found = self.geometry.chain, x.new_zeros(len(x), self.parameters)
+        moving = chain.moving_names.index(chain.joint_names[joint])
+        if self.own.axes and int(chain.coupling[:, joint].count_nonzero()) == 1:
+            axes, turns = self._errors_of("axes", x), 3 * int(chain.revolute[moving])
+            functions = wave_angles(axes, chain.moving_values(x), torch).cos() * (axes.joints == moving)  # (N, K')
+            along = torch.nn.functional.pad(chain.axes[moving], (turns, 3 - turns)).to(x)
+            found[:, self.parts["axes"]] = (functions[..., None] * along).flatten(1)
+        return found
+
     def _errors(self, x: Tensor, theta: Tensor) -> Tensor:
         """Error parameters of the geometry: (K,), or (N, K) where the robot deflects or an axis is crooked."""
         (errors, coefficients), chain = self.split(theta), self.geometry.chain

@@ -1,4 +1,4 @@
-"""Transmission errors of single joints, read off the kernel terms that act on one joint alone, and gear lines."""
+"""Transmission errors of single joints: of kernel terms that act on one joint alone, its axis, and gear lines."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ def smooth_transmission(deformation: Deformation, robot: Tree, joint: str, value
     terms = deformation.spec.joint_kernel.terms
     own = [t for t in terms if isinstance(t, RadialKernel) and t.columns == (index,) and t.output == index]
     fields = (term.field(x, deformation.x, deformation.momenta.joint)[:, index] for term in own)
-    return sum(fields, torch.zeros_like(x[:, index]))
+    nominal, found = deformation.spec.nominal, sum(fields, torch.zeros_like(x[:, index]))
+    theta = deformation.momenta.theta
+    return found + nominal.along_axis(x, index) @ theta if isinstance(nominal, GeometryMap) else found
 
 
 def _configurations(robot: Tree, joint: str, values: object) -> tuple[Tensor, int]:

@@ -109,9 +109,27 @@ def test_lines_have_names() -> None:
     assert found[7.3].multiple == found[5.1].multiple == 1
     values = torch.linspace(-1.0, 1.0, 7, dtype=torch.float64)
     wave = found[5.1].amplitude * (5.1 * values - found[5.1].phase).cos()
+    x = torch.nn.functional.pad(values[:, None], (0, model.robot.n - 1))
+    by_axis = model.nominal.along_axis(x, 0) @ model.map.deformation.momenta.theta
     first, plain = model.robot.joint_names[0], model_of(CHAINS["arm"])
-    assert_close(model.transmission(first, values), plain.transmission(first, values) + wave, rtol=0, atol=1e-12)
+    expected = plain.transmission(first, values) + wave + by_axis
+    assert_close(model.transmission(first, values), expected, rtol=0, atol=1e-12)
     assert gear_lines(plain) == ()
+
+
+@pytest.mark.parametrize("name", ["arm", "slides", "mimic slides"])
+def test_errors_of_an_axis_along_itself_are_a_transmission_error(name: str) -> None:
+    chain, x = CHAINS[name], draw(5, CHAINS[name].n, seed=1)
+    for joint, moving in enumerate(map(chain.moving_names.index, chain.joint_names)):
+        nominal = GeometryMap(geometry_of(chain), own=PositionErrors((), ((moving, -1.0, 1.0, 2),)))
+        theta, part = torch.zeros(nominal.parameters, dtype=torch.float64), nominal.parts["axes"]
+        along = torch.cat([chain.axes[moving] * ~chain.revolute[moving], chain.axes[moving] * chain.revolute[moving]])
+        added = nominal.along_axis(x, joint)[:, part].unflatten(1, (2, 6)) @ along  # (N, 2)
+        followed = int(chain.coupling[:, joint].count_nonzero()) > 1
+        by_axis = nominal.sensitivities(x, theta)[..., part].unflatten(2, (2, 6)) @ along
+        expected = nominal.jacobian(x, theta)[..., joint, None] * added[:, None]
+        assert bool(added.any()) != followed
+        assert_close(added.any() * by_axis, expected, rtol=0, atol=1e-12)
 
 
 def test_an_axis_shifts_and_turns_the_frame_before_its_joint() -> None:

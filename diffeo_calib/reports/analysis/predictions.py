@@ -180,6 +180,9 @@ class FitRows:
             for node in data.joint:
                 total += kernel.gram(q, node.weight * along, q, along)
                 cross += kernel.gram(node.points, node.weight * node.effect, q, along).view_as(cross)
+        by_axis, variance = self.map.geodesic.spec.nominal.along_axis(q, joint), self.map.geodesic.spec.prior_variance
+        total += (by_axis * variance) @ by_axis.T
+        cross += data.sensitivity[..., : len(variance)] @ (by_axis * variance).T
         solved, cross = regression.solve(cross), cross.flatten(0, 1)
         covariance = total - cross.T @ solved.flatten(0, 1)
         return (centred @ covariance @ centred).diagonal().clamp(min=0.0).sqrt()
