@@ -244,6 +244,14 @@ def test_a_model_holds_for_the_rows_before_a_slip() -> None:
     assert errors.norm(dim=-1).square().mean().sqrt() < 1e-4
     assert covariance.diagonal(dim1=-2, dim2=-1).sum() < 4 * errors.square().sum()
 
+    def interrupting(task: str, done: int, total: int) -> None:
+        if task == "hyper-parameters" and done == 5:
+            raise KeyboardInterrupt
+
+    with pytest.warns(DiffeoCalibWarning, match="near row 50") as said:  # it is not opened then
+        assert dc.calibrate(arm.nominal, dc.Measurements(q, points), progress=interrupting).interrupted
+    assert not any("holds for" in str(one.message) for one in said)
+
 
 def test_a_slow_drift_is_told_from_a_jump() -> None:
     arm = SimulatedArm(3)

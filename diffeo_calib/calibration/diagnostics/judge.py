@@ -95,13 +95,14 @@ def judge(
     *,
     devices: Iterable[Hypothesis] = (),
     bodies: Mapping[str, str] = MappingProxyType({}),
+    opens: bool = True,
 ) -> Finding | None:
     """The explanation with which left-out errors fall most, relative to what its kind asks for; None without any.
 
     Args:
         data, scales, left_out: the rows of a calibration, its scales and left-out errors. lines: (N,) of the rows in
             their file: their order is that of the measurements. devices: what may change of devices in unknown places.
-            bodies: better names of the measuring device and of what is on the tool.
+            bodies: better names of the measuring device and of what is on the tool. opens: whether it may be opened.
     """
     rows, lines = SampledRows.of(data, scales), lines.to(data.x.device)
     if len(rows.index) < 4 * gates.CHANGE_ROWS:
@@ -112,8 +113,8 @@ def judge(
     if len(own) >= gates.MIXED_ROWS:
         found += [own for one in changes if one.name == MARKERS for own in two_tools(rows, one.effects, lines)]
         found += other_payloads(rows, data, lines)
-    whole = len(rows.index) == len(data.x)
-    return best_of([one if whole else one._replace(opens="") for one in found], rows)
+    opens &= len(rows.index) == len(data.x)
+    return best_of([one if opens else one._replace(opens="") for one in found], rows)
 
 
 def best_of(found: Iterable[Candidate], rows: SampledRows) -> Finding | None:
