@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from functools import cache
 from math import inf
 from types import SimpleNamespace
@@ -19,7 +20,7 @@ from torch.distributions import MultivariateNormal
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.recalibration.compare import Comparison
-from diffeo_calib.calibration.recalibration.find_changes import NOISE_FACTORS, SIZES, likelihood_ratios
+from diffeo_calib.calibration.recalibration.find_changes import NOISE_FACTORS, SIZES, likelihood_ratios, parts_of
 
 OFFSET = 1e-3
 """Of a joint, rad."""
@@ -98,6 +99,15 @@ def test_places_that_a_fit_left_open_explain_no_difference_of_models() -> None:
     compared = dc.compare(old, model(positions))
     assert compared.expected < 1e-3
     assert not compared.changes.found
+
+
+def test_what_a_model_lacks_cannot_change() -> None:
+    fitted: Any = model(positions).map
+    spec, sag = fitted.geodesic.spec, fitted.geodesic.spec.nominal.sag
+    bare = replace(spec, prior_variance=spec.prior_variance.index_fill(0, torch.arange(sag.start, sag.stop), 0.0))
+    own: Any = SimpleNamespace(geodesic=SimpleNamespace(spec=bare), deformation=SimpleNamespace(spec=bare))
+    names, fewer = ([part.name for part in parts_of(each)] for each in (fitted, own))
+    assert fewer == [name for name in names if name != "gravity"] != names
 
 
 def test_ratios_are_those_of_the_definition() -> None:

@@ -279,6 +279,15 @@ def test_rows_of_a_noisy_kind_take_nothing_from_precise_ones() -> None:
     assert 0.5 < float(noisy.median()) < 1.5
 
 
+def test_the_ball_of_a_robot_that_errs_by_centimetres() -> None:
+    """Its readings are not doubted: a warning fails this test."""
+    arm = SimulatedArm(seed=2, geometry=40, markers=2)
+    q, points = arm.measure(60, seed=4)
+    tracked = dc.Measurements(q, points[:, 1:], arm.nominal.joint_names)
+    placed = place(arm.nominal, dc.Measurements.joined([tracked, readings(arm, "image", 90)]), silent)
+    assert placed.registration.rms > 20 * placed.identification.rms
+
+
 # --- tables of several kinds ------------------------------------------------------------------------------------------
 
 PLAIN = SimulatedArm(3)

@@ -31,6 +31,7 @@ from diffeo_calib.calibration.identification.identification import (
     described,
     estimated,
     held_parameters,
+    identify,
     with_ball,
 )
 from diffeo_calib.calibration.placing.lens import LensAndBoard
@@ -62,7 +63,15 @@ from diffeo_calib.sensors.coordinates import errors_of_kinds
 from diffeo_calib.sensors.devices import ROW
 from diffeo_calib.sensors.errors import Evaluations, shown_unit
 from diffeo_calib.sensors.places import Places, fitting_devices
-from diffeo_calib.sensors.tables import Coordinates, OtherReadings, ball_tip, check_poses, divided, with_markers
+from diffeo_calib.sensors.tables import (
+    Coordinates,
+    OtherReadings,
+    ball_tip,
+    check_poses,
+    divided,
+    sees_frame,
+    with_markers,
+)
 
 
 class Told(NamedTuple):
@@ -353,8 +362,9 @@ def _by_coordinates(
     warn_of_open_directions(robot, table, registration)
     tables, adrift = [one.table for one in readings], table.without_device
     geometry, ball = registration.geometry, None
-    if not places:
-        ball = ball_of(tables, geometry, ball_tip(None, readings, geometry.on[-1]))
+    if not places and not all(map(sees_frame, tables)):
+        known = identify(geometry, table.q, table.points).geometry  # a nominal robot may miss its ball by centimetres
+        ball = ball_of(tables, known, ball_tip(None, readings, geometry.on[-1]))
         geometry = geometry if ball is None else with_ball(geometry, ball)
     devices = tuple(fitting_devices(one, geometry.points(one.q)) for one in tables)
     shared = [one.shared(len(table), 3 * table.markers).unflatten(1, (-1, 3)) for one in places]

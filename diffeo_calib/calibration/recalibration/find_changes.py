@@ -97,7 +97,8 @@ def parts_of(fitted: FittedMap) -> list[ChangedPart]:
         kernel = RadialKernel.from_config(term.to_config() | {"variance": max(float(term.variance), least)})
         found.append(ChangedPart(names[joint], partial(of_joint, kernel, joint), joint))
     parameters = {"gravity": nominal.sag, "geometry": nominal.geometry.slices["joints"]}
-    return found + [ChangedPart(name, partial(of_parameters, s)) for name, s in parameters.items() if s.start < s.stop]
+    there = {name: some for name, some in parameters.items() if bool(spec.prior_variance[some].any())}
+    return found + [ChangedPart(name, partial(of_parameters, some)) for name, some in there.items()]
 
 
 SIMULATED_DRAWS = 2000

@@ -378,9 +378,9 @@ class NewRows:
     # --- the same rows otherwise ---
 
     def changed(self, **changes: object) -> NewRows:
-        """The same rows with another noise or prior; what does not change is kept."""
+        """The same rows with another noise or prior; what does not change is computed once."""
         other = replace(self, **changes)
-        vars(other).update({name: vars(self)[name] for name in LINEARISED if name in vars(self)})
+        vars(other).update({name: getattr(self, name) for name in LINEARISED})
         return other
 
     def kept(self, index: Tensor) -> NewRows:
