@@ -155,9 +155,9 @@ def calibrate(
             calibration exceeds 5 % of the markers' spread and no other reading explains it; a column holds one value
             although the robot moves; the rows show no errors of the robot; too few poses to
             select scales; leave-one-out errors contradict the scales; during the measurements something moved or
-            drifted, a joint offset or a zero changed; a length of robot or device is not what it is said to be; wrong
-            rows follow one another; more than 40 % of the rows are outliers; the joint values are rounded and this
-            limits the accuracy.
+            drifted, a joint offset or a zero changed; rows that follow an axis do not tell its errors from a drift; a
+            length of robot or device is not what it is said to be; wrong rows follow one another; more than 40 % of the
+            rows are outliers; the joint values are rounded and this limits the accuracy.
     """
     check_arguments(robot, measurements, hyperparameters)
     check_models(scales_of, robot)

@@ -19,6 +19,7 @@ from diffeo_calib.calibration.scales import axis_errors
 from diffeo_calib.calibration.scales.axis_errors import with_axis_errors
 from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.process.scales import axis_deviations
+from diffeo_calib.reports.analysis.predictions import FitRows
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.runtime.build import axis_waves
 from diffeo_calib.runtime.chain import Waves, wave_angles
@@ -115,6 +116,10 @@ def test_a_bent_slide_is_part_of_the_model(tmp_path: Path, monkeypatch: pytest.M
     far[:, 2] = 0.66
     wider = result.model.predict(far, noise=False)[1].reshape(200, 3, 3).diagonal(dim1=1, dim2=2).sum(1).mean()
     assert float(wider) > 2.0 * float(covariance.diagonal(dim1=1, dim2=2).sum(1).mean())
+    values = torch.linspace(0.02, 0.58, 40, dtype=torch.float64)
+    moved = result.model.transmission("slide", values)  # there is none: its bend is not taken for one
+    inside = (moved - moved.mean()).abs() < 1.96 * FitRows(result.model).transmission_deviation(2, values)
+    assert 0.8 <= float(inside.double().mean()) <= 1.0
     dc.save(result.model, tmp_path / "model.safetensors")
     again = dc.load(tmp_path / "model.safetensors")
     assert_close(again.predict(far)[1], result.model.predict(far)[1], rtol=1e-9, atol=0)

@@ -28,6 +28,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import place, residuals
+from diffeo_calib.kinematics.registered_map import robot_map
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import POINTS
 from diffeo_calib.measurements.table import Measurements
@@ -180,7 +181,7 @@ class FitRows:
             for node in data.joint:
                 total += kernel.gram(q, node.weight * along, q, along)
                 cross += kernel.gram(node.points, node.weight * node.effect, q, along).view_as(cross)
-        by_axis, variance = self.map.geodesic.spec.nominal.along_axis(q, joint), self.map.geodesic.spec.prior_variance
+        by_axis, variance = robot_map(self.map).along_axis(q, joint), self.map.geodesic.spec.prior_variance
         total += (by_axis * variance) @ by_axis.T
         cross += data.sensitivity[..., : len(variance)] @ (by_axis * variance).T
         solved, cross = regression.solve(cross), cross.flatten(0, 1)
