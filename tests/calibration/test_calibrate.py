@@ -176,7 +176,7 @@ def test_twelve_poses_are_selected_on(twelve: Any, arm: Case) -> None:
 
 def test_progress_is_reported(twelve: Any) -> None:
     tasks = list(dict.fromkeys(task for task, _, _ in twelve[1]))
-    assert tasks == ["registration", "geometry", "hyper-parameters", "cross-validation", "Gauss-Newton"]
+    assert tasks == ["registration", "geometry", "hyper-parameters", "axes", "cross-validation", "Gauss-Newton"]
     assert all(0 <= done <= total for _, done, total in twelve[1])
 
 

@@ -165,7 +165,8 @@ def test_left_out_is_conditioning_without(case: Case) -> None:
 def test_opened_unknowns_are_those_of_another_factor(case: Case, size: float | None) -> None:
     E = 1e-4 * normal(len(case.posterior.mu), 3, seed=8)
     found = case.posterior.opened(E, size)
-    again = Factor(found.factor.L, found.factor.W)
+    W = found.factor.W
+    again = Factor(found.factor.L, W, W.T @ W)
     more = 2.0 * E if size else E / E.norm(dim=0)
     close(again.matrix, case.posterior.factor.matrix + more @ more.T, 1e-9)
     close(found.inverse, again.inverse, 1e-7)

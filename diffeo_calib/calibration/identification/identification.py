@@ -260,7 +260,8 @@ def body_squares(errors: Sequence[Tensor]) -> Tensor:
 
 def sizes_and_kinds(errors: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     """Numbers d (M,) of all bodies, and (M,) of which kind of rows each is."""
-    counts = torch.tensor([own[..., 0].numel() for own in errors], device=errors[0].device)
+    sizes = [own[..., 0].numel() for own in errors]
+    counts = torch.tensor(sizes, dtype=torch.int64, device=errors[0].device)
     kind = torch.arange(len(errors), device=errors[0].device).repeat_interleave(counts)
     return errors[0].new_tensor([own.shape[2] for own in errors])[kind], kind
 

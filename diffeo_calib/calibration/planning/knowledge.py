@@ -28,6 +28,7 @@ from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.cameras.images import UNKNOWNS
 from diffeo_calib.common.checks import as_tensor
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, as_written, few
 from diffeo_calib.common.threads import large_work
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS
@@ -196,7 +197,8 @@ def of_robot(
         the scene, and the row numbers of targets, measured ones, those of a registration, and candidates.
     """
     marker, scales = asked
-    points, on, lever = _measured_points(robot, marker, torch.eye(4, dtype=torch.float64) if frames else MARKER)
+    usual = torch.eye(4, dtype=torch.float64, device=HOST) if frames else MARKER
+    points, on, lever = _measured_points(robot, marker, usual)
     near, known, wanted = groups
     q, numbers = gathered((near, known, known[:0], wanted), points.numel())
     geometry, near, residual = Geometry.nominal(robot).with_tool(points, on), q[numbers[0]], USUAL_RESIDUAL

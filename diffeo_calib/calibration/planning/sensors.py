@@ -273,7 +273,8 @@ class BoardImages(Sensor):
         explain. The noise is that of a pose beyond that of its corners, m^2.
         """
         fitted, (set_up, rows) = self.model.map, self._last
-        root, little = self.camera.root, SMALLEST_REST_M**2 * torch.eye(9, dtype=self.camera.root.dtype)
+        root = self.camera.root
+        little = SMALLEST_REST_M**2 * torch.eye(9, dtype=root.dtype, device=root.device)
         if self.camera.view is None:  # of earlier versions
             return root[:, :0], rows[:0], little
         new = root, torch.full_like(root[0], NEW, dtype=torch.int64), little
