@@ -263,7 +263,8 @@ class Campaign:
         if before.accepted != accepted:
             self.wait()
             if self._model is not None:
-                some = len(self.accepted) > 1  # which a model holds at least
+                names, known = self.table.device_names, self._model.around.placed.data.device_names
+                some = sum(names[row] in known for row in self.accepted) > 1  # which a model holds at least
                 self._model = self._model.rebuilt(self.table, self.verdicts) if some else None
 
     def _renew(self) -> None:

@@ -92,6 +92,16 @@ def test_the_result_is_that_of_the_accepted_rows(running: dc.Campaign, measured:
     assert (campaign.accepted, campaign.expected_error, campaign.next(1)) == ([], None, None)
 
 
+def test_a_model_without_rows_of_its_devices_ends(measured: tuple[Tensor, Tensor]) -> None:
+    rows = dc.Measurements(*(part[:16] for part in measured)).with_sessions(["a"] * 14 + ["b"] * 2)
+    campaign = begun(rows.rows(slice(0, 14)), ARM.nominal, candidates=ARM.sample(5, seed=8))
+    campaign.add(rows.rows(slice(14, 16)))
+    assert campaign.expected_error is not None
+    for row in range(14):
+        campaign.reject(row)
+    assert (campaign.accepted, campaign.expected_error) == ([14, 15], None)
+
+
 def test_mistakes_of_one_row_are_named_and_left_out(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
     q, y = (part[ROWS : ROWS + 1] for part in measured)
     before = measured[0][ROWS - 1]
