@@ -336,6 +336,9 @@ class CampaignModel:
         if not cause:
             change = find_change(Seen.of(at, self.around.noise(last)), window, changes(), flags, **how)
         if change is not None:
+            known = verdicts[window[0]].change
+            if known is not None and change.row == window[0]:  # it is older than these rows
+                change = replace(change, row=known.row)
             change = replace(change, line=lines[change.row])
             for number in window:
                 one, before = verdicts[number], number < change.row

@@ -260,6 +260,13 @@ def test_rows_that_are_there_before_are_judged_as_with_once(
     assert accepted[0] == accepted[1]
 
 
+def test_it_ends_while_a_program_may_still_send_rows(tmp_path: Path, lines: list[str]) -> None:
+    (tmp_path / "run.csv").write_text("".join(lines[:4]))
+    words = [sys.executable, "-c", PROGRAM, "campaign", "campaign.toml", "--once", "--stdin"]
+    with subprocess.Popen(words, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
+        assert process.wait(120) == 0
+
+
 def test_a_campaign_goes_on_as_it_was_begun(tmp_path: Path, lines: list[str], command: Command) -> None:
     """With the same robot, columns and units: else rows before and after are of other tables."""
     (tmp_path / "run.csv").write_text("".join(lines[:4]))

@@ -117,14 +117,14 @@ def test_mistakes_of_one_row_are_named_and_left_out(running: dc.Campaign, measur
 def test_a_moved_device_and_a_joint_are_named_and_their_rows_taken_out(
     running: dc.Campaign, measured: tuple[Tensor, Tensor]
 ) -> None:
-    q, y = (part[ROWS:] for part in measured)
+    q, y = (torch.cat([own[ROWS:], more]) for own, more in zip(measured, ARM.measure(6, seed=11), strict=True))
     away = torch.tensor([0.5 * MM, -0.3 * MM, 0.4 * MM], dtype=y.dtype)
     other = q + torch.tensor([0, 2e-3, 0, 0, 0, 0], dtype=q.dtype)
     cases = {"device": (q, y + away), ARM.nominal.joint_names[1]: (q, ARM.true_points(other))}
     for words, rows in cases.items():
         campaign, (verdict,) = after(running, *(part[:1] for part in rows))
         assert verdict.change is None, "a single wrong row is no change of six unknowns some rows before"
-        verdicts = [*campaign.add(*(part[1:8] for part in rows))]
+        verdicts = [*campaign.add(*(part[1:18] for part in rows))]  # more than are looked at together
         change = next(one.change for one in verdicts[::-1] if one.change is not None)
         assert words in (change.cause, *change.others)[0], (words, str(verdicts[-1]))
         assert change.row == ROWS

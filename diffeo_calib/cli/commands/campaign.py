@@ -346,7 +346,8 @@ def _followed(live: Live, given: CampaignOptions, inbox: Inbox, page: Page | Non
 def _happening(live: Live, given: CampaignOptions, inbox: Inbox) -> Iterator[bool]:
     """Do what comes, until the rows end; yields whether anything was done."""
     if given.stdin:
-        Thread(target=read_lines, args=(sys.stdin.buffer, inbox), daemon=True).start()
+        lines = getattr(sys.stdin.buffer, "raw", sys.stdin.buffer)  # a lock of a buffer would break the exit of Python
+        Thread(target=read_lines, args=(lines, inbox), daemon=True).start()
     while True:
         lines = live.new_lines()
         live.judge(lines)
