@@ -279,4 +279,5 @@ def _result(
         outliers=found,
         fit=fitted,
         lengths=found_lengths,
+        partial=best is not None and best.columns is not None,
     )

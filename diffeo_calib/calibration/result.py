@@ -52,6 +52,7 @@ class CalibrationResult:
         outliers: measurements far from their prediction.
         fit: the exact model's fit with its certificates.
         lengths: sizes of the robot, of its links and of devices against what they are said to be.
+        partial: whether the model holds for some of the rows alone, since something changed during them.
         registration: base and markers only. identification: full geometry, the classical baseline.
         placement: devices in unknown places and what is known of them: measuring frames of sessions (the model's is
             that of the largest), sockets, and the devices of readings.
@@ -68,6 +69,7 @@ class CalibrationResult:
     outliers: list[Outlier]
     fit: Fit
     lengths: list[Length]
+    partial: bool
 
     def __repr__(self) -> str:
         return f"CalibrationResult({self.model!r}: {self.status})"

@@ -72,7 +72,7 @@ def run(given: FitOptions) -> None:
     wrong.sort(key=lambda outlier: -outlier.distance)
     say(*printed.outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"))
     say(*_lines_about_places(result, data, held_out, hand_eye))
-    say(*_advice(judged, wrong=bool(wrong)), f"model: {given.output}")
+    say(*_advice(judged, wrong=bool(wrong), partial=result.partial), f"model: {given.output}")
     shown, rows = (train, "training") if test is None else (test, "held-out")
     _write_pictures(result, given, held_out or in_train, f"{rows} rows", shown)
     _end(result, in_train, held_out or in_train)
@@ -183,8 +183,11 @@ def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors |
         none = []
 
 
-def _advice(judged: list[Any], *, wrong: bool) -> Iterator[str]:
+def _advice(judged: list[Any], *, wrong: bool, partial: bool) -> Iterator[str]:
     """What the errors on held-out rows mean where rows are wrong, or the model no better than geometry."""
+    if partial:
+        yield "these errors are of all rows, also of those for which the model does not hold: see the warning"
+        return
     for stage in judged:
         geometry, model = stage[GEOMETRIC], stage[CALIBRATED]
         if wrong:
