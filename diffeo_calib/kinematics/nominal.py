@@ -187,7 +187,7 @@ class GeometryMap(NominalMap):
         """Error parameters of the geometry: (K,), or (N, K) where the robot deflects or an axis is crooked."""
         (errors, coefficients), chain = self.split(theta), self.geometry.chain
         live = wrapped(theta) or theta.requires_grad  # what vanishes, in value and derivatives, need not be computed
-        twists = list[Tensor]()
+        twists: list[Tensor] = []  # torch.compile does not follow list[Tensor]()
         if self.elasticity is not None and (live or bool(coefficients.any())):
             twists.append(self.elasticity.twists(x, coefficients).flatten(1))
         if self.own.axes and (live or bool(theta[self.parts["axes"]].any())):

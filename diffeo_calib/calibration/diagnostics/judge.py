@@ -52,7 +52,8 @@ ROUNDS = 20
 MISTYPED = (10.0, 0.1, 1000.0, 0.001, 1 / 0.45359237, 0.45359237)
 """Factors of one payload in another unit, or with a wrong digit: g, pounds."""
 OPENED_M = 0.01
-"""Prior RMS motion by what is opened in a model: far more than what is found, else it is gross."""
+"""Prior RMS motion by what is opened in a model, more than what is found. Larger motions are gross, such as exchanged
+markers, and left to the weights of the rows."""
 SLOW = (
     "if it stood in several places, name the set-ups in a column (`session`); else let robot and device warm up, and "
     "measure in random order; or name a column of times or temperatures (`time`, `temperature`), with which the model "
@@ -127,7 +128,7 @@ def best_of(found: Iterable[Candidate], rows: SampledRows) -> Finding | None:
     moved = left_out_rms(rows.process) * (1.0 - left**2) ** 0.5
     got = f"about {1e3 * moved:.2g} mm of error, and leave-one-out errors that fall to {100 * left:.0f} % beside it"
     fix, columns = best.fix, None
-    if best.opens:
+    if best.opens and moved < OPENED_M:
         fix += f"; the model holds for {best.opens}"
         numbers = rows.process.numbers.in_table(best.columns).unbind(2)
         columns = torch.stack([rows.data.in_coordinates(one) for one in numbers], 2)
