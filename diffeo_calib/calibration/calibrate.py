@@ -242,8 +242,7 @@ def _result(
     explained, found = parts(model), outliers(model, placed, data, chosen.judged, least)
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
     warn_of_outliers(found, placed.data)
-    explained_by = placed.mislabelled(model, found) or (best and best.text)
-    warn_of_contradictions(model, placed.coordinates, found, explained_by)
+    warn_of_contradictions(model, placed.coordinates, found, placed.mislabelled(model, found) or (best and best.text))
     warn_of_rounding(robot, placed.data, data, chosen.left_out)
     found_lengths = lengths(data, scales, placed.placement.hypotheses(data, VALUE))
     summary = Summary(
