@@ -26,8 +26,8 @@ RANGE_RAD = 1.0
 class Inclinometers(Devices):
     """Inclinometers: constants are their axes x and y in the tool's frame, and the upward direction.
 
-    An angle is that of an axis above the horizontal. Increments: turns of the axes about x, y and z, of y towards x, and
-    of the upward direction towards two others [rad].
+    An angle is that of an axis above the horizontal. Increments: turns of the axes about x, y and z, of y towards x,
+    and of the upward direction towards two others [rad].
     """
 
     kind = "inclination"
