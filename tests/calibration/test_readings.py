@@ -240,9 +240,9 @@ def test_what_is_refused() -> None:
     )
 
 
-def test_a_ball_without_a_start_that_leads_anywhere_is_sought(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ball_without_a_start_that_leads_anywhere_is_sought() -> None:
     arm = SimulatedArm(2)
-    data = readings(arm, "distance", 60)
-    expected = place(arm.nominal, data, silent).identification.geometry.tool
-    monkeypatch.setattr("diffeo_calib.calibration.placing.readings._starts", lambda *_: [])
-    assert_close(place(arm.nominal, data, silent).identification.geometry.tool, expected, rtol=0, atol=1e-6)
+    data, near = [readings(arm, "image", 60)], Geometry.nominal(arm.nominal, 1)
+    far = near.with_tool(near.tool + 1e3)
+    found, expected = (register_readings(start, data).geometry.tool for start in (far, near))
+    assert_close(found, expected, rtol=0, atol=1e-5)
