@@ -71,6 +71,9 @@ def test_exact_readings_find_both_devices(kind: type[Devices]) -> None:
     assert float(found.errors(data, points).abs().max()) < 1e-9
     same = TOLD.get(kind, slice(None))
     assert_close(found.constants[:, same].abs(), there.constants[:, same].abs(), rtol=0, atol=1e-7)
+    rough = replace(data, values=data.values + 1e-3 * normal(*data.values.shape, seed=17))
+    again = kind.at(rough, points).refined(data, points)  # increments lead from wherever readings with errors start
+    assert float(again.errors(data, points).abs().max()) < 1e-9
 
 
 @pytest.mark.parametrize("kind", KINDS)
