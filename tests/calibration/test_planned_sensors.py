@@ -304,7 +304,7 @@ def test_candidates_that_no_camera_sees_are_refused() -> None:
 def test_images_of_the_fit_are_what_they_were(kind: str) -> None:
     """Their noise and what lens and board do to them, by the poses of the model alone."""
     model = kind_named(kind).model
-    placed = next(own for own in model.placement if own.devices.cameras)
+    placed = next(own for own in model.placement if own.cameras)
     for number, one in enumerate(cameras(kind_named(kind))):
         rows = placed.rows[placed.device == number]
         points = model(model.configurations[rows]).detach().flatten(1)
