@@ -26,7 +26,6 @@ from diffeo_calib.calibration.identification.identification import (
 )
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.placing.place import place
-from diffeo_calib.calibration.result import errors_by_kind
 from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places
 from diffeo_calib.calibration.scales.selection import defaults, log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -340,10 +339,10 @@ def test_as_accurate_as_expected(name: str) -> None:
     error = rms(ball_errors(result, free=free))
     assert 0.5 * result.expected.workspace < error < 1.8 * result.expected.workspace
     assert result.fit.converged
-    kinds = errors_by_kind(result, dc.Observations.joined(parts))
+    kinds = result.errors(dc.Observations.joined(parts))
     assert len(kinds) == len(parts)
     for one in kinds.values():
-        assert one.stages["calibrated"].rms < one.stages["geometric"].rms
+        assert one["calibrated"].rms < one["geometric"].rms
 
 
 @pytest.fixture(scope="module")
