@@ -22,14 +22,12 @@ from diffeo_calib.cli.main import app
 from diffeo_calib.cli.models import load_kinematics, made_by_command, robot_of
 from diffeo_calib.cli.record import entries_by_kind, kind_entry, make_folder, record
 from diffeo_calib.cli.tables import measured_table
-from diffeo_calib.common.errors import PACKAGE, few, printable
-from diffeo_calib.common.files import write_figure
+from diffeo_calib.common.errors import PACKAGE, few
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_entry, hand_eye_sentences
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.reports.plots.errors import stages
 from diffeo_calib.reports.report import write_report
 from diffeo_calib.robots.cartesian import is_cartesian, turns_nowhere
 from diffeo_calib.robots.simulated_arm import SimulatedArm
@@ -73,8 +71,12 @@ def run(given: FitOptions) -> None:
     say(*printed.outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"))
     say(*_lines_about_places(result, data, held_out, hand_eye))
     say(*_advice(judged, wrong=bool(wrong), partial=result.partial), f"model: {given.output}")
-    shown, rows = (train, "training") if test is None else (test, "held-out")
-    _write_pictures(result, given, held_out or in_train, f"{rows} rows", shown)
+    if given.report is not None:
+        with progress_bar() as progress:
+            how = {"stages": result.stages, "places": {stage: result.places(stage) for stage in result.stages}}
+            shown = train if test is None else test
+            write_report(result.model, given.report, shown, **how, warnings=record.warnings, progress=progress)
+        say(f"report: {given.report} (open it in a browser)")
     _end(result, in_train, held_out or in_train)
 
 
@@ -126,27 +128,11 @@ def _lines_about_places(
     yield from placement[1:] if placed.free else placement  # without a device the robot's base is the measuring frame
 
 
-def _write_pictures(result: CalibrationResult, given: FitOptions, errors: Errors, rows: str, data: Any) -> None:
-    """Draw the figure and write the report, if they are wanted; ``rows`` are what ``data`` to show are."""
-    if given.figure is not None:
-        shown = f"{sum(len(one.rows) for one in errors.values())} {rows}"
-        shown += ", no row was held out" * rows.startswith("training")
-        title = f"{printable(given.csv.name)}: errors on {shown}"
-        write_figure(stages([one.stages for one in errors.values()], title), given.figure)
-        say(f"figure: {given.figure}")
-    if given.report is not None:
-        with progress_bar() as progress:
-            placed = {stage: result.places(stage) for stage in result.stages}
-            how = {"stages": result.stages, "places": placed, "warnings": record.warnings}
-            write_report(result.model, given.report, data, **how, progress=progress)
-        say(f"report: {given.report} (open it in a browser)")
-
-
 def _record(result: CalibrationResult, in_train: Errors, held_out: Errors, given: FitOptions) -> None:
     """Add the results for programs."""
     both = {"training": in_train, "held_out": held_out}
     kinds = {kind: {rows: one[kind].stages for rows, one in both.items() if kind in one} for kind in in_train}
-    files = {"model": given.output, "figure": given.figure, "report": given.report}
+    files = {"model": given.output, "report": given.report}
     record.add(
         **result.placement.entry(),
         **entries_by_kind(kinds),
@@ -232,8 +218,7 @@ def run_demo(given: DemoOptions) -> None:
     lines = [
         ["fit", csv, "--robot", urdf, "--base", arm.nominal.base, "--tip", arm.nominal.tip],
         ["--position", ",".join(POSITION), "--length", "mm", "--angle", "deg"],
-        ["-o", folder / "model.safetensors", "--figure", folder / "calibration.png"],
-        ["--report", folder / "report.html"],
+        ["-o", folder / "model.safetensors", "--report", folder / "report.html"],
     ]
     command = [list(map(str, line)) for line in lines]
     say(f"{given.count} simulated measurements written to {csv}. Now running:\n")
