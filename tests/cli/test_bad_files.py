@@ -56,7 +56,7 @@ def test_a_model_s_joints_missing_in_the_table(
 PLACES = [("none/file.png", "No such file or directory"), ("here.png", "Is a directory")]
 
 
-@pytest.mark.parametrize("case", [(option, *place) for option in ("-o", "--figure") for place in PLACES])
+@pytest.mark.parametrize("case", [(option, *place) for option in ("-o", "--report") for place in PLACES])
 def test_outputs_are_checked_before_the_fit(
     case: tuple[str, str, str], small_site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
