@@ -138,34 +138,34 @@ class Around:
 
     @cached_property
     def like(self) -> int:
-        """Number of the row as which the candidates would be measured, see :meth:`Placed.row_like`."""
-        return self.placed.row_like(self.candidates)
+        """Number of the last row as which some of the candidates can be measured; else the very last."""
+        last = len(self.placed.data) - 1
+        return next((row for row in range(last, -1, -1) if bool(self._sees(row, self.candidates).any())), last)
+
+    def _sees(self, row: int, q: Tensor) -> Tensor:
+        """(M,) boolean: configurations in which a row can be measured."""
+        return self.placed.elsewhere(row, q)[0]
 
     @cached_property
     def open(self) -> Tensor:
         """(M,) boolean, candidates that can be measured."""
-        return self.placed.sees(self.like, self.candidates)
+        return self._sees(self.like, self.candidates)
 
     def with_open_candidates(self, count: int, seed: int) -> Around:
         """The same with ``count`` candidates that can be measured, drawn where some of these cannot; else itself."""
-        robot = self.placed.registration.geometry.chain
+        chain, where = self.placed.registration.geometry.chain, self.placed.reached(self.like)
+        how: Any = {"ranges": ranges_around(chain, self.placed.data.q), "keep": partial(self._sees, self.like), **where}
         with suppress(InputError):  # hardly any can
             if not bool(self.open.all()):
-                how: Any = {
-                    "ranges": ranges_around(robot, self.placed.data.q),
-                    **self.placed.places_to_reach(self.like),
-                }
-                return replace(
-                    self,
-                    candidates=candidates(robot, count, keep=partial(self.placed.sees, self.like), seed=seed, **how),
-                )
+                return replace(self, candidates=candidates(chain, count, seed=seed, **how))
         return self
 
     @cached_property
     def options(self) -> tuple[Numbers, Tensor]:
         """What the candidates would tell, and its noise (M, r, r), m^2."""
-        rows = self.placed.data.rows([self.like] * len(self.candidates))
-        copies = self.placed.measured_at(self.like, with_joints(rows, self.candidates), self.candidates)
+        copies = with_joints(self.placed.data.rows([self.like] * len(self.candidates)), self.candidates)
+        for changed in self.placed.elsewhere(self.like, self.candidates)[1]:
+            copies = changed(copies)
         data = self.rows(copies)[0]
         (noise,) = data.numbers.blocks_of_table(self.noise(data))
         return data.numbers, noise

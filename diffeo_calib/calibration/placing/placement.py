@@ -9,7 +9,7 @@ columns Z are the effects of shifts c ~ N(0, I). After the fit their posterior i
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -24,7 +24,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.sensors.devices import Extrinsics, Hypothesis
-from diffeo_calib.sensors.set_ups import SetUps, View
+from diffeo_calib.sensors.set_ups import SetUps
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings
 
 S = TypeVar("S", bound="DeviceSet")
@@ -147,29 +147,16 @@ class DeviceSet(ABC):
         """Better names of what stands, and of what is on the tool, than those of diagnostics/hypotheses.py."""
         return {}
 
-    def views(self) -> Mapping[str, View]:
-        """Name of a set-up -> how it sees poses of the model; none if there is one set-up."""
-        return {}
-
-    def sees(self, row: int, points: Tensor, views: Mapping[str, View]) -> Tensor:
-        """(M,) boolean: whether points (M, P, 3), m, can be measured as a row was, as far as these devices measured it.
+    def elsewhere(self, row: int, points: Tensor, devices: Placement) -> tuple[Tensor, Callable[[Any], Any]]:
+        """Where a row could be measured as far as these devices measured it, and what changes in its copies there.
 
         Args:
-            row: number in the table. points: of the model. views: those of all devices.
+            row: number in the table. points: (M, P, 3) of the model, m. devices: all.
+
+        Returns:
+            (M,) boolean, and a function of a table, M copies of the row at other joint values.
         """
-        return torch.ones(len(points), dtype=torch.bool, device=points.device)
-
-    def measured_at(self, row: int, like: T, points: Tensor, views: Mapping[str, View]) -> T:
-        """M copies ``like`` of a row at other joint values, as these devices would measure them there.
-
-        Args:
-            row: its number in the table. points: (M, P, 3) of the model there, m. views: those of all devices.
-        """
-        return like
-
-    def places_at(self, row: int) -> Tensor | None:
-        """(D, 3) places in the measuring frame, m, to which a row of this kind brings the ball; None for anywhere."""
-        return None
+        return torch.ones(len(points), dtype=torch.bool, device=points.device), lambda copies: copies
 
     def sentences(self) -> list[str]:
         """Where the devices are."""
@@ -195,10 +182,6 @@ class Placement(tuple[DeviceSet, ...]):
     def bodies(self) -> Mapping[str, str]:
         """See :attr:`DeviceSet.bodies`."""
         return {name: words for own in self for name, words in own.bodies.items()}
-
-    def views(self) -> dict[str, View]:
-        """Those of all devices, see :meth:`DeviceSet.views`."""
-        return {name: view for own in self for name, view in own.views().items()}
 
     def shared(self, data: Seen) -> Tensor:
         """Effects of all devices, side by side: (N, R, c)."""
