@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     from diffeo_calib.measurements.table import Measurements as Measurements
     from diffeo_calib.paper.gradient_descent import GradientDescent as GradientDescent
     from diffeo_calib.process.scales import Hyperparameters as Hyperparameters
-    from diffeo_calib.reports.report import pictures as pictures
+    from diffeo_calib.reports import plots as plots
     from diffeo_calib.reports.report import write_report as write_report
     from diffeo_calib.robots.cartesian import cartesian as cartesian
     from diffeo_calib.robots.cartesian import pose_inputs as pose_inputs

@@ -57,7 +57,7 @@ def check_page(text: str) -> None:
 
 
 def test_pictures_are_figures_by_name(arm: Case) -> None:
-    found = dc.pictures(arm.model, arm.test[:SHOWN])
+    found = dc.plots.pictures(arm.model, arm.test[:SHOWN])
     assert {"distributions-0", "before-after-0", "expected-0", "parts", "transmission-5", "coverage"} <= set(found)
     (axes,) = found["distributions-0"].axes
     assert (axes.get_xlabel(), len(axes.lines)) == ("position error [mm]", 3)
