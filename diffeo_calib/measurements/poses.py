@@ -325,17 +325,6 @@ def inverse_poses(poses: Tensor) -> Tensor:
     return torch.where(poses.isnan(), poses, found)
 
 
-def camera_jacobian(poses: Tensor, lever: float, board: Tensor) -> Tensor:
-    """Derivatives (N, 9, 6) of the points of cameras at poses (N, 4, 4), m, by errors (-dt, -dw) of the board's pose.
-
-    Shift, m, and turn, rad, are along and about the axes of the camera, in whose frame the board's origin is at
-    ``board`` (N, 3), m; coordinates of a point are adjacent.
-    """
-    axes = poses[:, :3, :3]
-    arms = lever * marks(poses.device) - board[:, None]  # (N, point, 3) from the board, in the camera's frame
-    return (axes[:, None] @ _by_motion(arms)).flatten(1, 2)
-
-
 def _by_motion(arms: Tensor) -> Tensor:
     """Derivatives (..., 3, 6) of points at arms (..., 3) by a shift and a small rotation of what carries them."""
     return torch.cat([torch.eye(3, dtype=arms.dtype, device=arms.device).expand(*arms.shape, 3), -skew(arms)], -1)
@@ -344,8 +333,14 @@ def _by_motion(arms: Tensor) -> Tensor:
 def pose_jacobian(poses: Tensor, lever: float, board: Tensor | None) -> Tensor:
     """Derivatives (N, T, 9, 6) of the three points of each frame by the errors of measured poses.
 
+    Those of a camera on the tool are by errors (-dt, -dw) of the board's pose: shift, m, and turn, rad, along and about
+    the axes of the camera. Coordinates of a point are adjacent.
+
     Args:
         poses: (N, T, 4, 4), m, NaN where hidden; T is 1 for a camera. lever: distance of the points, m.
-        board: see :func:`camera_jacobian`; None if the measuring device stood and saw the tool.
+        board: (N, 3) its origin in the camera's frame, m; None if the measuring device stood and saw the tool.
     """
-    return mark_jacobian(poses, lever) if board is None else camera_jacobian(poses[:, 0], lever, board)[:, None]
+    if board is None:
+        return mark_jacobian(poses, lever)
+    arms = lever * marks(poses.device) - board[:, None]  # (N, point, 3) from the board, in the camera's frame
+    return (poses[:, :, None, :3, :3] @ _by_motion(arms)[:, None]).flatten(2, 3)
