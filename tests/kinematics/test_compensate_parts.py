@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from deformation_bank import made_with
+from deformation_bank import model_of
 from product_bank import Case
 from robots_bank import CHAINS, parallelogram
 from table_bank import held
@@ -35,7 +35,7 @@ TOOLS = torch.tensor([[0.0, 0.0, 0.1], [0.02, 0.05, 0.0]], dtype=torch.float64)
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> dc.CalibratedKinematics:
-    made = made_with(robot(tmp_path_factory.mktemp("two_arms")), dc.RK4(1))
+    made = model_of(robot(tmp_path_factory.mktemp("two_arms")), dc.RK4(1), 1, elastic=False)
     return made.with_tool(None, HANDS[0])
 
 
@@ -159,7 +159,7 @@ def rigid(model: dc.CalibratedKinematics, axes: int) -> tuple[ToolFunctions, Tar
 @pytest.mark.parametrize("slides", [False, True])
 def test_gradient_and_hessian_of_the_cost(model: dc.CalibratedKinematics, axes: int, slides: bool) -> None:
     """By central differences."""
-    tool, goal, q = rigid(made_with(CHAINS["slides"], dc.RK4(1)) if slides else model, axes)
+    tool, goal, q = rigid(model_of(CHAINS["slides"], dc.RK4(1)) if slides else model, axes)
 
     def slope(at: Array) -> Array:
         return -np.einsum("nkj,nk->nj", goal.slopes(tool.jacobian(at)), goal.errors(tool.poses(at)))
@@ -175,7 +175,7 @@ def test_gradient_and_hessian_of_the_cost(model: dc.CalibratedKinematics, axes: 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_joints_that_push_against_their_limits_are_apart(side: float) -> None:
-    tool, goal, q = rigid(made_with(CHAINS["arm"], dc.RK4(1)), 3)
+    tool, goal, q = rigid(model_of(CHAINS["arm"], dc.RK4(1)), 3)
     box = Box(q, np.minimum(q, q - side), np.maximum(q, q - side), np.ones_like(q))
     found = Search(tool, goal, q, box)
     found.begin(exact=True)
