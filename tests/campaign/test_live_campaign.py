@@ -305,8 +305,7 @@ def test_a_row_elsewhere_is_in_the_socket_there() -> None:
     row = int(resting[-1])
     copies = with_joints(data.rows(torch.full_like(resting, row)), data.q[resting])
     assert set(copies.row_sockets) == {data.row_sockets[row]}
-    there, changes = placed.elsewhere(row, data.q[resting])
-    for changed in changes:
-        copies = changed(copies)
+    for own in placed.elsewhere(row, data.q[resting]):
+        copies = own.changed(copies)
+        assert bool(own.there.all())
     assert copies.row_sockets == data.rows(resting).row_sockets
-    assert bool(there.all())

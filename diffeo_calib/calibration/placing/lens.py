@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.hypotheses import BASE, MARKERS
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Placement, Seen, Settled
+from diffeo_calib.calibration.placing.placement import DeviceSet, Elsewhere, OtherRows, Placement, Seen, Settled
 from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.cameras.board import LENS
 from diffeo_calib.cameras.images import expected, sees
@@ -21,6 +21,7 @@ from diffeo_calib.measurements.poses import inverse_poses, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.board_camera import BoardCamera, BoardCameras, Explained
 from diffeo_calib.sensors.devices import OUTLIER_MEDIANS, ROW, Hypothesis, median_weights
+from diffeo_calib.sensors.set_ups import TRANSFORMS
 
 SIZE_WARNED = 0.006
 """Shares by which lengths of a board may differ from the robot's. Simulated arms with errors of a mm: below 0.004."""
@@ -154,16 +155,16 @@ class LensAndBoard(CameraErrors):
         }
         return replace(self, shared=shared, devices=self.devices.with_cameras(cameras))
 
-    def elsewhere(self, row: int, points: Tensor, devices: Placement) -> tuple[Tensor, Callable[[Any], Any]]:
+    def elsewhere(self, row: int, points: Tensor, devices: Placement) -> Elsewhere:
         """With the errors of images there; where the board is not seen, as at another place."""
-        number, sessions = self.shared.seen_by[self.rows == row].tolist(), devices.one(Sessions)
+        number = self.shared.seen_by[self.rows == row].tolist()
         if not number:
             return super().elsewhere(row, points, devices)
         name, camera = [*self.shared.cameras.items()][number[0]]
         poses = poses_from_marks(points, self.lever)
-        if sessions is not None:
-            own = [k for k, set_up in enumerate(sessions.names) if set_up.partition("/")[0] == name]
-            poses = sessions.devices.view(own[-1], poses) if own else poses
+        for own in (one.devices for one in devices if one.devices.kind in TRANSFORMS):
+            last = [k for k, set_up in enumerate(own.names) if set_up.partition("/")[0] == name][-1:]
+            poses = own.view(last[0], poses) if last else poses
         boards = inverse_poses(poses) if self.on_tool else poses
         there = sees(camera, boards)
 
@@ -174,7 +175,7 @@ class LensAndBoard(CameraErrors):
             covariance, effects = expected(camera, shown)
             return copies.with_board_at(copies.q, shown, (covariance, effects @ camera.root))
 
-        return there, images
+        return Elsewhere(there, points.new_zeros(0, 3), images)
 
     def sentences(self) -> list[str]:
         lines = super().sentences()

@@ -35,7 +35,7 @@ from diffeo_calib.calibration.identification.identification import (
     with_ball,
 )
 from diffeo_calib.calibration.placing.lens import LensAndBoard
-from diffeo_calib.calibration.placing.placement import OtherLabel, OtherRows, Placement
+from diffeo_calib.calibration.placing.placement import Elsewhere, OtherLabel, OtherRows, Placement
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
     ball_of,
@@ -171,19 +171,10 @@ class Placed:
                 return row.unit[0], float(one.devices.in_unit(row, torch.ones_like(row.values))[0, 0])
         return shown_unit("m")
 
-    def elsewhere(self, row: int, q: Tensor) -> tuple[Tensor, list[Callable[[Any], Any]]]:
-        """Where in q (M, n) a row could be measured, by the same devices, and what changes in M copies of it there."""
-        points, there = self.identification.geometry.points(q), torch.ones(len(q), dtype=torch.bool, device=q.device)
-        parts = [own.elsewhere(row, points, self.placement) for own in self.placement]
-        return torch.stack([there, *(seen for seen, _ in parts)]).all(0), [changed for _, changed in parts]
-
-    def reached(self, row: int) -> dict[str, Any]:
-        """Where a row of a ball in a socket could be measured: arguments of :func:`candidates`; none for others."""
-        geometry, sockets = self.identification.geometry, self.placement.one(SocketDevices)
-        if sockets is None or not bool((sockets.rows == row).any()):
-            return {}
-        base = geometry.base.to(sockets.positions)
-        return {"places": (sockets.positions - base[:3, 3]) @ base[:3, :3], "ball": geometry.tool[-1]}
+    def elsewhere(self, row: int, q: Tensor) -> list[Elsewhere]:
+        """A row at other configurations q (M, n), as far as the devices of each set measured it."""
+        points = self.identification.geometry.points(q)
+        return [own.elsewhere(row, points, self.placement) for own in self.placement]
 
     def settled(self, fitted: Fit, fitted_map: FittedMap, chosen: ChosenScales) -> Placed:
         """The same with the devices where a fit puts them, and with all markers of the model.

@@ -147,16 +147,9 @@ class DeviceSet(ABC):
         """Better names of what stands, and of what is on the tool, than those of diagnostics/hypotheses.py."""
         return {}
 
-    def elsewhere(self, row: int, points: Tensor, devices: Placement) -> tuple[Tensor, Callable[[Any], Any]]:
-        """Where a row could be measured as far as these devices measured it, and what changes in its copies there.
-
-        Args:
-            row: number in the table. points: (M, P, 3) of the model, m. devices: all.
-
-        Returns:
-            (M,) boolean, and a function of a table, M copies of the row at other joint values.
-        """
-        return torch.ones(len(points), dtype=torch.bool, device=points.device), lambda copies: copies
+    def elsewhere(self, row: int, points: Tensor, devices: Placement) -> Elsewhere:
+        """A row of the table at other points (M, P, 3) of the model, m, as far as these of all devices measured it."""
+        return Elsewhere(torch.ones(len(points), dtype=torch.bool, device=points.device), points.new_zeros(0, 3))
 
     def sentences(self) -> list[str]:
         """Where the devices are."""
@@ -227,6 +220,14 @@ class Placement(tuple[DeviceSet, ...]):
     def placed(self) -> tuple[Extrinsics, ...]:
         """What a model keeps of all devices."""
         return tuple(own.devices for own in self if own.names)
+
+
+class Elsewhere(NamedTuple):
+    """A row as some devices would measure it at M other configurations."""
+
+    there: Tensor  # (M,) boolean, where they can
+    places: Tensor  # (D, 3) in the measuring frame, m, to which it has to bring the ball; none for anywhere
+    changed: Callable[[Any], Any] = lambda copies: copies  # of a table, copies of the row at these joint values
 
 
 class OtherLabel(NamedTuple):

@@ -10,9 +10,8 @@ Without a device no row says where the robot's base is: base and error twist of 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -39,7 +38,7 @@ from diffeo_calib.calibration.identification.registration import (
     register_sockets,
     socket_means,
 )
-from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Placement, Seen, Settled
+from diffeo_calib.calibration.placing.placement import DeviceSet, Elsewhere, OtherRows, Placement, Seen, Settled
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.checks import numbers_of
@@ -140,11 +139,12 @@ class SocketDevices(DeviceSet):
         points[rows, -1] = self.positions[table.socket_numbers[rows]]
         return with_attributes(table, points=points)
 
-    def elsewhere(self, row: int, points: Tensor, devices: Placement) -> tuple[Tensor, Callable[[Any], Any]]:
+    def elsewhere(self, row: int, points: Tensor, devices: Placement) -> Elsewhere:
         if not bool((self.rows == row).any()):
             return super().elsewhere(row, points, devices)
         away, nearest = torch.cdist(points[:, -1], self.positions.to(points)).min(1)
-        return away < IN_SOCKET_M, lambda copies: with_attributes(copies, socket=nearest, sockets=self.sockets)
+        there = {"socket": nearest, "sockets": self.sockets}
+        return Elsewhere(away < IN_SOCKET_M, self.positions, lambda copies: with_attributes(copies, **there))
 
     @property
     def size(self) -> int:
