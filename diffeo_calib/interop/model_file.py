@@ -84,7 +84,7 @@ def load(
         what = f"{path} has contents that do not fit together ({error})"
         raise ModelFileError.of(what, fix="save the model again") from error
     for own in model.placement if isinstance(model, CalibratedKinematics) else ():
-        own.devices.warn_if_unknown()
+        own.warn_if_unknown()
     return model
 
 

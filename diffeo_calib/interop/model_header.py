@@ -41,7 +41,7 @@ from diffeo_calib.robots.payload import NO_PAYLOAD, Payload
 from diffeo_calib.robots.position_errors import PositionErrors
 from diffeo_calib.robots.se3 import rigid
 from diffeo_calib.robots.tree import robot_from_config
-from diffeo_calib.sensors.places import PlacedDevices
+from diffeo_calib.sensors.kinds import stored_devices
 
 UNITS = {"length": "m", "angle": "rad"}
 LARGEST_PARAMETER = 1e6
@@ -122,7 +122,7 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
             "urdf": model.robot.source,
             "provenance": None if model.provenance is None else entries_of(model.provenance),
             "ball": True if model.ball and model.map.workspace is None else None,
-            "placement": [own.entry() for own in model.placement] or None,
+            "placement": [own.stored() for own in model.placement] or None,
         }
         header |= {name: entry for name, entry in known.items() if entry is not None}
         header |= {"report": model.report, "lever": model.lever}
@@ -219,7 +219,7 @@ def rebuild(
     given: dict[str, Any] = {name: header.get(name) for name in ("lever", "tool", "tool_tip")}
     given |= {name: tensors.get(name) for name in ROBOT_TENSORS} | {"learnt": learnt}
     given["ball"] = header.get("ball", False) is True
-    given["placement"] = tuple(PlacedDevices.from_entry(own, len(fitted.x)) for own in header.get("placement", ()))
+    given["placement"] = tuple(stored_devices(own, len(fitted.x)) for own in header.get("placement", ()))
     made = header.get("provenance")
     given["provenance"] = None if made is None else record_of(Provenance, made, "provenance")
     return CalibratedKinematics(k0.geometry.chain, fitted, summary, **given)

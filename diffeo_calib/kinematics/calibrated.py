@@ -35,7 +35,7 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.program import Program
-from diffeo_calib.sensors.places import PlacedDevices
+from diffeo_calib.sensors.devices import Extrinsics
 
 
 @methods_outside_inference_mode
@@ -75,7 +75,7 @@ class CalibratedKinematics:
         rigid_errors: Tensor | None = None,
         provenance: Provenance | None = None,
         ball: bool = False,
-        placement: tuple[PlacedDevices, ...] = (),
+        placement: tuple[Extrinsics, ...] = (),
         scales: Tensor | None = None,
         learnt: Registration | None = None,
     ) -> None:

@@ -67,7 +67,7 @@ def test_pixels_are_better_than_poses() -> None:
 
 
 def test_lens_and_board_are_found_with_the_robot() -> None:
-    camera = calibrated().model.placement[0].devices.cameras["camera"].camera
+    camera = calibrated().model.placement[0].cameras["camera"].camera
     truth, deviations = true_camera().unknowns, camera.deviations
     assert float(((camera.unknowns - truth) / deviations).abs().max()) < 4.5
     before = data().camera
@@ -148,9 +148,7 @@ def kind() -> Any:
 
 
 def camera() -> Any:
-    return next(
-        iter(next(own for own in kind().model.placement if own.devices.cameras).devices.cameras.values())
-    ).camera
+    return next(iter(next(own for own in kind().model.placement if own.cameras).cameras.values())).camera
 
 
 @cache
@@ -173,7 +171,7 @@ def test_the_size_comes_from_board_and_tracker() -> None:
 
 
 def test_the_marker_is_where_it_is_on_the_tool() -> None:
-    placed = next(own for own in kind().model.placement if own.kind == "marker").devices
+    placed = next(own for own in kind().model.placement if own.kind == "marker")
     on_flange = poses_from_marks(camera_arm(60).arm.truth.tool[None], LEVER)[0]
     marker = torch.linalg.inv(on_flange) @ torch.cat([SimulatedArm(seed=1).truth.tool[0], torch.ones(1)])
     away = placed.constants[0, 12:] - marker[:3]
@@ -194,7 +192,7 @@ def test_the_tracker_makes_the_workspace_known() -> None:
 def test_sockets_are_where_they_are() -> None:
     rows = with_sockets()[1]
     found = dc.calibrate(kind().robot, rows, hyperparameters=kind().scales)
-    placed = next(own for own in found.model.placement if own.kind == "contact").devices
+    placed = next(own for own in found.model.placement if own.kind == "contact")
     assert placed.names == ("0/0", "0/1", "1/0", "1/1")
     places, std = placed.constants[:, :3], placed.deviations[:, :3].norm(dim=1)
     for first in (0, 2):  # the sockets of a block are 50 mm apart, which nobody said

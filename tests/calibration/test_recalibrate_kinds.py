@@ -70,7 +70,7 @@ def test_what_was_measured_is_in_the_file(name: str, tmp_path: Path) -> None:
     loaded: Any = dc.load(tmp_path / "model.safetensors")
     assert torch.equal(loaded.map.measured(), model.map.measured())
     for read, kept in zip(loaded.placement, model.placement, strict=True):
-        assert read.entry() == kept.entry()
+        assert read.stored() == kept.stored()
     assert [own.kind for own in model.placement] == {"heights": ["height"], "sockets": ["socket"]}[name]
     again = dc.recalibrate(loaded, CASES[name].new(ARM, 30, 5))
     dc.save(again.model, tmp_path / "again.safetensors")
@@ -129,7 +129,7 @@ def test_a_recalibrated_model_keeps_its_devices() -> None:
 def test_sockets_of_a_registered_model_are_known_as_means_of_their_rows() -> None:
     kind = kind_named("mixture")
     found = quietly(kind.model.registered, kind.moved)
-    sockets = next(own.devices for own in found.placement if own.kind == "socket")
+    sockets = next(own for own in found.placement if own.kind == "socket")
     seen = found(kind.moved.q).detach()[:, -1].numpy()
     again = set(kind.moved.row_sockets) - {""}
     assert set(sockets.names) - again == set(kind.data.row_sockets) - {""} - again  # they stay where they were

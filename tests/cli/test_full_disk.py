@@ -45,17 +45,17 @@ def test_old_files_stay(name: str, server: Server, small_site: Site, sound_path:
     assert sorted(tmp_path.iterdir()) == paths
 
 
-def test_the_model_is_written_although_there_is_no_room_for_its_figure(
+def test_the_model_is_written_although_there_is_no_room_for_its_report(
     server: Server, small_site: Site, sound: bytes, tmp_path: Path
 ) -> None:
-    model, figure = outputs(tmp_path, "model.safetensors", "figure.png")
-    arguments = small_site.fit(small_site.csv, model, "--figure", figure)
+    model, report = outputs(tmp_path, "model.safetensors", "report.html")
+    arguments = small_site.fit(small_site.csv, model, "--report", report)
     done = server(arguments, limit=SMALL)
-    assert (done.code, model.read_bytes(), figure.read_bytes()) == (1, OLD, OLD)
+    assert (done.code, model.read_bytes(), report.read_bytes()) == (1, OLD, OLD)
     assert FULL in done.error
     done = server(arguments, limit=2 * len(sound))
     assert done.code == 1
-    assert f"file '{figure}' {FULL}" in done.error
+    assert f"file '{report}' {FULL}" in done.error
     assert isinstance(dc.load(model), dc.CalibratedKinematics)
-    assert figure.read_bytes() == OLD
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["figure.png", "model.safetensors"]
+    assert report.read_bytes() == OLD
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["model.safetensors", "report.html"]

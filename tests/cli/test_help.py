@@ -18,7 +18,7 @@ ROWS = (
 TEXTS = {
     "fit": (
         f"{ROWS} {UNITS} CSV --robot --base --tip --load --dh-convention -o --output --holdout --seed --controls "
-        "--duplicates --figure --note --scales-of --report"
+        "--duplicates --note --scales-of --report"
     ),
     "campaign": (
         f"{ROWS} {UNITS} CSV --robot --base --tip --load --dh-convention --tolerance --stdin "
@@ -26,7 +26,7 @@ TEXTS = {
     ),
     "record": "BAG --seen -o --output --joints --still --shortest --offset",
     "evaluate": f"{ROWS} {UNITS} MODEL CSV --free -o --output --tolerance --report --against",
-    "init": "CSV ROBOT --places --by -o --output --force",
+    "init": "CSV ROBOT --places --by -o --output",
     "images": "FOLDER JOINTS --board --length -o --output --board-std --report --sep --decimal",
     "predict": f"{UNITS} MODEL CSV --convention --rotation-angle --payload -o --output",
     "correct": (
@@ -43,7 +43,7 @@ TEXTS = {
         "--candidates --target-poses --measured --draw --range --tracker --floor --column --collisions "
         "--sensor --payload"
     ),
-    "recalibrate": f"{ROWS} {UNITS} OLD OTHER -o --output --marker-freedom --drift --seed --note",
+    "recalibrate": f"{ROWS} {UNITS} OLD OTHER -o --output --marker-freedom --seed --note",
     "demo": "-o --output -n --count --seed",
 }
 OPTIONS = {name: [*text.split(), "--json"] for name, text in TEXTS.items()}

@@ -20,12 +20,11 @@ from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.measurements.csv.files import read_measurements, write_measurements
 from diffeo_calib.measurements.poses import (
     angle_between,
-    camera_jacobian,
     inverse_poses,
     mark_jacobian,
     mark_points,
     marks,
-    pose_directions,
+    pose_jacobian,
     poses_from_marks,
     rigid_poses,
     rotation_matrices,
@@ -221,21 +220,6 @@ def test_jacobian_of_the_points_against_differences() -> None:
     assert_close(mark_jacobian(poses, lever), torch.stack(columns, -1), rtol=0, atol=1e-9)
 
 
-def test_pose_covariance_is_that_of_poses_from_marks() -> None:
-    """Monte Carlo: points with an arbitrary noise, and the spread of the poses fitted to them."""
-    rng, lever, pose = np.random.default_rng(0), 0.1, random_poses(1)
-    factor = 1e-5 * rng.normal(size=(9, 9))
-    draws = torch.from_numpy(rng.normal(size=(40_000, 9)) @ factor.T)
-    found = poses_from_marks(mark_points(pose, lever) + draws.unflatten(1, (3, 3)), lever)
-    turns = rotation_numbers(found[:, :3, :3] @ pose[:, :3, :3].mT, "rotvec")
-    errors = torch.cat([found[:, :3, 3] - pose[:, :3, 3], turns], 1)
-    wanted = pose_directions(pose, lever)[0]
-    expected = wanted @ torch.from_numpy(factor @ factor.T) @ wanted.mT
-    scale = expected.diagonal().sqrt()
-    ratio = torch.cov(errors.T) / torch.outer(scale, scale)
-    assert_close(ratio, expected / torch.outer(scale, scale), rtol=0, atol=0.03)
-
-
 # --- rigid transforms -----------------------------------------------------------------------------
 
 
@@ -282,9 +266,10 @@ def seen(**options: Any) -> tuple[Tensor, dc.Measurements]:
 
 
 def test_derivatives_of_the_points_are_those_of_the_inverted_pose() -> None:
-    """Finite differences of the inverse of (exp(w) R, t + dt) by dt and w, in the camera's axes."""
-    boards, data = seen(lever=0.07)
-    found = camera_jacobian(held(data.poses), 0.07, held(data.board))
+    """Finite differences of the inverse of (exp(w) R, t + dt) by dt and w, in the camera's axes; so are deviations."""
+    position, turn = (1e-5 * (1 + draw(ROWS, 3, seed=seed).abs()) for seed in (1, 2))
+    boards, data = seen(lever=0.07, position_std=position, rotation_std=turn)
+    found = pose_jacobian(held(data.frames), 0.07, held(data.board))[:, 0]
     step = 1e-6
     for k, change in enumerate(step * torch.eye(6, dtype=torch.float64, device=HOST)):
 
@@ -293,20 +278,9 @@ def test_derivatives_of_the_points_are_those_of_the_inverted_pose() -> None:
             return mark_points(inverse_poses(transforms(turned, boards[:, :3, 3] + e[:3])), 0.07).flatten(1)
 
         slope = (points(change) - points(-change)) / (2 * step)
-        assert_close(
-            found[..., k], -slope, rtol=0, atol=1e-9
-        )  # the errors of the camera are those of the board, negated
-
-
-def test_covariance_is_that_of_drawn_errors_of_the_board() -> None:
-    position, turn = 1e-5 * (1 + draw(ROWS, 3, seed=1).abs()), 1e-5 * (1 + draw(ROWS, 3, seed=2).abs())
-    boards, data = seen(position_std=position, rotation_std=turn)
-    draws = 20_000
-    shifts, turns = position[:, None] * draw(ROWS, draws, 3, seed=4), turn[:, None] * draw(ROWS, draws, 3, seed=5)
-    wrong = transforms(rotation(turns) @ boards[:, None, :3, :3], boards[:, None, :3, 3] + shifts).flatten(0, 1)
-    away = mark_points(inverse_poses(wrong), 0.1).view(ROWS, draws, 9) - data.points.view(ROWS, 1, 9)
-    known = held(data.covariance)
-    assert_close(away.mT @ away / draws, known, rtol=0, atol=0.03 * float(known.abs().max()))
+        assert_close(found[..., k], -slope, rtol=0, atol=1e-9)  # errors of the camera are those of the board, negated
+    known = found * torch.cat([position, turn], 1)[:, None]
+    assert_close(held(data.covariance), known @ known.mT, rtol=1e-9, atol=1e-18)
 
 
 def test_errors_move_with_the_board_to_another_frame() -> None:

@@ -15,7 +15,6 @@ from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, See
 from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.cameras.board import LENS
 from diffeo_calib.cameras.images import Camera, expected, sees
-from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
 from diffeo_calib.measurements.images import SharedErrors
 from diffeo_calib.measurements.poses import inverse_poses, poses_from_marks
@@ -48,8 +47,7 @@ class CameraErrors(DeviceSet):
     @classmethod
     def around(cls, data: Measurements, rows: Tensor) -> list[Any]:
         """Those of the images of a table beside a model, none for other tables; arguments as of :meth:`of_table`."""
-        none = torch.zeros(0, 1, dtype=torch.float64, device=HOST)  # no entry for the model file
-        return [cls(BoardCameras((), none, none), rows, one.seen_by, one) for one in data.shared_errors()]
+        return [cls(BoardCameras.of_rows(rows, one.seen_by), one) for one in data.shared_errors()]
 
     @property
     def size(self) -> int:
@@ -64,7 +62,7 @@ class CameraErrors(DeviceSet):
         if other.aligned is None:
             raise MeasurementError.of("rows of a camera", expected="images", got="none")
         (shared,) = other.aligned.table.shared_errors()
-        return replace(self, shared=shared, rows=other.aligned.rows, device=shared.seen_by)
+        return replace(self, shared=shared).measuring(other.aligned.rows, shared.seen_by)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +107,7 @@ class LensAndBoard(CameraErrors):
             apart = apart - places @ torch.linalg.lstsq(places, apart, driver="gelsd").solution
             larger = _relative_size(data, registration, free)
             own = data.bodies.pose_lever(), apart.view_as(shared.slopes), larger
-            found.append(cls(BoardCameras.of(cameras), rows, shared.seen_by, shared, *own))
+            found.append(cls(BoardCameras.of_rows(rows, shared.seen_by).with_cameras(cameras), shared, *own))
             if abs(larger) >= SIZE_WARNED:
                 what = "the size of the board does not fit that of the robot"
                 got = f"lengths in the images {100 * abs(larger):.1f} % {'larger' if larger > 0 else 'smaller'}"
@@ -131,7 +129,7 @@ class LensAndBoard(CameraErrors):
             camera = replace(camera, unknowns=camera.unknowns + change, root=root)
             cameras[name] = BoardCamera(camera, own.on_tool, replace(own.explained, **known))
         shared = self.shared._replace(cameras={name: own.camera for name, own in cameras.items()})
-        return replace(self, shared=shared, devices=BoardCameras.of(cameras))
+        return replace(self, shared=shared, devices=self.devices.with_cameras(cameras))
 
     def hypotheses(self, data: Seen) -> Iterator[Hypothesis]:
         effects = data.points.new_zeros(*data.points.shape, 1)
@@ -157,7 +155,7 @@ class LensAndBoard(CameraErrors):
             name: replace(own, explained=replace(own.explained, corners=_corners(shared, number)))
             for number, (name, own) in enumerate(self.devices.cameras.items())
         }
-        return replace(self, shared=shared, devices=BoardCameras.of(cameras))
+        return replace(self, shared=shared, devices=self.devices.with_cameras(cameras))
 
     def sees(self, row: int, points: Tensor, views: Mapping[str, View]) -> Tensor:
         seen = self._boards(row, points, views)

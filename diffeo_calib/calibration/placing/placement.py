@@ -24,7 +24,6 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.sensors.devices import Extrinsics, Hypothesis
-from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import SetUps, View
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings
 
@@ -73,16 +72,25 @@ class Settled(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DeviceSet(ABC):
-    """Devices of one kind and the rows that they measured."""
+    """Devices of one kind in a calibration."""
 
-    devices: Extrinsics  # where they are; before a fit the deviations of their increments are those of the prior
-    rows: Tensor  # (M,) numbers of the rows that they measured
-    device: Tensor  # (M,) which of them did
+    # where they are, and their rows; before a fit the deviations of their increments are those of the prior
+    devices: Extrinsics
 
     @property
     def names(self) -> tuple[str, ...]:
         """Of the devices."""
         return self.devices.names
+
+    @property
+    def rows(self) -> Tensor:
+        """(M,) numbers of the rows that they measured."""
+        return self.devices.rows
+
+    @property
+    def device(self) -> Tensor:
+        """(M,) which of them did."""
+        return self.devices.device
 
     def by_row(self, count: int) -> Tensor:
         """(N,) numbers of the devices of all rows, -1 for rows of none."""
@@ -92,7 +100,11 @@ class DeviceSet(ABC):
 
     def of_rows(self: S, rows: Tensor) -> S:
         """The same among more rows, of which these (M,) are those here."""
-        return replace(self, rows=rows[self.rows])
+        return self.measuring(rows[self.rows], self.device)
+
+    def measuring(self: S, rows: Tensor, device: Tensor) -> S:
+        """The same devices with other rows (M,), each of one of them."""
+        return replace(self, devices=replace(self.devices, rows=rows, device=device))
 
     @property
     @abstractmethod
@@ -114,10 +126,6 @@ class DeviceSet(ABC):
     def at_places(self, table: T) -> T:
         """Rows that tell coordinates where these devices put them."""
         return table
-
-    def placed(self) -> PlacedDevices:
-        """Their entries for the model file."""
-        return PlacedDevices(self.devices, self.rows, self.device)
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:  # noqa: B027
         """Warn (DiffeoCalibWarning) of what these devices leave open in a model, and of what would show it."""
@@ -233,9 +241,9 @@ class Placement(tuple[DeviceSet, ...]):
             found[name] = own | {key: before[key] | own[key] for key in before}
         return found
 
-    def placed(self) -> tuple[PlacedDevices, ...]:
-        """Entries of all devices for the model file."""
-        return tuple(found for own in self if (found := own.placed()).names)
+    def placed(self) -> tuple[Extrinsics, ...]:
+        """What a model keeps of all devices."""
+        return tuple(own.devices for own in self if own.names)
 
 
 class OtherLabel(NamedTuple):

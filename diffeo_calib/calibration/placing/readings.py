@@ -36,7 +36,6 @@ from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.devices import Devices, Hypothesis, check_devices
 from diffeo_calib.sensors.kinds import kind_of
-from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.tables import OtherReadings
 
 ROUGH_M = 2e-3
@@ -73,9 +72,6 @@ class ReadingDevices(DeviceSet):
         """(r,) where their r numbers stand in these rows."""
         return torch.arange(self.data.values.shape[1], device=self.rows.device)
 
-    def placed(self) -> PlacedDevices:
-        return replace(super().placed(), shown=self.data.shown)
-
     def _seen(self, data: Seen) -> Tensor:
         """(M, 3 k) coordinates of what the devices see, m."""
         return self.devices.points_of(data.points[self.rows].unflatten(1, (-1, 3)))
@@ -101,7 +97,7 @@ class ReadingDevices(DeviceSet):
 
     def with_rows(self, other: OtherRows) -> ReadingDevices:
         own = next(one for one in other.readings if one.table.column_kind == self.data.column_kind)
-        return replace(self, data=own.table, rows=own.rows, device=self.devices.numbers(own.table))
+        return replace(self, data=own.table).measuring(own.rows, self.devices.numbers(own.table))
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:
         """Warn if most of the expected error is the robot's size."""
@@ -210,7 +206,7 @@ def reading_sets(
 ) -> tuple[ReadingDevices, ...]:
     """Sets of devices and the rows that they measured; ``frame``: that of the devices, in words."""
     each = zip(readings, devices, strict=True)
-    return tuple(ReadingDevices(own, rows, own.numbers(table), table, frame) for (table, rows), own in each)
+    return tuple(ReadingDevices(own, table, frame).measuring(rows, own.numbers(table)) for (table, rows), own in each)
 
 
 def check_known(tables: Sequence[Readings], registration: Identification, found: Identification) -> None:

@@ -28,7 +28,6 @@ from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register, register_inliers, spread
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherLabel, OtherRows, Seen, Settled
-from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.fitting.result import Progress
 from diffeo_calib.measurements.observations import Observations
@@ -118,7 +117,7 @@ class Sessions(DeviceSet):
         reference = int(torch.bincount(session[session != NO_SOCKET], minlength=len(names)).argmax())
         found = kind.of(seen, data, geometry.marker_turns)
         rows = (session != NO_SOCKET).nonzero()[:, 0]
-        return cls(found.with_reference(reference), rows, session[rows], reference, data.markers)
+        return cls(found.with_reference(reference), reference, data.markers).measuring(rows, session[rows])
 
     @staticmethod
     def beside(
@@ -196,7 +195,7 @@ class Sessions(DeviceSet):
         if other.coordinates is not None and device is not None:
             number = self.devices.numbers(device.table)
             rows, number = other.coordinates.rows[device.rows][number != NO_SOCKET], number[number != NO_SOCKET]
-        return replace(self, rows=rows, device=number, centre=other.centre)
+        return replace(self, centre=other.centre).measuring(rows, number)
 
 
 def _doubt(robot: Tree, data: Measurements, median: float) -> None:
@@ -239,9 +238,8 @@ class Drift(DeviceSet):
         joints = tuple(zip(chain.joint_names, chain.periodic, strict=True))
         nothing = values.new_zeros(values.shape[1], OFFSETS + len(joints))
         ends = values.amin(0), values.amax(0), *values.new_zeros(3, len(nothing))
-        known = KnownDrift(data.covariate_names, torch.cat([torch.stack(ends, 1), nothing], 1), nothing, joints)
-        none = torch.zeros(0, dtype=torch.int64, device=HOST)
-        return [cls(known, none, none, known.ramp(data), data.q)]
+        known = KnownDrift(data.covariate_names, torch.cat([torch.stack(ends, 1), nothing], 1), nothing, joints=joints)
+        return [cls(known, known.ramp(data), data.q)]
 
     @property
     def size(self) -> int:

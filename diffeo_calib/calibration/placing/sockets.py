@@ -101,8 +101,8 @@ class SocketDevices(DeviceSet):
         root = torch.linalg.solve_triangular(R[:, :-1], wide, upper=True)
         places, rows = positions + (root @ R[:, -1]).view(-1, 3), (data.socket_numbers != NO_SOCKET).nonzero()[:, 0]
         covariance = root @ root.mT
-        devices = SocketPlaces(sockets.names, places, _deviations(covariance))
-        return cls(devices, rows, data.socket_numbers[rows], sockets, root, not data.without_device, covariance)
+        devices = SocketPlaces(sockets.names, places, _deviations(covariance), rows, data.socket_numbers[rows])
+        return cls(devices, sockets, root, not data.without_device, covariance)
 
     @classmethod
     def around_model(cls, table: Measurements, rows: Tensor, seen: Tensor) -> list[SocketDevices]:
@@ -186,7 +186,7 @@ class SocketDevices(DeviceSet):
             B = frame_slopes(positions[None], positions.mean(0))[0]  # (3 S, 6)
             root = root - B @ (torch.linalg.pinv(B) @ root)
         covariance = root @ found.covariance @ root.mT
-        devices = SocketPlaces(self.names, positions, _deviations(covariance))
+        devices = replace(self.devices, constants=positions, deviations=_deviations(covariance))
         left_out = () if found.chosen is None else self._left_out(found.chosen)
         return replace(self, devices=devices, covariance=covariance, left_out=left_out)
 
@@ -195,7 +195,7 @@ class SocketDevices(DeviceSet):
         if other.coordinates is not None:
             socket = self.named(other.coordinates.table).socket_numbers
             rows, socket = other.coordinates.rows[socket != NO_SOCKET], socket[socket != NO_SOCKET]
-        return replace(self, rows=rows, device=socket)
+        return self.measuring(rows, socket)
 
     def named(self, table: Measurements) -> Measurements:
         """The rows of a table with these sockets; MeasurementError for others."""

@@ -286,8 +286,8 @@ def without_positions(model: CalibratedKinematics) -> bool:
     shared = model.map.noise.shared
     other = torch.zeros(len(shared), dtype=torch.bool, device=shared.device)
     for own in model.placement:
-        if own.devices.seen_points or own.devices.cameras:
+        if own.seen_points or own.cameras:
             other[own.rows] = True
-        if own.devices.cameras:
+        if own.cameras:
             other |= (shared != 0).any(1).sum(1) >= len(UNKNOWNS)
     return bool(other.all())

@@ -28,7 +28,7 @@ def run(given: RecalibrateOptions) -> None:
         return _compare(given)
     model = load_kinematics(given.old)
     source = table_of(model, given.other, given)
-    how: Any = {"marker": given.marker_freedom, "seed": given.seed, "drift": given.drift, "note": given.note}
+    how: Any = {"marker": given.marker_freedom, "seed": given.seed, "note": given.note}
     say(*provenance_lines(model), *another_date_lines(model))
     with progress_bar() as progress:
         data = source.read(model.robot)
