@@ -165,14 +165,13 @@ def poses_from_marks(points: Tensor, lever: float) -> Tensor:
     if isinstance(points, Tensor) and wrapped(points):
         return poses_of_triangles(points)
     places = as_tensor(points, "points", ("N", 3, 3), fix="pass the three points of a pose", empty=True).detach()
-    centre = places.mean(1)
-    spread = (places - centre[:, None]).mT @ marks(places.device)  # sum_k (p_k - centre) u_k^T
+    spread = (places - places.mean(1, keepdim=True)).mT @ marks(places.device)  # sum_k (p_k - centre) u_k^T
     thickness = torch.linalg.svdvals(spread)[:, 1] / (1.5 * lever)  # 1 for an unbent triangle
     if bool((thickness < FLATTEST_TRIANGLE_LEVERS).any()):
         row = int((thickness < FLATTEST_TRIANGLE_LEVERS).nonzero()[0])
         what = f"row {row}: the three points of the pose lie on one line"
         raise InputError.of(what, expected=f"a triangle with corners {lever:g} m from its centre")
-    return transforms(se3.nearest_rotations(spread), centre)
+    return poses_of_triangles(places)
 
 
 def poses_of_triangles(points: Tensor) -> Tensor:
@@ -267,16 +266,9 @@ def points_of_frames(frames: Tensor, lever: float) -> Tensor:
 
 def frames_of_points(points: Tensor, lever: float) -> Tensor:
     """The frames (N, T, 4, 4), NaN where hidden, of points (N, 3 T, 3), m; see :func:`poses_from_marks`."""
-    triples = points.unflatten(1, (-1, POINTS))
-    if wrapped(points):
-        check_lever(lever)
-        return poses_of_triangles(triples)
-    hidden = triples.isnan().flatten(2).any(2)
-    if not bool(hidden.any()):
-        return poses_from_marks(triples.flatten(0, 1), lever).unflatten(0, triples.shape[:2])
-    found = triples.new_full((*hidden.shape, 4, 4), torch.nan)
-    found[~hidden] = poses_from_marks(triples[~hidden], lever)
-    return found
+    check_lever(lever)
+    triples = (points if wrapped(points) else points.detach()).unflatten(1, (-1, POINTS))
+    return poses_of_triangles(triples).masked_fill(triples.isnan().flatten(2).any(2)[..., None, None], torch.nan)
 
 
 def transforms_of_frames(rotations: Tensor, places: Tensor) -> Tensor:

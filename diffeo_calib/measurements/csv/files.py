@@ -191,7 +191,7 @@ def read_joints(path: str | PathLike[str], table: TableFormat) -> Tensor:
 
 def read_configurations(path: str | PathLike[str], table: TableFormat) -> dict[str, Tensor]:
     """Joint values "q" as of :func:`read_joints`, with the "payload" (N,), "time" and "temperature" that are named."""
-    rows = read_table(Path(path), Columns.of(table.joints_only()))
+    rows = read_table(path if isinstance(path, Path) else Path(path), Columns.of(table.joints_only()))
     return {"q": rows.q} | rows.beside
 
 
