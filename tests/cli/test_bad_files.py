@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_bank import TABLE, Command, Site, edited, set_cell
+from command_bank import TABLE, Command, Site
 
 import diffeo_calib as dc
 
@@ -38,19 +38,6 @@ def test_a_model_of_a_plain_function(small_site: Site, command: Command, tmp_pat
     done = command("evaluate", tmp_path / "plain.safetensors", small_site.csv, *TABLE)
     assert done.code == 1
     assert "plain function" in done.error
-
-
-def test_a_model_s_joints_missing_in_the_table(
-    small_site: Site, sound: bytes, command: Command, tmp_path: Path
-) -> None:
-    (tmp_path / "model").write_bytes(sound)
-    csv = edited(small_site, tmp_path / "bad.csv", set_cell(0, 5, "wrist_rol_joint"))
-    done = command("evaluate", tmp_path / "model", csv, *TABLE)
-    assert done.code == 1
-    assert "did you mean wrist_rol_joint" in done.error
-    done = command("evaluate", tmp_path / "model", small_site.csv, *TABLE, "--joints", "waist_joint")
-    assert done.code == 1
-    assert "expected 6 columns, in the order waist_joint" in done.error
 
 
 PLACES = [("none/file.png", "No such file or directory"), ("here.png", "Is a directory")]
