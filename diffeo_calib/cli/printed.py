@@ -40,38 +40,36 @@ class ErrorTable:
     """Errors in their own unit, and of orientations in degrees if there are any; in two tables where one is too wide.
 
     Args:
-        errors: of the kind to show. of: whose they are, the end of the title. columns: names of the leading columns.
+        rows: what each row is called -> its errors, all of one kind. of: whose they are, the end of the title.
+        columns: names of the leading columns. expected: RMS, m, in a column of its own.
     """
 
-    def __init__(self, errors: Evaluation, of: str, *columns: str) -> None:
-        self.title, self.of, self.columns = f"{errors.title} in {errors.shown[0]}", of, columns
-        self.rows: list[tuple[tuple[str, ...], tuple[list[float], ...]]] = []
+    def __init__(
+        self, rows: Mapping[tuple[str, ...], Evaluation], of: str, *columns: str, expected: float | None = None
+    ) -> None:
+        self.rows, self.of, self.columns, self.expected = rows, of, columns, expected
 
-    def add(self, errors: Evaluation, *labels: str, expected: float | None = None) -> None:
-        """Add a row: its errors, what it is called, and the expected RMS."""
-        last = [] if expected is None else [errors.shown[1] * expected]
-        turned = errors.orientation
-        self.rows.append((labels, (errors.sizes, [] if turned is None else turned.sizes, last)))
-
-    def _table(self, title: str, *groups: int) -> Table:
-        """A table of some groups of numbers: 0 errors, 1 those of orientations, 2 expected errors."""
-        names, own = (SIZES, [f"{size} deg" for size in SIZES], ["expected RMS"]), self.rows[0][1]
-        header = [*self.columns, *(name for group in groups for name in names[group][: len(own[group])])]
-        rows = [
-            [*labels, *("-" if isnan(value) else f"{value:.4f}" for group in groups for value in numbers[group])]
-            for labels, numbers in self.rows
-        ]
-        return text_table(title, header, rows, len(self.columns))
+    def _table(self, title: str, *, errors: bool = True, angles: bool) -> Table:
+        """A table of errors, those of orientations, or both."""
+        last = [self.expected] if self.expected is not None and errors else []
+        header = [*self.columns, *SIZES * errors, *[f"{size} deg" for size in SIZES] * angles]
+        lines = list[list[str]]()
+        for labels, own in self.rows.items():
+            each = own.each[not errors : 1 + angles]
+            numbers = [*(size for one in each for size in one.sizes), *(own.shown[1] * value for value in last)]
+            lines.append([*labels, *("-" if isnan(value) else f"{value:.4f}" for value in numbers)])
+        return text_table(title, [*header, *["expected RMS"] * len(last)], lines, len(self.columns))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:
-        angles = bool(self.rows[0][1][1])
-        whole = self._table(f"{self.title} {self.of}" + ", orientation errors in deg" * angles, 0, 1, 2)
+        one = next(iter(self.rows.values()))
+        title, turned = f"{one.title} in {one.shown[0]} {self.of}", one.orientation is not None
+        whole = self._table(title + ", orientation errors in deg" * turned, angles=turned)
         wide = options.update(max_width=WIDEST)
-        if not angles or console.measure(whole, options=wide).maximum <= options.max_width:
+        if not turned or console.measure(whole, options=wide).maximum <= options.max_width:
             yield whole
         else:
-            yield self._table(f"{self.title} {self.of}", 0, 2)
-            yield self._table(f"Orientation errors in deg {self.of}", 1)
+            yield self._table(title, angles=False)
+            yield self._table(f"Orientation errors in deg {self.of}", errors=False, angles=True)
 
 
 def outlier_lines(outliers: Sequence[Outlier], rows: int, what: str = "training rows") -> Iterator[str]:

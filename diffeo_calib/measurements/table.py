@@ -133,7 +133,7 @@ class Measurements(ImageTable):
                 in the same shapes.
             camera_on_tool: the poses are those of a fixed board in the frame of a camera on the tool, as detectors of
                 boards return them, and deviations are along the camera's axes. They are kept inverted, as the camera's
-                poses in the board's frame, see :func:`~diffeo_calib.measurements.poses.camera_jacobian`.
+                poses in the board's frame, see :func:`~diffeo_calib.measurements.poses.pose_jacobian`.
 
         Raises:
             MeasurementError: as the constructor; a transform that is not rigid (its row is named); a lever or a

@@ -152,11 +152,6 @@ class TableFormat:
             return []
         return list(by_frame("position", self.position, "three names of columns for each marker", 3))
 
-    @property
-    def in_a_plane(self) -> int:
-        """How many markers have a z-coordinate of 0 in all rows, unless the file has a column of this name."""
-        return sum(names[2] == ZERO for names in self.triples)
-
     def for_reading(self) -> TableFormat:
         """The same format with checked options of the rotation.
 

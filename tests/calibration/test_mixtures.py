@@ -27,7 +27,6 @@ from diffeo_calib.calibration.identification.identification import (
 )
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.placing.place import place
-from diffeo_calib.calibration.result import errors_by_kind
 from diffeo_calib.calibration.scales.selection import defaults, log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import MeasurementError
@@ -278,10 +277,10 @@ def test_sockets_and_distances_alone() -> None:
     error = rigid_rms(result.model(q).detach(), PLAIN.true_points(q))
     assert 0.5 * result.expected.workspace < error < 1.8 * result.expected.workspace
     assert result.fit.converged
-    kinds = errors_by_kind(result, data)
+    kinds = result.errors(data)
     assert len(kinds) == 2
     for one in kinds.values():
-        assert one.stages["calibrated"].rms < one.stages["geometric"].rms
+        assert one["calibrated"].rms < one["geometric"].rms
 
 
 @pytest.mark.slow

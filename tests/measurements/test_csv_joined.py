@@ -51,14 +51,6 @@ def test_messages_name_both_files(tmp_path: Path) -> None:
         dc.read_measurements(found, ["a", "b"], ["x", "y", "z"], length="m", angle="rad")
 
 
-def test_the_file_goes_with_its_path(tmp_path: Path) -> None:
-    found = joined(tmp_path)
-    folder = Path(found.__fspath__()).parent
-    assert folder.is_dir()
-    del found
-    assert not folder.exists()
-
-
 def test_files_may_have_separators_of_their_own(tmp_path: Path) -> None:
     found = joined(tmp_path, places=tuple(line.replace(",", ";") for line in PLACES))
     assert read_cells(found, ",")[1][0] == (2, ["p3", "5", "6", "9", "9", "9"])

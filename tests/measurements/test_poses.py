@@ -20,11 +20,11 @@ from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.measurements.csv.files import read_measurements, write_measurements
 from diffeo_calib.measurements.poses import (
     angle_between,
-    camera_jacobian,
     inverse_poses,
     mark_jacobian,
     mark_points,
     marks,
+    pose_jacobian,
     poses_from_marks,
     rigid_poses,
     rotation_matrices,
@@ -266,9 +266,10 @@ def seen(**options: Any) -> tuple[Tensor, dc.Measurements]:
 
 
 def test_derivatives_of_the_points_are_those_of_the_inverted_pose() -> None:
-    """Finite differences of the inverse of (exp(w) R, t + dt) by dt and w, in the camera's axes."""
-    boards, data = seen(lever=0.07)
-    found = camera_jacobian(held(data.poses), 0.07, held(data.board))
+    """Finite differences of the inverse of (exp(w) R, t + dt) by dt and w, in the camera's axes; so are deviations."""
+    position, turn = (1e-5 * (1 + draw(ROWS, 3, seed=seed).abs()) for seed in (1, 2))
+    boards, data = seen(lever=0.07, position_std=position, rotation_std=turn)
+    found = pose_jacobian(held(data.frames), 0.07, held(data.board))[:, 0]
     step = 1e-6
     for k, change in enumerate(step * torch.eye(6, dtype=torch.float64, device=HOST)):
 
@@ -277,9 +278,9 @@ def test_derivatives_of_the_points_are_those_of_the_inverted_pose() -> None:
             return mark_points(inverse_poses(transforms(turned, boards[:, :3, 3] + e[:3])), 0.07).flatten(1)
 
         slope = (points(change) - points(-change)) / (2 * step)
-        assert_close(
-            found[..., k], -slope, rtol=0, atol=1e-9
-        )  # the errors of the camera are those of the board, negated
+        assert_close(found[..., k], -slope, rtol=0, atol=1e-9)  # errors of the camera are those of the board, negated
+    known = found * torch.cat([position, turn], 1)[:, None]
+    assert_close(held(data.covariance), known @ known.mT, rtol=1e-9, atol=1e-18)
 
 
 def test_errors_move_with_the_board_to_another_frame() -> None:
