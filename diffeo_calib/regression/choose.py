@@ -11,8 +11,7 @@ from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.cholesky import CholeskyRegression
-from diffeo_calib.regression.conditional import DataConditional
+from diffeo_calib.regression.conditional import Process
 from diffeo_calib.regression.conjugate_gradients import CG_TOLERANCE, MAX_RANK, ConjugateGradientRegression
 from diffeo_calib.regression.control_points import BLOCK_ENTRIES, ControlPointRegression
 
@@ -27,7 +26,7 @@ BYTES_PER_GIB = 2.0**30
 
 def condition(
     linearisation: Linearisation, noise: Noise, linear: LinearSolver = "auto", tolerance: float = CG_TOLERANCE
-) -> DataConditional:
+) -> Process | ConjugateGradientRegression:
     """Condition on data that are all control points; ``tolerance`` is that of conjugate gradients.
 
     Raises:
@@ -38,7 +37,7 @@ def condition(
     method = choose(linear, n * m)
     check_memory(predicted_memory(method, n * m), f"{n * m} measured coordinates with linear={method!r}")
     if method == "cholesky":
-        return CholeskyRegression(linearisation, noise)
+        return Process.of_rows(linearisation, noise)
     return ConjugateGradientRegression(linearisation, noise, tolerance=tolerance)
 
 

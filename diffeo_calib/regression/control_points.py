@@ -34,7 +34,8 @@ from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.conditional import NOISE_ADVICE, Conditional, Features, of_parameters
+from diffeo_calib.regression.cholesky import NOISE_ADVICE
+from diffeo_calib.regression.conditional import Conditional, Features, of_parameters
 
 JITTER_RATIO = 1e-13
 """Added to the diagonal of the controls' kernel matrices, relative to its largest entry: the level of rounding."""
@@ -145,7 +146,7 @@ class ControlPointRegression(Conditional):
             expressed = self._whiten(rows.T)  # (size, M r)
             left = torch.linalg.solve_triangular(self.core, expressed, upper=False)
         fields = self.size - self.like.theta.numel() - self._shifts  # momenta
-        return Features.of(at, (expressed[:fields], -1), (left, 1))
+        return Features(at, expressed[:fields], left)
 
     def _blocks(self, size: int) -> list[Tensor]:
         """Row numbers of the blocks of data that this process works on."""

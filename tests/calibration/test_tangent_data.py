@@ -110,7 +110,7 @@ def test_six_numbers_say_what_nine_coordinates_do(posed: Setting) -> None:
     process, gram = told.process(posed.scales), at.gram()
     found = gram @ process.mu
     assert_close(found, basis.T @ mean, rtol=0, atol=1e-4 * float(mean.abs().max()))
-    left = process.expected(told.numbers).covariance
+    left = process.covariance_between(process.numbers.at)
     assert_close(left, gram - basis.T @ covariance @ basis, rtol=0, atol=1e-3 * float(left.abs().max()))
 
 

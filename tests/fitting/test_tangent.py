@@ -10,7 +10,7 @@ from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.problem import Problem, Regression, tangent
 from diffeo_calib.flows.integrators import RK4
 from diffeo_calib.regression import choose
-from diffeo_calib.regression.cholesky import CholeskyRegression
+from diffeo_calib.regression.conditional import Process
 
 
 def subset(problem: Problem, rows: list[int]) -> Problem:
@@ -33,9 +33,9 @@ PROBLEMS = {
 every_problem = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=PROBLEMS.keys())
 
 
-def dense(regression: Regression) -> CholeskyRegression:
-    assert isinstance(regression.conditional, CholeskyRegression)
-    return regression.conditional
+def dense(regression: Regression) -> Process:
+    assert isinstance(regression.conditional, Process)
+    return regression.conditional.about(regression.target)
 
 
 @every_problem
@@ -53,13 +53,14 @@ def test_factor_and_target_at_zero(problem: Problem) -> None:
     torch.testing.assert_close(dense(regression).factor.matrix, expected, rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(regression.target, problem.y - k0, rtol=0, atol=1e-15)
     mu = torch.linalg.solve(expected, (problem.y - k0).flatten()).reshape(problem.y.shape)
-    torch.testing.assert_close(dense(regression).mu(regression.target), mu, rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(dense(regression).mu.view_as(mu), mu, rtol=1e-8, atol=1e-8)
 
 
 @every_problem
 def test_leave_one_out_is_refitting_without_the_row(problem: Problem) -> None:
     regression = tangent(problem)
-    errors, _ = dense(regression).left_out(regression.target)
+    process = dense(regression)
+    errors = process.left_out(process.numbers.owner)[0].view(problem.y.shape)
     zero = torch.zeros(0, dtype=torch.float64)
     count = len(problem.x)
     for left_out in range(count):

@@ -21,7 +21,6 @@ from two_arms_bank import HANDS, robot
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.compensation.problem import joint_limits
-from diffeo_calib.kinematics.compensation.search import Box, Search
 from diffeo_calib.kinematics.compensation.targets import Targets, ToolFunctions, tool_functions
 from diffeo_calib.measurements.poses import angle_between
 from diffeo_calib.robots.joint import Joint
@@ -171,18 +170,6 @@ def test_gradient_and_hessian_of_the_cost(model: dc.CalibratedKinematics, axes: 
         np.testing.assert_allclose(slope(q)[:, joint], rise / (2 * h), rtol=0, atol=1e-8)
         change = (slope(q + step) - slope(q - step)) / (2 * h)
         np.testing.assert_allclose(hessian[:, :, joint], change, rtol=0, atol=1e-8)
-
-
-@pytest.mark.parametrize("side", [1.0, -1.0])
-def test_joints_that_push_against_their_limits_are_apart(side: float) -> None:
-    tool, goal, q = rigid(model_of(CHAINS["arm"], dc.RK4(1)), 3)
-    box = Box(q, np.minimum(q, q - side), np.maximum(q, q - side), np.ones_like(q))
-    found = Search(tool, goal, q, box)
-    found.begin(exact=True)
-    free = side * found.gradient > 0
-    assert 5 < free.sum() < free.size - 5
-    together = (free[:, :, None] & free[:, None, :]) | np.eye(q.shape[1], dtype=bool)
-    np.testing.assert_array_equal(np.abs(found.hessian) > 1e-12, together)
 
 
 # --- limits ---------------------------------------------------------------------------------------------------------

@@ -25,8 +25,7 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.regression import choose, conditional, control_points
 from diffeo_calib.regression import conjugate_gradients as iterative
-from diffeo_calib.regression.cholesky import CholeskyRegression
-from diffeo_calib.regression.conditional import Conditional
+from diffeo_calib.regression.conditional import Conditional, Process
 from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegression, partial_cholesky, pivots
 from diffeo_calib.regression.control_points import ControlPointRegression
 from diffeo_calib.robots import elastic_rr
@@ -55,7 +54,7 @@ every_seen = pytest.mark.parametrize("problem", SEEN.values(), ids=SEEN.keys())
 
 Way = Callable[[Problem, GeodesicDeformation], Any]
 WAYS: dict[str, Way] = {
-    "cholesky": lambda problem, at: CholeskyRegression(at.linearise(), problem.noise),
+    "cholesky": lambda problem, at: Process.of_rows(at.linearise(), problem.noise),
     "iterative": lambda problem, at: ConjugateGradientRegression(at.linearise(), problem.noise),
     "iterative, poor preconditioner": lambda problem, at: ConjugateGradientRegression(
         at.linearise(), problem.noise, rank=4
@@ -181,7 +180,7 @@ def test_any_kernel_in_both_flows(kernel: Kernel) -> None:
     torch.testing.assert_close(projected.rows(some).own_blocks(), blocks[some], rtol=1e-12, atol=1e-13)
     expected = naive_covariance(problem, data, queries)
     prior = float(naive_gram(queries, queries).diagonal().max())
-    close(CholeskyRegression(data, problem.noise).covariance(queries), expected, prior, 1e-10)
+    close(Process.of_rows(data, problem.noise).covariance(queries), expected, prior, 1e-10)
 
 
 @every_seen
@@ -216,12 +215,12 @@ def test_parameters_apart_are_the_formula(problem: Problem) -> None:
     at, x = deformed(problem), uniform(7, 2, seed=20)
     data, queries = (with_parameters(problem, at, points, 2.0) for points in (problem.x, x))
     expected, prior = naive_covariance(problem, data, queries), float(naive_gram(queries, queries).diagonal().max())
-    regression = CholeskyRegression(data, problem.noise)
+    regression = Process.of_rows(data, problem.noise)
     close(regression.covariance(queries), expected, prior, 1e-10)
     values, K = normal(len(data.gram()), 3, seed=8), data.gram() + matrix_of(problem)
-    solved = regression.solve(values.view(*problem.y.shape, 3)).flatten(0, 1)
+    solved = regression.factor.solve(values)
     torch.testing.assert_close(solved, torch.linalg.solve(K, values), rtol=1e-6, atol=1e-6)
-    C = torch.stack([regression.of_white(column) for column in torch.eye(len(K), dtype=torch.float64)], 1)
+    C = torch.stack([regression.factor.of_white(column) for column in torch.eye(len(K), dtype=torch.float64)], 1)
     torch.testing.assert_close(C.T @ K @ C, torch.eye(len(K), dtype=torch.float64), rtol=0, atol=1e-6)
 
 
@@ -232,7 +231,7 @@ def test_wide_priors_do_not_cancel() -> None:
     found = []
     for wide in (1e8, 1e16):
         data, queries = (with_parameters(problem, at, points, wide) for points in (problem.x, x))
-        found.append(CholeskyRegression(data, problem.noise).covariance(queries))
+        found.append(Process.of_rows(data, problem.noise).covariance(queries))
     torch.testing.assert_close(found[0], found[1], rtol=1e-6, atol=1e-9 * float(found[1].abs().max()))
 
 
@@ -273,7 +272,7 @@ def test_covariance_of_a_large_problem(problem: Problem, wide: float, monkeypatc
         replace(lin, spec=model, sensitivity=torch.ones(*lin.sensitivity.shape[:2], 1, dtype=torch.float64))
         for lin in (at.linearise(), at.linearise(uniform(6, 2, seed=20)))
     )
-    expected = CholeskyRegression(data, problem.noise).covariance(queries)
+    expected = Process.of_rows(data, problem.noise).covariance(queries)
     scale = float(expected.abs().max())
     actual = ConjugateGradientRegression(data, problem.noise).covariance(queries)
     torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5 * scale)

@@ -152,6 +152,12 @@ def register_readings(bare: Geometry, tables: Sequence[Readings]) -> Identificat
     return described(rows, [noise] * len(tables), adrift=True)
 
 
+def rough_error(bare: Geometry, tables: Sequence[Readings]) -> float:
+    """RMS error of the readings from the first starts of :func:`register_readings`, m; infinite where none leads on."""
+    found = _rough_fits(tables, _starts(bare, tables))
+    return float(torch.cat([own.flatten() for own in found[0].errors]).square().mean().sqrt()) if found else inf
+
+
 class RoughFit(NamedTuple):
     """Ball and devices from one start, with errors (N, 1, r) of all readings, m.
 

@@ -210,14 +210,14 @@ class SocketDevices(DeviceSet):
         What the others tell about shifts that they share with it, those of a distance, is no prediction of the model.
         """
         data, sockets, found = chosen.data, self.sockets, []
-        numbers, process = data.numbers, data.process(chosen.selection.scales)
-        shared = numbers.S[:, data.sensitivities.shape[2] :]
+        process = data.process(chosen.selection.scales)
+        numbers, shared = process.numbers, process.numbers.of_table(data.shared)
         socket = self.by_row(len(data.y))
         place = torch.where(socket == NO_SOCKET, NO_SOCKET, sockets.place[socket])
         ball = numbers.cells % numbers.shape[1] >= numbers.shape[1] - 3
         for number, name in enumerate(sockets.place_names):
             index = (ball & (place[numbers.owner] == number)).nonzero()[:, 0]
-            index, rows = index[numbers.cells[index].argsort()], (place == number).nonzero()[:, 0]
+            rows = (place == number).nonzero()[:, 0]
             errors = process.left_out(place.new_full(numbers.cells.shape, -1).index_fill(0, index, 0))[0][index]
             others = process.mu - process.inverse[:, index] @ errors  # K^-1 y without the place
             errors = errors + shared[index] @ (shared.T @ others)
