@@ -97,6 +97,8 @@ class NominalChain:
     motions: Array  # (4, n_all, 4, 4) C, S, D, L
     coupling: Array  # (n_all, n), and below (n_all,): moving joints' values from the active ones'
     coupling_offset: Array
+    names: tuple[str, ...]  # of the n active joints
+    limits: Array  # (n, 2) their lower and upper limits, infinite without one
 
     @cached_property
     def ancestors(self) -> np.ndarray:
