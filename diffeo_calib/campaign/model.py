@@ -18,6 +18,7 @@ from diffeo_calib.calibration.choose_scales import VARIANCE_RATIO, choose_scales
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import changes_of
 from diffeo_calib.calibration.placing.place import Placed, place
+from diffeo_calib.calibration.placing.placement import Elsewhere
 from diffeo_calib.calibration.planning.candidates import candidates, ranges_around
 from diffeo_calib.calibration.planning.knowledge import greedy
 from diffeo_calib.calibration.scales.leave_one_out import variance_ratio
@@ -139,34 +140,43 @@ class Around:
 
     @cached_property
     def like(self) -> int:
-        """Number of the row as which the candidates would be measured, see :meth:`Placed.row_like`."""
-        return self.placed.row_like(self.candidates)
+        """Number of the last row as which some of the candidates can be measured; else the very last."""
+        last = len(self.placed.data) - 1
+        return next((row for row in range(last, -1, -1) if bool(self._sees(row, self.candidates).any())), last)
+
+    @property
+    def _elsewhere(self) -> list[Elsewhere]:
+        """That row at the candidates."""
+        return self.placed.elsewhere(self.like, self.candidates)
+
+    def _sees(self, row: int, q: Tensor) -> Tensor:
+        """(M,) boolean: configurations in which a row can be measured."""
+        every = torch.ones(len(q), dtype=torch.bool, device=q.device)
+        return torch.stack([every, *(own.there for own in self.placed.elsewhere(row, q))]).all(0)
 
     @cached_property
     def open(self) -> Tensor:
         """(M,) boolean, candidates that can be measured."""
-        return self.placed.sees(self.like, self.candidates)
+        return self._sees(self.like, self.candidates)
 
     def with_open_candidates(self, count: int, seed: int) -> Around:
         """The same with ``count`` candidates that can be measured, drawn where some of these cannot; else itself."""
-        robot = self.placed.registration.geometry.chain
+        geometry, places = self.placed.identification.geometry, [own.places for own in self._elsewhere]
+        chain, base = geometry.chain, geometry.base
+        how: Any = {"ranges": ranges_around(chain, self.placed.data.q), "keep": partial(self._sees, self.like)}
+        if any(map(len, places)):
+            how |= {"places": (torch.cat(places) - base[:3, 3]) @ base[:3, :3], "ball": geometry.tool[-1]}
         with suppress(InputError):  # hardly any can
             if not bool(self.open.all()):
-                how: Any = {
-                    "ranges": ranges_around(robot, self.placed.data.q),
-                    **self.placed.places_to_reach(self.like),
-                }
-                return replace(
-                    self,
-                    candidates=candidates(robot, count, keep=partial(self.placed.sees, self.like), seed=seed, **how),
-                )
+                return replace(self, candidates=candidates(chain, count, seed=seed, **how))
         return self
 
     @cached_property
     def options(self) -> tuple[Linearisation, Tensor]:
         """What the candidates would tell, and its noise (M, r, r), m^2."""
-        rows = self.placed.data.rows([self.like] * len(self.candidates))
-        copies = self.placed.measured_at(self.like, with_joints(rows, self.candidates), self.candidates)
+        copies = with_joints(self.placed.data.rows([self.like] * len(self.candidates)), self.candidates)
+        for own in self._elsewhere:
+            copies = own.changed(copies)
         data = self.rows(copies)[0]
         return data.numbers(self.scales).at, self.noise(data)
 

@@ -20,9 +20,8 @@ from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.registered_map import Registration
+from diffeo_calib.measurements.bodies import marker_lines, transform_words, triple
 from diffeo_calib.measurements.csv.cells import number
-from diffeo_calib.measurements.poses import POINTS, rotation_numbers
-from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.errors import SIZES, Evaluation, shown_unit
 from diffeo_calib.sensors.kinds import known_kinds
 
@@ -88,41 +87,6 @@ def outlier_lines(outliers: Sequence[Outlier], rows: int, what: str = "training 
         yield f"  and {len(outliers) - MOST_OUTLIERS} more"
 
 
-def placement_lines(
-    geometry: Geometry, *, poses: bool, ball: bool = False, frame: str = "the measuring frame"
-) -> Iterator[str]:
-    """Where the robot's base was found in the measuring ``frame``, and the markers in their tips' frames.
-
-    Args:
-        geometry: as refined with the deformations. poses: whether the markers are the points of measured frames, three
-            of each. ball: whether the last one of several is a ball that rested in sockets.
-    """
-    yield f"robot base in {frame}: {_transform(geometry.base)}"
-    yield from _marker_lines(geometry.tool, geometry.on, poses=poses, ball=ball)
-
-
-def _marker_lines(
-    points: Tensor, tips: Sequence[str], *, poses: bool, ball: bool = False, known: Tensor | None = None
-) -> Iterator[str]:
-    """Places (P, 3) of markers, m, or of the frames that they represent; ``known``: standard deviations (P, 3)."""
-    places, tips = (points.unflatten(0, (-1, POINTS)).mean(1), tips[::POINTS]) if poses else (points, tips)
-    for k, (place, tip) in enumerate(zip(places, tips, strict=True)):
-        what = "measured frame" if poses else "marker" + f" {k}" * (len(places) > 1 + ball)
-        what = "ball" if ball and k == len(places) - 1 > 0 else what
-        end = "" if known is None else f", known to {_triple(1e3 * known[k], '.2g')} mm"
-        yield f"{what} in the frame of '{tip}': {_triple(1e3 * place)} mm{end}"
-
-
-def _transform(frame: Tensor) -> str:
-    """A transform (4, 4), m, in words."""
-    turn = rotation_numbers(frame[None, :3, :3], "rotvec", angle="deg")[0]
-    return f"{_triple(1e3 * frame[:3, 3])} mm, rotation vector {_triple(turn)} deg"
-
-
-def _triple(values: Tensor, digits: str = ".3f") -> str:
-    return " ".join(f"{value:{digits}}" for value in values.tolist())
-
-
 def registration_lines(model: CalibratedKinematics) -> Iterator[str]:
     """Where measuring frame and markers were found, how well, and from how many rows."""
     found = model.registration
@@ -144,7 +108,7 @@ def motion_lines(found: Registration, tips: Sequence[str], *, doubt: str = "") -
     if found.free != "base":
         tips = tips if len(tips) == len(found.markers) else [tips[0]] * len(found.markers)
         rigid = found.lever is not None
-        yield from _marker_lines(found.markers, tips, poses=rigid, known=None if rigid else found.marker_deviations)
+        yield from marker_lines(found.markers, tips, poses=rigid, known=None if rigid else found.marker_deviations)
         if found.shift is not None:
             largest = 1e3 * float(found.shift.norm(dim=1).max())
             sure = f" (unmoved with probability {found.same_place:.2f})" if found.same_place is not None else ""
@@ -155,9 +119,9 @@ def motion_lines(found: Registration, tips: Sequence[str], *, doubt: str = "") -
 
 def frame_lines(found: Registration) -> Iterator[str]:
     """Where the measuring frame is now."""
-    yield f"the measuring frame of the model, seen from the new one: {_transform(found.transform)}"
+    yield f"the measuring frame of the model, seen from the new one: {transform_words(found.transform)}"
     shift, turn = 1e3 * found.frame_deviations[:3], torch.rad2deg(found.frame_deviations[3:])
-    yield f"  known to {_triple(shift, '.2g')} mm at the middle of the rows, and to {_triple(turn, '.2g')} deg"
+    yield f"  known to {triple(shift, '.2g')} mm at the middle of the rows, and to {triple(turn, '.2g')} deg"
 
 
 def socket_lines(errors: Evaluation, rows: str) -> Iterator[str]:

@@ -15,7 +15,6 @@ from diffeo_calib.calibration.expected_errors import ExpectedError, stands_free
 from diffeo_calib.cli.console import out, plain, say, text_table
 from diffeo_calib.cli.declarations import ExportOptions
 from diffeo_calib.cli.models import load_laden, tool_in_tip
-from diffeo_calib.cli.printed import placement_lines
 from diffeo_calib.cli.record import make_folder, record
 from diffeo_calib.common.files import write_together
 from diffeo_calib.interop.c_source import CFiles, c_files
@@ -42,6 +41,7 @@ from diffeo_calib.interop.torch_program import export_onnx, export_torch
 from diffeo_calib.interop.ur_kinematics import ur_text, ur_transforms
 from diffeo_calib.interop.urdf import corrected_urdf, urdf_of
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.bodies import placement_lines
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.known_drift import KnownDrift

@@ -26,6 +26,7 @@ from diffeo_calib.common.errors import PACKAGE, few
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.evaluation import positions_of
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_entry, hand_eye_sentences
+from diffeo_calib.measurements.bodies import placement_lines
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -117,7 +118,7 @@ def _lines_about_places(
     """Hidden markers, and where devices, base and markers, or camera and board, were found."""
     placed = result.placed
     placement = list(hand_eye_sentences(hand_eye)) or list(
-        printed.placement_lines(result.model.geometry, poses=placed.lever is not None, ball=placed.ball)
+        placement_lines(result.model.geometry, poses=placed.lever is not None, ball=placed.ball)
     )
     for one in held_out.values():
         yield from printed.socket_lines(one[CALIBRATED], "held out")

@@ -15,7 +15,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics, measured_wo
 from diffeo_calib.kinematics.evaluation import at_payloads
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_sentences
 from diffeo_calib.kinematics.transmission import gear_lines
-from diffeo_calib.measurements.bodies import matrix_lines
+from diffeo_calib.measurements.bodies import placement_lines
 from diffeo_calib.reports.analysis.findings import Findings, RowsOfKind
 from diffeo_calib.reports.analysis.predictions import FitRows, Predictions
 from diffeo_calib.reports.analysis.stages import STANDARD_REPEATS, Kinematics
@@ -321,6 +321,6 @@ def record(model: CalibratedKinematics, data_sha256: str | None) -> Section:
             certificate = "without certificate: fewer control points than rows"
         lines.append(f"optimum       {certificate}")
         lines.append(f"status        {summary.status}; scales: {summary.scales}")
-    lines += ["robot base in the measuring frame, 4 x 4 [m]:", *matrix_lines(model.geometry.base)]
-    lines += [*model.bodies.place_lines(model), *hand_eye_sentences(HandEye.of_fit(model))]
+    lines += map(printable, placement_lines(model.geometry, poses=model.lever is not None, ball=model.ball))
+    lines += hand_eye_sentences(HandEye.of_fit(model))
     return Section("record", "Record", "Everything needed to make this model again.", text=lines)
