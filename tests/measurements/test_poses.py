@@ -220,27 +220,6 @@ def test_jacobian_of_the_points_against_differences() -> None:
 # --- rigid transforms -----------------------------------------------------------------------------
 
 
-def spoilt(row: int, entry: tuple[int, int], value: float) -> Tensor:
-    poses = random_poses(3)
-    poses[row, entry[0], entry[1]] = value
-    return poses
-
-
-@pytest.mark.parametrize(
-    ("poses", "message"),
-    [
-        (random_poses(3)[:, :3], ("`poses`", "(N, 4, 4)", "(3, 3, 4)")),
-        (random_poses(3).mT, ("`poses`, row 0", "last row", "transpose")),
-        (spoilt(1, (0, 0), 3.0), ("`poses`, row 1", "rotation matrix")),
-        (spoilt(1, (0, 3), math.nan), ("`poses`", "index [1, 0, 3]")),
-        (random_poses(3) * torch.tensor([1.0, -1.0, 1.0, 1.0])[:, None], ("`poses`, row 0", "mirrored")),
-    ],
-)
-def test_transforms_that_are_not_rigid_are_one_clear_error(poses: Any, message: tuple[str, ...]) -> None:
-    with pytest.raises(InputError, match=says(*message)):
-        rigid_poses(poses)
-
-
 def test_rounded_transforms_become_rigid() -> None:
     poses = random_poses(20)
     found = rigid_poses(poses.numpy().round(5).tolist())
