@@ -20,7 +20,7 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics import gates, likely_mistakes
 from diffeo_calib.calibration.diagnostics.plausibility import marker_column, unmeasured_markers
 from diffeo_calib.calibration.identification.registration import register, register_sockets, spread
-from diffeo_calib.calibration.placing.readings import register_readings
+from diffeo_calib.calibration.placing.readings import rough_error
 from diffeo_calib.cli.column_names import column
 from diffeo_calib.cli.guesses import (
     LENS,
@@ -145,8 +145,7 @@ class Source:
         if not lengths:
             return max(_in_images(self.robot, one) for one in tables)
         size = float(torch.cat([one.reported.flatten() for one in lengths]).square().mean().sqrt())
-        rms = register_readings(Geometry.nominal(self.robot), lengths).noise  # of a number
-        return rms / max(size, SMALLEST_SPREAD_M)
+        return rough_error(Geometry.nominal(self.robot), lengths) / max(size, SMALLEST_SPREAD_M)
 
     def positions(self) -> Iterator[tuple[Source, Measurements]]:
         """Ways in all units that can be read, with the positions of the largest set-up; none where there are none."""

@@ -23,7 +23,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, ModelFileError, few, warn_user
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows import integrator_from_config
-from diffeo_calib.interop.container import FORMAT, Header
+from diffeo_calib.interop.numpy_model import FORMAT, Header
 from diffeo_calib.kernels.base import Kernel, SumKernel
 from diffeo_calib.kernels.profiles import PROBED_R2, Profile, probe
 from diffeo_calib.kernels.radial import PROBE, RadialKernel

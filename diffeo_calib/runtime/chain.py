@@ -18,8 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from diffeo_calib.runtime.arrays import ONE, SKEW, Array, cross, skew, transforms
-from diffeo_calib.runtime.flow import NUMPY
+from diffeo_calib.runtime.arrays import NUMPY, ONE, SKEW, Array, cross, skew, transforms
 
 COINCIDENT_FRAMES_M = 1e-6
 """Frames whose origins are closer than this [m] count as one place for masses."""
@@ -97,6 +96,8 @@ class NominalChain:
     motions: Array  # (4, n_all, 4, 4) C, S, D, L
     coupling: Array  # (n_all, n), and below (n_all,): moving joints' values from the active ones'
     coupling_offset: Array
+    names: tuple[str, ...]  # of the n active joints
+    limits: Array  # (n, 2) their lower and upper limits, infinite without one
 
     @cached_property
     def ancestors(self) -> np.ndarray:

@@ -19,9 +19,9 @@ from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.fitting.result import silent
-from diffeo_calib.process.numbers import Numbers
-from diffeo_calib.process.process import Process
+from diffeo_calib.maps.linearisation import Numbers
 from diffeo_calib.process.tails import Tails
+from diffeo_calib.regression.conditional import Process
 from diffeo_calib.robots import SimulatedArm
 
 NARROW_M_RAD = 1e-3
@@ -36,16 +36,13 @@ class Case:
     scales: dc.Hyperparameters
 
     @cached_property
-    def noise(self) -> list[Tensor]:
-        """The weighted noise of every part."""
-        return self.noise_of(self.data)
+    def noise(self) -> Tensor:
+        """(N, R, R) weighted."""
+        return self.data.told.weighted_noise(self.scales)
 
-    def noise_of(self, data: TangentData) -> list[Tensor]:
-        return data.numbers.blocks_of_table(data.told.weighted_noise(self.scales))
-
-    @property
+    @cached_property
     def numbers(self) -> Numbers:
-        return self.data.numbers
+        return self.data.numbers(self.scales)
 
     @property
     def variance(self) -> Tensor:

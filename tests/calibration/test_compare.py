@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 from functools import cache
 from math import inf
 from types import SimpleNamespace
 from typing import Any
 
-import batch_bank
 import pytest
 import torch
 from again_bank import arm, model, payloads, positions
@@ -20,7 +18,7 @@ from torch.distributions import MultivariateNormal
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.recalibration.compare import Comparison
-from diffeo_calib.calibration.recalibration.find_changes import NOISE_FACTORS, SIZES, likelihood_ratios, parts_of
+from diffeo_calib.calibration.recalibration.find_changes import NOISE_FACTORS, SIZES, likelihood_ratios
 
 OFFSET = 1e-3
 """Of a joint, rad."""
@@ -101,15 +99,6 @@ def test_places_that_a_fit_left_open_explain_no_difference_of_models() -> None:
     assert not compared.changes.found
 
 
-def test_what_a_model_lacks_cannot_change() -> None:
-    fitted: Any = model(positions).map
-    spec, sag = fitted.geodesic.spec, fitted.geodesic.spec.nominal.sag
-    bare = replace(spec, prior_variance=spec.prior_variance.index_fill(0, torch.arange(sag.start, sag.stop), 0.0))
-    own: Any = SimpleNamespace(geodesic=SimpleNamespace(spec=bare), deformation=SimpleNamespace(spec=bare))
-    names, fewer = ([part.name for part in parts_of(each)] for each in (fitted, own))
-    assert fewer == [name for name in names if name != "gravity"] != names
-
-
 def test_ratios_are_those_of_the_definition() -> None:
     """Largest densities over all levels of noise and sizes of the change, with explicit matrices."""
     draws = torch.Generator().manual_seed(0)
@@ -147,18 +136,3 @@ def test_a_model_with_payloads_is_compared_with_one_without_any_under_none() -> 
         assert found.payload == 0.0
         assert found.rms < 3.0 * found.expected
         assert str(found).startswith("with a payload of 0")
-
-
-BATCHES = 2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["camera on the tool", "sessions"])
-def test_clean_batches_show_no_change(name: str) -> None:
-    """Not one at the level of 1 %, and none of these is near it."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # few rows
-        model = batch_bank.searched(name)
-        for seed in range(BATCHES):
-            found: Any = dc.compare(model, batch_bank.batch(name, seed), level=0.02)
-            assert not found.changes.found

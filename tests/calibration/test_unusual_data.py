@@ -60,24 +60,6 @@ def test_repeats_do_not_break_the_fit() -> None:
 
 
 @pytest.mark.slow
-def test_known_deviations_weigh_the_rows() -> None:
-    """Every other row is fifty times worse: rows that are known to be bad do no harm."""
-    arm, train, test = simulated(44)
-    robot, q, std = arm.nominal, train.q, torch.where(torch.arange(44) % 2 == 0, 1e-3, 2e-5).double()
-    draw = torch.from_numpy(np.random.default_rng(5).standard_normal((44, 1, 3)))
-    points = arm.true_points(q) + std[:, None, None] * draw
-    given = with_usual_scales(robot, dc.Measurements(q, points, std=std))
-    unknown = dc.calibrate(robot, dc.Measurements(q, points))
-    assert held_out(given, test) < 0.8 * held_out(unknown, test)
-    good = with_usual_scales(robot, dc.Measurements(q[1::2], points[1::2]))
-    assert held_out(given, test) < 1.1 * held_out(good, test)
-    assert given.outliers == []
-    noise = given.model.map.noise.covariance.diagonal(dim1=1, dim2=2).mean(1).sqrt()
-    assert float(noise[::2].min()) > 0.9e-3
-    assert float(noise[1::2].max()) < 2e-4
-
-
-@pytest.mark.slow
 def test_deviations_of_each_coordinate(arm: Case) -> None:
     """A device that sees depth badly: x is known to 0.5 mm only."""
     std = torch.tensor([5e-4, 2e-5, 2e-5], dtype=torch.float64).expand(60, 1, 3)

@@ -18,7 +18,7 @@ ROWS = (
 TEXTS = {
     "fit": (
         f"{ROWS} {UNITS} CSV --robot --base --tip --load --dh-convention -o --output --holdout --seed --controls "
-        "--duplicates --figure --note --scales-of --report"
+        "--duplicates --note --scales-of --report"
     ),
     "campaign": (
         f"{ROWS} {UNITS} CSV --robot --base --tip --load --dh-convention --tolerance --stdin "
@@ -43,7 +43,7 @@ TEXTS = {
         "--candidates --target-poses --measured --draw --range --tracker --floor --column --collisions "
         "--sensor --payload"
     ),
-    "recalibrate": f"{ROWS} {UNITS} OLD OTHER -o --output --marker-freedom --drift --seed --note",
+    "recalibrate": f"{ROWS} {UNITS} OLD OTHER -o --output --marker-freedom --seed --note",
     "demo": "-o --output -n --count --seed",
 }
 OPTIONS = {name: [*text.split(), "--json"] for name, text in TEXTS.items()}

@@ -16,7 +16,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.registration import with_joint_offsets
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.interop.rigid import GEOMETRIC, PROJECTION, best_joint_offsets, nominal_kinematics, rigid_kinematics
+from diffeo_calib.interop.rigid import GEOMETRIC, PROJECTION, best_joint_offsets, rigid_kinematics, with_errors
 from diffeo_calib.interop.urdf import urdf_of
 from diffeo_calib.robots import Chain, Geometry, simulated_arm
 
@@ -63,7 +63,7 @@ def test_numbers_are_those_of_the_geometry(arm: Case) -> None:
     d = (found.geometry.points(model.configurations) - model(model.configurations)).norm(dim=-1)
     assert found.rms == pytest.approx(float(d.square().mean().sqrt()), rel=1e-9)
     assert found.largest == pytest.approx(float(d.max()), rel=1e-9)
-    assert found.rms < found.validated[found.how] < nominal_kinematics(model).rms
+    assert found.rms < found.validated[found.how] < with_errors(model, None).rms
 
 
 @pytest.mark.slow
@@ -99,7 +99,7 @@ def test_poses_several_markers_and_slides(name: str, request: pytest.FixtureRequ
     model: dc.CalibratedKinematics = request.getfixturevalue(name).model
     found = rigid_kinematics(model)
     assert found.geometry.markers == model.markers
-    assert found.rms < nominal_kinematics(model).rms / 2
+    assert found.rms < with_errors(model, None).rms / 2
 
 
 @pytest.mark.parametrize("size", [1e-3, 0.2])

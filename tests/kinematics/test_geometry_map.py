@@ -61,27 +61,6 @@ def test_without_elasticity_it_is_the_geometry(chain: Chain) -> None:
     assert torch.equal(elastic.jacobian(x, longer), rigid.jacobian(x, theta))
 
 
-# --- parameters that differ from row to row -------------------------------------------------------------------------
-
-
-@every_chain
-def test_parameters_per_row_are_those_of_each_row(chain: Chain) -> None:
-    geometry, x = geometry_of(chain, 3), draw(N, chain.n, seed=15)
-    theta = draw(N, geometry.size, seed=16, size=0.3)
-    rows = [slice(k, k + 1) for k in range(N)]
-    for function in (geometry.points, geometry.jacobian, geometry.sensitivities):
-        expected = torch.cat([function(x[row], theta[k]) for k, row in enumerate(rows)])
-        torch.testing.assert_close(function(x, theta), expected, rtol=1e-13, atol=1e-14)
-
-
-def test_sensitivities_per_row_are_derivatives_of_that_row() -> None:
-    geometry, x = geometry_of(CHAINS["mimic joints"]), draw(3, CHAINS["mimic joints"].n, seed=17)
-    theta = draw(3, geometry.size, seed=18, size=0.3).requires_grad_()
-    expected = by_rows(geometry.points(x, theta).flatten(1), theta)
-    actual = geometry.sensitivities(x, theta.detach()).flatten(1, 2)
-    torch.testing.assert_close(actual, expected, rtol=1e-11, atol=1e-12)
-
-
 # --- waves of gears in the nominal map: derivatives, names, transmission errors -------------------------------------
 
 

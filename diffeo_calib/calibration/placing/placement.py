@@ -9,7 +9,7 @@ columns Z are the effects of shifts c ~ N(0, I). After the fit their posterior i
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -24,7 +24,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.sensors.devices import Extrinsics, Hypothesis
-from diffeo_calib.sensors.set_ups import SetUps, View
+from diffeo_calib.sensors.set_ups import SetUps
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings
 
 S = TypeVar("S", bound="DeviceSet")
@@ -147,29 +147,9 @@ class DeviceSet(ABC):
         """Better names of what stands, and of what is on the tool, than those of diagnostics/hypotheses.py."""
         return {}
 
-    def views(self) -> Mapping[str, View]:
-        """Name of a set-up -> how it sees poses of the model; none if there is one set-up."""
-        return {}
-
-    def sees(self, row: int, points: Tensor, views: Mapping[str, View]) -> Tensor:
-        """(M,) boolean: whether points (M, P, 3), m, can be measured as a row was, as far as these devices measured it.
-
-        Args:
-            row: number in the table. points: of the model. views: those of all devices.
-        """
-        return torch.ones(len(points), dtype=torch.bool, device=points.device)
-
-    def measured_at(self, row: int, like: T, points: Tensor, views: Mapping[str, View]) -> T:
-        """M copies ``like`` of a row at other joint values, as these devices would measure them there.
-
-        Args:
-            row: its number in the table. points: (M, P, 3) of the model there, m. views: those of all devices.
-        """
-        return like
-
-    def places_at(self, row: int) -> Tensor | None:
-        """(D, 3) places in the measuring frame, m, to which a row of this kind brings the ball; None for anywhere."""
-        return None
+    def elsewhere(self, row: int, points: Tensor, devices: Placement) -> Elsewhere:
+        """A row of the table at other points (M, P, 3) of the model, m, as far as these of all devices measured it."""
+        return Elsewhere(torch.ones(len(points), dtype=torch.bool, device=points.device), points.new_zeros(0, 3))
 
     def sentences(self) -> list[str]:
         """Where the devices are."""
@@ -195,10 +175,6 @@ class Placement(tuple[DeviceSet, ...]):
     def bodies(self) -> Mapping[str, str]:
         """See :attr:`DeviceSet.bodies`."""
         return {name: words for own in self for name, words in own.bodies.items()}
-
-    def views(self) -> dict[str, View]:
-        """Those of all devices, see :meth:`DeviceSet.views`."""
-        return {name: view for own in self for name, view in own.views().items()}
 
     def shared(self, data: Seen) -> Tensor:
         """Effects of all devices, side by side: (N, R, c)."""
@@ -244,6 +220,14 @@ class Placement(tuple[DeviceSet, ...]):
     def placed(self) -> tuple[Extrinsics, ...]:
         """What a model keeps of all devices."""
         return tuple(own.devices for own in self if own.names)
+
+
+class Elsewhere(NamedTuple):
+    """A row as some devices would measure it at M other configurations."""
+
+    there: Tensor  # (M,) boolean, where they can
+    places: Tensor  # (D, 3) in the measuring frame, m, to which it has to bring the ball; none for anywhere
+    changed: Callable[[Any], Any] = lambda copies: copies  # of a table, copies of the row at these joint values
 
 
 class OtherLabel(NamedTuple):

@@ -145,6 +145,12 @@ def register_readings(bare: Geometry, tables: Sequence[Readings]) -> Identificat
     return described(rows, [noise] * len(tables), adrift=True)
 
 
+def rough_error(bare: Geometry, tables: Sequence[Readings]) -> float:
+    """RMS error of the readings from the first starts of :func:`register_readings`, m; infinite where none leads on."""
+    found = _rough_fits(tables, _starts(bare, tables))
+    return float(torch.cat([own.flatten() for own in found[0].errors]).square().mean().sqrt()) if found else inf
+
+
 class RoughFit(NamedTuple):
     """Ball and devices from one start, with errors (N, 1, r) of all readings, m.
 
@@ -168,8 +174,10 @@ def _rough_fits(bare: Geometry, tables: Sequence[Readings], balls: Tensor) -> li
     for ball in balls:
         with suppress(InputError):  # the start has the ball at a fixed point or behind a camera
             found.append(_rough_fit(bare, tables, ball))
-            # a device may be lost where the ball was far away: all of them anew around the ball that was found
-            found.append(_rough_fit(bare, tables, found[-1].stage.geometry.tool[0]))
+    found.sort(key=itemgetter(0))
+    for best in found[:1]:  # a device may be lost where the ball was far away: all anew around the ball that was found
+        with suppress(InputError):
+            found.append(_rough_fit(bare, tables, best.stage.geometry.tool[0]))
     return sorted(found, key=itemgetter(0))
 
 

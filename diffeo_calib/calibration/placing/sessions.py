@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -43,7 +42,6 @@ from diffeo_calib.sensors.set_ups import (
     MeasuringFrames,
     MountedMarkers,
     SetUps,
-    View,
     frame_slopes,
     sessions_of,
     set_up_kind,
@@ -173,9 +171,6 @@ class Sessions(DeviceSet):
         std = found.covariance.diagonal().clamp(min=0).sqrt().view_as(steps) if k else steps[:, :0]
         moved = self.devices.moved(self.others, steps, std, found.centre, found.transform)
         return replace(self, devices=moved if found.known is None else moved.after(found.known))
-
-    def views(self) -> dict[str, View]:
-        return {name: partial(self.devices.view, number) for number, name in enumerate(self.names)}
 
     def labels(self, own: Coordinates, seen: Tensor) -> Iterator[OtherLabel]:
         session = self.by_row(int(own.rows.max()) + 1)[own.rows]

@@ -10,9 +10,8 @@ Without a device no row says where the robot's base is: base and error twist of 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -39,7 +38,7 @@ from diffeo_calib.calibration.identification.registration import (
     register_sockets,
     socket_means,
 )
-from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
+from diffeo_calib.calibration.placing.placement import DeviceSet, Elsewhere, OtherRows, Placement, Seen, Settled
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.checks import numbers_of
@@ -51,10 +50,8 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import VALUE, Hypothesis
-from diffeo_calib.sensors.set_ups import View, frame_slopes
+from diffeo_calib.sensors.set_ups import frame_slopes
 from diffeo_calib.sensors.sockets import IN_SOCKET_M, SocketPlaces, socket_errors
-
-T = TypeVar("T")
 
 ALIKE = 0.05
 """Deviation of a block's distance from one place to another, relative to that of the distance itself."""
@@ -142,21 +139,12 @@ class SocketDevices(DeviceSet):
         points[rows, -1] = self.positions[table.socket_numbers[rows]]
         return with_attributes(table, points=points)
 
-    def places_at(self, row: int) -> Tensor | None:
-        return self.positions if bool((self.rows == row).any()) else None
-
-    def sees(self, row: int, points: Tensor, views: Mapping[str, View]) -> Tensor:
-        places = self.places_at(row)
-        if places is None:
-            return super().sees(row, points, views)
-        return torch.cdist(points[:, -1], places.to(points)).amin(1) < IN_SOCKET_M
-
-    def measured_at(self, row: int, like: T, points: Tensor, views: Mapping[str, View]) -> T:
-        places = self.places_at(row)
-        if places is None:
-            return like
-        nearest = torch.cdist(points[:, -1], places.to(points)).argmin(1)
-        return with_attributes(like, socket=nearest, sockets=self.sockets)
+    def elsewhere(self, row: int, points: Tensor, devices: Placement) -> Elsewhere:
+        if not bool((self.rows == row).any()):
+            return super().elsewhere(row, points, devices)
+        away, nearest = torch.cdist(points[:, -1], self.positions.to(points)).min(1)
+        there = {"socket": nearest, "sockets": self.sockets}
+        return Elsewhere(away < IN_SOCKET_M, self.positions, lambda copies: with_attributes(copies, **there))
 
     @property
     def size(self) -> int:
@@ -210,14 +198,14 @@ class SocketDevices(DeviceSet):
         What the others tell about shifts that they share with it, those of a distance, is no prediction of the model.
         """
         data, sockets, found = chosen.data, self.sockets, []
-        numbers, process = data.numbers, data.process(chosen.selection.scales)
-        shared = numbers.S[:, data.sensitivities.shape[2] :]
+        process = data.process(chosen.selection.scales)
+        numbers, shared = process.numbers, process.numbers.of_table(data.shared)
         socket = self.by_row(len(data.y))
         place = torch.where(socket == NO_SOCKET, NO_SOCKET, sockets.place[socket])
         ball = numbers.cells % numbers.shape[1] >= numbers.shape[1] - 3
         for number, name in enumerate(sockets.place_names):
             index = (ball & (place[numbers.owner] == number)).nonzero()[:, 0]
-            index, rows = index[numbers.cells[index].argsort()], (place == number).nonzero()[:, 0]
+            rows = (place == number).nonzero()[:, 0]
             errors = process.left_out(place.new_full(numbers.cells.shape, -1).index_fill(0, index, 0))[0][index]
             others = process.mu - process.inverse[:, index] @ errors  # K^-1 y without the place
             errors = errors + shared[index] @ (shared.T @ others)

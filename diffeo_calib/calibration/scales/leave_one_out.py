@@ -129,10 +129,8 @@ def leave_one_out(
     for rows, part in _parts(told, seed, block_coordinates):
         every = torch.arange(len(rows), device=rows.device)
         errors[rows], squares[rows] = left_out_rows(part, scales, every, part.noise(scales))
-        inverse = part.numbers.diagonal_blocks(part.process(scales).inverse)
-        own = part.numbers.blocks_of_table(part.weighted_noise(scales))
-        noise = float(sum((one * block).sum() for one, block in zip(own, inverse, strict=True)))
-        effective.append(part.coordinates - noise)
+        inverse = part.numbers(scales).blocks(part.process(scales).inverse)
+        effective.append(part.coordinates - float((part.weighted_noise(scales) * inverse).sum()))
     errors = data.in_coordinates(errors).masked_fill(~data.visible, nan)
     return LeaveOneOut(errors, squares, effective[0] if len(effective) == 1 else None, told.coordinates)
 
@@ -165,10 +163,10 @@ def _parts(data: TangentData, seed: int, coordinates: int) -> Iterator[tuple[Ten
 def _expected_squares(part: TangentData, scales: Hyperparameters, tails: Tails) -> Tensor:
     """Expected squared distances of the errors in units of the noise without tails: (N, bodies)."""
     part.expected(scales)  # the same for all weights
-    data, numbers = part.with_tails(tails), part.numbers
+    data = part.with_tails(tails)
     process, noise = data.process(scales), data.weighted_noise(scales)
-    inverse = numbers.blocks_in_table(numbers.diagonal_blocks(process.inverse))
-    residual = noise @ numbers.in_table(process.mu)[:, :, None]
+    inverse = process.numbers.blocks(process.inverse)
+    residual = noise @ process.numbers.in_table(process.mu)[:, :, None]
     moments = residual @ residual.mT + noise - noise @ inverse @ noise
     return data.noise_model.squares(data.noise(scales), moments)
 
@@ -180,10 +178,10 @@ def left_out_rows(data: TangentData, scales: Hyperparameters, part: Tensor, new:
         data: the measurements. scales: held fixed. part: (N,) that is left out with each row; negative for none: NaN.
         new: (N, m, m) noise of a new measurement like each row, whose predicted covariance is the unit of squares.
     """
-    numbers, process, own = data.numbers, data.process(scales), data.weighted_noise(scales)
-    errors, covariance = process.left_out(part[numbers.owner])
-    errors = numbers.in_table(errors)
-    predicted = numbers.blocks_in_table(numbers.diagonal_blocks(covariance)) - own + new
+    process, own = data.process(scales), data.weighted_noise(scales)
+    errors, covariance = process.left_out(part[process.numbers.owner])
+    errors = process.numbers.in_table(errors)
+    predicted = process.numbers.blocks(covariance) - own + new
     predicted = torch.where(part[:, None, None] < 0, own, predicted)
     return errors, data.noise_model.squares(predicted, errors[:, :, None] * errors[:, None])
 
@@ -267,7 +265,8 @@ def inflation_by_places(
             coordinates share an unknown shift with: its socket.
         groups: (N,) a number for each configuration, the same for its repeats.
     """
-    process, owner = data.process(scales), data.numbers.owner
+    process = data.process(scales)
+    owner = process.numbers.owner
     resting, errors = place >= 0, process.left_out(place[owner])[0]
     total = float((errors * process.mu).nansum())
     sockets = len(torch.stack([place, shared], 1)[resting].unique(dim=0))

@@ -145,14 +145,14 @@ def log_posterior(logarithms: Tensor, centre: Hyperparameters, data: TangentData
     Returns:
         None where G + R is not positive definite in float64.
     """
-    told, numbers, point = data.told, data.numbers, logarithms.detach().clone().requires_grad_()
+    numbers, pairs, point = data.numbers(centre), data.pairs, logarithms.detach().clone().requires_grad_()
     with torch.enable_grad():
         scales = centre.from_logarithms(point)
-        noise = numbers.blocks_of_table(told.weighted_noise(scales))
-        variance, values = data.unknowns_variance(scales), data.pairs.values(scales)
-    F = numbers.add_blocks(data.pairs.matrix(values), [block.detach() for block in noise])
-    wide = variance.detach() * numbers.S.square().amax(0) > LARGEST_GAIN * F.diagonal().min()
-    narrow, S = numbers.S[:, ~wide], numbers.S[:, wide]
+        noise = data.told.weighted_noise(scales)
+        variance, values = data.unknowns_variance(scales), pairs.values(scales)
+    F, S = numbers.with_noise(pairs.matrix(values), noise.detach()), numbers.S
+    wide = variance.detach() * S.square().amax(0) > LARGEST_GAIN * F.diagonal().min()
+    narrow, S = S[:, ~wide], S[:, wide]
     F, root = F.addmm_(narrow * variance.detach()[~wide], narrow.T), variance.detach()[wide].sqrt()
     try:
         factor = Factor.of(F, S * root)
@@ -161,7 +161,7 @@ def log_posterior(logarithms: Tensor, centre: Hyperparameters, data: TangentData
     mu = factor.solve(numbers.target[:, None])[:, 0]
     slope = factor.inverse.addr_(mu, mu, beta=-0.5, alpha=0.5)  # of the likelihood by F + R, in closed form
     with torch.enable_grad():
-        by_noise = sum((own * block).sum() for own, block in zip(numbers.diagonal_blocks(slope), noise, strict=True))
+        by_noise = (numbers.blocks(slope) * noise).sum()
         explained = (root * (S.T @ mu)).square() - 1.0 + torch.cholesky_inverse(factor.B).diagonal()
         by_unknowns = 0.5 * explained @ variance[wide].log() + ((slope @ narrow) * narrow).sum(0) @ variance[~wide]
         away, amplitudes = point - centre.logarithms(), centre.amplitudes()
@@ -169,7 +169,7 @@ def log_posterior(logarithms: Tensor, centre: Hyperparameters, data: TangentData
         mean = means @ away
         widths = torch.where(amplitudes, torch.where(mean.detach() > 0, GROWTH, SHRINKAGE), LENGTH)
         density = -0.5 * (means.diagonal() @ (mean / widths).square() + ((away - mean) / AXES).square().sum())
-        (data.pairs.inner(values, slope) + by_noise + by_unknowns + density).backward()
+        (pairs.inner(values, numbers.square(slope)) + by_noise + by_unknowns + density).backward()
     gradient = torch.zeros_like(point) if point.grad is None else point.grad
     return LogPosterior(factor.log_density(numbers.target, mu), float(density.detach()), gradient)
 

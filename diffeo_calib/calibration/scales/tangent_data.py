@@ -21,13 +21,12 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.kinematics.nominal import GeometryMap, rigid_motions
 from diffeo_calib.maps.deformation import ModelSpec
-from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
+from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity, Numbers
 from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.maps.observation import LinearFunctionals, Observation
-from diffeo_calib.process.numbers import Covariance, Numbers
-from diffeo_calib.process.process import Expected, Process
-from diffeo_calib.process.scales import Hyperparameters
+from diffeo_calib.process.scales import Hyperparameters, Pairs
 from diffeo_calib.process.tails import Tails
+from diffeo_calib.regression.conditional import BeforeData, Features, Process
 from diffeo_calib.regression.regions import region_factor
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.position_errors import PositionErrors
@@ -222,7 +221,8 @@ class TangentData:
     def with_tails(self, tails: Tails) -> TangentData:
         """The same measurements with other weights."""
         other = self._variant(tails=tails)
-        vars(other).update({name: vars(self)[name] for name in ("numbers", "_expected") if name in vars(self)})
+        same = vars(self).keys() & {"pairs", "_numbers", "_expected"}
+        vars(other).update({name: vars(self)[name] for name in same})
         blocks = vars(self).get("blocks", {})  # of calibration/scales/leave_one_out.py
         kept = {key: [(rows, own.with_tails(tails.rows(rows))) for rows, own in each] for key, each in blocks.items()}
         vars(other)["blocks"] = kept
@@ -306,37 +306,39 @@ class TangentData:
             return own * region_factor(self.tails.freedom, int(self.noise_model.freedom.max()))
         return without_hidden(self.noise_of_any_row(scales).expand_as(own), self.visible)
 
-    @cached_property
-    def numbers(self) -> Numbers:
+    def numbers(self, scales: Hyperparameters) -> Numbers:
         """All that the rows tell; the shifts that they share are the last unknowns."""
-        told = self.told
-        S = torch.cat([told.sensitivities, told.shared], 2)
-        return Numbers.of(self.x, self.points, told.visible, target=told.target, S=S, J=told.jacobian, A=told.slopes)
+
+        def told() -> Numbers:
+            own = self.told
+            at = own.linearisation(scales).with_columns(own.shared, own.sensitivities.shape[2])
+            return Numbers.of(at, own.target, own.visible)
+
+        return self._kept("_numbers", scales, told)
 
     @cached_property
-    def pairs(self) -> Covariance:
-        """The covariance of the numbers by the fields, for many scales."""
-        return Covariance(self.numbers, self.numbers, self.space)
+    def pairs(self) -> Pairs:
+        """The covariance of the numbers by the fields, hidden ones too, for many scales."""
+        return Pairs(self.x, self.points, self.told.jacobian, self.told.slopes, self.space)
 
     def unknowns_variance(self, scales: Hyperparameters) -> Tensor:
         """(K,) prior variances of theta and of the shifts."""
         return torch.cat([self.prior_variance(scales), self.x.new_ones(self.shared.shape[2])])
 
-    def prior(self, scales: Hyperparameters) -> Process:
+    def prior(self, scales: Hyperparameters) -> BeforeData:
         """What is known before these rows."""
-        return Process.prior(scales, self.space, self.unknowns_variance(scales), self.numbers)
+        return BeforeData(self.unknowns_variance(scales).sqrt())
 
-    def expected(self, scales: Hyperparameters) -> tuple[Process, Expected]:
-        """What is known before these rows, and their numbers as they are expected then: the same for all weights."""
-        prior = self.prior(scales)
-        return self._kept("_expected", scales, lambda: (prior, prior.expected(self.numbers)))
+    def expected(self, scales: Hyperparameters) -> Features:
+        """The numbers as they are expected before these rows: the same for all weights."""
+        return self._kept("_expected", scales, lambda: self.prior(scales).features(self.numbers(scales).at))
 
     def process(self, scales: Hyperparameters) -> Process:
         """What is known by these rows with their weights."""
 
         def given() -> Process:
-            prior, expected = self.expected(scales)
-            return prior.given(self.numbers, self.numbers.blocks_of_table(self.told.weighted_noise(scales)), expected)
+            noise = self.told.weighted_noise(scales)
+            return self.prior(scales).given(self.numbers(scales), noise, self.expected(scales))
 
         return self._kept("_process", scales, given)
 

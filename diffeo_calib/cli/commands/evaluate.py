@@ -108,12 +108,9 @@ def _show(model: CalibratedKinematics, found: Evaluations, used: Tensor, seen: M
             of_rows |= {"used in the fit": errors.rows(own), "not used in the fit": errors.rows(~own)}
         of_devices, what = _by_device(errors), "session" if positions else "device"
         expected = expected_rms(model, seen, errors.errors.shape[1]) if positions and seen is not None else None
-        table = printed.ErrorTable(errors, f"of {plain(name)}", "rows")
-        for label, some in of_rows.items():
-            table.add(some, f"{some.count} {label}", expected=expected)
-        for device, some in of_devices.items():
-            table.add(some, f"{some.count} of {what} '{plain(device)}'", expected=expected)
-        out.print(table)
+        labels = of_rows | {f"of {what} '{plain(device)}'": some for device, some in of_devices.items()}
+        rows = {(f"{some.count} {label}",): some for label, some in labels.items()}
+        out.print(printed.ErrorTable(rows, f"of {plain(name)}", "rows", expected=expected))
         entries = {label.replace("in all", "all").replace(" ", "_"): some for label, some in of_rows.items()}
         named[kind] = entries | ({f"in_{what}s": of_devices} if of_devices else {})
     record.add(files={}, **entries_by_kind(named))
@@ -152,11 +149,9 @@ def _registered(model: CalibratedKinematics, data: Any, options: EvaluateOptions
     known = found.registration is not None and found.registration.rms_before is not None
     before = residuals(model, place(model, data), data) if known else None
     for kind, after in kinds.items():
-        table = printed.ErrorTable(after, f"of {plain(options.model.name)}", "rows")
-        if before is not None:
-            table.add(before[kind], f"{after.count} with the places of the fit")
-        table.add(after, f"{after.count} with places found anew")
-        out.print(table)
+        rows = {} if before is None else {(f"{after.count} with the places of the fit",): before[kind]}
+        rows |= {(f"{after.count} with places found anew",): after}
+        out.print(printed.ErrorTable(rows, f"of {plain(options.model.name)}", "rows"))
     say(*map(plain, (*printed.registration_lines(found), *placement_sentences(found))))
     if output is not None:
         say(f"registered model: {output}")
