@@ -334,7 +334,7 @@ def _marker(model: CalibratedKinematics, q: Tensor, errors: Tensor) -> Motion:
     step = torch.linalg.lstsq(slopes[seen], errors[seen][:, None], driver="gelsd").solution[:, 0]
     left = errors - slopes @ step
     shift = step.view(-1, 3).norm(dim=1)
-    what = f"the {'marker' if model.lever is None else 'tool'}{'s' * (len(shift) > model.bodies.points)} on the flange"
+    what = f"{model.bodies.moved_words(len(shift))} on the flange"
     return Motion(what, float(shift.max()), 0.0, _explained(errors, left, len(step)), left)
 
 

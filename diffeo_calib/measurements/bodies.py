@@ -133,16 +133,24 @@ class Bodies:
         """The same of other rows of the device, whose points (K, P, 3) are known, m: a camera sees its board there."""
         if self.lever is None:
             return None
-        frames, board = pose_math.frames_of_points(points, self.lever), None
-        if data.board is not None:  # which is where the camera saw it
-            origins = data.poses[:, :3, 3] + (data.poses[:, :3, :3] @ data.board[..., None])[..., 0]
-            away = origins.mean(0) - frames[:, 0, :3, 3]
+        frames, seen = pose_math.frames_of_points(points, self.lever), seen_board(data)
+        board = None
+        if seen is not None:
+            away = seen.origins.mean(0) - frames[:, 0, :3, 3]
             board = (frames[:, 0, :3, :3].mT @ away[..., None])[..., 0]
         return pose_math.pose_jacobian(frames, self.lever, board)
+
+    def moved_words(self, points: int) -> str:
+        """Name in messages for this number of points of the tool that may have moved."""
+        return f"the {'marker' if self.lever is None else 'tool'}{'s' * (points > self.points)}"
 
     def mirrored(self, data: Any) -> Iterator[Tensor]:
         """Points (N, P, 3) in a frame of the other hand; none where a rotation shows the hand."""
         yield from [] if self.lever is not None else [data.points * data.points.new_tensor([1.0, 1.0, -1.0])]
+
+    def exchangeable(self, data: Any) -> range:
+        """Bodies whose numbers may be exchanged in a row: a tip has one frame."""
+        return range(data.markers if self.lever is None else 0)
 
     def labels(self, data: Any, on: Sequence[str] | None = None) -> list[tuple[int | None, str | None]]:
         """Number of each of several markers, tip of each of several frames; ``on``: of points that name none."""
@@ -189,6 +197,23 @@ class Bodies:
     def name(self, number: int, count: int) -> str:
         """Name of one of several bodies."""
         return "measured frame" if self.lever is not None else f"marker {number}" if count > 1 else "marker"
+
+
+class SeenBoard(NamedTuple):
+    """A board that a camera on the tool saw in N rows."""
+
+    board: Tensor  # (N, 3) its origin in the camera's frame, m
+    origins: Tensor  # (N, 3) the same in the measuring frame
+    axes: Tensor  # (N, 3, 3) of the camera
+    lever: float  # of the points that represent its poses, m
+
+
+def seen_board(data: Any) -> SeenBoard | None:
+    """The board of some rows; None unless a camera on the tool saw one."""
+    if data.board is None or data.poses is None or data.lever is None:
+        return None
+    axes = data.poses[:, :3, :3]
+    return SeenBoard(data.board, data.poses[:, :3, 3] + (axes @ data.board[..., None])[..., 0], axes, data.lever)
 
 
 def placement_lines(

@@ -131,6 +131,13 @@ class ImageTable(SocketTable):
         pairs = zip(self.camera_names, names, strict=True)
         return [name if f"{name}/".startswith(f"{own}/") else f"{own}/{name}" for own, name in pairs]
 
+    def sees_board_from_tool(self, *, commanded: bool = False) -> bool | None:
+        """Whether the camera is on the tool, or stands; None if nothing says that a camera saw a board.
+
+        Beside ``commanded`` poses, measured ones are of a frame on the tool that a camera sees.
+        """
+        return True if self.board is not None else False if self.cameras or (commanded and self.lever) else None
+
     def shared_errors(self) -> Iterator[SharedErrors]:
         """Those of images; none of other rows."""
         shared, own, lever = self.pose_shared, self.pose_covariance, self.lever

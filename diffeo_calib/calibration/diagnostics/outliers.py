@@ -152,8 +152,7 @@ def found_outliers(
 def _reason(row: int, body: int, data: Measurements, predicted: Tensor, bad: Tensor) -> str:
     """Probable cause of an outlier, in words."""
     small = gates.REMAINING_ERROR * float(known((predicted[row] - data.points[row]).norm(dim=-1)).max())
-    # a tip has one frame, so that poses are never exchanged
-    for other in range(data.markers if data.lever is None and data.markers <= MAX_MARKERS_FOR_EXCHANGE else 0):
+    for other in data.bodies.exchangeable(data) if data.seen_bodies.shape[1] <= MAX_MARKERS_FOR_EXCHANGE else ():
         errors = (predicted[row, [body, other]] - data.points[row, [other, body]]).norm(dim=-1)
         if other != body and float(errors.max()) < small:
             return f"markers {body} and {other} seem to be exchanged"

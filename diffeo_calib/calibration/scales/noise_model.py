@@ -42,6 +42,7 @@ from diffeo_calib.calibration.identification.identification import Identificatio
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.maps.noise import mean_block, without_hidden
+from diffeo_calib.measurements.bodies import seen_board
 from diffeo_calib.measurements.poses import block_diagonal, inverse_poses, own_blocks, poses_from_marks
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table import Measurements
@@ -269,17 +270,16 @@ def with_best_seen_point(data: Measurements, found: Identification) -> Measureme
     Args:
         data: N rows. found: their geometric calibration.
     """
-    poses, board, lever = data.poses, data.board, data.lever
-    if poses is None or board is None or lever is None or data.covariance is not None:
+    seen = seen_board(data)
+    if seen is None or data.covariance is not None:
         return data
-    S = poses[:, :3, :3]
-    origins = poses[:, :3, 3] + (S @ board[..., None])[..., 0]
+    origins, S = seen.origins, seen.axes
     if float((origins - origins[0]).abs().max()) > SAME_BOARD_M:
         return data
-    predicted = poses_from_marks(found.geometry.points(data.q), lever)
+    predicted = poses_from_marks(found.geometry.points(data.q), seen.lever)
     turned = S.mT - predicted[:, :3, :3].mT  # R_i - R^_i
     towards = inverse_poses(predicted)
-    away = board - towards[:, :3, :3] @ origins[0] - towards[:, :3, 3]
+    away = seen.board - towards[:, :3, :3] @ origins[0] - towards[:, :3, 3]
     weights = found.tails.weights.amin(1)
     size = float((weights * away.square().mean(1)).sum() / weights.sum())
     eye = torch.eye(3, dtype=away.dtype, device=away.device)
@@ -287,4 +287,4 @@ def with_best_seen_point(data: Measurements, found: Identification) -> Measureme
     push, point = -torch.einsum("n,nki,nk->i", weights, turned, away), torch.zeros_like(origins[0])
     point[:2] = torch.linalg.solve(normal[:2, :2], push[:2])
     LOG.info("the board is seen best at %s mm from its origin", [round(v, 1) for v in (1e3 * point).tolist()])
-    return with_attributes(data, board=board + (S.mT @ point))
+    return with_attributes(data, board=seen.board + (S.mT @ point))

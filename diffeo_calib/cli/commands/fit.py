@@ -56,9 +56,8 @@ def run(given: FitOptions) -> None:
         result = calibrate(chain, train, **how, progress=interrupts.watching(progress, err.print))
         result = replace(result, model=made_by_command(result.model))
     own, commanded = result.placed.coordinates, is_cartesian(chain) and not turns_nowhere(chain)
-    hand_eye = {}
-    if own is not None and (own.table.board is not None or own.table.cameras or (commanded and own.table.lever)):
-        hand_eye = HandEye.of_each(result.model, camera_on_tool=own.table.board is not None)
+    on_tool = None if own is None else own.table.sees_board_from_tool(commanded=commanded)
+    hand_eye = {} if on_tool is None else HandEye.of_each(result.model, camera_on_tool=on_tool)
     save(result.model, given.output)  # before anything is printed: output may be cut off
     in_train, held_out = result.errors(train), {} if test is None else result.errors(test)
     record.add(**hand_eye_entry(hand_eye))
