@@ -21,8 +21,8 @@ from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap
-from diffeo_calib.regression.choose import condition, condition_controls
 from diffeo_calib.regression.conditional import Conditional, Opened, without_rigid_motions
+from diffeo_calib.regression.conjugate_gradients import condition
 from diffeo_calib.regression.control_points import ControlPointRegression
 
 PREDICT_ROWS, WORKSPACE_ROWS = 1024, 100  # number of configurations that are linearised together for their covariances
@@ -406,7 +406,7 @@ class FittedMap:
         """The fields around the fitted flows, conditioned on the data."""
         around, slopes = self.geodesic, self.slopes
         if self.data is not None:
-            return condition_controls(around, self.data, self.noise, slopes)
+            return ControlPointRegression(around, self.data, self.noise, slopes)
         at = around.linearise()
         return condition(at if slopes is None else at.projected(slopes), self.noise)
 

@@ -41,7 +41,7 @@ from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.maps.observation import LinearFunctionals, Observation, Part, Stacked
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.regression.choose import MAX_DENSE
+from diffeo_calib.regression.conjugate_gradients import MAX_DENSE
 from diffeo_calib.robots.payload import joined_masses
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import sensor_of
