@@ -323,14 +323,6 @@ class FittedMap:
         first = len(self.geodesic.spec.prior_variance)
         return self.parameter_covariance(first + torch.arange(self.noise.shared.shape[2], device=self.x.device))
 
-    def explained_by(self, which: Tensor, x: Tensor) -> float:
-        """Share of the posterior variance of k1 at x (M, n) that knowing these parameters would remove."""
-        own, at = self.parameters_as_points(which), self.geodesic.linearise(x)
-        between = self.conditional.covariance_between(at, own)  # (M m, k)
-        known = self.conditional.posterior(own)[0]
-        removed = (between * torch.linalg.solve(known, between.T).T).sum()
-        return float(removed / self.conditional.covariance(at).diagonal(dim1=1, dim2=2).sum())
-
     def parameters_as_points(self, which: Tensor) -> Linearisation:
         """The parameters with these numbers as if they were the coordinates of one configuration.
 
