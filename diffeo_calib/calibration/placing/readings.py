@@ -146,8 +146,8 @@ def register_readings(bare: Geometry, tables: Sequence[Readings]) -> Identificat
 
 
 def rough_error(bare: Geometry, tables: Sequence[Readings]) -> float:
-    """RMS error of the readings from the first starts of :func:`register_readings`, m; infinite where none leads on."""
-    found = _rough_fits(tables, _starts(bare, tables))
+    """RMS error of the readings from the start of :func:`register_readings`, m; infinite where none leads on."""
+    found = _rough_fits(bare, tables, bare.tool[:1])
     return float(torch.cat([own.flatten() for own in found[0].errors]).square().mean().sqrt()) if found else inf
 
 
