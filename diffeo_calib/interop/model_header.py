@@ -216,7 +216,7 @@ def rebuild(
     given["ball"] = header.get("ball", False) is True
     given["placement"] = tuple(stored_devices(own, len(fitted.x)) for own in header.get("placement", ()))
     made = header.get("provenance")
-    given["provenance"] = None if made is None else record_of(Provenance, made, "provenance")
+    given["provenance"] = None if made is None else record_of(Provenance, made)
     return CalibratedKinematics(k0.geometry.chain, fitted, summary, **given)
 
 
@@ -347,4 +347,4 @@ def rebuild_registration(entry: Any, tensors: Tensors, n: int) -> Registration:
     plain.pop(LEARNT, None)
     moved = plain.pop("shift", None)
     shift = None if moved is None else as_tensor(moved, "shift", (m // 3, 3))
-    return record_of(Registration, plain, "registration", **arrays, shift=shift)
+    return record_of(Registration, plain, **arrays, shift=shift)
