@@ -20,7 +20,7 @@ from diffeo_calib.cli.options import Rows, Units
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.tables import MeasuredTable, as_written, of_robot, table_format, with_rows
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError, warn_user
+from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -85,7 +85,10 @@ def run(options: EvaluateOptions) -> None:
     say(*(line for errors in found.values() for line in printed.socket_lines(errors, "all rows")))
     say(*printed.expectation_lines(model, data))
     warn_outside_range(model, data.q)
-    source.warn_of_other_frames(rows_of_other_frames(model, data.q))
+    if source.table.session is None and (count := rows_of_other_frames(model, data.q)):
+        what = f"{count} rows of the fit were measured in another set-up than that of the model, and are judged in "
+        fix = "name the column of the set-ups (--session), or leave these rows out"
+        warn_user(sentence(f"{what}its frame", fix=fix))
     if judged.refusal is not None:
         raise MeasurementError(judged.refusal)
     positions = 0 if found.positions is None else len(found.positions.errors)
@@ -106,7 +109,12 @@ def _show(model: CalibratedKinematics, found: Evaluations, used: Tensor, seen: M
         of_rows = {"in all": errors}
         if own.any() and not own.all():
             of_rows |= {"used in the fit": errors.rows(own), "not used in the fit": errors.rows(~own)}
-        of_devices, what = _by_device(errors), "session" if positions else "device"
+        of_devices, what = dict[str, Evaluation](), "session" if positions else "device"
+        present = [one for one in dict.fromkeys(errors.devices) if one and errors.what != SPREAD]
+        if errors.what != READINGS or len(present) > 1:
+            for one in present:  # sockets have no errors of their own
+                mask = torch.tensor([device == one for device in errors.devices], dtype=torch.bool, device=HOST)
+                of_devices[one] = errors.rows(mask)
         expected = expected_rms(model, seen, errors.errors.shape[1]) if positions and seen is not None else None
         labels = of_rows | {f"of {what} '{plain(device)}'": some for device, some in of_devices.items()}
         rows = {(f"{some.count} {label}",): some for label, some in labels.items()}
@@ -114,15 +122,6 @@ def _show(model: CalibratedKinematics, found: Evaluations, used: Tensor, seen: M
         entries = {label.replace("in all", "all").replace(" ", "_"): some for label, some in of_rows.items()}
         named[kind] = entries | ({f"in_{what}s": of_devices} if of_devices else {})
     record.add(files={}, **entries_by_kind(named))
-
-
-def _by_device(errors: Evaluation) -> dict[str, Evaluation]:
-    """The errors of each set-up, or of each of several devices; sockets have no errors of their own."""
-    present = [name for name in dict.fromkeys(errors.devices) if name] if errors.what != SPREAD else []
-    if errors.what == READINGS and len(present) < 2:
-        return {}
-    masks = {name: [own == name for own in errors.devices] for name in present}
-    return {name: errors.rows(torch.tensor(mask, dtype=torch.bool, device=HOST)) for name, mask in masks.items()}
 
 
 def _residuals(found: Evaluations, used: Tensor, source: MeasuredTable) -> Iterator[list[float | str]]:
@@ -201,7 +200,12 @@ def run_predict(given: PredictOptions) -> None:
     """
     kinematics, output = models.load_kinematics(given.model), given.output
     say(*models.provenance_lines(kinematics))
-    table = of_robot(_written_as_read(kinematics, given), kinematics.robot)
+    units = {name: getattr(given, name) for name in Units.names()}
+    typed = Rows(**units, convention=given.convention, rotation_angle=given.rotation_angle, payload=given.payload)
+    read = models.as_fitted(kinematics, typed)
+    own = typed if given.length and given.angle else read  # the predictions are by default written as the rows were
+    rows = Rows(convention=own.convention, rotation_angle=own.rotation_angle, payload=own.payload)
+    table = of_robot(with_rows(table_format(read), rows), kinematics.robot)
     with_poses = kinematics.lever is not None
     if not with_poses and (table.convention or table.rotation_angle):
         what = "--convention and --rotation-angle say how orientations are written, but this model has none"
@@ -243,16 +247,6 @@ def run_predict(given: PredictOptions) -> None:
         own = replace(turned, joints=(), position=[[prefix + axis for axis in "xyz"] for prefix in prefixes])
         own = replace(own, rotation_std=None, **dict.fromkeys(BESIDE))
         say(f"`evaluate` and `fit` read these poses with {shlex.join(options_of(own))}")
-
-
-def _written_as_read(model: CalibratedKinematics, given: PredictOptions) -> TableFormat:
-    """The format of the predictions, by default that of the fit."""
-    units = {name: getattr(given, name) for name in Units.names()}
-    typed = Rows(**units, convention=given.convention, rotation_angle=given.rotation_angle, payload=given.payload)
-    read = models.as_fitted(model, typed)
-    own = typed if given.length and given.angle else read
-    rows = Rows(convention=own.convention, rotation_angle=own.rotation_angle, payload=own.payload)
-    return with_rows(table_format(read), rows)
 
 
 @dataclass(frozen=True)
