@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from diffeo_calib.common.errors import RobotError
-from diffeo_calib.runtime.arrays import Array, Tableau, as_index, skew, transforms
+from diffeo_calib.runtime.arrays import Array, Tableau, as_index, combined, skew, transforms
 from diffeo_calib.runtime.chain import CalibratedChain, Masses, NominalChain, Waves
-from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow, combined
+from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow
 from diffeo_calib.runtime.tables import JointTables, PeriodicSum, Table, tabulate
 
 ROTARY = ("revolute", "continuous")
@@ -71,9 +71,9 @@ def nominal_chain(robot: Mapping[str, Any]) -> NominalChain:
     limits = np.array([[joint["lower"], joint["upper"]] for joint in active], float).reshape(-1, 2)  # None is NaN
     limits = np.where(np.isnan(limits), [-np.inf, np.inf], limits)
     table = _coupling(robot, moving, [joint["name"] for joint in active], between)
-    places, coupling = (np.array(offsets), np.array(before), tuple(tips), ground >= 0), (table[:, :-1], table[:, -1])
-    names = tuple(joint["name"] for joint in active)
-    return NominalChain(*places, axes, revolute, motions, *map(np.ascontiguousarray, coupling), names, limits)
+    places, names = (np.array(offsets), np.array(before), tuple(tips), ground >= 0), [joint["name"] for joint in active]
+    coupling, start = table[:, :-1].copy(), table[:, -1].copy()
+    return NominalChain(*places, axes, revolute, motions, coupling, start, tuple(names), limits)
 
 
 def _coupling(
