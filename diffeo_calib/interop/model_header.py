@@ -10,7 +10,7 @@ model.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -27,7 +27,7 @@ from diffeo_calib.kernels.base import Kernel, SumKernel
 from diffeo_calib.kernels.profiles import PROBED_R2, Profile, probe
 from diffeo_calib.kernels.radial import PROBE, RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
+from diffeo_calib.kinematics.nominal import GeometryMap, PositionErrors, SessionMarkers
 from diffeo_calib.kinematics.provenance import Provenance, Summary, entries_of, record_of
 from diffeo_calib.kinematics.registered_map import RegisteredMap, Registration
 from diffeo_calib.kinematics.tool import tool_transform
@@ -37,7 +37,6 @@ from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap, SmoothMap
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import NO_PAYLOAD, Payload
-from diffeo_calib.robots.position_errors import PositionErrors
 from diffeo_calib.robots.se3 import rigid
 from diffeo_calib.robots.tree import robot_from_config
 from diffeo_calib.sensors.kinds import stored_devices
@@ -141,7 +140,7 @@ def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:
     robot: Header = {"kind": "robot", **chain.to_config(), "elastic": nominal.elasticity is not None}
     if len(set(geometry.on)) > 1 or geometry.on[0] != chain.tips[0]:
         robot["on"] = list(geometry.on)
-    robot |= {name: list(map(list, given)) for name, given in asdict(nominal.own).items() if given}
+    robot |= {name: list(map(list, given)) for name, given in nominal.own._asdict().items() if given}
     if nominal.payload is not None:
         carried = nominal.payload
         robot["payload"] = {"link": carried.link, "mass": float(carried.masses), "unit": carried.unit}
