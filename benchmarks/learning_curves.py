@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 from harness import Record
 
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.common.files import IMAGE_SUFFIXES
 from diffeo_calib.reports.plots.style import LOOKS
 
 if TYPE_CHECKING:
@@ -35,6 +34,7 @@ STYLES = {
 }
 TITLES = {"ipa_ur10": "UR10, laser tracker", "franka_fr3": "Franka FR3, camera"}
 MOST_COLUMNS = 3
+SUFFIXES = (".png", ".pdf", ".svg")  # of the files that figures can be written to
 LABELLED = ((5.0, tuple(range(1, 10))), (1000.0, (1, 2, 5)))
 """Upper limit of (largest / smallest error) of a panel, and the leading digits labelled below it; else decades."""
 CEILING = 2.0
@@ -124,8 +124,8 @@ def _legend(figure: Figure, columns: int) -> None:
 
 def check_place(path: Path) -> None:
     """Raise InputError unless a figure can be written to this path."""
-    if path.suffix.lower() not in IMAGE_SUFFIXES or not path.parent.is_dir():
-        expected = f"a file ending in {', '.join(IMAGE_SUFFIXES)} in an existing folder"
+    if path.suffix.lower() not in SUFFIXES or not path.parent.is_dir():
+        expected = f"a file ending in {', '.join(SUFFIXES)} in an existing folder"
         raise InputError.of(f"the figure cannot be written to {path}", expected=expected)
 
 

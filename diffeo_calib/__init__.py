@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from diffeo_calib.fitting.lbfgs import LBFGS as LBFGS
     from diffeo_calib.fitting.problem import Problem as Problem
     from diffeo_calib.fitting.result import Fit as Fit
+    from diffeo_calib.fitting.scales import choose_scales as choose_scales
     from diffeo_calib.flows.integrators import RK4 as RK4
     from diffeo_calib.flows.integrators import RK8 as RK8
     from diffeo_calib.flows.torchdiffeq import TorchDiffEq as TorchDiffEq

@@ -106,7 +106,7 @@ def fit_command(folder: Path) -> str:
     table = [f"--robot {shlex.quote(str(folder / URDF))} --base {BASE} --tip {TIP}"]
     columns = ",".join(f"measurement_{axis}" for axis in "xyz")
     table += [f"--position {columns} --length mm --angle rad --sep ';' --decimal ,"]
-    table += ["-o ur10.safetensors --figure ur10.png"]
+    table += ["-o ur10.safetensors --report ur10.html"]
     return " \\\n    ".join([f"diffeo-calib fit {shlex.quote(str(folder / FILE))}", *table])
 
 

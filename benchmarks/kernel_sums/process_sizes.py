@@ -20,14 +20,14 @@ from collections.abc import Callable, Iterator
 import harness
 import torch
 from harness import Record
-from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.process.numbers import Numbers
-from diffeo_calib.process.process import Process
+from diffeo_calib.maps.deformation import ModelSpec
+from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity, Numbers
 from diffeo_calib.process.scales import SCALES, Hyperparameters
+from diffeo_calib.regression.conditional import BeforeData
 from diffeo_calib.robots import Geometry, SimulatedArm
 
 ROWS, QUICK_ROWS, NEW = (1000, 2000, 4000, 8000), (200,), 100
@@ -46,37 +46,31 @@ def seconds(call: Callable[[], object], device: str) -> float:
     return time.perf_counter() - begin
 
 
-def rows(arm: SimulatedArm, count: int, seed: int, device: str) -> Numbers:
+def rows(arm: SimulatedArm, count: int, seed: int, scales: Hyperparameters) -> Numbers:
     """Numbers of ``count`` random configurations around the nominal arm."""
-    nominal = GeometryMap(Geometry.nominal(arm.nominal), elastic=True)
+    nominal, device = GeometryMap(Geometry.nominal(arm.nominal), elastic=True), scales.sensor_noise.device
     q, theta = arm.sample(count, seed), torch.zeros(nominal.parameters, dtype=torch.float64)
-    points = nominal(q, theta)
-    own = {
-        "target": torch.randn(points.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 1e-4,
-        "S": nominal.sensitivities(q, theta),
-        "J": nominal.jacobian(q, theta),
-        "A": torch.eye(3, dtype=torch.float64).expand(count, 3, 3),
-    }
-    shown = torch.ones_like(points, dtype=torch.bool)
-    return Numbers.of(*(t.to(device) for t in (q, points, shown)), **{name: t.to(device) for name, t in own.items()})
+    points, variance = nominal(q, theta), scales.prior_variance(nominal)
+    target = torch.randn(points.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 1e-4
+    kernels = scales.joint_kernel(Space(arm.nominal.periodic)), scales.task_kernel()
+    joint = NodeSensitivity(1.0, q.to(device), nominal.jacobian(q, theta).to(device))
+    task = NodeSensitivity(1.0, points.to(device), torch.eye(3, dtype=torch.float64, device=device).expand(count, 3, 3))
+    spec, S = ModelSpec(nominal, *kernels, variance, 3), nominal.sensitivities(q, theta).to(device)
+    return Numbers.of(Linearisation(spec, [joint], [task], S), target.to(device))
 
 
-def conditioned(count: int, device: str, scales: Hyperparameters, variance: Tensor) -> Iterator[Record]:
+def conditioned(count: int, device: str, scales: Hyperparameters) -> Iterator[Record]:
     """Covariance, conditioning and prediction of one size."""
     arm = SimulatedArm(seed=1)
-    known, new = rows(arm, count, 1, device), rows(arm, NEW, 2, device)
-    noise = [NOISE_M**2 * torch.eye(3, dtype=torch.float64, device=device).expand(count, 3, 3)]
-    prior = Process.prior(scales, Space(arm.nominal.periodic), variance.to(device), known)
-    at, process = prior.expected(known), None
-
-    def given() -> None:
-        nonlocal process
-        process = prior.given(known, noise, at)
-
+    known, new = rows(arm, count, 1, scales), rows(arm, NEW, 2, scales).at
+    noise = NOISE_M**2 * torch.eye(3, dtype=torch.float64, device=device).expand(count, 3, 3)
+    prior = BeforeData(known.at.spec.prior_variance.sqrt().to(device))
+    at = prior.features(known.at)
+    process = prior.given(known, noise, at)
     size = {"device": device, "numbers": 3 * count}
-    yield {"what": "covariance", **size, "seconds": seconds(lambda: prior.expected(known), device)}
-    yield {"what": "given", **size, "seconds": seconds(given, device)}
-    yield {"what": "expected", **size, "seconds": seconds(lambda: process.expected(new), device)}
+    yield {"what": "covariance", **size, "seconds": seconds(known.at.fields.gram, device)}
+    yield {"what": "given", **size, "seconds": seconds(lambda: prior.given(known, noise, at), device)}
+    yield {"what": "expected", **size, "seconds": seconds(lambda: process.covariance_between(new), device)}
 
 
 def measure(quick: bool) -> Iterator[Record]:
@@ -84,14 +78,13 @@ def measure(quick: bool) -> Iterator[Record]:
     arm = SimulatedArm(seed=1)
     result = dc.calibrate(arm.nominal, dc.Measurements(*arm.measure(40, seed=0)))
     scales = result.selection.scales
-    variance = scales.prior_variance(GeometryMap(Geometry.nominal(arm.nominal), elastic=True))
     devices = ["cpu", *["cuda"] * torch.cuda.is_available()]
     for device in devices:
         own = {name: getattr(scales, name).to(device) for name in SCALES}
         there = Hyperparameters(**own)
         for count in QUICK_ROWS if quick else ROWS:
             if device != "cpu" or count <= LARGEST_ON_CPU[0]:
-                yield from conditioned(count, device, there, variance)
+                yield from conditioned(count, device, there)
     generator = torch.Generator().manual_seed(0)
     for count in QUICK_POINTS if quick else POINTS:
         points, momenta = (torch.rand(count, 3, generator=generator, dtype=torch.float64) for _ in range(2))

@@ -35,7 +35,6 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.common.files import write_figure
 from diffeo_calib.robots import elastic_rr
 
 Kinematics = Callable[[Tensor], Tensor]
@@ -56,7 +55,7 @@ def paper_figures(model: Kinematics, folder: Path) -> list[Path]:
     paths = []
     for name, draw in DRAWINGS.items():
         paths.append(folder / f"{name}.png")
-        write_figure(draw(model), paths[-1], dpi=300)
+        draw(model).savefig(paths[-1], dpi=300)
     return paths
 
 

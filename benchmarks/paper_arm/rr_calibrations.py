@@ -15,7 +15,7 @@ import diffeo_calib as dc
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.cholesky import CholeskyRegression
+from diffeo_calib.regression.conditional import Process
 
 Predict = Callable[[Tensor], Tensor]
 """Joint angles (M, 2) [rad] -> tip (M, 2) [length units]."""
@@ -97,7 +97,7 @@ class Calibrated:
         """k0 + S (theta - theta0) + Dk0 v + w."""
         recipe, theta = self.recipe, self.data.theta
         conditional = self._conditional()
-        lin, mu = conditional.linearisation, conditional.mu(self.data.target).flatten()
+        lin, mu = conditional.numbers.at, conditional.about(self.data.target).mu
 
         def predict(x: Tensor) -> Tensor:
             at = linearise(recipe, self.vector, theta, x)
@@ -124,14 +124,14 @@ class Calibrated:
         solver = dc.GaussNewton(max_iterations=MOST_ITERATIONS, tolerance=TOLERANCE)
         return dc.fit(self._problem(sigma), solver, STEPS, start=start)
 
-    def _conditional(self) -> CholeskyRegression:
+    def _conditional(self) -> Process:
         lin = replace(self.data.lin, spec=self.recipe.spec(self.vector))
         for floor in JITTERS[:-1]:
             try:
-                return CholeskyRegression(lin, self._noise(floor))
+                return Process.of_rows(lin, self._noise(floor))
             except NumericalError:  # noise-free, with more rows than the scales were chosen on
                 continue
-        return CholeskyRegression(lin, self._noise(JITTERS[-1]))
+        return Process.of_rows(lin, self._noise(JITTERS[-1]))
 
     def _sigma(self, floor: float) -> float:
         return max(float(self.recipe.scales(self.vector)["noise"]), floor)

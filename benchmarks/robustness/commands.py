@@ -96,7 +96,7 @@ READING = (
 )
 SOUND = {
     "fit": (
-        *(*READING, ROBOT, ("--figure", "out.png"), ("--figure", "out.svg"), ("--holdout", "0"), ("--holdout", "0.2")),
+        *(*READING, ROBOT, ("--report", "out.html"), ("--holdout", "0"), ("--holdout", "0.2")),
         *(("--seed", "1"), ("--seed", "4294967295"), ("--note", "é [red] %s"), ("--controls", "10")),
         *(("--duplicates", "keep"), ("--duplicates", "drop"), ("-o", "other"), ("-o", "model")),
     ),

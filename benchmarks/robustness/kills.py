@@ -22,8 +22,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import harness
-import matplotlib.backends.backend_agg
-import matplotlib.figure  # noqa: F401  # before the commands are forked
+import matplotlib.backends.backend_agg  # noqa: F401  # before the commands are forked
 import scipy.spatial.transform  # noqa: F401
 
 import diffeo_calib as dc
@@ -119,11 +118,11 @@ def targets(folder: Path) -> dict[str, Target]:
     fitting = ["fit", table["measured.csv"], *robot, *POSITION, *UNITS, "-o"]
     if ended(start([*fitting, model])) != 0:
         raise dc.DiffeoCalibError.of("the model of this benchmark could not be fitted")
-    fitted, figure, predicted, corrected = (written / name for name in ("m.safetensors", "f.png", "p.csv", "c.csv"))
+    fitted, predicted, corrected = (written / name for name in ("m.safetensors", "p.csv", "c.csv"))
     exports = [written / f"a.{suffix}" for suffix in ("urdf", "c", "h", "csv")]
     exporting = ["export", model, "--urdf", str(exports[0]), "--c", str(exports[1]), "--dh", str(exports[3])]
     made = {
-        "fit": ([*fitting, str(fitted), "--figure", str(figure)], [fitted, figure]),
+        "fit": ([*fitting, str(fitted)], [fitted]),
         "predict": (["predict", model, table["joints.csv"], *UNITS, "-o", str(predicted)], [predicted]),
         "correct": (["correct", model, table["program.csv"], *UNITS, "-o", str(corrected)], [corrected]),
         "export": (exporting, exports),

@@ -30,8 +30,8 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibError
-from diffeo_calib.interop.container import ENTRY, digest
 from diffeo_calib.interop.model_file import read
+from diffeo_calib.interop.numpy_model import ENTRY, digest
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 Rng = np.random.Generator

@@ -28,7 +28,6 @@ from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.transmission import NamedGearLine, gear_lines
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
-from diffeo_calib.sensors.known_drift import KnownDrift
 from diffeo_calib.sensors.places import Places, joined
 from diffeo_calib.sensors.tables import with_positions
 
@@ -133,6 +132,12 @@ class CalibrationResult:
         others = [own.devices for own in self.placement if not own.devices.reads]
         return Places(joined([*others, *devices]), self.placed.ball)
 
+    def errors(self, data: Any) -> dict[str, dict[str, Evaluation]]:
+        """Errors by the kind of the rows and by stage, of rows in the measuring frames of the sessions."""
+        found = {name: residuals(kinematics, self.places(name), data) for name, kinematics in self.stages.items()}
+        kinds = next(iter(found.values()))
+        return {kind: {name: own[kind] for name, own in found.items()} for kind in kinds}
+
     @property
     def left_out(self) -> Evaluations:
         """Sizes of leave-one-out errors by the kind of the rows: those of rows in sockets are spreads."""
@@ -160,39 +165,3 @@ class CalibrationResult:
             how = "interrupted in the search for scales, the best so far are kept"
             return f"{how}; fitted with them: {self.fit.status}"
         return f"{self.fit.status}; scales: {self.selection.status}"
-
-
-@dataclass(frozen=True)
-class KindErrors:
-    """Errors of the rows of one kind."""
-
-    stages: dict[str, Evaluation]  # name of the stage -> its errors
-    rows: Any  # the table, measured positions in the frame of the model
-
-    @property
-    def one(self) -> Evaluation:
-        """The errors of the last stage."""
-        return list(self.stages.values())[-1]
-
-
-def errors_by_kind(result: CalibrationResult, data: Any) -> dict[str, KindErrors]:
-    """Errors of a table by the kind of its rows.
-
-    Args:
-        result: the calibration. data: rows of the devices that it knows, in the measuring frames of its sessions.
-    """
-    found = {name: residuals(kinematics, result.places(name), data) for name, kinematics in result.stages.items()}
-    first = next(iter(found.values()))
-    return {
-        kind: KindErrors({name: own[kind] for name, own in found.items()}, _rows(result, data, first, kind))
-        for kind in first
-    }
-
-
-def _rows(result: CalibrationResult, data: Any, errors: Any, kind: str) -> Any:
-    """The rows of a kind as a table of their own."""
-    (own,) = data.rows(errors.index[kind].tolist()).parts
-    if errors[kind] is not errors.positions:
-        return own
-    seen, drift = result.aligned(own.device_rows()), KnownDrift.of(result.model)
-    return seen if drift is None else drift.undone(seen)

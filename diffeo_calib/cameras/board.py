@@ -39,22 +39,15 @@ class BoardPrior:
 def real_board(points: Tensor, board: Tensor, size: float) -> Tensor:
     """Points (..., 3) of the board as it is, m, from those meant; board (5,)."""
     x, y, z = points.unbind(-1)
-    bent = z + size * (_bends(points, size) @ board[2:])
+    a, b = x / size, y / size
+    bent = z + size * (torch.stack([a * a, a * b, b * b], -1) @ board[2:])
     return torch.stack([(1 + board[0] + board[1]) * x, (1 + board[0] - board[1]) * y, bent], -1)
 
 
 def board_slopes(points: Tensor, size: float) -> Tensor:
-    """Derivatives (..., 3, 5) of the board's points by its parameters."""
-    x, y, _ = points.unbind(-1)
-    zero = torch.zeros_like(x)
-    flat = torch.stack([torch.stack([x, x], -1), torch.stack([y, -y], -1), torch.stack([zero, zero], -1)], -2)
-    bends = size * _bends(points, size)
-    return torch.cat([flat, torch.stack([torch.zeros_like(bends), torch.zeros_like(bends), bends], -2)], -1)
-
-
-def _bends(points: Tensor, size: float) -> Tensor:
-    a, b = points[..., 0] / size, points[..., 1] / size
-    return torch.stack([a * a, a * b, b * b], -1)
+    """Derivatives (..., 3, 5) of the board's points by its parameters, in which they are linear."""
+    units = torch.eye(len(BOARD), dtype=points.dtype, device=points.device)
+    return torch.stack([real_board(points, one, size) - points for one in units], -1)
 
 
 LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")

@@ -18,6 +18,7 @@ from diffeo_calib.calibration.choose_scales import VARIANCE_RATIO, choose_scales
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import changes_of
 from diffeo_calib.calibration.placing.place import Placed, place
+from diffeo_calib.calibration.placing.placement import Elsewhere
 from diffeo_calib.calibration.planning.candidates import candidates, ranges_around
 from diffeo_calib.calibration.planning.knowledge import greedy
 from diffeo_calib.calibration.scales.leave_one_out import variance_ratio
@@ -28,13 +29,13 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError, few
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.fitting.result import silent
+from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.rows import with_attributes
-from diffeo_calib.process.numbers import Numbers
-from diffeo_calib.process.process import Expected, Process
 from diffeo_calib.process.scales import Hyperparameters
+from diffeo_calib.regression.conditional import Conditional, Features, Process, diagonal_blocks
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import CHANGE, Hypothesis
@@ -120,78 +121,85 @@ class Around:
 
     def noise(self, data: TangentData) -> Tensor:
         """(N, R, R) of what rows tell, m^2."""
-        return data.told.weighted_noise(self.scales)
+        return data.noise_of_numbers(self.scales)
 
-    def given(self, before: Process, data: TangentData) -> Process:
+    def given(self, before: Conditional, data: TangentData) -> Process:
         """What is known after more rows."""
-        return before.given(data.numbers, data.numbers.blocks_of_table(self.noise(data)))
+        return before.given(data.numbers(self.scales), self.noise(data))
 
     def process(self, table: Any, accepted: Sequence[int]) -> Process:
         """What is known by rows of the campaign."""
         place_of = {row: number for number, row in enumerate(self.placed.data.line_numbers.tolist())}
         mine = [place_of[row] for row in accepted if row in place_of]
-        later, found = [row for row in accepted if row not in place_of], self.data.prior(self.scales)
-        if mine:
-            own = self.data.rows(torch.tensor(mine, dtype=torch.int64, device=HOST))
-            found = own.sample(len(mine), MOST_COORDINATES, 0)[1].process(self.scales)
+        later = [row for row in accepted if row not in place_of]
+        if not mine:
+            return self.given(self.data.prior(self.scales), self.rows(table.rows(later))[0])
+        own = self.data.rows(torch.tensor(mine, dtype=torch.int64, device=HOST))
+        found = own.sample(len(mine), MOST_COORDINATES, 0)[1].process(self.scales)
         return self.given(found, self.rows(table.rows(later))[0]) if later else found
 
     @cached_property
     def like(self) -> int:
-        """Number of the row as which the candidates would be measured, see :meth:`Placed.row_like`."""
-        return self.placed.row_like(self.candidates)
+        """Number of the last row as which some of the candidates can be measured; else the very last."""
+        last = len(self.placed.data) - 1
+        return next((row for row in range(last, -1, -1) if bool(self._sees(row, self.candidates).any())), last)
+
+    @property
+    def _elsewhere(self) -> list[Elsewhere]:
+        """That row at the candidates."""
+        return self.placed.elsewhere(self.like, self.candidates)
+
+    def _sees(self, row: int, q: Tensor) -> Tensor:
+        """(M,) boolean: configurations in which a row can be measured."""
+        every = torch.ones(len(q), dtype=torch.bool, device=q.device)
+        return torch.stack([every, *(own.there for own in self.placed.elsewhere(row, q))]).all(0)
 
     @cached_property
     def open(self) -> Tensor:
         """(M,) boolean, candidates that can be measured."""
-        return self.placed.sees(self.like, self.candidates)
+        return self._sees(self.like, self.candidates)
 
     def with_open_candidates(self, count: int, seed: int) -> Around:
         """The same with ``count`` candidates that can be measured, drawn where some of these cannot; else itself."""
-        robot = self.placed.registration.geometry.chain
+        geometry, places = self.placed.identification.geometry, [own.places for own in self._elsewhere]
+        chain, base = geometry.chain, geometry.base
+        how: Any = {"ranges": ranges_around(chain, self.placed.data.q), "keep": partial(self._sees, self.like)}
+        if any(map(len, places)):
+            how |= {"places": (torch.cat(places) - base[:3, 3]) @ base[:3, :3], "ball": geometry.tool[-1]}
         with suppress(InputError):  # hardly any can
             if not bool(self.open.all()):
-                how: Any = {
-                    "ranges": ranges_around(robot, self.placed.data.q),
-                    **self.placed.places_to_reach(self.like),
-                }
-                return replace(
-                    self,
-                    candidates=candidates(robot, count, keep=partial(self.placed.sees, self.like), seed=seed, **how),
-                )
+                return replace(self, candidates=candidates(chain, count, seed=seed, **how))
         return self
 
     @cached_property
-    def options(self) -> tuple[Numbers, Tensor]:
+    def options(self) -> tuple[Linearisation, Tensor]:
         """What the candidates would tell, and its noise (M, r, r), m^2."""
-        rows = self.placed.data.rows([self.like] * len(self.candidates))
-        copies = self.placed.measured_at(self.like, with_joints(rows, self.candidates), self.candidates)
+        copies = with_joints(self.placed.data.rows([self.like] * len(self.candidates)), self.candidates)
+        for own in self._elsewhere:
+            copies = own.changed(copies)
         data = self.rows(copies)[0]
-        (noise,) = data.numbers.blocks_of_table(self.noise(data))
-        return data.numbers, noise
+        return data.numbers(self.scales).at, self.noise(data)
 
     @cached_property
-    def errors(self) -> tuple[Numbers, Tensor]:
+    def errors(self) -> tuple[Linearisation, Tensor]:
         """The markers, or the origins of poses, at the target, and (T r, T r) what of their errors counts.
 
         Without a measuring device rigid motions of all of them do not.
         """
-        q, shifts = self.target, self.data.shared.shape[2]
-        at = replace(self.data, nominal=self.data.nominal.typical, x=q, shared=None, observe=None, beside=None)
-        A, points = Bodies(self.placed.lever).averaging(at.points), at.points.unflatten(1, (-1, 3))
-        nothing, S = points.new_zeros(len(q), len(A)), torch.nn.functional.pad(A @ at.sensitivities, (0, shifts))
-        own = {"target": nothing, "S": S, "J": A @ at.jacobian, "A": A.expand(len(q), *A.shape)}
-        numbers = Numbers.of(q, at.points, torch.ones_like(nothing, dtype=torch.bool), **own)
-        compared = torch.eye(nothing.numel(), dtype=S.dtype, device=S.device)
+        q, typical = self.target, self.data.nominal.typical
+        data = replace(self.data, nominal=typical, x=q, shared=None, observe=None, beside=None)
+        A, points = Bodies(self.placed.lever).averaging(data.points), data.points.unflatten(1, (-1, 3))
+        at = data.linearisation(self.scales).projected(A.expand(len(q), *A.shape))
+        compared = torch.eye(len(q) * len(A), dtype=A.dtype, device=A.device)
         if self.placed.free:
             B = (A @ frame_slopes(points, points.mean((0, 1)))).flatten(0, 1)
             compared -= B @ torch.linalg.pinv(B)
-        return numbers, compared
+        return at, compared
 
-    def covariance(self, target: Expected) -> Tensor:
+    def covariance(self, target: Features) -> Tensor:
         """Covariance (T r, T r) of the errors over the target, m^2."""
         compared = self.errors[1]
-        return compared @ target.covariance @ compared
+        return compared @ target.between() @ compared
 
     def deviation(self) -> float:
         """Standard deviation of the log RMS error over the target by uncertain scales.
@@ -207,7 +215,8 @@ class Around:
         def at(logarithms: Tensor) -> tuple[Tensor, float]:
             """Covariance of the rows, and log RMS error over the target."""
             process = some.process(self.scales.from_logarithms(logarithms))
-            return process.factor.matrix, 0.5 * float(self.covariance(process.expected(self.errors[0])).trace().log())
+            target = process.features(replace(self.errors[0], spec=process.numbers.at.spec))
+            return process.factor.matrix, 0.5 * float(self.covariance(target).trace().log())
 
         low = torch.linalg.cholesky(at(point)[0])
         for step in LOG_SCALE_STEP * torch.eye(len(point), dtype=point.dtype, device=point.device):
@@ -255,8 +264,8 @@ class CampaignModel:
         self.window = [one.row for one in judged[-gates.WINDOW :] if one.row >= first]
         self.process = around.process(table, [row for row in accepted if row not in self.window])
         self.last = around.rows(table.rows(self.window))[0]
-        self._target, self._options = self.process.expected(around.errors[0]), self.process.expected(around.options[0])
-        self._learn(verdicts, self.process.expected(self.last.numbers))
+        self._target, self._options = (self.process.features(each[0]) for each in (around.errors, around.options))
+        self._learn(verdicts, self.process.features(self.last.numbers(around.scales).at))
 
     def rebuilt(self, table: Any, verdicts: Sequence[Verdict]) -> CampaignModel:
         """Around the same places, what the rows say that are accepted now, of devices that have a place."""
@@ -292,14 +301,11 @@ class CampaignModel:
 
     def next(self, count: int) -> tuple[list[int], list[float]]:
         """Candidates that lower the variance over the target most, and the expected error before and after each, m."""
-        (numbers, noise), (_, compared), open_ = self.around.options, self.around.errors, self.around.open
-        self._options = self.process.expected(numbers, self._options)
-        options, target = (
-            self.now.expected(numbers, self._options),
-            self.now.expected(self._target.numbers, self._target),
-        )
-        K, (M, r), place = options.covariance, noise.shape[:2], torch.arange(len(noise), device=HOST)
-        cross, own = compared @ self.now.between(target, options), numbers.diagonal_blocks(K)[0] + noise
+        (at, noise), (_, compared), open_ = self.around.options, self.around.errors, self.around.open
+        self._options = self.process.features(at, self._options)
+        options, target = (self.now.features(one.at, one) for one in (self._options, self._target))
+        K, (M, r), place = options.between(), noise.shape[:2], torch.arange(len(noise), device=HOST)
+        cross, own = compared @ target.between(options), diagonal_blocks(K, M) + noise
         how: Any = {"place": place, "open_": open_, "count": min(count, int(open_.sum()))}
         order, by = greedy(cross, own, lambda row: K.view(M, r, -1)[row], **how)
         variance = self.covariance.diagonal().mean()[None]
@@ -329,12 +335,14 @@ class CampaignModel:
         cause = "" if fits else self._cause(table, own, single)
         shown = self.around.placed.shown(table.rows([row]).parts[0])
         verdicts.append(Verdict(row, fits, fits, found.error, found.expected, cause, shown=shown, line=lines[row]))
-        at, some = self.process.expected(last.numbers), [verdicts[number] for number in window]
+        numbers, some = last.numbers(self.around.scales), [verdicts[number] for number in window]
+        at = self.process.features(numbers.at)
         flags = _flags([one.accepted for one in some]), _flags([not one.cause for one in some])
         how: Any = {"single": found, "typical": typical, "coordinates": last.y.shape[1]}
         change = None
         if not cause:
-            change = find_change(Seen.of(at, self.around.noise(last)), window, changes(), flags, **how)
+            seen = Seen.of(self.process, numbers, self.around.noise(last), at)
+            change = find_change(seen, window, changes(), flags, **how)
         if change is not None:
             known = verdicts[window[0]].change
             if known is not None and change.row == window[0]:  # it is older than these rows
@@ -347,17 +355,17 @@ class CampaignModel:
                     verdicts[number] = replace(one, accepted=accepted, change=None if before else change)
         self._learn(verdicts, at)
 
-    def _learn(self, verdicts: Sequence[Verdict], at: Expected) -> None:
+    def _learn(self, verdicts: Sequence[Verdict], at: Features) -> None:
         """What is known now; ``at``: the last rows as the process predicts them. Those not accepted tell nothing."""
         accepted, noise = _flags([verdicts[row].accepted for row in self.window]), self.around.noise(self.last)
         noise = without_hidden(noise, accepted[:, None].expand(noise.shape[:2]))
-        self.now = self.process.given(at.numbers, at.numbers.blocks_of_table(noise), at)
-        self._target = self.process.expected(self._target.numbers, self._target)
-        self.covariance = self.around.covariance(self.now.expected(self._target.numbers, self._target))
+        self.now = self.process.given(self.last.numbers(self.around.scales), noise, at)
+        self._target = self.process.features(self._target.at, self._target)
+        self.covariance = self.around.covariance(self.now.features(self._target.at, self._target))
 
     def _seen(self, data: TangentData) -> Seen:
         """Rows as the accepted ones before them predict them."""
-        return Seen.of(self.now.expected(data.numbers), self.around.noise(data))
+        return Seen.of(self.now, data.numbers(self.around.scales), self.around.noise(data))
 
     def _cause(self, table: Any, own: TangentData, seen: Seen) -> str:
         """Why the last row is wrong, in words; empty if nothing that is undone makes it fit."""
@@ -381,7 +389,8 @@ class CampaignModel:
             order = [{a: b, b: a}.get(k, k) for k in range(each.shape[1])]
             values.append((f"markers {a} and {b} seem to be exchanged", each[:, order].flatten(1)))
         for words, other in values:
-            yield words, seen._replace(error=seen.error + seen.numbers.of_table(own.in_numbers(other - own.y)))
+            away = seen.numbers.of_table(own.in_numbers((other - own.y)[..., None]))[:, 0]
+            yield words, seen._replace(error=seen.error + away)
         q, chain = table.q[-1], self.around.placed.registration.geometry.chain
         turning = torch.tensor(chain.periodic, dtype=torch.bool, device=HOST)
         joints = {

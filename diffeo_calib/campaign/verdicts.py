@@ -22,9 +22,9 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.common.quantiles import chi2_above, chi2_probability
+from diffeo_calib.maps.linearisation import Numbers
 from diffeo_calib.process.evidence import Evidence
-from diffeo_calib.process.numbers import Numbers
-from diffeo_calib.process.process import Expected
+from diffeo_calib.regression.conditional import Features, Process
 from diffeo_calib.sensors.devices import Hypothesis
 
 
@@ -125,10 +125,11 @@ class Seen(NamedTuple):
     covariance: Tensor
 
     @classmethod
-    def of(cls, at: Expected, noise: Tensor) -> Seen:
-        """All numbers; ``noise``: (N, r, r) of the rows, m^2."""
-        covariance = at.numbers.add_blocks(at.covariance, at.numbers.blocks_of_table(noise))
-        return cls(at.numbers, at.numbers.target - at.mean, covariance)
+    def of(cls, process: Process, numbers: Numbers, noise: Tensor, at: Features | None = None) -> Seen:
+        """All numbers, with noise (N, R, R) of the rows, m^2; ``at``: their features, if known already."""
+        at = process.features(numbers.at) if at is None else at
+        error = numbers.target - numbers.there(process.mean(at))
+        return cls(numbers, error, numbers.with_noise(at.between(), noise))
 
     def some(self, wanted: Tensor) -> Seen:
         """Some of them, (R,) boolean."""

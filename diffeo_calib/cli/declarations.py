@@ -59,7 +59,6 @@ class FitOptions(Command, Rows, Robot):
     controls: int | None = option(
         "Number of rows that carry the deformation; by default all, or 200 of a large table.", min=10
     )
-    figure: Path | None = written("Also draw the errors (of the held-out rows, if any).", "IMAGE")
     report: Path | None = written("Also write the report: one page that needs neither a network nor a server.", "HTML")
     note: str = option(NOTE, "TEXT", "")
     scales_of: list[Path] | None = option(
@@ -371,11 +370,8 @@ class RecalibrateOptions(Command, Rows):
         default="evidence",
     )
     seed: int = option("Seed of the tests for changes.", **SEED)
-    drift: Literal["tested", "none"] = option(
-        "tested: what a test names may have changed; none: device and markers only.", default="tested"
-    )
     note: str = option(NOTE, "TEXT", "")
-    needs = (("--drift --note", "-o"),)
+    needs = (("--note", "-o"),)
 
 
 class DemoOptions(Command):

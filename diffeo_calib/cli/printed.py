@@ -20,9 +20,8 @@ from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.registered_map import Registration
+from diffeo_calib.measurements.bodies import marker_lines, transform_words, triple
 from diffeo_calib.measurements.csv.cells import number
-from diffeo_calib.measurements.poses import POINTS, rotation_numbers
-from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.errors import SIZES, Evaluation, shown_unit
 from diffeo_calib.sensors.kinds import known_kinds
 
@@ -40,38 +39,36 @@ class ErrorTable:
     """Errors in their own unit, and of orientations in degrees if there are any; in two tables where one is too wide.
 
     Args:
-        errors: of the kind to show. of: whose they are, the end of the title. columns: names of the leading columns.
+        rows: what each row is called -> its errors, all of one kind. of: whose they are, the end of the title.
+        columns: names of the leading columns. expected: RMS, m, in a column of its own.
     """
 
-    def __init__(self, errors: Evaluation, of: str, *columns: str) -> None:
-        self.title, self.of, self.columns = f"{errors.title} in {errors.shown[0]}", of, columns
-        self.rows: list[tuple[tuple[str, ...], tuple[list[float], ...]]] = []
+    def __init__(
+        self, rows: Mapping[tuple[str, ...], Evaluation], of: str, *columns: str, expected: float | None = None
+    ) -> None:
+        self.rows, self.of, self.columns, self.expected = rows, of, columns, expected
 
-    def add(self, errors: Evaluation, *labels: str, expected: float | None = None) -> None:
-        """Add a row: its errors, what it is called, and the expected RMS."""
-        last = [] if expected is None else [errors.shown[1] * expected]
-        turned = errors.orientation
-        self.rows.append((labels, (errors.sizes, [] if turned is None else turned.sizes, last)))
-
-    def _table(self, title: str, *groups: int) -> Table:
-        """A table of some groups of numbers: 0 errors, 1 those of orientations, 2 expected errors."""
-        names, own = (SIZES, [f"{size} deg" for size in SIZES], ["expected RMS"]), self.rows[0][1]
-        header = [*self.columns, *(name for group in groups for name in names[group][: len(own[group])])]
-        rows = [
-            [*labels, *("-" if isnan(value) else f"{value:.4f}" for group in groups for value in numbers[group])]
-            for labels, numbers in self.rows
-        ]
-        return text_table(title, header, rows, len(self.columns))
+    def _table(self, title: str, *, errors: bool = True, angles: bool) -> Table:
+        """A table of errors, those of orientations, or both."""
+        last = [self.expected] if self.expected is not None and errors else []
+        header = [*self.columns, *SIZES * errors, *[f"{size} deg" for size in SIZES] * angles]
+        lines = list[list[str]]()
+        for labels, own in self.rows.items():
+            each = own.each[not errors : 1 + angles]
+            numbers = [*(size for one in each for size in one.sizes), *(own.shown[1] * value for value in last)]
+            lines.append([*labels, *("-" if isnan(value) else f"{value:.4f}" for value in numbers)])
+        return text_table(title, [*header, *["expected RMS"] * len(last)], lines, len(self.columns))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:
-        angles = bool(self.rows[0][1][1])
-        whole = self._table(f"{self.title} {self.of}" + ", orientation errors in deg" * angles, 0, 1, 2)
+        one = next(iter(self.rows.values()))
+        title, turned = f"{one.title} in {one.shown[0]} {self.of}", one.orientation is not None
+        whole = self._table(title + ", orientation errors in deg" * turned, angles=turned)
         wide = options.update(max_width=WIDEST)
-        if not angles or console.measure(whole, options=wide).maximum <= options.max_width:
+        if not turned or console.measure(whole, options=wide).maximum <= options.max_width:
             yield whole
         else:
-            yield self._table(f"{self.title} {self.of}", 0, 2)
-            yield self._table(f"Orientation errors in deg {self.of}", 1)
+            yield self._table(title, angles=False)
+            yield self._table(f"Orientation errors in deg {self.of}", errors=False, angles=True)
 
 
 def outlier_lines(outliers: Sequence[Outlier], rows: int, what: str = "training rows") -> Iterator[str]:
@@ -88,41 +85,6 @@ def outlier_lines(outliers: Sequence[Outlier], rows: int, what: str = "training 
         yield f"  row {outlier.number}{marker}: {size:.3f} {unit} off{weight}; {outlier.reason}"
     if len(outliers) > MOST_OUTLIERS:
         yield f"  and {len(outliers) - MOST_OUTLIERS} more"
-
-
-def placement_lines(
-    geometry: Geometry, *, poses: bool, ball: bool = False, frame: str = "the measuring frame"
-) -> Iterator[str]:
-    """Where the robot's base was found in the measuring ``frame``, and the markers in their tips' frames.
-
-    Args:
-        geometry: as refined with the deformations. poses: whether the markers are the points of measured frames, three
-            of each. ball: whether the last one of several is a ball that rested in sockets.
-    """
-    yield f"robot base in {frame}: {_transform(geometry.base)}"
-    yield from _marker_lines(geometry.tool, geometry.on, poses=poses, ball=ball)
-
-
-def _marker_lines(
-    points: Tensor, tips: Sequence[str], *, poses: bool, ball: bool = False, known: Tensor | None = None
-) -> Iterator[str]:
-    """Places (P, 3) of markers, m, or of the frames that they represent; ``known``: standard deviations (P, 3)."""
-    places, tips = (points.unflatten(0, (-1, POINTS)).mean(1), tips[::POINTS]) if poses else (points, tips)
-    for k, (place, tip) in enumerate(zip(places, tips, strict=True)):
-        what = "measured frame" if poses else "marker" + f" {k}" * (len(places) > 1 + ball)
-        what = "ball" if ball and k == len(places) - 1 > 0 else what
-        end = "" if known is None else f", known to {_triple(1e3 * known[k], '.2g')} mm"
-        yield f"{what} in the frame of '{tip}': {_triple(1e3 * place)} mm{end}"
-
-
-def _transform(frame: Tensor) -> str:
-    """A transform (4, 4), m, in words."""
-    turn = rotation_numbers(frame[None, :3, :3], "rotvec", angle="deg")[0]
-    return f"{_triple(1e3 * frame[:3, 3])} mm, rotation vector {_triple(turn)} deg"
-
-
-def _triple(values: Tensor, digits: str = ".3f") -> str:
-    return " ".join(f"{value:{digits}}" for value in values.tolist())
 
 
 def registration_lines(model: CalibratedKinematics) -> Iterator[str]:
@@ -146,7 +108,7 @@ def motion_lines(found: Registration, tips: Sequence[str], *, doubt: str = "") -
     if found.free != "base":
         tips = tips if len(tips) == len(found.markers) else [tips[0]] * len(found.markers)
         rigid = found.lever is not None
-        yield from _marker_lines(found.markers, tips, poses=rigid, known=None if rigid else found.marker_deviations)
+        yield from marker_lines(found.markers, tips, poses=rigid, known=None if rigid else found.marker_deviations)
         if found.shift is not None:
             largest = 1e3 * float(found.shift.norm(dim=1).max())
             sure = f" (unmoved with probability {found.same_place:.2f})" if found.same_place is not None else ""
@@ -157,9 +119,9 @@ def motion_lines(found: Registration, tips: Sequence[str], *, doubt: str = "") -
 
 def frame_lines(found: Registration) -> Iterator[str]:
     """Where the measuring frame is now."""
-    yield f"the measuring frame of the model, seen from the new one: {_transform(found.transform)}"
+    yield f"the measuring frame of the model, seen from the new one: {transform_words(found.transform)}"
     shift, turn = 1e3 * found.frame_deviations[:3], torch.rad2deg(found.frame_deviations[3:])
-    yield f"  known to {_triple(shift, '.2g')} mm at the middle of the rows, and to {_triple(turn, '.2g')} deg"
+    yield f"  known to {triple(shift, '.2g')} mm at the middle of the rows, and to {triple(turn, '.2g')} deg"
 
 
 def socket_lines(errors: Evaluation, rows: str) -> Iterator[str]:

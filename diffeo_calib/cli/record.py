@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from diffeo_calib.common.errors import DiffeoCalibError, InputError
-from diffeo_calib.common.files import IMAGE_SUFFIXES, PROGRAM, check_writable, write_whole
+from diffeo_calib.common.files import PROGRAM, check_writable, write_whole
 from diffeo_calib.reports.results import FORMAT, SIZES, VERSION
 
 if TYPE_CHECKING:
@@ -152,7 +152,7 @@ def _plain(value: Any) -> Any:
 
 
 def check_outputs(named: dict[str, Path], inputs: dict[str, Path], *, may_come: Container[str] = ()) -> None:
-    """Refuse files that cannot be written, that are also read, or that are named twice, and unknown kinds of images.
+    """Refuse files that cannot be written, that are also read, or that are named twice.
 
     --json is one of the files. Files that are read must exist, which is known at once, before anything is loaded.
 
@@ -168,9 +168,6 @@ def check_outputs(named: dict[str, Path], inputs: dict[str, Path], *, may_come: 
     for option, path in named.items():
         _check(option, path, taken)
         taken[option] = path
-    figure = named.get("--figure")
-    if figure is not None and figure.suffix.lower() not in IMAGE_SUFFIXES:
-        raise InputError.of(f"--figure {figure}", expected=f"a name ending in {', '.join(IMAGE_SUFFIXES)}")
     for name, path in inputs.items():
         if name not in may_come and not os.path.lexists(path):
             kind = "model file" if name in ("MODEL", "OLD") else "file"

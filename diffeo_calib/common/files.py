@@ -1,9 +1,8 @@
-"""Files that are written whole or not at all, and figures as files."""
+"""Files that are written whole or not at all."""
 
 from __future__ import annotations
 
 import errno
-import io
 import os
 import re
 import tempfile
@@ -16,7 +15,6 @@ from typing import IO, TYPE_CHECKING
 from diffeo_calib.common.errors import InputError
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from typing_extensions import Self
 
 
@@ -247,18 +245,3 @@ def _take_permissions(part: Path, target: Path) -> None:
 
 
 PROGRAM = ".py:"  # in FILE.py:NAME, a function in a file
-IMAGE_SUFFIXES = (".png", ".pdf", ".svg")  # suffixes of the files that figures can be written to
-
-
-def write_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 160) -> None:
-    """Draw a figure into a file, whose suffix selects the format.
-
-    Raises:
-        InputError: an unknown format, a folder that does not exist, or a file that cannot be written.
-    """
-    if Path(path).suffix.lower() not in IMAGE_SUFFIXES or not Path(path).parent.is_dir():
-        expected = f"a file ending in {', '.join(IMAGE_SUFFIXES)} in an existing folder"
-        raise InputError.of(f"the figure cannot be written to {path}", expected=expected)
-    image = io.BytesIO()
-    figure.savefig(image, format=Path(path).suffix[1:].lower(), dpi=dpi)
-    write_whole(path, image.getvalue())

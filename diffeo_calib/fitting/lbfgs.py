@@ -26,7 +26,7 @@ from diffeo_calib.fitting.problem import Problem, slope
 from diffeo_calib.fitting.result import Progress, Solution, Stop, silent
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Momenta
-from diffeo_calib.regression.cholesky import CholeskyRegression
+from diffeo_calib.regression.conditional import Process
 
 ITERATIONS_PER_CALL = 5  # iterations per call of torch's optimiser; progress is reported between calls
 RENEWAL_ITERATIONS = 40  # iterations after which the preconditioned variables are renewed
@@ -129,11 +129,11 @@ class Descent:
     def renew(self, preconditioned: bool = False) -> None:
         """Choose new variables around the best momenta."""
         self.origin, self.renewed = self.best.flatten().detach(), self.iterations
-        self.factor: CholeskyRegression | None = None
+        self.factor: Process | None = None
         self.variables = self.origin.clone().requires_grad_()
         if preconditioned:
             self.factor = self.problem.preconditioner(self.best, self.integrator)
-            self.variables = torch.zeros_like(self.factor.factor.L[0], requires_grad=True)
+            self.variables = torch.zeros_like(self.factor.alpha, requires_grad=True)
         self.optimizer = torch.optim.LBFGS(
             [self.variables],
             max_iter=ITERATIONS_PER_CALL,
@@ -148,9 +148,7 @@ class Descent:
         """The optimiser's variables as momenta."""
         if self.factor is None:
             return self.best.unflatten(self.variables)
-        lin = self.factor.linearisation
-        mu = self.factor.of_white(self.variables)
-        change = self.problem.unknowns(lin.momenta(mu.view(lin.sensitivity.shape[:2])))
+        change = self.problem.unknowns(self.factor.of_white(self.variables))
         return self.best.unflatten(self.origin + change.flatten())
 
     def closure(self) -> Tensor:

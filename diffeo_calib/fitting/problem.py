@@ -34,10 +34,14 @@ from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap, as_nominal
 from diffeo_calib.maps.observation import Observation, coordinate_noise, observed_dim
-from diffeo_calib.regression.cholesky import CholeskyRegression
-from diffeo_calib.regression.choose import LinearSolver, condition, condition_controls
-from diffeo_calib.regression.conditional import DataConditional
-from diffeo_calib.regression.conjugate_gradients import CG_TOLERANCE
+from diffeo_calib.regression.conditional import Process
+from diffeo_calib.regression.conjugate_gradients import (
+    CG_TOLERANCE,
+    ConjugateGradientRegression,
+    LinearSolver,
+    condition,
+)
+from diffeo_calib.regression.control_points import ControlPointRegression
 
 SMALLEST_NOISE = 1e-100  # smallest standard deviation in m: its square must not underflow
 NEGLIGIBLE_VARIANCE = 1e-18  # noise in m^2 of new coordinates where none were measured: a nanometre
@@ -223,15 +227,15 @@ class Problem:
         """The free ones of all momenta (b, p, theta); the rest is implied by them, and empty."""
         return momenta
 
-    def preconditioner(self, momenta: Momenta, integrator: Integrator) -> CholeskyRegression:
+    def preconditioner(self, momenta: Momenta, integrator: Integrator) -> Process:
         """G + R of a Gauss-Newton step; with fewer controls than data, each control represents N / M measurements."""
         deformation = self.deform(momenta, integrator)
         slopes, at = self.slopes(deformation), deformation.linearise()
         if self.reduced:
             count = len(self.controls)
             mean = self.noise.mean if slopes is None else coordinate_noise(self.noise, slopes)
-            return CholeskyRegression(at, Noise((count / len(self.x) * mean).repeat(count, 1, 1)))
-        return CholeskyRegression(at if slopes is None else at.projected(slopes), self.noise)
+            return Process.of_rows(at, Noise((count / len(self.x) * mean).repeat(count, 1, 1)))
+        return Process.of_rows(at if slopes is None else at.projected(slopes), self.noise)
 
     def calibrated(self, deformation: Deformation) -> FittedMap:
         """A deformation of this problem as the map that users work with."""
@@ -310,7 +314,7 @@ def slope(
 class Regression(NamedTuple):
     """A linearisation conditioned on its data; ``target`` (N, m) is measured minus linearised at zero fields, m."""
 
-    conditional: DataConditional
+    conditional: Process | ConjugateGradientRegression
     target: Tensor
 
     def momenta(self) -> Momenta:
@@ -359,7 +363,7 @@ def linear_optimum(
     if not problem.reduced:
         return regress(problem, deformation, linear, tolerance).momenta(), nan
     slopes = problem.slopes(deformation)
-    return condition_controls(deformation, problem.x, problem.noise, slopes, problem.residual).mode()
+    return ControlPointRegression(deformation, problem.x, problem.noise, slopes, problem.residual).mode()
 
 
 def tangent(problem: Problem, linear: LinearSolver = "auto") -> Regression:

@@ -28,7 +28,7 @@ def camera_files(
 
     Raises InputError: a model without such a camera, or one that was registered again.
     """
-    cameras = {name: own for each in model.placement for name, own in each.devices.cameras.items()}
+    cameras = {name: own for each in model.placement for name, own in each.cameras.items()}
     if not cameras and (model.lever is None or on_tool is None):
         fix = "calibrate with a table of `images`; of poses of a board say whether the camera is on the tool"
         raise InputError.of("the camera of the model", expected="one that saw a board", got="none", fix=fix)

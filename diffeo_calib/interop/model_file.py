@@ -1,6 +1,6 @@
 """Model files: tensors in safetensors, everything else in its JSON header. Loading executes nothing.
 
-container.py reads the file, model_header.py defines its contents.
+numpy_model.py reads the file, model_header.py defines its contents.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, ModelFileError, as_written, printable
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.interop.container import ENTRY, UNSOUND, Header, digest, read_arrays
 from diffeo_calib.interop.model_header import KernelClasses, MissingArgumentError, Tensors, describe, rebuild
+from diffeo_calib.interop.numpy_model import ENTRY, UNSOUND, Header, digest, read_arrays
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.kernels.profiles import Profile, check_profile
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -84,7 +84,7 @@ def load(
         what = f"{path} has contents that do not fit together ({error})"
         raise ModelFileError.of(what, fix="save the model again") from error
     for own in model.placement if isinstance(model, CalibratedKinematics) else ():
-        own.devices.warn_if_unknown()
+        own.warn_if_unknown()
     return model
 
 

@@ -36,7 +36,7 @@ from diffeo_calib.robots.geometry import Geometry
 
 RANGE_ROWS = 200
 """Least number of configurations in the joint ranges of rows that show no positions."""
-GEOMETRIC, PROJECTION = "geometric calibration", "projection of the model"
+GEOMETRIC, PROJECTION, NOMINAL = "geometric calibration", "projection of the model", "nominal kinematics"
 FOLDS = 5
 """Of the cross-validation."""
 OFFSET_STD, LOOSE_STD = 2e-3, 0.5
@@ -110,23 +110,16 @@ def geometry_of(kinematics: CalibratedKinematics | Geometry) -> Geometry:
     return kinematics if isinstance(kinematics, Geometry) else rigid_kinematics(kinematics).geometry
 
 
-def nominal_kinematics(model: CalibratedKinematics, *, transmission: bool = False) -> RigidKinematics:
-    """The nominal robot with the base and the markers that fit the model best; for comparison."""
-    return _with_errors(model, None, "nominal kinematics", transmission=transmission)
+def with_errors(
+    model: CalibratedKinematics, errors: Tensor | None, how: str = NOMINAL, *, transmission: bool = False
+) -> RigidKinematics:
+    """Kinematics with these joint errors (n_all, 4, 4), m, or none, and the base and markers that fit the model best.
 
-
-def geometric_kinematics(model: CalibratedKinematics) -> RigidKinematics:
-    """The geometric calibration that the model was fitted from; without one, the projection of the model."""
-    errors = model.rigid_errors
-    return rigid_kinematics(model) if errors is None else _with_errors(model, errors, GEOMETRIC)
-
-
-def applied_with_tables(model: CalibratedKinematics, rigid: RigidKinematics, *, applied: bool) -> RigidKinematics:
-    """Rigid kinematics used with correction tables (``applied``) or without, whatever they were fitted for.
-
-    Joint errors are kept; base and markers are those that fit best.
+    Args:
+        model, transmission: see :func:`rigid_kinematics`. how: what they are, in words.
     """
-    return _with_errors(model, rigid.geometry.joint_errors, rigid.how, transmission=applied)
+    on = Compared.of(model, transmission=transmission)
+    return on.compared(_placed(model, errors, on), how, {})
 
 
 def best_joint_offsets(model: CalibratedKinematics) -> JointOffsets:
@@ -184,13 +177,6 @@ class Compared(NamedTuple):
         """A geometry with its distances from the model."""
         d = self.distances(geometry)
         return RigidKinematics(geometry, how, float(d.square().mean().sqrt()), float(d.max()), dict(validated))
-
-
-def _with_errors(
-    model: CalibratedKinematics, errors: Tensor | None, how: str, *, transmission: bool = False
-) -> RigidKinematics:
-    on = Compared.of(model, transmission=transmission)
-    return on.compared(_placed(model, errors, on), how, {})
 
 
 def _noise(rms: float) -> float:

@@ -19,7 +19,7 @@ from diffeo_calib.calibration.calibrate import Controls, calibrate
 from diffeo_calib.calibration.result import CalibrationResult
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.measurements.poses import POINTS, poses_from_marks
+from diffeo_calib.measurements.poses import POINTS
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.scales import Hyperparameters
@@ -57,12 +57,8 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         controls: Controls = "auto",
         seed: int = 0,
     ) -> None:
-        self.robot = robot
-        self.on = on
-        self.lever = lever
-        self.hyperparameters = hyperparameters
-        self.controls = controls
-        self.seed = seed
+        self.robot, self.on, self.lever = robot, on, lever
+        self.hyperparameters, self.controls, self.seed = hyperparameters, controls, seed
 
     def fit(self, X: Any, y: Any) -> DiffeoRegressor:
         """Calibrate the robot.
@@ -77,39 +73,30 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if not isinstance(robot, Tree):
             fix = "pass robot=dc.load_urdf(...) to the constructor"
             raise InputError.of("`robot`", expected="a dc.Tree", got=type(robot).__name__, fix=fix)
-        data: Any = y
-        if isinstance(y, RowGroups):
-            q = self._in_order(robot, validate_data(self, X, dtype=np.float64))
-            if not np.array_equal(q, y.q.numpy()):
-                raise MeasurementError.of("`X`", expected="the joint values of the rows in `y`", fix="pass y.q")
-        else:
-            values = np.asarray(y)
-            hidden = np.isnan(values) if values.dtype.kind == "f" else np.zeros(values.shape, dtype=bool)
-            known: Any = np.where(hidden, 0.0, values) if hidden.any() and not hidden.all() else y
-            checked: Any = validate_data(self, X, known, multi_output=True, y_numeric=True, dtype=np.float64)
-            points = np.array(checked[1], dtype=np.float64).reshape(len(checked[1]), -1)
-            points[hidden.reshape(points.shape)] = np.nan
-            data = self._measured(robot, self._in_order(robot, checked[0]), points)
+        data: Any = y if isinstance(y, RowGroups) else self._measured(robot, X, y)
+        if data is y and not np.array_equal(self._joints(robot, X, reset=True), y.q.numpy()):
+            raise MeasurementError.of("`X`", expected="the joint values of the rows in `y`", fix="pass y.q")
         chosen = {"hyperparameters": self.hyperparameters, "controls": self.controls, "seed": self.seed}
         self.result_ = calibrate(robot, data, **chosen)
         self.model_ = self.result_.model
         return self
 
-    def _measured(self, robot: Tree, q: np.ndarray, points: np.ndarray) -> Measurements:
-        """The rows as measurements; points (N, 3 P), m."""
-        each = 3 if self.lever is None else 3 * POINTS
-        if points.shape[1] % each:
+    def _measured(self, robot: Tree, X: Any, y: Any) -> Measurements:
+        """The rows as measurements."""
+        values = np.asarray(y)
+        hidden = np.isnan(values) if values.dtype.kind == "f" else np.zeros(values.shape, dtype=bool)
+        known: Any = np.where(hidden, 0.0, values) if hidden.any() and not hidden.all() else y
+        checked: Any = validate_data(self, X, known, multi_output=True, y_numeric=True, dtype=np.float64)
+        points = np.where(hidden, np.nan, checked[1]).reshape(len(checked[1]), -1)
+        each = 1 if self.lever is None else POINTS
+        if points.shape[1] % (3 * each):
             fix = "pass x, y and z of every marker, in m, or of three points for every pose; distances, heights and "
             fix += "images belong to devices whose places are found from all rows: dc.calibrate"
-            raise MeasurementError.of("`y`", expected=f"{each} P columns", got=points.shape[1], fix=fix)
-        if self.lever is None:
-            return Measurements(q, points.reshape(len(q), -1, 3), robot.joint_names, on=self.on)
-        marks = torch.from_numpy(points.reshape(-1, POINTS, 3))
-        poses, seen = marks.new_full((len(marks), 4, 4), torch.nan), ~marks.isnan().any((1, 2))
-        poses[seen] = poses_from_marks(marks[seen], self.lever)
-        poses = poses.unflatten(0, (len(q), -1))
-        poses = poses[:, 0] if poses.shape[1] == 1 else poses
-        return Measurements.from_poses(q, poses, robot.joint_names, lever=self.lever, on=self.on)
+            raise MeasurementError.of("`y`", expected=f"{3 * each} P columns", got=points.shape[1], fix=fix)
+        tips = None if self.on is None else [tip for tip in self.on for _ in range(each)]
+        q, places = (torch.from_numpy(part) for part in (self._in_order(robot, checked[0]), points))
+        rows = Measurements.of_points(q, places.unflatten(1, (-1, 3)), tips, self.lever)
+        return rows.with_joint_names(robot.joint_names).doubted(True)
 
     def score(self, X: Any, y: Any, sample_weight: Any = None) -> float:
         """R^2 of marker positions y (M, 3 P), m; InputError for rows of other kinds, which have no common unit."""
@@ -126,12 +113,11 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Returns (M, 3 P) m; with ``return_std`` also their standard deviations, (M, 3 P) m.
         """
         check_is_fitted(self, "model_")
-        q = self._in_order(self.model_.robot, validate_data(self, X, reset=False, dtype=np.float64))
+        q = self._joints(self.model_.robot, X, reset=False)
         if not return_std:
             return self.model_(q).flatten(1).numpy()
         mean, covariance = self.model_.predict(q)
-        deviations = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
-        return mean.flatten(1).numpy(), deviations.flatten(1).numpy()
+        return mean.flatten(1).numpy(), covariance.diagonal(dim1=-2, dim2=-1).sqrt().flatten(1).numpy()
 
     def __sklearn_tags__(self) -> Any:
         """A regressor of several outputs at once, whose input must be joint values of its robot."""
@@ -139,6 +125,9 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         tags.target_tags.single_output = False
         tags.regressor_tags.poor_score = True  # on tables that are no robot's
         return tags
+
+    def _joints(self, robot: Tree, X: Any, *, reset: bool) -> np.ndarray:
+        return self._in_order(robot, validate_data(self, X, reset=reset, dtype=np.float64))
 
     def _in_order(self, robot: Tree, q: Any) -> np.ndarray:
         """Columns in the robot's order, where they have names; MeasurementError unless they are its joints."""

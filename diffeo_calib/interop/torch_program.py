@@ -30,7 +30,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kernels.profiles import PROFILES
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.program import program_of
-from diffeo_calib.kinematics.tool import TOOL_LEVER, ToolKinematics, tool_points, tool_transform
+from diffeo_calib.kinematics.tool import ToolKinematics, tool_points, tool_transform
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.measurements.poses import POINTS, of_frames, poses_of_triangles
 from diffeo_calib.robots.se3 import twist_transform
@@ -107,7 +107,7 @@ TORCH = SimpleNamespace(
     transforms=twist_transform,
     inverse=_rigid_inverse,
 )
-"""See NUMPY in runtime/flow.py."""
+"""See NUMPY in runtime/arrays.py."""
 
 
 class _ConstantPoints(Constants):
@@ -164,7 +164,7 @@ class TorchProgram(nn.Module):
         if isinstance(model, CalibratedKinematics) and output == "tool_poses":
             own = model.tool if tool is None else tool_transform(tool)
             body = ToolKinematics(model.map, model.nominal, own, frame, model.tool_tip)
-            deformation, marks = body.deformation, tool_points(own, TOOL_LEVER)
+            deformation, marks = body.deformation, tool_points(own)
             self.to_frame = torch.linalg.inv(body.base) if frame == "base" else None
             program = None if program is None else program.at(body.tip)
         if program is None and dtype != torch.float64:

@@ -49,6 +49,15 @@ class Kernel(ABC):
         """The kernels that add up to this one: just itself, except for a :class:`SumKernel`."""
         return (self,)
 
+    @property
+    def scales(self) -> int:
+        """Number of scales that :meth:`rescaled` changes: none of a kernel that is not radial."""
+        return 0
+
+    def rescaled(self, logs: Tensor) -> Kernel:
+        """The kernel with length scales, then amplitudes, times exp(logs); differentiable in ``logs``."""
+        return self
+
     def field(self, x: Tensor | None, q: Tensor, a: Tensor) -> Tensor:
         """v(x) = sum_j K(x, q_j) a_j: (M, n). Differentiable by autograd.
 
@@ -266,6 +275,14 @@ class SumKernel(Kernel):
         ("matrix", "own_blocks", "field", "field_and_jacobian", "gradient", "hamiltonian_gradient", "hessian_product"),
     )
     scaled, using, to = map(_of_each, ("scaled", "using", "to"))
+
+    @property
+    def scales(self) -> int:
+        return sum(term.scales for term in self.terms)
+
+    def rescaled(self, logs: Tensor) -> SumKernel:
+        each = logs.split([term.scales for term in self.terms])
+        return SumKernel([term.rescaled(own) for term, own in zip(self.terms, each, strict=True)])
 
     def check(self, dim: int, name: str) -> None:
         for term in self.terms:

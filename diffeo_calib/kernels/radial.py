@@ -111,12 +111,24 @@ class RadialKernel(Kernel):
         other.backend, other.accuracy = check_backend(backend), check_accuracy(accuracy)
         return other
 
-    def scaled(self, factor: float) -> RadialKernel:
+    def _with(self, lengthscale: Tensor, variance: Tensor) -> RadialKernel:
         other = copy(self)
-        other.variance = factor * self.variance
+        other.lengthscale, other.variance, other._maps = lengthscale, variance, {}
         for known in ("_fixed_amplitude", "vanishes"):
             vars(other).pop(known, None)
         return other
+
+    def scaled(self, factor: float) -> RadialKernel:
+        return self._with(self.lengthscale, factor * self.variance)
+
+    @property
+    def scales(self) -> int:
+        return self.lengthscale.numel() + self.variance.numel()
+
+    def rescaled(self, logs: Tensor) -> RadialKernel:
+        lengths, amplitudes = logs.exp().split([self.lengthscale.numel(), self.variance.numel()])
+        variance = self.variance * amplitudes.square().view_as(self.variance)
+        return self._with(self.lengthscale * lengths.view_as(self.lengthscale), variance)
 
     def _field_vanishes(self, a: Tensor) -> bool:
         """Whether the field of momenta (N, ...) is zero, as at the start of a fit, so that no sum is needed."""
@@ -127,10 +139,7 @@ class RadialKernel(Kernel):
         return {name if self.accuracy is None else f"{name} within {self.accuracy:g}"}
 
     def to(self, device: torch.device | str) -> RadialKernel:
-        moved = copy(self)
-        moved.lengthscale, moved.variance, moved._maps = self.lengthscale.to(device), self.variance.to(device), {}
-        vars(moved).pop("_fixed_amplitude", None)
-        return moved
+        return self._with(self.lengthscale.to(device), self.variance.to(device))
 
     def to_config(self) -> dict[str, Any]:
         """The constructor's arguments as JSON values, the profile by its name, and if it is a user's by some values."""

@@ -23,7 +23,6 @@ from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import block_diagonal
 from diffeo_calib.sensors.devices import Devices, Extrinsics
-from diffeo_calib.sensors.places import PlacedDevices
 from diffeo_calib.sensors.set_ups import MountedMarkers, seen_mounted
 
 MOTION_SHARE = 0.01
@@ -79,11 +78,11 @@ class FittedDevice(NamedTuple):
     noise: Tensor | None = None  # (r, r) of a reading by its rows of the fit, m^2; None without any
 
     @classmethod
-    def of(cls, fitted: FittedMap, own: PlacedDevices, number: int) -> FittedDevice:
+    def of(cls, fitted: FittedMap, own: Extrinsics, number: int) -> FittedDevice:
         """A device of a set of those of readings."""
-        devices: Any = own.devices.only(own.names[number : number + 1])
+        devices: Any = own.only(own.names[number : number + 1])
         deviations = devices.deviations[0]
-        placed, rows = cls(devices, torch.diag(deviations)), own.rows[own.device == number]
+        placed, rows = cls(devices, torch.diag(deviations)), devices.rows
         if not len(rows):
             return placed
         numbers, shared = fitted.noise.visible[rows][0], fitted.noise.shared[rows]
@@ -117,18 +116,18 @@ def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[Pre
     """Predicted readings at q (N, n) of every device that a model knows, see :meth:`predict_readings`."""
     fitted: FittedMap = model.map
     for own in model.placement:
-        own.devices.warn_if_unknown()
-    sets = [(own, own.devices) for own in model.placement if own.devices.reads and len(q)]
-    markers = [own.devices for own in model.placement if own.kind == MountedMarkers.kind]
+        own.warn_if_unknown()
+    sets = [own for own in model.placement if own.reads and len(q)]
+    markers = [own for own in model.placement if own.kind == MountedMarkers.kind]
     found = [one for own in markers for one in _mounted(model, own, q, noise=noise)]
     each = (slice(first, first + PREDICT_ROWS) for first in range(0, len(q) if sets else 0, PREDICT_ROWS))
     seen = [fitted.linearised_value(q[some], fitted.geodesic.at_rows(some)) for some in each]
-    for own, devices in sets:
+    for own in sets:
         unit, scale, zero = own.shown or ("", (1.0,), (0.0,))  # files of old versions: as reported, lengths in m
         for number, name in enumerate(own.names):
             device = FittedDevice.of(fitted, own, number)
             means, blocks = zip(*(device.readings(fitted, rows, noise=noise) for rows in seen), strict=True)
-            factor = q.new_tensor(scale) / devices.metres[number]
+            factor = q.new_tensor(scale) / own.metres[number]
             mean = torch.cat(means) * factor + q.new_tensor(zero)
             covariance = torch.cat(blocks) * factor[:, None] * factor
             found.append(PredictedReadings(own.kind, name, unit, mean, covariance))

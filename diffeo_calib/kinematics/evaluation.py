@@ -130,7 +130,7 @@ def place(kinematics: Callable[[Tensor], Tensor], data: Any, *, every_session: b
 def placement_sentences(model: object) -> list[str]:
     """Where the devices are that a model knows, with deviations; none for other kinematics."""
     drift = KnownDrift.of(model)
-    lines = [line for own in getattr(model, "placement", None) or () for line in own.devices.sentences()]
+    lines = [line for own in getattr(model, "placement", None) or () for line in own.sentences()]
     return lines if drift is None else [*lines, *drift.of_joints()]
 
 

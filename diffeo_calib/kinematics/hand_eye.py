@@ -117,7 +117,7 @@ class HandEye:
         cls, model: CalibratedKinematics, *, camera_on_tool: bool, geometry: Geometry | None = None
     ) -> dict[str, HandEye]:
         """That of every camera, of several fixed ones every session's, by name; arguments as of :meth:`of`."""
-        cameras = [name for own in model.placement for name in own.devices.cameras] or [ONLY_CAMERA]
+        cameras = [name for own in model.placement for name in own.cameras] or [ONLY_CAMERA]
         known = {"camera_on_tool": camera_on_tool, "geometry": geometry}
         if len(cameras) == 1:
             return {cameras[0]: cls.of(model, **known)}
@@ -127,7 +127,7 @@ class HandEye:
     @classmethod
     def of_fit(cls, model: CalibratedKinematics) -> dict[str, HandEye]:
         """The same where the model's images, or the command that made it, say where the camera is; else nothing."""
-        made, seen = model.provenance, [one for own in model.placement for one in own.devices.cameras.values()]
+        made, seen = model.provenance, [one for own in model.placement for one in own.cameras.values()]
         words = shlex.split(made.command or "") if made is not None else []
         on_tool = seen[0].on_tool if seen else "--camera-on-tool" in words
         seen_board = bool(model.lever) and (bool(seen) or on_tool or "--robot-pose" in words)
@@ -176,14 +176,14 @@ class SetUp(NamedTuple):
         if name is None or own is None:
             return here
         number = own.names.index(name)
-        transform, rows = own.devices.constants[number].view(4, 4), own.rows[own.device == number]
+        transform, rows = own.constants[number].view(4, 4), own.rows[own.device == number]
         if bool((transform == eye).all()):
             return here
         framed = own.kind == SESSION
         found = here._replace(framed=framed, **{"transform" if framed else "mount": transform})
         columns, twists = found._shifts(model, rows)
         if not framed and not bool(columns.any()):
-            return found._replace(mount_std=own.devices.deviations[number])
+            return found._replace(mount_std=own.deviations[number])
         return found._replace(columns=columns, twists=twists)
 
     def _slopes(self, points: Tensor) -> Tensor:

@@ -140,15 +140,15 @@ def tool_transform(tool: object) -> Tensor:
     return identity
 
 
-def tool_points(tool: Tensor, lever: float = TOOL_LEVER) -> Tensor:
+def tool_points(tool: Tensor) -> Tensor:
     """The three virtual points of a tool (4, 4), in the tip's frame: (3, 3) m."""
-    return mark_points(tool[None], lever)[0]
+    return mark_points(tool[None], TOOL_LEVER)[0]
 
 
-def pose_slopes(points: Tensor, slopes: Tensor, lever: float = TOOL_LEVER) -> Tensor:
+def pose_slopes(points: Tensor, slopes: Tensor) -> Tensor:
     """Derivatives (N, 6, n) of the poses that fit three points best, see :func:`program.pose_slopes`."""
     use = torch, marks(points.device), torch.eye(3, dtype=points.dtype, device=points.device)
-    return program.pose_slopes(points, slopes, poses_from_marks(points, lever)[:, :3, :3], use)
+    return program.pose_slopes(points, slopes, poses_from_marks(points, TOOL_LEVER)[:, :3, :3], use)
 
 
 REFERENCE_ROWS = 40

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -190,3 +191,88 @@ class Linearisation:
         b, p = (nodes[0].pulled(mu[:, :, None])[:, :, 0] for nodes in (self.joint, self.task))
         theta = self.spec.prior_variance * torch.einsum("imk,im->k", self.sensitivity, mu)
         return Momenta(b, p, theta)
+
+
+@dataclass(frozen=True, eq=False)
+class Numbers:
+    """M numbers of N linearised rows with R numbers each, of which some were not measured.
+
+    Args:
+        at: the rows. target: (M,) measured minus linearised at zero fields and parameters.
+        cells: (M,) where the numbers stand in the table (N, R), flattened, in ascending order.
+    """
+
+    at: Linearisation
+    target: Tensor
+    cells: Tensor
+
+    @classmethod
+    def of(cls, at: Linearisation, target: Tensor | None = None, shown: Tensor | None = None) -> Numbers:
+        """Those of a table: target (N, R), zero by default, and which are there (N, R), boolean, all by default."""
+        S = at.sensitivity
+        target = S.new_zeros(S.shape[:2]) if target is None else target
+        shown = torch.ones_like(target, dtype=torch.bool) if shown is None else shown
+        cells = shown.flatten().nonzero()[:, 0]
+        return cls(at, target.flatten()[cells], cells)
+
+    @property
+    def shape(self) -> torch.Size:
+        """N and R."""
+        return self.at.sensitivity.shape[:2]
+
+    @cached_property
+    def all_there(self) -> bool:
+        """Whether all were measured."""
+        return len(self.cells) == self.shape.numel()
+
+    @cached_property
+    def S(self) -> Tensor:
+        """(M, K) derivatives by the parameters, column by column, for the solvers."""
+        return self.of_table(self.at.sensitivity).T.contiguous().T
+
+    @property
+    def owner(self) -> Tensor:
+        """(M,) the row of each number."""
+        return self.cells // self.shape[1]
+
+    def of_table(self, values: Tensor) -> Tensor:
+        """Values (N, R, ...) of the table as those of the numbers (M, ...)."""
+        return self.there(values.flatten(0, 1))
+
+    def there(self, values: Tensor) -> Tensor:
+        """The same of a flattened table: (N R, ...) -> (M, ...)."""
+        return values if self.all_there else values[self.cells]
+
+    def in_table(self, values: Tensor) -> Tensor:
+        """The inverse, zero where nothing was measured: (M, ...) -> (N, R, ...)."""
+        if not self.all_there:
+            values = values.new_zeros(self.shape.numel(), *values.shape[1:]).index_copy(0, self.cells, values)
+        return values.unflatten(0, self.shape)
+
+    def with_noise(self, matrix: Tensor, noise: Tensor) -> Tensor:
+        """(M, M) of a matrix (N R, N R) and the blocks (N, R, R) of noise on its diagonal."""
+        total = matrix.clone()
+        total.view(*self.shape, *self.shape).diagonal(dim1=0, dim2=2).add_(noise.permute(1, 2, 0))
+        return self.there(self.there(total).T).T
+
+    def square(self, matrix: Tensor) -> Tensor:
+        """A matrix (M, M) as that of the table, zero where nothing was measured: (N R, N R)."""
+        return self.in_table(self.in_table(matrix).flatten(0, 1).T).flatten(0, 1).T
+
+    def blocks(self, matrix: Tensor) -> Tensor:
+        """The blocks (N, R, R) of each row in a matrix (M, M), zero where nothing was measured."""
+        place = self.in_table(torch.arange(len(self.cells), device=matrix.device))
+        there = self.in_table(torch.ones_like(self.cells)).to(matrix)
+        return matrix[place[:, :, None], place[:, None]] * (there[:, :, None] * there[:, None])
+
+    def joined(self, other: Numbers) -> Numbers:
+        """These and others, in order."""
+        cells = torch.cat([self.cells, other.cells + self.shape.numel()])
+        return Numbers(Linearisation.joined([self.at, other.at]), torch.cat([self.target, other.target]), cells)
+
+    def gram(self, at: Linearisation, first: int = 0) -> Tensor:
+        """Covariance by the fields of the numbers from one on with k1 at M' configurations: (M - first, M' m)."""
+        if not first:
+            return self.there(self.at.fields.gram(at.fields))
+        rows = torch.arange(int(self.owner[first]), self.shape[0], device=self.cells.device)
+        return self.at.rows(rows).fields.gram(at.fields)[self.cells[first:] - int(rows[0]) * self.shape[1]]

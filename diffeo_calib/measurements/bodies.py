@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError, printable
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements import poses as pose_math
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.sockets import BALL
@@ -194,19 +194,6 @@ class Bodies:
         seen = count - model.ball
         return [*("marker_" if seen == 1 else f"marker{k + 1}_" for k in range(seen)), *[f"{BALL}_"] * model.ball]
 
-    def place_lines(self, model: Any) -> Iterator[str]:
-        """Where the bodies of a model are in the frames of their tips, for a record."""
-        geometry = model.geometry
-        if self.lever is not None:
-            frames = pose_math.by_frame(model.measured_frame[None])[0]
-            for tip, frame in zip(self.tips(geometry.on), frames, strict=True):
-                yield f"measured frame in the frame of {printable(tip)}, 4 x 4 [m]:"
-                yield from matrix_lines(frame)
-            return
-        for number, (tip, marker) in enumerate(zip(geometry.on, geometry.tool.tolist(), strict=True)):
-            place = " ".join(f"{value:.6f}" for value in marker)
-            yield f"marker {number} in the frame of {printable(tip)} [m]: {place}"
-
     def name(self, number: int, count: int) -> str:
         """Name of one of several bodies."""
         return "measured frame" if self.lever is not None else f"marker {number}" if count > 1 else "marker"
@@ -229,10 +216,37 @@ def seen_board(data: Any) -> SeenBoard | None:
     return SeenBoard(data.board, data.poses[:, :3, 3] + (axes @ data.board[..., None])[..., 0], axes, data.lever)
 
 
-def matrix_lines(transform: Tensor) -> Iterator[str]:
-    """A transform (4, 4) as a matrix, and as a place and a rotation vector."""
-    for row in transform.tolist():
-        yield "  " + " ".join(f"{value: .8f}" for value in row)
-    turn = pose_math.rotation_numbers(transform[None, :3, :3], "rotvec")[0]
-    numbers = torch.cat([transform[:3, 3], turn]).tolist()
-    yield "  x y z rx ry rz [m, rad]: " + " ".join(f"{value:.6f}" for value in numbers)
+def placement_lines(
+    geometry: Any, *, poses: bool, ball: bool = False, frame: str = "the measuring frame"
+) -> Iterator[str]:
+    """Where the robot's base was found in the measuring ``frame``, and the markers in their tips' frames.
+
+    Args:
+        geometry: as refined with the deformations. poses: whether the markers are the points of measured frames, three
+            of each. ball: whether the last one of several is a ball that rested in sockets.
+    """
+    yield f"robot base in {frame}: {transform_words(geometry.base)}"
+    yield from marker_lines(geometry.tool, geometry.on, poses=poses, ball=ball)
+
+
+def marker_lines(
+    points: Tensor, tips: Sequence[str], *, poses: bool, ball: bool = False, known: Tensor | None = None
+) -> Iterator[str]:
+    """Places (P, 3) of markers, m, or of the frames that they represent; ``known``: standard deviations (P, 3)."""
+    places, tips = (points, tips) if not poses else (points.unflatten(0, (-1, 3)).mean(1), tips[:: pose_math.POINTS])
+    for k, (place, tip) in enumerate(zip(places, tips, strict=True)):
+        what = "measured frame" if poses else "marker" + f" {k}" * (len(places) > 1 + ball)
+        what = "ball" if ball and k == len(places) - 1 > 0 else what
+        end = "" if known is None else f", known to {triple(1e3 * known[k], '.2g')} mm"
+        yield f"{what} in the frame of '{tip}': {triple(1e3 * place)} mm{end}"
+
+
+def transform_words(frame: Tensor) -> str:
+    """A transform (4, 4), m, in words."""
+    turn = pose_math.rotation_numbers(frame[None, :3, :3], "rotvec", angle="deg")[0]
+    return f"{triple(1e3 * frame[:3, 3])} mm, rotation vector {triple(turn)} deg"
+
+
+def triple(values: Tensor, digits: str = ".3f") -> str:
+    """Three numbers in words."""
+    return " ".join(f"{value:{digits}}" for value in values.tolist())

@@ -165,14 +165,13 @@ def poses_from_marks(points: Tensor, lever: float) -> Tensor:
     if isinstance(points, Tensor) and wrapped(points):
         return poses_of_triangles(points)
     places = as_tensor(points, "points", ("N", 3, 3), fix="pass the three points of a pose", empty=True).detach()
-    centre = places.mean(1)
-    spread = (places - centre[:, None]).mT @ marks(places.device)  # sum_k (p_k - centre) u_k^T
+    spread = (places - places.mean(1, keepdim=True)).mT @ marks(places.device)  # sum_k (p_k - centre) u_k^T
     thickness = torch.linalg.svdvals(spread)[:, 1] / (1.5 * lever)  # 1 for an unbent triangle
     if bool((thickness < FLATTEST_TRIANGLE_LEVERS).any()):
         row = int((thickness < FLATTEST_TRIANGLE_LEVERS).nonzero()[0])
         what = f"row {row}: the three points of the pose lie on one line"
         raise InputError.of(what, expected=f"a triangle with corners {lever:g} m from its centre")
-    return transforms(se3.nearest_rotations(spread), centre)
+    return poses_of_triangles(places)
 
 
 def poses_of_triangles(points: Tensor) -> Tensor:
@@ -269,13 +268,10 @@ def frames_of_points(points: Tensor, lever: float) -> Tensor:
     """The frames (N, T, 4, 4), NaN where hidden, of points (N, 3 T, 3), m; see :func:`poses_from_marks`."""
     triples = points.unflatten(1, (-1, POINTS))
     if wrapped(points):
-        check_lever(lever)
         return poses_of_triangles(triples)
-    hidden = triples.isnan().flatten(2).any(2)
-    if not bool(hidden.any()):
-        return poses_from_marks(triples.flatten(0, 1), lever).unflatten(0, triples.shape[:2])
-    found = triples.new_full((*hidden.shape, 4, 4), torch.nan)
-    found[~hidden] = poses_from_marks(triples[~hidden], lever)
+    seen = ~triples.isnan().flatten(2).any(2)
+    found = triples.new_full((*seen.shape, 4, 4), torch.nan)
+    found[seen] = poses_from_marks(triples[seen], lever)
     return found
 
 
@@ -325,17 +321,6 @@ def inverse_poses(poses: Tensor) -> Tensor:
     return torch.where(poses.isnan(), poses, found)
 
 
-def camera_jacobian(poses: Tensor, lever: float, board: Tensor) -> Tensor:
-    """Derivatives (N, 9, 6) of the points of cameras at poses (N, 4, 4), m, by errors (-dt, -dw) of the board's pose.
-
-    Shift, m, and turn, rad, are along and about the axes of the camera, in whose frame the board's origin is at
-    ``board`` (N, 3), m; coordinates of a point are adjacent.
-    """
-    axes = poses[:, :3, :3]
-    arms = lever * marks(poses.device) - board[:, None]  # (N, point, 3) from the board, in the camera's frame
-    return (axes[:, None] @ _by_motion(arms)).flatten(1, 2)
-
-
 def _by_motion(arms: Tensor) -> Tensor:
     """Derivatives (..., 3, 6) of points at arms (..., 3) by a shift and a small rotation of what carries them."""
     return torch.cat([torch.eye(3, dtype=arms.dtype, device=arms.device).expand(*arms.shape, 3), -skew(arms)], -1)
@@ -344,8 +329,14 @@ def _by_motion(arms: Tensor) -> Tensor:
 def pose_jacobian(poses: Tensor, lever: float, board: Tensor | None) -> Tensor:
     """Derivatives (N, T, 9, 6) of the three points of each frame by the errors of measured poses.
 
+    Those of a camera on the tool are by errors (-dt, -dw) of the board's pose: shift, m, and turn, rad, along and about
+    the axes of the camera. Coordinates of a point are adjacent.
+
     Args:
         poses: (N, T, 4, 4), m, NaN where hidden; T is 1 for a camera. lever: distance of the points, m.
-        board: see :func:`camera_jacobian`; None if the measuring device stood and saw the tool.
+        board: (N, 3) its origin in the camera's frame, m; None if the measuring device stood and saw the tool.
     """
-    return mark_jacobian(poses, lever) if board is None else camera_jacobian(poses[:, 0], lever, board)[:, None]
+    if board is None:
+        return mark_jacobian(poses, lever)
+    arms = lever * marks(poses.device) - board[:, None]  # (N, point, 3) from the board, in the camera's frame
+    return (poses[:, :, None, :3, :3] @ _by_motion(arms)[:, None]).flatten(2, 3)

@@ -19,7 +19,7 @@ from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.measurements import checks
 from diffeo_calib.measurements.observations import joined_tables
-from diffeo_calib.measurements.rows import RowGroups, set_attributes, value_range, with_attributes
+from diffeo_calib.measurements.rows import RowGroups, set_attributes, with_attributes
 
 MILLIMETRES = "mm", 1e3
 """Unit in which lengths are shown, and how many of it are a metre."""
@@ -269,12 +269,6 @@ class Readings(RowGroups):
         if self.reported_std is not None:
             columns |= dict(zip([f"std_{name}" for name in columns], self.reported_std.T, strict=True))
         return columns | {"session": self.device_names}
-
-    @property
-    def ranges(self) -> list[list[str]]:
-        """See :attr:`RowGroups.ranges`."""
-        unit = {"px": "px", "mm": "m"}.get(self.unit[0], "rad")
-        return [value_range(*one, unit) for one in zip(self.value_names, self.reported.T, strict=True)]
 
     def rows(self, index: object) -> Readings:
         """See :class:`RowGroups`; the devices are those of these rows."""

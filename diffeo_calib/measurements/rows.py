@@ -85,8 +85,6 @@ class RowGroups:
     """(N, c) numbers in which a row that repeats another one equals it."""
     measured: Any
     """() -> name -> values (N,) of every column but joints, payloads and covariates, in SI units and pixels."""
-    ranges: Any
-    """Column, smallest and largest value and their unit, of what was measured."""
 
     @property
     def parts(self) -> tuple[Self, ...]:
@@ -273,13 +271,16 @@ class RowGroups:
         return sorted(found, key=lambda pair: pair[1])
 
     def _repr_html_(self) -> str:
-        ranges = []
+        ranges = list[tuple[str, Tensor, str]]()
         for joint, values in enumerate(self.q.T):
             turns = f"{math.degrees(float(values.min())):.1f} to {math.degrees(float(values.max())):.1f} if it turns"
             name = printable(self.joint_names[joint]) if self.joint_names else f"joint {joint}"
-            ranges.append(value_range(name, values, turns))
-        header = "column", "from [rad or m]", "to", "degrees"
-        return table_html(repr(self), header, ranges + [one for part in self.parts for one in part.ranges])
+            ranges.append((name, values, turns))
+        measured = (column for part in self.parts for column in part.measured().items())
+        ranges += [(name, values, "") for name, values in measured if isinstance(values, Tensor)]
+        seen = ((name, values[~values.isnan()], turns) for name, values, turns in ranges)
+        rows = [[name, f"{float(v.min()):.4f}", f"{float(v.max()):.4f}", turns] for name, v, turns in seen if len(v)]
+        return table_html(repr(self), ("column", "from [rad, m or px]", "to", "degrees"), rows)
 
     @property
     def masses(self) -> Tensor:
@@ -378,11 +379,6 @@ class RowGroups:
         alone = int(self.places.max()) + 1 + torch.arange(len(self), device=HOST)
         labels = connected(torch.where(resting, self.places, alone)[rows], self.rows(rows).groups())
         return rows.numpy(), labels, PLACES if bool(resting.all()) else CONFIGURATIONS
-
-
-def value_range(name: str, values: Tensor, unit: str) -> list[str]:
-    """The range of one column (N,)."""
-    return [name, f"{float(values.min()):.4f}", f"{float(values.max()):.4f}", unit]
 
 
 def common(values: Sequence[T]) -> T | None:

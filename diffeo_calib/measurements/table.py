@@ -22,7 +22,7 @@ from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.images import ImageTable
 from diffeo_calib.measurements.observations import Observations, joined_tables
 from diffeo_calib.measurements.readings import Readings, as_readings
-from diffeo_calib.measurements.rows import NO_SOCKET, set_attributes, value_range, with_attributes
+from diffeo_calib.measurements.rows import NO_SOCKET, set_attributes, with_attributes
 from diffeo_calib.measurements.sockets import ONE_SESSION, Distances, Sockets
 from diffeo_calib.measurements.table_format import LEVER
 
@@ -133,7 +133,7 @@ class Measurements(ImageTable):
                 in the same shapes.
             camera_on_tool: the poses are those of a fixed board in the frame of a camera on the tool, as detectors of
                 boards return them, and deviations are along the camera's axes. They are kept inverted, as the camera's
-                poses in the board's frame, see :func:`~diffeo_calib.measurements.poses.camera_jacobian`.
+                poses in the board's frame, see :func:`~diffeo_calib.measurements.poses.pose_jacobian`.
 
         Raises:
             MeasurementError: as the constructor; a transform that is not rigid (its row is named); a lever or a
@@ -352,13 +352,6 @@ class Measurements(ImageTable):
         for known, own in ((self.std, names), (self.rotation_std, turns)):
             columns |= {} if known is None else zip([f"std_{name}" for name in own], known.flatten(1).T, strict=False)
         return columns if self.session is None else columns | {"session": self.device_names}
-
-    @property
-    def ranges(self) -> list[list[str]]:
-        """See :attr:`RowGroups.ranges`; of the places, none for a ball in sockets."""
-        places = self.origins.flatten(0, 1)
-        measured = places[~places.isnan().any(1)]
-        return [value_range(axis, values, "m") for axis, values in zip("xyz", measured.T, strict=True) if len(measured)]
 
     def with_tips(self, on: Sequence[str] | None) -> Measurements:
         """Return the same measurements with markers or poses on these tips, a name for each, else MeasurementError."""

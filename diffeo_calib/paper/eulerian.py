@@ -39,8 +39,8 @@ from diffeo_calib.flows.geodesic import energy
 from diffeo_calib.flows.integrators import RK4, Integrator, Run
 from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, finite
 from diffeo_calib.maps.nominal import NominalMap
-from diffeo_calib.regression.cholesky import CholeskyRegression
-from diffeo_calib.regression.conditional import DataConditional
+from diffeo_calib.regression.conditional import Process
+from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegression
 
 
 @dataclass(frozen=True)
@@ -301,17 +301,17 @@ class EulerianProblem(Problem):
     def deform(self, momenta: Momenta, integrator: Integrator) -> EulerianDeformation:  # pyright: ignore[reportIncompatibleMethodOverride]
         return EulerianDeformation(self.spec, self.x, momenta, integrator, self.equations)
 
-    def preconditioner(self, momenta: Momenta, integrator: Integrator) -> CholeskyRegression:
+    def preconditioner(self, momenta: Momenta, integrator: Integrator) -> Process:
         """G + R of the tangent model, for any momenta."""
         return self._factor
 
     @cached_property
-    def _factor(self) -> CholeskyRegression:
+    def _factor(self) -> Process:
         known = self._conditional
-        return known if isinstance(known, CholeskyRegression) else self.exact.preconditioner(self.exact.zero(), RK4(1))
+        return known if isinstance(known, Process) else self.exact.preconditioner(self.exact.zero(), RK4(1))
 
     @cached_property
-    def _conditional(self) -> DataConditional:
+    def _conditional(self) -> Process | ConjugateGradientRegression:
         return tangent(self.exact).conditional
 
     def start(self, integrator: Integrator) -> tuple[Momenta, int]:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.process.process import Process
+from diffeo_calib.regression.conditional import Process
 
 RELATIVE_RIDGE = 1e-9
 """Relative size of the diagonal that keeps H invertible where rows do not determine all unknowns."""

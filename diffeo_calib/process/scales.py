@@ -260,3 +260,46 @@ class KernelValues:
                 slopes = variances.detach() * (weights * slope).mul_(self.distances).sum((1, 2))
             total = total + variances @ sums + slopes @ (rates - rates.detach())  # zero, with a derivative
         return total
+
+
+class Pairs:
+    """Covariance by the fields of all numbers of N rows; distances are computed once, for a search of many scales.
+
+    Args:
+        x: (N, n) configurations. points: (N, 3 P) of the robot there, m. J: (N, R, n) and A: (N, R, 3 P) derivatives
+            of the numbers by the errors of the joints and of the points.
+    """
+
+    def __init__(self, x: Tensor, points: Tensor, J: Tensor, A: Tensor, space: Space) -> None:
+        self.J, self.A, z = J, A.unflatten(2, (-1, 3)), points.reshape(-1, 3)
+        self._joints = space.squared_distances(x, x)
+        self._points = torch.cdist(z, z, compute_mode="donot_use_mm_for_euclid_dist").square_()
+
+    def values(self, scales: Hyperparameters) -> tuple[KernelValues, KernelValues]:
+        """K_V at all pairs of configurations, and kappa of K_W = kappa I at those of points."""
+        return scales.joint_kernel_values(self._joints), scales.task_kernel_values(self._points)
+
+    def matrix(self, values: tuple[KernelValues, KernelValues]) -> Tensor:
+        """(N R, N R), without a graph."""
+        (joint, task), (N, R, P, _) = (one.values for one in values), self.A.shape
+        by_joint = (joint.transpose(0, 1)[..., None] * self.J.permute(2, 0, 1)).flatten(2)  # (N, n, N R)
+        by_point = torch.einsum("tjp,jrpc->tcjr", task[0].unflatten(1, (N, P)), self.A)
+        by_point = self.A.flatten(2) @ by_point.reshape(N, 3 * P, N * R)
+        return torch.baddbmm(by_point, self.J, by_joint).flatten(0, 1)
+
+    def inner(self, values: tuple[KernelValues, KernelValues], weights: Tensor) -> Tensor:
+        """sum(weights * matrix) for weights (N R, N R), differentiable in the scales: scalar.
+
+        With the gradient of a function of the matrix as weights, its derivative is that of the function, but autograd
+        records no matrix of this size.
+        """
+        N, R, P, _ = self.A.shape
+        half = (self.A.flatten(2).mT @ weights.view(N, R, -1)).view(N * P, 3, N, R)
+        of_points = torch.einsum("tcjr,jrpc->tjp", half, self.A).flatten(1)
+        return values[0].inner(joint_weights(self.J, weights)) + values[1].inner(of_points[None])
+
+
+def joint_weights(J: Tensor, weights: Tensor) -> Tensor:
+    """The weights (n, N, N) of the values of K_V in a sum of weights (N R, N R) times the covariance: J^T W J."""
+    half = (J.mT @ weights.view(*J.shape[:2], -1)).unflatten(2, J.shape[:2])
+    return torch.einsum("icjr,jrc->cij", half, J).contiguous()

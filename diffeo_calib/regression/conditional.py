@@ -1,13 +1,18 @@
-"""What all ways to condition on the data share: covariances from features, and parameters apart from the fields.
+"""What is known from rows of fields and parameters: one Gaussian, conditioned on more rows by one block of Cholesky.
 
-A parameter such as the place of the base has a prior deviation of decimetres, and predictions deviate by micrometres:
-the difference G(x, x) - G(x, data) (G + R)^-1 G(data, x) loses eight digits and more. With G = F + S Lambda^-1 S^T, F
-the covariance of the fields, it is
+Rows report S u + J v(q) + A w(z) + e, to first order, of parameters u ~ N(0, P) and fields v and w. With F the
+covariance by the fields, R that of the noise e, L L^T = F + R, W = L^-1 S P^1/2 and B B^T = 1 + W^T W,
 
-    F(x, x) - F(x, data) (F + R)^-1 F(data, x) + D (Lambda + S^T (F + R)^-1 S)^-1 D^T
-    D = S(x) - F(x, data) (F + R)^-1 S
+    P^-1/2 u^ = B^-T B^-1 W^T alpha,    alpha = L^-1 target,    mu = L^-T (alpha - W P^-1/2 u^) = K^-1 target,
+
+where K = F + R + S P S^T is never formed: a parameter such as the place of the base has a prior deviation of
+decimetres, and predictions deviate by micrometres. What is left of the covariance of two predictions is
+
+    F(x, x') - V(x)^T V(x') + D(x)^T D(x'),    V = L^-1 F(rows, x),    D = B^-1 (P^1/2 S(x)^T - W^T V)
 
 (Rasmussen & Williams, "Gaussian Processes for Machine Learning", 2006, section 2.7), in which nothing large cancels.
+V and D are the features of x. So are those of any knowledge before the rows, whose V and D take the place of none and
+of P^1/2 S^T: of control points, of a model that was placed anew, of unknowns that were opened since.
 Shifts that rows share (:class:`Noise`) are parameters, too.
 """
 
@@ -15,61 +20,59 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import nan
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import large_work
 from diffeo_calib.maps.deformation import Momenta
-from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.maps.linearisation import Linearisation, Numbers
 from diffeo_calib.maps.noise import Noise
+from diffeo_calib.regression.cholesky import Factor, lower_root
 
-NOISE_ADVICE = "raise `noise` or lower the kernels' variances"
-"""How to repair a matrix that float64 cannot factorise."""
 BLOCK_ENTRIES = 1 << 21
 """Number of covariances between data and queries that are computed together (16 MiB, within usual caches)."""
 ROUNDING_RATIO = 1e-12  # eigenvalues of correlations, relative to the largest, that are rounding errors
 
 
-class Features(NamedTuple):
-    """Features f of M configurations: what parameters and data add to the covariance of the fields, a column each.
+@dataclass(frozen=True, eq=False)
+class Features:
+    """V and D of M configurations with r numbers each, see above, from which their covariances follow cheaply."""
 
-    covariance(x, x') = F(x, x') + sum_k sign_k f_k(x) f_k(x')^T, with F that of the fields. Nothing large cancels.
-    """
+    at: Linearisation  # the configurations
+    known: Tensor  # V (k, M r)
+    unknown: Tensor  # D (u, M r)
 
-    at: Linearisation  # the linearisation, r numbers each
-    values: Tensor  # (k, M r)
-    signs: Tensor  # (k,) 1 or -1
+    @cached_property
+    def fields(self) -> Tensor:
+        """(M r, M r) prior covariance by the fields."""
+        return self.at.fields.gram()
 
-    @classmethod
-    def of(cls, at: Linearisation, *parts: tuple[Tensor, int]) -> Features:
-        """Several features (k_i, M r), each with its sign."""
-        signs = [values.new_full((len(values),), float(sign)) for values, sign in parts]
-        return cls(at, torch.cat([values for values, _ in parts]), torch.cat(signs))
-
-    def beside(self, *parts: tuple[Tensor, int]) -> Features:
-        """These, and others (k_i, M r) with their signs."""
-        _, values, signs = Features.of(self.at, *parts)
-        return Features(self.at, torch.cat([self.values, values]), torch.cat([self.signs, signs]))
+    def beside(self, known: Tensor, unknown: Tensor) -> Features:
+        """These, and others (k, M r) and (u, M r)."""
+        return replace(self, known=torch.cat([self.known, known]), unknown=torch.cat([self.unknown, unknown]))
 
     def rows(self, index: Tensor) -> Features:
         """Those of some configurations (B,)."""
-        values = self.values.unflatten(1, (len(self.at.sensitivity), -1))[:, index].flatten(1)
-        return Features(self.at.rows(index), values, self.signs)
+        M = len(self.at.sensitivity)
+        known, unknown = (part.unflatten(1, (M, -1))[:, index].flatten(1) for part in (self.known, self.unknown))
+        return Features(self.at.rows(index), known, unknown)
 
     def blocks(self) -> Tensor:
         """Covariance of every configuration of a projected linearisation with itself: (M, r, r)."""
-        values = self.values.T.reshape(*self.at.sensitivity.shape[:2], -1)
-        return self.at.fields.own_blocks() + (values * self.signs) @ values.mT
+        known, unknown = (part.T.unflatten(0, self.at.sensitivity.shape[:2]) for part in (self.known, self.unknown))
+        return self.at.fields.own_blocks() - known @ known.mT + unknown @ unknown.mT
 
     def between(self, other: Features | None = None) -> Tensor:
         """Covariance (M r, M' r') with others, by default themselves."""
+        fields = self.fields.clone() if other is None else self.at.fields.gram(other.at.fields)
         theirs = self if other is None else other
-        fields = self.at.fields.gram(None if other is None else other.at.fields)
         with large_work(fields.numel()):
-            return fields.addmm_(self.values.T * self.signs, theirs.values)
+            fields.addmm_(self.known.T, theirs.known, alpha=-1.0)
+            return fields.addmm_(self.unknown.T, theirs.unknown)
 
 
 class Conditional(ABC):
@@ -85,6 +88,18 @@ class Conditional(ABC):
     @abstractmethod
     def features(self, at: Linearisation) -> Features:
         """Features of a linearisation, from which covariances between any of its configurations follow cheaply."""
+
+    def given(self, new: Numbers, noise: Tensor, at: Features | None = None) -> Process:
+        """What is known after rows with noise (N, R, R); ``at``: :meth:`features` of all of them, if known already.
+
+        Raises:
+            NumericalError: their covariance is not positive definite in float64.
+        """
+        at = self.features(new.at) if at is None else at
+        known, unknown = new.there(at.known.T), new.there(at.unknown.T)
+        F = new.with_noise(at.fields, noise)
+        factor = Factor.of(F.addmm_(known, known.T, alpha=-1.0), unknown)
+        return Process(self, new, known, factor, factor.white(new.target[:, None])[:, 0])
 
     def posterior(self, at: Linearisation) -> Tensor:
         """Posterior covariance at the M configurations of a projected linearisation, all at once: (M, r, r)."""
@@ -115,65 +130,16 @@ class Conditional(ABC):
         return torch.cat(blocks)
 
 
-class DataConditional(Conditional):
-    """Conditioning with all N data of m numbers as control points; the unknown is mu, the momentum at time 1.
+@dataclass(frozen=True, eq=False)
+class BeforeData(Conditional):
+    """The fields and parameters with these deviations (K,), before any data."""
 
-    Args:
-        linearisation: first-order response of k1 at the data to fields and parameters. noise: R.
-
-    Attributes:
-        slopes: H (N m, K + c) derivatives by parameters and shared shifts, in units of their prior ``deviations``.
-    """
-
-    def __init__(self, linearisation: Linearisation, noise: Noise) -> None:
-        self.linearisation, self.size = linearisation, linearisation.sensitivity.shape[:2].numel()
-        deviations, shared = linearisation.spec.prior_variance.sqrt(), noise.shared
-        self.slopes = torch.cat([linearisation.sensitivity * deviations, shared], 2).flatten(0, 1)
-        self.deviations = torch.cat([deviations, shared.new_ones(shared.shape[2])])
-
-    @abstractmethod
-    def solve(self, values: Tensor) -> Tensor:
-        """(G + R)^-1 values: (N, m, k) -> (N, m, k)."""
-
-    @abstractmethod
-    def white(self, values: Tensor) -> Tensor:
-        """T values (N m, k), with T^T T = (F + R)^-1 of fields and noise."""
-
-    @property
-    @abstractmethod
-    def apart(self) -> tuple[Tensor, Tensor]:
-        """W = T H, and the Cholesky factor B of 1 + W^T W."""
-
-    def mu(self, target: Tensor) -> Tensor:
-        """(G + R)^-1 target: (N, m) -> (N, m)."""
-        return self.solve(target[:, :, None])[:, :, 0]
-
-    def momenta(self, target: Tensor) -> Momenta:
-        """Posterior mode of b, p, theta: mu transported back to time 0.
-
-        Args:
-            target: (N, m) measured minus linearised model at zero fields, m.
-        """
-        return self.linearisation.momenta(self.mu(target))
-
-    def features(self, at: Linearisation) -> Features:
-        """Information of the data about the fields, and about the parameters without it (K + c, M r)."""
-        W, B = self.apart
-        cross = self.linearisation.fields.gram(at.fields)
-        with large_work(cross.numel()):
-            known = self.white(cross)
-        unknown = (of_parameters(at, len(B)).flatten(0, 1) * self.deviations).T - W.T @ known  # (D Lambda^-1/2)^T
-        return Features.of(at, (known, -1), (torch.linalg.solve_triangular(B, unknown, upper=False), 1))
-
-
-class Fields(Conditional):
-    """The fields alone, before any data and without parameters."""
-
+    deviations: Tensor
     size = 0
 
     def features(self, at: Linearisation) -> Features:
-        rows = at.sensitivity.flatten(0, 1)
-        return Features.of(at, (rows.new_zeros(0, len(rows)), 1))
+        unknown = (of_parameters(at, len(self.deviations)).flatten(0, 1) * self.deviations).T
+        return Features(at, unknown[:0], unknown)
 
 
 class Opened(Conditional):
@@ -188,28 +154,143 @@ class Opened(Conditional):
         self.before, self.size, self.first, self.deviations = before, before.size, first, deviations
 
     def features(self, at: Linearisation) -> Features:
+        found = self.before.features(at)
         opened = of_parameters(at, self.first + len(self.deviations))[..., self.first :] * self.deviations
-        return self.before.features(at).beside((opened.flatten(0, 1).T, 1))
+        return found.beside(found.known[:0], opened.flatten(0, 1).T)
 
 
-class Given(Conditional):
-    """The same after more rows.
+@dataclass(frozen=True, eq=False)
+class Process(Conditional):
+    """The posterior of fields and parameters by rows, see above.
 
     Args:
-        before: without them. rows: linearisation of what they report. noise: (O, r, r).
-
-    Raises:
-        NumericalError: their covariance is not positive definite in float64.
+        before: what was known before them. numbers: M of the rows so far. known: (M, k) V of these before.
+        factor: of their covariance then, with noise. alpha: (M,).
     """
 
-    def __init__(self, before: Conditional, rows: Linearisation, noise: Tensor) -> None:
-        self.before, self.rows = before, before.features(rows)
-        self.size = before.size + noise.shape[:2].numel()
-        self._root = lower_root(self.rows.between() + torch.block_diag(*noise))
+    before: Conditional
+    numbers: Numbers
+    known: Tensor
+    factor: Factor
+    alpha: Tensor
 
-    def features(self, at: Linearisation) -> Features:
-        found = self.before.features(at)
-        return found.beside((torch.linalg.solve_triangular(self._root, self.rows.between(found), upper=False), -1))
+    @classmethod
+    def of_rows(cls, at: Linearisation, noise: Noise) -> Process:
+        """By a linearisation of all data, with the prior of its parameters and with what the rows share."""
+        deviations, shared = at.spec.prior_variance.sqrt(), noise.shared
+        prior = BeforeData(torch.cat([deviations, shared.new_ones(shared.shape[2])]))
+        at = at.with_columns(shared, len(deviations)) if shared.shape[2] else at
+        return prior.given(Numbers.of(at, shown=noise.visible), noise.covariance)
+
+    @property
+    def size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.before.size + len(self.alpha)
+
+    def given(self, new: Numbers, noise: Tensor, at: Features | None = None) -> Process:
+        at = self.features(new.at) if at is None else at
+        F, known = new.with_noise(at.fields, noise), new.there(at.known.T)
+        L, k = lower_root(F.addmm_(known, known.T, alpha=-1.0)), self.known.shape[1]
+        unknown = new.there(self.before.features(new.at).unknown.T) - known[:, k:] @ self.factor.W
+        right = torch.cat([(new.target - known[:, k:] @ self.alpha)[:, None], unknown], 1)
+        right = torch.linalg.solve_triangular(L, right, upper=False)
+        return replace(
+            self,
+            numbers=self.numbers.joined(new),
+            known=torch.cat([self.known, known[:, :k]]),
+            factor=self.factor.joined(known[:, k:].T, L, right[:, 1:]),
+            alpha=torch.cat([self.alpha, right[:, 0]]),
+        )
+
+    def opened(self, E: Tensor, size: float | None = None) -> Process:
+        """The same rows beside unknowns of this deviation, of any by default, with effects (M, U) on them alone."""
+        E = E / E.norm(dim=0).clamp(min=torch.finfo(E.dtype).tiny) if size is None else size * E
+        return replace(self, factor=self.factor.beside(E))
+
+    def features(self, at: Linearisation, sooner: Features | None = None) -> Features:
+        """Features of a linearisation; ``sooner``: the same by the first of these rows alone."""
+        found, L, k = self.before.features(at), self.factor.L, self.known.shape[1]
+        known = found.known[:0] if sooner is None else sooner.known[k:]
+        if (n := len(known)) < len(L):
+            cross = self.numbers.gram(at, n).addmm_(self.known[n:], found.known, alpha=-1.0)
+            cross.addmm_(L[n:, :n], known, alpha=-1.0)
+            with large_work(cross.numel()):
+                known = torch.cat([known, torch.linalg.solve_triangular(L[n:, n:], cross, upper=False)])
+        unknown = found.unknown - self.factor.W.T @ known
+        unknown = torch.linalg.solve_triangular(self.factor.B, unknown, upper=False)
+        new = Features(at, torch.cat([found.known, known]), unknown)
+        if sooner is not None:
+            vars(new).update({name: value for name, value in vars(sooner).items() if name == "fields"})
+        return new
+
+    def mean(self, at: Features) -> Tensor:
+        """(M r,) of numbers, with these features."""
+        by_unknown = torch.linalg.solve_triangular(self.factor.B, (self.factor.W.T @ self.alpha)[:, None], upper=False)
+        return at.known[self.known.shape[1] :].T @ self.alpha + at.unknown.T @ by_unknown[:, 0]
+
+    @cached_property
+    def _solved(self) -> tuple[Tensor, Tensor]:
+        return self.factor.solved(self.numbers.target[:, None])
+
+    @property
+    def mu(self) -> Tensor:
+        """(M,) K^-1 target."""
+        return self._solved[0][:, 0]
+
+    @property
+    def inverse(self) -> Tensor:
+        """(M, M) K^-1."""
+        return self.factor.inverse
+
+    @property
+    def evidence(self) -> float:
+        """log N(target; 0, K) of all numbers; that of later ones given the others is a difference."""
+        return self.factor.log_density(self.numbers.target, self.mu)
+
+    @property
+    def estimate(self) -> Tensor:
+        """(K,) posterior mean of the parameters of the nominal map."""
+        return self._parameters(self._solved[1])
+
+    def momenta(self, target: Tensor) -> Momenta:
+        """Posterior mode of b, p, theta by another target (N, R): fields by mu, transported back to time 0."""
+        mu, shift = self.factor.solved(self.numbers.of_table(target)[:, None])
+        return self._momenta(mu[:, 0], shift)
+
+    def of_white(self, values: Tensor) -> Momenta:
+        """Momenta of mu = C values with C C^T = K^-1: (M,)."""
+        mu = self.factor.of_white(values)
+        return self._momenta(mu, self.factor.W.T @ (self.factor.L.T @ mu[:, None]))
+
+    def _momenta(self, mu: Tensor, shift: Tensor) -> Momenta:
+        """With parameters apart, since S^T mu would lose their digits; ``shift``: (K, 1) P^-1/2 u."""
+        found = self.numbers.at.fields.momenta(self.numbers.in_table(mu))
+        return replace(found, theta=self._parameters(shift))
+
+    def _parameters(self, shift: Tensor) -> Tensor:
+        variance = self.numbers.at.spec.prior_variance
+        return variance.sqrt() * shift[: len(variance), 0]
+
+    def about(self, target: Tensor) -> Process:
+        """The same rows with another target (N, R)."""
+        target = self.numbers.of_table(target)
+        alpha = self.factor.white(target[:, None])[:, 0]
+        return replace(self, numbers=replace(self.numbers, target=target), alpha=alpha)
+
+    def left_out(self, group: Tensor) -> tuple[Tensor, Tensor]:
+        """Errors (M,) of groups of numbers as all others predict them, and their covariances with noise in (M, M).
+
+        Args:
+            group: (M,) that of each number; negative for none, with the error NaN.
+        """
+        errors, covariance = torch.full_like(self.mu, nan), torch.zeros_like(self.inverse)
+        counts = group[group >= 0].unique(return_counts=True)[1]
+        parts = group.argsort(stable=True)[int((group < 0).sum()) :].split(counts.tolist())
+        for size in counts.unique().tolist():
+            at = torch.stack([part for part in parts if len(part) == size])
+            block = torch.linalg.inv(self.inverse[at[:, :, None], at[:, None]])
+            errors[at] = (block @ self.mu[at][:, :, None])[:, :, 0]
+            covariance[at[:, :, None], at[:, None]] = block
+        return errors, covariance
 
 
 class Estimated(Conditional):
@@ -238,7 +319,6 @@ class Estimated(Conditional):
         self.before, self.size, self.gain, self.columns = before, before.size, gain, list(columns)
         self.reference = before.features(reference)
         covariance = gain @ self.reference.between() @ gain.T if covariance is None else covariance
-        self._by_gain = gain @ self.reference.values.T
         self.root, self._to_white = roots(covariance)
 
     def slopes(self, at: Linearisation) -> Tensor:
@@ -248,8 +328,9 @@ class Estimated(Conditional):
     def features(self, at: Linearisation) -> Features:
         found = self.before.features(at)
         fields = self.gain @ self.reference.at.fields.gram(at.fields)
-        g = self._to_white @ (fields + self._by_gain * found.signs @ found.values)
-        return found.beside((g, -1), (self.root.T @ self.slopes(at).T - g, 1))
+        known, unknown = (self.gain @ part.T for part in (self.reference.known, self.reference.unknown))
+        g = self._to_white @ (fields - known @ found.known + unknown @ found.unknown)
+        return found.beside(g, self.root.T @ self.slopes(at).T - g)
 
 
 def without_rigid_motions(before: Conditional, reference: Linearisation, base: Sequence[int]) -> Estimated:
@@ -260,15 +341,6 @@ def without_rigid_motions(before: Conditional, reference: Linearisation, base: S
     """
     gain = torch.linalg.pinv(reference.sensitivity[..., list(base)].flatten(0, 1))  # (6, M m)
     return Estimated(before, reference, gain, base)
-
-
-def lower_root(F: Tensor) -> Tensor:
-    """L with L L^T = F (M, M); NumericalError where F is not positive definite in float64."""
-    with large_work(F.numel()):
-        L, info = torch.linalg.cholesky_ex(F)
-    if int(info):
-        raise NumericalError.of("the covariance of the rows is not positive definite", fix=NOISE_ADVICE)
-    return L
 
 
 def roots(covariance: Tensor, rounding: float = ROUNDING_RATIO) -> tuple[Tensor, Tensor]:

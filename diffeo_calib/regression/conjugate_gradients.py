@@ -13,15 +13,19 @@ the noise's variance. Iterating on hundreds of columns would take minutes.
 from __future__ import annotations
 
 from functools import cached_property
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.checks import check_memory
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.errors import NumericalError
+from diffeo_calib.common.errors import InputError, NumericalError, as_written
+from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.conditional import DataConditional, lower_root
+from diffeo_calib.regression.cholesky import lower_root
+from diffeo_calib.regression.conditional import BeforeData, Conditional, Features, Process
 
 BLOCK_CONFIGURATIONS = 64  # number of configurations that are drawn together
 NEGLIGIBLE_VARIANCE_RATIO = 0.03
@@ -73,7 +77,7 @@ def pivots(linearisation: Linearisation, count: int) -> Tensor:
     return torch.cat([chosen, unused.nonzero()[:, 0][: count - len(chosen)]])
 
 
-class ConjugateGradientRegression(DataConditional):
+class ConjugateGradientRegression(Conditional):
     """Preconditioned conjugate gradients on (G + R) mu = target.
 
     Args:
@@ -84,13 +88,25 @@ class ConjugateGradientRegression(DataConditional):
     def __init__(
         self, linearisation: Linearisation, noise: Noise, *, rank: int = MAX_RANK, tolerance: float = CG_TOLERANCE
     ) -> None:
-        super().__init__(linearisation, noise)
+        self.linearisation, self.size = linearisation, linearisation.sensitivity.shape[:2].numel()
         self.noise, self.tolerance = noise, tolerance
+        deviations, shared = linearisation.spec.prior_variance.sqrt(), noise.shared
+        self.before = BeforeData(torch.cat([deviations, shared.new_ones(shared.shape[2])]))
+        self.slopes = torch.cat([linearisation.sensitivity * deviations, shared], 2).flatten(0, 1)
         max_rest = NEGLIGIBLE_VARIANCE_RATIO * float(noise.covariance.diagonal(dim1=1, dim2=2)[noise.visible].sum())
         n, m, _ = noise.covariance.shape
         self.P, rest, _ = partial_cholesky(linearisation.fields, max_rest, max(1, rank // m))
         blocks = noise.covariance + torch.diag_embed(rest.view(n, m))
         self.preconditioner = Noise(blocks, torch.cat([self.P, self.slopes], 1).view(n, m, -1))
+
+    def momenta(self, target: Tensor) -> Momenta:
+        """Posterior mode of b, p, theta by a target (N, m): mu transported back to time 0."""
+        return self.linearisation.momenta(self.solve(target[:, :, None])[:, :, 0])
+
+    def features(self, at: Linearisation) -> Features:
+        (W, B), found = self._apart, self.before.features(at)
+        known = self._white(self.linearisation.fields.gram(at.fields))
+        return Features(at, known, torch.linalg.solve_triangular(B, found.unknown - W.T @ known, upper=False))
 
     def solve(self, values: Tensor) -> Tensor:
         """(G + R)^-1 values: (N, m, k) -> (N, m, k), all k columns together.
@@ -122,7 +138,7 @@ class ConjugateGradientRegression(DataConditional):
             )
         return x
 
-    def white(self, values: Tensor) -> Tensor:
+    def _white(self, values: Tensor) -> Tensor:
         """T values (N m + r, k), with T^T T the inverse of P P^T + R and what P does not explain.
 
         Woodbury's identity is a small difference of large numbers. In coordinates in which the noise is white, with
@@ -133,8 +149,9 @@ class ConjugateGradientRegression(DataConditional):
         return torch.cat([white - upper @ inside, lower @ inside])
 
     @cached_property
-    def apart(self) -> tuple[Tensor, Tensor]:
-        W = self.white(self.slopes)
+    def _apart(self) -> tuple[Tensor, Tensor]:
+        """W = T H of the slopes H, and the Cholesky factor B of 1 + W^T W."""
+        W = self._white(self.slopes)
         return W, lower_root(torch.eye(W.shape[1], dtype=W.dtype, device=W.device) + W.T @ W)
 
     @cached_property
@@ -160,3 +177,42 @@ def _norm(a: Tensor) -> Tensor:
 def _ratio(a: Tensor, b: Tensor) -> Tensor:
     """a / b; 0 where b is 0, in columns that have converged exactly."""
     return torch.where(b != 0.0, a / torch.where(b != 0.0, b, torch.ones_like(b)), torch.zeros_like(a))
+
+
+LinearSolver = Literal["auto", "cholesky", "cg"]
+MAX_DENSE = 8_000
+"""Largest N m for which `auto` factorises the matrix (0.5 GiB in float64, at the peak four times as much)."""
+BYTES_PER_FLOAT = 8
+
+
+def condition(
+    linearisation: Linearisation, noise: Noise, linear: LinearSolver = "auto", tolerance: float = CG_TOLERANCE
+) -> Process | ConjugateGradientRegression:
+    """Condition on data that are all control points; ``tolerance`` is that of conjugate gradients.
+
+    Raises:
+        InputError: the method needs more memory than is free.
+        NumericalError: F + R is not positive definite in float64.
+    """
+    n, m, _ = noise.covariance.shape
+    method = choose(linear, n * m)
+    check_memory(predicted_memory(method, n * m), f"{n * m} measured coordinates with linear={method!r}")
+    if method == "cholesky":
+        return Process.of_rows(linearisation, noise)
+    return ConjugateGradientRegression(linearisation, noise, tolerance=tolerance)
+
+
+def choose(linear: LinearSolver, size: int) -> LinearSolver:
+    """The method for ``size`` measured coordinates: ``linear`` itself, or the choice of `auto`.
+
+    Raises:
+        InputError: an unknown method.
+    """
+    if linear not in get_args(LinearSolver):
+        raise InputError.of("`linear`", expected=", ".join(get_args(LinearSolver)), got=as_written(linear))
+    return linear if linear != "auto" else "cholesky" if size <= MAX_DENSE else "cg"
+
+
+def predicted_memory(linear: LinearSolver, size: int) -> int:
+    """Bytes at the peak of one step: four matrices, or four factors of the preconditioner."""
+    return 4 * BYTES_PER_FLOAT * size * (size if linear == "cholesky" else min(MAX_RANK, size))

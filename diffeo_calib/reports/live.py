@@ -1,7 +1,7 @@
 """A page that shows a campaign while it runs, served to this machine alone.
 
-The page is one file without outside resources (html/live.html). What it shows comes as server-sent events. Each of them
-holds everything, so that a page that was reloaded or slept misses nothing. Decisions about rows come back by POST.
+The page is one file without outside resources (html/live.html). It asks twice a second for what it shows, which holds
+everything, so that a page that was reloaded or slept misses nothing. Decisions about rows come back by POST.
 
 Other machines connect only to an address that was asked for, with a token. Without one the Host header must name this
 machine, so that no page of another origin reaches the server under a name of its own; and a POST needs a header that
@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
-from threading import Condition, Thread
+from threading import Thread
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -30,8 +30,6 @@ LOCAL = ("127.0.0.1", "localhost")
 PATHS = tuple(f"/{name}" for name in DECISIONS)
 SHOWN_ROWS, SHOWN_POSES = 8, 500
 """The last rows, and poses."""
-ALIVE_SECONDS = 10.0
-"""After this long without news, the page receives a sign of life; closed ones are noticed then."""
 
 
 class Page(ThreadingHTTPServer):
@@ -48,36 +46,16 @@ class Page(ThreadingHTTPServer):
         self.token = "" if place[0] in LOCAL else secrets.token_urlsafe()
         self.url = f"http://{host}:{port}/" + (f"?token={self.token}" if self.token else "")
         self.decisions = decisions
-        self._news, self._state, self._count, self.closed = Condition(), "{}", 0, False
+        self.state = "{}"
 
     def publish(self, state: dict[str, Any]) -> None:
         """Show something new on all pages."""
-        with self._news:
-            self._state, self._count = json.dumps(state), self._count + 1
-            self._news.notify_all()
-
-    def end(self) -> None:
-        """Let all pages go."""
-        with self._news:
-            self.closed = True
-            self._news.notify_all()
+        self.state = json.dumps(state)
 
     def handle_error(self, *given: Any) -> None:
         """A cut connection is no event."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handle_error(*given)
-
-    def states(self) -> Iterator[str]:
-        """Events to show from now on; empty texts in between."""
-        seen = -1
-        while True:
-            with self._news:
-                if not self.closed and self._count == seen:
-                    self._news.wait(ALIVE_SECONDS)
-                if self.closed:
-                    return
-                text, seen = "" if self._count == seen else self._state, self._count
-            yield text
 
 
 @contextmanager
@@ -102,7 +80,6 @@ def served(address: str, decisions: Inbox) -> Iterator[Page]:
         yield page
     finally:
         page.shutdown()
-        page.end()
         page.server_close()
         thread.join()
 
@@ -154,18 +131,16 @@ class _Handler(BaseHTTPRequestHandler):
         return True
 
     def do_GET(self) -> None:
-        """The page, or its events."""
+        """The page, or what it shows."""
         path = self._parts.path
         if not self._allowed():
             self.send_error(403)
         elif path == "/":
             self._begin("text/html; charset=utf-8")
             self.wfile.write(files("diffeo_calib.reports.html").joinpath("live.html").read_bytes())
-        elif path == "/events":
-            self._begin("text/event-stream")
-            for text in self.server.states():
-                self.wfile.write(f"data: {text}\n\n".encode() if text else b": alive\n\n")
-                self.wfile.flush()
+        elif path == "/state":
+            self._begin("application/json")
+            self.wfile.write(self.server.state.encode())
         else:
             self.send_error(404)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.device import outside_inference_mode
@@ -19,6 +19,9 @@ from diffeo_calib.reports.analysis.stages import Kinematics
 from diffeo_calib.reports.html import sections, sentences
 from diffeo_calib.reports.html.document import page
 from diffeo_calib.sensors.places import Places
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 LOG = logging.getLogger(__name__)
 
@@ -74,6 +77,11 @@ def write_report(
     fit, rows = f"{robot.n} joints, {len(model.configurations)} rows in the fit{date}{note}", sentences.rows_of(found)
     known = (summary.warnings or "").splitlines() if summary else []
     sha256 = None if data is None or not found.new else data.sha256
+    parts = [*sections.sections(found), sections.record(model, sha256)]
+    drawn, drawings = [picture for section in parts for picture in section.pictures], dict[str, str]()
+    for number, picture in enumerate(drawn):
+        progress("drawing", number, len(drawn))
+        drawings[picture.name] = picture.svg()
     text = page(
         title=printable(title or f"Robot {robot.name}, {robot.base} to {robot.tip}"),
         subtitle=f"{fit}. Errors: {rows}.",
@@ -81,8 +89,21 @@ def write_report(
         warnings=known if warnings is None else warnings,
         advice=list(sentences.advice(found)),
         figures=dict(sentences.figures(found)),
-        sections=[*sections.sections(found, progress), sections.record(model, sha256)],
+        sections=parts,
+        drawings=drawings,
     )
     write_whole(path, text.encode())
     LOG.info("report written to %s", shown(path))
     return found
+
+
+@small_work()
+@outside_inference_mode
+def pictures(model: CalibratedKinematics, data: Any = None, **how: Any) -> dict[str, Figure]:
+    """The pictures of :func:`write_report`, by their names in the page, as figures of matplotlib.
+
+    Args:
+        model, data: as there. how: ``stages``, ``places`` and ``against`` as there.
+    """
+    found = find(model, data, **how)
+    return {one.name: one.figure() for section in sections.sections(found) for one in section.pictures}

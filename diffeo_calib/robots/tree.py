@@ -108,12 +108,10 @@ class Tree:
             raise RobotError.of("the parents of joints", expected="one earlier joint, or -1, each", got=self.parents)
         if not self.tips or not all(BASE <= end < count for end in (*self.ends.values(), self.ground)):
             raise RobotError.of(f"the ends of robot '{self.name}'", expected="numbers of its joints", got=self.ends)
-        active = [joint for joint in [*moving, *self.drivers] if joint.kind != "fixed" and joint.mimic is None]
-        self.joint_names = tuple(joint.name for joint in active)
-        self.kinds = tuple(joint.kind for joint in active)
-        limits = [[joint.lower, joint.upper] for joint in active]
-        self.limits = torch.tensor(limits, dtype=torch.float64, device="cpu")
         self.arrays = found = nominal_chain(self.to_config())
+        self.joint_names, self.limits = found.names, torch.from_numpy(found.limits)
+        kinds = {joint.name: joint.kind for joint in (*moving, *self.drivers)}
+        self.kinds = tuple(kinds[name] for name in self.joint_names)
         tensors = found.axes, found.revolute, found.coupling, found.coupling_offset
         self.axes, self.revolute, self.coupling, self.coupling_offset = map(torch.from_numpy, tensors)
         self.motion_terms, self.ancestors = torch.from_numpy(found.motions), torch.from_numpy(found.ancestors)

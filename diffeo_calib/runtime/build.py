@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from diffeo_calib.common.errors import RobotError
-from diffeo_calib.runtime.arrays import Array, Tableau, as_index, skew, transforms
+from diffeo_calib.runtime.arrays import Array, Tableau, as_index, combined, skew, transforms
 from diffeo_calib.runtime.chain import CalibratedChain, Masses, NominalChain, Waves
-from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow, combined
+from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow
 from diffeo_calib.runtime.tables import JointTables, PeriodicSum, Table, tabulate
 
 ROTARY = ("revolute", "continuous")
@@ -67,23 +67,23 @@ def nominal_chain(robot: Mapping[str, Any]) -> NominalChain:
     motions[1, :, :3, :3], motions[2, :, :3, :3] = K, -(K @ K)
     motions[3, :, :3, 3] = axes * ~revolute[:, None]
     between = f"'{robot['base']}' and '{', '.join(tips)}'"
-    table = _coupling(robot, moving, between)
-    places = np.array(offsets), np.array(before), tuple(tips), ground >= 0
-    return NominalChain(*places, axes, revolute, motions, table[:, :-1].copy(), table[:, -1].copy())
+    active = [joint for joint in (*moving, *drivers) if joint["kind"] != "fixed" and joint["mimic"] is None]
+    limits = np.array([[joint["lower"], joint["upper"]] for joint in active], float).reshape(-1, 2)  # None is NaN
+    limits = np.where(np.isnan(limits), [-np.inf, np.inf], limits)
+    table = _coupling(robot, moving, [joint["name"] for joint in active], between)
+    places, names = (np.array(offsets), np.array(before), tuple(tips), ground >= 0), [joint["name"] for joint in active]
+    coupling, start = table[:, :-1].copy(), table[:, -1].copy()
+    return NominalChain(*places, axes, revolute, motions, coupling, start, tuple(names), limits)
 
 
-def active_joints(robot: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """The joints whose values are the columns of q, described as in model files."""
-    every = [*robot["joints"], *robot.get("drivers", ())]
-    return [joint for joint in every if joint["kind"] != "fixed" and joint["mimic"] is None]
-
-
-def _coupling(robot: Mapping[str, Any], moving: Sequence[Mapping[str, Any]], between: str) -> Array:
+def _coupling(
+    robot: Mapping[str, Any], moving: Sequence[Mapping[str, Any]], active: Sequence[str], between: str
+) -> Array:
     """Values of the n_all moving joints by those of the n active ones, and 1: (n_all, n + 1), rad or m."""
     drivers = [joint for joint in robot.get("drivers", ()) if joint["kind"] != "fixed"]
     mimics = {joint["name"]: joint["mimic"] or {} for joint in (*moving, *drivers)}
     fixed = [joint["name"] for joint in (*robot["joints"], *robot.get("drivers", ())) if joint["name"] not in mimics]
-    active, place = [joint["name"] for joint in active_joints(robot)], list(mimics).index
+    place = list(mimics).index
     slopes, start = np.zeros((len(mimics), len(mimics))), np.zeros((len(mimics), len(active) + 1))
     start[:, -1] = [joint["mimic_offset"] for joint in (*moving, *drivers)]
     start[[place(name) for name in active]] = np.eye(*start[: len(active)].shape)

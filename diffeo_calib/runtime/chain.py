@@ -4,7 +4,7 @@
 
 the product over the joints l on the path to the tip, A_l the constant transform of moving joint l with its geometric
 error, tau_l(q) its error twist: a constant, gravity sag and errors of its axis (robots/geometry.py,
-robots/gravity.py, robots/position_errors.py).
+robots/gravity.py, kinematics/nominal.py).
 J_l = C + S sin q + D cos q + L q.
 """
 
@@ -18,8 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from diffeo_calib.runtime.arrays import ONE, SKEW, Array, cross, skew, transforms
-from diffeo_calib.runtime.flow import NUMPY
+from diffeo_calib.runtime.arrays import NUMPY, ONE, SKEW, Array, cross, skew, transforms
 
 COINCIDENT_FRAMES_M = 1e-6
 """Frames whose origins are closer than this [m] count as one place for masses."""
@@ -97,6 +96,8 @@ class NominalChain:
     motions: Array  # (4, n_all, 4, 4) C, S, D, L
     coupling: Array  # (n_all, n), and below (n_all,): moving joints' values from the active ones'
     coupling_offset: Array
+    names: tuple[str, ...]  # of the n active joints
+    limits: Array  # (n, 2) their lower and upper limits, infinite without one
 
     @cached_property
     def ancestors(self) -> np.ndarray:

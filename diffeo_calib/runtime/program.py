@@ -64,13 +64,13 @@ class Program:
             moved, bent = self.task_flow.with_jacobian((arms + tip[..., :3, 3]).reshape(-1, 3))
             return moved.reshape(arms.shape), bent.reshape(*arms.shape, 3) @ placed
 
-    def poses(self, q: Array, tool: Array, frame: str, lever: float = TOOL_LEVER) -> Array:
+    def poses(self, q: Array, tool: Array, frame: str) -> Array:
         """Poses (N, 4, 4) [m] in a frame of :data:`FRAMES` of a tool (4, 4) in the tip's frame, by points around it."""
-        return self._to(frame) @ nearest_poses(self.points(q, tool_points(tool, lever)))
+        return self._to(frame) @ nearest_poses(self.points(q, tool_points(tool)))
 
-    def poses_and_jacobian(self, q: Array, tool: Array, frame: str, lever: float = TOOL_LEVER) -> tuple[Array, Array]:
+    def poses_and_jacobian(self, q: Array, tool: Array, frame: str) -> tuple[Array, Array]:
         """Poses (N, 4, 4) and their derivatives (N, 6, n), linear, then angular velocity; see :meth:`poses`."""
-        points, slopes = self.points_and_jacobian(q, tool_points(tool, lever))
+        points, slopes = self.points_and_jacobian(q, tool_points(tool))
         poses, to_frame = nearest_poses(points), self._to(frame)
         found = pose_slopes(points, slopes, poses[:, :3, :3])
         return to_frame @ poses, np.kron(np.eye(2), to_frame[:3, :3]) @ found
@@ -87,9 +87,9 @@ def inverse(transform: Array) -> Array:
     return out
 
 
-def tool_points(tool: Array, lever: float) -> Array:
+def tool_points(tool: Array) -> Array:
     """The three points around a tool (4, 4): (3, 3) [m]."""
-    return tool[:3, 3] + lever * (MARKS @ tool[:3, :3].T)
+    return tool[:3, 3] + TOOL_LEVER * (MARKS @ tool[:3, :3].T)
 
 
 def nearest_poses(points: Array) -> Array:

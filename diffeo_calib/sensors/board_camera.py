@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, fields, replace
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.cameras.images import UNKNOWNS, Camera, View
+from diffeo_calib.common.device import HOST
 from diffeo_calib.sensors.devices import Extrinsics
 
 SIZE = len(UNKNOWNS)
@@ -92,10 +93,16 @@ class BoardCameras(Extrinsics):
     kind = "camera"
 
     @classmethod
-    def of(cls, cameras: Mapping[str, BoardCamera]) -> BoardCameras:
-        """Cameras by their names."""
+    def of_rows(cls, rows: Tensor, device: Tensor) -> BoardCameras:
+        """Without names, which a model does not keep."""
+        none = torch.zeros(0, 1, dtype=torch.float64, device=HOST)
+        return cls((), none, none, rows, device)
+
+    def with_cameras(self, cameras: Mapping[str, BoardCamera]) -> BoardCameras:
+        """The same rows of cameras by their names."""
         numbers = torch.stack([own.numbers for own in cameras.values()])
-        return cls(tuple(cameras), numbers, torch.stack([own.camera.deviations for own in cameras.values()]))
+        deviations = torch.stack([own.camera.deviations for own in cameras.values()])
+        return replace(self, names=tuple(cameras), constants=numbers, deviations=deviations)
 
     @property
     def cameras(self) -> dict[str, BoardCamera]:

@@ -16,15 +16,15 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, listed
-from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake, rare_names
+from diffeo_calib.measurements.checks import ANGLE_MISTAKES, rare_names
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.devices import Devices, Extrinsics
 from diffeo_calib.sensors.errors import ERRORS, READINGS, SPREAD, Evaluation, Evaluations
 from diffeo_calib.sensors.kinds import kind_of
-from diffeo_calib.sensors.places import BALL_IS_THE_MARKER, PlacedDevices, Places, joined, placed
+from diffeo_calib.sensors.places import BALL_IS_THE_MARKER, Places, joined, placed
 from diffeo_calib.sensors.set_ups import ROWS, Turns, check_same_markers, set_up_kind
 from diffeo_calib.sensors.sockets import SocketPlaces, socket_errors, sockets_of
 from diffeo_calib.sensors.tables import Coordinates
@@ -81,7 +81,7 @@ class Sensor(ABC):
         """Measured minus predicted values, for points (N, P, 3) of the tool, m."""
 
     @abstractmethod
-    def settled(self, data: Any, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
+    def settled(self, data: Any, points: Tensor, turns: Turns) -> tuple[Extrinsics, ...]:
         """The devices around points (N, P, 3) of a model, m, with what these rows leave open about them.
 
         ``turns`` of the tips that carry the points: see :class:`SetUps`.
@@ -135,7 +135,7 @@ class Positions(Sensor):
         away = data.points - points
         return replace(whole, errors=away.norm(dim=-1), away=away)
 
-    def settled(self, data: Measurements, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
+    def settled(self, data: Measurements, points: Tensor, turns: Turns) -> tuple[Extrinsics, ...]:
         """The frames of the set-ups that rows name, or their markers; those of the only one are those of the model."""
         names = data.present_sessions
         if len(names) < 2:
@@ -143,8 +143,8 @@ class Positions(Sensor):
                 return ()
             none = torch.zeros(1, 3 * data.markers * data.remounted, dtype=torch.float64, device=HOST)
             here = none if data.remounted else torch.eye(4, dtype=none.dtype, device=HOST).view(1, 16)
-            return (PlacedDevices(set_up_kind(data)(names, here, none)),)
-        return (PlacedDevices(set_up_kind(data).of(points, data, turns)),)
+            return (set_up_kind(data)(names, here, none),)
+        return (set_up_kind(data).of(points, data, turns),)
 
 
 class Poses(Positions):
@@ -182,11 +182,10 @@ class Contacts(Sensor):
             return float(away.nanmedian()) / max(motion, SMALLEST_MOTION_M)
 
         own = share(data.q)
-        for factor, words in ANGLE_MISTAKES:
+        for factor, fix in ANGLE_MISTAKES:
             other = share(torch.where(turning, factor * data.q, data.q))
             if other < REMAINING_SPREAD * own:
                 expected = f"a spread within sockets of {1e2 * other:.2g} % of the tip's motion, as in the other unit"
-                fix = angle_mistake(words)
                 raise MeasurementError.of("the joint values", expected=expected, got=f"{1e2 * own:.2g} %", fix=fix)
 
     def with_points(self, data: Measurements, model: Any) -> Measurements:
@@ -208,8 +207,8 @@ class Contacts(Sensor):
         size, lines, names = away.norm(dim=1, keepdim=True), data.line_numbers, data.row_sockets
         return Evaluation(size, None, away[:, None], lines, distances, what=SPREAD, kind="socket", devices=names)
 
-    def settled(self, data: Measurements, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
-        return (PlacedDevices(SocketPlaces.around(points[:, -1], data)),)
+    def settled(self, data: Measurements, points: Tensor, turns: Turns) -> tuple[Extrinsics, ...]:
+        return (SocketPlaces.around(points[:, -1], data),)
 
 
 class OtherDevices(Sensor):
@@ -252,7 +251,7 @@ class OtherDevices(Sensor):
         size, names, lines = away.norm(dim=1, keepdim=True), data.device_names, data.line_numbers
         return Evaluation(size, None, away[:, None], lines, what=READINGS, kind=data.kind, unit=unit, devices=names)
 
-    def settled(self, data: Readings, points: Tensor, turns: Turns) -> tuple[PlacedDevices, ...]:
+    def settled(self, data: Readings, points: Tensor, turns: Turns) -> tuple[Extrinsics, ...]:
         """The devices, with the standard deviations of their increments."""
         found = placed(data, points)
         seen = found.points_of(points)
@@ -263,8 +262,7 @@ class OtherDevices(Sensor):
             raise MeasurementError.of(
                 "median error of readings at the best places", expected=expected, got=got, fix=fix
             )
-        deviations = found.open_deviations(data, seen)
-        return (PlacedDevices(replace(found, deviations=deviations), shown=data.shown),)
+        return (replace(found, deviations=found.open_deviations(data, seen)),)
 
 
 def of_devices(data: Any, names: Collection[str]) -> Any:

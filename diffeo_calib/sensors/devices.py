@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import torch
@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.func import jacrev, vmap
 
 from diffeo_calib.common.checks import wrapped
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.maps.observation import Observation, ReadPoints
 from diffeo_calib.measurements.checks import numbers_of, rare_names
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 MODEL_FRAME = "the frame of the model"
+Shown = tuple[str, tuple[float, ...], tuple[float, ...]]
+"""Unit in which r numbers are shown, and what they are multiplied by and shifted by to be in it."""
 SMALLEST_M = 1e-12
 """Of a column of a linear system, against division by zero."""
 ROUNDS = 20
@@ -40,7 +43,6 @@ OUTLIER_MEDIANS = 3.0
 SMALLEST_MEDIAN_M = 1e-7
 SMALLEST_DISTANCE_M = 1e-6
 """Nearer to its fixed end the direction of a distance, and nearer to its lens the image of a camera, is undefined."""
-BISECTIONS = 100
 
 
 MILLIMETRE = "mm", 1e-3
@@ -68,13 +70,19 @@ class Hypothesis(NamedTuple):
         return f"{size / one:{sign}.2g} {unit}"
 
 
+def _nothing() -> Tensor:
+    return torch.zeros(0, dtype=torch.int64, device=HOST)
+
+
 @dataclass(frozen=True, eq=False)
 class Extrinsics(ABC):
-    """What is known of devices of one kind beside a model.
+    """What is known of devices of one kind beside a model, and the rows of its fit that they measured.
 
     Args:
         names: D names. constants: (D, c). deviations: (D, k) standard deviations of increments of these, m or rad: of
             their prior before a fit, after it of what the rows leave open.
+        rows: (M,) int64, numbers of the rows that they measured; by default none. device: (M,) which of them did.
+        shown: how their readings are shown; None for other kinds, and in files of old versions.
     """
 
     kind: ClassVar[str]
@@ -88,6 +96,14 @@ class Extrinsics(ABC):
     names: tuple[str, ...]
     constants: Tensor
     deviations: Tensor
+    rows: Tensor = field(default_factory=_nothing)
+    device: Tensor = field(default_factory=_nothing)
+    shown: Shown | None = None
+
+    def stored(self) -> dict[str, Any]:
+        """For the file of a model, in m and rad."""
+        values = {name: getattr(self, name).tolist() for name in ("constants", "deviations", "rows", "device")}
+        return {"kind": self.kind, "names": self.names} | values | ({"shown": self.shown} if self.shown else {})
 
     def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
         """Constants beside another model of the same robot: those of readings read of its points what they read before.
@@ -125,18 +141,28 @@ class Extrinsics(ABC):
         return self.kind == other.kind
 
     def only(self, names: Collection[str]) -> Self:
-        """Those with some names."""
-        kept = [number for number, name in enumerate(self.names) if name in names]
-        own = tuple(self.names[number] for number in kept)
-        return replace(self, names=own, constants=self.constants[kept], deviations=self.deviations[kept])
+        """Those with some names, and their rows."""
+        own = tuple(name for name in self.names if name in names)
+        kept = [self.names.index(name) for name in own]
+        places = [own.index(name) if name in own else -1 for name in self.names]
+        device = torch.tensor(places, dtype=torch.int64, device=HOST)[self.device.to(HOST)]
+        values = {"rows": self.rows[device >= 0], "device": device[device >= 0]}
+        return replace(self, names=own, constants=self.constants[kept], deviations=self.deviations[kept], **values)
 
     def beside(self, other: Self) -> Self:
         """These, and those of the same kind under other names."""
         if not self.names:
             return other
         other = other.only({*other.names} - {*self.names})
-        values = {k: torch.cat([getattr(self, k), getattr(other, k)]) for k in ("constants", "deviations")}
-        return replace(self, names=(*self.names, *other.names), **values)
+        other = replace(other, device=other.device + len(self.names))
+        every = "constants", "deviations", "rows", "device"
+        values = {name: torch.cat([getattr(self, name), getattr(other, name)]) for name in every}
+        return replace(self, names=(*self.names, *other.names), shown=self.shown or other.shown, **values)
+
+    @property
+    def rows_elsewhere(self) -> Tensor:
+        """(K,) rows of the fit that were measured in another set-up than the model's, whose frame it has."""
+        return self.rows[self.elsewhere.to(HOST)[self.device]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,18 +279,6 @@ class Devices(Extrinsics):
         """Where a device is in a frame, with standard deviations of its increments (k,)."""
 
     @classmethod
-    def alone(cls, data: Readings, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor] | None:
-        """Point (3,) in the tip's frame, m, and constants (c,) of one device, in closed form from its own rows.
-
-        Args:
-            data: readings of one device. R: (N, 3, 3), t: (N, 3), the tip's poses, m.
-
-        Returns:
-            None where there is no closed form: the search then starts with the point at the tip.
-        """
-        return None
-
-    @classmethod
     def doubts_unit(cls, data: Readings, errors: Tensor) -> bool:
         """Whether the errors (N, r), m, of a rough fit make the unit of readings doubtful."""
         return False
@@ -294,7 +308,7 @@ class Devices(Extrinsics):
     def of(cls, data: Readings, constants: Tensor) -> Devices:
         """Devices with wide priors around constants (D, c)."""
         prior = constants.new_tensor(cls.prior(data.offset_std))
-        return cls(data.names, constants, prior.expand(len(constants), -1))
+        return cls(data.names, constants, prior.expand(len(constants), -1), shown=data.shown)
 
     @classmethod
     def at(cls, data: Readings, points: Tensor) -> Devices:
@@ -416,24 +430,6 @@ def median_weights(distances: Tensor, half: float) -> Tensor:
 def across(directions: Tensor) -> Tensor:
     """Two unit vectors at right angles to each direction and to each other: (..., 3) -> (..., 2, 3)."""
     return torch.linalg.svd(directions[..., None, :], full_matrices=True).Vh[..., 1:, :]
-
-
-def unit_least_squares(matrix: Tensor, target: Tensor) -> Tensor:
-    """The unit vector x (k,) of least |matrix x - target|; for a target of zeros the direction of least variance.
-
-    (M^T M + mu) x = M^T target with the mu above minus the smallest eigenvalue that gives x its length, by bisection.
-    """
-    values, vectors = torch.linalg.eigh(matrix.mT @ matrix)
-    along = vectors.mT @ (matrix.mT @ target)
-    low, high = 0.0, float(along.norm()) + SMALLEST_M**2
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        longer = float((along / (values - values[0] + middle)).norm()) > 1.0
-        low, high = (middle, high) if longer else (low, middle)
-    x = along / (values - values[0] + high)
-    rest = (1.0 - x.square().sum()).clamp(min=0.0).sqrt()  # where the target has no part along the first direction
-    x[0] = x[0] + (rest if float(x[0]) >= 0 else -rest)
-    return vectors @ (x / x.norm())
 
 
 def moved_pose(rows: Tensor, twist: Tensor) -> Tensor:

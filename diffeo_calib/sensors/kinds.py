@@ -8,15 +8,19 @@ inclinometer.py. The command line knows it if a package that is installed names 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import entry_points
+from typing import Any
 
+import torch
 from torch import Tensor
 
+from diffeo_calib.common.checks import as_tensor
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, listed, sentence, warn_user
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.sensors.board_camera import BoardCameras
-from diffeo_calib.sensors.devices import Devices, Extrinsics
+from diffeo_calib.sensors.devices import Devices, Extrinsics, Shown
 from diffeo_calib.sensors.height import Planes
 from diffeo_calib.sensors.image import Cameras
 from diffeo_calib.sensors.known_drift import KnownDrift
@@ -91,7 +95,40 @@ class Unregistered(Extrinsics):
         raise InputError.of(f"devices of the kind {self.kind!r} in a model", got="a kind not registered", fix=fix)
 
 
-def extrinsics(kind: str, names: tuple[str, ...], constants: Tensor, deviations: Tensor) -> Extrinsics:
-    """Devices of any kind, of one that nobody registered too; see :class:`Extrinsics`."""
-    found = {**known_kinds(), **WITHOUT_READINGS}.get(kind)
-    return Unregistered(names, constants, deviations, kind) if found is None else found(names, constants, deviations)
+ENTRIES = ("kind", "names", "constants", "deviations", "rows", "device")
+
+
+def stored_devices(entry: Any, rows: int) -> Extrinsics:
+    """Devices of any kind, of one that nobody registered too: the inverse of :meth:`Extrinsics.stored`.
+
+    Args:
+        entry: of a file. rows: how many the fit of its model has.
+
+    Raises:
+        InputError: entries that do not fit together.
+    """
+    if not isinstance(entry, dict) or set(entry) - {"shown"} != set(ENTRIES):
+        raise InputError.of("the entry placement", expected=sorted(ENTRIES), got=sorted(entry))
+    if not isinstance(entry["kind"], str):
+        raise InputError.of("the kind of the devices of a model", expected="a text", got=entry["kind"])
+    names = tuple(map(str, entry["names"]))
+    deviations = torch.tensor(entry["deviations"], dtype=torch.float64, device=HOST).view(len(names), -1)
+    constants = as_tensor(entry["constants"], "placement", (len(names), "c"))
+    numbers, device = (torch.tensor(entry[name], dtype=torch.int64, device=HOST) for name in ("rows", "device"))
+    inside = bool(((numbers >= 0) & (numbers < rows)).all() & ((device >= 0) & (device < len(names))).all())
+    if len(numbers) != len(device) or not inside:
+        raise InputError.of("the rows of the devices of a model", expected=f"numbers below {rows}")
+    found = {**known_kinds(), **WITHOUT_READINGS}.get(entry["kind"], partial(Unregistered, read_kind=entry["kind"]))
+    return found(names, constants, deviations, numbers, device, _shown(entry.get("shown")))
+
+
+def _shown(entry: Any) -> Shown | None:
+    """How readings of a model are shown, by its file."""
+    if entry is None:
+        return None
+    try:
+        unit, scale, zero = entry
+        return str(unit), tuple(map(float, scale)), tuple(map(float, zero))
+    except (TypeError, ValueError):
+        expected = "a unit, factors and zeros"
+        raise InputError.of("how readings of a model are shown", expected=expected, got=repr(entry)) from None

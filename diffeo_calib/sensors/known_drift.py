@@ -49,7 +49,7 @@ class KnownDrift(Extrinsics):
             InputError: numbers that do not fit the robot's joints.
         """
         sets = getattr(model, "placement", None) or ()
-        own: Any = next((own.devices for own in sets if own.kind == cls.kind), None)
+        own: Any = next((own for own in sets if own.kind == cls.kind), None)
         if own is None:
             return None
         joints = tuple(zip(model.robot.joint_names, model.robot.periodic, strict=True))

@@ -191,7 +191,7 @@ class MeasuringFrames(SetUps):
         found = torch.stack([robust_fit(predicted[some], data.points[some]).to(HOST) for some in rows]).flatten(1)
         cameras = set(data.session_names) <= set(data.cameras)  # nothing on the tool was mounted again between these
         free = NUMBERS_OF_A_FRAME + 3 * data.markers * (not cameras)
-        return cls(names, found, found[:, :0], turns, free)
+        return cls(names, found, found[:, :0], turns=turns, increments_each=free)
 
     def aligned(self, data: Any) -> Any:
         return data.in_frames(torch.linalg.inv(self.of_rows(data).unflatten(1, (4, 4))))
@@ -231,7 +231,7 @@ class MountedMarkers(SetUps):
         away = _turned(turns, data)[:, :P].mT @ (data.points[:, :P] - predicted[:, :P])[..., None]
         found = [_middle(away[whose == number][..., 0]) for number in range(len(names))]
         shifts, deviations = (torch.stack(each).flatten(1).to(HOST) for each in zip(*found, strict=True))
-        return cls(names, shifts, deviations, turns, 3 * data.markers)
+        return cls(names, shifts, deviations, turns=turns, increments_each=3 * data.markers)
 
     def aligned(self, data: Any) -> Any:
         shifts = self.of_rows(data).unflatten(1, (-1, 3))
@@ -275,7 +275,8 @@ class MountedFrames(SetUps):
         points, deviations = (torch.stack(each).to(HOST) for each in zip(*found, strict=True))
         shifts = deviations.square().mean(1).sqrt()
         M = poses_from_marks(points, lever).flatten(1)
-        return cls(names, M, torch.cat([shifts, shifts / lever], 1), turns, NUMBERS_OF_A_FRAME)
+        free = {"turns": turns, "increments_each": NUMBERS_OF_A_FRAME}
+        return cls(names, M, torch.cat([shifts, shifts / lever], 1), **free)
 
     def aligned(self, data: Any) -> Any:
         return data.on_frames(self.of_rows(data).unflatten(1, (4, 4)))

@@ -26,14 +26,14 @@ RANGE_RAD = 1.0
 class Inclinometers(Devices):
     """Inclinometers: constants are their axes x and y in the tool's frame, and the upward direction.
 
-    An angle is that of an axis above the horizontal. Increments: turns of the axes about x, y and z, then of the upward
-    direction towards two others [rad].
+    An angle is that of an axis above the horizontal. Increments: turns of the axes about x, y and z, of y towards x,
+    and of the upward direction towards two others [rad].
     """
 
     kind = "inclination"
     size_fix = "measure poses too: angles hold no lengths"
     stated_as = "XX,XY,XZ,YX,YY,YZ,UX,UY,UZ"
-    seen_points, numbers_each, increments_each = 3, 2, 5
+    seen_points, numbers_each, increments_each = 3, 2, 6
     metres_each, unit = 0.1, ("mrad", 1e3)
 
     @staticmethod
@@ -46,8 +46,8 @@ class Inclinometers(Devices):
     def changed(constants: Tensor, increments: Tensor) -> Tensor:
         """Turned."""
         axes, up = constants[:6].view(2, 3), constants[6:]
-        up = torch.nn.functional.normalize(up + increments[3:] @ across(up), dim=0)
-        return torch.cat([(axes @ rotation(increments[:3]).mT).flatten(), up])
+        (x, y), up = axes @ rotation(increments[:3]).mT, up + increments[4:] @ across(up)
+        return torch.cat([x, *(torch.nn.functional.normalize(own, dim=0) for own in (y + increments[3] * x, up))])
 
     @classmethod
     def stated(cls, numbers: Tensor) -> Tensor:
@@ -70,7 +70,7 @@ class Inclinometers(Devices):
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
         """Axes, and the upward direction."""
         x, y, up = (numbers_text(part.tolist()) for part in self.constants[number].split(3))
-        mounted, level = (1e3 * float(part.norm()) for part in deviations.split(3))
+        mounted, level = (1e3 * float(part.norm()) for part in deviations.split((4, 2)))
         what = f"inclinometer '{self.names[number]}': axes {x} and {y} of the tool +- {mounted:.2f} mrad"
         return f"{what}, up is {up} in {frame} +- {level:.2f} mrad"
 

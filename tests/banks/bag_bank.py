@@ -77,3 +77,16 @@ class Bag:
                     content = self.store.serialize_cdr(message, kind)
                     writer.write(connection, round(1e9 * max(time + 5, 0)), content)
         return path
+
+
+def standing(places: np.ndarray, stand_s: float, move_s: float, times: np.ndarray) -> np.ndarray:
+    """Joints (T, n), rad, that stand at each of some places (P, n) and move smoothly to the next."""
+    number, rest = np.divmod(times, stand_s + move_s)
+    share = np.clip((rest - stand_s) / move_s, 0, 1)[:, None]
+    first, after = (places[np.minimum(number.astype(int) + k, len(places) - 1)] for k in (0, 1))
+    return first + (after - first) * (3 * share**2 - 2 * share**3)
+
+
+def place(q: np.ndarray) -> np.ndarray:
+    """Where a tool of two joints is (T, 3), m."""
+    return np.stack([np.cos(q[:, 0]), np.sin(q[:, 0]), q[:, 1]], 1)

@@ -17,7 +17,6 @@ import diffeo_calib as dc
 from diffeo_calib.cli import main as cli
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.reports.html.document import Picture
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 PROGRAM = "import sys; sys.argv[0] = 'diffeo-calib'; from diffeo_calib.__main__ import main; main()"
@@ -30,7 +29,7 @@ STAGES = ("nominal", "geometric", "calibrated")
 
 FEW_CONFIGURATIONS = 100
 
-UNDRAWN = Picture(f'<svg viewBox="0 0 1 1">{4 * "<path/>"}</svg>', "undrawn")
+UNDRAWN = f'<svg viewBox="0 0 1 1">{4 * "<path/>"}</svg>'
 """In place of the pictures of a page."""
 
 Edit = Callable[[list[list[str]]], object]
@@ -43,8 +42,7 @@ def leave_undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     What the model expects is averaged over fewer configurations.
     """
     monkeypatch.setattr("diffeo_calib.reports.analysis.stages.CONFIGURATIONS", FEW_CONFIGURATIONS)
-    path = "diffeo_calib.reports.html.sections.panel"
-    monkeypatch.setattr(path, lambda _, label, *__, **___: UNDRAWN._replace(label=label))
+    monkeypatch.setattr("diffeo_calib.reports.html.document.Picture.svg", lambda _: UNDRAWN)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import torch
 from robots_bank import CHAINS, draw
@@ -13,19 +14,18 @@ import diffeo_calib as dc
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.kernels.base import SumKernel
-from diffeo_calib.kernels.profiles import PROFILES, Profile
+from diffeo_calib.kernels.profiles import PROFILES
 from diffeo_calib.kernels.radial import RadialKernel
-from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.nominal import GeometryMap, PositionErrors
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.measurements.poses import mark_points
-from diffeo_calib.robots import Chain, Geometry
-from diffeo_calib.robots.position_errors import PositionErrors
+from diffeo_calib.robots import Geometry
 from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.robots.tree import Tree
 
-CONTROLS, LARGE_CONTROLS = 9, 12
+CONTROLS = 9
 RK4_TWICE = dc.RK4(2)
 LEVER = 0.1
 
@@ -38,25 +38,27 @@ def geometry_of(chain: Tree, markers: int = 2, size: float = 0.3, *, seed: int =
 
 
 def deformation_of(
-    chain: Chain,
-    profile: Profile = PROFILES["matern52"],
+    chain: Tree,
+    profile: str = "matern52",
     *,
     elastic: bool = True,
     waves: bool = False,
     integrator: Integrator = RK4_TWICE,
+    markers: int = 2,
 ) -> GeodesicDeformation:
     """A deformation in general position: every kernel, error and parameter differs from zero."""
-    nominal = GeometryMap(geometry_of(chain), elastic=elastic, own=errors_of(chain) if waves else PositionErrors())
-    space, n = dc.Space(chain.periodic), chain.n
+    geometry, space, n, kappa = geometry_of(chain, markers), dc.Space(chain.periodic), chain.n, PROFILES[profile]
+    if markers == 3:  # a triangle, whose poses the model has
+        geometry = geometry.with_tool(mark_points(twist_transform(draw(1, 6, seed=30, size=0.2)), LEVER)[0])
+    nominal = GeometryMap(geometry, elastic=elastic, own=errors_of(chain) if waves else PositionErrors())
     scales = torch.linspace(0.6, 1.2, n, dtype=torch.float64)
     together = dc.Gaussian(scales, variance=1e-2 * scales, space=space)
     # the scales of different joints differ; the compound kernel is anisotropic in and out
-    joint = SumKernel([dc.PerJoint(scales, 1e-2 * scales, space, profile), together])
-    task = SumKernel([dc.Gaussian(0.8, 1e-2), dc.Cauchy(0.7, 1e-2)])
+    joint = SumKernel([dc.PerJoint(scales, 1e-2 * scales, space, kappa), together])
+    task = SumKernel([dc.Gaussian(0.8, 1e-2), RadialKernel(kappa, lengthscale=0.7, variance=1e-2)])
     spec = ModelSpec(nominal, joint, task, torch.ones(nominal.parameters, dtype=torch.float64), 3)
-    momenta = Momenta(
-        draw(CONTROLS, n, seed=1), draw(2 * CONTROLS, 3, seed=2), draw(nominal.parameters, seed=3, size=0.05)
-    )
+    theta = draw(nominal.parameters, seed=3, size=0.05)
+    momenta = Momenta(draw(CONTROLS, n, seed=1), draw(markers * CONTROLS, 3, seed=2), theta)
     return GeodesicDeformation(spec, draw(CONTROLS, n, seed=4, size=2.0), momenta, integrator)
 
 
@@ -67,44 +69,19 @@ def errors_of(chain: Tree) -> PositionErrors:
     return PositionErrors(((chain.n - 1, 7.3), (chain.n - 1, 14.7), (0, 5.1)), axes)
 
 
-def model_of(chain: Chain, integrator: Integrator = RK4_TWICE, waves: bool = False) -> dc.CalibratedKinematics:
-    """A model of two markers around such a deformation."""
-    noise = 1e-4 * torch.eye(6, dtype=torch.float64).expand(CONTROLS, 6, 6)
-    return dc.CalibratedKinematics(
-        chain, FittedMap(deformation_of(chain, integrator=integrator, waves=waves), Noise(noise))
-    )
+def model_of(
+    chain: Tree, integrator: Integrator = RK4_TWICE, markers: int = 2, **options: Any
+) -> dc.CalibratedKinematics:
+    """A model around such a deformation; of poses with three markers."""
+    noise = Noise(1e-8 * torch.eye(3 * markers, dtype=torch.float64).repeat(CONTROLS, 1, 1))
+    fitted = FittedMap(deformation_of(chain, integrator=integrator, markers=markers, **options), noise)
+    return dc.CalibratedKinematics(chain, fitted, lever=LEVER if markers == 3 else None, tool=[0.1, -0.05, 0.2])
 
 
 @cache
-def made(
-    name: str, *, profile: str = "matern52", markers: int = 1, elastic: bool = True, steps: int = 1
-) -> dc.CalibratedKinematics:
-    """A model of one of the CHAINS, whose errors are centimetres and hundredths of a radian; poses of three markers."""
-    return made_with(CHAINS[name], dc.RK4(steps), profile, markers, elastic)
-
-
-def made_with(
-    chain: Tree, integrator: Integrator, profile: str = "matern52", markers: int = 1, elastic: bool = False
-) -> dc.CalibratedKinematics:
-    geometry, space = geometry_of(chain, markers, 0.2, seed=31, reach=0.1), dc.Space(chain.periodic)
-    if markers == 3:  # a triangle, whose poses the model has
-        geometry = geometry.with_tool(mark_points(twist_transform(draw(1, 6, seed=30, size=0.2)), LEVER)[0])
-    nominal = GeometryMap(geometry, elastic=elastic)
-    scales, variances = torch.linspace(0.5, 1.0, chain.n), torch.linspace(1e-3, 2e-3, chain.n)
-    own = dc.PerJoint(scales, variances, space, PROFILES[profile])
-    together = RadialKernel(PROFILES["gaussian"], lengthscale=scales + 1.0, variance=variances, periodic=space.periodic)
-    task = RadialKernel(PROFILES[profile], lengthscale=0.7, variance=1e-3)
-    prior = torch.ones(nominal.parameters, dtype=torch.float64)
-    spec = ModelSpec(nominal, own + together, task, prior, 3)
-    momenta = Momenta(
-        draw(LARGE_CONTROLS, chain.n, seed=33, size=2.0),
-        draw(LARGE_CONTROLS * markers, 3, seed=34, size=2.0),
-        draw(nominal.parameters, seed=35, size=0.01),
-    )
-    deformation = GeodesicDeformation(spec, draw(LARGE_CONTROLS, chain.n, seed=36), momenta, integrator)
-    noise = Noise(1e-8 * torch.eye(3 * markers, dtype=torch.float64).repeat(LARGE_CONTROLS, 1, 1))
-    fitted = FittedMap(deformation, noise)
-    return dc.CalibratedKinematics(chain, fitted, lever=LEVER if markers == 3 else None, tool=[0.1, -0.05, 0.2])
+def made(name: str, *, markers: int = 1, steps: int = 1, **options: Any) -> dc.CalibratedKinematics:
+    """A model of one of the CHAINS."""
+    return model_of(CHAINS[name], dc.RK4(steps), markers, **options)
 
 
 def queries(model: dc.CalibratedKinematics | FittedMap, rows: int = 5) -> Tensor:

@@ -19,9 +19,9 @@ from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.fitting.result import silent
-from diffeo_calib.process.numbers import Numbers
-from diffeo_calib.process.process import Process
+from diffeo_calib.maps.linearisation import Numbers
 from diffeo_calib.process.tails import Tails
+from diffeo_calib.regression.conditional import Process
 from diffeo_calib.robots import SimulatedArm
 
 NARROW_M_RAD = 1e-3
@@ -36,16 +36,13 @@ class Case:
     scales: dc.Hyperparameters
 
     @cached_property
-    def noise(self) -> list[Tensor]:
-        """The weighted noise of every part."""
-        return self.noise_of(self.data)
+    def noise(self) -> Tensor:
+        """(N, R, R) weighted."""
+        return self.data.noise_of_numbers(self.scales)
 
-    def noise_of(self, data: TangentData) -> list[Tensor]:
-        return data.numbers.blocks_of_table(data.told.weighted_noise(self.scales))
-
-    @property
+    @cached_property
     def numbers(self) -> Numbers:
-        return self.data.numbers
+        return self.data.numbers(self.scales)
 
     @property
     def variance(self) -> Tensor:
@@ -56,16 +53,12 @@ class Case:
     @cached_property
     def fields(self) -> Tensor:
         """Prior covariance by the fields of all numbers of the table, hidden ones too: (N R, N R)."""
-        whole = self.data.told.linearisation(self.scales)
-        assert whole.sensitivity is not None
-        return replace(whole, sensitivity=torch.zeros_like(whole.sensitivity)).gram()
+        return self.numbers.at.fields.gram()
 
     @cached_property
     def unknowns(self) -> Tensor:
         """(N R, K) their derivatives by the unknowns."""
-        told = self.data.told
-        S = torch.cat([told.sensitivities, told.shared], 2)
-        return S.flatten(0, 1)
+        return self.numbers.at.sensitivity.flatten(0, 1)
 
     @cached_property
     def posterior(self) -> Process:

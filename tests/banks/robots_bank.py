@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from diffeo_calib.robots import Chain, Geometry, Joint, SimulatedArm, from_dh
+from diffeo_calib.robots import Chain, Joint, SimulatedArm, from_dh
 from diffeo_calib.robots.se3 import rotation, twist_transform
 
 
@@ -150,12 +150,4 @@ def expand(q: Tensor) -> Tensor:
     rack = 0.1 * elbow
     return torch.stack(
         [1.5 * rail - 0.2, waist, rail, total, elbow, rack, 0.7 - 0.5 * total + 2 * rack + 0.25 * waist], dim=1
-    )
-
-
-def errors_of(chain: Chain, markers: int = 2, size: float = 0.3) -> Geometry:
-    """A geometry in general position."""
-    twists = twist_transform(draw(chain.moving + 1, 6, seed=5, size=size))
-    return replace(
-        Geometry.nominal(chain, markers), base=twists[0], joint_errors=twists[1:], tool=draw(markers, 3, seed=6)
     )

@@ -8,21 +8,17 @@ from pathlib import Path
 
 import baselines
 import harness
-import learning_curves
 import numpy as np
 import protocols
 import pytest
 import real_robots
 import torch
-from harness import Record
-from robot_data import DESCRIPTOR, RobotData, find, read
+from robot_data import DESCRIPTOR, RobotData
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import DiffeoCalibError, InputError
+from diffeo_calib.common.errors import DiffeoCalibError
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.se3 import rotation, transforms
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 QUARTER = math.pi / 2
@@ -118,18 +114,6 @@ def test_every_method_on_a_small_arm() -> None:
     assert set(real_robots.COLUMNS) - set(records["geometry"]) == set()
 
 
-def test_errors_of_orientations_are_recorded() -> None:
-    arm = SimulatedArm(seed=1)
-    q = arm.sample(20)
-    poses = arm.truth.poses(q)
-    axis = torch.tensor([0.0, 0.0, 0.25 * torch.pi / 180], dtype=torch.float64)
-    turned = poses @ transforms(rotation(axis), torch.zeros_like(axis))
-    measured, predicted = (dc.Measurements.from_poses(q, frames) for frames in (poses, turned))
-    fitted = baselines.Fitted(lambda _: predicted.points)
-    assert real_robots.errors(fitted, measured)["rms_deg"] == pytest.approx(0.25)
-    assert real_robots.errors(fitted, dc.Measurements(q, measured.points))["rms_deg"] is None
-
-
 def test_coverage_counts_markers_inside_the_ellipsoids() -> None:
     q, points = torch.zeros(4, 2), torch.zeros(4, 1, 3)
     points[:, 0, 0] = torch.tensor([0.0, 2.7, 2.9, 30.0])  # sqrt(7.8147) = 2.795
@@ -156,38 +140,6 @@ def test_the_program(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture
         harness.earlier([out], real_robots.KEY)
 
 
-# --- data sets ------------------------------------------------------------------------------------------------------
-
-
-def test_data_sets_of_a_folder(folder: Path) -> None:
-    found = find(folder)
-    assert list(found) == ["dh", "urdf"]
-    robot, data = sliding()
-    two = read(folder / "dh", found["dh"])
-    assert two.robot.kinds == robot.kinds
-    torch.testing.assert_close(two.measurements.points, data.points, rtol=0, atol=1e-12)
-    torch.testing.assert_close(two.measurements.q, data.q, rtol=0, atol=1e-12)
-    arm = read(folder / "urdf", found["urdf"])
-    assert arm.measurements.joint_names == arm.robot.joint_names
-    assert list(find(folder, ["urdf"])) == ["urdf"]
-
-
-def test_bad_descriptors(folder: Path) -> None:
-    descriptor = folder / "dh" / DESCRIPTOR
-    changes: tuple[dict[str, object], ...] = (
-        *({"lenght": "mm"}, {"sep": 1}, {"robot": {"dh": []}}, {"robot": {"dh": 3, "convention": "craig"}}),
-        {"rotation": {"columns": []}},
-    )
-    for change in changes:
-        descriptor.write_text(json.dumps(DH | change))
-        with pytest.raises(InputError, match=f"(?=.*dataset.json)(?=.*({next(iter(change))}|'dh' in))"):
-            find(folder)
-    for text in ("{", "[1]", "", json.dumps({name: value for name, value in DH.items() if name != "joints"})):
-        descriptor.write_text(text)
-        with pytest.raises(InputError, match=r"dataset\.json"):
-            find(folder)
-
-
 # --- splits ---------------------------------------------------------------------------------------------------------
 
 
@@ -212,49 +164,3 @@ def test_repeats_stay_on_one_side_and_all_rows_are_used() -> None:
     for split in found:
         assert keys(split.train).isdisjoint(keys(split.test))
         assert len(split.train) == (30 if split.size == "30" else 100 - len(split.test))
-
-
-def test_curves_are_nested_and_drawn_from_the_same_split() -> None:
-    data = repeated()
-    small, large, whole = protocols.curve(data, [60, 30, 5000, None], seed=1)
-    train, test = data.split(0.7, 1)
-    assert [len(split.train) for split in (small, large, whole)] == [30, 60, len(train)]
-    assert keys(small.train) < keys(large.train) <= keys(train)
-    for split in (small, large, whole):
-        assert torch.equal(split.test.q, test.q)
-
-
-# --- peers ----------------------------------------------------------------------------------------------------------
-
-
-def test_joint_offsets_are_recovered() -> None:
-    """A slide and turning joints, two markers; offsets that base and tool can replace are not compared."""
-    robot, data = sliding()
-    truth = torch.tensor([0.02, -0.01, 4e-3, 0.015, -0.03], dtype=torch.float64)
-    true = Geometry.nominal(robot, 2)
-    points = data.points.new_tensor([[0.05, 0.02, 0.1], [-0.04, 0.0, 0.06]])
-    poses = robot(data.q + truth)
-    seen = points @ poses[:, :3, :3].mT + poses[:, None, :3, 3]
-    geometry, offsets = baselines.with_offsets(robot, dc.Measurements(data.q, seen))
-    assert float((geometry.points(data.q) - seen).norm(dim=-1).max()) < 1e-9
-    assert offsets[1:4] == pytest.approx(truth[1:4].numpy(), abs=1e-7)
-    turned = geometry.joint_errors @ torch.linalg.inv(true.joint_errors)
-    assert float(turned[[0, 1, 3, 4], :3, 3].abs().max()) < 1e-12  # nothing but turns about the joints' own axes
-    own = (turned[..., :3, :3] @ robot.axes[..., None])[..., 0]
-    assert float((own - robot.axes).abs().max()) < 1e-12
-
-
-# --- means ----------------------------------------------------------------------------------------------------------
-
-
-def test_means_over_seeds() -> None:
-    same: Record = {"dataset": "arm", "protocol": "curve", "size": "60", "train": 60.0, "test": 60}
-    records = [
-        same | {"method": method, "fold_or_seed": seed, "rms_mm": level * (1 + 0.1 * seed), "note": None}
-        for method, level in (("diffeo_calib", 0.2), ("geometry", 0.4))
-        for seed in range(3)
-    ]
-    failed = same | {"method": "geometry", "fold_or_seed": 3, "note": "failed"}
-    rows = learning_curves.summary([*records, failed])
-    found = [(row["method"], row["runs"], row["failed"], row["rms_mm"]) for row in rows]
-    assert found == [("geometry", 3, 1, pytest.approx(0.44)), ("diffeo_calib", 3, 0, pytest.approx(0.22))]

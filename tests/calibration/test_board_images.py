@@ -30,7 +30,6 @@ from diffeo_calib.robots import SimulatedArm
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 
 SCALES = camera_on_tool().scales
-NOISE_PX = 0.1
 
 
 @cache
@@ -38,14 +37,12 @@ def arm() -> CameraArm:
     return camera_arm(60)
 
 
-@cache
 def data() -> dc.Measurements:
-    return arm().images(NOISE_PX)
+    return kind_named("images of a board").data
 
 
-@cache
 def calibrated() -> Any:
-    return dc.calibrate(arm().arm.nominal, data(), hyperparameters=SCALES)
+    return kind_named("images of a board").result
 
 
 def of_corners(corners: Tensor, q: Tensor | None = None, **known: Any) -> dc.Measurements:
@@ -67,7 +64,7 @@ def test_pixels_are_better_than_poses() -> None:
 
 
 def test_lens_and_board_are_found_with_the_robot() -> None:
-    camera = calibrated().model.placement[0].devices.cameras["camera"].camera
+    camera = calibrated().model.placement[0].cameras["camera"].camera
     truth, deviations = true_camera().unknowns, camera.deviations
     assert float(((camera.unknowns - truth) / deviations).abs().max()) < 4.5
     before = data().camera
@@ -80,7 +77,7 @@ def test_a_mirrored_board_is_the_same_board_from_behind() -> None:
     mirrored = corners.clone()
     mirrored[..., 0] *= -1
     found = dc.calibrate(arm().arm.nominal, of_corners(mirrored), hyperparameters=SCALES)
-    assert abs(error_mm(found.model) / error_mm(calibrated().model) - 1) < 0.02
+    assert abs(error_mm(found.model) / error_mm(calibrated().model) - 1) < 0.05
 
 
 def test_a_board_of_nearly_the_right_size_is_named() -> None:
@@ -100,8 +97,8 @@ def test_tables_that_cannot_be() -> None:
         ("row", lambda: dc.calibrate(arm().arm.nominal, of_corners(corners.roll(1, 0)))),
         ("640 x 480", lambda: of_corners(corners, camera=small)),
         ("640 x 480", lambda: dc.Measurements.from_images(data().q, corners, (640, 480))),
-        (r"corners.*\(N, K, 5\)", lambda: of_corners(torch.zeros(60, 35))),
-        (r"corners.*\(N, K, 5\)", lambda: of_corners(torch.zeros(60, 35, 4))),
+        (r"corners.*\(N, K, 5\)", lambda: of_corners(torch.zeros(45, 35))),
+        (r"corners.*\(N, K, 5\)", lambda: of_corners(torch.zeros(45, 35, 4))),
     )
 
 
@@ -148,9 +145,7 @@ def kind() -> Any:
 
 
 def camera() -> Any:
-    return next(
-        iter(next(own for own in kind().model.placement if own.devices.cameras).devices.cameras.values())
-    ).camera
+    return next(iter(next(own for own in kind().model.placement if own.cameras).cameras.values())).camera
 
 
 @cache
@@ -173,7 +168,7 @@ def test_the_size_comes_from_board_and_tracker() -> None:
 
 
 def test_the_marker_is_where_it_is_on_the_tool() -> None:
-    placed = next(own for own in kind().model.placement if own.kind == "marker").devices
+    placed = next(own for own in kind().model.placement if own.kind == "marker")
     on_flange = poses_from_marks(camera_arm(60).arm.truth.tool[None], LEVER)[0]
     marker = torch.linalg.inv(on_flange) @ torch.cat([SimulatedArm(seed=1).truth.tool[0], torch.ones(1)])
     away = placed.constants[0, 12:] - marker[:3]
@@ -194,7 +189,7 @@ def test_the_tracker_makes_the_workspace_known() -> None:
 def test_sockets_are_where_they_are() -> None:
     rows = with_sockets()[1]
     found = dc.calibrate(kind().robot, rows, hyperparameters=kind().scales)
-    placed = next(own for own in found.model.placement if own.kind == "contact").devices
+    placed = next(own for own in found.model.placement if own.kind == "contact")
     assert placed.names == ("0/0", "0/1", "1/0", "1/1")
     places, std = placed.constants[:, :3], placed.deviations[:, :3].norm(dim=1)
     for first in (0, 2):  # the sockets of a block are 50 mm apart, which nobody said

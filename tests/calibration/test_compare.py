@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 from functools import cache
 from math import inf
 from types import SimpleNamespace
 from typing import Any
 
-import batch_bank
 import pytest
 import torch
 from again_bank import arm, model, payloads, positions
@@ -20,7 +18,7 @@ from torch.distributions import MultivariateNormal
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.recalibration.compare import Comparison
-from diffeo_calib.calibration.recalibration.find_changes import NOISE_FACTORS, SIZES, likelihood_ratios, parts_of
+from diffeo_calib.calibration.recalibration.find_changes import NOISE_FACTORS, SIZES, likelihood_ratios
 
 OFFSET = 1e-3
 """Of a joint, rad."""
@@ -73,20 +71,18 @@ def test_the_smallest_offset_that_rows_show() -> None:
 
 
 def test_a_change_between_two_models_is_named() -> None:
-    """An offset, or wear."""
-    old, rows, name = model(positions), positions(arm(), 60, seed=7), arm().nominal.joint_names[2]
-    offset, worn = with_offset(rows, 2, 0.4 * OFFSET), positions(arm().worn(2, 3.0), 60, seed=7)
-    for data, parts in ((rows, []), (offset, [f"the offset of {name}"]), (worn, [name])):
-        new = dc.calibrate(arm().nominal, data, hyperparameters=usual_scales(arm().nominal)).model
-        compared = dc.compare(old, new)
-        ratio = compared.rms / compared.expected
-        assert 1.0 / 2.0 < ratio < 1.5 if not parts else ratio > 2.0  # a change does not explain itself
+    """An offset, or wear; tests/test_matrix.py compares models between which nothing changed."""
+    name = arm().nominal.joint_names[2]
+    offset = with_offset(positions(arm(), 40, seed=7), 2, 0.4 * OFFSET)
+    for rows, part in ((offset, f"the offset of {name}"), (positions(arm().worn(2, 3.0), 40, seed=7), name)):
+        new = dc.calibrate(arm().nominal, rows, hyperparameters=usual_scales(arm().nominal)).model
+        compared = dc.compare(model(positions), new)
+        assert compared.rms > 2.0 * compared.expected  # a change does not explain itself
         assert compared.telling
-        found = compared.changes.found
-        assert [one.part for one in found] == parts
-        for one in found:
-            assert one.deviation is None or one.size == pytest.approx(0.4 * OFFSET, abs=4 * one.deviation)
-            assert one.part in str(compared)
+        (one,) = compared.changes.found
+        assert one.part == part
+        assert one.deviation is None or one.size == pytest.approx(0.4 * OFFSET, abs=4 * one.deviation)
+        assert one.part in str(compared)
 
 
 def test_places_that_a_fit_left_open_explain_no_difference_of_models() -> None:
@@ -99,15 +95,6 @@ def test_places_that_a_fit_left_open_explain_no_difference_of_models() -> None:
     compared = dc.compare(old, model(positions))
     assert compared.expected < 1e-3
     assert not compared.changes.found
-
-
-def test_what_a_model_lacks_cannot_change() -> None:
-    fitted: Any = model(positions).map
-    spec, sag = fitted.geodesic.spec, fitted.geodesic.spec.nominal.sag
-    bare = replace(spec, prior_variance=spec.prior_variance.index_fill(0, torch.arange(sag.start, sag.stop), 0.0))
-    own: Any = SimpleNamespace(geodesic=SimpleNamespace(spec=bare), deformation=SimpleNamespace(spec=bare))
-    names, fewer = ([part.name for part in parts_of(each)] for each in (fitted, own))
-    assert fewer == [name for name in names if name != "gravity"] != names
 
 
 def test_ratios_are_those_of_the_definition() -> None:
@@ -147,18 +134,3 @@ def test_a_model_with_payloads_is_compared_with_one_without_any_under_none() -> 
         assert found.payload == 0.0
         assert found.rms < 3.0 * found.expected
         assert str(found).startswith("with a payload of 0")
-
-
-BATCHES = 2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["camera on the tool", "sessions"])
-def test_clean_batches_show_no_change(name: str) -> None:
-    """Not one at the level of 1 %, and none of these is near it."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # few rows
-        model = batch_bank.searched(name)
-        for seed in range(BATCHES):
-            found: Any = dc.compare(model, batch_bank.batch(name, seed), level=0.02)
-            assert not found.changes.found

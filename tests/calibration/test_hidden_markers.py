@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
-from functools import cache
 from math import nan
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from command_bank import leave_undrawn
-from tangent_bank import Setting, noise_covariance, shaken, tangent_covariance
+from process_bank import case
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -21,124 +18,24 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.choose_scales import robot_problem
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register
-from diffeo_calib.calibration.scales.leave_one_out import leave_one_out, left_out_squares
-from diffeo_calib.calibration.scales.noise_model import NoiseModel
-from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.gauss_newton import GaussNewton
-from diffeo_calib.process.tails import Tails
 from diffeo_calib.reports.analysis.predictions import FitRows, Predictions
 from diffeo_calib.robots import SimulatedArm
 
-MARKERS, ROWS = 3, 24
-HIDDEN = np.random.default_rng(7).random((ROWS, MARKERS)) < 0.3
-PLACES = 1e-3
-"""Prior deviation of base and markers: with the usual one, G + R spans so many powers of ten that digits are lost."""
-HIDDEN[0] = True, True, False
-HIDDEN[1] = False
-HIDDEN[HIDDEN.all(1), 0] = False
-
-
-def hidden(data: dc.Measurements, where: np.ndarray = HIDDEN) -> dc.Measurements:
-    """The same measurements without some markers."""
-    points = data.points.masked_fill(torch.from_numpy(where)[..., None], nan)
-    return dc.Measurements(data.q, points, data.joint_names, std=data.std)
-
-
-@dataclass
-class Case:
-    """A setting with hidden markers and scales, and the covariance of its coordinates by the second implementation."""
-
-    setting: Setting
-    data: TangentData
-    scales: dc.Hyperparameters
-
-    @property
-    def seen(self) -> Tensor:
-        """(N m,) coordinates that were measured."""
-        return ~self.setting.data.points.isnan().flatten()
-
-    def covariance(self) -> tuple[Tensor, Tensor]:
-        """G and the blocks of R of all coordinates: (N m, N m)."""
-        theta, nominal = self.data.theta, self.setting.nominal
-        G = tangent_covariance(self.scales, nominal, theta, self.data.x)
-        parts, S = nominal.geometry.slices, nominal.sensitivities(self.data.x, theta).flatten(0, 1)
-        S = torch.cat([S[:, parts["base"]], S[:, parts["tool"]]], 1)
-        G = G + (PLACES**2 - 0.1**2) * S @ S.mT
-        R = noise_covariance(self.scales, self.setting, theta, self.data.tails.weights)
-        return G, torch.block_diag(*R)
-
-    def target(self) -> Tensor:
-        """(N m,) measured minus the linear model at zero."""
-        nominal, theta, x = self.setting.nominal, self.data.theta, self.data.x
-        predicted = nominal(x, theta) - nominal.sensitivities(x, theta) @ theta
-        return self.setting.data.points.flatten() - predicted.flatten()
-
-
-@cache
-def case(known: bool = False) -> Case:
-    arm = SimulatedArm(seed=3, markers=MARKERS)
-    q, points = arm.measure(ROWS, seed=4)
-    std = torch.from_numpy(np.random.default_rng(1).uniform(1e-5, 4e-5, (ROWS, MARKERS, 3))) if known else None
-    data = hidden(dc.Measurements(q, points, std=std))
-    setting = object.__new__(Setting)
-    setting.data = data
-    registration = register(arm.nominal, data.q, data.points)
-    setting.identification = identify(registration.geometry, data.q, data.points)
-    full = Setting(arm.nominal, dc.Measurements(q, points))
-    weights = torch.from_numpy(np.random.default_rng(2).uniform(0.1, 1.0, (ROWS, MARKERS)))
-    weights[torch.from_numpy(HIDDEN)] = 1.0
-    y = torch.where(data.points.isnan().flatten(1), full.tangent_data.values, data.points.flatten(1))
-    tangent = replace(full.tangent_data, y=y, noise_model=NoiseModel.of(data, 1e-4), tails=Tails(4.0, weights))
-    tangent = replace(tangent, place_deviation=PLACES)
-    setting.tangent_data = tangent
-    return Case(setting, tangent, shaken(full.scales, 5))
-
-
-both = pytest.mark.parametrize("known", [False, True])
-
-
-@both
-def test_rows_left_out_are_predicted_from_the_seen_coordinates_of_the_others(known: bool) -> None:
-    one = case(known)
-    G, R = one.covariance()
-    target, seen, m = one.target(), one.seen, 3 * MARKERS
-    found = leave_one_out(one.data, one.scales)
-    assert bool((found.errors.isnan().flatten() == ~seen).all())
-    assert bool((found.squares.isnan() == torch.from_numpy(HIDDEN)).all())
-    plain = torch.block_diag(*one.data.noise_model.covariance(one.scales, one.data.jacobian))
-    for row in range(ROWS):
-        own = torch.zeros_like(seen)
-        own[row * m : (row + 1) * m] = True
-        others, own = seen & ~own, seen & own
-        weights = torch.linalg.solve((G + R)[others][:, others], G[others][:, own]).mT
-        error = target[own] - weights @ target[others]
-        assert_close(found.errors.flatten()[own], error, rtol=1e-6, atol=1e-12)
-        covariance = (G + plain)[own][:, own] - weights @ G[others][:, own]
-        markers = [k for k in range(MARKERS) if not HIDDEN[row, k]]
-        for number, marker in enumerate(markers):
-            block, part = covariance[3 * number :][:3, 3 * number :][:, :3], error[3 * number :][:3]
-            expected = float(part @ torch.linalg.solve(block, part))
-            assert float(found.squares[row, marker]) == pytest.approx(expected, rel=1e-6)
-    G_vv, K = G[seen][:, seen], (G + R)[seen][:, seen]
-    assert found.effective == pytest.approx(float(torch.linalg.solve(K, G_vv).trace()), rel=1e-6)
-    rows = torch.arange(0, ROWS, 5)
-    squares = left_out_squares(one.data, one.scales, torch.isin(torch.arange(ROWS), rows).to(torch.int64) - 1)[rows]
-    assert bool((squares.isnan() == torch.from_numpy(HIDDEN)[rows]).all())
-
 
 def test_exact_model_is_conditioned_on_the_seen_coordinates_alone() -> None:
-    one = case()
+    one = case("hidden markers")
     problem = robot_problem(one.data, one.scales)
     model = fit(problem, GaussNewton(tolerance=1e-9)).model
     value, at = model.geodesic.linearised_value(one.data.x)
     G, R = at.gram(), torch.block_diag(*model.noise.covariance)
-    seen = one.seen
+    seen = one.data.visible.flatten()
     p = model.geodesic.end_momenta.reshape(-1)
     residual = (problem.y - value).flatten()
     assert_close(R[seen][:, seen] @ p[seen], residual[seen], rtol=1e-5, atol=1e-11)  # p = R^-1 (y - k1)
-    new = SimulatedArm(seed=3, markers=MARKERS).sample(5, seed=8)
+    new = SimulatedArm(seed=3, markers=3).sample(5, seed=8)
     mean, covariance = model.predict(new, noise=False)
     there = model.geodesic.linearise(new)
     cross = at.gram(there)

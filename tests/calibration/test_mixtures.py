@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 import torch
+from kind_bank import rigid_rms
 from mixture_bank import DISTANCES, TRACKED
-from reading_bank import POINTS, readings
+from reading_bank import readings
 from reading_bank import scales as usual
 from simulated_sockets import SocketRows, rest_in_sockets
 from table_bank import refused
@@ -26,17 +27,13 @@ from diffeo_calib.calibration.identification.identification import (
 )
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.placing.place import place
-from diffeo_calib.calibration.result import errors_by_kind
-from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places
 from diffeo_calib.calibration.scales.selection import defaults, log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.sockets import Sockets
-from diffeo_calib.regression.regions import region_factor
 from diffeo_calib.robots import SimulatedArm
-from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.sensors.places import fitting_devices
 
@@ -155,23 +152,6 @@ def test_the_noise_of_sockets_is_searched(tangent: TangentData) -> None:
     assert float(wider) == 2.0 * float(centre.other_noise)
 
 
-def test_each_tracked_configuration_is_a_degree_of_freedom_beside_the_places(
-    tangent: TangentData, mixture: dc.Measurements
-) -> None:
-    """Places that contradict each other widen the deviations as by themselves, but no more for being few."""
-    places, socket, groups = mixture.places, mixture.socket, mixture.groups()
-    assert len(places.unique()) == 4 + 1, "one number for all tracked rows"
-    wide = defaults(tangent, 1e-2, Prior())
-    assert inflation_by_places(tangent, wide, places, socket, groups) == region_factor(4 + TRACKED, 3)
-    repeated = torch.where(places < 0, groups // 5, groups)
-    assert inflation_by_places(tangent, wide, places, socket, repeated) == region_factor(4 + TRACKED // 5, 3)
-    narrow = defaults(tangent, 1e-5, Prior())
-    found = inflation_by_places(tangent, narrow, places, socket, groups)
-    assert found > 2.0 * region_factor(4 + TRACKED, 3), "contradictions are not diluted by tracked rows"
-    alone = inflation_by_places(tangent, narrow, places, socket, torch.zeros_like(groups))
-    assert found / region_factor(4 + TRACKED, 3) == pytest.approx(alone / region_factor(4 + 1, 3), rel=1e-9)
-
-
 def test_evaluation_of_each_kind(result: Any, tracked: Any, resting: Any, mixture: Any) -> None:
     new, model, summary = tracked.rows(slice(TRACKED, None)), result.model, result.model.summary
     positions, spread, both = (dc.evaluate(model, rows) for rows in (new, resting, mixture))
@@ -204,23 +184,6 @@ def test_several_set_ups_of_the_device(
 
 
 # --- tables of both ---------------------------------------------------------------------------------------------------
-
-
-def test_splits_hold_out_measured_positions(mixture: dc.Measurements) -> None:
-    train, test = mixture.split(0.6, seed=1)
-    assert bool((test.places < 0).all())
-    assert (len(test), int((train.places >= 0).sum())) == (10, 64)
-    held = torch.cat([part.line_numbers for _, part in mixture.folds(5)])
-    assert torch.equal(held.sort().values, torch.arange(TRACKED))
-
-
-def test_joined_and_taken_apart(mixture: Any, tracked: Any, resting: Any) -> None:
-    assert mixture.device_rows().sha256 == tracked.rows(slice(TRACKED)).sha256
-    assert mixture.socket_rows().sha256 == resting.sha256
-    assert "2 markers, the last one in 8 sockets in 64 of the rows" in repr(mixture)
-    frame = mixture.to_frame()
-    assert list(frame.columns[6:]) == ["socket", "x", "y", "z"]
-    assert frame["x"].isna().sum() == (frame["socket"] != "").sum() == len(resting)
 
 
 def test_rows_in_sockets_join_a_mixture(mixture: dc.Measurements, resting: dc.Measurements) -> None:
@@ -295,92 +258,38 @@ NAMES = PLAIN.nominal.joint_names
 NOISE = 2e-5
 
 
-def positions(count: int) -> dc.Measurements:
-    return dc.Measurements(*PLAIN.measure(count, seed=4), NAMES)
+def read(kind: str, count: int) -> dc.Readings:
+    return readings(PLAIN, kind, count, noise=NOISE)
 
 
-def sockets() -> dc.Measurements:
+def fit_of(data: dc.Observations) -> Any:
+    """With the noise of each kind given."""
+    other = torch.full((len(data.parts) - 1,), NOISE, dtype=torch.float64)
+    return dc.calibrate(PLAIN.nominal, data, hyperparameters=replace(usual(), other_noise=other))  # type: ignore[arg-type]
+
+
+def test_sockets_and_distances_alone() -> None:
+    """As good as the model says; errors of every kind are judged by themselves, and better than by geometry."""
     rows = rest_in_sockets(PLAIN, seed=3, places=4, rows=5)
-    return dc.Measurements.from_sockets(rows.q, rows.names, NAMES, distances={("0", "1"): 0.05}, distance_std=1e-5)
-
-
-def read(kind: str, count: int, zero: float = 0.0) -> dc.Readings:
-    return readings(PLAIN, kind, count, zero, noise=NOISE)
-
-
-def fit_of(parts: list[object], **options: object) -> Any:
-    """Of the joined tables, with the noise of each kind given."""
-    data = dc.Observations.joined(parts)
-    other = torch.full((len({part.kind for part in data.parts}) - 1,), NOISE, dtype=torch.float64)
-    given = replace(usual(), other_noise=other if len(other) else None)
-    return dc.calibrate(PLAIN.nominal, data, hyperparameters=given, **options)  # type: ignore[arg-type]
-
-
-def ball_errors(result: Any, *, free: bool, q: Tensor | None = None) -> Tensor:
-    """Errors (N, 3) of the ball, m; after a rigid fit if no device says where the robot stands."""
-    q = PLAIN.sample(200, 9) if q is None else q
-    truth, found = PLAIN.true_points(q)[:, 0], result.model(q).detach()[:, -1]
-    T = rigid_fit(found, truth) if free else torch.eye(4, dtype=torch.float64)
-    return found @ T[:3, :3].mT + T[:3, 3] - truth
-
-
-CASES = {
-    "sockets, distances": lambda: [sockets(), read("distance", 36)],
-    "positions, distances from another zero": lambda: [positions(25), read("distance", 36, 0.03)],
-    "positions, sockets, images": lambda: [positions(20), sockets(), read("image", 24)],
-}
-
-
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * ("images" in name)) for name in CASES])
-def test_as_accurate_as_expected(name: str) -> None:
-    """Better than geometry, and as good as the model says; errors of every kind are judged by themselves."""
-    parts = CASES[name]()
-    result = fit_of(parts)
-    free = not any(part.kind == "position" for part in parts)
-    error = rms(ball_errors(result, free=free))
+    sockets = dc.Measurements.from_sockets(rows.q, rows.names, NAMES, distances=DISTANCES, distance_std=1e-5)
+    data: Any = dc.Observations.joined([sockets, read("distance", 36)])
+    result, q = fit_of(data), PLAIN.sample(200, 9)
+    error = rigid_rms(result.model(q).detach(), PLAIN.true_points(q))
     assert 0.5 * result.expected.workspace < error < 1.8 * result.expected.workspace
     assert result.fit.converged
-    kinds = errors_by_kind(result, dc.Observations.joined(parts))
-    assert len(kinds) == len(parts)
+    kinds = result.errors(data)
+    assert len(kinds) == 2
     for one in kinds.values():
-        assert one.stages["calibrated"].rms < one.stages["geometric"].rms
-
-
-@pytest.fixture(scope="module")
-def joint() -> Any:
-    return fit_of([positions(25), read("distance", 36)])
-
-
-@pytest.mark.slow
-def test_devices_are_where_they_are_within_their_deviations(joint: Any) -> None:
-    """Three fixed points in the tracker's frame, and the ball as a marker of its own."""
-    base = PLAIN.truth.base
-    ranges = joint.readings[0]
-    errors = ranges.devices.constants[:, :3] - (POINTS @ base[:3, :3].mT + base[:3, 3])
-    away = errors / ranges.devices.deviations[:, :3]
-    assert float(away.square().mean()) < 4.0
-    assert 1e-6 < float(ranges.devices.deviations[:, :3].max()) < 1e-3
-    assert float((joint.model.geometry.tool[1] - PLAIN.truth.tool[0]).norm()) < 1e-3
-    assert joint.model.markers == 2
-    assert "mm in the measuring frame" in joint.placement.sentences()[0]
+        assert one["calibrated"].rms < one["geometric"].rms
 
 
 @pytest.mark.slow
 def test_the_order_of_the_rows_does_not_matter() -> None:
-    data = dc.Observations.joined([positions(20), read("distance", 24), read("height", 24)])
+    tracked = dc.Measurements(*PLAIN.measure(20, seed=4), NAMES)
+    data: Any = dc.Observations.joined([tracked, read("distance", 24), read("height", 24)])
     order = torch.randperm(len(data), generator=torch.Generator().manual_seed(2))
     order[order.argmin()], order[0] = order[0].clone(), 0  # positions stay the first kind
     mixed = data.rows(order.tolist())
     assert [part.kind for part in data.parts] != [part.kind for part in mixed.parts]
-    q, given = PLAIN.sample(20, 9), replace(usual(), other_noise=torch.full((2,), NOISE, dtype=torch.float64))
-    one, other = (dc.calibrate(PLAIN.nominal, rows, hyperparameters=given).model(q) for rows in (data, mixed))
+    one, other = (fit_of(rows).model(PLAIN.sample(20, 9)) for rows in (data, mixed))
     torch.testing.assert_close(other, one, rtol=0, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_controls(joint: Any) -> None:
-    """Fewer momenta than rows: the deviations of devices are found as well."""
-    coarse = fit_of([positions(25), read("distance", 36)], controls=40)
-    for one, other in zip(joint.readings, coarse.readings, strict=True):
-        torch.testing.assert_close(other.devices.deviations, one.devices.deviations, rtol=0.1, atol=1e-6)
-    assert rms(joint.model(PLAIN.sample(50, 2)).detach() - coarse.model(PLAIN.sample(50, 2)).detach()) < 1e-4

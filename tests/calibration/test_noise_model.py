@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 from kind_bank import kind_named
 from scipy.stats import chi2
-from simulated_camera import camera_arm
 from tangent_bank import built, normal
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import robot_problem
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, differing_factor
 from diffeo_calib.maps.noise import HIDDEN_VARIANCE
-from diffeo_calib.measurements.poses import mark_jacobian, mark_points, pose_jacobian
+from diffeo_calib.measurements.poses import mark_jacobian
 from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.regression.regions import region_factor
-
-DRAWS = 20000
 
 
 def poses(count: int, seed: int = 0) -> Tensor:
@@ -48,58 +44,6 @@ def covariances(rows: int, m: int, seed: int) -> Tensor:
     return root @ root.mT + 0.1 * torch.eye(m, dtype=torch.float64)
 
 
-def close_to_sample(actual: Tensor, draws: Tensor) -> None:
-    """A covariance (m, m) against draws (count, m), in units of its own size."""
-    sample = draws.mT @ draws / len(draws)
-    scale = actual.diagonal().sqrt()
-    difference = (actual - sample) / (scale[:, None] * scale)
-    assert float(difference.abs().max()) < 5.0 / len(draws) ** 0.5
-
-
-def test_covariance_of_markers_is_that_of_simulated_noise() -> None:
-    """A tracker that errs and joints that do not repeat, through the robot itself."""
-    pair, noise = built("two markers"), torch.linspace(2e-5, 2e-4, 6, dtype=torch.float64)
-    scales = replace(pair.scales, joint_noise=noise, sensor_noise=torch.tensor(3e-5, dtype=torch.float64))
-    data = pair.tangent_data
-    q = data.x[:1]
-    shaky = data.nominal(q + noise * normal(DRAWS, 6, seed=1), data.theta) + 3e-5 * normal(DRAWS, 6, seed=2)
-    close_to_sample(data.noise(scales)[0], shaky - data.nominal(q, data.theta))
-
-
-def test_covariance_of_poses_is_that_of_simulated_noise() -> None:
-    """A frame that is shifted and turned as a whole; slack and joints are switched off."""
-    framed: Any = built("posed")
-    data, scales = framed.data, framed.scales
-    shift, turn = 4e-5, 5e-4
-    scales = replace(
-        scales,
-        sensor_noise=torch.tensor(shift, dtype=torch.float64),
-        rotation_noise=torch.tensor(turn, dtype=torch.float64),
-        joint_noise=torch.zeros(6, dtype=torch.float64),
-    )
-    moved = data.poses[:1].repeat(DRAWS, 1, 1)
-    moved[:, :3, :3] = turned(turn * normal(DRAWS, 3, seed=3)) @ moved[:, :3, :3]
-    moved[:, :3, 3] += shift * normal(DRAWS, 3, seed=4)
-    draws = (mark_points(moved, data.lever) - mark_points(data.poses[:1], data.lever)).flatten(1)
-    sensor = NoiseModel.of(data, 0.0).without_known
-    close_to_sample(sensor.covariance(scales, framed.tangent_data.jacobian)[0], draws)
-
-
-@pytest.mark.parametrize("markers", [1, 3])
-def test_squares_of_markers(markers: int) -> None:
-    """r_k^T R_kk^-1 r_k, every marker by itself."""
-    sensor, m = NoiseModel.alike(4, markers), 3 * markers
-    covariance, errors = covariances(4, m, seed=8), normal(4, m, seed=9)
-    found = sensor.squares(covariance, errors[:, :, None] * errors[:, None])
-    assert found.shape == (4, markers)
-    for row in range(4):
-        for k in range(markers):
-            own = slice(3 * k, 3 * k + 3)
-            r = errors[row, own]
-            expected = float(r @ torch.linalg.inv(covariance[row, own, own]) @ r)
-            assert float(found[row, k]) == pytest.approx(expected, rel=1e-10)
-
-
 def test_squares_of_poses() -> None:
     """The shift and turn that fit the points' errors best, in units of their own covariance."""
     sensor = pose_sensor(4)
@@ -118,7 +62,6 @@ def test_squares_of_poses() -> None:
 # --- new measurements where the noise differs from row to row ---------------------------------------------------------
 
 INSIDE_95 = float(chi2.ppf(0.95, 3))
-POSITION_STD, ROTATION_STD = 1e-4, 1e-3
 
 
 def blocks(rows: int, coordinates: int, seed: int) -> Tensor:
@@ -166,22 +109,6 @@ def test_hidden_markers_do_not_count() -> None:
     other = torch.where(seen[:, :, None] & seen[:, None], each, torch.eye(6, dtype=torch.float64))
     mean = each.mean(0)
     assert differing_factor(hidden, mean, seen) == pytest.approx(differing_factor(other, mean, seen), rel=1e-12)
-
-
-@pytest.mark.slow
-def test_a_camera_s_poses_lie_in_the_regions_of_their_noise() -> None:
-    """Errors of drawn poses of the board, turned into poses of the camera with its own formulas; ten of each."""
-    seen = camera_arm(150, 2)
-    seen = replace(seen, q=seen.q.repeat(10, 1), boards=seen.boards.repeat(10, 1, 1))
-    data = seen.measured(POSITION_STD, ROTATION_STD)
-    errors = (data.points - seen.arm.true_points(seen.q)).flatten(1)
-    modes = pose_jacobian(data.frames, LEVER, data.board)[:, 0]
-    deviations = torch.tensor([POSITION_STD] * 3 + [ROTATION_STD] * 3, dtype=torch.float64)
-    each = modes * deviations.square() @ modes.mT
-    mean = each.mean(0) + 1e-16 * torch.eye(9, dtype=torch.float64)
-    factor = differing_factor(each, mean, everywhere(each))
-    assert share(errors, mean) < 0.93
-    assert share(errors, factor * mean) == pytest.approx(0.95, abs=0.01)
 
 
 def test_new_noise_is_the_mean_and_what_differs() -> None:

@@ -12,7 +12,7 @@ import pytest
 import reading_bank
 import torch
 import two_arms_bank
-from kind_bank import Kind, kind_named, marked, rigid_rms
+from kind_bank import Kind, kind_named, marked
 from simulated_camera import BOARD_PRIOR, HEIGHT, WIDTH, camera_arm, fixed_camera_arm, seen_corners, true_camera
 from table_bank import refused
 from torch import Tensor
@@ -142,24 +142,6 @@ def test_a_camera_measures_what_it_sees() -> None:
     assert bool((-line[:, 0] > 0.87 * line.norm(dim=1)).all())
     with pytest.raises(dc.DiffeoCalibError, match="candidates that can be measured: expected at least 100"):
         dc.plan(arm.nominal, q, 100, sensor=sensor)
-
-
-def test_expected_errors_of_distances_come_true() -> None:
-    """15 more planned distances to the same fixed points, measured in simulation and fitted."""
-    result, q = fitted("distance"), ARM.sample(300, seed=11)
-    plan = dc.plan(result.model, q, 15)
-    devices: Any = result.placement[0].devices
-    sensors: Any = sensor_of(result.model)
-    where = {one.names[0]: one.devices[0].devices.constants[0, :3] for one in sensors}
-    numbers = [int((devices.constants[:, :3] - where[name]).norm(dim=1).argmin()) for name in plan.devices]
-    names = [devices.names[number] for number in numbers]
-    which = torch.tensor([int(name.split()[1]) for name in names])
-    lengths = (reading_bank.in_base(ARM, plan.q) - reading_bank.POINTS[which]).norm(dim=1)
-    new = dc.Readings.distances(plan.q, lengths, names, ARM.nominal.joint_names)
-    both = dc.Readings.joined([kind_named("distances").data, new])
-    again = dc.calibrate(ARM.nominal, both, hyperparameters=reading_bank.scales()).model
-    for model, expected in ((result.model, plan.expected_rms[0]), (again, plan.expected_rms[-1])):
-        assert 0.4 < rigid_rms(model(q).detach(), ARM.true_points(q)) / float(expected) < 1.6
 
 
 AGAIN = ("heights", "mixture", "several kinds", "two cameras on the tool")
@@ -297,25 +279,6 @@ def test_candidates_that_no_camera_sees_are_refused() -> None:
     q = candidates(wrist().robot, 40)
     with pytest.raises(dc.DiffeoCalibError, match=r"candidates that can be measured: expected at least 5.*its board"):
         dc.plan(wrist().model, q, 5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["images of a board", "two cameras", "two cameras on the tool"])
-def test_images_of_the_fit_are_what_they_were(kind: str) -> None:
-    """Their noise and what lens and board do to them, by the poses of the model alone."""
-    model = kind_named(kind).model
-    placed = next(own for own in model.placement if own.devices.cameras)
-    for number, one in enumerate(cameras(kind_named(kind))):
-        rows = placed.rows[placed.device == number]
-        points = model(model.configurations[rows]).detach().flatten(1)
-        assert float(sees(one.camera, one.boards(points)).double().mean()) > 0.9
-        known, by_lens = one.tells(points)
-        shared = model.map.noise.shared[rows].clone()
-        if one.set_up.columns is not None:
-            shared[..., one.set_up.columns] = 0.0
-        assert float((by_lens @ one.lens[0] - shared).norm() / shared.norm()) < 0.02
-        sizes = [each.diagonal(dim1=1, dim2=2).sum(1) for each in (known, model.map.noise.covariance[rows])]
-        assert 0.7 < float((sizes[0] / sizes[1]).median()) < 1.0
 
 
 @pytest.mark.slow

@@ -20,8 +20,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.placing.place import place
-from diffeo_calib.calibration.placing.placement import Placement
-from diffeo_calib.calibration.placing.readings import reading_sets, register_readings
+from diffeo_calib.calibration.placing.readings import register_readings
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -32,25 +31,11 @@ from diffeo_calib.process.scales import SCALES
 from diffeo_calib.robots import Geometry, SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.places import fitting_devices
 from diffeo_calib.sensors.range import FixedPoints
-from diffeo_calib.sensors.tables import OtherReadings
 
 
 def registered(robot: Tree, data: dc.Readings) -> Identification:
     return register_readings(Geometry.nominal(robot, 1), [data])
-
-
-def test_devices_of_several_kinds_are_all_written() -> None:
-    arm, every = SimulatedArm(0), torch.arange(30)
-    tables = [readings(arm, kind, 30) for kind in ("distance", "height")]
-    tables[1] = replace(tables[1], names=("x", "y", "z"))
-    devices = [fitting_devices(one, in_base(arm, one.q)[:, None]) for one in tables]
-    sets = reading_sets([OtherReadings(one, every) for one in tables], devices)
-    found, *alone = (Placement(some).entry()["devices"] for some in (sets, sets[:1], sets[1:]))
-    for what, values in found.items():
-        assert values == alone[0][what] | alone[1][what]
-        assert len(values) == 6
 
 
 @pytest.mark.parametrize(
@@ -238,11 +223,3 @@ def test_what_is_refused() -> None:
         ("above 0", lambda: dc.Readings.distances(data.q, -data.values)),
         ("60 names", lambda: dc.Readings.heights(data.q, 0.0, ["table"])),
     )
-
-
-def test_a_ball_without_a_start_that_leads_anywhere_is_sought(monkeypatch: pytest.MonkeyPatch) -> None:
-    arm = SimulatedArm(2)
-    data = readings(arm, "distance", 60)
-    expected = place(arm.nominal, data, silent).identification.geometry.tool
-    monkeypatch.setattr("diffeo_calib.calibration.placing.readings._starts", lambda *_: [])
-    assert_close(place(arm.nominal, data, silent).identification.geometry.tool, expected, rtol=0, atol=1e-6)

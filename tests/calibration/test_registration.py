@@ -22,10 +22,9 @@ from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import (
     find_joint_offsets,
     register,
-    register_robustly,
     with_joint_offsets,
 )
-from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.robots import Chain, DHRow, Geometry, SimulatedArm, from_dh
 from diffeo_calib.robots.placement import PLACES
 
@@ -42,7 +41,7 @@ def somewhere(seed: int, markers: int = 1) -> Geometry:
 
 
 @pytest.mark.parametrize("markers", [1, 3])
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(4))
 def test_registration_finds_any_frame_and_marker(seed: int, markers: int) -> None:
     truth, q = somewhere(seed, markers), ARM.sample(12, seed)
     found = register(ARM.nominal, q, truth.points(q))
@@ -65,7 +64,7 @@ def test_registration_is_a_minimum_and_reports_its_deviations() -> None:
 
 def test_registration_from_four_poses_needs_its_many_starts() -> None:
     # With so few poses a single start, even the linear solution, sometimes ends in another local minimum.
-    for seed in range(60):
+    for seed in range(20):
         truth, q = somewhere(seed), ARM.sample(4, seed)
         found = register(ARM.nominal, q, truth.points(q))
         torch.testing.assert_close(found.geometry.base, truth.base, rtol=0, atol=1e-6)
@@ -137,13 +136,6 @@ def test_absorbed_offsets_are_exactly_other_joint_values() -> None:
     q = torch.randn(7, chain.n, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     offsets = torch.tensor([0.2, -0.05, 0.4], dtype=torch.float64)
     assert_close(with_joint_offsets(geometry, offsets).points(q), geometry.points(q + offsets), rtol=0, atol=1e-14)
-
-
-def test_left_out_rows_decide_on_offsets() -> None:
-    q, points = OTHER.measure(40, seed=1)
-    q[:, 2] -= 0.3
-    with pytest.warns(DiffeoCalibWarning, match="joint offsets are far .*: elbow_joint by 17.* degrees: got"):
-        assert register_robustly(OTHER.nominal, dc.Measurements(q, points)).rms < 0.02
 
 
 # --- long chains ------------------------------------------------------------------------------------------------------

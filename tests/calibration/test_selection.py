@@ -14,7 +14,6 @@ from product_bank import Case, noise_blocks
 from tangent_bank import (
     Setting,
     built,
-    gravity_covariance,
     noise_covariance,
     normal,
     shaken,
@@ -30,10 +29,8 @@ from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.scales import selection
 from diffeo_calib.calibration.scales.selection import (
     LARGEST_AMPLITUDE_RATIO,
-    SEARCH_LIMITS,
+    LOG_RANGE,
     LogPosterior,
-    SearchLimits,
-    Selection,
     defaults,
     log_posterior,
     select,
@@ -55,22 +52,6 @@ def test_defaults_are_usable_scales(setting: Setting) -> None:
     assert ratio <= LARGEST_AMPLITUDE_RATIO * 1.001
     moving = setting.nominal.geometry.chain.moving
     assert scales.compliance.shape == scales.lateral_compliance.shape == (moving,)
-
-
-def test_every_part_moves_the_markers_by_less_than_the_residual_at_first(setting: Setting) -> None:
-    """The defaults of gravity: the sag of one joint has the size of the geometric residual."""
-    scales, data, noise = setting.scales, setting.tangent_data, setting.identification.noise
-    nominal = data.nominal
-    for joint in range(nominal.geometry.chain.moving):
-        off = torch.zeros_like(scales.compliance)
-        for name, share in (("compliance", 0.3), ("lateral_compliance", 0.1)):
-            alone = off.clone()
-            alone[joint] = getattr(scales, name)[joint]
-            other = {"compliance": off, "lateral_compliance": off} | {name: alone}
-            covariance = gravity_covariance(replace(scales, **other), nominal, data.theta, data.x)
-            assert float(covariance.diagonal().mean().sqrt()) <= 1.001 * share * noise
-    total = gravity_covariance(scales, nominal, data.theta, data.x)
-    assert float(total.diagonal().mean().sqrt()) > 0.3 * noise
 
 
 def test_the_unit_of_length_does_not_matter() -> None:
@@ -160,10 +141,9 @@ def log_density(matrix: Tensor, target: Tensor) -> float:
     return float(-0.5 * (square + size + len(target) * np.log(2 * np.pi)))
 
 
-@pytest.mark.parametrize("seed", [2])
-def test_posterior_is_likelihood_times_prior(setting: Setting, seed: int) -> None:
-    scales, data = shaken(setting.scales, seed), weighted(setting, seed)
-    nominal, theta, x = data.told.nominal, data.theta, data.x
+def test_posterior_is_likelihood_times_prior(setting: Setting) -> None:
+    scales, data = shaken(setting.scales, 2), weighted(setting, 2)
+    nominal, theta, x = data.nominal.changed(rigid=True) if data.basis is not None else data.nominal, data.theta, data.x
     total = tangent_covariance(scales, nominal, theta, x)
     total += torch.block_diag(*noise_covariance(scales, setting, theta, data.tails.weights))
     target = (data.y - nominal(x, theta) + nominal.sensitivities(x, theta) @ theta).flatten()
@@ -262,12 +242,6 @@ def test_a_wide_prior_costs_no_digits(setting: Setting) -> None:
     torch.testing.assert_close(wide[0].gradient, wide[1].gradient, rtol=1e-4, atol=1e-4)
 
 
-def brief(iterations: int = 5, **others: int) -> SearchLimits:
-    """A search with ``iterations`` iterations from every start."""
-    each = dict.fromkeys(("iterations", "first", "fewest_first", "most_first"), iterations)
-    return SearchLimits(**each | others)
-
-
 def value(setting: Setting, scales: dc.Hyperparameters) -> float:
     """Log posterior, up to a constant."""
     found = log_posterior(scales.logarithms(), setting.scales, setting.tangent_data)
@@ -295,7 +269,7 @@ def test_select_is_better_than_the_default_and_reports_its_likelihood(setting: S
     assert f"likelihood {found.likelihood:.1f} on {len(setting.data)} poses" in selection.status
     assert not selection.interrupted
     moved = selection.scales.logarithms() - setting.scales.logarithms()
-    assert float(moved.abs().max()) <= SEARCH_LIMITS.log_range + 1e-9
+    assert float(moved.abs().max()) <= LOG_RANGE + 1e-9
 
 
 def test_a_given_start_is_where_the_search_begins() -> None:
@@ -304,7 +278,7 @@ def test_a_given_start_is_where_the_search_begins() -> None:
     start = shaken(setting.scales, 4)
     begun = select(setting.scales, setting.tangent_data, start=start, progress=interrupting(2))
     torch.testing.assert_close(begun.scales.logarithms(), start.logarithms(), rtol=1e-12, atol=1e-12)
-    climbed = select(setting.scales, setting.tangent_data, start=start, limits=brief(1))
+    climbed = select(setting.scales, setting.tangent_data, start=start, iterations=1)
     assert value(setting, climbed.scales) > value(setting, start)
 
 
@@ -320,7 +294,7 @@ def test_interrupted_later_keeps_the_best_so_far() -> None:
     assert len(set(kept)) < len(kept)  # some evaluations were no improvement
 
 
-@pytest.mark.parametrize("every", [1, 2, 3])
+@pytest.mark.parametrize("every", [1, 3])
 def test_a_failed_factorisation_is_a_rejected_step(every: int, monkeypatch: pytest.MonkeyPatch) -> None:
     real, calls = torch.linalg.cholesky_ex, {"all": 0, "failed": 0}
 
@@ -341,26 +315,6 @@ def test_a_failed_factorisation_is_a_rejected_step(every: int, monkeypatch: pyte
     assert calls["failed"] > 0
     assert bool(torch.isfinite(selection.scales.logarithms()).all())
     assert value(setting, selection.scales) >= value(setting, setting.scales)
-
-
-def found_in(arm: SimulatedArm, rows: int) -> tuple[Setting, Selection]:
-    setting = Setting(arm.nominal, dc.Measurements(*arm.measure(rows, seed=2)))
-    return setting, select(setting.scales, setting.tangent_data, limits=brief(15))
-
-
-def gravity_effect(setting: Setting, scales: dc.Hyperparameters) -> float:
-    """Displacement by gravity that is to be expected a priori, m per coordinate."""
-    data = setting.tangent_data
-    return float(gravity_covariance(scales, data.nominal, data.theta, data.x).diagonal().mean().sqrt())
-
-
-@pytest.mark.slow
-def test_gravity_that_is_not_there_shrinks_and_gravity_that_is_stays() -> None:
-    setting, without = found_in(SimulatedArm(seed=2, gravity=0, transmission=0), 60)
-    assert gravity_effect(setting, setting.scales) > 0.5 * setting.identification.noise
-    assert gravity_effect(setting, without.scales) < 0.3 * setting.identification.noise
-    setting, with_it = found_in(SimulatedArm(seed=2, gravity=2.0, transmission=0), 60)
-    assert gravity_effect(setting, with_it.scales) > 0.8 * setting.identification.noise
 
 
 @pytest.mark.slow

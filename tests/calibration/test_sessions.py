@@ -1,8 +1,6 @@
 """Campaigns in several set-ups of the measuring device: found, fitted, saved, and as accurate as in one."""
 
-import json
 import re
-from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +8,12 @@ import numpy as np
 import pytest
 import torch
 from command_bank import Command
-from product_bank import usual_scales, with_usual_scales
+from product_bank import with_usual_scales
 from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegression
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 
@@ -77,14 +74,6 @@ def test_the_frames_are_found(result: Any) -> None:
     assert len(sessions.sentences()) == len(NAMES) - 1
 
 
-def test_the_frames_are_known_as_well_where_the_rows_are_many(result: Any) -> None:
-    """Where conjugate gradients take the place of a factor of all rows."""
-    fitted, many = result.model.map, copy(result.model.map)
-    vars(many)["conditional"] = ConjugateGradientRegression(fitted.geodesic.linearise(None), fitted.noise)
-    expected = fitted.shift_covariance()
-    assert_close(many.shift_covariance(), expected, rtol=1e-3, atol=1e-3 * float(expected.diagonal().min()))
-
-
 def test_new_rows_of_a_session_are_brought_into_the_model_frame(arm: SimulatedArm, result: Any) -> None:
     q, T = arm.sample(50, seed=8), frames()[1]
     seen = dc.Measurements(q, arm.true_points(q) @ T[:3, :3].mT + T[:3, 3], arm.nominal.joint_names)
@@ -113,28 +102,6 @@ def test_names_of_sessions() -> None:
     assert data.with_sessions([" a", "a "] * 3).session_names == ("a",)
 
 
-def test_poses_in_several_sessions(arm: SimulatedArm) -> None:
-    q, T = arm.sample(80, seed=3), frames()[1]
-    poses = arm.truth.poses(q)
-    rng = np.random.default_rng(5)
-    poses[:, :3, 3] += torch.from_numpy(1e-5 * rng.standard_normal((80, 3)))
-    poses[:, :3, :3] = poses[:, :3, :3] @ rotation(torch.from_numpy(1e-5 * rng.standard_normal((80, 3))))
-    poses[40:] = T @ poses[40:]
-    data = dc.Measurements.from_poses(q, poses, arm.nominal.joint_names)
-    data = data.with_sessions(["a"] * 40 + ["b"] * 40)
-    found = dc.calibrate(arm.nominal, data, hyperparameters=usual_scales(arm.nominal)).sessions
-    assert_close(found.transforms[1], T, rtol=0, atol=1e-3)
-
-
-def test_deviations_turn_with_the_frame(arm: SimulatedArm) -> None:
-    q, quarter = arm.sample(5), torch.eye(4, dtype=torch.float64)
-    quarter[:2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
-    data = dc.Measurements(q, arm.true_points(q), std=torch.tensor([1.0, 2.0, 3.0]).mul(1e-4).expand(5, 2, 3))
-    turned = data.in_frames(quarter.expand(5, 4, 4))
-    assert_close(turned.std[0, 0], torch.tensor([2e-4, 1e-4, 3e-4], dtype=torch.float64))
-    assert_close(turned.in_frames(torch.linalg.inv(quarter).expand(5, 4, 4)).points, data.points)
-
-
 def test_too_few_rows_of_a_session_are_refused(arm: SimulatedArm) -> None:
     data = campaign(arm, shuffled=False)
     with pytest.raises(MeasurementError, match="session 'b': expected 4 rows, got 'b' in 3 rows"):
@@ -160,24 +127,6 @@ TABLE = ["--position", "x,y,z", "--position", "u,v,w", "--length", "m", "--angle
 def other_names(text: str) -> str:
     """A table whose sessions the model does not know."""
     return re.sub("Monday|Tuesday|Friday", lambda found: f"new {found[0]}", text)
-
-
-def test_every_other_session_is_evaluated_where_it_fits_best(table: Any, result: Any, command: Command) -> None:
-    dc.save(result.model, "m.safetensors")
-    Path("t.csv").write_text(other_names(Path("t.csv").read_text()))
-    done = command("evaluate", "m.safetensors", "t.csv", *TABLE, "--session", "day", "--json", "e.json")
-    assert done.code == 0, done.err
-    assert not done.warnings
-    assert "the frames of 3 sessions were found from these rows, 18 numbers in all" in " ".join(done.out.split())
-    found = json.loads(Path("e.json").read_text())["results"]
-    reference = frames()[NAMES.index(result.sessions.names[result.sessions.reference])]
-    centre = torch.tensor([0.0, 0.0, 0.5, 1.0], dtype=torch.float64)
-    for name, T in zip(NAMES, frames(), strict=True):
-        own = torch.tensor(found["session_transforms"][f"new {name}"], dtype=torch.float64)
-        assert_close(own @ centre, T @ torch.linalg.inv(reference) @ centre, rtol=0, atol=3e-4)
-        assert found["errors"]["in_sessions"][f"new {name}"]["rows"] == ROWS // 3
-    aligned = dc.evaluate(result.model, result.aligned(table)).rms
-    assert 0.5 * aligned < found["errors"]["all"]["rms_m"] <= aligned * (1 + 1e-9)  # the places fit these rows best
 
 
 def test_rows_of_other_sessions_in_one_frame_are_named(table: dc.Measurements, result: Any, command: Command) -> None:

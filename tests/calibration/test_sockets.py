@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -17,21 +16,11 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration, check_sockets
-from diffeo_calib.calibration.identification.identification import (
-    PRECISE,
-    MeasuredPoints,
-    Prior,
-    Rows,
-    held_parameters,
-    solve,
-)
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.placing.sockets import SocketDevices
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import silent
-from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.regression.conditional import Estimated
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
@@ -110,18 +99,6 @@ def test_covariances_by_the_projection_written_out(arm: SimulatedArm, result: An
     torch.testing.assert_close(model.predict(q, noise=False)[1][:, 0], blocks, rtol=1e-3, atol=1e-12)
 
 
-def test_covariances_do_not_depend_on_what_is_held(result: Any) -> None:
-    """Free base and first joint add rigid motions to the prior, and these alone."""
-    fitted = result.model.map
-    variance = fitted.geodesic.spec.prior_variance.clone()
-    variance[list(held_parameters(result.model.nominal.geometry, adrift=True))] = 1e-6
-    free = FittedMap(fitted.geodesic.with_prior(variance), fitted.noise, None, fitted.new_noise, fitted.workspace)
-    held, other = (one.posterior(fitted.x[:5], noise=False)[1] for one in (fitted, free))
-    torch.testing.assert_close(held, other, rtol=2e-2, atol=1e-11)
-    measured = FittedMap(fitted.geodesic.with_prior(variance), fitted.noise, None, fitted.new_noise)
-    assert float((measured.posterior(fitted.x[:5], noise=False)[1] - held).diagonal(dim1=1, dim2=2).amin()) > 1e-8
-
-
 @pytest.fixture(scope="module")
 def placed(arm: SimulatedArm, data: dc.Measurements) -> Placed:
     return place(arm.nominal, data, silent)
@@ -174,25 +151,6 @@ def test_deviations_grow_where_places_contradict_each_other(data: dc.Measurement
     assert inflation_by_places(tangent, wide, data.places, data.socket, groups) == region_factor(6, 3)
 
 
-def test_geometry_does_not_depend_on_where_the_sockets_are_thought(arm: SimulatedArm, data: dc.Measurements) -> None:
-    found = register_sockets(arm.nominal, data.q, data.socket)  # type: ignore[arg-type]
-    geometry = found.geometry
-    bare = replace(data.sockets, distances=(), distance_std=None)  # type: ignore[type-var]
-    thetas = []
-    for shift in (0.0, 3e-3):
-        away = shift * torch.tensor([1.0, -1.0, 0.5]).double()
-        places = SocketDevices.around(with_attributes(data, sockets=bare), found.positions + away)
-        placed, shared = places.at_places(data), places.shared(len(data), 3).unflatten(1, (-1, 3))
-        sought = Rows(geometry, (MeasuredPoints.of(placed.q, placed.points, shared),))
-        root, noise = (
-            Prior().root(geometry, held_parameters(geometry, adrift=True)),
-            shared.new_full((len(data),), 1e-4),
-        )
-        thetas.append(solve(sought, noise, root, **PRECISE).theta)
-    assert not bool(thetas[0][:12].any())
-    torch.testing.assert_close(*thetas, rtol=0, atol=5e-6)
-
-
 def test_distances_of_a_block_have_one_error() -> None:
     """The size of what the places span is known as well as the block's distance, not better for more places."""
     names = [f"{place}/{socket}" for place in "abcdef" for socket in "01"]
@@ -219,15 +177,6 @@ def test_a_size_that_is_not_the_robots_is_warned_about(arm: SimulatedArm, rows: 
     assert re.match(r"the (distance of .*\(51.00 mm\)|size of the robot) seems to differ by \+", text), text
     assert result.lengths[0].value == pytest.approx(0.02, abs=0.006)
     assert result.expected.workspace > 3e-3
-
-
-def test_registration_survives_rows_in_wrong_sockets(arm: SimulatedArm, rows: SocketRows) -> None:
-    socket = torch.arange(12).repeat_interleave(12)
-    clean = register_sockets(arm.nominal, rows.q, socket)
-    wrong = socket.clone()
-    wrong[::7] = 11 - wrong[::7]
-    found = register_sockets(arm.nominal, rows.q, wrong)
-    torch.testing.assert_close(found.positions, clean.positions, rtol=0, atol=5e-4)
 
 
 def test_evaluation_of_rows_in_sockets(result: Any, data: dc.Measurements) -> None:

@@ -65,7 +65,7 @@ def of_corners(corners: Tensor | None = None, **known: Any) -> Any:
 
 
 def test_lenses_and_the_one_board_are_found() -> None:
-    placed = next(own for own in kind().model.placement if own.devices.cameras).devices
+    placed = next(own for own in kind().model.placement if own.cameras)
     assert placed.names == ("left", "right")
     for name, arm in zip(placed.names, arms(), strict=True):
         camera = placed.cameras[name].camera

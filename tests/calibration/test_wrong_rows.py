@@ -22,13 +22,11 @@ from diffeo_calib.calibration.diagnostics.open_directions import warn_of_flat_pl
 from diffeo_calib.calibration.diagnostics.outliers import contradicted, excluded
 from diffeo_calib.calibration.diagnostics.row_order import (
     block_text,
-    check_row_order,
     find_block,
     out_of_step,
     steps_of,
 )
 from diffeo_calib.calibration.expected_errors import workspace_deviation
-from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.rows import with_attributes
@@ -267,17 +265,6 @@ def test_a_table_that_is_out_of_step_is_refused() -> None:
         dc.calibrate(arm.nominal, shifted(train, 20, -1))
 
 
-@pytest.mark.slow
-def test_tables_that_are_right_pass() -> None:
-    """With a few wrong rows, and with a pair of exchanged ones."""
-    arm, train, _ = simulated(40)
-    points = train.points.clone()
-    points[[3, 4]] = points[[4, 3]]
-    points[[8, 15, 30]] += 0.2
-    data = dc.Measurements(train.q, points)
-    check_row_order(arm.nominal, data, register(arm.nominal, data.q, data.points))
-
-
 NOISE = 1e-3
 TYPICAL = 1.5 * NOISE
 """Median length of three coordinates."""
@@ -362,20 +349,3 @@ def test_a_gross_error_is_named_and_hidden_markers_are_not() -> None:
     squares[4, 1], squares[7, 0] = 100.0, torch.nan
     found = excluded(squares, torch.full_like(squares, 3.0))
     assert found.nonzero().tolist() == [[4, 1]]
-
-
-@pytest.mark.parametrize("by_others", [True, False])
-def test_a_factor_on_errors_is_one_on_their_squares(by_others: bool) -> None:
-    squares = normal(30, 3, seed=5).square().sum(1, keepdim=True)
-
-    def limit(factor: float) -> float:
-        """The smallest square of the first row that is excluded."""
-        low, high = 0.0, 1e4
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            squares[0] = middle
-            bad = excluded(squares, torch.full_like(squares, 3.0), factor=factor, by_others=by_others)
-            low, high = (low, middle) if bool(bad[0]) else (middle, high)
-        return high
-
-    assert limit(3.0) == pytest.approx(9.0 * limit(1.0), rel=1e-6)

@@ -14,7 +14,7 @@ from board_bank import CAMERA, images
 from torch.autograd.functional import jacobian
 from torch.testing import assert_close
 
-from diffeo_calib.cameras.board import LENS, BoardPrior, board_slopes, project, project_slopes, real_board
+from diffeo_calib.cameras.board import LENS, BoardPrior, project, project_slopes
 from diffeo_calib.cameras.files import camera_text, read_camera
 from diffeo_calib.cameras.images import UNKNOWNS, Images, first_guess, sighted, sighted_by_several
 from diffeo_calib.common.device import seeded
@@ -43,12 +43,6 @@ def test_derivatives_of_pixels() -> None:
     full: Any = jacobian(lambda p: project(p, lens), points)
     assert_close(by_point, torch.stack([full[i, :, i] for i in range(3)]), rtol=0, atol=1e-9)
     assert_close(by_lens, jacobian(lambda own: project(points, own), lens), rtol=0, atol=1e-9)
-
-
-def test_derivatives_of_the_board() -> None:
-    points, board = torch.randn(4, 3, dtype=torch.float64), CAMERA.board
-    full = jacobian(lambda own: real_board(points, own, 0.1), board)
-    assert_close(board_slopes(points, 0.1), full, rtol=0, atol=1e-12)
 
 
 def test_opencv_projects_alike() -> None:

@@ -94,12 +94,12 @@ def test_every_view_of_nothing(run: Callable[..., tuple[Outcome, Answers]]) -> N
 
     def shown(text: str) -> int:
         """Number of poses on the page when it says something."""
-        with asked("GET", "/events") as events:
-            for line in events:
-                if line.startswith(b"data: {"):
-                    state = json.loads(line.removeprefix(b"data: "))
-                    if state.get("state", "").startswith(text):
-                        return len(state["done"])
+        for _ in range(600):
+            with asked("GET", "/state") as answer:
+                state = json.load(answer)
+            if state.get("state", "").startswith(text):
+                return len(state["done"])
+            time.sleep(0.1)
         return -1
 
     def lines() -> Iterator[bytes]:

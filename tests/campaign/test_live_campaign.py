@@ -305,6 +305,7 @@ def test_a_row_elsewhere_is_in_the_socket_there() -> None:
     row = int(resting[-1])
     copies = with_joints(data.rows(torch.full_like(resting, row)), data.q[resting])
     assert set(copies.row_sockets) == {data.row_sockets[row]}
-    found = placed.measured_at(row, copies, data.q[resting])
-    assert found.row_sockets == data.rows(resting).row_sockets
-    assert bool(placed.sees(row, data.q[resting]).all())
+    for own in placed.elsewhere(row, data.q[resting]):
+        copies = own.changed(copies)
+        assert bool(own.there.all())
+    assert copies.row_sockets == data.rows(resting).row_sockets

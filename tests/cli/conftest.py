@@ -30,8 +30,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
 
 @pytest.fixture(scope="session")
 def fitted(site: Site) -> Outcome:
-    """One real fit in a process of its own, with its model and its figure."""
-    return run_process(*site.fit(site.csv, site.folder / "model.safetensors", "--figure", site.folder / "errors.png"))
+    """One real fit in a process of its own, with its model."""
+    return run_process(*site.fit(site.csv, site.folder / "model.safetensors"))
 
 
 @pytest.fixture(scope="session")
@@ -79,7 +79,8 @@ def init(command: Command, tmp_path: Path) -> Callable[..., tuple[dict[str, Any]
     """
 
     def proposed(*words: object, name: str = "c.toml") -> tuple[dict[str, Any], str]:
-        done = command("init", *words, "-o", tmp_path / name, "--force")
+        (tmp_path / name).unlink(missing_ok=True)
+        done = command("init", *words, "-o", tmp_path / name)
         text = done.error if done.code else (tmp_path / name).read_text(encoding="utf-8")
         return {} if done.code else tomllib.loads(text), text
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from command_bank import Command, Site
-from deformation_bank import made_with
+from deformation_bank import model_of
 from table_bank import held
 from torch import Tensor
 from two_arms_bank import HANDS
@@ -226,7 +226,7 @@ PLACES = torch.tensor([[0.0, 0.0, 0.1], [0.02, 0.05, 0.0]], dtype=torch.float64)
 
 def both_arms(folder: Path) -> tuple[dc.CalibratedKinematics, Path, Path]:
     """A model of two arms, saved as arms.safetensors; files of its program and of the corrected one."""
-    arms = made_with(two_arms(folder), dc.RK4(1))
+    arms = model_of(two_arms(folder), dc.RK4(1))
     dc.save(arms, folder / "arms.safetensors")
     return arms, folder / "both.csv", folder / "out.csv"
 
@@ -280,7 +280,7 @@ def test_commands_of_both_hands(tmp_path: Path, command: Command) -> None:
     ],
 )
 def test_wrong_options_of_both_hands(tmp_path: Path, command: Command, options: list[str], message: str) -> None:
-    model = made_with(two_arms(tmp_path), dc.RK4(1))
+    model = model_of(two_arms(tmp_path), dc.RK4(1))
     dc.save(model, tmp_path / "arms.safetensors")
     (tmp_path / "p.csv").write_text(",".join(model.robot.joint_names) + "\n0,0,0,0,0\n")
     units = ["--length", "mm", "--angle", "rad", "-o", tmp_path / "out.csv"]

@@ -1,4 +1,4 @@
-"""What a terminal shows of names and cells, short and without control characters; endless files; the progress line."""
+"""What a terminal shows of names and cells, short and without control characters; the progress line."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import io
 from pathlib import Path
 
 import pytest
-from command_bank import TABLE, Command, Site, edited, set_cell
+from command_bank import Command, Site, edited, set_cell
 from product_bank import simulated
 from rich.console import Console
 
@@ -63,14 +63,6 @@ def test_escape_sequences_of_a_file_do_not_reach_the_terminal(
     done = command(*small_site.fit(small_site.csv, tmp_path / "model", "--position", ESCAPE))
     assert done.code == 1
     assert "\x1b" not in done.err
-
-
-@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs a device without an end")
-def test_a_device_without_line_ends(small_site: Site, command: Command, tmp_path: Path) -> None:
-    zero, model = Path("/dev/zero"), tmp_path / "model"
-    assert "no text but binary" in command(*small_site.fit(zero, model)).error
-    assert "is no file" in command(*small_site.fit(small_site.csv, model, "--robot", zero)).error
-    assert "there is no model file /dev/zero" in command("evaluate", zero, small_site.csv, *TABLE).error
 
 
 def last_line(monkeypatch: pytest.MonkeyPatch, *calls: tuple[str, int, int]) -> str:

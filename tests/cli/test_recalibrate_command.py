@@ -42,15 +42,6 @@ def test_a_new_model_and_what_has_changed(files: dict[str, str], command: Comman
     assert "no change was found" in compared.out
 
 
-def test_a_table_needs_its_columns(files: dict[str, str], command: Command) -> None:
-    done = command("recalibrate", files["old.safetensors"], files["new.csv"])
-    assert done.code == 1
-    assert "--length and --angle missing" in done.error
-    done = command("recalibrate", files["old.safetensors"], files["new.csv"], "--position", POSITION)
-    assert done.code == 1
-    assert "--length and --angle missing" in done.error
-
-
 def written(path: Path, q: Tensor) -> str:
     """Rows of the arm at these configurations, as a table."""
     robot = simulated(1)[0]

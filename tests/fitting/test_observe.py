@@ -120,7 +120,7 @@ def test_an_unknown_constant_is_a_shift_that_rows_share() -> None:
 def tangent_energy(problem: Problem) -> float:
     """1/2 target^T (G + R)^-1 target of the tangent model."""
     found = tangent(problem, "cholesky")
-    mu = found.conditional.solve(found.target[:, :, None])[:, :, 0]  # pyright: ignore[reportAttributeAccessIssue]
+    mu = found.conditional.about(found.target).mu.view_as(found.target)  # pyright: ignore[reportAttributeAccessIssue]
     return 0.5 * float((found.target * mu).sum())
 
 

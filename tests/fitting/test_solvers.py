@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from contextlib import suppress
 from itertools import pairwise
-from typing import Any
 
 import pytest
 import torch
@@ -12,7 +11,6 @@ from math_bank import (
     K_V,
     K_W,
     few_points,
-    normal,
     planar_two_markers,
     real_two_markers,
     rr_problem,
@@ -178,31 +176,6 @@ def test_a_fit_that_is_stuck_far_from_an_optimum_has_not_converged() -> None:
     assert "converged" not in fit.status
 
 
-SOLVERS = (
-    dc.GaussNewton(max_iterations=3),
-    dc.LBFGS(max_iterations=5, preconditioned=False),
-    dc.GradientDescent(1e-9, max_iterations=3),
-)
-
-
-@pytest.mark.parametrize("solver", SOLVERS, ids=lambda solver: type(solver).__name__)
-def test_evaluations_are_runs_of_the_flows(
-    solver: dc.GaussNewton | dc.LBFGS | dc.GradientDescent, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    problem, runs = rr_problem(3), []
-    deform = problem.deform
-
-    def counted(*arguments: Any, **options: Any) -> GeodesicDeformation:
-        runs.append(arguments)
-        return deform(*arguments, **options)
-
-    monkeypatch.setattr(problem, "deform", counted)
-    solution = solver.solve(problem, dc.RK4(1), start=random_start(problem))
-    assert solution.exhausted
-    assert solution.evaluations == len(runs)
-    assert solution.iterations == solver.max_iterations
-
-
 @pytest.mark.parametrize("integrator", [dc.RK4(2), None], ids=["two steps", "chosen steps"])
 def test_noise_too_small_is_one_clear_error(integrator: dc.RK4 | None) -> None:
     """A repeated configuration, and noise that float64 cannot resolve beside the kernels."""
@@ -288,27 +261,6 @@ def test_lbfgs_keeps_its_best_evaluation(monkeypatch: pytest.MonkeyPatch) -> Non
         energies.append(dc.fit(problem, dc.LBFGS(), dc.RK4(1), start=start).energy)
     assert all(after <= before for before, after in pairwise(energies))
     assert energies[-1] < energies[0]
-
-
-@pytest.mark.slow
-def test_overflowing_steps_of_lbfgs_are_shortened(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the flows overflow, the line search turns back and the descent continues."""
-    calls, deform = [0], Problem.deform
-
-    def overflowing(problem: Problem, *arguments: Any, **options: Any) -> GeodesicDeformation:
-        calls[0] += 1
-        if calls[0] in (5, 6):
-            raise NumericalError("too far")
-        return deform(problem, *arguments, **options)
-
-    problem, solver = few_points(), dc.LBFGS()
-    start = problem.zero()
-    start = start.unflatten(0.05 * normal(start.flatten().numel(), seed=9))
-    expected = dc.fit(problem, dc.GaussNewton(), dc.RK4(1)).energy
-    monkeypatch.setattr(Problem, "deform", overflowing)
-    fit = dc.fit(problem, solver, dc.RK4(1), start=start)
-    assert calls[0] > 6
-    assert fit.energy == pytest.approx(expected, rel=1e-6)
 
 
 # --- Mixed steps ---------------------------------------------------------------------------------------------------

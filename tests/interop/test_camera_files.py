@@ -43,7 +43,7 @@ def fixed() -> dc.CalibratedKinematics:
 
 
 def camera_of(model: dc.CalibratedKinematics) -> BoardCamera:
-    (found,) = [own for each in model.placement for own in each.devices.cameras.values()]
+    (found,) = [own for each in model.placement for own in each.cameras.values()]
     return found
 
 
@@ -140,15 +140,15 @@ def test_what_explains_the_errors_adds_up() -> None:
     assert own.arm > max(parts[1:]), "errors of a mm, and a good camera"
     assert 0 < own.lens_std < own.corners
     assert 0 < own.board_std < own.corners
-    lines = "\n".join(on_tool().placement[0].devices.sentences())
+    lines = "\n".join(on_tool().placement[0].sentences())
     assert f"arm {1e3 * own.arm:.3f}" in lines
 
 
 def test_models_of_earlier_versions_have_lens_and_board_alone() -> None:
     placed = on_tool().placement[0]
-    old = replace(placed, devices=replace(placed.devices, constants=camera_of(on_tool()).camera.unknowns[None]))
-    assert not old.devices.cameras
-    assert old.devices.sentences() == []
+    old = replace(placed, constants=camera_of(on_tool()).camera.unknowns[None])
+    assert not old.cameras
+    assert old.sentences() == []
     model = on_tool()
     poor = dc.CalibratedKinematics(model.robot, model.map, lever=model.lever, placement=(old,))
     with pytest.raises(InputError, match=r"camera of the model.*none"):

@@ -12,7 +12,7 @@ import torch
 import two_arms_bank
 from c_bank import CModel, c_model, needs_compiler
 from deformation_bank import deformation_of, model_of
-from robots_bank import CHAINS, draw, every_chain
+from robots_bank import CHAINS, draw
 
 import diffeo_calib as dc
 from diffeo_calib.interop import write_c
@@ -20,10 +20,8 @@ from diffeo_calib.interop.torch_program import _ConstantPoints
 from diffeo_calib.kernels.profiles import PROFILES
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of
-from diffeo_calib.kinematics.tool import FlangePoints, pose_slopes
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
-from diffeo_calib.measurements.poses import mark_points, poses_from_marks
 from diffeo_calib.robots.dh import DHRow
 from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.runtime import build
@@ -89,9 +87,7 @@ CASES: dict[str, Callable[[], GeodesicDeformation]] = {
     **{f"{name} with sag": lambda chain=chain: deformation_of(chain) for name, chain in CHAINS.items()},
     **{f"{name}, rigid": lambda chain=chain: deformation_of(chain, elastic=False) for name, chain in CHAINS.items()},
     **{
-        f"{profile} on {where}": lambda p=profile, chain=CHAINS[robot]: deformation_of(
-            chain, PROFILES[p], integrator=dc.RK8(1)
-        )
+        f"{profile} on {where}": lambda p=profile, chain=CHAINS[robot]: deformation_of(chain, p, integrator=dc.RK8(1))
         for profile in PROFILES
         for robot, where in (("gantry", "lines"), ("arm", "circles"))  # the second in tables
     },
@@ -146,20 +142,6 @@ def test_sums_in_place_of_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(build, "MOST_TABULATED", 0)
     agree("c", deformation_of(CHAINS["mimic slides"]), tmp_path)
     assert "interpolate" not in (tmp_path / "generated.c").read_text()
-
-
-@every_chain
-def test_tool_poses_by_numpy(chain: dc.Chain) -> None:
-    deformation, tool = deformation_of(chain), torch.from_numpy(TOOL)
-    nominal = deformation.spec.nominal
-    assert isinstance(nominal, GeometryMap)
-    q = draw(ROWS, chain.n, seed=5)
-    other = deformation.with_nominal(FlangePoints(nominal, mark_points(tool[None], 0.2)[0]))
-    points, slopes = other(q).unflatten(1, (3, 3)), other.jacobian(q).unflatten(1, (3, 3))
-    poses, jacobian = made(deformation).poses_and_jacobian(q.numpy(), TOOL, "measuring", 0.2)
-    near(poses, poses_from_marks(points, 0.2).numpy(), 1e-12)
-    near(made(deformation).poses(q.numpy(), TOOL, "measuring", 0.2), poses, 1e-12)
-    near(jacobian, pose_slopes(points, slopes, 0.2).numpy(), 1e-9)
 
 
 def test_jacobian_is_the_derivative_of_the_program_itself() -> None:

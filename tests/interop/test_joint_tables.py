@@ -13,13 +13,7 @@ from product_bank import Case, simulated
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.interop.rigid import (
-    applied_with_tables,
-    best_joint_offsets,
-    joint_motion,
-    nominal_kinematics,
-    rigid_kinematics,
-)
+from diffeo_calib.interop.rigid import best_joint_offsets, joint_motion, rigid_kinematics, with_errors
 from diffeo_calib.interop.tables import correction_tables, write_correction_tables, write_joint_offsets
 
 
@@ -80,15 +74,15 @@ def test_rigid_kinematics_made_for_the_tables_are_better_with_them(arm_200: Case
     alone, made = rigid_kinematics(model), rigid_kinematics(model, transmission=True)
     moved = dc.Measurements(joint_motion(model, test.q), test.points)
     errors = [
-        dc.evaluate(nominal_kinematics(model).geometry.points, test).rms,
+        dc.evaluate(with_errors(model, None).geometry.points, test).rms,
         dc.evaluate(alone.geometry.points, test).rms,
-        dc.evaluate(applied_with_tables(model, alone, applied=True).geometry.points, moved).rms,
+        dc.evaluate(with_errors(model, alone.geometry.joint_errors, transmission=True).geometry.points, moved).rms,
         dc.evaluate(made.geometry.points, moved).rms,
     ]
     assert errors == sorted(errors, reverse=True)
     assert errors[3] < 0.7 * errors[1]
-    assert made.rms < applied_with_tables(model, made, applied=False).rms
-    again = applied_with_tables(model, made, applied=True)
+    assert made.rms < with_errors(model, made.geometry.joint_errors).rms
+    again = with_errors(model, made.geometry.joint_errors, transmission=True)
     assert again.rms == pytest.approx(made.rms, rel=1e-3)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from deformation_bank import bend, fitted_plain, made, made_with, queries
+from deformation_bank import bend, fitted_plain, made, model_of, queries
 from robots_bank import CHAINS, draw
 from torch import Tensor
 from torch.func import jacfwd, jacrev, vmap
@@ -33,7 +33,7 @@ assert not any(name.startswith("diffeo_calib") for name in sys.modules)
 """
 
 
-def same(found: Tensor, expected: Tensor, atol: float = 1e-12) -> None:
+def same(found: Tensor, expected: Tensor, atol: float = 2e-12) -> None:
     torch.testing.assert_close(found, expected, rtol=0, atol=atol)
 
 
@@ -120,7 +120,7 @@ def test_wrong_arguments(arguments: dict[str, object], message: str) -> None:
 
 def test_models_without_a_program() -> None:
     with pytest.raises(InputError, match=r"expected dc\.RK4 or dc\.RK8, got TorchDiffEq"):
-        TorchProgram(made_with(CHAINS["one joint"], dc.TorchDiffEq("rk4")))
+        TorchProgram(model_of(CHAINS["one joint"], dc.TorchDiffEq("rk4")))
     x = draw(9, 2, seed=4)
     kernel = dc.Gaussian(1.0)
     problem = dc.Problem(bend, x, bend(x), joint_kernel=kernel, task_kernel=kernel, noise=0.01)

@@ -266,12 +266,3 @@ def test_modules_load_between_large_blocks_of_memory() -> None:
     """Addresses within a module have 32 bits: parts that are allocated one by one make LLVM end the process."""
     done = subprocess.run([sys.executable, "-c", FAR_APART], capture_output=True, text=True, check=False)
     assert done.stdout == "done\n", done.stderr[-500:]
-
-
-def test_shares_of_processes_add_up() -> None:
-    i, j = points(700, 1), points(600, 2)
-    program = Fused().program(GRADIENT, GaussianProfile(), i, j)
-    assert program is not None
-    for rows in (None, i):
-        shares = [program.totals(rows, j, lambda tiles, k=k: list(tiles)[k::2]) for k in range(2)]
-        torch.testing.assert_close(shares[0] + shares[1], program.totals(rows, j), rtol=1e-13, atol=1e-10)

@@ -42,15 +42,6 @@ def misses(case: Case, q: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
     return (poses - targets)[:, :3, 3].norm(dim=1), angle_between(poses[:, :3, :3], targets[:, :3, :3])
 
 
-def gradient(case: Case, q: Tensor, targets: Tensor) -> Tensor:
-    """(N, n) of 1/2 |p* - p|^2 + LEVER^2 (1 - cos angle), from the rotation vector of the angle."""
-    poses, J = case.model.tool_poses(q, tool_frame()), case.model.tool_jacobian(q, tool_frame())
-    spin = targets[:, :3, :3] @ poses[:, :3, :3].mT
-    turn = 0.5 * torch.stack([spin[:, i, j] - spin[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], 1)
-    shift = (targets - poses)[:, :3, 3]
-    return -(J[:, :3].mT @ shift[..., None] + LEVER**2 * J[:, 3:].mT @ turn[..., None])[..., 0]
-
-
 def inside(case: Case, found: dc.Compensation, bound: float = BOUND) -> bool:
     low, high = case.robot.limits.unbind(1)
     return bool(((found.q >= low) & (found.q <= high) & (found.correction.abs() <= bound)).all())
@@ -129,24 +120,6 @@ def near_wrist_singularity(case: Case, rows: int) -> Tensor:
     q = commands(case, rows, seed=4)
     q[:, 4] = torch.from_numpy(np.random.default_rng(5).uniform(-1e-3, 1e-3, rows))
     return q
-
-
-def test_the_nearest_command_in_the_box(arm: Case) -> None:
-    """First-order conditions: no allowed motion of a joint lowers the miss."""
-    q = near_wrist_singularity(arm, 100)
-    targets = intended(arm, q)
-    found = dc.compensate(arm.model, targets, q, tool=tool_frame())
-    assert inside(arm, found)
-    missed = ~found.reached
-    assert int(missed.sum()) > 50
-    slope = gradient(arm, found.q, targets)[missed]
-    low = torch.maximum(arm.robot.limits[:, 0], q - BOUND)[missed]
-    high = torch.minimum(arm.robot.limits[:, 1], q + BOUND)[missed]
-    at = found.q[missed]
-    blocked = ((at <= low + 1e-12) & (slope > 0)) | ((at >= high - 1e-12) & (slope < 0))
-    scale = gradient(arm, q, targets)[missed].norm(dim=1)
-    assert bool(blocked.any(1).all())
-    assert float((torch.where(blocked, 0.0, slope).norm(dim=1) / scale).max()) < 1e-6
 
 
 def scipy_cost(case: Case, start: Tensor, target: Tensor) -> float:

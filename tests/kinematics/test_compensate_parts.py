@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import gc
 import weakref
-from itertools import product
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from deformation_bank import made_with
+from deformation_bank import model_of
 from product_bank import Case
 from robots_bank import CHAINS, parallelogram
 from table_bank import held
@@ -20,11 +21,12 @@ from two_arms_bank import HANDS, robot
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.compensation.problem import joint_limits
-from diffeo_calib.kinematics.compensation.search import Box, _Search, box_minimum
 from diffeo_calib.kinematics.compensation.targets import Targets, ToolFunctions, tool_functions
 from diffeo_calib.measurements.poses import angle_between
 from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.se3 import twist_transform
+from diffeo_calib.runtime.build import calibrated_chain
+from diffeo_calib.runtime.chain import tip_poses
 
 ROWS = 12
 TOOLS = torch.tensor([[0.0, 0.0, 0.1], [0.02, 0.05, 0.0]], dtype=torch.float64)
@@ -32,7 +34,7 @@ TOOLS = torch.tensor([[0.0, 0.0, 0.1], [0.02, 0.05, 0.0]], dtype=torch.float64)
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> dc.CalibratedKinematics:
-    made = made_with(robot(tmp_path_factory.mktemp("two_arms")), dc.RK4(1))
+    made = model_of(robot(tmp_path_factory.mktemp("two_arms")), dc.RK4(1), 1, elastic=False)
     return made.with_tool(None, HANDS[0])
 
 
@@ -133,47 +135,22 @@ def test_wrong_targets_of_both_hands(model: dc.CalibratedKinematics) -> None:
             dc.compensate(model, **{"targets": targets, "start": start, **change})  # pyright: ignore[reportArgumentType]
 
 
-# --- parts of the search: quadratic programs against every face of the box, limits of mimic joints, models ----------
+# --- parts of the search: derivatives, limits of mimic joints, models -----------------------------------------------
 
 Array = np.ndarray
 
 
-def smallest(H: Array, g: Array, low: Array, high: Array) -> Array:
-    """By trying every face of the box."""
-    best, value = np.zeros_like(g), np.inf
-    for face in product((0, 1, 2), repeat=len(g)):
-        kind = np.array(face)
-        s = np.where(kind == 0, 0.0, np.where(kind == 1, low, high))
-        free = kind == 0
-        s[free] = np.linalg.solve(H[np.ix_(free, free)], -(g + H @ s)[free])
-        if (s >= low - 1e-12).all() and (s <= high + 1e-12).all() and 0.5 * s @ H @ s + g @ s < value:
-            best, value = s, 0.5 * s @ H @ s + g @ s
-    return best
-
-
-def test_the_minimum_in_a_box() -> None:
-    """Well and badly conditioned, on faces of every dimension, with joints that cannot move."""
-    rng = np.random.default_rng(0)
-    root = rng.standard_normal((200, 4, 4)) * 10.0 ** rng.uniform(-3, 0, (200, 1, 4))
-    H = root @ root.swapaxes(1, 2) + 1e-8 * np.eye(4)
-    g, low, high = rng.standard_normal((200, 4)), -rng.random((200, 4)), rng.random((200, 4))
-    low[::3, 1], high[::5, 2] = 0.0, 0.0
-    low[::7, 3] = high[::7, 3] = 0.0
-    found = box_minimum(H, g, low, high)
-    for row in range(200):
-        expected = smallest(H[row], g[row], low[row], high[row])
-        values = [0.5 * s @ H[row] @ s + g[row] @ s for s in (found[row], expected)]
-        assert values[0] == pytest.approx(values[1], rel=1e-9, abs=1e-12)
-        assert bool(((found[row] >= low[row]) & (found[row] <= high[row])).all())
-
-
 def rigid(model: dc.CalibratedKinematics, axes: int) -> tuple[ToolFunctions, Targets, Array]:
-    """Kinematics of all tips; targets for six rows, far away, with one free tip of several in two; joint values."""
+    """Rough kinematics of all tips; targets for six rows, far away, a free tip of several in two; joint values."""
     rng, tips = np.random.default_rng(1), model.robot.tips
     poses, free = twist_transform(torch.from_numpy(rng.standard_normal((6, len(tips), 6)))).numpy(), np.zeros((6, 2))
     free[1, 0] = free[4, 1] = len(tips) - 1
     parts = poses[..., :3, 3], poses[..., :3, :axes], np.eye(3)[:, 3 - axes :]
-    tool = tool_functions(model, {tip: torch.eye(4, dtype=torch.float64) for tip in tips}, "base")[1]
+    tool = tool_functions(model, {tip: torch.eye(4, dtype=torch.float64) for tip in tips}, "base")
+    chain = calibrated_chain(
+        model.robot.arrays, np.eye(4), model.geometry.joint_errors.numpy(), np.zeros(6 + 6 * model.robot.moving)
+    )
+    tool = replace(tool, poses=partial(tip_poses, chain), jacobian=tool.rough)
     return tool, Targets(*parts, 0.3, free[:, : len(tips)] > 0), rng.uniform(-2, 2, (6, model.robot.n))
 
 
@@ -181,7 +158,7 @@ def rigid(model: dc.CalibratedKinematics, axes: int) -> tuple[ToolFunctions, Tar
 @pytest.mark.parametrize("slides", [False, True])
 def test_gradient_and_hessian_of_the_cost(model: dc.CalibratedKinematics, axes: int, slides: bool) -> None:
     """By central differences."""
-    tool, goal, q = rigid(made_with(CHAINS["slides"], dc.RK4(1)) if slides else model, axes)
+    tool, goal, q = rigid(model_of(CHAINS["slides"], dc.RK4(1)) if slides else model, axes)
 
     def slope(at: Array) -> Array:
         return -np.einsum("nkj,nk->nj", goal.slopes(tool.jacobian(at)), goal.errors(tool.poses(at)))
@@ -193,17 +170,6 @@ def test_gradient_and_hessian_of_the_cost(model: dc.CalibratedKinematics, axes: 
         np.testing.assert_allclose(slope(q)[:, joint], rise / (2 * h), rtol=0, atol=1e-8)
         change = (slope(q + step) - slope(q - step)) / (2 * h)
         np.testing.assert_allclose(hessian[:, :, joint], change, rtol=0, atol=1e-8)
-
-
-@pytest.mark.parametrize("side", [1.0, -1.0])
-def test_joints_that_push_against_their_limits_are_apart(side: float) -> None:
-    tool, goal, q = rigid(made_with(CHAINS["arm"], dc.RK4(1)), 3)
-    box = Box(q, np.minimum(q, q - side), np.maximum(q, q - side), np.ones_like(q))
-    found = _Search(tool, goal, q, box, tool.poses(q))
-    free = side * found.gradient > 0
-    assert 5 < free.sum() < free.size - 5
-    together = (free[:, :, None] & free[:, None, :]) | np.eye(q.shape[1], dtype=bool)
-    np.testing.assert_array_equal(np.abs(found.hessian) > 1e-12, together)
 
 
 # --- limits ---------------------------------------------------------------------------------------------------------

@@ -11,11 +11,9 @@ from robots_bank import CHAINS, draw, every_chain
 from torch import Tensor
 from torch.testing import assert_close
 
-from diffeo_calib.common.errors import InputError
-from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.nominal import GeometryMap, PositionErrors
 from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.robots import Chain
-from diffeo_calib.robots.position_errors import PositionErrors
 
 N = 4
 
@@ -59,27 +57,6 @@ def test_without_elasticity_it_is_the_geometry(chain: Chain) -> None:
     longer = torch.cat([theta, theta.new_zeros(elastic.parameters - geometry.size)])
     assert torch.equal(elastic(x, longer), rigid(x, theta))
     assert torch.equal(elastic.jacobian(x, longer), rigid.jacobian(x, theta))
-
-
-# --- parameters that differ from row to row -------------------------------------------------------------------------
-
-
-@every_chain
-def test_parameters_per_row_are_those_of_each_row(chain: Chain) -> None:
-    geometry, x = geometry_of(chain, 3), draw(N, chain.n, seed=15)
-    theta = draw(N, geometry.size, seed=16, size=0.3)
-    rows = [slice(k, k + 1) for k in range(N)]
-    for function in (geometry.points, geometry.jacobian, geometry.sensitivities):
-        expected = torch.cat([function(x[row], theta[k]) for k, row in enumerate(rows)])
-        torch.testing.assert_close(function(x, theta), expected, rtol=1e-13, atol=1e-14)
-
-
-def test_sensitivities_per_row_are_derivatives_of_that_row() -> None:
-    geometry, x = geometry_of(CHAINS["mimic joints"]), draw(3, CHAINS["mimic joints"].n, seed=17)
-    theta = draw(3, geometry.size, seed=18, size=0.3).requires_grad_()
-    expected = by_rows(geometry.points(x, theta).flatten(1), theta)
-    actual = geometry.sensitivities(x, theta.detach()).flatten(1, 2)
-    torch.testing.assert_close(actual, expected, rtol=1e-11, atol=1e-12)
 
 
 # --- waves of gears in the nominal map: derivatives, names, transmission errors -------------------------------------
@@ -146,17 +123,3 @@ def test_an_axis_shifts_and_turns_the_frame_before_its_joint() -> None:
     found, theta = crooked(x, torch.cat([theta, c.flatten()])), torch.cat([theta, c.flatten()])
     assert_close(found, geometry.points(x, errors).flatten(1), rtol=0, atol=1e-13)
     assert_close(crooked.jacobian(x, theta), by_rows(crooked(x.requires_grad_(), theta), x), rtol=0, atol=1e-12)
-
-
-def test_waves_and_axes_that_cannot_be() -> None:
-    for waves in ((-1, 5.0), (0, 0.0), (0, float("nan"))):
-        with pytest.raises(InputError, match="waves of gears"):
-            PositionErrors((waves,))
-    for axis in ((-1, 0.0, 1.0, 2), (0, 1.0, 1.0, 2), (0, float("nan"), 1.0, 2), (0, 0.0, 1.0, 0)):
-        with pytest.raises(InputError, match="errors of axes"):
-            PositionErrors(axes=(axis,))
-    chain = CHAINS["arm"]
-    geometry = geometry_of(chain)
-    for own, what in ((PositionErrors(((chain.n, 5.0),)), "gear waves"), (PositionErrors((), ((9, 0, 1, 2),)), "axes")):
-        with pytest.raises(InputError, match=f"joints of {what}"):
-            GeometryMap(geometry, own=own)

@@ -68,7 +68,7 @@ def test_the_place_of_the_whole_scene_moves_no_reading() -> None:
     assert max(bare) < 0.3
     assert all(0.0 < one < other for one, other in zip(bare, whole, strict=True))
     (placed,) = kind.model.placement
-    assert float(1e3 * placed.devices.deviations[:, :3].median()) > 2 * float(np.median(bare))
+    assert float(1e3 * placed.deviations[:, :3].median()) > 2 * float(np.median(bare))
 
 
 def test_means_are_the_observations_of_the_model(tmp_path: Any) -> None:
@@ -78,7 +78,7 @@ def test_means_are_the_observations_of_the_model(tmp_path: Any) -> None:
     (placed,) = model.placement
     q = kind.q(3)
     for number, own in enumerate(model.predict_readings(q)):
-        camera = placed.devices.poses[number]
+        camera = placed.poses[number]
         seen = model(q).detach()[:, -1] @ camera[:3, :3].mT + camera[:3, 3]
         fx, fy, cx, cy = readings(kind)[0].intrinsics
         expected = seen[:, :2] / seen[:, 2:] * torch.tensor([fx, fy]) + torch.tensor([cx, cy])
@@ -128,4 +128,4 @@ def test_devices_of_a_kind_that_is_not_registered_are_warned_of(tmp_path: Any, m
     with pytest.warns(dc.DiffeoCalibWarning, match=words):
         assert model.predict_readings(kind.q(2)) == []
     with pytest.raises(dc.DiffeoCalibError, match=r"kind 'height' in a model.*load the model again"):
-        model.placement[0].devices.carried(torch.eye(4), torch.zeros(0), torch.zeros(0), torch.zeros(0))
+        model.placement[0].carried(torch.eye(4), torch.zeros(0), torch.zeros(0), torch.zeros(0))

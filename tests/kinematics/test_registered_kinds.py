@@ -28,9 +28,7 @@ def of_device(rows: Any, name: str) -> Any:
 
 
 def placement(model: dc.CalibratedKinematics) -> dict[str, torch.Tensor]:
-    return {
-        name: place for own in model.placement for name, place in zip(own.names, own.devices.constants, strict=True)
-    }
+    return {name: place for own in model.placement for name, place in zip(own.names, own.constants, strict=True)}
 
 
 def test_devices_without_new_rows_stay(kind: Kind) -> None:
@@ -121,7 +119,7 @@ def test_the_middle_of_a_socket_with_one_row_is_known_as_well_as_a_row() -> None
     name = next(own for own in sockets if own)
     lone = [row for row, own in enumerate(sockets) if own == name][1:]
     rows = mixture.data.rows([row for row in range(len(sockets)) if row not in lone])
-    (placed,) = (own.devices for own in mixture.model.registered(rows).placement if name in own.names)
+    (placed,) = (own for own in mixture.model.registered(rows).placement if name in own.names)
     deviations = placed.deviations.norm(dim=1)
     others = torch.cat([deviations[: placed.names.index(name)], deviations[placed.names.index(name) + 1 :]])
     assert float(deviations[placed.names.index(name)]) > float(others.max())

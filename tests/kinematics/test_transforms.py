@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from deformation_bank import fitted_plain, made, made_with, queries
+from deformation_bank import fitted_plain, made, model_of, queries
 from robots_bank import CHAINS
 from torch import Tensor
 from torch.func import hessian, jacfwd, jacrev, vmap
@@ -85,7 +85,7 @@ def test_values_are_checked_outside_of_transforms_only() -> None:
 
 
 def test_adaptive_steps_are_refused() -> None:
-    model = made_with(CHAINS["one joint"], dc.TorchDiffEq("dopri5"))
+    model = model_of(CHAINS["one joint"], dc.TorchDiffEq("dopri5"))
     with pytest.raises(InputError, match=r"dc\.RK4 or dc\.RK8, got TorchDiffEq"):
         jacrev(lambda row: model(row[None])[0])(model.configurations[0])
 

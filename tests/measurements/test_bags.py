@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_bank import JOINTS, PICTURES, PLACES, Bag
+from bag_bank import JOINTS, PICTURES, PLACES, Bag, place, standing
 from command_bank import Command
 
 from diffeo_calib.measurements.bags import read_images
@@ -20,17 +20,9 @@ PNG = b"\x89PNG of this test"
 
 
 def motion(rate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times, s, and two joints (T, 2), rad, that stand at each place and turn to the next."""
+    """Times, s, and two joints (T, 2), rad."""
     times = np.arange(0, len(PLACES_RAD) * (STAND_S + MOVE_S), 1 / rate)
-    number, rest = np.divmod(times, STAND_S + MOVE_S)
-    share = np.clip((rest - STAND_S) / MOVE_S, 0, 1)[:, None]
-    first, after = (PLACES_RAD[np.minimum(number.astype(int) + k, len(PLACES_RAD) - 1)] for k in (0, 1))
-    return START_S + times, first + share * (after - first)
-
-
-def place(q: np.ndarray) -> np.ndarray:
-    """Where the tool is (T, 3), m."""
-    return np.stack([np.cos(q[:, 0]), np.sin(q[:, 0]), q[:, 1]], 1)
+    return START_S + times, standing(PLACES_RAD, STAND_S, MOVE_S, times)
 
 
 @pytest.fixture

@@ -6,30 +6,14 @@ import math
 from pathlib import Path
 from typing import Any
 
-import pytest
 import torch
 from table_bank import held
 from torch.testing import assert_close
 
 from diffeo_calib.measurements.csv.files import read_measurements
 from diffeo_calib.measurements.poses import angle_between
-from diffeo_calib.measurements.table import Measurements
 
-UR10_JOINTS = [
-    "shoulder_pan_joint",
-    "shoulder_lift_joint",
-    "elbow_joint",
-    "wrist_1_joint",
-    "wrist_2_joint",
-    "wrist_3_joint",
-]
-
-
-@pytest.fixture(scope="module")
-def ur10(ur10_folder: Path) -> Measurements:
-    path = ur10_folder / "measurements_iso_cubes.csv"
-    position = ["measurement_x", "measurement_y", "measurement_z"]
-    return read_measurements(path, UR10_JOINTS, position, length="mm", angle="rad", sep=";", decimal=",")
+UR10_JOINTS = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", *(f"wrist_{k}_joint" for k in (1, 2, 3))]
 
 
 UR10_POSES: dict[str, Any] = {
@@ -49,14 +33,14 @@ def relative_spread(measured: torch.Tensor, nominal: torch.Tensor) -> torch.Tens
     return turned.abs()
 
 
-def test_ur10_poses_are_read(ur10: Measurements, ur10_folder: Path) -> None:
+def test_ur10_poses_are_read(ur10_folder: Path) -> None:
     """The convention is right: turns between poses are those between the commanded flange poses."""
     path = ur10_folder / "measurements_iso_cubes.csv"
     position = ["measurement_x", "measurement_y", "measurement_z"]
     options: dict[str, Any] = {"length": "mm", "angle": "rad", "sep": ";", "decimal": ","}
     data = read_measurements(path, UR10_JOINTS, position, **options, **UR10_POSES)
     poses = held(data.poses)
-    assert_close(poses[:, :3, 3], ur10.points[:, 0], rtol=0, atol=1e-15)
+    assert_close(poses[:, :3, 3], read_measurements(path, UR10_JOINTS, position, **options).points[:, 0])
     goal: dict[str, Any] = {"rotation": ["Goal roll", "Goal pitch", "Goal yaw"], "convention": "xyz"}
     goal |= {"rotation_angle": "rad", "duplicates": "keep"}
     commanded = read_measurements(

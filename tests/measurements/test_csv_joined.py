@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bag_bank import place, standing
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import MeasurementError
@@ -49,14 +50,6 @@ def test_messages_name_both_files(tmp_path: Path) -> None:
         MeasurementError, match=r"places\.csv, joined with .*joints\.csv', line 4, column 'x'.*got '\?'"
     ):
         dc.read_measurements(found, ["a", "b"], ["x", "y", "z"], length="m", angle="rad")
-
-
-def test_the_file_goes_with_its_path(tmp_path: Path) -> None:
-    found = joined(tmp_path)
-    folder = Path(found.__fspath__()).parent
-    assert folder.is_dir()
-    del found
-    assert not folder.exists()
 
 
 def test_files_may_have_separators_of_their_own(tmp_path: Path) -> None:
@@ -111,50 +104,13 @@ def test_a_row_each_of_the_same_stops_by_two_clocks(second: float, order: list[i
         joined(tmp_path, joints, ("t,x", "50,1", "54,2", "61,3"), "t")
 
 
-@pytest.mark.parametrize("offset", [0.0, 1.37, None])  # None: both on the same grid of times
-def test_recordings_with_clocks_of_their_own(offset: float | None, tmp_path: Path) -> None:
-    """One line for every stop, from its middle; columns that only count or that do not move do not matter."""
-    rng = np.random.default_rng(0)
-    ends = np.cumsum(rng.uniform(1.0, 2.0, 12))
-    goals = rng.uniform(-90.0, 90.0, 13)
-
-    def at(times: np.ndarray) -> np.ndarray:
-        """Moves of half a second between stops."""
-        return goals[0] + sum(
-            (goals[k + 1] - goals[k]) * np.clip((times - end) / 0.5, 0.0, 1.0) for k, end in enumerate(ends)
-        )
-
-    one, two = np.arange(0.0, 20.0, 0.01), np.arange(0.4, 19.0, 0.037 if offset is not None else 0.01)
-    offset = offset or 0.0
-    joints = ("t,n,a,c", *(f"{t:.4f},{k},{v:.4f},5" for k, (t, v) in enumerate(zip(one, at(one), strict=True))))
-    seen = at(two)[:, None] * [1.0, 2.0, -3.0] + rng.normal(0.0, 0.01, (len(two), 3))
-    places = ("t,x,y,z", *(f"{t - offset:.4f},{x:.4f},{y:.4f},{z:.4f}" for t, (x, y, z) in zip(two, seen, strict=True)))
-    found = joined(tmp_path, joints, places, "t")
-    rows = np.array([[float(cell) for cell in cells] for _, cells in read_cells(found, ",")[1]])
-    assert 8 <= len(rows) <= 13
-    assert np.abs(rows[:, 4] - rows[:, 2]).max() < 0.1
-    words = re.search(r"middle of every stop, (\S*) s added to the times of places.csv", found.sentence)
-    assert words is not None
-    assert abs(float(words[1]) - offset) < 0.03
-
-
 STOPS, STAND_S, MOVE_S, OFFSET_S = 8, 1.5, 0.7, 0.437
 NOISE_M = 2e-5
 
 
 def angle(times: np.ndarray) -> np.ndarray:
-    """Two joints (T, 2), rad: they stand for some time at random places, and move smoothly between these."""
-    places = np.random.default_rng(0).uniform(-1, 1, (STOPS, 2))
-    period = STAND_S + MOVE_S
-    number = np.clip((times // period).astype(int), 0, STOPS - 1)
-    share = np.clip((times - number * period - STAND_S) / MOVE_S, 0, 1)[:, None]
-    after = places[np.minimum(number + 1, STOPS - 1)]
-    return places[number] + (after - places[number]) * (3 * share**2 - 2 * share**3)
-
-
-def place(q: np.ndarray) -> np.ndarray:
-    """Where the tool is (T, 3), m."""
-    return np.stack([np.cos(q[:, 0]), np.sin(q[:, 0]), q[:, 1]], 1)
+    """Two joints (T, 2), rad."""
+    return standing(np.random.default_rng(0).uniform(-1, 1, (STOPS, 2)), STAND_S, MOVE_S, times)
 
 
 def recordings(seed: int = 1) -> tuple[Recording, Recording]:
@@ -163,6 +119,22 @@ def recordings(seed: int = 1) -> tuple[Recording, Recording]:
     joints, seen = np.arange(0, last, 0.01), np.arange(0, last, 1 / 130)
     noisy = place(angle(seen)) + NOISE_M * random.standard_normal((len(seen), 3))
     return Recording(joints, angle(joints)), Recording(seen - OFFSET_S, noisy)
+
+
+@pytest.mark.parametrize(("offset", "rate"), [(0.0, 27), (1.37, 27), (0.0, 100)])  # 100: both on one grid of times
+def test_recordings_with_clocks_of_their_own(offset: float, rate: float, tmp_path: Path) -> None:
+    """One line for every stop, from its middle; columns that only count or that do not move do not matter."""
+    one, two = (np.arange(first, STOPS * (STAND_S + MOVE_S), step) for first, step in ((0.0, 0.01), (0.4, 1 / rate)))
+    seen = 1e3 * place(angle(two)) + np.random.default_rng(0).normal(0.0, 0.02, (len(two), 3))
+    lines = (f"{t:.4f},{k},{a:.6f},{b:.6f},5" for k, (t, (a, b)) in enumerate(zip(one, angle(one), strict=True)))
+    places = (f"{t - offset:.4f},{x:.4f},{y:.4f},{z:.4f}" for t, (x, y, z) in zip(two, seen, strict=True))
+    found = joined(tmp_path, ("t,n,a,b,c", *lines), ("t,x,y,z", *places), "t")
+    rows = np.array([[float(cell) for cell in cells] for _, cells in read_cells(found, ",")[1]])
+    assert len(rows) == STOPS
+    np.testing.assert_allclose(rows[:, 5:], 1e3 * place(rows[:, 2:4]), rtol=0, atol=0.2)
+    words = re.search(r"middle of every stop, (\S*) s added to the times of places.csv", found.sentence)
+    assert words is not None
+    assert abs(float(words[1]) - offset) < 0.03
 
 
 def test_stops_and_the_offset_are_found() -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from table_bank import held, random_poses, says, some
+from table_bank import CONVENTIONS, held, random_poses, says, some
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -57,6 +58,15 @@ def poses() -> dc.Measurements:
     return dc.Measurements.from_poses(some(5, seed=6).q, random_poses(5), NAMES, position_std=1e-4, rotation_std=1e-3)
 
 
+def on_tips() -> dc.Measurements:
+    """With a hidden frame, and deviations of each."""
+    frames, (std, turns) = random_poses(10).unflatten(0, (5, 2)), 1e-3 * values(2, 5, 2, 3).abs()
+    frames[2, 1] = torch.nan
+    return dc.Measurements.from_poses(
+        some(5, seed=8).q, frames, NAMES, on=["l", "r"], position_std=std, rotation_std=turns
+    )
+
+
 def markers() -> dc.Measurements:
     points = values(5, 2, 3)
     points[2, 1] = torch.nan
@@ -70,6 +80,7 @@ KINDS: dict[str, Any] = {
     "payloads": lambda: positions().with_payload([0.0, 1.0, 2.0, 0.0, 0.5]),
     "hidden markers on tips": markers,
     "poses": poses,
+    "poses on tips": on_tips,
     "poses in sessions": lambda: poses().with_sessions(list("xyxyx")).with_payload(1.0),
     "sockets": resting,
     "mixture": lambda: dc.Measurements.joined([positions(1e-4), resting()]),
@@ -110,8 +121,13 @@ def assert_same(found: Any, wanted: Any) -> None:
             assert own.socket.tolist() == other.socket.tolist()
 
 
-@pytest.mark.parametrize("table", [SI, DEGREES], ids=["SI", "degrees"])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("kind", "table"),
+    [
+        *product(KINDS, (SI, DEGREES)),
+        *(("poses on tips", replace(DEGREES, convention=own, rotation_angle="rad")) for own in CONVENTIONS[:5]),
+    ],
+)
 def test_written_tables_are_read_back(kind: str, table: TableFormat, tmp_path: Path) -> None:
     data = KINDS[kind]()
     form = write_measurements(tmp_path / "t.csv", data, table)

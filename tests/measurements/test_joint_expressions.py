@@ -86,7 +86,7 @@ def test_a_table_is_read_and_written_in_its_own_columns(tmp_path: Path) -> None:
     assert (tmp_path / "again.csv").read_text().startswith("A,B,s,x,y,z")
     assert_close(read_joints(tmp_path / "again.csv", replace(table, joints=texts, kinds=kinds)), expected)
     columns = Columns.of(replace(table, joints=texts, kinds=kinds).joints_only())
-    cells = columns.from_si({"q": expected + 0.01})
+    cells = columns.cells(expected + 0.01, {})
     write_columns(tmp_path / "new.csv", read_cells(tmp_path / "t.csv", table.sep), cells, table)
     assert_close(read_joints(tmp_path / "new.csv", replace(table, joints=texts, kinds=kinds)), expected + 0.01)
 

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from table_bank import CONVENTIONS, held, random_poses, read_table, says
+from table_bank import held, random_poses, says
 from torch import Tensor
 from torch.testing import assert_close
 
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.measurements.csv.files import read_measurements, write_measurements
+from diffeo_calib.measurements.csv.files import read_measurements
 from diffeo_calib.measurements.poses import directions_of_frames, frames_of_points, points_of_frames
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_format import TableFormat
 
 ROWS, TIPS = 6, ("left", "right", "head")
 HIDDEN = [(0, 1), (2, 0), (2, 2)]
@@ -94,21 +92,6 @@ def test_other_measuring_frames() -> None:
 
 
 # --- files --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("convention", CONVENTIONS[:5])
-def test_frames_are_written_and_read_back(convention: str, tmp_path: Path) -> None:
-    data, path = table(), tmp_path / "poses.csv"
-    written = TableFormat("mm", "deg", ";", ",", convention=convention, rotation_angle="rad")
-    write_measurements(path, data, written)
-    kept = written.for_writing(rotation_std=True, prefixes=[f"{tip}_" for tip in TIPS])
-    std = [f"std_{tip}_{axis}" for tip in TIPS for axis in "xyz"]
-    position = [[f"{tip}_{axis}" for axis in "xyz"] for tip in TIPS]
-    again = read_table(path, ["a", "b"], position, replace(kept, std=std, lever=0.2)).with_tips(TIPS)
-    assert path.read_text().splitlines()[1].count(";;") > 0  # the cells of a hidden frame are empty
-    for name in ("q", "poses", "points", "std", "rotation_std", "covariance"):
-        assert_close(getattr(again, name), getattr(data, name), rtol=1e-9, atol=1e-12, equal_nan=True)
-    assert again.on == data.on
 
 
 def test_frames_in_a_data_frame() -> None:

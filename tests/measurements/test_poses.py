@@ -18,14 +18,14 @@ import diffeo_calib as dc
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.measurements.csv.files import read_measurements, write_measurements
+from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.poses import (
     angle_between,
-    camera_jacobian,
     inverse_poses,
     mark_jacobian,
     mark_points,
     marks,
-    pose_directions,
+    pose_jacobian,
     poses_from_marks,
     rigid_poses,
     rotation_matrices,
@@ -54,6 +54,8 @@ def test_round_trips(convention: str, angle: str) -> None:
     matrices = random_rotations(200)
     numbers = rotation_numbers(matrices, convention, angle=angle)
     assert numbers.shape == (200, numbers_of(convention))
+    if convention.startswith("quat"):
+        assert float(numbers[:, convention.index("w") - len("quat_")].min()) >= 0  # the scalar
     assert_close(rotation_matrices(numbers, convention, angle=angle), matrices, rtol=0, atol=1e-14)
 
 
@@ -87,9 +89,16 @@ def test_quaternions_and_vectors_and_matrices_written_out() -> None:
     assert_close(rotation_numbers(expected, "rotvec", angle="deg"), torch.tensor([[0.0, 0.0, 60.0]]).double())
 
 
-def test_quaternions_are_written_with_a_positive_scalar() -> None:
-    for convention, scalar in (("quat_xyzw", 3), ("quat_wxyz", 0)):
-        assert float(rotation_numbers(random_rotations(200), convention)[:, scalar].min()) >= 0
+def test_controllers_name_their_conventions() -> None:
+    """KUKA: A about z, then B about the new y, C about the newest x; Fanuc: W, P, R about the fixed x, y, z."""
+    a, b, c = 0.3, -0.7, 1.1
+    expected = turn("z", a) @ turn("y", b) @ turn("x", c)
+    for name, numbers in (("kuka_abc", [a, b, c]), ("fanuc_wpr", [c, b, a])):
+        written = TableFormat("m", "rad", convention=name).convention
+        assert PoseColumns.of(f"x,y,z,rx,ry,rz={name}").convention == written
+        assert_close(rotation_matrices([numbers], str(written))[0].numpy(), expected, rtol=0, atol=1e-14)
+    assert TableFormat("m", "rad", convention="ur_rotvec").convention == "rotvec"
+    assert TableFormat("m", "rad", convention="abb_quaternion").convention == "quat_wxyz"
 
 
 def test_gimbal_lock_is_written_without_a_warning() -> None:
@@ -221,43 +230,7 @@ def test_jacobian_of_the_points_against_differences() -> None:
     assert_close(mark_jacobian(poses, lever), torch.stack(columns, -1), rtol=0, atol=1e-9)
 
 
-def test_pose_covariance_is_that_of_poses_from_marks() -> None:
-    """Monte Carlo: points with an arbitrary noise, and the spread of the poses fitted to them."""
-    rng, lever, pose = np.random.default_rng(0), 0.1, random_poses(1)
-    factor = 1e-5 * rng.normal(size=(9, 9))
-    draws = torch.from_numpy(rng.normal(size=(40_000, 9)) @ factor.T)
-    found = poses_from_marks(mark_points(pose, lever) + draws.unflatten(1, (3, 3)), lever)
-    turns = rotation_numbers(found[:, :3, :3] @ pose[:, :3, :3].mT, "rotvec")
-    errors = torch.cat([found[:, :3, 3] - pose[:, :3, 3], turns], 1)
-    wanted = pose_directions(pose, lever)[0]
-    expected = wanted @ torch.from_numpy(factor @ factor.T) @ wanted.mT
-    scale = expected.diagonal().sqrt()
-    ratio = torch.cov(errors.T) / torch.outer(scale, scale)
-    assert_close(ratio, expected / torch.outer(scale, scale), rtol=0, atol=0.03)
-
-
 # --- rigid transforms -----------------------------------------------------------------------------
-
-
-def spoilt(row: int, entry: tuple[int, int], value: float) -> Tensor:
-    poses = random_poses(3)
-    poses[row, entry[0], entry[1]] = value
-    return poses
-
-
-@pytest.mark.parametrize(
-    ("poses", "message"),
-    [
-        (random_poses(3)[:, :3], ("`poses`", "(N, 4, 4)", "(3, 3, 4)")),
-        (random_poses(3).mT, ("`poses`, row 0", "last row", "transpose")),
-        (spoilt(1, (0, 0), 3.0), ("`poses`, row 1", "rotation matrix")),
-        (spoilt(1, (0, 3), math.nan), ("`poses`", "index [1, 0, 3]")),
-        (random_poses(3) * torch.tensor([1.0, -1.0, 1.0, 1.0])[:, None], ("`poses`, row 0", "mirrored")),
-    ],
-)
-def test_transforms_that_are_not_rigid_are_one_clear_error(poses: Any, message: tuple[str, ...]) -> None:
-    with pytest.raises(InputError, match=says(*message)):
-        rigid_poses(poses)
 
 
 def test_rounded_transforms_become_rigid() -> None:
@@ -282,9 +255,10 @@ def seen(**options: Any) -> tuple[Tensor, dc.Measurements]:
 
 
 def test_derivatives_of_the_points_are_those_of_the_inverted_pose() -> None:
-    """Finite differences of the inverse of (exp(w) R, t + dt) by dt and w, in the camera's axes."""
-    boards, data = seen(lever=0.07)
-    found = camera_jacobian(held(data.poses), 0.07, held(data.board))
+    """Finite differences of the inverse of (exp(w) R, t + dt) by dt and w, in the camera's axes; so are deviations."""
+    position, turn = (1e-5 * (1 + draw(ROWS, 3, seed=seed).abs()) for seed in (1, 2))
+    boards, data = seen(lever=0.07, position_std=position, rotation_std=turn)
+    found = pose_jacobian(held(data.frames), 0.07, held(data.board))[:, 0]
     step = 1e-6
     for k, change in enumerate(step * torch.eye(6, dtype=torch.float64, device=HOST)):
 
@@ -293,20 +267,9 @@ def test_derivatives_of_the_points_are_those_of_the_inverted_pose() -> None:
             return mark_points(inverse_poses(transforms(turned, boards[:, :3, 3] + e[:3])), 0.07).flatten(1)
 
         slope = (points(change) - points(-change)) / (2 * step)
-        assert_close(
-            found[..., k], -slope, rtol=0, atol=1e-9
-        )  # the errors of the camera are those of the board, negated
-
-
-def test_covariance_is_that_of_drawn_errors_of_the_board() -> None:
-    position, turn = 1e-5 * (1 + draw(ROWS, 3, seed=1).abs()), 1e-5 * (1 + draw(ROWS, 3, seed=2).abs())
-    boards, data = seen(position_std=position, rotation_std=turn)
-    draws = 20_000
-    shifts, turns = position[:, None] * draw(ROWS, draws, 3, seed=4), turn[:, None] * draw(ROWS, draws, 3, seed=5)
-    wrong = transforms(rotation(turns) @ boards[:, None, :3, :3], boards[:, None, :3, 3] + shifts).flatten(0, 1)
-    away = mark_points(inverse_poses(wrong), 0.1).view(ROWS, draws, 9) - data.points.view(ROWS, 1, 9)
-    known = held(data.covariance)
-    assert_close(away.mT @ away / draws, known, rtol=0, atol=0.03 * float(known.abs().max()))
+        assert_close(found[..., k], -slope, rtol=0, atol=1e-9)  # errors of the camera are those of the board, negated
+    known = found * torch.cat([position, turn], 1)[:, None]
+    assert_close(held(data.covariance), known @ known.mT, rtol=1e-9, atol=1e-18)
 
 
 def test_errors_move_with_the_board_to_another_frame() -> None:

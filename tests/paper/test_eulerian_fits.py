@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 from weakref import ref
 
-import numpy as np
 import pytest
 import torch
 from eulerian_bank import P0, deformed
@@ -39,19 +38,6 @@ def test_shooting_starts_at_the_tangent_solution_and_ends_at_12() -> None:
     assert evaluations > 2
     assert float(eulerian.energy(reached).total) < float(eulerian.energy(first).total)
     assert eulerian.end_residual(reached) < 0.2 * eulerian.end_residual(first)
-
-
-@pytest.mark.slow
-def test_lbfgs_by_torchdiffeq_and_its_adjoint() -> None:
-    energies = [
-        dc.fit(few_points(), dc.LBFGS(max_iterations=20), integrator, formulation="eulerian").energy
-        for integrator in (
-            dc.RK4(2),
-            dc.TorchDiffEq("rk4", step_size=0.5),
-            dc.TorchDiffEq("rk4", adjoint=True, step_size=0.5),
-        )
-    ]
-    np.testing.assert_allclose(energies, energies[0], rtol=1e-3)
 
 
 def test_a_flow_ends_with_its_last_reference() -> None:

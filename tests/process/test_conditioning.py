@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from diffeo_calib.common.errors import NumericalError
-from diffeo_calib.process.process import Expected, Process
 from diffeo_calib.regression.cholesky import Factor
+from diffeo_calib.regression.conditional import Process
 
 
 def close(found: Tensor, expected: Tensor, relative: float) -> None:
@@ -29,8 +29,18 @@ def cut(case: Case) -> tuple[Case, Case, Case]:
     return tuple(case.part(rows[rows % 3 == k]) for k in range(3))  # pyright: ignore
 
 
-def noiseless(process: Process, part: Case) -> Expected:
-    return process.expected(part.numbers)
+def noiseless(process: Process, part: Case) -> tuple[Tensor, Tensor]:
+    """Mean and covariance of the numbers of rows."""
+    numbers, at = part.numbers, process.features(part.numbers.at)
+    return numbers.there(process.mean(at)), numbers.there(numbers.there(at.between()).T)
+
+
+def unknowns(process: Process) -> tuple[Tensor, Tensor]:
+    """Mean, of those of the nominal map, and covariance of the unknowns."""
+    at, K = process.numbers.at, process.factor.W.shape[1]
+    nothing = torch.zeros(1, K, at.sensitivity.shape[1], dtype=torch.float64)
+    alone = replace(at.rows(torch.tensor([0])).projected(nothing), sensitivity=torch.eye(K, dtype=torch.float64)[None])
+    return process.estimate, process.posterior(alone)[0]
 
 
 # --- the posterior ------------------------------------------------------------------------------------------------
@@ -39,17 +49,18 @@ def noiseless(process: Process, part: Case) -> Expected:
 def test_posterior_is_that_of_the_whole_covariance(case: Case) -> None:
     at, found, y = case.numbers.cells, case.posterior, case.numbers.target
     S, P = case.unknowns[at], torch.diag(case.variance)
-    R = torch.block_diag(*case.data.told.weighted_noise(case.scales))[at][:, at]
+    R = torch.block_diag(*case.noise)[at][:, at]
     K = case.fields[at][:, at] + R + S @ P @ S.T
     inverse = torch.linalg.inv(K)
     close(found.inverse, inverse, 1e-6)
     close(found.mu, inverse @ y, 1e-5)
     close(found.factor.solve(S), inverse @ S, 1e-6)
     deviation = case.variance.sqrt()
-    close(found.estimate / deviation, P @ S.T @ inverse @ y / deviation, 1e-5)
+    (estimate, covariance), count = unknowns(found), len(found.estimate)
+    close(estimate / deviation[:count], (P @ S.T @ inverse @ y / deviation)[:count], 1e-5)
     explained = P @ S.T @ inverse @ S @ P
     scale = torch.outer(deviation, deviation)
-    close(found.covariance / scale, (P - explained) / scale, 1e-5)
+    close(covariance / scale, (P - explained) / scale, 1e-5)
     normal = torch.distributions.MultivariateNormal(torch.zeros_like(y), K)
     assert found.evidence == pytest.approx(float(normal.log_prob(y)), rel=1e-6)
 
@@ -58,38 +69,32 @@ def test_predictions_are_those_of_the_whole_covariance(case: Case) -> None:
     """Of rows that are new."""
     first, second, new = cut(case)
     known = first.data.process(case.scales).given(second.numbers, second.noise)
-    found = noiseless(known, new)
-    count, R = len(case.data.x), case.data.told.y.shape[1]
+    mean, covariance = noiseless(known, new)
+    count, R = len(case.data.x), case.data.size
     K = case.fields + case.unknowns @ torch.diag(case.variance) @ case.unknowns.T
-    noise = torch.block_diag(*case.data.told.weighted_noise(case.scales))
+    noise = torch.block_diag(*case.noise)
 
     def cells(part: Case, k: int) -> Tensor:
         return torch.arange(k, count, 3)[part.numbers.owner] * R + part.numbers.cells % R
 
     at, to = torch.cat([cells(first, 0), cells(second, 1)]), cells(new, 2)
     gain = torch.linalg.solve((K + noise)[at][:, at], K[at][:, to]).T
-    target = case.data.told.target.flatten()
-    close(found.mean, gain @ target[at], 1e-6)
-    close(found.covariance, K[to][:, to] - gain @ K[at][:, to], 1e-6)
+    target = case.data.target.flatten()
+    close(mean, gain @ target[at], 1e-6)
+    close(covariance, K[to][:, to] - gain @ K[at][:, to], 1e-6)
 
 
 def test_before_any_row(case: Case) -> None:
-    prior, S = case.data.prior(case.scales), case.numbers.S
-    found = prior.expected(case.numbers)
-    at = case.numbers.cells
-    assert not bool(found.mean.any())
-    close(found.covariance, case.fields[at][:, at] + S @ torch.diag(case.variance) @ S.T, 1e-12)
-    assert prior.evidence == 0.0
-    close(prior.covariance, torch.diag(case.variance), 1e-12)
-    assert not bool(prior.estimate.any())
+    found = case.data.prior(case.scales).covariance_between(case.numbers.at)
+    close(found, case.fields + case.unknowns @ torch.diag(case.variance) @ case.unknowns.T, 1e-12)
 
 
 def test_estimates_are_spread_as_their_covariance_says() -> None:
     """Measurements that are drawn from the prior: errors of the unknowns, whitened by the posterior, are N(0, 1)."""
     one = case("one marker")
     numbers, K = one.numbers, len(one.variance)
-    F = torch.linalg.cholesky(numbers.add_blocks(one.fields.clone(), one.noise))
-    root, squares = torch.linalg.cholesky(one.posterior.covariance), []
+    F = torch.linalg.cholesky(numbers.with_noise(one.fields, one.noise))
+    root, squares = torch.linalg.cholesky(unknowns(one.posterior)[1]), []
     for seed in range(60):
         u = one.variance.sqrt() * normal(K, seed=seed)
         y = numbers.S @ u + F @ normal(len(numbers.target), seed=1000 + seed)
@@ -107,18 +112,18 @@ def test_rows_may_come_in_parts_and_in_any_order(case: Case) -> None:
     prior = case.data.prior(case.scales)
     both = case.part(torch.arange(len(case.data.x))[torch.arange(len(case.data.x)) % 3 != 2])
     whole = prior.given(both.numbers, both.noise)
-    deviation = whole.covariance.diagonal().sqrt()
+    estimate, covariance = unknowns(whole)
+    deviation = covariance.diagonal().sqrt()
     scale, expected = torch.outer(deviation, deviation), noiseless(whole, new)
     for a, b in ((first, second), (second, first)):
         found = prior.given(a.numbers, a.noise).given(b.numbers, b.noise)
-        close(found.estimate / deviation, whole.estimate / deviation, 1e-9)
-        close(found.covariance / scale, whole.covariance / scale, 1e-9)
+        own = unknowns(found)
+        close(own[0] / deviation[: len(estimate)], estimate / deviation[: len(estimate)], 1e-9)
+        close(own[1] / scale, covariance / scale, 1e-9)
         assert found.evidence == pytest.approx(whole.evidence, rel=1e-9)
-        at = noiseless(found, new)
-        close(at.mean, expected.mean, 1e-9)
-        close(at.covariance, expected.covariance, 1e-9)
-        order, other = found.numbers.cells.argsort(), found.inverse
-        assert other.shape == (len(order),) * 2
+        for actual, wanted in zip(noiseless(found, new), expected, strict=True):
+            close(actual, wanted, 1e-9)
+        other = found.inverse
         assert_close(other @ found.numbers.target, found.mu, rtol=0, atol=1e-8 * float(found.mu.abs().max()))
 
 
@@ -126,20 +131,20 @@ def test_what_was_expected_before_goes_on_with_later_rows(case: Case) -> None:
     first, second, new = cut(case)
     known = first.data.process(case.scales)
     whole = known.given(second.numbers, second.noise)
-    expected, found = noiseless(whole, new), whole.expected(new.numbers, noiseless(known, new))
-    close(found.mean, expected.mean, 1e-9)
-    close(found.covariance, expected.covariance, 1e-9)
-    close(whole.between(found, expected), expected.covariance, 1e-9)
-    assert whole.expected(new.numbers, expected) is expected
+    at = new.numbers.at
+    expected, found = whole.features(at), whole.features(at, known.features(at))
+    close(whole.mean(found), whole.mean(expected), 1e-9)
+    close(found.between(), expected.between(), 1e-9)
+    close(found.between(expected), expected.between(), 1e-9)
 
 
 def test_evidence_of_later_rows_is_a_difference(case: Case) -> None:
     first, second, _ = cut(case)
     before = first.data.process(case.scales)
-    at = noiseless(before, second)
+    at = before.features(second.numbers.at)
     after = before.given(second.numbers, second.noise, at)
-    K = second.numbers.add_blocks(at.covariance, second.noise)
-    normal = torch.distributions.MultivariateNormal(at.mean, (K + K.T) / 2)
+    K = second.numbers.with_noise(at.between(), second.noise)
+    normal = torch.distributions.MultivariateNormal(second.numbers.there(before.mean(at)), (K + K.T) / 2)
     assert after.evidence - before.evidence == pytest.approx(float(normal.log_prob(second.numbers.target)), rel=1e-7)
 
 
@@ -148,17 +153,13 @@ def test_left_out_is_conditioning_without(case: Case) -> None:
     rows = torch.arange(len(case.data.x))
     for own in (rows[:1], rows[4:5], rows[1::4]):
         kept, gone = case.part(rows[~torch.isin(rows, own)]), case.part(own)
-        at = noiseless(kept.data.process(case.scales), gone)
+        known = kept.data.process(case.scales)
+        at = known.features(gone.numbers.at)
         group = torch.isin(case.numbers.owner, own)
         errors, covariance = case.posterior.left_out(group.to(torch.int64) - 1)
         assert bool(errors[~group].isnan().all())
-        at_group = group.nonzero()[:, 0]
-        at_group = at_group[case.numbers.cells[at_group].argsort()]
-        errors, covariance = errors[at_group], covariance[at_group[:, None], at_group]
-        order = gone.numbers.cells.argsort()
-        expected = gone.numbers.add_blocks(at.covariance, gone.noise)[order][:, order]
-        close(errors, (gone.numbers.target - at.mean)[order], 1e-6)
-        close(covariance, expected, 1e-6)
+        close(errors[group], gone.numbers.target - gone.numbers.there(known.mean(at)), 1e-6)
+        close(covariance[group][:, group], gone.numbers.with_noise(at.between(), gone.noise), 1e-6)
 
 
 @pytest.mark.parametrize("size", [2.0, None])
@@ -177,7 +178,7 @@ def test_rows_without_noise_that_are_there_twice_are_refused() -> None:
     one = case("three markers")
     twice = one.part(torch.tensor([0, 0]))
     with pytest.raises(NumericalError, match="the covariance of the rows is not positive definite"):
-        twice.data.prior(one.scales).given(twice.numbers, [0.0 * block for block in twice.noise])
+        twice.data.prior(one.scales).given(twice.numbers, 0.0 * twice.noise)
 
 
 # --- digits -------------------------------------------------------------------------------------------------------
@@ -199,10 +200,10 @@ def test_priors_of_a_metre_cost_no_digits() -> None:
     one = case("one marker")
     some = Case(replace(one.data, place_deviation=1.0), one.scales).part(torch.arange(9))
     numbers, found = some.numbers, some.posterior
-    F = numbers.add_blocks(some.fields.clone(), some.noise)
+    F = numbers.with_noise(some.fields, some.noise)
     mu, estimate = exactly(F, numbers.S, some.variance, numbers.target)
     close(found.mu, mu, 1e-9)
-    deviation = found.covariance.diagonal().sqrt()
+    deviation = unknowns(found)[1].diagonal().sqrt()
     close(found.estimate / deviation, estimate / deviation, 1e-9)
     naive = torch.linalg.solve(F + numbers.S @ torch.diag(some.variance) @ numbers.S.T, numbers.target)
     assert float((naive - mu).abs().max()) > 1e2 * float((found.mu - mu).abs().max())
@@ -215,7 +216,7 @@ def test_where_the_device_is_thought_does_not_matter(name: str) -> None:
     numbers, step = wide.numbers, torch.zeros_like(wide.variance)
     step[:3] = torch.tensor([0.5, -0.3, 0.2])
     before = wide.posterior
-    moved = type(numbers)([(*part[:2], part[2] + part[3] @ step, *part[3:]) for part in numbers._given], numbers.shape)
+    moved = replace(numbers, target=numbers.target + numbers.S @ step)
     after = wide.data.prior(wide.scales).given(moved, wide.noise)
     one, other = before.left_out(numbers.owner)[0], after.left_out(numbers.owner)[0]
     assert_close(other, one, rtol=0, atol=1e-7)

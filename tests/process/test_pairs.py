@@ -11,43 +11,33 @@ from tangent_bank import normal
 from torch import Tensor
 from torch.testing import assert_close
 
-from diffeo_calib.process.numbers import Covariance, Numbers
-from diffeo_calib.process.scales import Hyperparameters
+from diffeo_calib.process.scales import Hyperparameters, Pairs
 
 
-def two(case: Case) -> tuple[Numbers, Numbers]:
-    """Some rows, and the others with one of these."""
-    count = len(case.data.x)
-    return tuple(case.data.rows(rows).numbers for rows in (torch.arange(0, count, 3), torch.arange(1, count)))  # pyright: ignore
-
-
-def matrix(pairs: Covariance, scales: Hyperparameters) -> Tensor:
+def matrix(pairs: Pairs, scales: Hyperparameters) -> Tensor:
     return pairs.matrix(pairs.values(scales))
 
 
 def test_matrix_is_that_of_the_linearised_model(case: Case) -> None:
-    found = matrix(case.data.pairs, case.scales)
-    at = case.numbers.cells
-    expected = case.fields[at][:, at]
+    found, expected = matrix(case.data.pairs, case.scales), case.fields
     assert_close(found, expected, rtol=0, atol=1e-13 * float(expected.abs().max()))
     assert_close(found, found.T, rtol=0, atol=1e-14 * float(expected.abs().max()))
 
 
 def test_both_fields_count(case: Case) -> None:
     """Each by itself, where the other would hide it."""
-    at = case.numbers.cells
     for name in ("transmission_amplitude", "coupled_amplitude", "task_amplitude"):
         names = {"transmission_amplitude", "coupled_amplitude", "task_amplitude"} - {name}
         alone = replace(case.scales, **{other: torch.zeros_like(getattr(case.scales, other)) for other in names})
-        expected = Case(case.data, alone).fields[at][:, at]
+        expected = Case(case.data, alone).fields
         assert float(expected.abs().max()) > 0.0
         assert_close(matrix(case.data.pairs, alone), expected, rtol=0, atol=1e-13 * float(expected.abs().max()))
 
 
 def test_inner_is_the_sum_with_the_matrix_and_so_is_its_slope(case: Case) -> None:
     """Of each kind of scale, by central differences."""
-    a, b = two(case)
-    pairs, weights = Covariance(a, b, case.data.space), normal(len(a.target), len(b.target), seed=4)
+    pairs = case.data.pairs
+    weights = normal(*case.fields.shape, seed=4)
     point = case.scales.logarithms().requires_grad_()
     inner = pairs.inner(pairs.values(case.scales.from_logarithms(point)), weights)
     size = float((weights * matrix(pairs, case.scales)).abs().sum())

@@ -15,18 +15,19 @@ from math_bank import normal, rr_problem, two_marker_problem, uniform
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.common import checks
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.problem import Problem, regress
 from diffeo_calib.kernels.base import Kernel
+from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import without_hidden
-from diffeo_calib.regression import choose, conditional, control_points
+from diffeo_calib.regression import conditional, control_points
 from diffeo_calib.regression import conjugate_gradients as iterative
-from diffeo_calib.regression.cholesky import CholeskyRegression
-from diffeo_calib.regression.conditional import Conditional
+from diffeo_calib.regression.conditional import Conditional, Process
 from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegression, partial_cholesky, pivots
 from diffeo_calib.regression.control_points import ControlPointRegression
 from diffeo_calib.robots import elastic_rr
@@ -55,12 +56,12 @@ every_seen = pytest.mark.parametrize("problem", SEEN.values(), ids=SEEN.keys())
 
 Way = Callable[[Problem, GeodesicDeformation], Any]
 WAYS: dict[str, Way] = {
-    "cholesky": lambda problem, at: CholeskyRegression(at.linearise(), problem.noise),
+    "cholesky": lambda problem, at: Process.of_rows(at.linearise(), problem.noise),
     "iterative": lambda problem, at: ConjugateGradientRegression(at.linearise(), problem.noise),
     "iterative, poor preconditioner": lambda problem, at: ConjugateGradientRegression(
         at.linearise(), problem.noise, rank=4
     ),
-    "reduced": lambda problem, at: ControlPointRegression(at, problem.x, problem.noise),
+    "reduced": lambda problem, at: ControlPointRegression(at, problem.x, problem.noise, residual=problem.residual),
 }
 
 
@@ -181,7 +182,7 @@ def test_any_kernel_in_both_flows(kernel: Kernel) -> None:
     torch.testing.assert_close(projected.rows(some).own_blocks(), blocks[some], rtol=1e-12, atol=1e-13)
     expected = naive_covariance(problem, data, queries)
     prior = float(naive_gram(queries, queries).diagonal().max())
-    close(CholeskyRegression(data, problem.noise).covariance(queries), expected, prior, 1e-10)
+    close(Process.of_rows(data, problem.noise).covariance(queries), expected, prior, 1e-10)
 
 
 @every_seen
@@ -216,12 +217,12 @@ def test_parameters_apart_are_the_formula(problem: Problem) -> None:
     at, x = deformed(problem), uniform(7, 2, seed=20)
     data, queries = (with_parameters(problem, at, points, 2.0) for points in (problem.x, x))
     expected, prior = naive_covariance(problem, data, queries), float(naive_gram(queries, queries).diagonal().max())
-    regression = CholeskyRegression(data, problem.noise)
+    regression = Process.of_rows(data, problem.noise)
     close(regression.covariance(queries), expected, prior, 1e-10)
     values, K = normal(len(data.gram()), 3, seed=8), data.gram() + matrix_of(problem)
-    solved = regression.solve(values.view(*problem.y.shape, 3)).flatten(0, 1)
+    solved = regression.factor.solve(values)
     torch.testing.assert_close(solved, torch.linalg.solve(K, values), rtol=1e-6, atol=1e-6)
-    C = torch.stack([regression.of_white(column) for column in torch.eye(len(K), dtype=torch.float64)], 1)
+    C = torch.stack([regression.factor.of_white(column) for column in torch.eye(len(K), dtype=torch.float64)], 1)
     torch.testing.assert_close(C.T @ K @ C, torch.eye(len(K), dtype=torch.float64), rtol=0, atol=1e-6)
 
 
@@ -232,7 +233,7 @@ def test_wide_priors_do_not_cancel() -> None:
     found = []
     for wide in (1e8, 1e16):
         data, queries = (with_parameters(problem, at, points, wide) for points in (problem.x, x))
-        found.append(CholeskyRegression(data, problem.noise).covariance(queries))
+        found.append(Process.of_rows(data, problem.noise).covariance(queries))
     torch.testing.assert_close(found[0], found[1], rtol=1e-6, atol=1e-9 * float(found[1].abs().max()))
 
 
@@ -251,6 +252,11 @@ def test_product_with_parameters(problem: Problem) -> None:
     torch.testing.assert_close(lin.product(mu).flatten(0, 1), lin.gram() @ mu.flatten(0, 1), rtol=1e-11, atol=1e-11)
 
 
+def mode(found: Any, target: Tensor) -> Momenta:
+    """Of the problem that was linearised."""
+    return found.mode()[0] if isinstance(found, ControlPointRegression) else found.momenta(target)
+
+
 @pytest.mark.slow
 @every_way
 @every_problem
@@ -258,10 +264,10 @@ def test_same_momenta_as_the_cholesky_factor(problem: Problem, way: Way) -> None
     """Compared by their effect at the data, since flat directions of the momenta are rounding errors."""
     at = deformed(problem)
     expected = regress(problem, at, "cholesky")
-    actual = way(problem, at).momenta(expected.target)
+    actual = mode(way(problem, at), expected.target)
     reduced = ControlPointRegression(at, problem.x, problem.noise)
     wanted = reduced.response(expected.momenta())
-    torch.testing.assert_close(reduced.response(actual), wanted, rtol=1e-5, atol=1e-6 * float(wanted.abs().max()))
+    torch.testing.assert_close(reduced.response(actual), wanted, rtol=1e-5, atol=1e-5 * float(wanted.abs().max()))
 
 
 @pytest.mark.parametrize("wide", [1.0, 100.0])
@@ -273,7 +279,7 @@ def test_covariance_of_a_large_problem(problem: Problem, wide: float, monkeypatc
         replace(lin, spec=model, sensitivity=torch.ones(*lin.sensitivity.shape[:2], 1, dtype=torch.float64))
         for lin in (at.linearise(), at.linearise(uniform(6, 2, seed=20)))
     )
-    expected = CholeskyRegression(data, problem.noise).covariance(queries)
+    expected = Process.of_rows(data, problem.noise).covariance(queries)
     scale = float(expected.abs().max())
     actual = ConjugateGradientRegression(data, problem.noise).covariance(queries)
     torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5 * scale)
@@ -321,7 +327,7 @@ def test_parameters_of_the_nominal_map(way: Way) -> None:
     at = problem.deform(problem.zero(), dc.RK4(1))
     exact = regress(problem, at, "cholesky")
     conditional = way(problem, at)
-    torch.testing.assert_close(conditional.momenta(exact.target).theta, exact.momenta().theta, rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(mode(conditional, exact.target).theta, exact.momenta().theta, rtol=1e-6, atol=1e-9)
     queries = at.linearise(uniform(4, 2, seed=5))
     expected = exact.conditional.covariance(queries)
     if way is not WAYS["iterative, poor preconditioner"]:  # whose covariances are larger
@@ -340,14 +346,14 @@ def test_conjugate_gradients_that_cannot_converge_say_so() -> None:
 
 
 def test_unknown_free_memory_refuses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(choose, "free_memory", lambda: None)
-    choose.check_memory(10**18, "nothing")
+    monkeypatch.setattr(checks, "free_memory", lambda: None)
+    checks.check_memory(10**18, "nothing")
 
 
 def test_auto_takes_conjugate_gradients_for_large_problems() -> None:
-    assert choose.choose("auto", choose.MAX_DENSE) == "cholesky"
-    assert choose.choose("auto", choose.MAX_DENSE + 1) == "cg"
-    assert choose.predicted_memory("cg", 100_000) < choose.predicted_memory("cholesky", 100_000) / 30
+    assert iterative.choose("auto", iterative.MAX_DENSE) == "cholesky"
+    assert iterative.choose("auto", iterative.MAX_DENSE + 1) == "cg"
+    assert iterative.predicted_memory("cg", 100_000) < iterative.predicted_memory("cholesky", 100_000) / 30
     with pytest.raises(InputError, match="`linear`: expected auto, cholesky, cg, got 'lu'"):
         dc.fit(PROBLEMS["rr"], dc.GaussNewton(linear="lu"), dc.RK4(1))  # pyright: ignore[reportArgumentType]
 
@@ -355,22 +361,14 @@ def test_auto_takes_conjugate_gradients_for_large_problems() -> None:
 @pytest.mark.slow
 @every_problem
 def test_control_points_in_many_blocks_of_data(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One row per block or all rows at once, one pass over the data or two: the same optimum."""
+    """One row per block or all rows at once: the same optimum."""
     at = deformed(problem)
-    whole = ControlPointRegression(at, problem.x, problem.noise)
-    target = problem.y - at.z1 + whole.response(at.momenta)
+    whole = ControlPointRegression(at, problem.x, problem.noise, residual=problem.residual)
     monkeypatch.setattr(control_points, "BLOCK_ENTRIES", 1)
     each = ControlPointRegression(at, problem.x, problem.noise, residual=problem.residual)
     torch.testing.assert_close(each.core, whole.core, rtol=1e-8, atol=1e-9)
-    wanted = whole.response(whole.momenta(target))
-    for found in (each.mode()[0], each.momenta(target)):
-        torch.testing.assert_close(whole.response(found), wanted, rtol=1e-6, atol=1e-8 * float(wanted.abs().max()))
-
-
-def test_the_mode_needs_a_residual() -> None:
-    problem = PROBLEMS["rr"]
-    with pytest.raises(InputError, match="the mode of control points: expected their data's residual"):
-        ControlPointRegression(deformed(problem), problem.x, problem.noise).mode()
+    found, wanted = (whole.response(one.mode()[0]) for one in (each, whole))
+    torch.testing.assert_close(found, wanted, rtol=1e-6, atol=1e-8 * float(wanted.abs().max()))
 
 
 @full_ways

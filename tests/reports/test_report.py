@@ -56,6 +56,13 @@ def check_page(text: str) -> None:
     assert all(len(figure.xpath(".//*[local-name()='path']")) > 3 for figure in page.iter("figure"))
 
 
+def test_pictures_are_figures_by_name(arm: Case) -> None:
+    found = dc.plots.pictures(arm.model, arm.test[:SHOWN])
+    assert {"distributions-0", "before-after-0", "expected-0", "parts", "transmission-5", "coverage"} <= set(found)
+    (axes,) = found["distributions-0"].axes
+    assert (axes.get_xlabel(), len(axes.lines)) == ("position error [mm]", 3)
+
+
 @pytest.mark.parametrize("name", ["arm", *(pytest.param(name, marks=pytest.mark.slow) for name in ("slider",))])
 def test_models_of_every_kind(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     case: Case = request.getfixturevalue(name)

@@ -6,7 +6,8 @@ from math import pi
 
 import pytest
 import torch
-from robots_bank import CHAIN, draw, errors_of
+from deformation_bank import geometry_of
+from robots_bank import CHAIN, draw
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
@@ -25,7 +26,7 @@ def chain() -> Chain:
 @pytest.fixture(params=["table", "mimic joints"])
 def geometry(chain: Chain, request: pytest.FixtureRequest) -> Geometry:
     """A geometry in general position: nothing is the identity, three markers."""
-    return errors_of(chain if request.param == "table" else CHAIN, 3)
+    return geometry_of(chain if request.param == "table" else CHAIN, 3)
 
 
 @pytest.fixture(params=[0.0, 1e-9, 5e-3, 0.4, 2.0])
@@ -74,7 +75,7 @@ def test_absorbing_theta_changes_no_point(geometry: Geometry, theta: Tensor) -> 
 
 
 def test_wrong_input_is_explained(chain: Chain) -> None:
-    geometry, q, eye = errors_of(chain, 3), torch.zeros(2, 4), torch.eye(4)
+    geometry, q, eye = geometry_of(chain, 3), torch.zeros(2, 4), torch.eye(4)
     for theta, message in ((torch.zeros(3), "expected (39,), or one"), (torch.full((39,), torch.nan), "has 39")):
         with pytest.raises(InputError, match=re.escape(message)):
             geometry.points(q, theta)

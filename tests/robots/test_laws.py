@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
-from deformation_bank import errors_of
+from deformation_bank import errors_of, geometry_of
 from robots_bank import CHAIN, CHAINS, CROOKED, LIFT, draw, every_chain
 from simulated_body import HANDS, URDF_FILE
 from torch import Tensor
@@ -23,10 +23,10 @@ from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.poses import mark_points, poses_from_marks
 from diffeo_calib.measurements.table_format import LEVER
-from diffeo_calib.robots import DHRow, Geometry, SimulatedArm, from_dh, load_urdf
+from diffeo_calib.robots import DHRow, SimulatedArm, from_dh, load_urdf
 from diffeo_calib.robots.gravity import GravitySag
 from diffeo_calib.robots.payload import Payload
-from diffeo_calib.robots.se3 import skew, twist_transform
+from diffeo_calib.robots.se3 import skew
 from diffeo_calib.robots.tree import Ends, Tree, robot_from_config
 
 # torch compiles its forward-mode rules on first use with torch.jit.script, which it has deprecated.
@@ -190,20 +190,10 @@ def test_derivatives_pass_through_every_transform(name: str) -> None:
     assert torch.autograd.gradgradcheck(lambda x: chain.jacobian(x)[:, :3], (q[:1].detach().requires_grad_(),))
 
 
-def in_general_position(robot: Tree) -> Geometry:
-    """Nothing is the identity; two markers on every tip."""
-    twists, on = (
-        twist_transform(draw(robot.moving + 1, 6, seed=11, size=0.3)),
-        [tip for tip in robot.tips for _ in "ab"],
-    )
-    bare = Geometry.nominal(robot, len(on), tuple(on))
-    return replace(bare, base=twists[0], joint_errors=twists[1:], tool=draw(len(on), 3, seed=12))
-
-
 def laden(robot: Tree) -> GeometryMap:
     """Elastic, with waves and crooked axes, and with a weight at its last end."""
     payload = Payload(list(robot.ends)[-1], torch.tensor(3.0, dtype=torch.float64), 5.0)
-    return GeometryMap(in_general_position(robot), elastic=True, own=errors_of(robot), payload=payload)
+    return GeometryMap(geometry_of(robot), elastic=True, own=errors_of(robot), payload=payload)
 
 
 @every_robot
@@ -220,7 +210,7 @@ def test_errors_sag_waves_and_axes_have_exact_derivatives(robot: Tree, size: flo
 
 
 def test_second_derivatives_exist_at_zero_and_pass_through_vmap() -> None:
-    geometry, q = in_general_position(CHAIN), draw(2, CHAIN.n, seed=6)
+    geometry, q = geometry_of(CHAIN), draw(2, CHAIN.n, seed=6)
     zero = torch.zeros(geometry.size, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: geometry.sensitivities(q[:1], x), (zero,))
     assert torch.autograd.gradcheck(lambda x: geometry.jacobian(x, zero), (q[:1].clone().requires_grad_(),))

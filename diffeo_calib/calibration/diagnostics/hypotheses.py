@@ -12,8 +12,8 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.kinematics.nominal import rigid_motions
 from diffeo_calib.process.evidence import Evidence
-from diffeo_calib.process.process import Process
 from diffeo_calib.process.scales import Hyperparameters
+from diffeo_calib.regression.conditional import Process
 from diffeo_calib.sensors.devices import Hypothesis
 from diffeo_calib.sensors.set_ups import frame_slopes
 
@@ -31,12 +31,13 @@ class SampledRows(NamedTuple):
     data: TangentData
     index: Tensor
     process: Process
+    scales: Hyperparameters
 
     @classmethod
     def of(cls, data: TangentData, scales: Hyperparameters) -> SampledRows:
         """Those of a calibration with these scales."""
         index, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed=0)
-        return cls(some, index, some.process(scales))
+        return cls(some, index, some.process(scales), scales)
 
     def columns(self, effects: Tensor, codes: Tensor | None = None) -> Tensor:
         """Effects (N, R, U) on what rows tell, in each row times its code (N,), as those on the numbers (M, U)."""
@@ -48,7 +49,7 @@ class SampledRows(NamedTuple):
 
     def distances(self, effects: Tensor, u: Tensor) -> Tensor:
         """(N, B) motions, m, of the points, or numbers, of each row by unknowns (U,) with effects (N, R, U)."""
-        motion = self.data.in_coordinates(effects @ u)
+        motion = self.data.in_coordinates(effects) @ u
         return motion.unflatten(1, (-1, 3 if motion.shape[1] % 3 == 0 else motion.shape[1])).norm(dim=2)
 
     def likeliest_size(self, E: Tensor) -> tuple[float, float]:
@@ -65,7 +66,7 @@ class SampledRows(NamedTuple):
 def left_out_rms(process: Process) -> float:
     """RMS of the errors of rows, m, as all other rows predict them."""
     errors, _ = process.left_out(process.numbers.owner)
-    return float((errors.square().sum() / len(process.numbers.q)).sqrt())
+    return float((errors.square().sum() / len(process.numbers.owner.unique())).sqrt())
 
 
 def worth_it(before: Tensor, after: Tensor) -> bool:

@@ -42,9 +42,9 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import few, sentence, warn_user, with_deviation
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.process.evidence import Evidence
-from diffeo_calib.process.process import Process
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import FACTORS
+from diffeo_calib.regression.conditional import Process
 from diffeo_calib.sensors.devices import MILLIMETRE, Hypothesis
 
 ROUNDS = 20
@@ -130,8 +130,7 @@ def best_of(found: Iterable[Candidate], rows: SampledRows) -> Finding | None:
     fix, columns = best.fix, None
     if best.opens and moved < OPENED_M:
         fix += f"; the model holds for {best.opens}"
-        numbers = rows.process.numbers.in_table(best.columns).unbind(2)
-        columns = torch.stack([rows.data.in_coordinates(one) for one in numbers], 2)
+        columns = rows.data.in_coordinates(rows.process.numbers.in_table(best.columns))
         columns = OPENED_M * columns / columns[columns.any(2)].square().sum(1).mean().sqrt()
     return Finding(sentence(best.what, expected=best.expected, got=got, fix=fix), columns)
 
@@ -281,7 +280,7 @@ class Mixture:
         """What each row alone says of unknowns of its own beside the codes: g (N, U) and H (N, U, U)."""
         process, numbers = self.rows.process, self.rows.process.numbers
         left = process.mu - process.inverse @ (self.rows.columns(self.effects, chosen) @ u)
-        own = numbers.blocks_in_table(numbers.diagonal_blocks(process.inverse))
+        own = numbers.blocks(process.inverse)
         g = (self.effects * numbers.in_table(left)[..., None]).sum(1)
         return Evidence(g, self.effects.mT @ own @ self.effects)
 
@@ -338,7 +337,7 @@ def other_payloads(rows: SampledRows, data: TangentData, lines: Tensor) -> Itera
     loaded = torch.arange(part.start, part.stop, device=masses.device)[some.nominal.elasticity.loaded]
     full = some.nominal.under(torch.full_like(own, load.unit))  # the sag of every row under the same mass
     S = full.sensitivities(some.x, some.theta)[..., loaded]
-    sizes = some.prior_variance(replace(rows.process.scales, payload=1.0))[loaded].sqrt()
+    sizes = some.prior_variance(replace(rows.scales, payload=1.0))[loaded].sqrt()
     E = some.motions_in_numbers(S if some.slopes is None else some.slopes @ S) * sizes
     mixed = Mixture(rows, E, masses.unique() / load.unit - own[:, None])
     others = {words: other[rows.index] / load.unit - own for words, other in _other_columns(masses, lines)}

@@ -4,27 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.hypotheses import BASE, MARKERS
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
+from diffeo_calib.calibration.placing.placement import DeviceSet, Elsewhere, OtherRows, Placement, Seen, Settled
 from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.cameras.board import LENS
-from diffeo_calib.cameras.images import Camera, expected, sees
-from diffeo_calib.common.device import HOST
+from diffeo_calib.cameras.images import expected, sees
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
 from diffeo_calib.measurements.images import SharedErrors
 from diffeo_calib.measurements.poses import inverse_poses, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.board_camera import BoardCamera, BoardCameras, Explained
 from diffeo_calib.sensors.devices import OUTLIER_MEDIANS, ROW, Hypothesis, median_weights
-from diffeo_calib.sensors.set_ups import View
-
-T = TypeVar("T")
+from diffeo_calib.sensors.set_ups import TRANSFORMS
 
 SIZE_WARNED = 0.006
 """Shares by which lengths of a board may differ from the robot's. Simulated arms with errors of a mm: below 0.004."""
@@ -48,8 +45,7 @@ class CameraErrors(DeviceSet):
     @classmethod
     def around(cls, data: Measurements, rows: Tensor) -> list[Any]:
         """Those of the images of a table beside a model, none for other tables; arguments as of :meth:`of_table`."""
-        none = torch.zeros(0, 1, dtype=torch.float64, device=HOST)  # no entry for the model file
-        return [cls(BoardCameras((), none, none), rows, one.seen_by, one) for one in data.shared_errors()]
+        return [cls(BoardCameras.of_rows(rows, one.seen_by), one) for one in data.shared_errors()]
 
     @property
     def size(self) -> int:
@@ -64,7 +60,7 @@ class CameraErrors(DeviceSet):
         if other.aligned is None:
             raise MeasurementError.of("rows of a camera", expected="images", got="none")
         (shared,) = other.aligned.table.shared_errors()
-        return replace(self, shared=shared, rows=other.aligned.rows, device=shared.seen_by)
+        return replace(self, shared=shared).measuring(other.aligned.rows, shared.seen_by)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +105,7 @@ class LensAndBoard(CameraErrors):
             apart = apart - places @ torch.linalg.lstsq(places, apart, driver="gelsd").solution
             larger = _relative_size(data, registration, free)
             own = data.bodies.pose_lever(), apart.view_as(shared.slopes), larger
-            found.append(cls(BoardCameras.of(cameras), rows, shared.seen_by, shared, *own))
+            found.append(cls(BoardCameras.of_rows(rows, shared.seen_by).with_cameras(cameras), shared, *own))
             if abs(larger) >= SIZE_WARNED:
                 what = "the size of the board does not fit that of the robot"
                 got = f"lengths in the images {100 * abs(larger):.1f} % {'larger' if larger > 0 else 'smaller'}"
@@ -131,7 +127,7 @@ class LensAndBoard(CameraErrors):
             camera = replace(camera, unknowns=camera.unknowns + change, root=root)
             cameras[name] = BoardCamera(camera, own.on_tool, replace(own.explained, **known))
         shared = self.shared._replace(cameras={name: own.camera for name, own in cameras.items()})
-        return replace(self, shared=shared, devices=BoardCameras.of(cameras))
+        return replace(self, shared=shared, devices=self.devices.with_cameras(cameras))
 
     def hypotheses(self, data: Seen) -> Iterator[Hypothesis]:
         effects = data.points.new_zeros(*data.points.shape, 1)
@@ -157,36 +153,29 @@ class LensAndBoard(CameraErrors):
             name: replace(own, explained=replace(own.explained, corners=_corners(shared, number)))
             for number, (name, own) in enumerate(self.devices.cameras.items())
         }
-        return replace(self, shared=shared, devices=BoardCameras.of(cameras))
+        return replace(self, shared=shared, devices=self.devices.with_cameras(cameras))
 
-    def sees(self, row: int, points: Tensor, views: Mapping[str, View]) -> Tensor:
-        seen = self._boards(row, points, views)
-        return super().sees(row, points, views) if seen is None else sees(*seen)
-
-    def measured_at(self, row: int, like: T, points: Tensor, views: Mapping[str, View]) -> T:
-        """With the errors of images there; where it is not seen, as at another place."""
-        seen = self._boards(row, points, views)
-        if seen is None or seen[0].view is None:
-            return like
-        camera, boards = seen
-        there = sees(camera, boards)
-        if not bool(there.any()):
-            return like
-        table: Any = like
-        boards = torch.where(there[:, None, None], boards, boards[there][0])
-        covariance, effects = expected(camera, boards)
-        return table.with_board_at(table.q, boards, (covariance, effects @ camera.root))
-
-    def _boards(self, row: int, points: Tensor, views: Mapping[str, View]) -> tuple[Camera, Tensor] | None:
-        """The camera of a row, and where it would see its board (M, 4, 4), m; None if the row is no image."""
+    def elsewhere(self, row: int, points: Tensor, devices: Placement) -> Elsewhere:
+        """With the errors of images there; where the board is not seen, as at another place."""
         number = self.shared.seen_by[self.rows == row].tolist()
         if not number:
-            return None
+            return super().elsewhere(row, points, devices)
         name, camera = [*self.shared.cameras.items()][number[0]]
         poses = poses_from_marks(points, self.lever)
-        for view in [view for set_up, view in views.items() if set_up.partition("/")[0] == name][-1:]:
-            poses = view(poses)
-        return camera, inverse_poses(poses) if self.on_tool else poses
+        for own in (one.devices for one in devices if one.devices.kind in TRANSFORMS):
+            last = [k for k, set_up in enumerate(own.names) if set_up.partition("/")[0] == name][-1:]
+            poses = own.view(last[0], poses) if last else poses
+        boards = inverse_poses(poses) if self.on_tool else poses
+        there = sees(camera, boards)
+
+        def images(copies: Any) -> Any:
+            if camera.view is None or not bool(there.any()):
+                return copies
+            shown = torch.where(there[:, None, None], boards, boards[there][0])
+            covariance, effects = expected(camera, shown)
+            return copies.with_board_at(copies.q, shown, (covariance, effects @ camera.root))
+
+        return Elsewhere(there, points.new_zeros(0, 3), images)
 
     def sentences(self) -> list[str]:
         lines = super().sentences()

@@ -35,7 +35,7 @@ from diffeo_calib.calibration.identification.identification import (
     with_ball,
 )
 from diffeo_calib.calibration.placing.lens import LensAndBoard
-from diffeo_calib.calibration.placing.placement import OtherLabel, OtherRows, Placement
+from diffeo_calib.calibration.placing.placement import Elsewhere, OtherLabel, OtherRows, Placement
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
     ball_of,
@@ -171,32 +171,10 @@ class Placed:
                 return row.unit[0], float(one.devices.in_unit(row, torch.ones_like(row.values))[0, 0])
         return shown_unit("m")
 
-    def row_like(self, q: Tensor) -> int:
-        """Number of the last row as which some of the configurations q (M, n) can be measured; else the very last."""
-        last = len(self.data) - 1
-        return next((row for row in range(last, -1, -1) if bool(self.sees(row, q).any())), last)
-
-    def sees(self, row: int, q: Tensor) -> Tensor:
-        """(M,) boolean: configurations that can be measured as a row was, by a camera that sees its board."""
-        points, views = self.identification.geometry.points(q), self.placement.views()
-        every = torch.ones(len(q), dtype=torch.bool, device=q.device)
-        return torch.stack([every, *(own.sees(row, points, views) for own in self.placement)]).all(0)
-
-    def places_to_reach(self, row: int) -> dict[str, Tensor]:
-        """Where configurations bring the ball that are measured as a row was: see :func:`candidates`."""
-        geometry = self.identification.geometry
-        for own in self.placement:
-            if (found := own.places_at(row)) is not None:
-                base = geometry.base.to(found)
-                return {"places": (found - base[:3, 3]) @ base[:3, :3], "ball": geometry.tool[-1]}
-        return {}
-
-    def measured_at(self, row: int, like: Any, q: Tensor) -> Any:
-        """M copies ``like`` of a row as it would be measured at q (M, n), rad or m."""
-        points, views = self.identification.geometry.points(q), self.placement.views()
-        for own in self.placement:
-            like = own.measured_at(row, like, points, views)
-        return like
+    def elsewhere(self, row: int, q: Tensor) -> list[Elsewhere]:
+        """A row at other configurations q (M, n), as far as the devices of each set measured it."""
+        points = self.identification.geometry.points(q)
+        return [own.elsewhere(row, points, self.placement) for own in self.placement]
 
     def settled(self, fitted: Fit, fitted_map: FittedMap, chosen: ChosenScales) -> Placed:
         """The same with the devices where a fit puts them, and with all markers of the model.

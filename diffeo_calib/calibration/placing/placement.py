@@ -9,7 +9,7 @@ columns Z are the effects of shifts c ~ N(0, I). After the fit their posterior i
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -24,8 +24,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.sensors.devices import Extrinsics, Hypothesis
-from diffeo_calib.sensors.places import PlacedDevices
-from diffeo_calib.sensors.set_ups import SetUps, View
+from diffeo_calib.sensors.set_ups import SetUps
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings
 
 S = TypeVar("S", bound="DeviceSet")
@@ -73,16 +72,25 @@ class Settled(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DeviceSet(ABC):
-    """Devices of one kind and the rows that they measured."""
+    """Devices of one kind in a calibration."""
 
-    devices: Extrinsics  # where they are; before a fit the deviations of their increments are those of the prior
-    rows: Tensor  # (M,) numbers of the rows that they measured
-    device: Tensor  # (M,) which of them did
+    # where they are, and their rows; before a fit the deviations of their increments are those of the prior
+    devices: Extrinsics
 
     @property
     def names(self) -> tuple[str, ...]:
         """Of the devices."""
         return self.devices.names
+
+    @property
+    def rows(self) -> Tensor:
+        """(M,) numbers of the rows that they measured."""
+        return self.devices.rows
+
+    @property
+    def device(self) -> Tensor:
+        """(M,) which of them did."""
+        return self.devices.device
 
     def by_row(self, count: int) -> Tensor:
         """(N,) numbers of the devices of all rows, -1 for rows of none."""
@@ -92,7 +100,11 @@ class DeviceSet(ABC):
 
     def of_rows(self: S, rows: Tensor) -> S:
         """The same among more rows, of which these (M,) are those here."""
-        return replace(self, rows=rows[self.rows])
+        return self.measuring(rows[self.rows], self.device)
+
+    def measuring(self: S, rows: Tensor, device: Tensor) -> S:
+        """The same devices with other rows (M,), each of one of them."""
+        return replace(self, devices=replace(self.devices, rows=rows, device=device))
 
     @property
     @abstractmethod
@@ -115,10 +127,6 @@ class DeviceSet(ABC):
         """Rows that tell coordinates where these devices put them."""
         return table
 
-    def placed(self) -> PlacedDevices:
-        """Their entries for the model file."""
-        return PlacedDevices(self.devices, self.rows, self.device)
-
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:  # noqa: B027
         """Warn (DiffeoCalibWarning) of what these devices leave open in a model, and of what would show it."""
 
@@ -139,29 +147,9 @@ class DeviceSet(ABC):
         """Better names of what stands, and of what is on the tool, than those of diagnostics/hypotheses.py."""
         return {}
 
-    def views(self) -> Mapping[str, View]:
-        """Name of a set-up -> how it sees poses of the model; none if there is one set-up."""
-        return {}
-
-    def sees(self, row: int, points: Tensor, views: Mapping[str, View]) -> Tensor:
-        """(M,) boolean: whether points (M, P, 3), m, can be measured as a row was, as far as these devices measured it.
-
-        Args:
-            row: number in the table. points: of the model. views: those of all devices.
-        """
-        return torch.ones(len(points), dtype=torch.bool, device=points.device)
-
-    def measured_at(self, row: int, like: T, points: Tensor, views: Mapping[str, View]) -> T:
-        """M copies ``like`` of a row at other joint values, as these devices would measure them there.
-
-        Args:
-            row: its number in the table. points: (M, P, 3) of the model there, m. views: those of all devices.
-        """
-        return like
-
-    def places_at(self, row: int) -> Tensor | None:
-        """(D, 3) places in the measuring frame, m, to which a row of this kind brings the ball; None for anywhere."""
-        return None
+    def elsewhere(self, row: int, points: Tensor, devices: Placement) -> Elsewhere:
+        """A row of the table at other points (M, P, 3) of the model, m, as far as these of all devices measured it."""
+        return Elsewhere(torch.ones(len(points), dtype=torch.bool, device=points.device), points.new_zeros(0, 3))
 
     def sentences(self) -> list[str]:
         """Where the devices are."""
@@ -187,10 +175,6 @@ class Placement(tuple[DeviceSet, ...]):
     def bodies(self) -> Mapping[str, str]:
         """See :attr:`DeviceSet.bodies`."""
         return {name: words for own in self for name, words in own.bodies.items()}
-
-    def views(self) -> dict[str, View]:
-        """Those of all devices, see :meth:`DeviceSet.views`."""
-        return {name: view for own in self for name, view in own.views().items()}
 
     def shared(self, data: Seen) -> Tensor:
         """Effects of all devices, side by side: (N, R, c)."""
@@ -233,9 +217,17 @@ class Placement(tuple[DeviceSet, ...]):
             found[name] = own | {key: before[key] | own[key] for key in before}
         return found
 
-    def placed(self) -> tuple[PlacedDevices, ...]:
-        """Entries of all devices for the model file."""
-        return tuple(found for own in self if (found := own.placed()).names)
+    def placed(self) -> tuple[Extrinsics, ...]:
+        """What a model keeps of all devices."""
+        return tuple(own.devices for own in self if own.names)
+
+
+class Elsewhere(NamedTuple):
+    """A row as some devices would measure it at M other configurations."""
+
+    there: Tensor  # (M,) boolean, where they can
+    places: Tensor  # (D, 3) in the measuring frame, m, to which it has to bring the ball; none for anywhere
+    changed: Callable[[Any], Any] = lambda copies: copies  # of a table, copies of the row at these joint values
 
 
 class OtherLabel(NamedTuple):

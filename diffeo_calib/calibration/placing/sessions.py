@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -28,7 +27,6 @@ from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register, register_inliers, spread
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherLabel, OtherRows, Seen, Settled
-from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.fitting.result import Progress
 from diffeo_calib.measurements.observations import Observations
@@ -44,7 +42,6 @@ from diffeo_calib.sensors.set_ups import (
     MeasuringFrames,
     MountedMarkers,
     SetUps,
-    View,
     frame_slopes,
     sessions_of,
     set_up_kind,
@@ -118,7 +115,7 @@ class Sessions(DeviceSet):
         reference = int(torch.bincount(session[session != NO_SOCKET], minlength=len(names)).argmax())
         found = kind.of(seen, data, geometry.marker_turns)
         rows = (session != NO_SOCKET).nonzero()[:, 0]
-        return cls(found.with_reference(reference), rows, session[rows], reference, data.markers)
+        return cls(found.with_reference(reference), reference, data.markers).measuring(rows, session[rows])
 
     @staticmethod
     def beside(
@@ -175,9 +172,6 @@ class Sessions(DeviceSet):
         moved = self.devices.moved(self.others, steps, std, found.centre, found.transform)
         return replace(self, devices=moved if found.known is None else moved.after(found.known))
 
-    def views(self) -> dict[str, View]:
-        return {name: partial(self.devices.view, number) for number, name in enumerate(self.names)}
-
     def labels(self, own: Coordinates, seen: Tensor) -> Iterator[OtherLabel]:
         session = self.by_row(int(own.rows.max()) + 1)[own.rows]
         points, count = own.table.points, self.markers
@@ -196,7 +190,7 @@ class Sessions(DeviceSet):
         if other.coordinates is not None and device is not None:
             number = self.devices.numbers(device.table)
             rows, number = other.coordinates.rows[device.rows][number != NO_SOCKET], number[number != NO_SOCKET]
-        return replace(self, rows=rows, device=number, centre=other.centre)
+        return replace(self, centre=other.centre).measuring(rows, number)
 
 
 def _doubt(robot: Tree, data: Measurements, median: float) -> None:
@@ -239,9 +233,8 @@ class Drift(DeviceSet):
         joints = tuple(zip(chain.joint_names, chain.periodic, strict=True))
         nothing = values.new_zeros(values.shape[1], OFFSETS + len(joints))
         ends = values.amin(0), values.amax(0), *values.new_zeros(3, len(nothing))
-        known = KnownDrift(data.covariate_names, torch.cat([torch.stack(ends, 1), nothing], 1), nothing, joints)
-        none = torch.zeros(0, dtype=torch.int64, device=HOST)
-        return [cls(known, none, none, known.ramp(data), data.q)]
+        known = KnownDrift(data.covariate_names, torch.cat([torch.stack(ends, 1), nothing], 1), nothing, joints=joints)
+        return [cls(known, known.ramp(data), data.q)]
 
     @property
     def size(self) -> int:

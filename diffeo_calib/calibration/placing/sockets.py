@@ -10,9 +10,8 @@ Without a device no row says where the robot's base is: base and error twist of 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -39,7 +38,7 @@ from diffeo_calib.calibration.identification.registration import (
     register_sockets,
     socket_means,
 )
-from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
+from diffeo_calib.calibration.placing.placement import DeviceSet, Elsewhere, OtherRows, Placement, Seen, Settled
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.checks import numbers_of
@@ -51,10 +50,8 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import VALUE, Hypothesis
-from diffeo_calib.sensors.set_ups import View, frame_slopes
+from diffeo_calib.sensors.set_ups import frame_slopes
 from diffeo_calib.sensors.sockets import IN_SOCKET_M, SocketPlaces, socket_errors
-
-T = TypeVar("T")
 
 ALIKE = 0.05
 """Deviation of a block's distance from one place to another, relative to that of the distance itself."""
@@ -101,8 +98,8 @@ class SocketDevices(DeviceSet):
         root = torch.linalg.solve_triangular(R[:, :-1], wide, upper=True)
         places, rows = positions + (root @ R[:, -1]).view(-1, 3), (data.socket_numbers != NO_SOCKET).nonzero()[:, 0]
         covariance = root @ root.mT
-        devices = SocketPlaces(sockets.names, places, _deviations(covariance))
-        return cls(devices, rows, data.socket_numbers[rows], sockets, root, not data.without_device, covariance)
+        devices = SocketPlaces(sockets.names, places, _deviations(covariance), rows, data.socket_numbers[rows])
+        return cls(devices, sockets, root, not data.without_device, covariance)
 
     @classmethod
     def around_model(cls, table: Measurements, rows: Tensor, seen: Tensor) -> list[SocketDevices]:
@@ -142,21 +139,12 @@ class SocketDevices(DeviceSet):
         points[rows, -1] = self.positions[table.socket_numbers[rows]]
         return with_attributes(table, points=points)
 
-    def places_at(self, row: int) -> Tensor | None:
-        return self.positions if bool((self.rows == row).any()) else None
-
-    def sees(self, row: int, points: Tensor, views: Mapping[str, View]) -> Tensor:
-        places = self.places_at(row)
-        if places is None:
-            return super().sees(row, points, views)
-        return torch.cdist(points[:, -1], places.to(points)).amin(1) < IN_SOCKET_M
-
-    def measured_at(self, row: int, like: T, points: Tensor, views: Mapping[str, View]) -> T:
-        places = self.places_at(row)
-        if places is None:
-            return like
-        nearest = torch.cdist(points[:, -1], places.to(points)).argmin(1)
-        return with_attributes(like, socket=nearest, sockets=self.sockets)
+    def elsewhere(self, row: int, points: Tensor, devices: Placement) -> Elsewhere:
+        if not bool((self.rows == row).any()):
+            return super().elsewhere(row, points, devices)
+        away, nearest = torch.cdist(points[:, -1], self.positions.to(points)).min(1)
+        there = {"socket": nearest, "sockets": self.sockets}
+        return Elsewhere(away < IN_SOCKET_M, self.positions, lambda copies: with_attributes(copies, **there))
 
     @property
     def size(self) -> int:
@@ -186,7 +174,7 @@ class SocketDevices(DeviceSet):
             B = frame_slopes(positions[None], positions.mean(0))[0]  # (3 S, 6)
             root = root - B @ (torch.linalg.pinv(B) @ root)
         covariance = root @ found.covariance @ root.mT
-        devices = SocketPlaces(self.names, positions, _deviations(covariance))
+        devices = replace(self.devices, constants=positions, deviations=_deviations(covariance))
         left_out = () if found.chosen is None else self._left_out(found.chosen)
         return replace(self, devices=devices, covariance=covariance, left_out=left_out)
 
@@ -195,7 +183,7 @@ class SocketDevices(DeviceSet):
         if other.coordinates is not None:
             socket = self.named(other.coordinates.table).socket_numbers
             rows, socket = other.coordinates.rows[socket != NO_SOCKET], socket[socket != NO_SOCKET]
-        return replace(self, rows=rows, device=socket)
+        return self.measuring(rows, socket)
 
     def named(self, table: Measurements) -> Measurements:
         """The rows of a table with these sockets; MeasurementError for others."""
@@ -210,14 +198,14 @@ class SocketDevices(DeviceSet):
         What the others tell about shifts that they share with it, those of a distance, is no prediction of the model.
         """
         data, sockets, found = chosen.data, self.sockets, []
-        numbers, process = data.numbers, data.process(chosen.selection.scales)
-        shared = numbers.S[:, data.sensitivities.shape[2] :]
+        process = data.process(chosen.selection.scales)
+        numbers, shared = process.numbers, process.numbers.of_table(data.shared)
         socket = self.by_row(len(data.y))
         place = torch.where(socket == NO_SOCKET, NO_SOCKET, sockets.place[socket])
         ball = numbers.cells % numbers.shape[1] >= numbers.shape[1] - 3
         for number, name in enumerate(sockets.place_names):
             index = (ball & (place[numbers.owner] == number)).nonzero()[:, 0]
-            index, rows = index[numbers.cells[index].argsort()], (place == number).nonzero()[:, 0]
+            rows = (place == number).nonzero()[:, 0]
             errors = process.left_out(place.new_full(numbers.cells.shape, -1).index_fill(0, index, 0))[0][index]
             others = process.mu - process.inverse[:, index] @ errors  # K^-1 y without the place
             errors = errors + shared[index] @ (shared.T @ others)

@@ -41,14 +41,8 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import Tails
-from diffeo_calib.regression.conditional import (
-    Conditional,
-    Fields,
-    Opened,
-    diagonal_blocks,
-    lower_root,
-    without_rigid_motions,
-)
+from diffeo_calib.regression.cholesky import lower_root
+from diffeo_calib.regression.conditional import BeforeData, Conditional, Opened, diagonal_blocks, without_rigid_motions
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
@@ -128,7 +122,7 @@ class Scene(NamedTuple):
         """
         told, noise, place = rows
         at, seen = known.features(self.at.rows(targets)), known.features(told)
-        P = torch.eye(at.values.shape[1], dtype=at.values.dtype, device=at.values.device)
+        P = torch.eye(at.known.shape[1], dtype=at.known.dtype, device=at.known.device)
         if self.free:
             B = at.at.sensitivity[..., self.motions].flatten(0, 1)
             P = P - B @ torch.linalg.pinv(B)
@@ -217,7 +211,7 @@ def of_robot(
     scales = defaults(around(near), residual, Prior()) if scales is None else scales
     data = replace(around(q), held=held_parameters(geometry, adrift=free), adrift=free)
     deviations, noise = data.prior_variance(scales).sqrt(), data.noise(scales)
-    known = Opened(Fields(), 0, deviations), data.linearisation(scales), len(deviations)
+    known = BeforeData(deviations), data.linearisation(scales), len(deviations)
     averaged = Bodies(lever).averaging(noise)
     scene = Scene(*known, data.points, noise, geometry.base, averaged, points.numel(), free, unplaced=False)
     return scene, numbers
@@ -292,8 +286,8 @@ def without_positions(model: CalibratedKinematics) -> bool:
     shared = model.map.noise.shared
     other = torch.zeros(len(shared), dtype=torch.bool, device=shared.device)
     for own in model.placement:
-        if own.devices.seen_points or own.devices.cameras:
+        if own.seen_points or own.cameras:
             other[own.rows] = True
-        if own.devices.cameras:
+        if own.cameras:
             other |= (shared != 0).any(1).sum(1) >= len(UNKNOWNS)
     return bool(other.all())

@@ -21,11 +21,12 @@ from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.maps.linearisation import Numbers
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.lines import write_rows
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.regression.conditional import Conditional, Given, Opened
+from diffeo_calib.regression.conditional import Conditional, Opened
 from diffeo_calib.robots.tree import Tree
 
 SMALLEST_STROKE = 1e-9
@@ -259,7 +260,7 @@ def plan(
     new = options.noise.new_ones(options.at.sensitivity.shape[2] - scene.columns)
     posterior: Conditional = Opened(scene.known, scene.columns, new)
     for rows in measured_rows:
-        posterior = Given(posterior, rows.at, rows.noise)
+        posterior = Conditional.given(posterior, Numbers.of(rows.at), rows.noise)  # of any size
     order, variance = scene.choose(posterior, (options.at, options.noise, options.rows), targets, count)
     LOG.info("%d poses chosen of %d", count, len(q))
     blocks = scene.without_motions(posterior, targets).covariance(scene.at.rows(wanted))

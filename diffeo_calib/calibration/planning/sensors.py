@@ -342,11 +342,11 @@ def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
     """
     found: list[Sensor] = [] if without_positions(model) else [Positions(of_frames=model.lever is not None)]
     for own in model.placement:
-        for k, (name, seen) in enumerate(own.devices.cameras.items()):
+        for k, (name, seen) in enumerate(own.cameras.items()):
             found.append(BoardImages(model=model, name=name, seen=seen, rows=own.rows[own.device == k]))
     words = [word for own in model.placement for word in own.names]
     for own in model.placement:
-        for number, word in enumerate(own.names if own.devices.seen_points else ()):
+        for number, word in enumerate(own.names if own.seen_points else ()):
             name = f"{own.kind} {word}" if words.count(word) > 1 else word
             found.append(DeviceReadings(names=(name,), devices=(FittedDevice.of(model.map, own, number),), new=False))
     if not found:

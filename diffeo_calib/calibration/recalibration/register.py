@@ -41,12 +41,13 @@ from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.maps.observation import LinearFunctionals, Observation, Part, Stacked
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.regression.choose import MAX_DENSE
+from diffeo_calib.regression.conjugate_gradients import MAX_DENSE
 from diffeo_calib.robots.payload import joined_masses
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import sensor_of
+from diffeo_calib.sensors.devices import Extrinsics
 from diffeo_calib.sensors.known_drift import KnownDrift
-from diffeo_calib.sensors.places import PlacedDevices, mounted_of
+from diffeo_calib.sensors.places import mounted_of
 from diffeo_calib.sensors.set_ups import frame_slopes
 from diffeo_calib.sensors.tables import measured_positions, rows_of_one_kind
 
@@ -66,7 +67,7 @@ def registered(
     rows = measured_positions(new)
     check_same_robot(model, new)
     if rows is None:
-        return model._with(placement=devices_beside(model, new))
+        return model.changed(placement=devices_beside(model, new))
     rows = mounted_of(model).in_any_frame(rows).largest_session()
     rows = sensor_of(rows).with_points(rows, model)
     here = model.to(HOST)._carrying(model.nominal.load.under(rows.payload).typical)
@@ -76,16 +77,16 @@ def registered(
     found = replace(found, table_sha256=" ".join([before, new.sha256][: 1 + learns]).strip())
     vars(placed).update({} if learns else {"registration": found})
     known = {"map": placed.to(model.configurations.device), "lever": found.lever, "placement": (), "ball": ball}
-    seen = model._with(**known, learnt=found if learns else None)._carrying(model.nominal.load)
+    seen = model.changed(**known, learnt=found if learns else None)._carrying(model.nominal.load)
     same = found.same and ball == model.ball
-    lost = [own for own in model.placement if own.devices.reads and not same]
+    lost = [own for own in model.placement if own.reads and not same]
     if lost:
         names = few([f"'{name}'" for own in lost for name in own.names])
         what = f"the model no longer knows the devices {names}: these rows show other markers than what they read"
         warn_user(sentence(what, fix="pass rows of the fit's markers, or rows of these devices, to keep them"))
-    kept = model._with(placement=tuple(own for own in model.placement if own not in lost))
-    seen = seen._with(placement=carried_devices(kept, seen, found.transform))
-    return seen._with(placement=devices_beside(seen, new))
+    kept = model.changed(placement=tuple(own for own in model.placement if own not in lost))
+    seen = seen.changed(placement=carried_devices(kept, seen, found.transform))
+    return seen.changed(placement=devices_beside(seen, new))
 
 
 @small_work()
@@ -204,7 +205,7 @@ def _sessions(tool: Tensor, new: NewRows, newest: GeometryMap) -> SessionMarkers
     return SessionMarkers(newest, torch.cat([session, latest]), torch.cat([tools, newest.geometry.tool[None]]))
 
 
-def devices_beside(model: Any, data: Any, fitted: Sequence[PlacedDevices] = ()) -> tuple[PlacedDevices, ...]:
+def devices_beside(model: Any, data: Any, fitted: Sequence[Extrinsics] = ()) -> tuple[Extrinsics, ...]:
     """The devices of rows of any kinds, placed around a calibrated model that knows the rows' points.
 
     Devices that the model knows and that have no rows stay where they are.
@@ -219,25 +220,25 @@ def devices_beside(model: Any, data: Any, fitted: Sequence[PlacedDevices] = ()) 
         points = model.at_payloads(part.payload).map(part.q).detach().unflatten(1, (-1, 3))
         for placed in sensor_of(part).settled(part, points, model.turns):
             own = _with_rows(placed, fitted)
-            alike = [number for number, old in enumerate(found) if own.devices.same_set(old.devices)]
+            alike = [number for number, old in enumerate(found) if own.same_set(old)]
             same = alike[0] if alike else len(found)
-            alone = [] if own.devices.set_up and len(own.names) == 1 else [own]
+            alone = [] if own.set_up and len(own.names) == 1 else [own]
             found[same : same + 1] = [own.beside(old) for old in found[same : same + 1]] or alone
     return tuple(found)
 
 
-def _with_rows(own: PlacedDevices, fitted: Sequence[PlacedDevices]) -> PlacedDevices:
+def _with_rows(own: Extrinsics, fitted: Sequence[Extrinsics]) -> Extrinsics:
     """Devices with their rows of a fit, if any set of it has them; set-ups are where the fit has them."""
     for one in fitted:
-        if one.devices.same_set(own.devices) and own.devices.set_up:
+        if one.same_set(own) and own.set_up:
             return one
-        if one.devices.same_set(own.devices):
+        if one.same_set(own):
             number = torch.tensor([own.names.index(name) for name in one.names], dtype=torch.int64, device=HOST)
             return replace(own, rows=one.rows, device=number[one.device])
     return own
 
 
-def carried_devices(old: Any, new: Any, T: Tensor) -> tuple[PlacedDevices, ...]:
+def carried_devices(old: Any, new: Any, T: Tensor) -> tuple[Extrinsics, ...]:
     """The devices of a model beside another one of the same robot, as it stands among them.
 
     A drift is none of them: it belongs to the rows of the old fit.
@@ -254,7 +255,7 @@ def carried_devices(old: Any, new: Any, T: Tensor) -> tuple[PlacedDevices, ...]:
     away = (before @ T[:3, :3].mT + T[:3, 3])[:, :P] - after[:, :P]
     markers = (turns[:, :P].mT @ away[..., None])[..., 0].mean(0)
     return tuple(
-        replace(own, devices=replace(own.devices, constants=own.devices.carried(T, before, after, markers)))
+        replace(own, constants=own.carried(T, before, after, markers))
         for own in old.placement
         if own.kind != KnownDrift.kind
     )

@@ -23,9 +23,8 @@ from torch import Tensor
 
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.process.evidence import Evidence
-from diffeo_calib.process.numbers import joint_weights
-from diffeo_calib.process.process import Process
-from diffeo_calib.process.scales import GearLine, Hyperparameters
+from diffeo_calib.process.scales import GearLine, Hyperparameters, joint_weights
+from diffeo_calib.regression.conditional import Process
 
 MEDIAN_OF_CHANCE = 2.0 * log(2.0)
 """Median of chi-squared with two degrees of freedom."""
@@ -103,11 +102,10 @@ class _Scan:
     """What the scan needs of K^-1; lines that were found are unknowns of the process."""
 
     def __init__(self, process: Process) -> None:
-        self.process, numbers = process, process.numbers
-        self.q = numbers.q - numbers.q.mean(0)
-        self.pairs = joint_weights(numbers, numbers, process.inverse).transpose(0, 1)  # (n, N, N) J_l^T K^-1 J_l
-        rows = [(part.J.mT @ process.mu[part.numbers].view(*part.cells.shape, 1))[..., 0] for part in numbers.parts]
-        self.rows = torch.cat(rows).T  # (n, N) J_l^T K^-1 r
+        self.process, numbers, at = process, process.numbers, process.numbers.at
+        self.q, J = at.xi - at.xi.mean(0), at.joint_to_start
+        self.pairs = joint_weights(J, numbers.square(process.inverse))  # (n, N, N) J_l^T K^-1 J_l
+        self.rows = torch.einsum("irn,ir->ni", J, numbers.in_table(process.mu))  # (n, N) J_l^T K^-1 r
         first, last = (round(w / STEP) for w in (LOWEST, HIGHEST))
         self._steps = slice(first, last + 1)
         self.frequencies = STEP * torch.arange(first, last + 1, dtype=self.q.dtype, device=self.q.device)
@@ -170,7 +168,8 @@ class _Scan:
         """The scan beside a line of any amplitude."""
         waves = self._waves(joint, self.q.new_tensor([frequency]))[:, 0]
         numbers = self.process.numbers
-        return _Scan(self.process.opened(numbers.J[:, joint, None] * waves[numbers.row]))
+        effects = numbers.at.joint_to_start[:, :, joint, None] * waves[:, None]
+        return _Scan(self.process.opened(numbers.of_table(effects)))
 
     def width(self, joint: int) -> float:
         """Distance from a peak within which its side lobes lie, which predict the same in the joint's range."""

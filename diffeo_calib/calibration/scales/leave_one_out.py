@@ -23,13 +23,13 @@ beside them show it too, and add one for each configuration.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf, nan
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.scales.selection import SEARCH_LIMITS, select
+from diffeo_calib.calibration.scales.selection import COORDINATES, POSES, select
 from diffeo_calib.calibration.scales.tangent_data import KEPT_COORDINATES, TangentData
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.quantiles import chi2_median
@@ -74,32 +74,23 @@ class LeaveOneOut:
         return region_factor(freedom, 3)
 
 
-def weighed(
-    data: TangentData,
-    scales: Hyperparameters,
-    seed: int = 0,
-    *,
-    rounds: int = ROUNDS,
-    block_coordinates: int = BLOCK_COORDINATES,
-) -> TangentData:
+def weighed(data: TangentData, scales: Hyperparameters, seed: int = 0) -> TangentData:
     """The measurements with the weights that outliers get with these scales, by expectation maximisation.
 
     Memory does not grow with the number of blocks. An outlier anywhere counts: no sample could stand for all rows.
 
     Args:
         data: the measurements, with the weights to begin with. scales: held fixed. seed: draws the blocks.
-        rounds: largest number of steps.
-        block_coordinates: largest number of measured coordinates of a block.
     """
-    told, tails = data.told, data.tails
-    for _ in range(rounds):
+    tails = data.tails
+    for _ in range(ROUNDS):
         squares = torch.empty_like(tails.weights)
-        for rows, part in _parts(told, seed, block_coordinates):
+        for rows, part in _parts(data, seed):
             squares[rows] = _expected_squares(part, scales, tails.rows(rows))
-        before, tails = tails, reweight(squares, told.noise_model.freedom)
+        before, tails = tails, reweight(squares, data.noise_model.freedom)
         if _settled(before, tails):
             break
-    return data.with_tails(_among_gross(told, scales, tails, seed))
+    return data.with_tails(_among_gross(data, scales, tails, seed))
 
 
 def _among_gross(data: TangentData, scales: Hyperparameters, tails: Tails, seed: int) -> Tails:
@@ -119,22 +110,19 @@ def _settled(before: Tails, after: Tails) -> bool:
     return float((after.weights / before.weights - 1.0).abs().max()) < WEIGHT_CHANGE
 
 
-def leave_one_out(
-    data: TangentData, scales: Hyperparameters, seed: int = 0, *, block_coordinates: int = BLOCK_COORDINATES
-) -> LeaveOneOut:
+def leave_one_out(data: TangentData, scales: Hyperparameters, seed: int = 0) -> LeaveOneOut:
     """Leave-one-out errors in closed form; arguments as of :func:`weighed`."""
-    told = data.told
-    errors, squares = torch.empty_like(told.y), torch.empty_like(told.tails.weights)
-    effective = []
-    for rows, part in _parts(told, seed, block_coordinates):
+    errors, squares = torch.empty_like(data.y), torch.empty_like(data.tails.weights)
+    effective, count = [], 0
+    for rows, part in _parts(data, seed):
         every = torch.arange(len(rows), device=rows.device)
         errors[rows], squares[rows] = left_out_rows(part, scales, every, part.noise(scales))
-        inverse = part.numbers.diagonal_blocks(part.process(scales).inverse)
-        own = part.numbers.blocks_of_table(part.weighted_noise(scales))
-        noise = float(sum((one * block).sum() for one, block in zip(own, inverse, strict=True)))
-        effective.append(part.coordinates - noise)
-    errors = data.in_coordinates(errors).masked_fill(~data.visible, nan)
-    return LeaveOneOut(errors, squares, effective[0] if len(effective) == 1 else None, told.coordinates)
+        process = part.process(scales)
+        noise = float((part.noise_of_numbers(scales) * process.numbers.blocks(process.inverse)).sum())
+        effective.append(len(process.mu) - noise)
+        count += len(process.mu)
+    errors = errors.masked_fill(~data.visible, nan)
+    return LeaveOneOut(errors, squares, effective[0] if len(effective) == 1 else None, count)
 
 
 def variance_ratio(data: TangentData, left_out: LeaveOneOut) -> float:
@@ -142,33 +130,33 @@ def variance_ratio(data: TangentData, left_out: LeaveOneOut) -> float:
     return float((left_out.squares / data.noise_model.of_freedom(chi2_median, left_out.squares)).nanmedian())
 
 
-def _parts(data: TangentData, seed: int, coordinates: int) -> Iterator[tuple[Tensor, TangentData]]:
+def _parts(data: TangentData, seed: int) -> Iterator[tuple[Tensor, TangentData]]:
     """Row numbers and data of random blocks of about equal size, each with about so many coordinates at most.
 
     A single one is the data themselves, with the matrices that they keep; a few are kept with the data.
     """
-    count, every = -(-data.y.numel() // coordinates), torch.arange(len(data.x), device=data.x.device)
+    count, every = -(-len(data.x) * data.size // BLOCK_COORDINATES), torch.arange(len(data.x), device=data.x.device)
     if count == 1:
         yield every, data
         return
-    parts, key = vars(data).setdefault("blocks", {}), (seed, coordinates)
-    if key not in parts:
+    parts = vars(data).setdefault("blocks", {})
+    if seed not in parts:
         order = torch.randperm(len(data.x), generator=seeded(seed), device=HOST)
         found = ((rows, data.rows(rows)) for rows in order.to(every.device).tensor_split(count))
-        if data.y.numel() > KEPT_BLOCKS:
+        if len(data.x) * data.size > KEPT_BLOCKS:
             yield from found
             return
-        parts[key] = list(found)
-    yield from parts[key]
+        parts[seed] = list(found)
+    yield from parts[seed]
 
 
 def _expected_squares(part: TangentData, scales: Hyperparameters, tails: Tails) -> Tensor:
     """Expected squared distances of the errors in units of the noise without tails: (N, bodies)."""
     part.expected(scales)  # the same for all weights
-    data, numbers = part.with_tails(tails), part.numbers
+    data = part.with_tails(tails)
     process, noise = data.process(scales), data.weighted_noise(scales)
-    inverse = numbers.blocks_in_table(numbers.diagonal_blocks(process.inverse))
-    residual = noise @ numbers.in_table(process.mu)[:, :, None]
+    inverse = data.blocks_in_coordinates(process.numbers.blocks(process.inverse))
+    residual = noise @ data.in_coordinates(process.numbers.in_table(process.mu)[:, :, None])
     moments = residual @ residual.mT + noise - noise @ inverse @ noise
     return data.noise_model.squares(data.noise(scales), moments)
 
@@ -180,10 +168,10 @@ def left_out_rows(data: TangentData, scales: Hyperparameters, part: Tensor, new:
         data: the measurements. scales: held fixed. part: (N,) that is left out with each row; negative for none: NaN.
         new: (N, m, m) noise of a new measurement like each row, whose predicted covariance is the unit of squares.
     """
-    numbers, process, own = data.numbers, data.process(scales), data.weighted_noise(scales)
-    errors, covariance = process.left_out(part[numbers.owner])
-    errors = numbers.in_table(errors)
-    predicted = numbers.blocks_in_table(numbers.diagonal_blocks(covariance)) - own + new
+    process, own = data.process(scales), data.weighted_noise(scales)
+    errors, covariance = process.left_out(part[process.numbers.owner])
+    errors = data.in_coordinates(process.numbers.in_table(errors)[:, :, None])[:, :, 0]
+    predicted = data.blocks_in_coordinates(process.numbers.blocks(covariance)) - own + new
     predicted = torch.where(part[:, None, None] < 0, own, predicted)
     return errors, data.noise_model.squares(predicted, errors[:, :, None] * errors[:, None])
 
@@ -225,7 +213,7 @@ def cross_validated_inflation(
     Returns:
         None if Ctrl-C ended the search.
     """
-    chosen, _ = data.sample(SEARCH_LIMITS.poses, SEARCH_LIMITS.coordinates, seed)
+    chosen, _ = data.sample(POSES, COORDINATES, seed)
     new = torch.ones(len(data.x), dtype=torch.bool, device=data.x.device)
     new[chosen] = centre is None
     rows, data = data.sample(len(data.x), MOST_COORDINATES, seed)
@@ -234,12 +222,11 @@ def cross_validated_inflation(
         squares = left_out_squares(data, scales, torch.where(torch.isin(numbers, numbers[new]), numbers, -1))
         squares[~new] = nan
     else:
-        search = replace(SEARCH_LIMITS, iterations=ITERATIONS)
         squares, folds = torch.full_like(data.tails.weights, nan), random_folds(numbers, FOLDS, seed)
         try:
             for done, (inside, rows) in enumerate(folds):
                 progress("cross-validation", done, len(folds))
-                again = select(centre, data.rows(inside), start=scales, seed=seed, limits=search)
+                again = select(centre, data.rows(inside), start=scales, seed=seed, iterations=ITERATIONS)
                 if again.interrupted:
                     return None
                 part = torch.where(torch.isin(numbers, numbers[rows]), numbers, -1)
@@ -267,7 +254,8 @@ def inflation_by_places(
             coordinates share an unknown shift with: its socket.
         groups: (N,) a number for each configuration, the same for its repeats.
     """
-    process, owner = data.process(scales), data.numbers.owner
+    process = data.process(scales)
+    owner = process.numbers.owner
     resting, errors = place >= 0, process.left_out(place[owner])[0]
     total = float((errors * process.mu).nansum())
     sockets = len(torch.stack([place, shared], 1)[resting].unique(dim=0))
@@ -313,4 +301,4 @@ def left_out_squares(data: TangentData, scales: Hyperparameters, part: Tensor) -
 
     NaN for hidden markers, and for rows of no part.
     """
-    return left_out_rows(data.told, scales, part, data.blocks_in_numbers(data.noise_of_new_rows(scales)))[1]
+    return left_out_rows(data, scales, part, data.noise_of_new_rows(scales))[1]

@@ -135,7 +135,7 @@ def run(options: CorrectOptions) -> None:
         added |= tool.added(robot, found, own, table)
     place = {"command": 0, "status": 1, "miss": 2, "angle": 2, "std": 3}
     added = {name: added[name] for name in sorted(added, key=lambda name: place[name.split("_")[0]])}
-    write_columns(options.output, sheet, columns.from_si({"q": found.q}) | added, table)
+    write_columns(options.output, sheet, columns.cells(found.q, {}) | added, table)
     misses = {tool.tip: {"miss_m": tool.own(found.miss), "angle_miss_deg": _degrees(found, tool)} for tool in tools}
     record.add(rows=len(found), statuses=found.counts, misses=misses, files={"program": options.output})
     _summarise(robot, found, tools, [line for line, _ in sheet.rows])

@@ -15,7 +15,6 @@ from diffeo_calib.calibration.expected_errors import ExpectedError, stands_free
 from diffeo_calib.cli.console import out, plain, say, text_table
 from diffeo_calib.cli.declarations import ExportOptions
 from diffeo_calib.cli.models import load_laden, tool_in_tip
-from diffeo_calib.cli.printed import placement_lines
 from diffeo_calib.cli.record import make_folder, record
 from diffeo_calib.common.files import write_together
 from diffeo_calib.interop.c_source import CFiles, c_files
@@ -25,10 +24,9 @@ from diffeo_calib.interop.mjcf import mjcf_text
 from diffeo_calib.interop.rigid import (
     Compared,
     RigidKinematics,
-    applied_with_tables,
     best_joint_offsets,
-    nominal_kinematics,
     rigid_kinematics,
+    with_errors,
 )
 from diffeo_calib.interop.tables import (
     CorrectionTable,
@@ -43,6 +41,7 @@ from diffeo_calib.interop.torch_program import export_onnx, export_torch
 from diffeo_calib.interop.ur_kinematics import ur_text, ur_transforms
 from diffeo_calib.interop.urdf import corrected_urdf, urdf_of
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.bodies import placement_lines
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.known_drift import KnownDrift
@@ -75,7 +74,7 @@ class _Export:
     def __init__(self, model: CalibratedKinematics, given: ExportOptions) -> None:
         self.model, self.given = model, given
         self.files: dict[str, bytes] = {}
-        self.rows: dict[str, RigidKinematics] = {NOMINAL: nominal_kinematics(model)}
+        self.rows: dict[str, RigidKinematics] = {NOMINAL: with_errors(model, None)}
         self.lines: list[str] = []
         self.geometry: Geometry | None = None
 
@@ -84,7 +83,7 @@ class _Export:
         urdf = urdf_of(self.model.robot, self.given.robot) if {"--urdf", "--ur-kinematics"} & {*options} else b""
         found = rigid_kinematics(self.model, transmission=tables)
         self.geometry, name = found.geometry, ", ".join(options)
-        alone = {f"{name} alone": applied_with_tables(self.model, found, applied=False)} if tables else {}
+        alone = {f"{name} alone": with_errors(self.model, found.geometry.joint_errors, found.how)} if tables else {}
         self.rows |= {f"{name} and --correction-tables" if tables else name: found} | alone
         self.lines += [TOGETHER] * tables
         said = ", ".join(f"{name} {1e3 * rms:.4f} mm" for name, rms in found.validated.items())
@@ -122,7 +121,7 @@ class _Export:
             self.lines.append(OFFSETS)
         if "--correction-tables" in wanted:
             tables = correction_tables(self.model)
-            self.rows["--correction-tables, nominal robot"] = nominal_kinematics(self.model, transmission=True)
+            self.rows["--correction-tables, nominal robot"] = with_errors(self.model, None, transmission=True)
             self.files["--correction-tables"] = tables_text(tables, length, angle).encode()
             self.lines += _table_lines(tables)
         if "--field" in wanted:

@@ -11,10 +11,10 @@ from typing import Any
 import typer
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
-from diffeo_calib.calibration.diagnostics.outliers import contradicted
+from diffeo_calib.calibration.diagnostics.outliers import Outlier, contradicted
 from diffeo_calib.calibration.judgement import check_errors
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
-from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, KindErrors, errors_by_kind
+from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC
 from diffeo_calib.cli import printed
 from diffeo_calib.cli.console import EXIT_INTERRUPTED, err, interrupts, out, plain, progress_bar, say, text_table
 from diffeo_calib.cli.declarations import DemoOptions, FitOptions
@@ -22,26 +22,26 @@ from diffeo_calib.cli.main import app
 from diffeo_calib.cli.models import load_kinematics, made_by_command, robot_of
 from diffeo_calib.cli.record import entries_by_kind, kind_entry, make_folder, record
 from diffeo_calib.cli.tables import measured_table
-from diffeo_calib.common.errors import PACKAGE, few, printable
-from diffeo_calib.common.files import write_figure
+from diffeo_calib.common.errors import PACKAGE, few
 from diffeo_calib.interop.model_file import save
+from diffeo_calib.kinematics.evaluation import positions_of
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_entry, hand_eye_sentences
+from diffeo_calib.measurements.bodies import placement_lines
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.reports.plots.errors import stages
 from diffeo_calib.reports.report import write_report
 from diffeo_calib.robots.cartesian import is_cartesian, turns_nowhere
 from diffeo_calib.robots.simulated_arm import SimulatedArm
-from diffeo_calib.sensors.errors import ERRORS
+from diffeo_calib.sensors.errors import ERRORS, Evaluation
 from diffeo_calib.sensors.tables import divided
 
 EXIT_UNCONVERGED = 3
 LARGE_SHARE = 0.5
 """Of the expected error, from which the robot's size is said to be worth measuring."""
 
-Errors = dict[str, KindErrors]
-"""Errors of every stage by the kind of rows."""
+Errors = dict[str, dict[str, Evaluation]]
+"""Errors by the kind of rows and by stage."""
 
 
 def run(given: FitOptions) -> None:
@@ -59,23 +59,37 @@ def run(given: FitOptions) -> None:
     on_tool = None if own is None else own.table.sees_board_from_tool(commanded=commanded)
     hand_eye = {} if on_tool is None else HandEye.of_each(result.model, camera_on_tool=on_tool)
     save(result.model, given.output)  # before anything is printed: output may be cut off
-    in_train, held_out = errors_by_kind(result, train), {} if test is None else errors_by_kind(result, test)
+    in_train, held_out = result.errors(train), {} if test is None else result.errors(test)
     record.add(**hand_eye_entry(hand_eye))
     _record(result, in_train, held_out, given)
-    judged = [one.stages for one in held_out.values() if one.one.what == ERRORS]
+    judged = _of_positions(held_out)
     say(*_verdict(result, judged))
     _show_errors(result, in_train, None if test is None else held_out)
     _show_findings(result, len(train))
-    wrong = [outlier for one in held_out.values() for outlier in contradicted_in_sockets(result.model, one.rows)]
-    for one in held_out.values():
-        wrong += contradicted(result.model, one.rows) if one.one.what == ERRORS else ()
-    wrong.sort(key=lambda outlier: -outlier.distance)
+    wrong = [] if test is None else _wrong(result, test)
     say(*printed.outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"))
     say(*_lines_about_places(result, data, held_out, hand_eye))
     say(*_advice(judged, wrong=bool(wrong), partial=result.partial), f"model: {given.output}")
-    shown, rows = (train, "training") if test is None else (test, "held-out")
-    _write_pictures(result, given, held_out or in_train, f"{rows} rows", shown)
+    if given.report is not None:
+        with progress_bar() as progress:
+            how = {"stages": result.stages, "places": {stage: result.places(stage) for stage in result.stages}}
+            shown = train if test is None else test
+            write_report(result.model, given.report, shown, **how, warnings=record.warnings, progress=progress)
+        say(f"report: {given.report} (open it in a browser)")
     _end(result, in_train, held_out or in_train)
+
+
+def _of_positions(errors: Errors) -> list[dict[str, Evaluation]]:
+    """Errors of measured positions by stage, in a list; an empty one without any."""
+    return [stages for stages in errors.values() if stages[CALIBRATED].what == ERRORS]
+
+
+def _wrong(result: CalibrationResult, test: Any) -> list[Outlier]:
+    """Rows that were not fitted and look wrong, the worst first."""
+    seen, (own, _) = positions_of(result.model, result.places(), test), divided(test)
+    wrong = [] if own is None else contradicted_in_sockets(result.model, own.table)
+    wrong += [] if seen is None else contradicted(result.model, seen)
+    return sorted(wrong, key=lambda outlier: -outlier.distance)
 
 
 def _verdict(result: CalibrationResult, judged: list[Any]) -> Iterator[str]:
@@ -92,9 +106,8 @@ def _end(result: CalibrationResult, in_train: Errors, judged: Errors) -> None:
     """Exit with the code of the fit, or with errors of ``judged`` rows that no calibrated robot has."""
     if result.interrupted or interrupts.asked:
         raise typer.Exit(EXIT_INTERRUPTED)
-    for kind, one in judged.items():
-        if one.one.what == ERRORS and kind in in_train:
-            check_errors(result.model, one.one, in_train[kind].stages[GEOMETRIC].median)
+    for one, fitted in zip(_of_positions(judged), _of_positions(in_train), strict=False):
+        check_errors(result.model, one[CALIBRATED], fitted[GEOMETRIC].median)
     if not result.fit.converged:
         raise typer.Exit(EXIT_UNCONVERGED)
 
@@ -105,10 +118,10 @@ def _lines_about_places(
     """Hidden markers, and where devices, base and markers, or camera and board, were found."""
     placed = result.placed
     placement = list(hand_eye_sentences(hand_eye)) or list(
-        printed.placement_lines(result.model.geometry, poses=placed.lever is not None, ball=placed.ball)
+        placement_lines(result.model.geometry, poses=placed.lever is not None, ball=placed.ball)
     )
     for one in held_out.values():
-        yield from printed.socket_lines(one.one, "held out")
+        yield from printed.socket_lines(one[CALIBRATED], "held out")
     own, _ = divided(data)
     if own is not None and not placed.free:
         seen = own.table.device_rows()
@@ -116,7 +129,7 @@ def _lines_about_places(
         if counts := [f"{name} in {count}" for name, count in hidden if count]:
             yield f"hidden in some of {len(seen)} rows: {few(counts)} of them"
     yield from (*result.placement.sentences(), *map(str, result.lengths[:1]))
-    if any(one.one.what == ERRORS for one in held_out.values()):  # else they are the verdict
+    if _of_positions(held_out):  # else they are the verdict
         yield printed.stage_line(result.model, result.stages, result.expected)
     yield from printed.expectation_lines(result.model, data, result.expected)
     advice = next(filter(None, (one.size_advice() for one in result.placement)), None)
@@ -126,27 +139,11 @@ def _lines_about_places(
     yield from placement[1:] if placed.free else placement  # without a device the robot's base is the measuring frame
 
 
-def _write_pictures(result: CalibrationResult, given: FitOptions, errors: Errors, rows: str, data: Any) -> None:
-    """Draw the figure and write the report, if they are wanted; ``rows`` are what ``data`` to show are."""
-    if given.figure is not None:
-        shown = f"{sum(len(one.rows) for one in errors.values())} {rows}"
-        shown += ", no row was held out" * rows.startswith("training")
-        title = f"{printable(given.csv.name)}: errors on {shown}"
-        write_figure(stages([one.stages for one in errors.values()], title), given.figure)
-        say(f"figure: {given.figure}")
-    if given.report is not None:
-        with progress_bar() as progress:
-            placed = {stage: result.places(stage) for stage in result.stages}
-            how = {"stages": result.stages, "places": placed, "warnings": record.warnings}
-            write_report(result.model, given.report, data, **how, progress=progress)
-        say(f"report: {given.report} (open it in a browser)")
-
-
 def _record(result: CalibrationResult, in_train: Errors, held_out: Errors, given: FitOptions) -> None:
     """Add the results for programs."""
     both = {"training": in_train, "held_out": held_out}
-    kinds = {kind: {rows: one[kind].stages for rows, one in both.items() if kind in one} for kind in in_train}
-    files = {"model": given.output, "figure": given.figure, "report": given.report}
+    kinds = {kind: {rows: one[kind] for rows, one in both.items() if kind in one} for kind in in_train}
+    files = {"model": given.output, "report": given.report}
     record.add(
         **result.placement.entry(),
         **entries_by_kind(kinds),
@@ -172,13 +169,12 @@ def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors |
     fitted = "was held out: these are errors on rows that were fitted"
     none = [f"no row {fitted}, those of new rows are larger (leave-one-out RMS: {result.left_out.rms_text})"]
     for kind, one in in_train.items():
-        table = printed.ErrorTable(one.one, "by stage", "stage", "rows")
-        other = (held_out or {}).get(kind)
-        for name, errors in one.stages.items():
-            table.add(errors, name, f"{errors.count} training")
+        other, rows = (held_out or {}).get(kind), dict[tuple[str, ...], Evaluation]()
+        for name, errors in one.items():
+            rows[name, f"{errors.count} training"] = errors
             if other is not None:
-                table.add(other.stages[name], name, f"{other.stages[name].count} held out")
-        out.print(table)
+                rows[name, f"{other[name].count} held out"] = other[name]
+        out.print(printed.ErrorTable(rows, "by stage", "stage", "rows"))
         say(*none if held_out is None else [f"no row of this kind {fitted}"] * (other is None))
         none = []
 
@@ -232,8 +228,7 @@ def run_demo(given: DemoOptions) -> None:
     lines = [
         ["fit", csv, "--robot", urdf, "--base", arm.nominal.base, "--tip", arm.nominal.tip],
         ["--position", ",".join(POSITION), "--length", "mm", "--angle", "deg"],
-        ["-o", folder / "model.safetensors", "--figure", folder / "calibration.png"],
-        ["--report", folder / "report.html"],
+        ["-o", folder / "model.safetensors", "--report", folder / "report.html"],
     ]
     command = [list(map(str, line)) for line in lines]
     say(f"{given.count} simulated measurements written to {csv}. Now running:\n")

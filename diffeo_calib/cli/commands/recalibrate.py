@@ -15,11 +15,12 @@ from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
 from diffeo_calib.cli.console import progress_bar, say
 from diffeo_calib.cli.declarations import RecalibrateOptions
 from diffeo_calib.cli.models import another_date_lines, load_kinematics, made_by_command, provenance_lines, table_of
-from diffeo_calib.cli.printed import frame_lines, motion_lines, placement_lines
+from diffeo_calib.cli.printed import frame_lines, motion_lines
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.common.errors import InputError, few
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.joint_ranges import repeated_lines, warn_outside_range
+from diffeo_calib.measurements.bodies import placement_lines
 
 
 def run(given: RecalibrateOptions) -> None:
@@ -28,7 +29,7 @@ def run(given: RecalibrateOptions) -> None:
         return _compare(given)
     model = load_kinematics(given.old)
     source = table_of(model, given.other, given)
-    how: Any = {"marker": given.marker_freedom, "seed": given.seed, "drift": given.drift, "note": given.note}
+    how: Any = {"marker": given.marker_freedom, "seed": given.seed, "note": given.note}
     say(*provenance_lines(model), *another_date_lines(model))
     with progress_bar() as progress:
         data = source.read(model.robot)

@@ -179,15 +179,15 @@ def compensate(
     begin, following = _starts(start, robot, wanted)
     goals = checked_targets(wanted, robot, len(begin), axis=axis, tool_axis=tool_axis, lever=lever)
     tools = _tools(model, tool, goals)
-    exact, rough = tool_functions(model, tools, frame)
+    functions = tool_functions(model, tools, frame)
     if not any(robot.periodic):
-        v = rough.jacobian(np.zeros((1, robot.n)))[0, :, :3]
+        v = functions.rough(np.zeros((1, robot.n)))[0, :, :3]
         goals = replace(goals, along=v @ np.linalg.pinv(v, rcond=LEAST_DIRECTION))
     usual = usual_motion(robot, BOUND_FACTOR_BETWEEN_ROWS if following and bound is None else 1.0)
     motion = by_joint(robot, bound, "bound", usual)
     aimed = np.ones((len(begin), 1), dtype=bool) if goals.free is None else ~goals.free
     mobility = mobilities(robot, weights, tuple(tools), aimed)
-    problem = CompensationProblem(exact, rough, goals, begin, joint_limits(robot, limits), motion, mobility)
+    problem = CompensationProblem(functions, goals, begin, joint_limits(robot, limits), motion, mobility)
     pace = _pace(robot, problem, rate, time, path=path and not following)
     if following:
         return _result(*follow(problem, begin[0] if len(begin) else motion))

@@ -15,7 +15,7 @@ import numpy as np
 
 from diffeo_calib.common.checks import positive, real_tensor
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.kinematics.compensation.search import Box, box_search, chord_search
+from diffeo_calib.kinematics.compensation.search import Box, box_search
 from diffeo_calib.kinematics.compensation.targets import Array, Targets, ToolFunctions
 from diffeo_calib.robots.tree import Tree
 
@@ -126,8 +126,7 @@ class Solution(NamedTuple):
 class CompensationProblem:
     """N targets, the boxes of their commands, and the kinematics."""
 
-    tool: ToolFunctions  # the calibrated kinematics
-    rough: ToolFunctions  # those of its geometry
+    tool: ToolFunctions  # the kinematics
     targets: Targets  # N targets
     start: Array  # (N, n) rad or m
     limits: Limits  # of the joints, and of mimic joints
@@ -157,22 +156,11 @@ class CompensationProblem:
         for first in range(0, len(possible), ROWS_AT_ONCE):
             rows = possible[first : first + ROWS_AT_ONCE]
             own, box = self.started(rows, self.start[rows]), self.box(rows)
-            q, seen, done = own.search(box, np.clip(box.start, box.low, box.high))
+            q, seen, done = box_search(self.tool, own.targets, np.clip(box.start, box.low, box.high), box)
             solved = own.keep_mimics(Solution(q, seen, own._codes(q, seen, done)))
             for whole, part in zip(found, solved, strict=True):
                 whole[rows] = part
         return found
-
-    def search(self, box: Box, q: Array) -> tuple[Array, Array, Array]:
-        """The fast search from ``q`` (N, n), and the careful one for the rows that it gives up."""
-        poses = self.tool.poses(q)
-        slopes = self.targets.slopes(self.rough.jacobian(q))
-        found, seen, done = chord_search(self.tool, self.targets, q, box, slopes=slopes, poses=poses)
-        rest = np.flatnonzero(~done)
-        if len(rest):
-            parts = box_search(self.tool, self.targets.take(rest), q[rest], box.take(rest), poses=poses[rest])
-            found[rest], seen[rest], done[rest] = parts
-        return found, seen, done
 
     def keep_mimics(self, found: Solution) -> Solution:
         """Shorten corrections that would take mimic joints of several joints beyond their limits."""
@@ -247,7 +235,7 @@ class CompensationProblem:
 
     def _slopes(self, targets: Targets, q: Array) -> Array:
         """(R, k, n) of the tool, in m, by motions of the joints in bounds."""
-        return targets.slopes(self.rough.jacobian(q)) * targets.to_metres(self.tool.length)[:, None] * self.bound
+        return targets.slopes(self.tool.rough(q)) * targets.to_metres(self.tool.length)[:, None] * self.bound
 
 
 WEAK_DIRECTION_SHARE = 0.1

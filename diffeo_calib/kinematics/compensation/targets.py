@@ -33,7 +33,6 @@ from diffeo_calib.kinematics.tool import ToolKinematics
 from diffeo_calib.measurements.poses import rigid_poses
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.build import calibrated_chain
-from diffeo_calib.runtime.chain import tip_poses
 
 Array = np.ndarray
 
@@ -244,55 +243,40 @@ class ToolFunctions:
     poses: Callable[[Array], Array]  # (N, n) joint values -> (N, T, 4, 4) m
     # (N, n) -> (N, T, 6, n), linear then angular velocity about the axes of the frame
     jacobian: Callable[[Array], Array]
+    rough: Callable[[Array], Array]  # the same of the geometric part alone: off by about 1 mm, and much faster
     serial: bool  # whether every column belongs to one joint, in the order of the chain (no mimic joints)
     length: float  # m that a turn of one radian counts as where directions are compared: a quarter of the robot's reach
 
 
 # the functions know the model's map but not the model, which would otherwise never be forgotten
-_ready: WeakKeyDictionary[CalibratedKinematics, dict[object, tuple[ToolFunctions, ToolFunctions]]] = WeakKeyDictionary()
+_ready: WeakKeyDictionary[CalibratedKinematics, dict[object, ToolFunctions]] = WeakKeyDictionary()
 
 
-def tool_functions(
-    model: CalibratedKinematics, tools: Mapping[str, Tensor], frame: str
-) -> tuple[ToolFunctions, ToolFunctions]:
-    """Calibrated and rough kinematics of tools (4, 4) on these tips in a frame, "base" or "measuring".
-
-    They are kept for later calls.
-    """
+def tool_functions(model: CalibratedKinematics, tools: Mapping[str, Tensor], frame: str) -> ToolFunctions:
+    """Kinematics of tools (4, 4) on these tips in a frame, "base" or "measuring"; kept for later calls."""
     known = _ready.setdefault(model, {})
     key = frame, *((tip, tool.numpy().tobytes()) for tip, tool in tools.items())
     if key not in known:
         if len(known) >= MOST_TOOLS:
             known.clear()
-        known[key] = _calibrated(model, tools, frame), _rough(model, tools, frame)
+        known[key] = _functions(model, tools, frame)
     return known[key]
 
 
-def _shape(robot: Tree) -> tuple[bool, float]:
-    return robot.moving == robot.n, 0.25 * robot.reach if isfinite(robot.reach) else SOME_LENGTH
-
-
-def _calibrated(model: CalibratedKinematics, tools: Mapping[str, Tensor], frame: str) -> ToolFunctions:
-    device = model.configurations.device
+def _functions(model: CalibratedKinematics, tools: Mapping[str, Tensor], frame: str) -> ToolFunctions:
+    robot, geometry, device = model.robot, model.geometry, model.configurations.device
     each = [ToolKinematics(model.map, model.nominal, tool, frame, tip) for tip, tool in tools.items()]
 
     def by_tool(of: Callable[[ToolKinematics, Tensor], Tensor], q: Array) -> Array:
         at = torch.from_numpy(q).to(device)
         return torch.stack([of(tool, at) for tool in each], 1).detach().cpu().numpy()
 
-    poses, jacobian = (partial(by_tool, of) for of in (ToolKinematics.poses, ToolKinematics.jacobian))
-    return ToolFunctions(poses, jacobian, *_shape(model.robot))
-
-
-def _rough(model: CalibratedKinematics, tools: Mapping[str, Tensor], frame: str) -> ToolFunctions:
-    """Those of the geometric part of the calibrated kinematics: off by about 1 mm, and a hundred times faster."""
-    geometry, robot = model.geometry, model.robot
     start = geometry.base.numpy() if frame == "measuring" else np.eye(4)
-    errors = geometry.joint_errors.numpy()
-    chain = calibrated_chain(robot.arrays, start, errors, np.zeros(6 + 6 * robot.moving))
+    chain = calibrated_chain(robot.arrays, start, geometry.joint_errors.numpy(), np.zeros(6 + 6 * robot.moving))
     numbers, ends = [robot.tips.index(tip) for tip in tools], chain.tips.copy()
     ends[numbers] = ends[numbers] @ np.stack([tool.numpy() for tool in tools.values()])
     chain = replace(chain, tips=ends)
-    return ToolFunctions(
-        lambda q: tip_poses(chain, q)[:, numbers], lambda q: chain.poses_and_jacobian(q)[1][:, numbers], *_shape(robot)
-    )
+    poses, jacobian = (partial(by_tool, of) for of in (ToolKinematics.poses, ToolKinematics.jacobian))
+    length = 0.25 * robot.reach if isfinite(robot.reach) else SOME_LENGTH
+    rough = lambda q: chain.poses_and_jacobian(q)[1][:, numbers]  # noqa: E731
+    return ToolFunctions(poses, jacobian, rough, robot.moving == robot.n, length)

@@ -17,17 +17,12 @@ from diffeo_calib.measurements.csv.cells import repeated
 from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
 from diffeo_calib.measurements.table_format import (
     UNITS_PER_METRE,
-    ZERO,
     TableFormat,
     check_choice,
     column_names,
     flat_names,
 )
 from diffeo_calib.robots.joint import KINDS
-
-Values = dict[Any, Tensor]
-"""Numbers of the rows of a table in SI by the keys of :attr:`Columns.groups`."""
-
 
 PER_SI = {**UNITS_PER_METRE, "rad": 1.0, "deg": 180.0 / math.pi, None: 1.0}
 """Units per rad or m; numbers without a unit are as they are."""
@@ -45,21 +40,13 @@ MASS = Check("a mass of 0 or more", zero=True)
 DEVIATION = Check("a positive standard deviation")
 
 
-class Group(NamedTuple):
-    """Columns of numbers of one quantity."""
+class Column(NamedTuple):
+    """A column of numbers."""
 
-    names: tuple[str, ...]  # of the columns
+    name: str
     unit: str | float | None = None  # in the file: m, mm, rad, deg, or how many of it are one in SI; None without
     check: Check | None = None  # what the numbers are expected to be
     what: str = ""  # name of numbers whose unit is judged by their size
-
-    def to_si(self, values: Tensor) -> Tensor:
-        """Numbers in the unit of the file -> rad, m, or as they are."""
-        return values / self.per_si
-
-    def from_si(self, values: Tensor) -> Tensor:
-        """The inverse of :meth:`to_si`, on the host, one row for each of the values (N, ...)."""
-        return values.cpu().reshape(len(values), -1) * self.per_si
 
     @property
     def per_si(self) -> float:
@@ -67,16 +54,19 @@ class Group(NamedTuple):
         return self.unit if isinstance(self.unit, (int, float)) else PER_SI[self.unit]
 
 
-class Hideable(NamedTuple):
-    """Columns of values and of deviations that lines may leave empty together: their places; what they show."""
+class Body(NamedTuple):
+    """The columns of a marker, frame or reading, and what lines do that fill them, such as "holds a distance".
 
-    values: list[int]
-    deviations: list[int]
+    Lines may leave them empty together; not those of all bodies, without such words.
+    """
+
+    columns: Sequence[Column]
     word: str
 
-
-Body = tuple[Sequence[Group], str]
-"""The columns of a marker, frame or reading, and what lines do that fill them, such as "holds a distance"."""
+    @property
+    def values(self) -> list[Column]:
+        """Those that hold no deviations; deviations where there are no others."""
+        return [one for one in self.columns if one.check != DEVIATION] or [*self.columns]
 
 
 @dataclass(frozen=True)
@@ -87,8 +77,7 @@ class Columns:
     joints: JointExpressions | PoseColumns  # names or expressions of n joints, or the columns of a pose
     prismatic: Tensor  # (n,) which of them are prismatic
     kinds_known: bool  # whether the kinds of the joints were given; otherwise all are taken as revolute
-    # of numbers: "q", those beside joints by what they hold, and what was measured by themselves
-    groups: dict[Any, Group]
+    numbers: tuple[Column, ...]  # of what was measured, then those beside
     sensors: Sequence[Any] = ()  # the columns of each kind of rows, see sensors.py
 
     @classmethod
@@ -105,23 +94,18 @@ class Columns:
             raise MeasurementError.of(what, got="joints that are all taken as revolute", fix=fix)
         for name, column in table.beside.items():
             column_names(name, [column], "the name of a column", (1,))
-        given, groups = table.joints, list[Group]()
+        given, found = table.joints, list[Column]()
         for sensor in sensors:
-            groups += [group for group in sensor.groups(table) if group not in groups]  # kinds may share deviations
+            own = [column for body in sensor.bodies(table) for column in body.columns]
+            found += [one for one in own if one not in found or one.check != DEVIATION]  # kinds may share deviations
         read = replace(given, angle=table.angle) if isinstance(given, PoseColumns) else JointExpressions.of(names)
-        every = {"q": Group(read.columns)} | {group: group for group in groups if group.names}
-        for name, column in table.beside.items():
-            every[name] = Group((column.strip(),), check=MASS if name == "payload" else None)
-        columns = cls(table, read, prismatic, kinds_known, every, sensors)
-        alike = [name for place, group in enumerate(groups) if group in groups[:place] for name in group.names]
-        named = [*columns.names, *alike]
-        for _ in range(table.in_a_plane - 1):
-            named.remove(ZERO)
-        twice = repeated(named) or repeated(names)
-        if twice:
+        checks = {"payload": MASS}
+        beside = (Column(column.strip(), check=checks.get(name)) for name, column in table.beside.items())
+        columns = cls(table, read, prismatic, kinds_known, (*found, *beside), sensors)
+        if twice := repeated(columns.names) or repeated(names):
             markers = len(table.triples)
-            plain = len(columns.names) + len(alike) == len(names) + 3 * markers
-            what = "`joints`" + " and `position`" * bool(markers) if plain else "the named columns"
+            what = "`joints`" + " and `position`" * bool(markers)
+            what = what if len(columns.names) == len(names) + 3 * markers else "the named columns"
             fix = "name every column once"
             deviations = {*twice} & {*flat_names(table.std), *flat_names(table.rotation_std)}
             fix += ", and one that holds the deviations of all axes alone" * bool(deviations)
@@ -131,7 +115,7 @@ class Columns:
     @property
     def names(self) -> list[str]:
         """All columns, joints first."""
-        return [name for group in self.groups.values() for name in group.names]
+        return [*self.joints.columns, *(column.name for column in self.numbers)]
 
     @property
     def texts(self) -> dict[str, bool]:
@@ -145,34 +129,27 @@ class Columns:
         return len(self.sensors) > 1
 
     @property
-    def hideable(self) -> list[Hideable]:
-        """The columns of every body that lines may leave empty, markers and frames first.
+    def hideable(self) -> list[Body]:
+        """The columns of every body that lines may leave empty, markers and frames first."""
+        some = [body for one in self.sensors if self.all_hidden or one.hidden for body in one.bodies(self.table)]
+        read = ([one for one in body.columns if one in self.numbers] for body in some)
+        return [Body(own, body.word) for body, own in zip(some, read, strict=True) if own and body.word]
 
-        Deviations are values where there are no others.
-        """
-        found, every = list[Hideable](), torch.arange(len(self.names), device=HOST)
-        places = {group: own[0].tolist() for group, own in self.parts(every[None]).items()}
-        for sensor in (one for one in self.sensors if self.all_hidden or one.hidden):
-            for groups, word in sensor.bodies(self.table):
-                known = [k for group in groups if group.check == DEVIATION for k in places.get(group, [])]
-                values = [k for group in groups if group.check != DEVIATION for k in places.get(group, [])]
-                found += [Hideable(values or known, known if values else [], word)] if values or known else []
-        return found
+    def places(self, some: Sequence[Column]) -> list[int]:
+        """Their places among all columns."""
+        return [len(self.joints.columns) + self.numbers.index(one) for one in some]
 
-    def to_si(self, raw: Tensor) -> Values:
-        """Rows (N, c) in the units of the file as those of each group (N, columns), or (N,) beside joints."""
-        found = self.parts(raw)
-        values = {name: group.to_si(found[name]) for name, group in self.groups.items()}
-        values["q"] = self.joints.values(found["q"]) / self._per_joint
-        return values | {name: values[name][:, 0] for name in self.table.beside}
+    def cells(self, q: Tensor, numbers: Mapping[str, Tensor]) -> dict[str, list[float]]:
+        """The cells of columns by name, of joint values (N, n) and of numbers (N,) by their columns, in SI."""
+        joints = zip(self.joints.columns, self.joints_from_si(q).T.tolist(), strict=True)
+        found = {
+            one.name: (numbers[one.name].cpu() * one.per_si).tolist() for one in self.numbers if one.name in numbers
+        }
+        return dict(joints) | found
 
-    def from_si(self, values: Mapping[Any, Tensor | None]) -> dict[str, list[float]]:
-        """The cells of columns by name, of values in SI by what they are."""
-        rows = {name: own for name, own in values.items() if own is not None}
-        found = {"q": self.joints_from_si(rows.pop("q"))}
-        found |= {name: self.groups[name].from_si(own) for name, own in rows.items()}
-        pairs = [zip(self.groups[name].names, own.T.tolist(), strict=True) for name, own in found.items()]
-        return {column: cells for pair in pairs for column, cells in pair}
+    def joints_to_si(self, raw: Tensor) -> Tensor:
+        """Joint values (N, n) in rad and m of rows (N, c) in the file's units."""
+        return self.joints.values(raw[:, : len(self.joints.columns)]) / self._per_joint
 
     def joints_from_si(self, q: Tensor) -> Tensor:
         """Joint values (N, n) in rad and m as the cells (N, c) of their columns, in the file's units."""
@@ -186,20 +163,15 @@ class Columns:
 
     def unlikely_units(self, raw: Tensor) -> list[str]:
         """Sentences about values (N, c), in the file's units, that look as if they were in another unit."""
-        found, table, plain = self.parts(raw), self.table, self.joints.plain
-        q = self.joints.values(found["q"])[:, plain] if bool(plain.any()) else found["q"][:, :0]
+        count, table, plain = len(self.joints.columns), self.table, self.joints.plain
+        q = self.joints.values(raw[:, :count])[:, plain] if bool(plain.any()) else raw[:, :0]
         slide, known = self.prismatic[plain], self.kinds_known
         sentences = unlikely_units("angles", q[:, ~slide], table.angle, "angle", kinds_known=known)
         sentences += unlikely_units("prismatic joints", q[:, slide], table.joint_unit, "joint_length")
         for what, option in (("positions", "length"), ("rotations", "rotation_angle")):
-            own = {key: group.unit for key, group in self.groups.items() if group.what == what}
-            cells = torch.cat([found[key] for key in own] or [raw[:, :0]], 1)
-            sentences += unlikely_units(what, cells, str(next(iter(own.values()), None)), option)
+            own = [one for one in self.numbers if one.what == what]
+            sentences += unlikely_units(what, raw[:, self.places(own)], str(own[0].unit), option) if own else []
         return sentences
-
-    def parts(self, raw: Tensor) -> Values:
-        """The columns of each group of rows (N, c)."""
-        return dict(zip(self.groups, raw.split([len(own.names) for own in self.groups.values()], dim=1), strict=True))
 
 
 def check_count(what: str, items: Sequence[object], count: int, each: str) -> None:

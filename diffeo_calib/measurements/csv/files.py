@@ -21,7 +21,7 @@ from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few, listed, shown, warn_user
 from diffeo_calib.measurements.checks import file_sha256, quiet
 from diffeo_calib.measurements.csv.cells import repeated
-from diffeo_calib.measurements.csv.columns import Columns, Values, check_count
+from diffeo_calib.measurements.csv.columns import Columns, check_count
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import Cells, write_rows
 from diffeo_calib.measurements.csv.sensors import (
@@ -71,8 +71,8 @@ def read_observations(
     tables = []
     for sensor, here in _divided(rows):
         found, own = sensor.table(here)
-        found = found.with_line_numbers(own.lines).with_payload(own.values.get("payload"))
-        tables.append(found.with_covariates(**{name: own.values.get(name) for name in ("time", "temperature")}))
+        found = found.with_line_numbers(own.lines).with_payload(own.beside.get("payload"))
+        tables.append(found.with_covariates(**{name: own.beside.get(name) for name in ("time", "temperature")}))
     data, sha256 = tables[0] if alone else joined_tables(tables), file_sha256(file)
     data = (data if alone else data.rows(data.line_numbers.argsort(stable=True))).with_columns(file_sha256=sha256)
     if alone and table.position is not None:
@@ -189,9 +189,10 @@ def read_joints(path: str | PathLike[str], table: TableFormat) -> Tensor:
     return read_configurations(path, table)["q"]
 
 
-def read_configurations(path: str | PathLike[str], table: TableFormat) -> Values:
+def read_configurations(path: str | PathLike[str], table: TableFormat) -> dict[str, Tensor]:
     """Joint values "q" as of :func:`read_joints`, with the "payload" (N,), "time" and "temperature" that are named."""
-    return read_table(Path(path), Columns.of(table.joints_only())).values
+    rows = read_table(path if isinstance(path, Path) else Path(path), Columns.of(table.joints_only()))
+    return {"q": rows.q} | rows.beside
 
 
 def read_poses(path: Path, table: TableFormat) -> Tensor:
@@ -244,13 +245,13 @@ def write_predictions(
     table = table.for_writing(rotation_std=True, prefixes=prefixes) if poses else table
     numeric = columns_of(table)
     own: PositionColumns = numeric.sensors[0]
-    of_bodies = [name for body in own.each for k in (0, 2, 1, 3) for name in body[k].names]
+    of_bodies = [name for body in own.each for k in (0, 2, 1, 3) for name in body[k]]
     names = [*numeric.joints.columns, *of_bodies]
 
     def rows(q: Tensor, mean: Tensor, deviations: Tensor, *others: Tensor) -> Cells:
         frames, spreads = by_frame(mean) if poses else None, deviations.reshape(len(q), len(prefixes), -1)
         places, turns = (mean, None) if frames is None else (frames[..., :3, 3], spreads[..., 3:])
-        cells = numeric.from_si({"q": q, **own.numbers(places, frames, spreads[..., :3], turns)})
+        cells = numeric.cells(q, own.numbers(places, frames, spreads[..., :3], turns))
         beside = torch.cat(others, 1).tolist() if others else [[]] * len(q)
         lines = zip(*(cells[name] for name in names), strict=True)
         return [[*line, *own] for line, own in zip(lines, beside, strict=True)]
@@ -306,10 +307,10 @@ def write_measurements(path: str | PathLike[str], data: Any, table: TableFormat,
         raise MeasurementError.of(what, expected="distinct names", got=got, fix=fix)
     found: list[tuple[int, dict[str, float | str]]] = []
     for part, rows, sensor in zip(whole.parts, whole.index, kinds, strict=True):
-        values, texts, lines = sensor.written(part, table)
-        known = {"q": part.q, "payload": part.payload, **part.drifting}
-        of_lines = {name: own if own is None else own[lines.to(own.device)] for name, own in known.items()}
-        cells = {**numeric.from_si({**of_lines, **values}), **texts}
+        numbers, texts, lines = sensor.written(part, table)
+        beside = part.drifting | ({} if part.payload is None else {"payload": part.payload})
+        numbers |= {getattr(table, name): own[lines.to(own.device)] for name, own in beside.items()}
+        cells = {**numeric.cells(part.q[lines.to(part.q.device)], numbers), **texts}
         each = [dict(zip(cells, line, strict=True)) for line in zip(*cells.values(), strict=True)]
         found += zip(rows[lines].tolist(), each, strict=True)
     there = {name for _, cells in found for name in cells}

@@ -14,24 +14,21 @@ joints takes the one nearest to its middle: clocks that differ by less than half
 
 from __future__ import annotations
 
-import csv
 import os
 import pathlib
-import shutil
-import tempfile
-import weakref
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple, TextIO
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from diffeo_calib.common.errors import MeasurementError, few, shown
 from diffeo_calib.measurements.csv.cells import find_columns, number
-from diffeo_calib.measurements.csv.lines import TextTable, read_cells
+from diffeo_calib.measurements.csv.lines import TextTable, csv_text, read_cells
 
 SEPARATORS = (",", ";", "\t", "|")
 MOVED = 1e-3
@@ -43,19 +40,25 @@ Pairs = list[tuple[int, int]]
 
 
 class JoinedFile(pathlib.WindowsPath if os.name == "nt" else pathlib.PosixPath):  # no subclass of Path before 3.12
-    """A file of joined lines, which lasts as long as this path to it; messages name the files that were joined.
+    """Joined lines, read as a file of places with this name would be; messages name the files that were joined.
 
     Attributes:
-        words: these files. sentence: how many lines are joined, and which have no partner.
+        words: these files. sentence: how many lines are joined, and which have no partner. content: the lines.
     """
 
     words = sentence = ""
+    content = b""
 
     def __str__(self) -> str:
         return self.words or super().__str__()
 
-    def __fspath__(self) -> str:
-        return super().__str__()
+    def is_file(self) -> bool:
+        """Whether it can be read."""
+        return True
+
+    def open(self, *_: Any, **__: Any) -> Any:
+        """The joined lines, as a file of bytes."""
+        return BytesIO(self.content)
 
 
 class _Table(NamedTuple):
@@ -119,10 +122,8 @@ def joined_file(
         expected, got = "values that both files have", " and ".join(without)
         raise MeasurementError.of(f"--by {shown(by)}", expected=expected, got=got, fix=fix)
     _refuse_several(tables, pairs, several=several)
-    found = JoinedFile(tempfile.mkdtemp(prefix="diffeo_calib_"), places.name)
-    weakref.finalize(found, shutil.rmtree, os.path.dirname(found), ignore_errors=True)
-    with found.open("w", encoding="utf-8", newline="") as file:
-        _write(file, tables, pairs, sep)
+    found = JoinedFile(places)
+    found.content = _written(tables, pairs, sep)
     found.words = f"{places}, joined with {joints}"
     found.sentence = f"{len(pairs)} lines of {places.name} are joined with lines of {joints.name} {how}"
     found.sentence += f"; lines without a partner: {' and '.join(without)}" * bool(without)
@@ -175,8 +176,8 @@ def _refuse_several(tables: Sequence[_Table], pairs: Pairs, *, several: bool) ->
             )
 
 
-def _write(file: TextIO, tables: Sequence[_Table], pairs: Pairs, sep: str) -> None:
-    """Write the joined lines under the numbers of those of the places; a name in both files says of which it is."""
+def _written(tables: Sequence[_Table], pairs: Pairs, sep: str) -> bytes:
+    """The joined lines under the numbers of those of the places; a name in both files says of which it is."""
     table, measured = tables[0].sheet, tables[1].sheet.without([tables[1].by])
     twice = {*table.header} & {*measured.header}
     names = [
@@ -184,13 +185,11 @@ def _write(file: TextIO, tables: Sequence[_Table], pairs: Pairs, sep: str) -> No
         for of, own in zip(("joints", "places"), (table, measured), strict=True)
         for name in own.header
     ]
-    writer, at = csv.writer(file, delimiter=sep, lineterminator="\n"), 2
-    writer.writerow(names)
+    lines = {1: names}
     for row, place in pairs:
         line, cells = measured.rows[place]
-        file.write("\n" * (line - at))
-        writer.writerow([" ".join(cell.split()) for cell in (*table.rows[row][1], *cells)])
-        at = line + 1
+        lines[line] = [" ".join(cell.split()) for cell in (*table.rows[row][1], *cells)]
+    return csv_text((lines.get(line, []) for line in range(1, max(lines) + 1)), sep, "\n")
 
 
 # --- stops

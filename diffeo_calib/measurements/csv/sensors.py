@@ -14,7 +14,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written, few, shown, warn_user
 from diffeo_calib.measurements.checks import of_measurements, unlikely_units
 from diffeo_calib.measurements.csv.cells import bad_cells
-from diffeo_calib.measurements.csv.columns import DEVIATION, Body, Check, Columns, Group
+from diffeo_calib.measurements.csv.columns import DEVIATION, Body, Check, Column, Columns
 from diffeo_calib.measurements.csv.tables import FileRows
 from diffeo_calib.measurements.images import Known
 from diffeo_calib.measurements.observations import WITH_POSITION
@@ -28,7 +28,7 @@ from diffeo_calib.measurements.poses import (
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 from diffeo_calib.measurements.sockets import SEPARATOR, Distances
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_format import TableFormat, column_names, flat_names
+from diffeo_calib.measurements.table_format import ZERO, TableFormat, column_names, flat_names, numbers_of
 
 ONE_READING = "every line is one reading of one device: fill the cell in, or remove the line"
 LENGTH = Check(
@@ -38,8 +38,8 @@ IMAGE, POINT, PIXEL, CAMERA = "image", ("board_x", "board_y"), ("u", "v"), "came
 """Columns of images: name of the image, place of the corner on the board in the unit of length, pixels; name of the
 camera, if there are several."""
 
-Written = tuple[Mapping[Any, Tensor | None], Mapping[str, Sequence[str]], Tensor]
-"""Rows as lines of a file: numbers in SI by what they are, texts by their column, and the row (M,) of each line."""
+Written = tuple[dict[str, Tensor], Mapping[str, Sequence[str]], Tensor]
+"""Rows as lines of a file: numbers in SI and texts by their column, and the row (M,) of each line."""
 
 
 class SensorColumns:
@@ -51,13 +51,9 @@ class SensorColumns:
     texts: Mapping[str, bool]
     """Columns of texts, and whether a table must have them."""
 
-    def groups(self, table: TableFormat) -> tuple[Group, ...]:
+    def bodies(self, table: TableFormat) -> Sequence[Body]:
         """The columns of numbers beside joints, payloads and covariates."""
         return ()
-
-    def bodies(self, table: TableFormat) -> list[Body]:
-        """Those that lines without such a row leave empty."""
-        return [(self.groups(table), f"holds {self.word}")]
 
     filled: Any
     """Lines -> (N,) boolean, which of them hold such a row."""
@@ -68,12 +64,12 @@ class SensorColumns:
 
 
 class OfBody(NamedTuple):
-    """The columns of a marker or frame: place, rotation, and deviations of both, which may be those of all bodies."""
+    """Columns of a marker or frame: place, rotation, and deviations of both, which may be those of all bodies."""
 
-    place: Group
-    turn: Group
-    std: Group
-    turn_std: Group
+    place: Sequence[str]
+    turn: Sequence[str]
+    std: Sequence[str]
+    turn_std: Sequence[str]
 
 
 @dataclass(frozen=True)
@@ -104,40 +100,43 @@ class PositionColumns(SensorColumns):
         if std is not None:
             expected = "names of columns: one, one per marker or three per marker"
             std = column_names("std", std, expected, (1, count, 3 * count))
-        unit, angles = form.rotation_angle or "rad", len(turn) == 3 * count  # no quaternions or matrices
-        kinds = (
-            (flat_names(form.triples), Group((), form.length, what="positions")),
-            (turn, Group((), unit, what="rotations") if angles else Group(())),
-            (std or (), Group((), form.length, DEVIATION)),
-            (turn_std, Group((), unit, DEVIATION)),
-        )
 
-        def own(names: Sequence[str], k: int) -> tuple[str, ...]:
+        def own(names: Sequence[str], k: int) -> Sequence[str]:
             each = len(names) // count
-            return tuple(names[k * each : (k + 1) * each] if each else names)
+            return names[k * each : (k + 1) * each] if each else names
 
-        return [OfBody(*(group._replace(names=own(names, k)) for names, group in kinds)) for k in range(count)]
-
-    def groups(self, table: TableFormat) -> tuple[Group, ...]:
-        place, turn, *deviations = zip(*self.each, strict=True)
-        return *place, *turn, *(group for groups in deviations for group in dict.fromkeys(groups))
+        every = flat_names(form.triples), turn, std or (), turn_std
+        return [OfBody(*(own(names, k) for names in every)) for k in range(count)]
 
     def bodies(self, table: TableFormat) -> list[Body]:
-        """Deviations of all belong to none of several."""
-        word = f"shows this {'frame' if self.form.rotation else 'marker'}"
-        return [
-            ([group for group in own if sum(group in other for other in self.each) == 1], word) for own in self.each
+        """Deviations of all belong to none of several, nor does a coordinate that is 0 in all rows."""
+        form, unit, word = self.form, self.form.rotation_angle or "rad", "frame" if self.form.rotation else "marker"
+        angles = form.convention is not None and numbers_of(form.convention) == 3  # no quaternion or matrix
+        kinds = (
+            Column("", form.length, what="positions"),
+            Column("", unit, what="rotations") if angles else Column(""),
+            Column("", form.length, DEVIATION),
+            Column("", unit, DEVIATION),
+        )
+        each = [
+            [kind._replace(name=name) for names, kind in zip(own, kinds, strict=True) for name in names]
+            for own in self.each
         ]
+        some = dict.fromkeys(one for own in each for one in own if one.check == DEVIATION or one.name == ZERO)
+        shared = [one for one in some if sum(one in own for own in each) > 1]
+        found = [Body([one for one in own if one not in shared], f"shows this {word}") for own in each]
+        return [*found, Body(shared, "")]
 
     def filled(self, rows: FileRows) -> Tensor:
-        return torch.stack([~rows.values[own.place].isnan().all(1) for own in self.each]).any(0)
+        return torch.stack([~rows.numbers(own.place[:1]).isnan()[:, 0] for own in self.each]).any(0)
 
     def table(self, rows: FileRows) -> tuple[Measurements, FileRows]:
         """MeasurementError for numbers that do not form a rotation."""
         form, names, joints = self.form, None, rows.columns.joints.texts
-        points = torch.stack([rows.values[own.place] for own in self.each], 1)
+        places = (rows.numbers(own.place) for own in self.each)
+        points = torch.stack([torch.cat([own, 0.0 * own[:, : 3 - own.shape[1]]], 1) for own in places], 1)  # in a plane
         std, turn_std = (
-            torch.stack([rows.values[own[k]].expand(-1, 3) for own in self.each], 1) if self.each[0][k].names else None
+            torch.stack([rows.numbers(own[k]).expand(-1, 3) for own in self.each], 1) if self.each[0][k] else None
             for k in (2, 3)
         )
         if form.marker is not None:
@@ -145,14 +144,15 @@ class PositionColumns(SensorColumns):
             nowhere = points.new_full((len(first), len(names), 3), torch.nan)
             points, std = nowhere.index_put(at, points[:, 0]), std if std is None else nowhere.index_put(at, std[:, 0])
             rows = rows.of(first)
-        q = rows.values["q"]
         if form.convention is None:
-            data = Measurements(q, points, joints, names, std=std, doubt=False)
+            data = Measurements(rows.q, points, joints, names, std=std, doubt=False)
         else:
             poses = of_frames(transforms_of_frames(self._rotations(rows, form.convention), points))
             known = [own if own is None or len(self.each) > 1 else own[:, 0] for own in (std, turn_std)]
             how = {"lever": form.lever, "position_std": known[0], "rotation_std": known[1]}
-            data = Measurements.from_poses(q, poses, joints, **how, camera_on_tool=form.camera_on_tool, doubt=False)
+            data = Measurements.from_poses(
+                rows.q, poses, joints, **how, camera_on_tool=form.camera_on_tool, doubt=False
+            )
         set_ups = rows.devices(form.session, "a name")
         return data.with_tips(form.on).with_sessions(set_ups, remounted=form.remounted), rows
 
@@ -162,14 +162,14 @@ class PositionColumns(SensorColumns):
         A row holds lines that follow each other with the same joint values, payload and session, of different markers.
         """
         column, _, given = marker.partition("=")
-        texts, values = rows.named(column, "the name of a marker"), rows.values
+        texts = rows.named(column, "the name of a marker")
         names = given.split(",") if given else list(dict.fromkeys(texts))
         if unknown := [name for name in dict.fromkeys(texts) if name not in names]:
             what, fix = f"file '{rows.path}', column '{column}'", "remove their lines, or calibrate with all of them"
             raise MeasurementError.of(what, expected=f"markers of the model: {few(names)}", got=few(unknown), fix=fix)
         sessions = [""] * len(texts) if self.form.session is None else rows.texts[self.form.session]
-        loads = values.get("payload", torch.zeros(len(texts), dtype=torch.float64, device=HOST))
-        poses = list(zip(values["q"].tolist(), loads.tolist(), sessions, strict=True))
+        loads = rows.beside.get("payload", torch.zeros(len(texts), dtype=torch.float64, device=HOST))
+        poses = list(zip(rows.q.tolist(), loads.tolist(), sessions, strict=True))
         numbers, first = list[int](), list[int]()
         for line, pose in enumerate(poses):
             if not first or pose != poses[first[-1]] or texts[line] in texts[first[-1] : line]:
@@ -181,13 +181,13 @@ class PositionColumns(SensorColumns):
 
     def _rotations(self, rows: FileRows, convention: str) -> Tensor:
         """Rotations (N, T, 3, 3) of frames, NaN where hidden."""
-        numbers = torch.stack([rows.values[own.turn] for own in self.each], 1)
+        numbers = torch.stack([rows.numbers(own.turn) for own in self.each], 1)
         seen = ~numbers.isnan().any(2)
         shown = seen.nonzero().tolist()
 
         def place(number: int) -> str:
             row, frame = shown[number]
-            return f"file '{rows.path}', line {rows.lines[row]}, columns {', '.join(self.each[frame].turn.names)}"
+            return f"file '{rows.path}', line {rows.lines[row]}, columns {', '.join(self.each[frame].turn)}"
 
         found = numbers.new_full((*seen.shape, 3, 3), torch.nan)
         with of_measurements():
@@ -196,11 +196,12 @@ class PositionColumns(SensorColumns):
 
     def numbers(
         self, places: Tensor, frames: Tensor | None, std: Tensor | None, turn_std: Tensor | None
-    ) -> dict[Group, Tensor]:
+    ) -> dict[str, Tensor]:
         """Places (N, B, 3), rotations of frames (N, B, 4, 4), and deviations (N, B, 3), in SI, by their columns."""
         turns = None if frames is None else rotation_numbers(frames[..., :3, :3], self.form.convention or "rotvec")
         parts = [(k, own) for k, own in enumerate((places, turns, std, turn_std)) if own is not None]
-        return {each[k]: own[:, body] for body, each in enumerate(self.each) for k, own in parts}
+        each = ((own[:, body], names[k]) for body, names in enumerate(self.each) for k, own in parts)
+        return {name: column for own, names in each for name, column in zip(names, own.T, strict=True)}
 
     def written(self, part: Any, table: TableFormat) -> Written:
         frames = part.frames if part.frames is None or part.board is None else inverse_poses(part.frames)
@@ -241,7 +242,7 @@ class SocketColumns(SensorColumns):
         parts = [rows.named(name, "the name of a place or socket", fix) for name in self.names]
         names = [SEPARATOR.join(row) for row in zip(*parts, strict=True)]
         known = {"distances": self.distances, "distance_std": self.distance_std}
-        data = Measurements.from_sockets(rows.values["q"], names, rows.columns.joints.texts, **known, doubt=False)
+        data = Measurements.from_sockets(rows.q, names, rows.columns.joints.texts, **known, doubt=False)
         return data.with_tips(None if self.on is None else [self.on]), rows
 
     def written(self, part: Any, table: TableFormat) -> Written:
@@ -300,34 +301,37 @@ class ReadingColumns(SensorColumns):
     def texts(self) -> Mapping[str, bool]:
         return {} if self.device is None else {self.device: True}
 
-    def groups(self, table: TableFormat) -> tuple[Group, Group]:
-        unit = None if self.kind == "image" else table.length if self.unit == MILLIMETRES else self.unit[1]
-        check = LENGTH if self.kind == "distance" and not self.offset_std else None
-        names = self.values if isinstance(self.values, tuple) else ()
-        return Group(names, unit, check), Group(tuple(self.std), unit, DEVIATION)
+    def unit_in(self, table: TableFormat) -> str | float | None:
+        """Unit of readings in a table, as of :class:`Column`."""
+        return None if self.kind == "image" else table.length if self.unit == MILLIMETRES else self.unit[1]
+
+    def bodies(self, table: TableFormat) -> list[Body]:
+        unit, check = self.unit_in(table), LENGTH if self.kind == "distance" and not self.offset_std else None
+        own = [Column(name, unit, check) for name in self.values] if isinstance(self.values, tuple) else []
+        return [Body([*own, *(Column(name, unit, DEVIATION) for name in self.std)], f"holds {self.word}")]
 
     def filled(self, rows: FileRows) -> Tensor:
         if isinstance(self.values, tuple):
-            return ~rows.values[self.groups(rows.columns.table)[0]].isnan().any(1)
+            return ~rows.numbers(self.values).isnan().any(1)
         if self.device is None:
             fix = "name the column of its devices: the rows that name one hold this reading"
             raise MeasurementError.of(f"one {self.kind} for all rows beside rows of other kinds", fix=fix)
         return rows.filled(self.device)
 
     def table(self, rows: FileRows) -> tuple[Readings, FileRows]:
-        q, joints, table = rows.values["q"], rows.columns.joints.texts, rows.columns.table
-        own, own_std = self.groups(table)
-        if own.names:
-            seen = rows.values[own]
+        q, joints, table = rows.q, rows.columns.joints.texts, rows.columns.table
+        per_si = Column("", self.unit_in(table)).per_si
+        if isinstance(self.values, tuple):
+            seen = rows.numbers(self.values)
         else:
-            seen = own.to_si(torch.tensor([[self.values]] * len(q), dtype=torch.float64, device=HOST))
+            seen = torch.full((len(q), 1), float(self.values) / per_si, dtype=torch.float64, device=HOST)
         devices = rows.devices(self.device, "the name of the device of this reading", ONE_READING)
-        std = rows.values[own_std].expand_as(seen) if self.std else None
+        std = rows.numbers(self.std).expand_as(seen) if self.std else None
         given, known = (q, seen, devices, joints), {"std": std, "doubt": False}
         if (lens := self.intrinsics) is not None:
             data = Readings.images(*given, focal=lens[:2], centre=lens[2:], **known)
         elif self.kind == "distance":
-            for text in unlikely_units("positions", own.from_si(seen), table.length, "length"):
+            for text in unlikely_units("positions", seen * per_si, table.length, "length"):
                 warn_user(f"file '{rows.path}': {text}".replace("positions", "distances"))
             data = Readings.distances(*given, offset_std=self.offset_std, **known)
         else:
@@ -335,8 +339,9 @@ class ReadingColumns(SensorColumns):
         return data.with_tips(None if self.on is None else [self.on]), rows
 
     def written(self, part: Any, table: TableFormat) -> Written:
-        own, std = self.groups(table)
-        values = {own: part.reported} | ({std: part.reported_std} if self.std else {})
+        names = self.values if isinstance(self.values, tuple) else ()
+        values = dict(zip(names, part.reported.T, strict=True))
+        values |= dict(zip(self.std, part.reported_std.T, strict=True)) if self.std else {}
         return values, {} if self.device is None else {self.device: part.device_names}, *part.index
 
 
@@ -368,8 +373,9 @@ class ImageColumns(SensorColumns):
     def texts(self) -> Mapping[str, bool]:
         return {CAMERA: False, IMAGE: True} | ({} if self.device is None else {self.device: True})
 
-    def groups(self, table: TableFormat) -> tuple[Group, ...]:
-        return Group(POINT, table.length), Group(PIXEL)
+    def bodies(self, table: TableFormat) -> list[Body]:
+        own = [Column(name, table.length) for name in POINT] + [Column(name) for name in PIXEL]
+        return [Body(own, f"holds {self.word}")]
 
     def filled(self, rows: FileRows) -> Tensor:
         return rows.filled(IMAGE)
@@ -382,13 +388,13 @@ class ImageColumns(SensorColumns):
         for row, name in enumerate(names):
             images.setdefault(name, []).append(row)
         for name, own in images.items():
-            other = (rows.values["q"][own] != rows.values["q"][own[0]]).any(1).nonzero()[:, 0].tolist()
+            other = (rows.q[own] != rows.q[own[0]]).any(1).nonzero()[:, 0].tolist()
             if other:
                 what = f"file '{rows.path}', image '{name}'"
                 got = f"other ones in line {few([rows.lines[own[row]] for row in other])}"
                 fix = "give every image a name of its own, and its joint values in all of its lines"
                 raise MeasurementError.of(what, expected="the joint values of its first line", got=got, fix=fix)
-        points, pixels = (rows.values[one] for one in self.groups(rows.columns.table))
+        points, pixels = rows.numbers(POINT), rows.numbers(PIXEL)
         flat = torch.cat([points, torch.zeros_like(points[:, :1]), pixels], 1)
         empty = flat[:, [0, 1, 3, 4]].isnan().nonzero().tolist()
         if empty:
@@ -401,7 +407,7 @@ class ImageColumns(SensorColumns):
         known: dict[str, Any] = {"camera_on_tool": self.camera_on_tool, "doubt": False}
         if CAMERA in rows.texts:
             known["seen_by"] = first.named(CAMERA, "the name of the camera")
-        data = Measurements.from_images(first.values["q"], corners, self.camera, rows.columns.joints.texts, **known)
+        data = Measurements.from_images(first.q, corners, self.camera, rows.columns.joints.texts, **known)
         set_ups = first.devices(self.device, "a name")
         return (data if set_ups is None else data.with_sessions(set_ups)), first
 
@@ -413,8 +419,7 @@ class ImageColumns(SensorColumns):
         named = {CAMERA: part.camera_names} if len(part.cameras) > 1 else {}
         named |= {} if self.device is None else {self.device: part.device_names}
         texts |= {name: [column[k] for k in whose] for name, column in named.items()}
-        points, pixels = self.groups(table)
-        return {points: seen[:, :2], pixels: seen[:, 3:]}, texts, number
+        return dict(zip((*POINT, *PIXEL), seen[:, [0, 1, 3, 4]].T, strict=True)), texts, number
 
 
 def columns_of(table: TableFormat) -> Columns:

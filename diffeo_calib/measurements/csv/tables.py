@@ -18,7 +18,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
 from diffeo_calib.measurements.checks import file_sha256
 from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, bad_cells, find_columns, number_hint, numbers_in
-from diffeo_calib.measurements.csv.columns import Columns, Hideable, Values
+from diffeo_calib.measurements.csv.columns import Body, Columns
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import ANGLES, CsvLines, read_cells, stated_unit
 from diffeo_calib.measurements.poses import (
@@ -84,16 +84,30 @@ class FileRows(NamedTuple):
 
     path: Path  # the file
     columns: Columns  # its columns
-    values: Values  # these in SI
+    raw: Tensor  # (N, c) numbers in these, in its units
     texts: Mapping[str, Sequence[str]]  # its columns of texts
     lines: Sequence[int]  # their numbers in the file
 
     def of(self, rows: Tensor) -> FileRows:
         """The rows with these numbers (M,), or those that a mask (N,) chooses."""
         chosen = torch.arange(len(self.lines), device=HOST)[rows].tolist()
-        values = {name: own[rows] for name, own in self.values.items()}
         texts = {name: [own[row] for row in chosen] for name, own in self.texts.items()}
-        return self._replace(values=values, texts=texts, lines=[self.lines[row] for row in chosen])
+        return self._replace(raw=self.raw[rows], texts=texts, lines=[self.lines[row] for row in chosen])
+
+    @property
+    def q(self) -> Tensor:
+        """(N, n) joint values, rad or m."""
+        return self.columns.joints_to_si(self.raw)
+
+    def numbers(self, names: Sequence[str]) -> Tensor:
+        """(N, k) numbers of some columns, in SI."""
+        own = [one for name in names for one in self.columns.numbers if one.name == name]
+        return self.raw[:, self.columns.places(own)] / self.raw.new_tensor([one.per_si for one in own])
+
+    @property
+    def beside(self) -> dict[str, Tensor]:
+        """(N,) payloads, times and temperatures, of those that are named."""
+        return {name: self.numbers([column.strip()])[:, 0] for name, column in self.columns.table.beside.items()}
 
     def filled(self, column: str) -> Tensor:
         """(N,) boolean, which rows have a text in a column."""
@@ -131,39 +145,34 @@ def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
     needed = [name for name, needed in texts.items() if needed]
     file = CsvLines(path, columns.table.sep, [*columns.names, *needed])
     named = [name for name in texts if name in needed or name in file.header]
-    nothing = [ZERO] * (columns.table.in_a_plane > 0 and ZERO not in file.header)
-    places = find_columns(path, [*file.header, *nothing], [*columns.names, *named], file.sep)
+    in_a_plane = ZERO not in file.header and any(names[2] == ZERO for names in columns.table.triples)
+    columns = replace(columns, numbers=tuple(one for one in columns.numbers if not (in_a_plane and one.name == ZERO)))
+    places = find_columns(path, file.header, [*columns.names, *named], file.sep)
     _check_units(file, columns)
     lines, rows = zip(*file.rows(), strict=True)
-    cells = list[list[str]]()
-    for place in places:
-        if place < len(file.header):
-            cells.append([row[place] for row in rows])
-        else:  # hidden where y is
-            y = zip(cells[-1], numbers_in(cells[-1], columns.table.decimal), strict=True)
-            cells.append([text if value is None or not abs(value) < LARGEST_NUMBER else ZERO for text, value in y])
+    cells = [[row[place] for row in rows] for place in places]
     words = [["" if text.lower() == "nan" else text for text in own] for own in cells[len(columns.names) :]]
     numbers, notes = _numbers(path, columns, lines, cells[: len(columns.names)])
-    for group, values in zip(columns.groups.values(), columns.parts(numbers).values(), strict=True):
-        check = group.check
-        wrong = [] if check is None else (values < 0 if check.zero else values <= 0).nonzero().tolist()
+    for column, values in zip(columns.numbers, numbers[:, len(columns.joints.columns) :].T, strict=True):
+        check = column.check
+        wrong = [] if check is None else (values < 0 if check.zero else values <= 0).nonzero()[:, 0].tolist()
         if check is not None and wrong:
-            bad = [(lines[row], group.names[k], f"{float(values[row, k]):g}") for row, k in wrong]
+            bad = [(lines[row], column.name, f"{float(values[row]):g}") for row in wrong]
             raise bad_cells(path, bad, check.expected, check.fix)
     for text in ["; ".join(file.notes + notes)] * bool(file.notes + notes) + columns.unlikely_units(numbers):
         warn_user(f"file '{path}': {text}")
     for own in columns.hideable:
-        if bool(numbers[:, own.values].isnan().all()):
-            names = few([columns.names[place] for place in own.values])
+        if bool(numbers[:, columns.places(own.values)].isnan().all()):
+            names = few([one.name for one in own.values])
             what, fix = f"file '{path}', columns {names}: empty in all {len(numbers)} lines", "leave them out"
             raise MeasurementError.of(what, expected=f"some line that {own.word}", fix=fix)
     markers = columns.hideable[: len(columns.table.triples)]
     for own in markers if zeros else ():
         _hide_marks(path, columns, numbers, lines, own)
-    whole = FileRows(path, columns, columns.to_si(numbers), dict(zip(named, words, strict=True)), lines)
+    whole = FileRows(path, columns, numbers, dict(zip(named, words, strict=True)), lines)
     if not markers or columns.all_hidden:
         return whole
-    seen = ~torch.stack([numbers[:, own.values].isnan().all(1) for own in markers]).all(0)
+    seen = ~torch.stack([numbers[:, columns.places(own.values)].isnan().all(1) for own in markers]).all(0)
     if gone := [lines[row] for row in (~seen).nonzero()[:, 0].tolist()]:
         warn_user(f"file '{path}': no marker was seen in line {few(gone)}: {len(gone)} row(s) left out")
     return whole.of(seen)
@@ -187,7 +196,8 @@ def _numbers(
     needed, shows = torch.zeros_like(empty), torch.zeros_like(empty[:, 0])
     theirs = torch.zeros_like(empty[:1])
     for own in hideable:
-        here, every = ~(empty[:, own.values].all(1) | large[:, own.values].all(1)), [*own.values, *own.deviations]
+        values, every = columns.places(own.values), columns.places(own.columns)
+        here = ~(empty[:, values].all(1) | large[:, values].all(1))
         needed[:, every] |= here[:, None]
         theirs[:, every] = True
         shows |= here
@@ -213,13 +223,14 @@ def _numbers(
     return numbers.masked_fill(gaps, math.nan), notes
 
 
-def _hide_marks(path: Path, columns: Columns, numbers: Tensor, lines: Sequence[int], own: Hideable) -> None:
+def _hide_marks(path: Path, columns: Columns, numbers: Tensor, lines: Sequence[int], own: Body) -> None:
     """Write NaN where a marker is at 0, 0, 0, or thrice at -9999, far from all rows: a device does not see it then.
 
     One row at 0, 0, 0 may be the frame's origin, or the first pose: all others must be farther from it than from one
     another. Another number must stand in rows of several configurations.
     """
-    points, q = numbers[:, own.values[:3]], numbers[:, : len(columns.joints.columns)]
+    at = columns.places([one for one in own.columns if one.what == "positions"])
+    points, q = numbers[:, at], numbers[:, : len(columns.joints.columns)]
     alike = (points == points[:, :1]).all(1)
     for mark in points[alike, 0].unique().tolist():
         lost = alike & (points[:, 0] == mark)
@@ -230,12 +241,11 @@ def _hide_marks(path: Path, columns: Columns, numbers: Tensor, lines: Sequence[i
         apart = torch.cdist(some, some).fill_diagonal_(math.inf).amin(1)
         limit = MUCH_FARTHER * apart.amax() if single or mark != 0.0 else apart.median()
         if bool(seen.norm(dim=1).amin() > limit):
-            for place in (*own.values, *own.deviations):
+            for place in columns.places(own.columns):
                 numbers[lost, place] = math.nan
-            at = few([lines[row] for row in lost.nonzero()[:, 0].tolist()])
-            names = few([columns.names[k] for k in own.values[:3]])
-            said = ", ".join([f"{mark:g}"] * 3)
-            warn_user(f"file '{path}': {names} are {said} in line {at}, far from other rows: taken as not seen")
+            names, said = few([columns.names[k] for k in at]), ", ".join([f"{mark:g}"] * len(at))
+            where = few([lines[row] for row in lost.nonzero()[:, 0].tolist()])
+            warn_user(f"file '{path}': {names} are {said} in line {where}, far from other rows: taken as not seen")
 
 
 def _check_units(file: CsvLines, columns: Columns) -> None:
@@ -244,7 +254,7 @@ def _check_units(file: CsvLines, columns: Columns) -> None:
     joints = zip(columns.joints.texts, columns.prismatic.tolist(), columns.joints.plain.tolist(), strict=True)
     units = [(name, table.joint_unit if slide else table.angle) for name, slide, plain in joints if plain]
     read: dict[str, Any] = dict(units)
-    read |= {name: group.unit for group in columns.groups.values() for name in group.names if group.unit}
+    read |= {column.name: column.unit for column in columns.numbers if column.unit}
     stated = {name: stated_unit(name, file.units) for name in read}
     if not columns.kinds_known:  # the joints may be prismatic
         stated |= {name: None for name, _ in units if stated[name] not in ANGLES}

@@ -32,7 +32,7 @@ from diffeo_calib.kinematics.registered_map import robot_map
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import POINTS
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.regression.cholesky import CholeskyRegression
+from diffeo_calib.regression.conditional import Process
 from diffeo_calib.sensors.coordinates import sensor_of
 from diffeo_calib.sensors.errors import Evaluation
 
@@ -111,15 +111,15 @@ class FitRows:
         return made if given is None else made.with_columns(line_numbers=given.line_numbers, origin=given.origin)
 
     @cached_property
-    def blocks(self) -> list[tuple[Tensor, CholeskyRegression]]:
+    def blocks(self) -> list[tuple[Tensor, Process]]:
         """Row numbers (B,) of each block, and the model conditioned on them: on all rows the map is that at hand."""
         n, m, _ = self.map.noise.covariance.shape
         known = self.map.by_data if self.map.data is None and n * m <= WHOLE_COORDINATES else None
-        if isinstance(known, CholeskyRegression):
+        if isinstance(known, Process):
             return [(torch.arange(n, device=HOST), known)]
         order = torch.randperm(n, generator=seeded(0), device=HOST)
         parts = [part.sort().values for part in order.tensor_split(ceil(n * m / BLOCK_COORDINATES))]
-        return [(rows, CholeskyRegression(self.linearised[1].rows(rows), self.map.noise.rows(rows))) for rows in parts]
+        return [(rows, Process.of_rows(self.linearised[1].rows(rows), self.map.noise.rows(rows))) for rows in parts]
 
     @cached_property
     def left_out(self) -> tuple[Tensor, Tensor]:
@@ -130,8 +130,9 @@ class FitRows:
         noise, seen = self.map.noise, self.map.noise.visible
         errors, covariance = torch.empty_like(self.target), torch.empty_like(noise.covariance)
         for rows, regression in self.blocks:
-            errors[rows], own = regression.left_out(self.target[rows])
-            covariance[rows] = own - noise.covariance[rows]
+            numbers = regression.numbers
+            error, own = regression.about(self.target[rows]).left_out(numbers.owner)
+            errors[rows], covariance[rows] = numbers.in_table(error), numbers.blocks(own) - noise.covariance[rows]
         both = seen[:, :, None] & seen[:, None, :]
         return errors.masked_fill(~seen, nan), torch.where(both, covariance, 0.0) + self.map.new_noise
 
@@ -171,7 +172,7 @@ class FitRows:
         terms = self.map.geodesic.spec.joint_kernel.terms
         own = [t for t in terms if isinstance(t, RadialKernel) and t.columns == (joint,) and t.output == joint]
         regression = self.blocks[0][1]
-        data, q = regression.linearisation, self.q.mean(0).repeat(len(values), 1)
+        data, q = regression.numbers.at, self.q.mean(0).repeat(len(values), 1)
         q[:, joint] = values
         along = torch.zeros_like(q)[:, None]
         along[:, :, joint] = 1.0
@@ -184,8 +185,8 @@ class FitRows:
         by_axis, variance = robot_map(self.map).along_axis(q, joint), self.map.geodesic.spec.prior_variance
         total += (by_axis * variance) @ by_axis.T
         cross += data.sensitivity[..., : len(variance)] @ (by_axis * variance).T
-        solved, cross = regression.solve(cross), cross.flatten(0, 1)
-        covariance = total - cross.T @ solved.flatten(0, 1)
+        cross = regression.numbers.of_table(cross)
+        covariance = total - cross.T @ regression.factor.solve(cross)
         return (centred @ covariance @ centred).diagonal().clamp(min=0.0).sqrt()
 
     @cached_property

@@ -26,7 +26,7 @@ from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, NOMINAL
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.quantiles import largest_known
-from diffeo_calib.interop.rigid import geometric_kinematics, nominal_kinematics
+from diffeo_calib.interop.rigid import rigid_kinematics, with_errors
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import at_payloads
 from diffeo_calib.kinematics.nominal import SessionMarkers
@@ -47,7 +47,9 @@ def stages_of(model: CalibratedKinematics, rows: FitRows | None = None) -> dict[
     rows = rows or FitRows(model)
     mounted_anew = isinstance(rows.map.geodesic.spec.at_controls, SessionMarkers)
     if not rows.known or mounted_anew or model.registration is not None or model.rigid_errors is None:
-        geometries = nominal_kinematics(model).geometry, geometric_kinematics(model).geometry
+        errors = model.rigid_errors
+        geometric = rigid_kinematics(model) if errors is None else with_errors(model, errors)
+        geometries = with_errors(model, None).geometry, geometric.geometry
     else:
         with quiet():  # they were shown when the model was fitted
             registered = register_robustly(model.robot, rows.measurements).geometry

@@ -6,8 +6,9 @@ import io
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from torch import Tensor
 
@@ -16,14 +17,62 @@ from diffeo_calib.reports.plots import style
 from diffeo_calib.reports.plots.joints import joint_label, joint_values
 from diffeo_calib.robots.tree import Tree
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 FOLDER = Path(__file__).parent
+VARIABLES = ("ink", "faint", "grid", "grey", "orange", "blue", "green", "purple")
+"""Variables of the page's style that replace the colours of this name."""
 
 
-class Picture(NamedTuple):
-    """A drawing of the page as SVG, and what it shows in words."""
+class Picture:
+    """One panel, drawn by ``draw(axes, *what, **how)``.
 
-    svg: str
-    label: str
+    Args:
+        name: distinguishes its elements from those of other panels. label: what it shows, in words.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        label: str,
+        draw: Callable[..., None],
+        *what: Any,
+        frame: style.Frame = style.FRAME,
+        **how: Any,
+    ) -> None:
+        self.name, self.label, self._draw, self._frame = name, label, partial(draw, **how), frame
+        self._what = what
+
+    def figure(self) -> Figure:
+        """As a figure of matplotlib, which touches neither pyplot nor any window."""
+        from matplotlib.figure import Figure  # noqa: PLC0415  # slow to import, needed for figures only
+
+        (width, height), left, top, bottom, right = self._frame
+        figure = Figure(figsize=self._frame.size)
+        share = (left / width, bottom / height, 1 - (left + right) / width, 1 - (bottom + top) / height)
+        self._draw(figure.add_axes(share), *self._what)
+        return figure
+
+    def svg(self) -> str:
+        """As a drawing inside a page."""
+        from matplotlib import rc_context  # noqa: PLC0415
+
+        text, name = io.StringIO(), self.name
+        with rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
+            self.figure().savefig(text, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+        svg = text.getvalue()
+        svg = svg[svg.index("<svg") :]
+        svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+        svg = re.sub(r'\bid="(?!(?:m|p|C)[0-9a-f_]{8,})[^"]*"', "", svg)
+        svg = re.sub(r'(id="|url\(#|xlink:href="#)', rf"\g<1>{name}-", svg)
+        svg = re.sub(r'<svg [^>]*viewBox="([^"]*)"[^>]*>', r'<svg viewBox="\1" aria-hidden="true">', svg, count=1)
+        svg = svg.replace("xlink:href", "href")
+        for variable in VARIABLES:
+            svg = re.sub(getattr(style, variable.upper()), f"var(--{variable})", svg, flags=re.IGNORECASE)
+        svg = re.sub(r"font: ([0-9.]+)px [^;\"]*", r"font-size: \1px", svg)
+        svg = re.sub(r'\b(?:d|x|y|transform)="[^"]*"', lambda found: re.sub(r"(\.\d{2})\d+", r"\1", found[0]), svg)
+        return re.sub(r"\s*\n\s*", "\n", svg)
 
 
 class Table(NamedTuple):
@@ -60,58 +109,6 @@ def page(**parts: Any) -> str:
         parts[name] = (FOLDER / file).read_text(encoding="utf-8")
     text = made.get_template("report.html.jinja").render(parts)
     return re.sub(r"(?<=\d) (?=(?:%|mm|m)\b|%)", "\u00a0", text)  # numbers stay with their units
-
-
-DOT = 0.2
-"""Length of a stroke, in the units of the drawing (1/72 inch), below which it is a dot."""
-VARIABLES = ("ink", "faint", "grid", "grey", "orange", "blue", "green", "purple")
-"""Variables of the page's style that replace the colours of this name."""
-
-
-def panel(
-    name: str, label: str, draw: Callable[..., None], *what: Any, frame: style.Frame = style.FRAME, **how: Any
-) -> Picture:
-    """A picture of one panel, drawn by ``draw(axes, *what, **how)``.
-
-    Args:
-        name: distinguishes its elements from those of other panels. label: what it shows.
-    """
-    from matplotlib import rc_context  # noqa: PLC0415  # slow to import, needed for figures only
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    (width, height), left, top, bottom, right = frame
-    figure = Figure(figsize=frame.size)
-    share = (left / width, bottom / height, 1 - (left + right) / width, 1 - (bottom + top) / height)
-    draw(figure.add_axes(share), *what, **how)
-    text = io.StringIO()
-    with rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
-        figure.savefig(text, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
-    svg = text.getvalue()
-    svg = svg[svg.index("<svg") :]
-    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    svg = re.sub(r'\bid="(?!(?:m|p|C)[0-9a-f_]{8,})[^"]*"', "", svg)
-    svg = re.sub(r'(id="|url\(#|xlink:href="#)', rf"\g<1>{name}-", svg)
-    svg = re.sub(r'<svg [^>]*viewBox="([^"]*)"[^>]*>', r'<svg viewBox="\1" aria-hidden="true">', svg, count=1)
-    svg = svg.replace("xlink:href", "href")
-    for variable in VARIABLES:
-        svg = re.sub(getattr(style, variable.upper()), f"var(--{variable})", svg, flags=re.IGNORECASE)
-    svg = re.sub(r"font: ([0-9.]+)px [^;\"]*", r"font-size: \1px", svg)
-    svg = re.sub(r'\b(?:d|x|y|transform)="[^"]*"', lambda found: re.sub(r"(\.\d{2})\d+", r"\1", found[0]), svg)
-    svg = re.sub(r"M (\S+) (\S+)\nL (\S+) \2\n", _dot, re.sub(r"\s*\n\s*", "\n", svg))
-    styles = dict[str, str]()  # of many markers, each written once
-
-    def short(found: re.Match[str]) -> str:
-        return f'{found[1]}class="{styles.setdefault(found[2], f"{name}-{len(styles)}")}"'
-
-    svg = re.sub(r'(<use [^>]*)style="([^"]*)"', short, svg)
-    rules = "".join(f".{key}{{{own}}}" for own, key in styles.items())
-    return Picture(svg.replace(">", f"><style>{rules}</style>", 1) if rules else svg, label)
-
-
-def _dot(stroke: re.Match[str]) -> str:
-    """A stroke that is too short to be seen as one of no length, whose round ends are a dot."""
-    x, y, end = stroke.groups()
-    return f"M{x} {y}h0" if abs(float(end) - float(x)) < DOT else stroke[0]
 
 
 def millimetres(metres: float) -> str:

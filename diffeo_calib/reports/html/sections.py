@@ -11,17 +11,16 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.outliers import Outlier
 from diffeo_calib.common.errors import PACKAGE, printable
-from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics, measured_words
 from diffeo_calib.kinematics.evaluation import at_payloads
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_sentences
 from diffeo_calib.kinematics.transmission import gear_lines
-from diffeo_calib.measurements.bodies import matrix_lines
+from diffeo_calib.measurements.bodies import placement_lines
 from diffeo_calib.reports.analysis.findings import Findings, RowsOfKind
 from diffeo_calib.reports.analysis.predictions import FitRows, Predictions
 from diffeo_calib.reports.analysis.stages import STANDARD_REPEATS, Kinematics
 from diffeo_calib.reports.html import sentences
-from diffeo_calib.reports.html.document import Picture, Section, Table, joint_values_by_row, marker_name, panel
+from diffeo_calib.reports.html.document import Picture, Section, Table, joint_values_by_row, marker_name
 from diffeo_calib.reports.html.document import millimetres as mm
 from diffeo_calib.reports.html.document import rough_millimetres as rough
 from diffeo_calib.reports.plots import errors as plots
@@ -53,13 +52,13 @@ def stage_pictures(stages: Mapping[str, Evaluation], suffix: str, repeatability:
     some = next(iter(stages.values()))
     label = f"Share of rows whose {some.label} is at most a value."
     how = {"repeatability": repeatability, "frame": UNDER_LEGEND}
-    yield panel(f"distributions{suffix}", label, plots.draw_distributions, stages, **how)
+    yield Picture(f"distributions{suffix}", label, plots.draw_distributions, stages, **how)
     label = f"Every row: {some.label} of the calibrated model against that of the stage before it."
-    yield panel(f"before-after{suffix}", label, plots.draw_before_after, stages, frame=UNDER_LEGEND)
+    yield Picture(f"before-after{suffix}", label, plots.draw_before_after, stages, frame=UNDER_LEGEND)
     turned = {name: one.orientation for name, one in stages.items() if one.orientation is not None}
     if turned:
         label = "Share of rows whose orientation error is at most a value."
-        yield panel(f"angles{suffix}", label, plots.draw_distributions, turned, frame=UNDER_LEGEND)
+        yield Picture(f"angles{suffix}", label, plots.draw_distributions, turned, frame=UNDER_LEGEND)
 
 
 def stage_table(stages: Mapping[str, Evaluation]) -> Table:
@@ -74,12 +73,9 @@ def stage_table(stages: Mapping[str, Evaluation]) -> Table:
     return Table(f"{some.title} by stage", header, rows)
 
 
-def sections(found: Findings, progress: Progress = silent) -> Iterator[Section]:
+def sections(found: Findings) -> Iterator[Section]:
     """Contents of the page before its record."""
-    every = how_good, where, why, trust, repeatability
-    for number, section in enumerate(every):
-        progress("drawing", number, len(every))
-        yield section(found)
+    yield from (section(found) for section in (how_good, where, why, trust, repeatability))
     if found.devices:
         see = "Where devices and sockets stand, and what was found from the rows shown as the model did not know it."
         yield Section("devices", "Devices", see, text=[printable(line) for line in found.devices])
@@ -115,7 +111,7 @@ def where(found: Findings) -> Section:
     pictures, solid = list[Picture](), "dashed anywhere in the measured ranges, solid where it was measured."
     for k, name in enumerate(robot.joint_names):
         label, what = f"Error that the model itself expects against {printable(name)}: {solid}", (robot, k)
-        pictures.append(panel(f"expected-{k}", label, joints.draw_expected, *what, found.deviations, key=k == 0))
+        pictures.append(Picture(f"expected-{k}", label, joints.draw_expected, *what, found.deviations, key=k == 0))
     scene = None if found.predictions is None else _scene(found.stages, found.predictions)
     arrows = "Arrows point from the predicted to the measured place, with one scale in all views. Below: "
     see = arrows * (scene is not None) + (
@@ -159,11 +155,11 @@ def why(found: Findings) -> Section:
     left = 0.3 + PER_LETTER * max(len(joints.short(part.name)) for part in parts)
     frame = Frame((joints.PART_WIDTH, 0.9 + 0.24 * len(parts)), left=left)
     label = "What each part of the model explains (parts may cancel)."
-    pictures = [panel("parts", label, joints.draw_parts, parts, frame=frame)]
+    pictures = [Picture("parts", label, joints.draw_parts, parts, frame=frame)]
     label = "motion beyond its reading, with its 95 % band; below, where the joint was measured."
     for joint, name in enumerate(found.model.robot.joint_names):
         what = joints.draw_transmission, found.model, found.rows, joint
-        pictures.append(panel(f"transmission-{joint}", f"{printable(name)}: {label}", *what))
+        pictures.append(Picture(f"transmission-{joint}", f"{printable(name)}: {label}", *what))
     see, tables = "A wide band means that the joint was measured too little there.", list[Table]()
     notes = ["Coupled joint errors depend on several joints, task space on the place of the marker."]
     if not is_cartesian(found.model.robot):  # whose joints have no links, gears and weight
@@ -222,11 +218,11 @@ def trust(found: Findings) -> Section:
     pictures = list[Picture]()
     if seen is not None:
         label = "Found against claimed shares of errors; on the diagonal the claims are true."
-        pictures.append(panel("coverage", label, plots.draw_coverage, seen))
+        pictures.append(Picture("coverage", label, plots.draw_coverage, seen))
     if found.learning_curve:
         label = "Error of rows of the fit when a model knows fewer of them, each row left out in turn."
         what = found.learning_curve, found.forecast, found.limit if found.repeats else None
-        pictures.append(panel("learning", label, plots.draw_learning_curve, *what))
+        pictures.append(Picture("learning", label, plots.draw_learning_curve, *what))
     pictures += _residuals(found)
     return Section("trust", "Can I trust it", sentences.judged(found), tables, None, pictures, notes)
 
@@ -243,11 +239,11 @@ def _residuals(found: Findings) -> Iterator[Picture]:
             missing = int((~values.isfinite()).sum())
             label += f" {missing} of {len(values)} rows have no value." * (missing > 0)
             given = values, errors, printable(name)
-            yield panel(f"residuals-{place}-{number}", label, plots.draw_residuals, *given, key=number == 0)
+            yield Picture(f"residuals-{place}-{number}", label, plots.draw_residuals, *given, key=number == 0)
         for joint, name in enumerate(robot.joint_names):
             label = f"{what} against {printable(name)}, their RMS dashed."
             given = joint_values(robot, joint, q[:, joint]), errors, joint_label(robot, joint)
-            yield panel(f"residuals-{place}-joint-{joint}", label, plots.draw_residuals, *given, key=False)
+            yield Picture(f"residuals-{place}-joint-{joint}", label, plots.draw_residuals, *given, key=False)
 
 
 def _largest(found: Findings, own: RowsOfKind) -> Table:
@@ -325,6 +321,6 @@ def record(model: CalibratedKinematics, data_sha256: str | None) -> Section:
             certificate = "without certificate: fewer control points than rows"
         lines.append(f"optimum       {certificate}")
         lines.append(f"status        {summary.status}; scales: {summary.scales}")
-    lines += ["robot base in the measuring frame, 4 x 4 [m]:", *matrix_lines(model.geometry.base)]
-    lines += [*model.bodies.place_lines(model), *hand_eye_sentences(HandEye.of_fit(model))]
+    lines += map(printable, placement_lines(model.geometry, poses=model.lever is not None, ball=model.ball))
+    lines += hand_eye_sentences(HandEye.of_fit(model))
     return Section("record", "Record", "Everything needed to make this model again.", text=lines)

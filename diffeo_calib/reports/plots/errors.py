@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib import colormaps
-from matplotlib.figure import Figure
 from torch import Tensor
 
-from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC
 from diffeo_calib.common.quantiles import known, largest_known
-from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.reports.analysis.predictions import SHARES, FitRows, Predictions
-from diffeo_calib.reports.analysis.stages import stages_of
+from diffeo_calib.reports.analysis.predictions import SHARES, Predictions
 from diffeo_calib.reports.plots import style
-from diffeo_calib.reports.plots.joints import joint_label, joint_values, rms_in_bins
-from diffeo_calib.reports.plots.style import BLUE, FAINT, GREEN, GREY, INK, LOOKS, ORANGE, finish, legend, note, panels
+from diffeo_calib.reports.plots.joints import rms_in_bins
+from diffeo_calib.reports.plots.style import BLUE, GREEN, GREY, INK, LOOKS, ORANGE, finish, legend, note
 from diffeo_calib.sensors.errors import Evaluation
 
 if TYPE_CHECKING:
@@ -26,33 +20,6 @@ if TYPE_CHECKING:
 
 SMALLEST_ERROR = 1e-9
 """Smaller errors in mm, px or deg are drawn as this one: a logarithmic axis has no zero."""
-
-
-def stages(
-    evaluations: Mapping[str, Evaluation] | Sequence[Mapping[str, Evaluation]],
-    title: str = "",
-    *,
-    repeatability: float | None = None,
-) -> Figure:
-    """Errors by stage: their distributions, the last stage against the one before it, and orientations if measured.
-
-    Args:
-        evaluations: name of each stage -> its errors on the same rows, in order; at least two. One such mapping for
-            each kind of rows if there are several.
-        title: one line that names the measurements.
-        repeatability: RMS distance of repeated measurements from their mean, m, drawn as the limit of any model.
-    """
-    kinds = [evaluations] if isinstance(evaluations, Mapping) else list(evaluations)
-    angles = [{name: one.orientation for name, one in kind.items() if one.orientation is not None} for kind in kinds]
-    columns = 2 + any(angles)
-    figure, axes = panels(2 * len(kinds) + sum(map(bool, angles)), columns=columns, title=title)
-    free = iter(axes)
-    for kind, turned in zip(kinds, angles, strict=True):
-        draw_distributions(next(free), kind, repeatability=repeatability)
-        draw_before_after(next(free), kind)
-        if turned:
-            draw_distributions(next(free), turned)
-    return figure
 
 
 def draw_distributions(
@@ -93,51 +60,8 @@ def _sizes(evaluation: Evaluation) -> np.ndarray:
     return np.maximum(evaluation.shown[1] * known(evaluation.errors).numpy(), SMALLEST_ERROR)
 
 
-ARROW_SHARE = 0.12
-"""Length of the longest arrow in units of the workspace."""
-
-
-def workspace(model: CalibratedKinematics, data: Measurements | None = None, title: str = "") -> Figure:
-    """Errors as arrows at the measured places, geometric calibration beside the model, enlarged by one factor.
-
-    Of rows that took no part in the fit; by default of those of the fit, each predicted by all others.
-    """
-    seen = Predictions.of(model, data)
-    geometric = seen.data.bodies.origins(stages_of(model)[GEOMETRIC](seen.data.q))
-    there = ~seen.measured.isnan().any(2)  # of the sightings
-    places, before, after = seen.measured[there], (seen.measured - geometric)[there], seen.away[there]
-    figure = Figure(figsize=(9.6, 4.8), layout="constrained")
-    size = float((places.amax(0) - places.amin(0)).max())
-    factor = ARROW_SHARE * size / max(float(before.norm(dim=-1).max()), float(after.norm(dim=-1).max()), 1e-12)
-    for number, (errors, name) in enumerate(((before, GEOMETRIC), (after, CALIBRATED)), 1):
-        axes: Any = figure.add_subplot(1, 2, number, projection="3d")
-        lengths = errors.norm(dim=-1)
-        colours = colormaps["viridis"]((lengths / lengths.max().clamp(min=1e-12)).numpy())
-        axes.scatter(*places.T.numpy(), s=4, color=colours)
-        arrows = {"color": colours, "linewidth": 1, "arrow_length_ratio": 0.2}
-        axes.quiver(*places.T.numpy(), *(factor * errors).T.numpy(), **arrows)
-        axes.set_box_aspect((places.amax(0) - places.amin(0)).clamp(min=1e-3).tolist())
-        axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
-        axes.tick_params(labelsize=7, colors=FAINT)
-        rms = 1e3 * float(errors.square().sum(-1).mean().sqrt())
-        axes.set_title(f"{name}: {rms:.3g} mm RMS, arrows x {factor:.0f}", fontsize=9, color=INK)
-    if title:
-        figure.suptitle(style.literal(title), fontsize=11, color=INK)
-    return figure
-
-
 FEWEST_BINNED = 30
 """Values from which a line of RMS errors is drawn through residuals."""
-
-
-def uncertainty(model: CalibratedKinematics, data: Measurements | None = None, title: str = "") -> Figure:
-    """Shares of errors inside the model's own regions against the shares that these claim.
-
-    ``data``: rows that took no part in its fit; by default the rows of the fit, each predicted by all others.
-    """
-    figure, (axes,) = panels(1, title=title)
-    draw_coverage(axes, Predictions.of(model, data))
-    return figure
 
 
 def draw_coverage(axes: Axes, predictions: Predictions) -> None:
@@ -158,17 +82,6 @@ def draw_coverage(axes: Axes, predictions: Predictions) -> None:
     legend(axes, loc="upper left")
 
 
-def residuals(model: CalibratedKinematics, data: Measurements | None = None, title: str = "") -> Figure:
-    """Errors against row and every joint; arguments as :func:`uncertainty`."""
-    predictions = Predictions.of(model, data)
-    figure, grid = panels(1 + model.robot.n, columns=3, title=title)
-    draw_residuals(grid[0], predictions.data.line_numbers.double(), predictions.errors, "row")
-    for joint, axes in enumerate(grid[1:]):
-        values = joint_values(model.robot, joint, predictions.data.q[:, joint])
-        draw_residuals(axes, values, predictions.errors, joint_label(model.robot, joint))
-    return figure
-
-
 def draw_residuals(axes: Axes, values: Tensor, errors: Evaluation, label: str, *, key: bool = True) -> None:
     """Errors of N rows against a column of numbers (N,); with ``key`` lines are named.
 
@@ -185,13 +98,6 @@ def draw_residuals(axes: Axes, values: Tensor, errors: Evaluation, label: str, *
             legend(axes, loc="upper right")
     axes.set_ylim(bottom=0)
     finish(axes, x=label, y=f"error [{unit}]")
-
-
-def learning_curve(model: CalibratedKinematics, title: str = "") -> Figure:
-    """Error of rows that are left out against the number of rows that the model knows."""
-    figure, (axes,) = panels(1, title=title)
-    draw_learning_curve(axes, FitRows(model).learning_curve())
-    return figure
 
 
 def draw_learning_curve(

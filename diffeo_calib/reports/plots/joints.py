@@ -10,18 +10,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.findings import Part, parts
+from diffeo_calib.calibration.findings import Part
 from diffeo_calib.common.errors import shown
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.transmission import smooth_transmission
 from diffeo_calib.reports.analysis.predictions import FitRows
 from diffeo_calib.reports.analysis.stages import Deviations
-from diffeo_calib.reports.plots.style import BLUE, GREY, INK, LOOKS, dots, finish, legend, literal, panels
+from diffeo_calib.reports.plots.style import BLUE, GREY, INK, LOOKS, dots, finish, legend, literal
 from diffeo_calib.robots.tree import Tree
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 POINTS = 120
@@ -36,15 +35,6 @@ PART_WIDTH = 4.7
 TWO_SIDED_95 = 1.96
 LONGEST_NAME = 36
 """Letters of a name in a panel."""
-
-
-def transmissions(model: CalibratedKinematics, title: str = "") -> Figure:
-    """Transmission error of every joint against its value, with its 95 % band and the measured values below."""
-    rows = FitRows(model)
-    figure, grid = panels(model.robot.n, columns=3, title=title)
-    for joint, axes in enumerate(grid):
-        draw_transmission(axes, model, rows, joint)
-    return figure
 
 
 def draw_transmission(axes: Axes, model: CalibratedKinematics, rows: FitRows, joint: int) -> None:
@@ -66,15 +56,6 @@ def draw_transmission(axes: Axes, model: CalibratedKinematics, rows: FitRows, jo
     finish(axes, x=joint_label(robot, joint), y=f"transmission error [{joint_unit(robot, joint, 'mrad')}]")
 
 
-def explained(model: CalibratedKinematics, title: str = "") -> Figure:
-    """Displacement explained by each part of the model: RMS displacement of the markers."""
-    found = parts(model)
-    figure, (axes,) = panels(1, title=title)
-    figure.set_size_inches(PART_WIDTH, 0.9 + 0.24 * len(found))
-    draw_parts(axes, found)
-    return figure
-
-
 def draw_parts(axes: Axes, found: Sequence[Part]) -> None:
     """Bars of the parts of a model, in mm."""
     lengths = [1e3 * part.displacement for part in found]
@@ -89,15 +70,6 @@ def draw_parts(axes: Axes, found: Sequence[Part]) -> None:
     finish(axes, x="RMS displacement [mm]", y="")
     axes.set_yticks(ticks, names)
     axes.grid(visible=False, axis="y")
-
-
-def expected_error(model: CalibratedKinematics, title: str = "", *, seed: int = 0) -> Figure:
-    """Error that the model itself expects, against every joint over the ranges of its fit."""
-    found = Deviations.of(model, seed)
-    figure, grid = panels(model.robot.n, columns=3, title=title)
-    for joint, axes in enumerate(grid):
-        draw_expected(axes, model.robot, joint, found)
-    return figure
 
 
 def draw_expected(axes: Axes, robot: Tree, joint: int, found: Deviations, *, key: bool = True) -> None:

@@ -12,7 +12,6 @@ from diffeo_calib.common.errors import printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 INK, FAINT, GRID = "#2b2f36", "#6b7280", "#d5d9e0"
 """Colours of text and axes, of notes, and of grids."""
@@ -41,21 +40,6 @@ LOOKS = (
     Look(PURPLE, (0, (6, 2, 1, 2, 1, 2)), 1.8),
 )
 """Nominal, geometric and calibrated, then others, in this order."""
-
-
-def panels(count: int, columns: int = 2, title: str = "") -> tuple[Figure, list[Axes]]:
-    """A figure of several panels, and its axes from left to right and down."""
-    from matplotlib.figure import Figure  # noqa: PLC0415  # slow to import, needed for figures only
-
-    columns = min(columns, count)
-    lines = -(-count // columns)
-    figure = Figure(figsize=(PANEL[0] * columns, PANEL[1] * lines + 0.4 * bool(title)), layout="constrained")
-    grid = list(figure.subplots(lines, columns, squeeze=False).ravel())
-    for axes in grid[count:]:
-        axes.set_axis_off()
-    if title:
-        figure.suptitle(literal(title), fontsize=11, color=INK)
-    return figure, grid[:count]
 
 
 class Frame(NamedTuple):

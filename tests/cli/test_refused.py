@@ -1,0 +1,193 @@
+"""Wrong usage, options and tables with mistakes, broken files: an exit code and one sentence that says what to do."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_bank import ROTATION, TABLE, Command, Edit, Site, edited, rows_of, set_cell
+
+import diffeo_calib as dc
+from diffeo_calib.measurements.csv.files import write_measurements
+from diffeo_calib.measurements.table_format import TableFormat
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "fit",
+        "fit t.csv --robot r.urdf",
+        "nonsense",
+        "evaluate m t.csv --position x,y,z --length km --angle rad",
+        "evaluate m t.csv --position x,y,z --length m --angle rad --surprise",
+        "fit t.csv --holdout 1.5",
+        "fit t.csv --holdout nan",
+        "evaluate m t.csv --position x,y,z --length m --angle rad --rotation-angle turn",
+        "demo --seed -1",
+        "demo --count 3",
+    ],
+)
+def test_wrong_usage_is_exit_2(words: str, command: Command) -> None:
+    done = command(*words.split())
+    assert done.code == 2
+    assert "Traceback" not in done.err
+    assert "Usage" in done.err
+
+
+def test_unconverged_is_exit_3_with_the_model_written(
+    site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_measurements(tmp_path / "t.csv", site.data.rows(slice(11)), TableFormat("m", "rad"))
+    monkeypatch.setattr("diffeo_calib.calibration.calibrate.GaussNewton", partial(dc.GaussNewton, max_iterations=1))
+    path = tmp_path / "early.safetensors"
+    table = ["--position", "x,y,z", "--length", "m", "--angle", "rad"]
+    done = command("fit", tmp_path / "t.csv", *site.robot(), *table, "-o", path, "--holdout", 0)
+    assert done.code == 3
+    assert "stopped at the limit of 1 iterations; judge it by held-out errors" in done.out
+    assert "pass fewer --controls" in done.out
+    assert "max_iterations" not in done.out
+    assert any("11 poses are too few to select scales" in warning for warning in done.warnings)
+    assert isinstance(dc.load(path), dc.CalibratedKinematics)
+
+
+def turned(cells: list[list[str]]) -> list[list[str]]:
+    """With columns of rotations, which are all the same."""
+    return [cells[0] + list("ijkl"), *([*row, *"7908"] for row in cells[1:])]
+
+
+def as_written(cells: list[list[str]]) -> list[list[str]]:
+    return cells
+
+
+def given(*words: str, edit: Edit = as_written) -> tuple[Sequence[str], Edit]:
+    return words, edit
+
+
+REFUSED = {
+    r"--sep and --decimal: expected different characters.*--sep ';'": given("--sep", ","),
+    r"no link 'hand'.*its links are base_link, .*flange": given("--tip", "hand"),
+    r"did you mean 'flange'": given("--tip", "flnage"),
+    r"--tip: expected 1, one for each --position, got 2": given("--tip", "flange", "--tip", "wrist_link"),
+    r"no moving joint from 'output_link' to 'flange'": given("--base", "output_link"),
+    r"do not fit this robot, even with geometric errors.* as the tip": given("--tip", "wrist_link"),
+    r"expected 6 columns, in the order .*, got 2": given("--joints", "waist_joint,shoulder_joint"),
+    r"names the robot's joints in another order than the robot's": given(
+        "--joints", "shoulder_joint,waist_joint,elbow_joint,forearm_roll_joint,wrist_bend_joint,wrist_roll_joint"
+    ),
+    r"there is no file nowhere.urdf; check the path of --robot": given("--robot", "nowhere.urdf"),
+    r"--rotation is given, but its --convention is not: expected 'rotvec'": given("--rotation", "a,b,c", edit=turned),
+    r"--rotation-angle is missing: the unit of the rotation: expected 'rad'": given(*ROTATION[:4], edit=turned),
+    r"--lever without --rotation": given("--lever", "100"),
+    r"--rotation-std without --rotation": given("--rotation-std", "a,b,c"),
+    r"--std: expected names of columns: one, one per marker or three per": given("--std", "a,b"),
+    r"`lever`.*above 0, got -0.005": given("--rotation", "i,j,k", *ROTATION[2:], "--lever", "-5", edit=turned),
+    r"line 5, column 'my': expected a number, got 'far'": given(edit=set_cell(4, 7, "far")),
+    r"for 'elbow_joint', did you mean elbow_jiont": given(edit=set_cell(0, 2, "elbow_jiont")),
+    r"line 32 repeats 4; real repeats differ by noise": given(edit=lambda cells: [*cells, cells[3]]),
+    r"in 1 row.*|at least 2|2 distinct": given(edit=rows_of(0, 1)),
+    r"at least 3 poses, got 1": given(edit=rows_of(0, 1, 2)),
+    r"at least 3 poses, got 2.*measure more poses": given("--holdout", "0", edit=rows_of(0, 1, 2)),
+}
+"""What is said -> options, and an edit of the table."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("message", REFUSED)
+def test_what_fit_refuses(message: str, small_site: Site, command: Command, tmp_path: Path) -> None:
+    options, edit = REFUSED[message]
+    words = small_site.fit(edited(small_site, tmp_path / "t.csv", edit), tmp_path / "model")
+    if "--tip" in options:  # a second one would be a second marker
+        at = words.index("--tip")
+        words = words[:at] + words[at + 2 :]
+    done = command(*words, *options)
+    assert done.code == 1
+    assert re.search(message, done.error), done.error
+    assert "tip" in message or not (tmp_path / "model").exists()
+    assert done.out == "" or "tip" in message
+
+
+@pytest.mark.slow
+def test_shuffled_rows(small_site: Site, command: Command, tmp_path: Path) -> None:
+    """Points paired with other rows' joints: what a sorted spreadsheet column does."""
+
+    def shuffle(cells: list[list[str]]) -> list[list[str]]:
+        order = np.random.default_rng(0).permutation(len(cells) - 1) + 1
+        return [cells[0], *(cells[i + 1][:6] + cells[j][6:] for i, j in enumerate(order))]
+
+    done = command(*small_site.fit(edited(small_site, tmp_path / "bad.csv", shuffle), tmp_path / "model"))
+    assert done.code == 1
+    doubts = [text for text in done.warnings if "the measurements do not fit this robot" in text]
+    assert "rows pair joints with their own points" in doubts[0]
+    assert "of the judged positions are more than" in done.error
+    assert (tmp_path / "model").exists()
+
+
+@pytest.mark.slow
+def test_models_that_do_not_belong_to_a_table(small_site: Site, sound: bytes, command: Command, tmp_path: Path) -> None:
+    """tests/interop damages files in every way."""
+    model, csv, out = tmp_path / "model.safetensors", small_site.csv, ["-o", tmp_path / "p.csv"]
+    x = np.random.default_rng(0).uniform(-1, 1, (6, 2))
+    kernels = dc.VonMises(1.0), dc.Gaussian(1.0)
+    problem = dc.Problem(lambda q: q * 1.0, x, x + 0.01, noise=0.01, joint_kernel=kernels[0], task_kernel=kernels[1])
+    dc.save(dc.fit(problem).model, tmp_path / "plain.safetensors")
+    misspelt = edited(small_site, tmp_path / "bad.csv", set_cell(0, 5, "wrist_rol_joint"))
+    poses = edited(small_site, tmp_path / "t.csv", turned)
+    whole = sound, (tmp_path / "plain.safetensors").read_bytes()
+    damaged = sound.replace(b'\\"rows\\": 10', b'\\"rows\\": 99'), csv.read_bytes()
+    for content, words, message in (
+        (b"", ["predict", "nowhere", csv, *TABLE[2:], *out], "there is no model file"),
+        (damaged[0], ["predict", model, csv, *TABLE[2:], *out], "checksum does not match"),
+        (damaged[1], ["predict", model, csv, *TABLE[2:], *out], "cannot be read as a model file"),
+        (b"", ["evaluate", small_site.urdf, csv, *TABLE], "it is a URDF; pass a file written by"),
+        (whole[1], ["evaluate", model, csv, *TABLE], "plain function"),
+        (whole[0], ["evaluate", model, misspelt, *TABLE], "did you mean wrist_rol_joint"),
+        (whole[0], ["evaluate", model, csv, *TABLE, "--joints", "waist_joint"], "expected 6 columns, in the order"),
+        (
+            whole[0],
+            ["evaluate", model, poses, *TABLE, "--rotation", "i,j,k", *ROTATION[2:]],
+            "calibrated with points: expected measured points, got poses",
+        ),
+        (whole[0], ["predict", model, csv, *TABLE[2:], "--convention", "rotvec", *out], "this model has none"),
+        (whole[0], ["predict", model, csv, *TABLE[2:], "--rotation-angle", "deg", *out], "this model has none"),
+    ):
+        model.write_bytes(content)
+        done = command(*words)
+        assert done.code == 1
+        assert message in done.error
+        assert not (tmp_path / "p.csv").exists()
+
+
+PLACES = [("none/file.png", "No such file or directory"), ("here.png", "Is a directory")]
+
+
+@pytest.mark.parametrize("case", [(option, *place) for option in ("-o", "--report") for place in PLACES])
+def test_outputs_are_checked_before_the_fit(
+    case: tuple[str, str, str], small_site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    option, place, message = case
+    monkeypatch.setattr("diffeo_calib.cli.commands.fit.robot_of", lambda *_, **__: pytest.fail("the work has begun"))
+    (tmp_path / "here.png").mkdir()
+    done = command(*small_site.fit(small_site.csv, tmp_path / "model"), option, tmp_path / place)
+    assert done.code == 1
+    assert f"file '{tmp_path / place}' cannot be written ({message})" in done.error
+
+
+def test_files_that_are_none(small_site: Site, command: Command, tmp_path: Path) -> None:
+    for csv, message in ((tmp_path / "nowhere.csv", "there is no file"), (tmp_path, "is a folder: expected a table")):
+        assert message in command(*small_site.fit(csv, tmp_path / "model")).error
+    joints = ",".join(f"q{number}" for number in range(6))
+    (tmp_path / "joints.csv").write_text(f"{joints},image\n0,0,0,0,0,0,{'x' * 5000}\n", encoding="utf-8")
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.png").write_bytes(b"")
+    words = tmp_path / "images", tmp_path / "joints.csv", "--board", "chessboard:7x5:0.03", "--length", "mm"
+    done = command("images", *words, "-o", tmp_path / "corners.csv")
+    assert done.code == 1
+    assert "File name too long; check the path" in done.error
+    if (zero := Path("/dev/zero")).exists():  # a device without an end
+        assert "no text but binary" in command(*small_site.fit(zero, tmp_path / "model")).error
+        assert "is no file" in command(*small_site.fit(small_site.csv, tmp_path / "model", "--robot", zero)).error
+        assert "there is no model file /dev/zero" in command("evaluate", zero, small_site.csv, *TABLE).error
