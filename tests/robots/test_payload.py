@@ -118,4 +118,4 @@ def test_a_map_of_payloads_at_rows_and_elsewhere() -> None:
 def test_payloads_of_rows_that_cannot_be(masses: Tensor, at: str | None, message: str) -> None:
     with pytest.raises(InputError, match=message):
         Payload.of_rows(SimulatedArm(0).nominal, masses, at)
-    assert Payload.of_rows(SimulatedArm(0).nominal, None, None) is None
+    assert not Payload.of_rows(SimulatedArm(0).nominal, None, None)
