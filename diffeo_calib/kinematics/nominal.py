@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import wrapped
-from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.gravity import GravitySag
@@ -55,9 +54,6 @@ class GeometryMap(NominalMap):
         own: errors of joints that depend on their own position.
         payload: known masses that the robot carries, for an elastic one.
         rigid: whether markers are points of frames, three each, which move as a whole: what bends them has no effect.
-
-    Raises:
-        InputError: a payload of a robot that does not bend.
     """
 
     def __init__(
@@ -70,8 +66,6 @@ class GeometryMap(NominalMap):
         rigid: bool = False,
     ) -> None:
         n, n_all = geometry.chain.n, geometry.chain.moving
-        if payload and not elastic:
-            raise InputError.of("a payload of a rigid robot", expected="elastic=True", fix="leave the payload out")
         self.geometry = geometry
         self.elasticity = GravitySag(geometry.chain, payload) if elastic else None
         self.own, self.rigid, self.load = own, rigid, payload

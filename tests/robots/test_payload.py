@@ -64,8 +64,6 @@ def test_wrong_payloads() -> None:
     sag = laden(arm)
     with pytest.raises(InputError, match="a payload of every row"):
         sag.folded(draw(sag.size))
-    with pytest.raises(InputError, match="a payload of a rigid robot"):
-        GeometryMap(Geometry.nominal(arm, 1), payload=sag.payload)
 
 
 def test_a_payload_beside_the_flange_sits_where_it_is_said() -> None:
