@@ -350,7 +350,7 @@ class NewRows:
         dim = self.noise_model.freedom
         if (weights := gross_weights(squares, dim)) is not None:  # gross rows are named, and say nothing of the robot
             squares = squares.masked_fill(weights < OUTLIER_WEIGHT, torch.nan)
-        return max(1.0, region_scale(squares, dim, prior=OTHER_DATE))
+        return max(1.0, region_scale(squares, dim, efolds=OTHER_DATE))
 
     @property
     def placed_residual(self) -> Tensor:
