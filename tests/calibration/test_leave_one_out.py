@@ -10,7 +10,6 @@ import pytest
 import torch
 from scipy.stats import chi2
 from tangent_bank import Setting, built, covariance, normal, prior_covariance
-from tangent_bank import weighted as weighted_setting
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -20,7 +19,6 @@ from diffeo_calib.calibration.scales.leave_one_out import (
     LeaveOneOut,
     cross_validated_inflation,
     leave_one_out,
-    left_out_squares,
     motions,
     random_folds,
 )
@@ -186,39 +184,8 @@ def test_few_data_inflate_the_regions_as_student_s_t_does() -> None:
 # --- folds ------------------------------------------------------------------------------------------------------------
 
 
-def narrow(setting: Setting) -> TangentData:
-    """With weights of any size, and a narrow prior of the base: G + R spans eight powers of ten with the usual."""
-    return replace(weighted_setting(setting), place_deviation=1e-3)
-
-
 def groups(data: TangentData) -> Tensor:
     return torch.arange(len(data.x))
-
-
-def parted(data: TangentData, *parts: Tensor) -> Tensor:
-    """(N,) the number of each row's part, negative for none."""
-    numbers = torch.full((len(data.x),), -1, dtype=torch.int64)
-    for number, rows in enumerate(parts):
-        numbers[rows] = number
-    return numbers
-
-
-def test_folds_are_predicted_from_all_other_rows(setting: Setting) -> None:
-    """By the formulas for conditional Gaussians, one marker or pose after the other."""
-    data, scales, rows = narrow(setting), setting.scales, torch.tensor([1, 4, 7])
-    m, new = data.size, data.blocks_in_numbers(data.noise_of_new_rows(scales))
-    inside = torch.isin(torch.arange(data.target.numel()) // m, rows)
-    K, y = covariance(data, scales), data.target.flatten()
-    gain = torch.linalg.solve(K[~inside][:, ~inside], K[~inside][:, inside]).T
-    errors = (y[inside] - gain @ y[~inside]).view(3, m, 1)
-    spread = (K[inside][:, inside] - gain @ K[~inside][:, inside]).view(3, m, 3, m)
-    own = torch.stack([spread[k, :, k] for k in range(3)])
-    part = data.rows(rows)
-    predicted = own - part.noise_of_numbers(scales) + new[rows]
-    expected = part.noise_model.squares(*map(part.blocks_in_coordinates, (predicted, errors @ errors.mT)))
-    found = left_out_squares(data, scales, parted(data, rows))
-    assert_close(found[rows], expected, rtol=1e-4, atol=1e-6)
-    assert bool(found[[0, 2, 3]].isnan().all())
 
 
 def test_rows_along_motions_and_repeats_belong_together() -> None:
