@@ -26,10 +26,10 @@ from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.transmission import NamedGearLine, gear_lines
-from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
 from diffeo_calib.sensors.places import Places, joined
+from diffeo_calib.sensors.tables import with_positions
 
 STAGES = NOMINAL, GEOMETRIC, CALIBRATED = "nominal", "geometric", "calibrated"
 """The stages of a calibration: base and markers only, with an error of every joint, and the model."""
@@ -117,8 +117,7 @@ class CalibrationResult:
 
     def aligned(self, data: Any) -> Any:
         """Rows of the same sessions in the frame of the model; those without positions, and of one session, stay."""
-        parts = [own if own.without_device else self.placement.aligned(own) for own in data.parts]
-        return Observations(parts, data.index) if len(parts) > 1 else parts[0]
+        return with_positions(data, self.placement.aligned)
 
     @property
     def stages(self) -> dict[str, Callable[[Tensor], Tensor]]:

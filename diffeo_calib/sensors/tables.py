@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few
-from diffeo_calib.measurements.observations import Rows, unmixed
+from diffeo_calib.measurements.observations import Observations, Rows, unmixed
 from diffeo_calib.measurements.poses import POINTS, kind_of_points, points_of_frames
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
@@ -82,6 +82,12 @@ def measured_positions(data: Any) -> Measurements | None:
     """The rows of any table whose positions or poses a device measured, without the ball; None without any."""
     own = divided(data)[0]
     return None if own is None or own.table.without_device else own.table.device_rows()
+
+
+def with_positions(data: Any, change: Callable[[Any], Any]) -> Any:
+    """Any table with a change of its rows whose positions or poses a device measured; the other ones stay."""
+    parts = [own if own.without_device else change(own) for own in data.parts]
+    return Observations(parts, data.index) if len(parts) > 1 else parts[0]
 
 
 def device_coordinates(coordinates: int, *, ball: bool, free: bool) -> int:
