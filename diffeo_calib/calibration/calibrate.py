@@ -61,7 +61,7 @@ from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.regression.choose import MAX_DENSE
+from diffeo_calib.regression.conjugate_gradients import MAX_DENSE
 from diffeo_calib.robots.payload import check_same_load
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import CHANGE, VALUE

@@ -162,6 +162,7 @@ class InitOptions(Command, Places):
     csv: Path = argument(CSV, "CSV")
     robot: Path | None = argument(ROBOT, "ROBOT", None)
     output: Path = written("Campaign file to write.", "TOML", Path("campaign.toml"))
+    force: bool = option("Replace a campaign file that was edited.", default=False)
 
 
 class ImagesOptions(Command):

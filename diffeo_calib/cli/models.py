@@ -120,7 +120,7 @@ def made_by_command(model: CalibratedKinematics) -> CalibratedKinematics:
     """The model with the command that runs in its provenance."""
     if model.provenance is None:
         return model
-    return model.with_provenance(replace(model.provenance, command=command_line()))
+    return model.changed(provenance=replace(model.provenance, command=command_line()))
 
 
 def provenance_lines(model: CalibratedKinematics) -> Iterator[str]:

@@ -210,3 +210,32 @@ def _of_tensor(tensor: Tensor, name: str) -> Tensor:
 
 def _unreadable(name: str, why: str, fix: str = "pass a numeric array, rows of equal length") -> InputError:
     return InputError.of(f"`{name}` cannot be read as numbers ({why})", fix=fix)
+
+
+BYTES_PER_GIB = 2.0**30
+
+
+def check_memory(needed: int, what: str) -> None:
+    """Raise InputError if less memory than ``needed`` (bytes) is free; check nothing if the system does not report it.
+
+    Args:
+        needed: bytes. what: subject of the message, plural.
+    """
+    free = free_memory()
+    if free is not None and needed > free:
+        raise InputError.of(
+            f"{what} need more memory than is free",
+            expected=f"{needed / BYTES_PER_GIB:.1f} GiB",
+            got=f"{free / BYTES_PER_GIB:.1f} GiB free",
+            fix="fit with fewer control points (`controls=500`), or a subset of the rows",
+        )
+
+
+def free_memory() -> int | None:
+    """Bytes of memory that are available, or None where unknown."""
+    try:
+        with open("/proc/meminfo", encoding="utf-8") as file:
+            entries = dict(line.split(":", 1) for line in file)
+        return int(entries["MemAvailable"].split()[0]) * 1024
+    except (OSError, KeyError, ValueError):
+        return None

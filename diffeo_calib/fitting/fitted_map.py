@@ -21,8 +21,8 @@ from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap
-from diffeo_calib.regression.choose import condition, condition_controls
 from diffeo_calib.regression.conditional import Conditional, Opened, without_rigid_motions
+from diffeo_calib.regression.conjugate_gradients import condition
 from diffeo_calib.regression.control_points import ControlPointRegression
 
 PREDICT_ROWS, WORKSPACE_ROWS = 1024, 100  # number of configurations that are linearised together for their covariances
@@ -323,14 +323,6 @@ class FittedMap:
         first = len(self.geodesic.spec.prior_variance)
         return self.parameter_covariance(first + torch.arange(self.noise.shared.shape[2], device=self.x.device))
 
-    def explained_by(self, which: Tensor, x: Tensor) -> float:
-        """Share of the posterior variance of k1 at x (M, n) that knowing these parameters would remove."""
-        own, at = self.parameters_as_points(which), self.geodesic.linearise(x)
-        between = self.conditional.covariance_between(at, own)  # (M m, k)
-        known = self.conditional.posterior(own)[0]
-        removed = (between * torch.linalg.solve(known, between.T).T).sum()
-        return float(removed / self.conditional.covariance(at).diagonal(dim1=1, dim2=2).sum())
-
     def parameters_as_points(self, which: Tensor) -> Linearisation:
         """The parameters with these numbers as if they were the coordinates of one configuration.
 
@@ -414,7 +406,7 @@ class FittedMap:
         """The fields around the fitted flows, conditioned on the data."""
         around, slopes = self.geodesic, self.slopes
         if self.data is not None:
-            return condition_controls(around, self.data, self.noise, slopes)
+            return ControlPointRegression(around, self.data, self.noise, slopes)
         at = around.linearise()
         return condition(at if slopes is None else at.projected(slopes), self.noise)
 

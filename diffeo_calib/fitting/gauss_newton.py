@@ -30,8 +30,7 @@ from diffeo_calib.fitting.result import MAX_END_RESIDUAL, NEGLIGIBLE_ENERGY, Pro
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
-from diffeo_calib.regression.choose import LinearSolver, choose
-from diffeo_calib.regression.conjugate_gradients import CG_TOLERANCE
+from diffeo_calib.regression.conjugate_gradients import CG_TOLERANCE, LinearSolver, choose
 
 SHORTEST_STEP = 1e-3  # smallest fraction of a Gauss-Newton step that is tried
 INNER_TOLERANCE_RATIO = 1e-3  # tolerance of conjugate gradients, relative to that of the iteration

@@ -34,9 +34,14 @@ from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap, as_nominal
 from diffeo_calib.maps.observation import Observation, coordinate_noise, observed_dim
-from diffeo_calib.regression.choose import LinearSolver, condition, condition_controls
 from diffeo_calib.regression.conditional import Process
-from diffeo_calib.regression.conjugate_gradients import CG_TOLERANCE, ConjugateGradientRegression
+from diffeo_calib.regression.conjugate_gradients import (
+    CG_TOLERANCE,
+    ConjugateGradientRegression,
+    LinearSolver,
+    condition,
+)
+from diffeo_calib.regression.control_points import ControlPointRegression
 
 SMALLEST_NOISE = 1e-100  # smallest standard deviation in m: its square must not underflow
 NEGLIGIBLE_VARIANCE = 1e-18  # noise in m^2 of new coordinates where none were measured: a nanometre
@@ -358,7 +363,7 @@ def linear_optimum(
     if not problem.reduced:
         return regress(problem, deformation, linear, tolerance).momenta(), nan
     slopes = problem.slopes(deformation)
-    return condition_controls(deformation, problem.x, problem.noise, slopes, problem.residual).mode()
+    return ControlPointRegression(deformation, problem.x, problem.noise, slopes, problem.residual).mode()
 
 
 def tangent(problem: Problem, linear: LinearSolver = "auto") -> Regression:

@@ -107,7 +107,7 @@ TORCH = SimpleNamespace(
     transforms=twist_transform,
     inverse=_rigid_inverse,
 )
-"""See NUMPY in runtime/flow.py."""
+"""See NUMPY in runtime/arrays.py."""
 
 
 class _ConstantPoints(Constants):

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.runtime.arrays import as_index
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ class FeatureMap:
     @cached_property
     def _selections(self) -> list[tuple[slice | list[int], slice | list[int]]]:
         """Indices of lines and of circles in the coordinates of x, and in the length scales."""
-        return [(_as_slice([self.columns[k] for k in places]), _as_slice(places)) for places in self._places]
+        return [(as_index([self.columns[k] for k in places]), as_index(places)) for places in self._places]
 
     def _parts(self, *points: Sequence[Tensor]) -> list[list[Tensor] | None]:
         """The lines of some points and the circles of others, with their inverse scales; None where there are none."""
@@ -144,7 +145,7 @@ class FeatureMap:
     def _scatter(self, x: Tensor, parts: list[Tensor]) -> Tensor:
         """Values on lines and circles as a vector of all n coordinates, zero elsewhere."""
         values, columns = _joined(parts), self._ordered
-        if isinstance(where := _as_slice(columns), slice):  # without a copy of the indices to the device
+        if isinstance(where := as_index(columns), slice):  # without a copy of the indices to the device
             before, after = where.start, x.shape[-1] - where.stop
             return torch.nn.functional.pad(values, (before, after)) if before or after else values
         out = torch.zeros((*values.shape[:-1], x.shape[-1]), dtype=values.dtype, device=values.device)
@@ -153,9 +154,3 @@ class FeatureMap:
 
 def _joined(parts: list[Tensor]) -> Tensor:
     return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
-
-
-def _as_slice(columns: list[int]) -> slice | list[int]:
-    """Consecutive columns as a slice, which indexes without a copy."""
-    first = columns[0] if columns else 0
-    return slice(first, first + len(columns)) if columns == list(range(first, first + len(columns))) else columns

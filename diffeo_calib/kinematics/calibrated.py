@@ -94,7 +94,7 @@ class CalibratedKinematics:
 
         For a robot with several tips, ``tip`` names the one that carries it, and commands and exports are those of it.
         """
-        return self._with(tool=tool, tool_tip=self.tool_tip if tip is None else tip)
+        return self.changed(tool=tool, tool_tip=self.tool_tip if tip is None else tip)
 
     @property
     def own_frame(self) -> bool:
@@ -140,16 +140,7 @@ class CalibratedKinematics:
 
     def _carrying(self, load: Payload) -> CalibratedKinematics:
         known = self.nominal
-        return self if load is known.load else self._with(map=self.map.with_nominal(known.with_payload(load)))
-
-    def with_provenance(self, provenance: Provenance) -> CalibratedKinematics:
-        """The same model with another record of where it comes from."""
-        return self._with(provenance=provenance)
-
-    def with_fit(self, fitted: FittedMap, provenance: Provenance, *, ball: bool | None = None) -> CalibratedKinematics:
-        """The same robot with its tool and another fit, which replaces what a registration found."""
-        changes = {"map": fitted, "provenance": provenance, "placement": (), "learnt": None}
-        return self._with(**changes, ball=self.ball if ball is None else ball)
+        return self if load is known.load else self.changed(map=self.map.with_nominal(known.with_payload(load)))
 
     def registered(
         self, measurements: Measurements, *, free: str = "both", marker_std: float | None = None, learn: bool = True
@@ -194,7 +185,7 @@ class CalibratedKinematics:
 
     def to(self, device: torch.device | str) -> CalibratedKinematics:
         """The same model on a device, where its joint values must be too."""
-        return self._with(map=self.map.to(usable(device)))
+        return self.changed(map=self.map.to(usable(device)))
 
     @property
     def report(self) -> dict[str, float | int | str]:
@@ -448,7 +439,7 @@ class CalibratedKinematics:
         """The program that answers a query at q; None where torch must."""
         return program_of(self.map.deformation) if takes_program(q) else None
 
-    def _with(self, **changes: Any) -> CalibratedKinematics:
+    def changed(self, **changes: Any) -> CalibratedKinematics:
         """A copy with other values of some of the constructor's arguments."""
         return CalibratedKinematics(**{name: own for name, own in vars(self).items() if name != "bodies"} | changes)
 

@@ -19,6 +19,8 @@ Names = Sequence[str] | Sequence[Sequence[str]]
 ANGLE_UNITS = ("rad", "deg")
 NUMBERS = {"rotvec": 3, "quat_xyzw": 4, "quat_wxyz": 4, "matrix": 9}
 """How many numbers write a rotation in each convention; an order of Euler angles takes three."""
+MAKERS = {"ur_rotvec": "rotvec", "abb_quaternion": "quat_wxyz", "kuka_abc": "ZYX", "fanuc_wpr": "xyz"}
+"""Conventions by the names of controllers."""
 CONVENTIONS = "'rotvec', 'quat_xyzw', 'quat_wxyz', 'matrix', or three letters as 'xyz' (extrinsic) or 'XYZ' (intrinsic)"
 LEVER = 0.1
 """Default distance [m] from a pose's origin to the three points that represent it: the size of usual tools."""
@@ -50,7 +52,8 @@ class TableFormat:
             several tips, whose origins are the positions, a list for each. Rotation and position map from the tool's
             frame to the measuring frame.
         convention: how all rotations are written: rotvec, quat_xyzw, quat_wxyz, matrix (nine columns row by row), or an
-            order of Euler angles, extrinsic (such as xyz) or intrinsic (such as XYZ).
+            order of Euler angles, extrinsic (such as xyz) or intrinsic (such as XYZ); or ur_rotvec, abb_quaternion,
+            kuka_abc, fanuc_wpr.
         rotation_angle: unit of Euler angles, rotation vectors and `rotation_std`.
         lever: distance from a pose's origin to the three points that represent the pose: it weighs orientation against
             position. 0.1 m by default. On the command line it is in the unit of `length`. In Python it is in m.
@@ -107,6 +110,8 @@ class TableFormat:
     marker: str | None = None
 
     def __post_init__(self) -> None:
+        if isinstance(self.convention, str):
+            object.__setattr__(self, "convention", MAKERS.get(self.convention, self.convention))
         check_choice("length", self.length, tuple(UNITS_PER_METRE))
         check_choice("angle", self.angle, ANGLE_UNITS)
         check_choice("joint_length", self.joint_unit, tuple(UNITS_PER_METRE))

@@ -13,17 +13,19 @@ the noise's variance. Iterating on hundreds of columns would take minutes.
 from __future__ import annotations
 
 from functools import cached_property
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.checks import check_memory
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.errors import NumericalError
+from diffeo_calib.common.errors import InputError, NumericalError, as_written
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import lower_root
-from diffeo_calib.regression.conditional import BeforeData, Conditional, Features
+from diffeo_calib.regression.conditional import BeforeData, Conditional, Features, Process
 
 BLOCK_CONFIGURATIONS = 64  # number of configurations that are drawn together
 NEGLIGIBLE_VARIANCE_RATIO = 0.03
@@ -175,3 +177,42 @@ def _norm(a: Tensor) -> Tensor:
 def _ratio(a: Tensor, b: Tensor) -> Tensor:
     """a / b; 0 where b is 0, in columns that have converged exactly."""
     return torch.where(b != 0.0, a / torch.where(b != 0.0, b, torch.ones_like(b)), torch.zeros_like(a))
+
+
+LinearSolver = Literal["auto", "cholesky", "cg"]
+MAX_DENSE = 8_000
+"""Largest N m for which `auto` factorises the matrix (0.5 GiB in float64, at the peak four times as much)."""
+BYTES_PER_FLOAT = 8
+
+
+def condition(
+    linearisation: Linearisation, noise: Noise, linear: LinearSolver = "auto", tolerance: float = CG_TOLERANCE
+) -> Process | ConjugateGradientRegression:
+    """Condition on data that are all control points; ``tolerance`` is that of conjugate gradients.
+
+    Raises:
+        InputError: the method needs more memory than is free.
+        NumericalError: F + R is not positive definite in float64.
+    """
+    n, m, _ = noise.covariance.shape
+    method = choose(linear, n * m)
+    check_memory(predicted_memory(method, n * m), f"{n * m} measured coordinates with linear={method!r}")
+    if method == "cholesky":
+        return Process.of_rows(linearisation, noise)
+    return ConjugateGradientRegression(linearisation, noise, tolerance=tolerance)
+
+
+def choose(linear: LinearSolver, size: int) -> LinearSolver:
+    """The method for ``size`` measured coordinates: ``linear`` itself, or the choice of `auto`.
+
+    Raises:
+        InputError: an unknown method.
+    """
+    if linear not in get_args(LinearSolver):
+        raise InputError.of("`linear`", expected=", ".join(get_args(LinearSolver)), got=as_written(linear))
+    return linear if linear != "auto" else "cholesky" if size <= MAX_DENSE else "cg"
+
+
+def predicted_memory(linear: LinearSolver, size: int) -> int:
+    """Bytes at the peak of one step: four matrices, or four factors of the preconditioner."""
+    return 4 * BYTES_PER_FLOAT * size * (size if linear == "cholesky" else min(MAX_RANK, size))

@@ -26,7 +26,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError, NumericalError
+from diffeo_calib.common.checks import check_memory
+from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import large_work
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.kernels.reductions.distributed import ranks_of
@@ -40,6 +41,7 @@ from diffeo_calib.regression.conditional import Conditional, Features, of_parame
 JITTER_RATIO = 1e-13
 """Added to the diagonal of the controls' kernel matrices, relative to its largest entry: the level of rounding."""
 BLOCK_ENTRIES = 1 << 22  # number of entries of A that are computed together (32 MiB)
+COPIES_OF_BLOCK = 5  # matrices of the size of one such block that exist at a time
 SHARED_ENTRIES = 1 << 24
 """Number of entries of A from which several processes share its blocks: with fewer, some would have nothing to do."""
 STRIPS = 8
@@ -56,6 +58,9 @@ class ControlPointRegression(Conditional):
         x: (N, n) configurations of the data. noise: R, (N, r, r) blocks.
         slopes: (N, r, m) linear functionals that were measured; None for all coordinates, r = m.
         residual: for :meth:`mode`, of row numbers (M,) and of k1 at these rows (M, m): measured minus predicted (M, r).
+
+    Raises:
+        InputError: the normal equations need more memory than is free. NumericalError: they are singular.
     """
 
     def __init__(
@@ -69,11 +74,12 @@ class ControlPointRegression(Conditional):
         self.spec: ModelSpec = deformation.spec
         self.deformation, self.like = deformation, deformation.momenta
         self.x, self.noise, self.slopes = x, noise, slopes
+        self._shifts = noise.shared.shape[2]
+        self.size = size = sum(t.numel() for t in self.like.tensors) + self._shifts
+        check_memory(8 * (3 * size**2 + COPIES_OF_BLOCK * BLOCK_ENTRIES), f"normal equations of {size} momenta")
         self.controls = deformation.momentum_sensitivities()
         kernels = self.spec.joint_kernel, self.spec.task_kernel
         self._roots = [_root(kernel, nodes) for kernel, nodes in zip(kernels, self.controls, strict=True)]
-        self._shifts = noise.shared.shape[2]
-        self.size = size = sum(t.numel() for t in self.like.tensors) + self._shifts
         large = len(x) * size * noise.covariance.shape[1] >= SHARED_ENTRIES
         self._ranks = ranks_of(deformation.backends if large else [])
         if self._ranks.count > 1:
@@ -89,27 +95,13 @@ class ControlPointRegression(Conditional):
                     pull += white @ self.noise.whiten(residual(rows, value)[:, :, None], rows).reshape(-1, 1)
             hessian, pull = self._ranks.total([hessian, pull])
             self.core, info = torch.linalg.cholesky_ex(hessian)  # its smallest eigenvalue is 1
-        self._pull = None if residual is None else pull
+        self._pull = pull
         if int(info):
             what = "the normal equations of the control points are singular"
             raise NumericalError.of(what, fix=NOISE_ADVICE)
 
-    def momenta(self, target: Tensor) -> Momenta:
-        """H^-1 A^T R^-1 target."""
-        total = target.new_zeros(self.size, 1)
-        for rows in self._blocks(self.size):
-            total += self._white_rows(rows)[1] @ self.noise.whiten(target[rows, :, None], rows).reshape(-1, 1)
-        (total,) = self._ranks.total([total])
-        return self._of_white(torch.cholesky_solve(total, self.core))
-
     def mode(self) -> tuple[Momenta, float]:
-        """Posterior mode of b, p, theta for the residual that was given, and how far the linearised energy falls to it.
-
-        Raises:
-            InputError: no residual was given.
-        """
-        if self._pull is None:
-            raise InputError.of("the mode of control points", expected="their data's residual", got="None")
+        """Posterior mode of b, p, theta by the residual, and how far the linearised energy falls to it."""
         u = self._white_momenta()
         slope = self._pull - u
         step = torch.cholesky_solve(slope, self.core)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from diffeo_calib.runtime.profiles import FORMULAS
 
 Array = NDArray[np.float64]
 
@@ -48,6 +51,33 @@ def transforms(twists: Array) -> Array:
     out[..., :3, 3], out[..., 3, 3] = twists[..., :3], 1.0
     return out
 
+
+def combined(x: Array, coefficients: Iterable[float], slopes: Sequence[Array]) -> Array:
+    """x + sum_k c_k slope_k."""
+    for c, slope in zip(np.asarray(coefficients).tolist(), slopes, strict=False):
+        if c:
+            x = x + c * slope
+    return x
+
+
+NUMPY = SimpleNamespace(
+    sin=np.sin,
+    cos=np.cos,
+    clip=np.clip,
+    within_turn=lambda x: np.mod(x, 2 * np.pi),  # angles in [0, 2 pi)
+    stack=np.stack,
+    concatenate=np.concatenate,
+    ones_like=np.ones_like,
+    broadcast_to=np.broadcast_to,
+    at_least=lambda values, floor: np.maximum(values, floor, out=values),
+    profile=lambda name, r2: next(FORMULAS[name](r2, (0,))),
+    # the columns of cells (7, K) that begin at the last starts before t: seven arrays
+    cells_around=lambda starts, cells, t: cells[:, np.searchsorted(starts, t, side="right") - 1],
+    combined=combined,
+    transforms=transforms,
+    inverse=np.linalg.inv,  # of rigid transforms
+)
+"""Functions of an array library for flows and poses: NumPy's here, torch's in interop/torch_program.py."""
 
 Tableau = tuple[Array, Array]
 """Coefficients (s, s), strictly lower triangular, and weights (s,)."""

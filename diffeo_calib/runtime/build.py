@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from diffeo_calib.common.errors import RobotError
-from diffeo_calib.runtime.arrays import Array, Tableau, as_index, skew, transforms
+from diffeo_calib.runtime.arrays import Array, Tableau, as_index, combined, skew, transforms
 from diffeo_calib.runtime.chain import CalibratedChain, Masses, NominalChain, Waves
-from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow, combined
+from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow
 from diffeo_calib.runtime.tables import JointTables, PeriodicSum, Table, tabulate
 
 ROTARY = ("revolute", "continuous")

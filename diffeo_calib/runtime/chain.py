@@ -18,8 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from diffeo_calib.runtime.arrays import ONE, SKEW, Array, cross, skew, transforms
-from diffeo_calib.runtime.flow import NUMPY
+from diffeo_calib.runtime.arrays import NUMPY, ONE, SKEW, Array, cross, skew, transforms
 
 COINCIDENT_FRAMES_M = 1e-6
 """Frames whose origins are closer than this [m] count as one place for masses."""

@@ -6,17 +6,16 @@ of the Runge-Kutta run that moved the controls (flows/geodesic.py).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from diffeo_calib.runtime.arrays import Array, transforms
+from diffeo_calib.runtime.arrays import NUMPY, Array, combined
 from diffeo_calib.runtime.profiles import FORMULAS
-from diffeo_calib.runtime.tables import JointTables, cells_around, tabulated, within_turn
+from diffeo_calib.runtime.tables import JointTables, tabulated
 
 BLOCK = 1 << 16
 """Largest number of kernel values that are held at once: they stay in the cache of the processor."""
@@ -125,51 +124,19 @@ class RecordedFlow:
         return (x[first : first + size] for first in range(0, max(len(x), 1), size))
 
 
-def combined(x: Array, coefficients: Iterable[float], slopes: Sequence[Array]) -> Array:
-    """x + sum_k c_k slope_k."""
-    for c, slope in zip(np.asarray(coefficients).tolist(), slopes, strict=False):
-        if c:
-            x = x + c * slope
-    return x
-
-
-NUMPY = SimpleNamespace(
-    sin=np.sin,
-    cos=np.cos,
-    clip=np.clip,
-    within_turn=within_turn,  # angles in [0, 2 pi)
-    stack=np.stack,
-    concatenate=np.concatenate,
-    ones_like=np.ones_like,
-    broadcast_to=np.broadcast_to,
-    at_least=lambda values, floor: np.maximum(values, floor, out=values),
-    profile=lambda name, r2: next(FORMULAS[name](r2, (0,))),
-    cells_around=cells_around,
-    combined=combined,
-    transforms=transforms,
-    inverse=np.linalg.inv,  # of rigid transforms
-)
-"""Functions of an array library for flows and poses: NumPy's here, torch's in interop/torch_program.py."""
-
-
 def advanced(flow: Any, x: Any, use: Any) -> Any:
     """The end of the flow of points (N, n), by the constants of a :class:`RecordedFlow` as arrays of a library."""
     for step in range(flow.steps):
         slopes: list[Any] = []
         for row in flow.coefficients:
             at, stage = use.combined(x, row, slopes), step * len(flow.weights) + len(slopes)
-            first, *others = _velocities(flow, stage, at, use)
-            slopes.append(sum(others, first))
+            distances = ((term, squared_distances(term, stage, at, use)[1]) for term in flow.terms)
+            parts = [use.profile(term.profile, r2) @ term.weights[stage] for term, r2 in distances]
+            if flow.tables is not None:
+                parts.append(tabulated(flow.tables, stage, at, use)[0] @ flow.tables.selection)
+            slopes.append(sum(parts[1:], parts[0]))
         x = use.combined(x, flow.weights, slopes)
     return x
-
-
-def _velocities(flow: Any, stage: int, x: Any, use: Any) -> Iterator[Any]:
-    """The parts of v_s at points (N, n)."""
-    for term in flow.terms:
-        yield use.profile(term.profile, squared_distances(term, stage, x, use)[1]) @ term.weights[stage]
-    if flow.tables is not None:
-        yield tabulated(flow.tables, stage, x, use.within_turn, use.cells_around)[0] @ flow.tables.selection
 
 
 def squared_distances(term: Any, stage: int, x: Any, use: Any) -> tuple[Any, Any]:

@@ -11,13 +11,13 @@ are halved until the error at their middle is below :data:`TOLERANCE`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from diffeo_calib.runtime.arrays import Array, as_index
+from diffeo_calib.runtime.arrays import NUMPY, Array, as_index
 from diffeo_calib.runtime.profiles import FORMULAS
 
 TOLERANCE = 1e-13
@@ -106,34 +106,20 @@ class JointTables:
 
     def velocity_and_jacobian(self, stage: int, x: Array) -> tuple[Array, Array]:
         """f of every joint in its component (N, n), and the derivative of the interpolated f, (N, n, n)."""
-        value, u, c = tabulated(self, stage, x, within_turn, cells_around)
+        value, u, c = tabulated(self, stage, x, NUMPY)
         slope = (((5 * c[5] * u + 4 * c[4]) * u + 3 * c[3]) * u + 2 * c[2]) * u + c[1]
         return value @ self.selection, (slope @ self.selection)[..., None] * np.eye(x.shape[1])
 
 
-def tabulated(
-    tables: Any, stage: int, x: Any, within: Callable[[Any], Any], around: Callable[[Any, Any, Any], Any]
-) -> tuple[Any, Any, list[Any]]:
+def tabulated(tables: Any, stage: int, x: Any, use: Any) -> tuple[Any, Any, list[Any]]:
     """f of every joint (N, L) at x (N, n), the distances (N, L) from the knots, and the coefficients there.
 
-    Args:
-        tables: the constants of :class:`JointTables`, as arrays of a library. within, around: of it, as
-            within_turn and cells_around.
+    ``tables`` are the constants of :class:`JointTables`, as arrays of a library.
     """
-    t = within(x[..., tables.joints]) + tables.shifts
-    start, *c = around(tables.starts[stage], tables.cells[stage], t)
+    t = use.within_turn(x[..., tables.joints]) + tables.shifts
+    start, *c = use.cells_around(tables.starts[stage], tables.cells[stage], t)
     u = t - start
     return _quintic(c, u), u, c
-
-
-def within_turn(x: Array) -> Array:
-    """Angles in [0, 2 pi)."""
-    return np.mod(x, TURN)
-
-
-def cells_around(starts: Array, cells: Array, t: Array) -> Array:
-    """The columns of cells (7, K) that begin at the last starts before t: seven arrays."""
-    return cells[:, np.searchsorted(starts, t, side="right") - 1]
 
 
 def _quintic(c: Any, u: Any) -> Any:

@@ -26,7 +26,7 @@ TEXTS = {
     ),
     "record": "BAG --seen -o --output --joints --still --shortest --offset",
     "evaluate": f"{ROWS} {UNITS} MODEL CSV --free -o --output --tolerance --report --against",
-    "init": "CSV ROBOT --places --by -o --output",
+    "init": "CSV ROBOT --places --by -o --output --force",
     "images": "FOLDER JOINTS --board --length -o --output --board-std --report --sep --decimal",
     "predict": f"{UNITS} MODEL CSV --convention --rotation-angle --payload -o --output",
     "correct": (

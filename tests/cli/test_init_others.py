@@ -131,6 +131,8 @@ def test_an_edited_file_is_kept(tmp_path: Path, command: Command, frame: Any) ->
     assert done.code == 1
     assert "exists and holds other options" in done.err
     assert (tmp_path / "c.toml").read_text().endswith("holdout = 0\n")
+    assert command(*words, "--force").code == 0
+    assert "holdout" not in (tmp_path / "c.toml").read_text()
 
 
 @pytest.mark.slow

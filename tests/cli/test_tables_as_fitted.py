@@ -147,6 +147,6 @@ def test_programs_are_read_in_the_units_of_the_fit(command: Command, tmp_path: A
     made = kind.model.provenance
     assert made is not None
     told = replace(made, command="diffeo-calib fit t.csv --position x,y,z --length mm --angle deg")
-    dc.save(kind.model.with_provenance(told), tmp_path / "m.safetensors")
+    dc.save(kind.model.changed(provenance=told), tmp_path / "m.safetensors")
     done = command("correct", tmp_path / "m.safetensors", path, "-o", tmp_path / "c.csv")
     assert done.code == 0, done.err

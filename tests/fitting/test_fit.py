@@ -10,10 +10,11 @@ import torch
 from math_bank import few_points, rr_problem, two_marker_problem, uniform
 
 import diffeo_calib as dc
+from diffeo_calib.common import checks
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.kernels.reductions.fused import FUSED
-from diffeo_calib.regression import choose
+from diffeo_calib.regression.conjugate_gradients import LinearSolver
 
 
 def test_conjugate_gradients_find_the_same_optimum() -> None:
@@ -28,9 +29,9 @@ def test_conjugate_gradients_find_the_same_optimum() -> None:
 
 @pytest.mark.parametrize(("linear", "controls"), [("cholesky", None), ("cg", None), ("auto", 5)])
 def test_fits_that_need_more_memory_than_is_free_are_refused(
-    monkeypatch: pytest.MonkeyPatch, linear: choose.LinearSolver, controls: int | None
+    monkeypatch: pytest.MonkeyPatch, linear: LinearSolver, controls: int | None
 ) -> None:
-    monkeypatch.setattr(choose, "free_memory", lambda: 2**10)
+    monkeypatch.setattr(checks, "free_memory", lambda: 2**10)
     with pytest.raises(InputError, match=r"more memory than is free: expected [\d.]+ GiB, got 0\.0 GiB free"):
         dc.fit(rr_problem(5), dc.GaussNewton(linear=linear), dc.RK4(1), controls=controls)
 

@@ -1,29 +1,16 @@
-"""The tangent model is Gaussian-process regression: likelihood, leave-one-out, first Gauss-Newton iterate."""
+"""The tangent model is Gaussian-process regression: factor, first Gauss-Newton iterate."""
 
 import pytest
 import torch
 from fit_bank import noise_blocks
 from math_bank import rr_problem, two_marker_problem, uniform
 
+from diffeo_calib.common import checks
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.problem import Problem, Regression, tangent
 from diffeo_calib.flows.integrators import RK4
-from diffeo_calib.regression import choose
 from diffeo_calib.regression.conditional import Process
-
-
-def subset(problem: Problem, rows: list[int]) -> Problem:
-    return Problem(
-        problem.spec.nominal,
-        problem.x[rows],
-        problem.y[rows],
-        joint_kernel=problem.spec.joint_kernel,
-        task_kernel=problem.spec.task_kernel,
-        noise=problem.noise.covariance[rows],
-        markers=problem.y.shape[1] // problem.spec.task_dim,
-    )
-
 
 PROBLEMS = {
     "rr": rr_problem(4),
@@ -57,25 +44,6 @@ def test_factor_and_target_at_zero(problem: Problem) -> None:
 
 
 @every_problem
-def test_leave_one_out_is_refitting_without_the_row(problem: Problem) -> None:
-    regression = tangent(problem)
-    process = dense(regression)
-    errors = process.left_out(process.numbers.owner)[0].view(problem.y.shape)
-    zero = torch.zeros(0, dtype=torch.float64)
-    count = len(problem.x)
-    for left_out in range(count):
-        rest = subset(problem, [i for i in range(count) if i != left_out])
-        fitted = tangent(rest).momenta()
-        x = problem.x[[left_out]]
-        k0, dk0 = problem.spec.nominal(x, zero), problem.spec.nominal.jacobian(x, zero)
-        controls = rest.spec.nominal(rest.x, zero).reshape(-1, rest.spec.task_dim)
-        v = rest.spec.joint_kernel.field(x, rest.x, fitted.joint)
-        w = rest.spec.task_kernel.field(k0.reshape(-1, rest.spec.task_dim), controls, fitted.task)
-        prediction = k0 + (dk0 @ v[:, :, None])[:, :, 0] + w.reshape(k0.shape)
-        torch.testing.assert_close(errors[[left_out]], problem.y[[left_out]] - prediction, rtol=1e-8, atol=1e-8)
-
-
-@every_problem
 def test_first_gauss_newton_iterate_is_the_tangent_model(problem: Problem) -> None:
     first = GaussNewton(max_iterations=1).solve(problem, RK4(2)).momenta
     for actual, expected in zip(first.tensors, tangent(problem).momenta().tensors, strict=True):
@@ -83,6 +51,6 @@ def test_first_gauss_newton_iterate_is_the_tangent_model(problem: Problem) -> No
 
 
 def test_more_memory_than_is_free_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(choose, "free_memory", lambda: 2**14)
+    monkeypatch.setattr(checks, "free_memory", lambda: 2**14)
     with pytest.raises(InputError, match=r"32 measured coordinates.*more memory than is free.*controls=500"):
         tangent(PROBLEMS["rr"])

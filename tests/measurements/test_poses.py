@@ -18,6 +18,7 @@ import diffeo_calib as dc
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.measurements.csv.files import read_measurements, write_measurements
+from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.poses import (
     angle_between,
     inverse_poses,
@@ -86,6 +87,18 @@ def test_quaternions_and_vectors_and_matrices_written_out() -> None:
     assert_close(rotation_matrices([[0, 0, 60]], "rotvec", angle="deg"), expected, rtol=0, atol=1e-15)
     assert_close(rotation_numbers(expected, "quat_wxyz"), torch.tensor([[c, 0, 0, s]], dtype=torch.float64))
     assert_close(rotation_numbers(expected, "rotvec", angle="deg"), torch.tensor([[0.0, 0.0, 60.0]]).double())
+
+
+def test_controllers_name_their_conventions() -> None:
+    """KUKA: A about z, then B about the new y, C about the newest x; Fanuc: W, P, R about the fixed x, y, z."""
+    a, b, c = 0.3, -0.7, 1.1
+    expected = turn("z", a) @ turn("y", b) @ turn("x", c)
+    for name, numbers in (("kuka_abc", [a, b, c]), ("fanuc_wpr", [c, b, a])):
+        written = TableFormat("m", "rad", convention=name).convention
+        assert PoseColumns.of(f"x,y,z,rx,ry,rz={name}").convention == written
+        assert_close(rotation_matrices([numbers], str(written))[0].numpy(), expected, rtol=0, atol=1e-14)
+    assert TableFormat("m", "rad", convention="ur_rotvec").convention == "rotvec"
+    assert TableFormat("m", "rad", convention="abb_quaternion").convention == "quat_wxyz"
 
 
 def test_gimbal_lock_is_written_without_a_warning() -> None:

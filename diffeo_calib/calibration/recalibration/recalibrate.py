@@ -188,7 +188,8 @@ def _result(
     # a ball that a device measured is none in an unknown place any more
     measured = place.ball is None and own is not None and not bool(own.table.points[:, -1].isnan().all())
     ball = place.new_ball or (knows_ball(model) and not measured)
-    again = model.with_fit(fitted_map, Provenance.now(new, note), ball=ball)
+    made = Provenance.now(new, note)
+    again = model.changed(map=fitted_map, provenance=made, placement=(), learnt=None, ball=ball)
     small = (rows.tails.weights < OUTLIER_WEIGHT).any(1)
     again.placement = carried_devices(model, again, place.transform)
     settled = rows.placement.settled(fitted, fitted.model, rows.centre, place.transform, known=mounted_of(model))

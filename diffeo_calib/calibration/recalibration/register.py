@@ -41,7 +41,7 @@ from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.maps.observation import LinearFunctionals, Observation, Part, Stacked
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.regression.choose import MAX_DENSE
+from diffeo_calib.regression.conjugate_gradients import MAX_DENSE
 from diffeo_calib.robots.payload import joined_masses
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import sensor_of
@@ -67,7 +67,7 @@ def registered(
     rows = measured_positions(new)
     check_same_robot(model, new)
     if rows is None:
-        return model._with(placement=devices_beside(model, new))
+        return model.changed(placement=devices_beside(model, new))
     rows = mounted_of(model).in_any_frame(rows).largest_session()
     rows = sensor_of(rows).with_points(rows, model)
     here = model.to(HOST)._carrying(model.nominal.load.under(rows.payload).typical)
@@ -77,16 +77,16 @@ def registered(
     found = replace(found, table_sha256=" ".join([before, new.sha256][: 1 + learns]).strip())
     vars(placed).update({} if learns else {"registration": found})
     known = {"map": placed.to(model.configurations.device), "lever": found.lever, "placement": (), "ball": ball}
-    seen = model._with(**known, learnt=found if learns else None)._carrying(model.nominal.load)
+    seen = model.changed(**known, learnt=found if learns else None)._carrying(model.nominal.load)
     same = found.same and ball == model.ball
     lost = [own for own in model.placement if own.reads and not same]
     if lost:
         names = few([f"'{name}'" for own in lost for name in own.names])
         what = f"the model no longer knows the devices {names}: these rows show other markers than what they read"
         warn_user(sentence(what, fix="pass rows of the fit's markers, or rows of these devices, to keep them"))
-    kept = model._with(placement=tuple(own for own in model.placement if own not in lost))
-    seen = seen._with(placement=carried_devices(kept, seen, found.transform))
-    return seen._with(placement=devices_beside(seen, new))
+    kept = model.changed(placement=tuple(own for own in model.placement if own not in lost))
+    seen = seen.changed(placement=carried_devices(kept, seen, found.transform))
+    return seen.changed(placement=devices_beside(seen, new))
 
 
 @small_work()

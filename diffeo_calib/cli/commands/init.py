@@ -60,7 +60,7 @@ COLUMNS = ("joints", "position", "marker", "socket", "rotation", "std", "reading
 
 
 def run(given: InitOptions) -> None:
-    """Propose a campaign, write it, and print it; a file that was edited stays."""
+    """Propose a campaign, write it, and print it; a file that was edited is replaced with --force alone."""
     output = given.output
     if given.csv.is_dir():
         read_cells(given.csv, ",")  # says why not
@@ -88,8 +88,8 @@ def run(given: InitOptions) -> None:
         *([f"# {sheet.odd}"] if sheet.odd else []),
     ]
     content = ("\n".join(lines) + "\n").encode()
-    if output.is_file() and output.read_bytes() != content:
-        fix = "name another file by -o, or remove it first"
+    if output.is_file() and not given.force and output.read_bytes() != content:
+        fix = "name another file by -o, or add --force to replace it"
         raise InputError.of(f"'{output}' exists and holds other options", expected="a new file", fix=fix)
     write_whole(output, content)
     say(*lines)

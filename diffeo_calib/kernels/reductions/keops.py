@@ -11,7 +11,7 @@ import hashlib
 import io
 import os
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache, reduce
 from pathlib import Path
 from types import ModuleType
@@ -88,11 +88,14 @@ class Keops(SumBackend):
         keops, summands = load(), formula.summands(columns)
         with torch.no_grad():
             lazy = _lazy(weights, keops, rows, columns)
-            some = [
-                (w * keops.Vj(b.contiguous()), b.shape[1]) for w, b in zip(lazy, summands, strict=True) if w is not None
-            ]
+            some = [(w, b) for w, b in zip(lazy, summands, strict=True) if w is not None]
+            sums = iter(())
             try:
-                sums = iter(_summed([term for term, _ in some], [width for _, width in some]))
+                if some:
+                    terms = reduce(lambda a, b: a.concat(b), [w * keops.Vj(b.contiguous()) for w, b in some])
+                    # KeOps' default sums in blocks of 200: the branch this needs prevents vectorisation of the loop
+                    total = terms.sum(dim=1, sum_scheme="direct_sum")
+                    sums = iter(torch.split(total, [b.shape[1] for _, b in some], dim=1))
             except Exception as error:  # the compiler chain may raise anything
                 return self.failed(f"KeOps could not compile or run a kernel sum ({error}).")
             found = [
@@ -100,15 +103,6 @@ class Keops(SumBackend):
                 for w, b, (_, scale) in zip(lazy, summands, weights.results, strict=True)
             ]
         return formula.finish(found, rows)
-
-
-def _summed(terms: list[Any], widths: list[int]) -> Sequence[Tensor]:
-    """The sums over all columns in one loop."""
-    if not terms:
-        return []
-    # KeOps' default sums in blocks of 200: the branch this needs prevents vectorisation of the loop.
-    fused = reduce(lambda a, b: a.concat(b), terms).sum(dim=1, sum_scheme="direct_sum")
-    return torch.split(fused, widths, dim=1)
 
 
 @cache

@@ -284,10 +284,16 @@ class _Block:
 
     def text(self, name: str) -> str:
         """The function."""
-        for result in self.results if self.mirrored else []:
-            self._store_shares(result)
+        for result in self.results:
+            for k in result.places if self.mirrored and result.terms else ():
+                address = self._address(self.loop, k, "%out", "%n", "%j")
+                self._accumulate(self.loop, self.vector, address, self.shares[k], "fsub" if result.odd else "fadd")
+        code, v = self.tail, self.vector
         for r, sums in enumerate(self.sums):
-            self._store_sums(r, sums)
+            for k in [k for result in self.results if result.terms for k in result.places]:
+                add = f"@llvm.vector.reduce.fadd.{v.suffix}"
+                total = code.value(f"call reassoc double {add}(double 0.0, {v} {sums[k]})")
+                self._accumulate(code, "double", self._address(code, k, "%out", "%m", f"%i{r}"), total, "fadd")
         zero = self.loop.constant(0.0)
         phis = [
             f"  {start} = phi {self.vector} [ {zero}, %entry ], [ {total}, %loop ]"
@@ -349,18 +355,6 @@ class _Block:
             theirs = [code.call("fmul", w, c) for c in theirs] if self.mirrored else ours
         apart = at.apart(term.apart or "")
         return [((a, d), (b, d)) for a, b in zip(ours, theirs, strict=True) for d in apart]
-
-    def _store_shares(self, result: _Result) -> None:
-        for k in result.places if result.terms else ():
-            address = self._address(self.loop, k, "%out", "%n", "%j")
-            self._accumulate(self.loop, self.vector, address, self.shares[k], "fsub" if result.odd else "fadd")
-
-    def _store_sums(self, r: int, sums: list[str]) -> None:
-        code, v = self.tail, self.vector
-        for k in [k for result in self.results if result.terms for k in result.places]:
-            total = code.value(f"call reassoc double @llvm.vector.reduce.fadd.{v.suffix}(double 0.0, {v} {sums[k]})")
-            address = self._address(code, k, "%out", "%m", f"%i{r}")
-            self._accumulate(code, "double", address, total, "fadd")
 
     def _accumulate(self, code: Code, kind: object, address: str, number: str, operation: str) -> None:
         old, new = code.name(), code.name()

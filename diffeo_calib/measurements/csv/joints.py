@@ -27,7 +27,7 @@ from diffeo_calib.common.files import PROGRAM
 from diffeo_calib.measurements.checks import of_measurements
 from diffeo_calib.measurements.csv.cells import repeated
 from diffeo_calib.measurements.poses import rotation_matrices, rotation_numbers
-from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, ANGLE_UNITS, CONVENTIONS, numbers_of
+from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, ANGLE_UNITS, CONVENTIONS, MAKERS, numbers_of
 from diffeo_calib.robots.cartesian import cartesian, pose_inputs
 from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.robots.tree import Chain
@@ -120,12 +120,13 @@ class PoseColumns:
         if len(columns) > 3 and not equal:
             what = f"the columns of a pose, {text}"
             raise MeasurementError.of(what, expected=f"=CONVENTION behind them: {CONVENTIONS}", got="none")
+        convention = MAKERS.get(convention.strip(), convention.strip())
         with of_measurements():
-            count = 3 + numbers_of(convention.strip()) if equal and PROGRAM not in convention else len(columns)
+            count = 3 + numbers_of(convention) if equal and PROGRAM not in convention else len(columns)
         if len(columns) != count or "" in columns or repeated(columns):
             expected = f"{count} names of columns" if equal else "names of columns"
             raise MeasurementError.of(f"the columns of a pose, {text}", expected=expected, got=as_written(columns))
-        return cls(columns, convention.strip())
+        return cls(columns, convention)
 
     @property
     def text(self) -> str:

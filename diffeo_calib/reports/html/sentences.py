@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import torch
-
-from diffeo_calib.calibration.expected_errors import STILL_RANGE
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.quantiles import binomial_band, largest_known
 from diffeo_calib.reports.analysis.findings import Findings
@@ -16,10 +13,6 @@ from diffeo_calib.sensors.errors import ERRORS
 
 WORTHWHILE_ERROR_FACTOR = 1.1
 """More rows are not worth it where the forecast is less than this factor below the error now."""
-BLAMED_VARIANCE_SHARE, PROBE_CONFIGURATIONS = 0.5, 60
-"""Share of the expected variance, at so many configurations, that knowing the markers would remove: they are blamed."""
-OPEN_M = 1e-3
-"""Deviation of a marker, m, in a direction that the rows leave open, from which it is blamed."""
 ENOUGH_FOR_P95 = 20
 """Rows from which a 95th percentile means something."""
 BAD_RATIO = 1.5
@@ -103,7 +96,6 @@ def advice(found: Findings) -> Iterator[str]:
         text = f"{len(wrong)} of {len(seen)} rows look wrong: check them, see below"
         yield f"{text}; without them {rest:.3f} mm RMS." if good else f"{text}."
     yield from unlike_poses(found)
-    yield from still_joints(found)
     if found.moved:
         return
     for one in found.kinds.values():
@@ -141,32 +133,15 @@ def _unless_planned(found: Findings) -> str:
 
 def unlike_poses(found: Findings) -> Iterator[str]:
     """A sentence about poses unlike the measured ones if they are much less certain, and why."""
+    error, why, what = found.deviations.error, "", "unlike them"
     if not found.unlike:
         return
-    rows, geometry = found.rows, found.model.nominal.geometry
-    tool = torch.arange(geometry.size, device=rows.q.device)[geometry.slices["tool"]]
-    open_directions = rows.map.open_directions[tool]
-    variances = rows.map.parameter_covariance(tool).diagonal() + open_directions.square().sum(1)
-    number, axis = divmod(int(variances.argmax()), 3)
-    why, what = "", "unlike them"
-    share = rows.map.explained_by(tool, found.deviations.q[:PROBE_CONFIGURATIONS])
-    if share > BLAMED_VARIANCE_SHARE or bool((open_directions.abs() > OPEN_M).any()):
-        marker, along = found.model.bodies.name(number, len(rows.on)), f"{'xyz'[axis]} of {printable(rows.on[number])}"
-        why = f", because {marker} and base can hardly be told apart along {along}"
+    if error.open_places:
+        why = f", because the rows leave {' and '.join(error.open_places)} open"
         what = "in which the tool is turned about other axes"
-    far = f"elsewhere errors of {rough_millimetres(found.deviations.error.whole)} mm are expected{why}"
+    far = f"elsewhere errors of {rough_millimetres(error.whole)} mm are expected{why}"
     what = f"To change that, measure poses {what}, such as those listed under Where."
     yield f"Use the model near the measured poses: {far}. {what}"
-
-
-def still_joints(found: Findings) -> Iterator[str]:
-    """A sentence about joints that never moved in the fit: their errors are not known."""
-    q, robot = found.rows.q, found.model.robot
-    for joint, name in enumerate(robot.joint_names):
-        if float(q[:, joint].max() - q[:, joint].min()) < STILL_RANGE:
-            place = f"{float(joint_values(robot, joint, q[:, joint]).mean()):.1f} {joint_unit(robot, joint)}"
-            nothing = f"never moved in the fit: nothing is known about it away from {place}"
-            yield f"{printable(name)} {nothing}. Measure poses in which it moves."
 
 
 def worst_range(found: Findings) -> Iterator[str]:
