@@ -22,7 +22,7 @@ from safetensors import SafetensorError, safe_open
 
 from diffeo_calib.common.data_frames import named_columns, real_array
 from diffeo_calib.common.errors import InputError, ModelFileError, as_written
-from diffeo_calib.runtime.arrays import MOST_STEPS, TABLEAUS, Array
+from diffeo_calib.runtime.arrays import TABLEAUS, Array
 from diffeo_calib.runtime.build import calibrated_chain, nominal_chain, recorded_flow, recorded_stages
 from diffeo_calib.runtime.chain import tip_poses
 from diffeo_calib.runtime.program import FRAMES, Program
@@ -211,9 +211,6 @@ def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
         chain, arrays["base"], arrays["joint_errors"], theta, sag if nominal["elastic"] else None, **errors
     )
     tableau, steps = TABLEAUS[integrator["kind"]](), integrator["steps"]
-    if not isinstance(steps, int) or isinstance(steps, bool) or not 1 <= steps <= MOST_STEPS:
-        expected = f"an integer of at least 1 and at most {MOST_STEPS}"
-        raise InputError.of("the number of time steps", expected=expected, got=as_written(steps))
     joint, xi = recorded_stages(kernels[0], arrays["x"], arrays["momenta_x"], tableau, steps)
     tip, markers = tip_poses(k0, xi[0])[:, on], tool + shifts  # (N, P, 4, 4); of every control those of its session
     if "session" in arrays:

@@ -73,7 +73,7 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if not isinstance(robot, Tree):
             fix = "pass robot=dc.load_urdf(...) to the constructor"
             raise InputError.of("`robot`", expected="a dc.Tree", got=type(robot).__name__, fix=fix)
-        data = y if isinstance(y, RowGroups) else self._measured(robot, X, y)
+        data: Any = y if isinstance(y, RowGroups) else self._measured(robot, X, y)
         if data is y and not np.array_equal(self._joints(robot, X, reset=True), y.q.numpy()):
             raise MeasurementError.of("`X`", expected="the joint values of the rows in `y`", fix="pass y.q")
         chosen = {"hyperparameters": self.hyperparameters, "controls": self.controls, "seed": self.seed}

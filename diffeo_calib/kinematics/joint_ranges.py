@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
-from diffeo_calib.measurements.checks import ANGLE_MISTAKES, LARGEST_JOINT_ANGLE_RAD, angle_mistake
+from diffeo_calib.measurements.checks import ANGLE_MISTAKES, LARGEST_JOINT_ANGLE_RAD
 from diffeo_calib.sensors.coordinates import check_joint_order, check_payload_link, sensor_of
 from diffeo_calib.sensors.tables import rows_of_one_kind
 
@@ -86,14 +86,14 @@ def refuse_other_angles(model: Any, q: object) -> None:
     too_far = float(values[:, turning].abs().max()) > LARGEST_JOINT_ANGLE_RAD
     moved = (values.amax(0) - values.amin(0)) / (fitted.amax(0) - fitted.amin(0)).clamp(min=SAME_CONFIGURATION)
     all_outside = bool(joints_outside_range(model, values).any(1).all())
-    for factor, words in ANGLE_MISTAKES:
+    for factor, fix in ANGLE_MISTAKES:
         meant = torch.where(turning, factor * values, values)
         if (factor < 1.0 and not too_far) or bool(joints_outside_range(model, meant).any()):
             continue
         moves = len(values) >= TELLING_ROWS and float(factor * moved[turning].median()) > TELLING_MOTION
         if all_outside or (factor > 1.0 and moves):
             expected, got = "the joint ranges of the fit", "values that are in them in the other unit of angles"
-            text = sentence("the joint values", expected=expected, got=got, fix=angle_mistake(words))
+            text = sentence("the joint values", expected=expected, got=got, fix=fix)
             if all_outside:
                 raise MeasurementError(text)
             warn_user(text)

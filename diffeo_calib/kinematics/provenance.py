@@ -7,9 +7,9 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from math import inf
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar
 
-from diffeo_calib.common.errors import PACKAGE, InputError, as_written, printable
+from diffeo_calib.common.errors import PACKAGE, InputError, printable
 
 HASH_SHOWN = 12
 """Digits of a hash that a sentence shows."""
@@ -139,12 +139,12 @@ class Summary:
             entries: of a file. positions: whether any was measured: old files have errors of other rows in their place.
 
         Raises:
-            InputError: an entry is missing or unknown, or its value has another type.
+            TypeError: an entry is missing or unknown.
         """
         own = {one.metadata.get("name", one.name) for one in fields(cls)}
         others = [name for name in entries if name not in own and name.endswith(LENGTH_UNIT)]
-        parts = {name.removesuffix(LENGTH_UNIT): read(entries[name], float, name, "summary") for name in others}
-        found = record_of(cls, {k: v for k, v in entries.items() if k not in others}, "summary", parts=parts)
+        parts = {name.removesuffix(LENGTH_UNIT): entries[name] for name in others}
+        found = record_of(cls, {k: v for k, v in entries.items() if k not in others}, parts=parts)
         return found if positions else replace(found, **dict.fromkeys(OF_POSITIONS))
 
 
@@ -153,7 +153,6 @@ OF_POSITIONS = ("registration_rms", "geometry_rms", "diffeomorphic_rms", "leave_
 
 # --- dataclasses of plain values as entries of a file ----------------------------------------------------------------
 
-WORDS = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
 Record = TypeVar("Record")
 
 
@@ -164,36 +163,13 @@ def entries_of(record: Any, *without: str) -> dict[str, Any]:
     return {name: list(value) if isinstance(value, tuple) else value for name, value in plain.items()}
 
 
-def record_of(kind: type[Record], entries: object, what: str, **given: Any) -> Record:
-    """A dataclass of the entries of a file, ``what`` in messages, and of other fields that are ``given``.
+def record_of(kind: type[Record], entries: Mapping[str, Any], **given: Any) -> Record:
+    """A dataclass of the entries of a file, and of other fields that are ``given``.
 
     Raises:
-        InputError: an entry is missing or unknown, or its value has another type than the field.
+        TypeError: an entry is missing or unknown.
     """
-    known: dict[str, Any] = {one.metadata.get("name", one.name): one for one in fields(kind)}  # pyright: ignore[reportArgumentType]
-    known = {name: one for name, one in known.items() if one.name not in given}
-    needed = {name for name, one in known.items() if one.default is MISSING}
-    if not isinstance(entries, Mapping) or not needed <= set(entries) <= set(known):
-        got = sorted(map(str, entries)) if isinstance(entries, Mapping) else entries
-        raise InputError.of(f"the entry {what}", expected=sorted(known), got=got)
-    hints = get_type_hints(kind)
-    values = {known[name].name: read(value, hints[known[name].name], name, what) for name, value in entries.items()}
+    known: dict[str, str] = {one.metadata.get("name", one.name): one.name for one in fields(kind)}  # pyright: ignore[reportArgumentType]
+    plain = {name: inf if value == INFINITE else value for name, value in entries.items()}
+    values = {known.get(name, name): tuple(own) if isinstance(own, list) else own for name, own in plain.items()}
     return kind(**values, **given)
-
-
-def read(value: Any, hint: Any, name: str, what: str) -> Any:
-    """A value of a file as a float, an int, text, true or false, a tuple of these, or None where its type says so."""
-    if get_origin(hint) is tuple and isinstance(value, list):
-        return tuple(read(one, get_args(hint)[0], name, what) for one in value)
-    kinds = get_args(hint) or (hint,)
-    if value is None and type(None) in kinds:
-        return None
-    kind: Any = kinds[0]
-    if kind is float and value == INFINITE:
-        return inf
-    accepted = (int, float) if kind is float else kind  # a whole number may stand for a float
-    if isinstance(value, bool) is not (kind is bool) or not isinstance(value, accepted):
-        raise InputError.of(
-            f"the entry {name!r} of the {what}", expected=WORDS.get(kind, "a list"), got=as_written(value)
-        )
-    return kind(value)

@@ -35,13 +35,11 @@ USUAL_SIZES = {
 """Larger values in rad or m, and smaller ones in deg or mm, are probably in the other unit."""
 OTHER_UNITS = {"rad": ("deg", "degrees"), "deg": ("rad", "radians"), "m": ("mm", "millimetres"), "mm": ("m", "metres")}
 
-ANGLE_MISTAKES = ((math.pi / 180, "degrees: convert them to radians"), (180 / math.pi, "radians that were converted"))
-"""Factor that undoes a wrong unit of joint values, and what they then are."""
-
-
-def angle_mistake(words: str) -> str:
-    """Sentence about a wrong unit of joint values."""
-    return f"the joint values seem to be {words}; check the angle unit"
+ANGLE_MISTAKES = (
+    (math.pi / 180, "the joint values seem to be degrees: convert them to radians; check the angle unit"),
+    (180 / math.pi, "the joint values seem to be radians that were converted; check the angle unit"),
+)
+"""Factor that undoes a wrong unit of joint values, and what to do."""
 
 
 @contextmanager

@@ -266,9 +266,13 @@ def points_of_frames(frames: Tensor, lever: float) -> Tensor:
 
 def frames_of_points(points: Tensor, lever: float) -> Tensor:
     """The frames (N, T, 4, 4), NaN where hidden, of points (N, 3 T, 3), m; see :func:`poses_from_marks`."""
-    check_lever(lever)
-    triples = (points if wrapped(points) else points.detach()).unflatten(1, (-1, POINTS))
-    return poses_of_triangles(triples).masked_fill(triples.isnan().flatten(2).any(2)[..., None, None], torch.nan)
+    triples = points.unflatten(1, (-1, POINTS))
+    if wrapped(points):
+        return poses_of_triangles(triples)
+    seen = ~triples.isnan().flatten(2).any(2)
+    found = triples.new_full((*seen.shape, 4, 4), torch.nan)
+    found[seen] = poses_from_marks(triples[seen], lever)
+    return found
 
 
 def transforms_of_frames(rotations: Tensor, places: Tensor) -> Tensor:

@@ -26,10 +26,6 @@ class Payload:
     masses: Tensor  # of the robot everywhere (), or of N rows (N,), in any unit
     unit: float  # the mass, in the same unit, that counts as one: coefficients are sags under it. Positive.
 
-    def __post_init__(self) -> None:
-        if not self.unit > 0:
-            raise InputError.of("the unit of a payload", expected="a positive mass", got=self.unit)
-
     @classmethod
     def of_rows(cls, robot: Tree, masses: Tensor | None, at: str | None) -> Payload | None:
         """The masses (N,) that a robot carried in N rows, the largest of which counts as one; None if not known.

@@ -71,9 +71,9 @@ def nominal_chain(robot: Mapping[str, Any]) -> NominalChain:
     limits = np.array([[joint["lower"], joint["upper"]] for joint in active], float).reshape(-1, 2)  # None is NaN
     limits = np.where(np.isnan(limits), [-np.inf, np.inf], limits)
     table = _coupling(robot, moving, [joint["name"] for joint in active], between)
-    places, coupling = (np.array(offsets), np.array(before), tuple(tips), ground >= 0), (table[:, :-1], table[:, -1])
-    names = tuple(joint["name"] for joint in active)
-    return NominalChain(*places, axes, revolute, motions, *map(np.ascontiguousarray, coupling), names, limits)
+    places, names = (np.array(offsets), np.array(before), tuple(tips), ground >= 0), [joint["name"] for joint in active]
+    coupling, start = table[:, :-1].copy(), table[:, -1].copy()
+    return NominalChain(*places, axes, revolute, motions, coupling, start, tuple(names), limits)
 
 
 def _coupling(

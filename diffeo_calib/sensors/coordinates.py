@@ -16,7 +16,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, listed
-from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake, rare_names
+from diffeo_calib.measurements.checks import ANGLE_MISTAKES, rare_names
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
@@ -182,11 +182,10 @@ class Contacts(Sensor):
             return float(away.nanmedian()) / max(motion, SMALLEST_MOTION_M)
 
         own = share(data.q)
-        for factor, words in ANGLE_MISTAKES:
+        for factor, fix in ANGLE_MISTAKES:
             other = share(torch.where(turning, factor * data.q, data.q))
             if other < REMAINING_SPREAD * own:
                 expected = f"a spread within sockets of {1e2 * other:.2g} % of the tip's motion, as in the other unit"
-                fix = angle_mistake(words)
                 raise MeasurementError.of("the joint values", expected=expected, got=f"{1e2 * own:.2g} %", fix=fix)
 
     def with_points(self, data: Measurements, model: Any) -> Measurements:

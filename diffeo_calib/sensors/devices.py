@@ -43,7 +43,6 @@ OUTLIER_MEDIANS = 3.0
 SMALLEST_MEDIAN_M = 1e-7
 SMALLEST_DISTANCE_M = 1e-6
 """Nearer to its fixed end the direction of a distance, and nearer to its lens the image of a camera, is undefined."""
-BISECTIONS = 100
 
 
 MILLIMETRE = "mm", 1e-3
@@ -280,18 +279,6 @@ class Devices(Extrinsics):
         """Where a device is in a frame, with standard deviations of its increments (k,)."""
 
     @classmethod
-    def alone(cls, data: Readings, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor] | None:
-        """Point (3,) in the tip's frame, m, and constants (c,) of one device, in closed form from its own rows.
-
-        Args:
-            data: readings of one device. R: (N, 3, 3), t: (N, 3), the tip's poses, m.
-
-        Returns:
-            None where there is no closed form: the search then starts with the point at the tip.
-        """
-        return None
-
-    @classmethod
     def doubts_unit(cls, data: Readings, errors: Tensor) -> bool:
         """Whether the errors (N, r), m, of a rough fit make the unit of readings doubtful."""
         return False
@@ -443,24 +430,6 @@ def median_weights(distances: Tensor, half: float) -> Tensor:
 def across(directions: Tensor) -> Tensor:
     """Two unit vectors at right angles to each direction and to each other: (..., 3) -> (..., 2, 3)."""
     return torch.linalg.svd(directions[..., None, :], full_matrices=True).Vh[..., 1:, :]
-
-
-def unit_least_squares(matrix: Tensor, target: Tensor) -> Tensor:
-    """The unit vector x (k,) of least |matrix x - target|; for a target of zeros the direction of least variance.
-
-    (M^T M + mu) x = M^T target with the mu above minus the smallest eigenvalue that gives x its length, by bisection.
-    """
-    values, vectors = torch.linalg.eigh(matrix.mT @ matrix)
-    along = vectors.mT @ (matrix.mT @ target)
-    low, high = 0.0, float(along.norm()) + SMALLEST_M**2
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        longer = float((along / (values - values[0] + middle)).norm()) > 1.0
-        low, high = (middle, high) if longer else (low, middle)
-    x = along / (values - values[0] + high)
-    rest = (1.0 - x.square().sum()).clamp(min=0.0).sqrt()  # where the target has no part along the first direction
-    x[0] = x[0] + (rest if float(x[0]) >= 0 else -rest)
-    return vectors @ (x / x.norm())
 
 
 def moved_pose(rows: Tensor, twist: Tensor) -> Tensor:

@@ -1,11 +1,4 @@
-"""Heights above planes: a dial gauge, or the ball that touches a surface.
-
-With the tip's poses (R_i, t_i) and the ball c, z_i = R_i c + t_i, the heights h above the plane of unit normal n give
-
-    n.z - d = h:    n.t + tr(R^T n c^T) - d = h,    |n| = 1,
-
-linear in (n, n c^T, d).
-"""
+"""Heights above planes, n.z - d of unit normal n and a ball at z: a dial gauge, or the ball that touches a surface."""
 
 from __future__ import annotations
 
@@ -22,11 +15,10 @@ from diffeo_calib.sensors.devices import (
     across,
     least_squares,
     numbers_text,
-    unit_least_squares,
 )
 
-LEAST_SHARE = 1e-4
-"""Directions of the unknowns that data determine less than this, relative to the best one, are left at zero."""
+LEAST_NORMAL = 0.5
+"""Length of a normal by least squares from which heights tell the points apart."""
 UNIT_RATIO, CORRELATED = 10.0, 0.5
 """Factor between measured and found heights that is doubted, and their correlation that shows it."""
 FLAT_SHARE = 0.2
@@ -56,9 +48,12 @@ class Planes(Devices):
 
     @classmethod
     def start(cls, values: Tensor, points: Tensor) -> Tensor:
-        """The unit normal n and the distance d of least squares of n.z - d - h."""
-        values = values[:, 0]
-        normal = unit_least_squares(points - points.mean(0), values - values.mean())
+        """n and d of least squares of n.z - d - h; of heights that hardly differ the direction of least variance."""
+        values, away = values[:, 0], points - points.mean(0)
+        normal, flat = least_squares(away, values - values.mean()), torch.linalg.svd(away).Vh[-1]
+        if float(normal.norm()) < LEAST_NORMAL:
+            normal = flat if float(flat @ normal) >= 0 else -flat
+        normal = normal / normal.norm()
         return torch.cat([normal, (points @ normal - values).mean()[None]])
 
     @staticmethod
@@ -79,17 +74,6 @@ class Planes(Devices):
         turn, shift = 1e3 * float(deviations[:2].norm()), 1e3 * float(deviations[2])
         what = f"plane '{self.names[number]}' in {frame}: normal {numbers_text(normal)} +- {turn:.2f} mrad"
         return f"{what}, {1e3 * distance:.3f} +- {shift:.3f} mm from the origin"
-
-    @classmethod
-    def alone(cls, data: Readings, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        values, one = data.values[:, 0], torch.ones_like(data.values)
-        others = torch.cat([R.flatten(1), -one], 1)  # their unknowns follow from the normal
-        basis = torch.linalg.svd(others, full_matrices=False)
-        Q = basis.U[:, LEAST_SHARE * basis.S[0] < basis.S]
-        t_left, values_left = t - Q @ (Q.mT @ t), values - Q @ (Q.mT @ values)
-        n = unit_least_squares(t_left, values_left)
-        found = least_squares(others, values - t @ n)
-        return found[:9].view(3, 3).mT @ n, torch.cat([n, found[9:]])
 
     @classmethod
     def doubts_unit(cls, data: Readings, errors: Tensor) -> bool:

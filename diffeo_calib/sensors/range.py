@@ -1,10 +1,5 @@
-"""Distances from fixed points: a ball bar, a wire, an interferometer, with an absolute or an unknown zero.
-
-With the tip's poses (R_i, t_i) and the ball c, z_i = R_i c + t_i, the readings l of a fixed point f with zero o give
-
-    |z - f|^2 = (l - o)^2:    t.t - 2 f.t + 2 c.(R^T t) - 2 f^T R c + (|c|^2 + |f|^2 - o^2) = l^2 - 2 o l,
-
-linear in (f, c, f c^T, ...).
+"""Distances |z - f| + o of a ball at z from fixed points f: a ball bar, a wire, an interferometer, whose zero o is
+absolute or unknown.
 """
 
 from __future__ import annotations
@@ -16,7 +11,6 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
-from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.sensors.devices import (
     SMALLEST_DISTANCE_M,
     Devices,
@@ -83,15 +77,6 @@ class FixedPoints(Devices):
         zero = f", its zero at {found[3]:.3f} +- {std[3]:.3f} mm" * bool(self.deviations[number, 3] > FIXED_DEVIATION_M)
         place = f"{numbers_text(found[:3])} +- {numbers_text(std[:3])} mm in {frame}"
         return f"fixed point '{self.names[number]}': {place}{zero}"
-
-    @classmethod
-    def alone(cls, data: Readings, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        values, one = data.values[:, 0], torch.ones_like(data.values)
-        columns = [-2 * t, 2 * (R.mT @ t[:, :, None])[..., 0], -2 * R.flatten(1), one]
-        columns += [2 * values[:, None]] * bool(data.offset_std)
-        found = least_squares(torch.cat(columns, 1), values**2 - t.square().sum(1))
-        offset = found[16:17] if data.offset_std else found.new_zeros(1)
-        return found[3:6], torch.cat([found[:3], offset])
 
     def freed(self) -> FixedPoints | None:
         if float(self.deviations[:, 3].max()) > FIXED_DEVIATION_M:

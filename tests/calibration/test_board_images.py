@@ -30,7 +30,6 @@ from diffeo_calib.robots import SimulatedArm
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 
 SCALES = camera_on_tool().scales
-NOISE_PX = 0.1
 
 
 @cache
@@ -38,14 +37,12 @@ def arm() -> CameraArm:
     return camera_arm(60)
 
 
-@cache
 def data() -> dc.Measurements:
-    return arm().images(NOISE_PX)
+    return kind_named("images of a board").data
 
 
-@cache
 def calibrated() -> Any:
-    return dc.calibrate(arm().arm.nominal, data(), hyperparameters=SCALES)
+    return kind_named("images of a board").result
 
 
 def of_corners(corners: Tensor, q: Tensor | None = None, **known: Any) -> dc.Measurements:
@@ -80,7 +77,7 @@ def test_a_mirrored_board_is_the_same_board_from_behind() -> None:
     mirrored = corners.clone()
     mirrored[..., 0] *= -1
     found = dc.calibrate(arm().arm.nominal, of_corners(mirrored), hyperparameters=SCALES)
-    assert abs(error_mm(found.model) / error_mm(calibrated().model) - 1) < 0.02
+    assert abs(error_mm(found.model) / error_mm(calibrated().model) - 1) < 0.05
 
 
 def test_a_board_of_nearly_the_right_size_is_named() -> None:
@@ -100,8 +97,8 @@ def test_tables_that_cannot_be() -> None:
         ("row", lambda: dc.calibrate(arm().arm.nominal, of_corners(corners.roll(1, 0)))),
         ("640 x 480", lambda: of_corners(corners, camera=small)),
         ("640 x 480", lambda: dc.Measurements.from_images(data().q, corners, (640, 480))),
-        (r"corners.*\(N, K, 5\)", lambda: of_corners(torch.zeros(60, 35))),
-        (r"corners.*\(N, K, 5\)", lambda: of_corners(torch.zeros(60, 35, 4))),
+        (r"corners.*\(N, K, 5\)", lambda: of_corners(torch.zeros(45, 35))),
+        (r"corners.*\(N, K, 5\)", lambda: of_corners(torch.zeros(45, 35, 4))),
     )
 
 

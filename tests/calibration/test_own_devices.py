@@ -7,7 +7,6 @@ from typing import Any
 
 import inclinometer
 import pytest
-import reading_bank
 import torch
 import two_arms_bank
 from inclinometer import Inclinometers
@@ -36,32 +35,18 @@ def registered() -> None:
     KINDS.update({Beams.kind: Beams, Inclinometers.kind: Inclinometers})
 
 
-@pytest.fixture(scope="module")
-def arm() -> SimulatedArm:
-    return SimulatedArm(seed=0, markers=2)
+ARM = SimulatedArm(seed=0, markers=2)
 
 
-@pytest.fixture(scope="module")
-def rows(arm: SimulatedArm) -> dc.Observations:
-    q, points = arm.measure(20, seed=5)
-    tracked = dc.Measurements(q, points[:, 1:], arm.nominal.joint_names)
-    return dc.Observations.joined([tracked, readings(arm, arm.sample(60, seed=6))])
-
-
-@pytest.fixture(scope="module")
-def result(arm: SimulatedArm, rows: dc.Observations) -> Any:
-    return dc.calibrate(arm.nominal, rows, hyperparameters=reading_bank.scales())  # pyright: ignore
-
-
-def test_beside_positions_it_makes_the_model_better(arm: SimulatedArm, rows: dc.Observations, result: Any) -> None:
-    q = arm.sample(100, seed=9)
-    truth = arm.true_points(q)[:, [1, 0]]
-    error = rigid_rms(result.model(q).detach(), truth)
-    alone = dc.calibrate(arm.nominal, rows.parts[0], hyperparameters=reading_bank.scales()).model
+def test_beside_positions_it_makes_the_model_better() -> None:
+    kind = kind_named("laser beams")
+    alone, q = dc.calibrate(kind.robot, kind.data.parts[0], hyperparameters=kind.scales).model, kind.q(100)
+    truth = kind.source.truth(q)
+    error = rigid_rms(kind.model(q).detach(), truth)
     assert error < 0.7 * rigid_rms(alone(q).detach(), truth[:, :1])
-    assert error < 2 * result.expected.workspace
-    assert "beam 'A' in the measuring frame through" in result.placement.sentences()[0]
-    assert set(result.placement.entry()["devices"]["constants"]) == {"A", "B"}
+    assert error < 2 * kind.result.expected.workspace
+    assert "beam 'A' in the measuring frame through" in kind.result.placement.sentences()[0]
+    assert set(kind.result.placement.entry()["devices"]["constants"]) == {"A", "B"}
 
 
 def test_an_inclinometer_finds_how_it_is_mounted_and_makes_the_model_better() -> None:
@@ -91,12 +76,12 @@ def test_a_frame_is_seen_beside_poses_only() -> None:
         dc.evaluate(kind_named("positions").model, seen)
 
 
-def test_written_and_read_in_its_own_unit(arm: SimulatedArm, tmp_path: Path) -> None:
-    q = arm.sample(8, seed=1)
-    names, table = arm.nominal.joint_names, TableFormat("mm", "deg")
+def test_written_and_read_in_its_own_unit(tmp_path: Path) -> None:
+    q = ARM.sample(8, seed=1)
+    names, table = ARM.nominal.joint_names, TableFormat("mm", "deg")
     angles = 0.1 * torch.arange(16.0, dtype=torch.float64).view(8, 2)
     turns = dc.Readings.of("tilt", q, angles, None, names, unit=("mrad", 1e3), std=1e-4, numbers=2)
-    beams = readings(arm, q)
+    beams = readings(ARM, q)
     for data, cell in ((turns, "1500."), (beams, f"{1e3 * float(beams.values[0]):.6f}"[:-2])):
         written = write_measurements(tmp_path / "t.csv", data, table)
         assert cell in (tmp_path / "t.csv").read_text()
@@ -106,7 +91,7 @@ def test_written_and_read_in_its_own_unit(arm: SimulatedArm, tmp_path: Path) -> 
         assert (same.std is None) == (data.std is None)
     assert list(turns.to_frame().columns)[6:8] == ["tilt 1", "tilt 2"]
     with pytest.raises(MeasurementError, match=r"'tilt'.*register"):
-        dc.calibrate(arm.nominal, dc.Readings.of("tilt", arm.sample(60), 0.1, None, names))
+        dc.calibrate(ARM.nominal, dc.Readings.of("tilt", ARM.sample(60), 0.1, None, names))
 
 
 def test_kinds_are_registered_once() -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import again_bank
 import pytest
 import torch
-from again_bank import CASES, Again
+from again_bank import OTHERWISE, WORN_ROWS, height, sockets
 from kind_bank import kind_named
 
 import diffeo_calib as dc
@@ -20,8 +20,6 @@ from diffeo_calib.common.errors import InputError
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # few rows
 ARM = again_bank.arm()
-OTHERWISE = [name for name, case in CASES.items() if case.old is not case.new]
-"""Measured in one way and then in another; tests/test_matrix.py recalibrates with rows of the same kind."""
 
 
 def quietly(work: Any, *given: Any) -> Any:
@@ -33,46 +31,40 @@ def quietly(work: Any, *given: Any) -> Any:
 @cache
 def recalibrated(name: str) -> dc.Recalibration:
     """A case's model and the new rows of the same robot."""
-    case: Again = CASES[name]
-    new = case.new(again_bank.arm(case.markers), case.count, 5)
-    return quietly(dc.recalibrate, again_bank.model(case.old, case.markers), new)
+    case = OTHERWISE[name]
+    return quietly(dc.recalibrate, again_bank.model(case.old), case.new(ARM, case.count, 5))
 
 
 @pytest.mark.parametrize("name", OTHERWISE)
 def test_new_rows_make_the_model_better(name: str) -> None:
-    case: Again = CASES[name]
-    model, arm = again_bank.model(case.old, case.markers), again_bank.arm(case.markers)
     found = recalibrated(name)
-    assert again_bank.true_error(found.model, arm) < again_bank.true_error(model, arm)
+    assert again_bank.true_error(found.model, ARM) < again_bank.true_error(again_bank.model(OTHERWISE[name].old), ARM)
     assert found.fit.converged
     assert found.changes.found == ()
     assert found.marker == "same"
     assert found.rms_after <= found.rms_before
 
 
-@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.wears])
+@pytest.mark.parametrize("name", WORN_ROWS)
 def test_a_worn_joint_is_found(name: str) -> None:
-    case: Again = CASES[name]
-    worn = again_bank.arm(case.markers).worn(again_bank.WORN, again_bank.FACTOR)
-    found = dc.compare(again_bank.model(case.old, case.markers), case.new(worn, case.count, 5))
-    assert isinstance(found, dc.Comparison)
-    assert [change.part for change in found.changes.found] == [worn.nominal.joint_names[again_bank.WORN]]
+    case, worn = WORN_ROWS[name], ARM.worn(again_bank.WORN, again_bank.FACTOR)
+    found: Any = dc.compare(again_bank.model(case.old), case.new(worn, case.count, 5))
     (change,) = found.changes.found
+    assert change.part == worn.nominal.joint_names[again_bank.WORN]
     assert str(found).startswith(f"{change.part} has changed")
     assert 1e-4 < change.size < 2e-3
     assert change.displacement > 1e-5
 
 
-@pytest.mark.parametrize("name", ["heights", "sockets"])
-def test_what_was_measured_is_in_the_file(name: str, tmp_path: Path) -> None:
-    model = again_bank.model(CASES[name].old)
+@pytest.mark.parametrize("rows", [height, sockets])
+def test_what_was_measured_is_in_the_file(rows: Any, tmp_path: Path) -> None:
+    model = again_bank.model(rows)
     dc.save(model, tmp_path / "model.safetensors")
     loaded: Any = dc.load(tmp_path / "model.safetensors")
     assert torch.equal(loaded.map.measured(), model.map.measured())
     for read, kept in zip(loaded.placement, model.placement, strict=True):
         assert read.stored() == kept.stored()
-    assert [own.kind for own in model.placement] == {"heights": ["height"], "sockets": ["socket"]}[name]
-    again = dc.recalibrate(loaded, CASES[name].new(ARM, 30, 5))
+    again = dc.recalibrate(loaded, rows(ARM, 30, 5))
     dc.save(again.model, tmp_path / "again.safetensors")
     back: Any = dc.load(tmp_path / "again.safetensors")
     q = ARM.sample(5, seed=3)
@@ -100,15 +92,6 @@ def test_old_rows_of_readings_keep_their_payloads() -> None:
     for mass in (0.0, 10.0):
         old, new = (again_bank.true_error(one.with_payload(mass), ARM, mass) for one in (model, again))
         assert new < 1.1 * old
-
-
-@pytest.mark.parametrize("name", ["heights", "sockets", "images", "mixture", "hidden markers"])
-def test_two_models_of_any_rows_are_compared(name: str) -> None:
-    case: Again = CASES[name]
-    model = again_bank.model(case.old, case.markers)
-    found = dc.compare(model, model)
-    assert found.rms < 1e-6
-    assert not found.changes.found
 
 
 def test_a_recalibrated_model_keeps_its_devices() -> None:
@@ -155,7 +138,7 @@ def test_a_session_that_deviates_is_a_change_and_no_outliers() -> None:
 
 
 def test_every_session_has_its_own_frame() -> None:
-    frames: Any = next(iter(recalibrated("two sessions").placement))
+    frames: Any = next(iter(recalibrated("positions, then two sessions").placement))
     between = torch.linalg.inv(again_bank.ELSEWHERE) @ again_bank.ELSEWHERE @ again_bank.TRIPOD
     assert frames.names == ("before", "after")
     other = frames.transforms[1 - frames.reference]

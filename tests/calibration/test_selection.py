@@ -29,9 +29,8 @@ from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.scales import selection
 from diffeo_calib.calibration.scales.selection import (
     LARGEST_AMPLITUDE_RATIO,
-    SEARCH_LIMITS,
+    LOG_RANGE,
     LogPosterior,
-    SearchLimits,
     defaults,
     log_posterior,
     select,
@@ -243,12 +242,6 @@ def test_a_wide_prior_costs_no_digits(setting: Setting) -> None:
     torch.testing.assert_close(wide[0].gradient, wide[1].gradient, rtol=1e-4, atol=1e-4)
 
 
-def brief(iterations: int = 5, **others: int) -> SearchLimits:
-    """A search with ``iterations`` iterations from every start."""
-    each = dict.fromkeys(("iterations", "first", "fewest_first", "most_first"), iterations)
-    return SearchLimits(**each | others)
-
-
 def value(setting: Setting, scales: dc.Hyperparameters) -> float:
     """Log posterior, up to a constant."""
     found = log_posterior(scales.logarithms(), setting.scales, setting.tangent_data)
@@ -276,7 +269,7 @@ def test_select_is_better_than_the_default_and_reports_its_likelihood(setting: S
     assert f"likelihood {found.likelihood:.1f} on {len(setting.data)} poses" in selection.status
     assert not selection.interrupted
     moved = selection.scales.logarithms() - setting.scales.logarithms()
-    assert float(moved.abs().max()) <= SEARCH_LIMITS.log_range + 1e-9
+    assert float(moved.abs().max()) <= LOG_RANGE + 1e-9
 
 
 def test_a_given_start_is_where_the_search_begins() -> None:
@@ -285,7 +278,7 @@ def test_a_given_start_is_where_the_search_begins() -> None:
     start = shaken(setting.scales, 4)
     begun = select(setting.scales, setting.tangent_data, start=start, progress=interrupting(2))
     torch.testing.assert_close(begun.scales.logarithms(), start.logarithms(), rtol=1e-12, atol=1e-12)
-    climbed = select(setting.scales, setting.tangent_data, start=start, limits=brief(1))
+    climbed = select(setting.scales, setting.tangent_data, start=start, iterations=1)
     assert value(setting, climbed.scales) > value(setting, start)
 
 

@@ -10,43 +10,10 @@ from command_bank import Command
 from diffeo_calib.cli.declarations import COMMANDS
 from diffeo_calib.cli.main import GONE
 
-UNITS = "--length --angle --joint-length --joints --robot-pose --sep --decimal"
-ROWS = (
-    "--position --rotation --convention --rotation-angle --lever --camera-on-tool --std --rotation-std --socket "
-    "--distance --distance-std --reading --session --remounted --payload --time --temperature --marker --places --by"
-)
-TEXTS = {
-    "fit": (
-        f"{ROWS} {UNITS} CSV --robot --base --tip --load --dh-convention -o --output --holdout --seed --controls "
-        "--duplicates --note --scales-of --report"
-    ),
-    "campaign": (
-        f"{ROWS} {UNITS} CSV --robot --base --tip --load --dh-convention --tolerance --stdin "
-        "--once --candidates --page -n --count --accepted"
-    ),
-    "record": "BAG --seen -o --output --joints --still --shortest --offset",
-    "evaluate": f"{ROWS} {UNITS} MODEL CSV --free -o --output --tolerance --report --against",
-    "init": "CSV ROBOT --places --by -o --output --force",
-    "images": "FOLDER JOINTS --board --length -o --output --board-std --report --sep --decimal",
-    "predict": f"{UNITS} MODEL CSV --convention --rotation-angle --payload -o --output",
-    "correct": (
-        f"{UNITS} MODEL PROGRAM --position --rotation --convention --rotation-angle -o --output --tip --tool "
-        "--frame --limit --rate --payload"
-    ),
-    "export": (
-        "MODEL --urdf --mjcf --dh --dh-convention --ur-kinematics --joint-offsets "
-        "--correction-tables --robot --length --angle --c --torch --onnx --camera --tool "
-        "--frame --payload --tip --field --grid"
-    ),
-    "plan": (
-        f"{UNITS} MODEL --robot --base --tip --load --dh-convention --marker -n --count -o --output --free --seed "
-        "--candidates --target-poses --measured --draw --range --tracker --floor --column --collisions "
-        "--sensor --payload"
-    ),
-    "recalibrate": f"{ROWS} {UNITS} OLD OTHER -o --output --marker-freedom --seed --note",
-    "demo": "-o --output -n --count --seed",
+OPTIONS = {
+    name: ["--json", *(word for one in options.all() for word in one.names or (one.shown,))]
+    for name, options in COMMANDS.items()
 }
-OPTIONS = {name: [*text.split(), "--json"] for name, text in TEXTS.items()}
 
 
 def entries(text: str) -> dict[str, str]:

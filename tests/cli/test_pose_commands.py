@@ -5,20 +5,14 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from command_bank import FORMAT, Command
+from command_bank import Command
 from kind_bank import UNITS, kind_named
-from table_bank import CONVENTIONS, read_table
-from torch.testing import assert_close
 
-from diffeo_calib.cli.commands.evaluate import reading_options
-from diffeo_calib.measurements.csv.files import write_predictions
-from diffeo_calib.measurements.poses import angle_between, rotation_matrices, transforms
+from diffeo_calib.measurements.poses import angle_between, rotation_matrices
 
 
 @pytest.mark.parametrize(
@@ -53,24 +47,3 @@ def test_predict_with_poses(options: list[str], columns: list[str], command: Com
     np.testing.assert_allclose(values[:, 6:9], 1e3 * poses[:, :3, 3].numpy(), rtol=0, atol=1e-9)
     np.testing.assert_allclose(values[:, 9:12], 1e3 * std[:, :3], rtol=1e-6)
     np.testing.assert_allclose(values[:, -3:], std[:, 3:] if unit == "rad" else np.degrees(std[:, 3:]), rtol=1e-6)
-
-
-@pytest.mark.parametrize("convention", CONVENTIONS)
-def test_predicted_poses_are_read_back_as_measurements(convention: str, tmp_path: Path) -> None:
-    """In every convention, with the options that `predict` prints."""
-    rng = np.random.default_rng(0)
-    q, shifts = torch.from_numpy(rng.uniform(-3, 3, (9, 2))), torch.from_numpy(rng.uniform(-1, 1, (9, 3)))
-    turns = rotation_matrices(torch.from_numpy(rng.uniform(-1.5, 1.5, (9, 3))), "rotvec")
-    poses, std = transforms(turns, shifts), torch.full((9, 6), 1e-5, dtype=torch.float64)
-    path, table = tmp_path / "p.csv", replace(FORMAT, convention=convention, rotation_angle="deg")
-    write_predictions(path, [(q, poses, std)], table, joints=["a", "b"], poses=True)
-    header = path.read_text().splitlines()[0].split(";")
-    columns = header[header.index("std_z") + 1 : header.index("std_rx")]
-    deviations = {"std": ["std_x", "std_y", "std_z"], "rotation_std": ["std_rx", "std_ry", "std_rz"]}
-    data = read_table(path, ["a", "b"], ["x", "y", "z"], replace(table, rotation=columns, **deviations))
-    assert_close(data.poses, poses, rtol=0, atol=1e-12)
-    assert_close(data.q, q, rtol=1e-14, atol=0)
-    assert_close(data.rotation_std, std[:, 3:], rtol=1e-12, atol=0)
-    words = reading_options(table).split()
-    assert words[words.index("--rotation") + 1] == ",".join(columns)
-    assert ("--rotation-angle" in words) == (len(columns) == 3)

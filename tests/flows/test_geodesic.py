@@ -30,15 +30,6 @@ def flow_of(case: Case, steps: int = 3, size: float = 0.3) -> Flow:
 
 
 @every_case
-def test_controls_follow_their_own_flow(case: Case) -> None:
-    flow = flow_of(case)
-    torch.testing.assert_close(flow(flow.nodes[0][0]), flow.end[0], rtol=0, atol=1e-14)
-    path, _ = flow.path(flow.nodes[0][0])
-    for point, node in zip(path, flow.nodes, strict=True):
-        torch.testing.assert_close(point, node[0], rtol=0, atol=1e-14)
-
-
-@every_case
 def test_passive_points_are_controls_without_momentum(case: Case) -> None:
     """The naive geodesic of controls and of passive points with a = 0, together."""
     flow, x = flow_of(case), case.points(M, seed=1)

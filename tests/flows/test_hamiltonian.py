@@ -21,17 +21,6 @@ def start(case: Case, size: float = 0.3) -> Tensor:
     return torch.stack([case.points(N, seed=2), size * normal(N, case.dim, seed=3)])
 
 
-def run(kernel: Kernel, state: Tensor, steps: int) -> Tensor:
-    return Flow(kernel, state[0], state[1], RK4(steps)).end
-
-
-@every_case
-def test_right_hand_side_is_that_of_hamilton(case: Case) -> None:
-    state = start(case)
-    actual, expected = geodesic_field(case.kernel, state), case.geodesic_field(state)
-    torch.testing.assert_close(actual, expected.detach(), rtol=1e-12, atol=1e-13)
-
-
 @every_case
 def test_adjoint_of_the_right_hand_side(case: Case) -> None:
     """The closed form compared with backpropagation through the gradient of H."""

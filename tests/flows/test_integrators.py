@@ -28,16 +28,6 @@ def test_order_on_an_equation_with_known_solution(
     assert slopes(errors) == pytest.approx([method.order] * (len(steps) - 1), abs=0.15)
 
 
-@pytest.mark.parametrize("method", [RK4, RK8])
-def test_tableau_is_explicit_and_consistent(method: type[RungeKutta]) -> None:
-    """c = A 1, and the quadrature conditions sum b c^k = 1 / (k + 1) up to the order."""
-    a, b = method.tableau()
-    torch.testing.assert_close(a, a.tril(-1), rtol=0, atol=0)
-    c = a.sum(1)
-    for degree in range(method.order):
-        torch.testing.assert_close((b * c**degree).sum(), tensor(1 / (degree + 1)), rtol=0, atol=1e-13)
-
-
 def test_stages_are_numbered_in_order() -> None:
     seen = []
 
@@ -59,11 +49,6 @@ def test_weights_integrate_polynomials(steps: int) -> None:
     for degree in range(4 if steps % 2 == 0 else 2):
         torch.testing.assert_close((weights * times**degree).sum(), tensor(1 / (degree + 1)), rtol=0, atol=1e-15)
     assert bool((weights > 0).all())
-
-
-def test_refined_halves_the_step() -> None:
-    assert RK4(3).refined() == RK4(6)
-    assert RK8(1).refined() == RK8(2)
 
 
 @pytest.mark.parametrize("steps", [0, -1, 1.5, "2", None])

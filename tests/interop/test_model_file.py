@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 from math_bank import constant_kernel
-from model_file_bank import Editor, header_of, planar, set_entry
+from model_file_bank import header_of, planar
 from product_bank import Case
 from safetensors import safe_open
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError, ModelFileError
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.interop import model_header
 from diffeo_calib.kernels.base import Kernel
@@ -125,15 +125,6 @@ def test_the_header_describes_the_model(arm: Case, tmp_path: Path) -> None:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     assert all(t.dtype == torch.float64 for t in tensors.values())
     assert tensors["x"].shape == (60, 6)
-
-
-def test_a_plain_function_has_no_lever(tmp_path: Path) -> None:
-    path = tmp_path / "plain.safetensors"
-    dc.save(planar().model, path)
-    assert header_of(path)["lever"] is None
-    editor = Editor(path.read_bytes(), tmp_path)
-    with pytest.raises(ModelFileError, match=r"entry lever: expected null for a plain function, got 0.1"):
-        dc.load(editor.write(set_entry("lever", value=0.1)), elastic_rr.nominal)
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Dense, Formula, Points
 from diffeo_calib.kernels.reductions.tiled import Tiled
 
-TILES = (1, 4, 6, COLUMNS, 9, ROWS * COLUMNS, 1000)
+TILES = (1, 6, 9, 1000)
 """Pairs in a tile: sides that divide the points and sides that do not, one tile, and more than all pairs."""
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from math import inf, isnan, nan
@@ -16,7 +15,6 @@ from product_bank import Case
 from safetensors import safe_open
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.provenance import Provenance, Summary, entries_of, record_of
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -76,12 +74,10 @@ def test_the_hash_is_that_of_the_file_or_of_the_arrays(arm: Case, tmp_path: Path
 
 
 def test_entries_that_cannot_be_read() -> None:
-    assert entries_of(record_of(Provenance, ORIGIN, "provenance")) == {**ORIGIN, "command": "", "table": ""}
-    for entries in ({}, ORIGIN | {"mood": "good"}, 3):
-        with pytest.raises(InputError, match="the entry provenance"):
-            record_of(Provenance, entries, "provenance")
-    with pytest.raises(InputError, match="the entry 'note' of the provenance: expected text, got 3"):
-        record_of(Provenance, ORIGIN | {"note": 3}, "provenance")
+    assert entries_of(record_of(Provenance, ORIGIN)) == {**ORIGIN, "command": "", "table": ""}
+    for entries in ({}, ORIGIN | {"mood": "good"}):
+        with pytest.raises(TypeError, match="argument"):
+            record_of(Provenance, entries)
 
 
 # --- the summary of a calibration: as a dictionary, from dictionaries of every age, and in model files --------------
@@ -142,24 +138,6 @@ def test_the_first_files_of_version_3_knew_less() -> None:
     found = Summary.from_dict(old)
     assert found == replace(SUMMARY, noise_degrees_of_freedom=None, effective_parameters=None)
     assert found.to_dict() == old
-
-
-def test_entries_of_a_summary_that_cannot_be_read() -> None:
-    for name in ("outliers", "energy", "status", "scales", "rows"):
-        with pytest.raises(InputError, match="the entry summary: expected"):
-            Summary.from_dict({k: v for k, v in ENTRIES.items() if k != name})
-    wrong: tuple[tuple[str, object, str], ...] = (
-        ("rows", 60.0, "a whole number, got 60.0"),
-        ("rows", True, "a whole number, got True"),
-        ("energy", None, "a number, got None"),
-        ("geometry [m]", "0.1", "a number, got '0.1'"),
-        ("status", 3, "text, got 3"),
-    )
-    for name, value, expected in wrong:
-        with pytest.raises(InputError, match=f"the entry '{re.escape(name)}' of the summary: expected {expected}"):
-            Summary.from_dict(ENTRIES | {name: value})
-    with pytest.raises(InputError, match=r"the entry summary: expected .*coupling residual"):
-        Summary.from_dict(ENTRIES | {"note": "mine"})
 
 
 def header(path: Path) -> dict[str, Any]:

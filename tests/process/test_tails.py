@@ -14,7 +14,6 @@ from diffeo_calib.process.tails import (
     FREEDOM_EFOLDS,
     GAUSSIAN_FREEDOM,
     SMALLEST_FREEDOM,
-    Tails,
     gross_weights,
     reweight,
 )
@@ -136,19 +135,6 @@ def test_likelihood_never_falls(dim: int, freedom: float) -> None:
         along += [log_posterior(errors, nu, scales[k]), log_posterior(errors, nu, scales[k + 1])]
     assert min(np.diff(along)) > -1e-8 * abs(along[-1])
     assert along[-1] - along[0] > 10.0
-
-
-# --- the data type ------------------------------------------------------------------------------------------------
-
-
-def test_no_tails_and_rows() -> None:
-    none = Tails.none(4, 2)
-    assert none.freedom == inf
-    assert torch.equal(none.weights, torch.ones(4, 2, dtype=torch.float64))
-    some = Tails(3.0, torch.arange(8.0, dtype=torch.float64).view(4, 2))
-    assert some.rows(torch.tensor([2, 0])).weights.tolist() == [[4.0, 5.0], [0.0, 1.0]]
-    assert some.rows(slice(1, 2)).weights.tolist() == [[2.0, 3.0]]
-    assert some.rows(slice(1, 2)).freedom == 3.0
 
 
 # --- good or gross ------------------------------------------------------------------------------------------------

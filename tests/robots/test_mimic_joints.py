@@ -20,11 +20,7 @@ from diffeo_calib.robots.tree import robot_from_config
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
 
 
-def test_coupling_is_constant_and_resolved_to_active_joints() -> None:
-    expected = [[0, 1.5, 0], [1, 0, 0], [0, 1, 0], [-1, 0, -1], [0, 0, 1], [0, 0, 0.1], [0.75, 0, 0.7]]
-    torch.testing.assert_close(CHAIN.coupling, torch.tensor(expected, dtype=torch.float64))
-    offset = torch.tensor([-0.2, 0, 0, 0.3, 0, 0, 0.55], dtype=torch.float64)
-    torch.testing.assert_close(CHAIN.coupling_offset, offset)
+def test_all_joints_follow_the_active_ones() -> None:
     q = draw(5, 3)
     torch.testing.assert_close(CHAIN.moving_values(q), expand(q), rtol=0, atol=1e-15)
     assert torch.equal(CHAIN.moving_values(q)[:, [1, 2, 4]], q)
@@ -116,16 +112,6 @@ def test_rows_of_a_table_with_mimic(convention: str) -> None:
 def urdf(tmp_path: Path) -> Path:
     (tmp_path / "lift.urdf").write_text(LIFT)
     return tmp_path / "lift.urdf"
-
-
-def test_urdf_files_with_mimic_are_read(urdf: Path) -> None:
-    chain = load_urdf(urdf, "floor", "hand")
-    assert chain.joint_names == ("turn", "lift", "wrist")
-    assert chain.moving_names == ("turn", "counter", "rack", "lift", "twin", "wrist")
-    expected = [[1, 0, 0], [-0.5, 0, 0], [0.1, 0, 0], [0, 1, 0], [0, 1, 0], [0, 0, 1]]
-    assert chain.coupling.tolist() == expected
-    assert chain.coupling_offset.tolist() == [0, 0.3, 0, 0, -0.1, 0]
-    assert load_urdf(urdf, "floor", "finger").coupling[-1].tolist() == [0, 0, 2]
 
 
 def test_a_driver_off_the_path_is_a_column(urdf: Path) -> None:

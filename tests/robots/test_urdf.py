@@ -3,12 +3,11 @@
 import os
 import re
 import warnings
-from math import inf, pi
+from math import inf
 from pathlib import Path
 
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, RobotError
@@ -35,16 +34,6 @@ def file(tmp_path: Path) -> Path:
 
 def robot(body: str, name: str = ' name="arm"') -> str:
     return f"<robot{name}>{body}</robot>"
-
-
-def test_a_plain_file_is_read(file: Path) -> None:
-    file.write_text(robot(LINKS + GOOD))
-    chain = load_urdf(str(file), "base_link", "tool")
-    assert (chain.name, chain.base, chain.tip) == ("arm", "base_link", "tool")
-    assert chain.joint_names == ("shoulder", "elbow")
-    expected = torch.tensor([1.0 - 0.5, 0.0, 0.0], dtype=torch.float64)
-    q = torch.tensor([[0.0, torch.pi / 2]], dtype=torch.float64)
-    torch.testing.assert_close(chain(q)[0, :3, 3], expected, rtol=0, atol=1e-15)
 
 
 def test_everything_but_kinematics_is_ignored(file: Path) -> None:
@@ -76,23 +65,6 @@ def test_defaults_of_the_format(file: Path) -> None:
     file.write_text(robot(LINKS + body))
     chain = load_urdf(file, "base_link", "tool")
     assert chain.limits.tolist() == [[-inf, inf], [-1.0, 2.0]]
-    assert chain.axes.tolist() == [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
-
-
-def test_origins_are_roll_pitch_yaw_then_a_shift(file: Path) -> None:
-    origin = '<origin rpy="0.3 -4 1.5707963267948966" xyz="1e-1 -2. 3"/>'
-    only_rpy, only_xyz = '<origin rpy="0 0 1"/>', '<origin xyz="1 2 3"/>'
-    body = joint("shoulder", "base_link", "upper_arm", "revolute", origin)
-    body += joint("elbow", "upper_arm", "forearm", "revolute", only_rpy)
-    body += joint("mount", "forearm", "tool", "fixed", only_xyz)
-    file.write_text(robot(LINKS + body))
-    chain = load_urdf(file, "base_link", "tool")
-    turn = Rotation.from_euler("xyz", [0.3, -4.0, pi / 2]).as_matrix()
-    torch.testing.assert_close(chain.offsets[0, :3, :3], torch.from_numpy(turn), rtol=0, atol=1e-15)
-    assert chain.offsets[0, :3, 3].tolist() == [0.1, -2.0, 3.0]
-    assert chain.offsets[1, :3, 3].tolist() == [0.0, 0.0, 0.0]
-    assert chain.tip_offsets[0][:, 3].tolist() == [1.0, 2.0, 3.0, 1.0]
-    assert torch.equal(chain.tip_offsets[0][:3, :3], torch.eye(3, dtype=torch.float64))
     assert chain.axes.tolist() == [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
 
 

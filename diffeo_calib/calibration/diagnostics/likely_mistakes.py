@@ -32,7 +32,7 @@ from diffeo_calib.common.errors import (
     warn_user,
 )
 from diffeo_calib.common.quantiles import known
-from diffeo_calib.measurements.checks import ANGLE_MISTAKES, angle_mistake
+from diffeo_calib.measurements.checks import ANGLE_MISTAKES
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
 from diffeo_calib.measurements.csv.tables import numeric_table, rereadings, with_coordinate
@@ -194,7 +194,7 @@ def other_units(robot: Tree, data: Measurements, *, slides: bool = True) -> Iter
     """Joint values in other units of angles, and of lengths if ``slides``."""
     own, turning = Reading.of(robot, data), torch.tensor(robot.periodic, dtype=torch.bool, device=data.q.device)
     for factor, words in ANGLE_MISTAKES if any(robot.periodic) else ():
-        yield replace(own, q=torch.where(turning, factor * data.q, data.q), words=angle_mistake(words))
+        yield replace(own, q=torch.where(turning, factor * data.q, data.q), words=words)
     for factor, times, words in _units_of_length() if slides and not all(robot.periodic) else ():
         text = f"the values of prismatic joints seem to be {times:.4g} times too {words}: check their unit"
         yield replace(own, q=torch.where(turning, data.q, factor * data.q), words=f"{text} (`joint_length`)")

@@ -6,10 +6,11 @@ twist of the first joint are held, the devices are unknown.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import inf
+from operator import itemgetter
 from typing import NamedTuple
 
 import torch
@@ -41,7 +42,6 @@ from diffeo_calib.sensors.tables import OtherReadings
 ROUGH_M = 2e-3
 """Errors of a robot before its calibration, to compare starts."""
 STARTS_STEPS = 200
-LONGEST_TOOL_M = 1.0
 BALLS_TRIED, BALL_SPREAD_M = 24, 0.15
 """Places of the ball on the tool that are tried where no start leads anywhere, and their standard deviation."""
 UNEXPLAINED = "no place of ball and devices explains the readings"
@@ -127,19 +127,12 @@ def register_readings(bare: Geometry, tables: Sequence[Readings]) -> Identificat
     Warns:
         DiffeoCalibWarning: readings that no place of ball and devices explains in either unit.
     """
-    most, found = LARGEST_SHARE * bare.chain.reach, _rough_fits(tables, _starts(bare, tables))
-
-    def tried(balls: Iterable[Tensor]) -> list[RoughFit]:
-        return sorted([*found, *_rough_fits(tables, [_around(bare, tables, ball) for ball in balls])], key=_worst)
-
-    if found and found[0].worst[0] > most:  # one kind is lost: place it anew
-        found = tried(one.stage.geometry.tool[0] for one in found)
+    most, found = LARGEST_SHARE * bare.chain.reach, _rough_fits(bare, tables, bare.tool[:1])
     if found and found[0].worst[0] > most:
         _refuse_another_unit(bare, tables, found[0])
     if not found or found[0].worst[0] > most:
-        found = tried(
-            BALL_SPREAD_M * torch.randn(BALLS_TRIED, 3, dtype=torch.float64, generator=seeded(0), device=HOST)
-        )
+        balls = BALL_SPREAD_M * torch.randn(BALLS_TRIED, 3, dtype=torch.float64, generator=seeded(0), device=HOST)
+        found = sorted([*found, *_rough_fits(bare, tables, balls)], key=itemgetter(0))
     if not found:
         raise MeasurementError.of(UNEXPLAINED, fix=CHECK)
     best, each = found[0], zip(tables, found[0].errors, strict=True)
@@ -148,13 +141,13 @@ def register_readings(bare: Geometry, tables: Sequence[Readings]) -> Identificat
     if best.worst[0] > most:
         warn_user(sentence(UNEXPLAINED, **best.said(most), fix=CHECK))
     noise = float(torch.cat([own.flatten() for own in best.errors]).square().mean().sqrt())
-    rows = _read(best.stage.geometry, tables, best.stage.devices)
+    rows = Rows(best.stage.geometry, tuple(map(ReadRows, tables, best.stage.devices)), rigid=True)
     return described(rows, [noise] * len(tables), adrift=True)
 
 
 def rough_error(bare: Geometry, tables: Sequence[Readings]) -> float:
-    """RMS error of the readings from the first starts of :func:`register_readings`, m; infinite where none leads on."""
-    found = _rough_fits(tables, _starts(bare, tables))
+    """RMS error of the readings from the start of :func:`register_readings`, m; infinite where none leads on."""
+    found = _rough_fits(bare, tables, bare.tool[:1])
     return float(torch.cat([own.flatten() for own in found[0].errors]).square().mean().sqrt()) if found else inf
 
 
@@ -175,26 +168,33 @@ class RoughFit(NamedTuple):
         return {"expected": expected, "got": f"a median of {1e3 * median:.3g} mm at {as_written(device)}"}
 
 
-def _worst(one: RoughFit) -> tuple[float, str]:
-    return one.worst
-
-
-def _rough_fits(tables: Sequence[Readings], starts: Sequence[Rows]) -> list[RoughFit]:
-    """From each start that leads anywhere, the best first."""
-    found = []
-    for rows in starts:
-        sigma = torch.full((sum(map(len, tables)),), ROUGH_M, dtype=torch.float64, device=HOST)
-        root = Prior().root(rows.geometry, range(rows.geometry.slices["tool"].start))
+def _rough_fits(bare: Geometry, tables: Sequence[Readings], balls: Tensor) -> list[RoughFit]:
+    """From each ball (B, 3) in the tip's frame, m, that leads anywhere, the best first."""
+    found = list[RoughFit]()
+    for ball in balls:
         with suppress(InputError):  # the start has the ball at a fixed point or behind a camera
-            fit = solve(rows, sigma, root, max_nfev=STARTS_STEPS, loss="soft_l1")
-            worst = max(
-                (float(errors[data.device == number].norm(dim=2).median()), name)
-                for data, errors in zip(tables, fit.errors, strict=True)
-                for number, name in enumerate(data.names)
-            )
-            stage = rows.found(fit, ROUGH_M, Prior(), Tails(inf, torch.ones_like(sigma)))
-            found.append(RoughFit(worst, stage, fit.errors))
-    return sorted(found, key=_worst)
+            found.append(_rough_fit(bare, tables, ball))
+    found.sort(key=itemgetter(0))
+    for best in found[:1]:  # a device may be lost where the ball was far away: all anew around the ball that was found
+        with suppress(InputError):
+            found.append(_rough_fit(bare, tables, best.stage.geometry.tool[0]))
+    return sorted(found, key=itemgetter(0))
+
+
+def _rough_fit(bare: Geometry, tables: Sequence[Readings], ball: Tensor) -> RoughFit:
+    """Ball and devices, from these in closed form around a ball (3,), errors of joints zero."""
+    geometry = bare.with_tool(ball[None])
+    devices = [kind_of(data).at(data, geometry.points(data.q)[:, 0]) for data in tables]
+    rows = Rows(geometry, tuple(map(ReadRows, tables, devices)), rigid=True)
+    sigma = torch.full((sum(map(len, tables)),), ROUGH_M, dtype=torch.float64, device=HOST)
+    root = Prior().root(geometry, range(geometry.slices["tool"].start))
+    fit = solve(rows, sigma, root, max_nfev=STARTS_STEPS, loss="soft_l1")
+    worst = max(
+        (float(errors[data.device == number].norm(dim=2).median()), name)
+        for data, errors in zip(tables, fit.errors, strict=True)
+        for number, name in enumerate(data.names)
+    )
+    return RoughFit(worst, rows.found(fit, ROUGH_M, Prior(), Tails(inf, torch.ones_like(sigma))), fit.errors)
 
 
 def ball_of(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Geometry | None:
@@ -232,39 +232,12 @@ def check_known(tables: Sequence[Readings], registration: Identification, found:
         devices.check_freed(found.noise, again.noise)
 
 
-def _starts(bare: Geometry, tables: Sequence[Readings]) -> list[Rows]:
-    """Balls and devices: in closed form by each device, and with the ball where it was."""
-    found = [_around(bare, tables, bare.tool[0])]
-    for place, data in enumerate(tables):
-        T, kind = bare.marker_poses(data.q)[:, 0], kind_of(data)
-        rows = [data.device == number for number in range(len(data.names))]
-        alone = [kind.alone(data.rows(own), T[own, :3, :3], T[own, :3, 3]) for own in rows]
-        each = [one for one in alone if one is not None]
-        found += [_around(bare, tables, ball) for ball, _ in each if float(ball.norm()) < LONGEST_TOOL_M]
-        if len(each) == len(rows):
-            start = _around(bare, tables, torch.stack([ball for ball, _ in each]).median(0).values)
-            own = ReadRows(data, kind.of(data, torch.stack([constants for _, constants in each])))
-            found.append(replace(start, parts=(*start.parts[:place], own, *start.parts[place + 1 :])))
-    return found
-
-
-def _around(bare: Geometry, tables: Sequence[Readings], ball: Tensor) -> Rows:
-    """The devices in closed form for a ball (3,) in the tip's frame, m."""
-    geometry = bare.with_tool(ball[None])
-    return _read(geometry, tables, [kind_of(data).at(data, geometry.points(data.q)[:, 0]) for data in tables])
-
-
-def _read(geometry: Geometry, tables: Sequence[Readings], devices: Sequence[Devices]) -> Rows:
-    """Readings of the ball around devices, errors of joints zero."""
-    return Rows(geometry, tuple(map(ReadRows, tables, devices)), rigid=True)
-
-
 def _refuse_another_unit(bare: Geometry, tables: Sequence[Readings], best: RoughFit) -> None:
     """Raise MeasurementError for readings that fit in mm or m, in place of the other unit, far better than ``best``."""
     most = LARGEST_SHARE * bare.chain.reach
     for factor, words in ((1e3, "small"), (1e-3, "large")):
         other = [replace(own, values=factor * own.values) if own.unit[0] == "mm" else own for own in tables]
-        found = _rough_fits(other, _starts(bare, other))
+        found = _rough_fits(bare, other, bare.tool[:1])
         if found and found[0].worst[0] < min(most, FAR_BETTER * best.worst[0]):
             fix = f"they seem to be 1000 times too {words}: check the units of the readings (mm or m)"
             raise MeasurementError.of(UNEXPLAINED, **best.said(most), fix=fix)

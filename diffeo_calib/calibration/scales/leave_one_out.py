@@ -23,13 +23,13 @@ beside them show it too, and add one for each configuration.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf, nan
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.scales.selection import SEARCH_LIMITS, select
+from diffeo_calib.calibration.scales.selection import COORDINATES, POSES, select
 from diffeo_calib.calibration.scales.tangent_data import KEPT_COORDINATES, TangentData
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.quantiles import chi2_median
@@ -74,27 +74,18 @@ class LeaveOneOut:
         return region_factor(freedom, 3)
 
 
-def weighed(
-    data: TangentData,
-    scales: Hyperparameters,
-    seed: int = 0,
-    *,
-    rounds: int = ROUNDS,
-    block_coordinates: int = BLOCK_COORDINATES,
-) -> TangentData:
+def weighed(data: TangentData, scales: Hyperparameters, seed: int = 0) -> TangentData:
     """The measurements with the weights that outliers get with these scales, by expectation maximisation.
 
     Memory does not grow with the number of blocks. An outlier anywhere counts: no sample could stand for all rows.
 
     Args:
         data: the measurements, with the weights to begin with. scales: held fixed. seed: draws the blocks.
-        rounds: largest number of steps.
-        block_coordinates: largest number of measured coordinates of a block.
     """
     told, tails = data.told, data.tails
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         squares = torch.empty_like(tails.weights)
-        for rows, part in _parts(told, seed, block_coordinates):
+        for rows, part in _parts(told, seed):
             squares[rows] = _expected_squares(part, scales, tails.rows(rows))
         before, tails = tails, reweight(squares, told.noise_model.freedom)
         if _settled(before, tails):
@@ -119,14 +110,12 @@ def _settled(before: Tails, after: Tails) -> bool:
     return float((after.weights / before.weights - 1.0).abs().max()) < WEIGHT_CHANGE
 
 
-def leave_one_out(
-    data: TangentData, scales: Hyperparameters, seed: int = 0, *, block_coordinates: int = BLOCK_COORDINATES
-) -> LeaveOneOut:
+def leave_one_out(data: TangentData, scales: Hyperparameters, seed: int = 0) -> LeaveOneOut:
     """Leave-one-out errors in closed form; arguments as of :func:`weighed`."""
     told = data.told
     errors, squares = torch.empty_like(told.y), torch.empty_like(told.tails.weights)
     effective = []
-    for rows, part in _parts(told, seed, block_coordinates):
+    for rows, part in _parts(told, seed):
         every = torch.arange(len(rows), device=rows.device)
         errors[rows], squares[rows] = left_out_rows(part, scales, every, part.noise(scales))
         inverse = part.numbers(scales).blocks(part.process(scales).inverse)
@@ -140,24 +129,24 @@ def variance_ratio(data: TangentData, left_out: LeaveOneOut) -> float:
     return float((left_out.squares / data.noise_model.of_freedom(chi2_median, left_out.squares)).nanmedian())
 
 
-def _parts(data: TangentData, seed: int, coordinates: int) -> Iterator[tuple[Tensor, TangentData]]:
+def _parts(data: TangentData, seed: int) -> Iterator[tuple[Tensor, TangentData]]:
     """Row numbers and data of random blocks of about equal size, each with about so many coordinates at most.
 
     A single one is the data themselves, with the matrices that they keep; a few are kept with the data.
     """
-    count, every = -(-data.y.numel() // coordinates), torch.arange(len(data.x), device=data.x.device)
+    count, every = -(-data.y.numel() // BLOCK_COORDINATES), torch.arange(len(data.x), device=data.x.device)
     if count == 1:
         yield every, data
         return
-    parts, key = vars(data).setdefault("blocks", {}), (seed, coordinates)
-    if key not in parts:
+    parts = vars(data).setdefault("blocks", {})
+    if seed not in parts:
         order = torch.randperm(len(data.x), generator=seeded(seed), device=HOST)
         found = ((rows, data.rows(rows)) for rows in order.to(every.device).tensor_split(count))
         if data.y.numel() > KEPT_BLOCKS:
             yield from found
             return
-        parts[key] = list(found)
-    yield from parts[key]
+        parts[seed] = list(found)
+    yield from parts[seed]
 
 
 def _expected_squares(part: TangentData, scales: Hyperparameters, tails: Tails) -> Tensor:
@@ -223,7 +212,7 @@ def cross_validated_inflation(
     Returns:
         None if Ctrl-C ended the search.
     """
-    chosen, _ = data.sample(SEARCH_LIMITS.poses, SEARCH_LIMITS.coordinates, seed)
+    chosen, _ = data.sample(POSES, COORDINATES, seed)
     new = torch.ones(len(data.x), dtype=torch.bool, device=data.x.device)
     new[chosen] = centre is None
     rows, data = data.sample(len(data.x), MOST_COORDINATES, seed)
@@ -232,12 +221,11 @@ def cross_validated_inflation(
         squares = left_out_squares(data, scales, torch.where(torch.isin(numbers, numbers[new]), numbers, -1))
         squares[~new] = nan
     else:
-        search = replace(SEARCH_LIMITS, iterations=ITERATIONS)
         squares, folds = torch.full_like(data.tails.weights, nan), random_folds(numbers, FOLDS, seed)
         try:
             for done, (inside, rows) in enumerate(folds):
                 progress("cross-validation", done, len(folds))
-                again = select(centre, data.rows(inside), start=scales, seed=seed, limits=search)
+                again = select(centre, data.rows(inside), start=scales, seed=seed, iterations=ITERATIONS)
                 if again.interrupted:
                     return None
                 part = torch.where(torch.isin(numbers, numbers[rows]), numbers, -1)

@@ -39,26 +39,15 @@ LARGEST_GAIN = 1e5
 factor of its own for all unknowns would take half as long again."""
 
 
-@dataclass(frozen=True)
-class SearchLimits:
-    """Size of the search for scales."""
-
-    poses: int = 150  # largest number of poses in the likelihood
-    coordinates: int = 900  # largest number of measured coordinates
-    iterations: int = 40  # of the optimiser from a given start, at most
-    fewest_first: int = 15  # iterations from each of several starts, at least
-    most_first: int = 60  # the same, at most
-    # the same with ``first_coordinates`` measured coordinates; fewer coordinates cost less per iteration and have more
-    # local optima, and get more iterations
-    first: int = 20
-    first_coordinates: int = 450  # see ``first``
-    log_range: float = 9.0  # bound on the logarithm of a scale relative to its default
-
-    def first_iterations(self, coordinates: int) -> int:
-        """Iterations from each of several starts, for a number of measured coordinates."""
-        wanted = self.first * (self.first_coordinates / coordinates) ** 2
-        return int(min(max(wanted, self.fewest_first), self.most_first))
-
+POSES, COORDINATES = 150, 900
+"""Largest number of poses, and of measured coordinates, in the likelihood."""
+ITERATIONS = 40
+"""Of the optimiser from a given start, at most."""
+FIRST, FEWEST_FIRST, MOST_FIRST, FIRST_COORDINATES = 20, 15, 60, 450
+"""Iterations from each of several starts with so many measured coordinates, at least, and at most: fewer coordinates
+cost less per iteration and have more local optima, and get more iterations."""
+LOG_RANGE = 9.0
+"""Bound on the logarithm of a scale relative to its default."""
 
 LENGTH, GROWTH, SHRINKAGE = 1.0, 1.0, 2.0
 """Log-normal prior of the scales around their defaults, standard deviations in e-folds: of length scales and noise, of
@@ -67,7 +56,6 @@ AXES = 0.3
 """The same of each axis of commanded poses or places around the mean of the slides, or of the turns. The axes of such a
 frame are a choice: fields look alike along all of them unless the rows say otherwise. Scales that were free for each
 axis would fit 20 poses too well, and the regions of a hand-eye transform would hold 0.90 for 0.95."""
-SEARCH_LIMITS = SearchLimits()
 SHORT = 0.3
 """Of the default length scales and noise."""
 
@@ -88,7 +76,7 @@ def select(
     *,
     start: Hyperparameters | None = None,
     seed: int = 0,
-    limits: SearchLimits = SEARCH_LIMITS,
+    iterations: int | None = None,
     progress: Progress = silent,
 ) -> Selection:
     """Maximise the marginal likelihood, times the prior, over all scales.
@@ -99,19 +87,18 @@ def select(
         start: where the search starts; by default it makes shorter searches from the defaults with each of several
             transmission length scales, and of commanded poses or places from short waves and little noise.
         seed: draws the subset of poses.
-        limits: size of the search.
+        iterations: of the optimiser from every start; by default as many as the number of coordinates allows.
         progress: called as ``progress(task, done, total)``.
 
     Returns:
         the best scales that were evaluated; Ctrl-C ends the search early.
     """
-    _, subset = data.sample(limits.poses, limits.coordinates, seed)
-    subset = subset.good
-    search = _Search(centre, subset, limits, progress)
+    subset = data.sample(POSES, COORDINATES, seed)[1].good
+    search = _Search(centre, subset, progress)
     try:
         if start is not None:
             search.best = start  # until better scales are found
-            search.climb([start], limits.iterations)
+            search.climb([start], iterations or ITERATIONS)
         else:
             usual = centre.transmission_lengthscale
             factors = [one / MESHING_LENGTHSCALE_RAD for one in TRANSMISSION_STARTS_RAD]
@@ -120,7 +107,8 @@ def select(
                 lengths = {"coupled_lengthscale": SHORT * centre.coupled_lengthscale}
                 noise = {"joint_noise": SHORT * centre.joint_noise, "sensor_noise": SHORT * centre.sensor_noise}
                 starts.append(replace(centre, **lengths, **noise))
-            search.climb(starts, limits.first_iterations(subset.target.numel()))
+            wanted = int(FIRST * (FIRST_COORDINATES / subset.target.numel()) ** 2)
+            search.climb(starts, iterations or min(max(wanted, FEWEST_FIRST), MOST_FIRST))
     except KeyboardInterrupt:
         return Selection(search.best, "search interrupted, the best so far are kept", interrupted=True)
     status = f"log marginal likelihood {search.best_likelihood:.1f} on {len(subset.x)} poses"
@@ -191,8 +179,8 @@ def _means_of(kinds: tuple[int, ...], sizes: tuple[tuple[str, int], ...]) -> Ten
 class _Search:
     """Climbs of the log posterior, and the best scales that were evaluated."""
 
-    def __init__(self, centre: Hyperparameters, data: TangentData, limits: SearchLimits, progress: Progress) -> None:
-        self.centre, self.data, self.limits, self.progress = centre, data, limits, progress
+    def __init__(self, centre: Hyperparameters, data: TangentData, progress: Progress) -> None:
+        self.centre, self.data, self.progress = centre, data, progress
         self.best, self.best_value, self.best_likelihood = centre, -float("inf"), -float("inf")
         self.done = self.ends = self.total = 0
 
@@ -200,7 +188,7 @@ class _Search:
         """Run the optimiser from each start."""
         from scipy.optimize import minimize  # noqa: PLC0415  # slow to import, not needed to use a model
 
-        origin, reach = self.centre.logarithms().numpy(), self.limits.log_range
+        origin, reach = self.centre.logarithms().numpy(), LOG_RANGE
         bounds = list(zip(origin - reach, origin + reach, strict=True))
         options, self.total = {"maxiter": iterations}, len(starts) * iterations
         for number, start in enumerate(starts):

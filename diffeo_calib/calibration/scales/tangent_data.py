@@ -19,7 +19,7 @@ from torch import Tensor
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.kernels.spaces import Space
-from diffeo_calib.kinematics.nominal import GeometryMap, rigid_motions
+from diffeo_calib.kinematics.nominal import GeometryMap, PositionErrors, rigid_motions
 from diffeo_calib.maps.deformation import ModelSpec
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity, Numbers
 from diffeo_calib.maps.noise import without_hidden
@@ -29,7 +29,6 @@ from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.conditional import BeforeData, Features, Process
 from diffeo_calib.regression.regions import region_factor
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.robots.position_errors import PositionErrors
 
 T = TypeVar("T")
 HELD_VARIANCE = 1e-18
@@ -235,8 +234,9 @@ class TangentData:
         """The same measurements around a map with these gear lines and axes, which add nothing yet."""
         own = PositionErrors(tuple((line.joint, line.frequency) for line in scales.lines), scales.axes)
         nominal = self.nominal.changed(own=own)
-        smooth = self.theta[: nominal.sag.stop]
-        other = self._variant(nominal=nominal, theta=torch.cat([smooth, smooth.new_zeros(sum(own.sizes))]))
+        theta = self.theta.new_zeros(nominal.parameters)
+        theta[: nominal.sag.stop] = self.theta[: nominal.sag.stop]
+        other = self._variant(nominal=nominal, theta=theta)
         vars(other).pop("sensitivities", None)
         return other
 

@@ -239,7 +239,10 @@ def run_predict(given: PredictOptions) -> None:
         say(OWN_FRAME)
     say(*readings.sentences())
     if with_poses:
-        say(f"`evaluate` and `fit` read these poses with {reading_options(table, prefixes)}")
+        turned = table.for_writing(rotation_std=False, prefixes=prefixes)
+        own = replace(turned, joints=(), position=[[prefix + axis for axis in "xyz"] for prefix in prefixes])
+        own = replace(own, rotation_std=None, **dict.fromkeys(BESIDE))
+        say(f"`evaluate` and `fit` read these poses with {shlex.join(options_of(own))}")
 
 
 def _written_as_read(model: CalibratedKinematics, given: PredictOptions) -> TableFormat:
@@ -250,14 +253,6 @@ def _written_as_read(model: CalibratedKinematics, given: PredictOptions) -> Tabl
     own = typed if given.length and given.angle else read
     rows = Rows(convention=own.convention, rotation_angle=own.rotation_angle, payload=own.payload)
     return with_rows(table_format(read), rows)
-
-
-def reading_options(table: TableFormat, prefixes: Sequence[str] = ("",)) -> str:
-    """The options with which `evaluate` and `fit` read the poses that `predict` writes in this format."""
-    written, units = table.for_writing(rotation_std=False, prefixes=prefixes), replace(table.joints_only(), joints=())
-    position = [[prefix + axis for axis in "xyz"] for prefix in prefixes]
-    turned = {name: getattr(written, name) for name in ("rotation", "convention", "rotation_angle")}
-    return shlex.join(options_of(replace(units, position=position, **turned, **dict.fromkeys(BESIDE))))
 
 
 @dataclass(frozen=True)
