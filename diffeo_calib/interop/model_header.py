@@ -141,8 +141,7 @@ def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:
     if len(set(geometry.on)) > 1 or geometry.on[0] != chain.tips[0]:
         robot["on"] = list(geometry.on)
     robot |= {name: list(map(list, given)) for name, given in nominal.own._asdict().items() if given}
-    if nominal.payload is not None:
-        carried = nominal.payload
+    if carried := nominal.load:
         robot["payload"] = {"link": carried.link, "mass": float(carried.masses), "unit": carried.unit}
     return robot, {name: getattr(geometry, name) for name in GEOMETRY}
 
@@ -166,7 +165,7 @@ def _tensors_of_rows(fitted: FittedMap) -> Tensors:
         found |= zip(SESSIONS, (shared, sessions.session.to(torch.float64), sessions.tools), strict=True)
     elif shared.shape[2]:
         found[SHARED] = shared
-    if isinstance(nominal, GeometryMap) and nominal.elasticity is not None and nominal.payload is not None:
+    if isinstance(nominal, GeometryMap) and nominal.elasticity is not None and nominal.load:
         rows = by_row.load if isinstance(by_row, GeometryMap | SessionMarkers) else NO_PAYLOAD
         if not rows.by_row:
             raise InputError.of("the model cannot be saved: the payloads of its rows are not known")
@@ -268,8 +267,8 @@ def _rebuild_nominal(
         raise MissingArgumentError.of("`nominal` was given, but the file holds its robot", fix="leave it out")
     robot, on = robot_from_config(description, source), tuple(description.get("on", ()))
     geometry = Geometry(robot, **{name: tensors[name] for name in GEOMETRY}, on=on)
-    payload, carried = None, description.get("payload")
-    if carried is not None:
+    payload = NO_PAYLOAD
+    if carried := description.get("payload"):
         mass = torch.tensor(carried["mass"], dtype=torch.float64, device=HOST)
         payload = Payload(carried["link"], mass, float(carried["unit"]))
     waves = tuple((int(joint), float(frequency)) for joint, frequency in description.get("waves", ()))
@@ -324,8 +323,7 @@ def _rebuild_rows(nominal: NominalMap, tensors: Tensors) -> GeometryMap | Sessio
         raise InputError.of("sessions of rows", expected="a robot", got="a plain function")
     if not isinstance(nominal, GeometryMap):
         return None
-    laden = nominal.payload
-    by_row = None if laden is None else nominal.with_payload(laden.weighing(tensors[PAYLOADS[0]]))
+    by_row = nominal.with_payload(nominal.load.weighing(tensors[PAYLOADS[0]])) if nominal.load else None
     if SESSIONS[1] not in tensors:
         return by_row
     whole = tensors["session"].round().to(torch.int64)

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import wrapped
-from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.gravity import GravitySag
@@ -55,9 +54,6 @@ class GeometryMap(NominalMap):
         own: errors of joints that depend on their own position.
         payload: known masses that the robot carries, for an elastic one.
         rigid: whether markers are points of frames, three each, which move as a whole: what bends them has no effect.
-
-    Raises:
-        InputError: a payload of a robot that does not bend.
     """
 
     def __init__(
@@ -66,16 +62,13 @@ class GeometryMap(NominalMap):
         *,
         elastic: bool = False,
         own: PositionErrors = NO_ERRORS,
-        payload: Payload | None = None,
+        payload: Payload = NO_PAYLOAD,
         rigid: bool = False,
     ) -> None:
         n, n_all = geometry.chain.n, geometry.chain.moving
-        load = payload or NO_PAYLOAD
-        if load and not elastic:
-            raise InputError.of("a payload of a rigid robot", expected="elastic=True", fix="leave the payload out")
         self.geometry = geometry
         self.elasticity = GravitySag(geometry.chain, payload) if elastic else None
-        self.own, self.rigid = own, rigid
+        self.own, self.rigid, self.load = own, rigid, payload
         tables = {"waves": gear_waves(own.waves, n), "axes": axis_waves(own.axes, n_all)}
         self._tables = {name: Waves(*map(torch.from_numpy, table)) for name, table in tables.items()}
         sag, crooked = self.elasticity.size if self.elasticity else 0, sum(6 * count for *_, count in own.axes)
@@ -96,28 +89,18 @@ class GeometryMap(NominalMap):
         """The same parameters around another geometry of the same chain."""
         return self.changed(geometry=geometry)
 
-    def with_payload(self, load: Payload | None) -> GeometryMap:
+    def with_payload(self, load: Payload) -> GeometryMap:
         """The same map with other masses of its payload."""
-        return self if load is self.load else self.changed(payload=load or None)
+        return self if load is self.load else self.changed(payload=load)
 
     def changed(self, **changes: Any) -> GeometryMap:
         """The same map with other arguments."""
-        own = {"geometry": self.geometry, "own": self.own, "payload": self.payload, "rigid": self.rigid}
+        own = {"geometry": self.geometry, "own": self.own, "payload": self.load, "rigid": self.rigid}
         return GeometryMap(elastic=self.elasticity is not None, **own | changes)
 
     def around(self, nominal: GeometryMap) -> GeometryMap:
         """Another nominal map under the payloads of the rows of this one."""
         return nominal.with_payload(self.load)
-
-    @property
-    def payload(self) -> Payload | None:
-        """The known masses that the robot carries."""
-        return None if self.elasticity is None else self.elasticity.payload
-
-    @property
-    def load(self) -> Payload:
-        """The same, :data:`NO_PAYLOAD` for none."""
-        return self.payload or NO_PAYLOAD
 
     def rows(self, index: Tensor | slice) -> GeometryMap:
         """The map at some of the rows whose payloads it knows."""

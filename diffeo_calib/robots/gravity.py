@@ -32,7 +32,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.robots.payload import Payload
+from diffeo_calib.robots.payload import NO_PAYLOAD, Payload
 from diffeo_calib.robots.tree import BASE, Tree
 from diffeo_calib.runtime.chain import Compliance, Masses, load_slopes, loads
 
@@ -42,7 +42,7 @@ class GravitySag:
 
     Args:
         chain: the nominal robot; its nominal frames make the features.
-        payload: masses at a tip or at a branch without markers (`load`); None without.
+        payload: masses at a tip or at a branch without markers (`load`).
 
     Attributes:
         compliances: all compliances, those under the payload last; their features follow each other in the coefficients
@@ -52,7 +52,7 @@ class GravitySag:
         loaded: (K,) True for the coefficients of the payload, the last ones.
     """
 
-    def __init__(self, chain: Tree, payload: Payload | None = None) -> None:
+    def __init__(self, chain: Tree, payload: Payload = NO_PAYLOAD) -> None:
         self.chain, self.payload = chain, payload
         self.compliances = (*chain.arrays.compliances, *(_under_payload(chain, payload.link) if payload else ()))
         self._masses = Masses(*map(torch.from_numpy, Masses.of(self.compliances, chain.arrays)))
@@ -72,7 +72,7 @@ class GravitySag:
         """(K,) which coefficients are of which part of the sag, by name; that of a payload only with one."""
         own, loaded = self.own, self.loaded
         found = {"gravity on joints": own & ~loaded, "gravity on links": ~own & ~loaded}
-        return found | ({"payload": loaded} if self.payload is not None else {})
+        return found | ({"payload": loaded} if self.payload else {})
 
     def features(self, q: Tensor) -> Tensor:
         """Feature values [m; 1 for forces on prismatic joints]: q (N, n) -> (N, K)."""
@@ -107,7 +107,7 @@ class GravitySag:
 
         The payload then is one of the unknown masses at its place. Raises InputError: one that differs between rows.
         """
-        if self.payload is None:
+        if not self.payload:
             return w
         if self.payload.by_row:
             raise InputError.of("a payload of every row", expected="one for all", fix="choose one: with_payload(mass)")
@@ -129,8 +129,7 @@ class GravitySag:
     def _loads(self, q: Tensor) -> Tensor:
         """(N or 1, compliances) the load of each in units: the payload where that is the load, else 1."""
         loaded = torch.tensor([one.loaded for one in self.compliances], dtype=torch.bool, device=q.device)
-        amounts = 1.0 if self.payload is None else self.payload.amounts(q)
-        return torch.where(loaded, amounts, q.new_ones(1, 1))
+        return torch.where(loaded, self.payload.amounts(q), q.new_ones(1, 1))
 
     def _frames(self, q: Tensor) -> Tensor:
         """All places in the ground's frame: (N, F, 4, 4)."""

@@ -203,7 +203,7 @@ class Placed:
         """The rows around the geometric calibration, weighted by its residuals; with effects (N, R, U) of unknowns."""
         geometry, theta = self.registration.geometry, self.identification.theta
         payload = Payload.of_rows(geometry.chain, self.data.payload, self.data.payload_at)
-        elastic = payload is not None or not is_cartesian(geometry.chain)
+        elastic = bool(payload) or not is_cartesian(geometry.chain)
         nominal = GeometryMap(geometry, elastic=elastic, payload=payload)
         theta = torch.cat([theta, theta.new_zeros(nominal.parameters - geometry.size)])
         data = self._rows(nominal, theta)

@@ -289,52 +289,27 @@ USUAL_LOG, EFOLDS = -6.0, 2.5
 """Log-normal prior of s^2: the logarithm of its centre, and the standard deviation of its logarithm."""
 LOG_SIZES = torch.linspace(-12.0, 4.0, 65, dtype=torch.float64, device="cpu")
 """Logarithms of the s^2 that are tried."""
-ROUNDS = 10
 
 
 def usual_drift(rows: NewRows, named: Sequence[ChangedPart]) -> list[ChangedPart]:
     """What may differ between the dates, besides what a test named: temperature, wear and screws change everything.
 
-    In each of three groups, the geometry, the load and the transmissions of all joints, errors may differ from the old
-    ones by s^2 times their old prior variance; the sizes s^2 maximise the evidence of the new rows with a wide prior
-    below one percent.
+    Errors of geometry, load and transmissions may differ from the old ones by s^2 times their old prior variance; s^2
+    maximises the evidence of the new rows with a wide prior below one percent.
 
     Args:
         rows: the new rows as the old model sees them. named: parts that have changed, which are free already.
     """
     free = {each.name for each in named}
-    groups: dict[str, list[ChangedPart]] = {}
-    for part in parts_of(rows.fitted):
-        if part.name not in free:
-            groups.setdefault(part.name if part.joint is None else "transmissions", []).append(part)
-    if not groups:
+    parts = [part for part in parts_of(rows.fitted) if part.name not in free]
+    if not parts:
         return []
-    roots = [torch.cat([part.root(rows.at) for part in parts], 2) for parts in groups.values()]
-    known = [each.root(rows.at) for each in named]
-    doubted, sizes = rows.drifting([*known, *roots]).with_weights(), list[float]()
+    known, root = [each.root(rows.at) for each in named], torch.cat([part.root(rows.at) for part in parts], 2)
+    doubted, sizes, size = rows.drifting([*known, root]).with_weights(), LOG_SIZES.exp().to(rows.y), 0.0
+    prior = -0.5 * ((sizes.log() - USUAL_LOG) / EFOLDS).square()
     for weighed, least in ((rows, gates.DRIFT_ODDS_OF_INLIERS), (doubted, gates.DRIFT_ODDS)):
-        sizes, odds = _likeliest(rows.changed(tails=weighed.tails).drifting(known), roots)
-        if odds < least:
+        odds = rows.changed(tails=weighed.tails).drifting(known).evidence(root).log_odds(sizes) + prior
+        if float(odds.max()) < least:
             return []
-    return [replace(part, variance=size) for parts, size in zip(groups.values(), sizes, strict=True) for part in parts]
-
-
-def _likeliest(rows: NewRows, roots: list[Tensor]) -> tuple[list[float], float]:
-    """The sizes s^2 of changes with these columns (M, R, c), each in turn the likeliest beside the others; log odds."""
-    sizes, chosen = LOG_SIZES.exp().to(rows.y), [0] * len(roots)
-    prior = -0.5 * ((LOG_SIZES.to(rows.y) - USUAL_LOG) / EFOLDS).square()
-
-    def scaled(k: int) -> Tensor:
-        return sizes[chosen[k]].sqrt() * roots[k]
-
-    every = range(len(roots))
-    for _ in range(ROUNDS):
-        before = list(chosen)
-        for k in every:
-            beside = rows.drifting([scaled(j) for j in every if j != k])
-            chosen[k] = int((beside.evidence(roots[k]).log_odds(sizes) + prior).argmax())
-        if chosen == before:
-            break
-    together = torch.cat([scaled(k) for k in every], 2)
-    odds = rows.evidence(together).log_odds(sizes.new_ones(1)) + prior[chosen].sum()
-    return sizes[chosen].tolist(), float(odds)
+        size = float(sizes[odds.argmax()])
+    return [replace(part, variance=size) for part in parts]

@@ -350,7 +350,7 @@ class NewRows:
         dim = self.noise_model.freedom
         if (weights := gross_weights(squares, dim)) is not None:  # gross rows are named, and say nothing of the robot
             squares = squares.masked_fill(weights < OUTLIER_WEIGHT, torch.nan)
-        return max(1.0, region_scale(squares, dim, prior=OTHER_DATE))
+        return max(1.0, region_scale(squares, dim, efolds=OTHER_DATE))
 
     @property
     def placed_residual(self) -> Tensor:
@@ -367,8 +367,7 @@ class NewRows:
     @property
     def excess(self) -> float:
         """Root mean square of the left-out errors of the better half of the rows in units of the expected ones."""
-        squares = (self.given.solved * self.given.left_out).nansum(1) / self.given.visible.sum(1)
-        return float(squares.median().sqrt())
+        return float((self.given.left_out_squares / self.visible.sum(1)).median().sqrt())
 
     def by_kind(self, errors: Tensor) -> Evaluations:
         """Errors (M, R) of the numbers of all rows, m, NaN where nothing was measured, in the unit of each kind."""

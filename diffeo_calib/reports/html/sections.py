@@ -165,7 +165,7 @@ def why(found: Findings) -> Section:
     if not is_cartesian(found.model.robot):  # whose joints have no links, gears and weight
         waves = "A wave of one period per turn is eccentricity of a gear or an encoder, of two its ovality"
         see, tables = f"{waves}, faster ones are meshing. {see}", [_corrections(found.model, found.rows)]
-        notes.insert(0, f"Gravity sag is elastic: {payload_sentence(found.model.nominal.payload)}.")
+        notes.insert(0, f"Gravity sag is elastic: {payload_sentence(found.model.nominal.load)}.")
         notes += [f"{line.sentence}, not in the pictures above." for line in gear_lines(found.model)]
         notes.append(
             "Corrections are open where the rows do not tell them; those of parallel axes stand for one another."
