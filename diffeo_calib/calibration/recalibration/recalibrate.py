@@ -192,7 +192,7 @@ def _result(
     again = model.changed(map=fitted_map, provenance=made, placement=(), learnt=None, ball=ball)
     small = (rows.tails.weights < OUTLIER_WEIGHT).any(1)
     again.placement = carried_devices(model, again, place.transform)
-    settled = rows.placement.settled(fitted, fitted.model, rows.centre, place.transform, known=mounted_of(model))
+    settled = rows.placement.settled(fitted, fitted.model, rows, place.transform, known=mounted_of(model))
     first = len(fitted.problem.y) - len(rows)
     again.placement = devices_beside(again, new, [replace(one, rows=one.rows + first) for one in settled.placed()])
     left = (fitted.residual[-len(rows) :] - shared @ fitted.shifts)[:, : rows.y.shape[1]]  # devices where it puts them
