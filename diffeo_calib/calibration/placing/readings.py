@@ -63,10 +63,6 @@ class ReadingDevices(DeviceSet):
     frame: str
 
     @property
-    def size(self) -> int:
-        return self.devices.freedom
-
-    @property
     def numbers(self) -> Tensor:
         """(r,) where their r numbers stand in these rows."""
         return torch.arange(self.data.values.shape[1], device=self.rows.device)

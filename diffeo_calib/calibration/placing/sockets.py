@@ -146,10 +146,6 @@ class SocketDevices(DeviceSet):
         there = {"socket": nearest, "sockets": self.sockets}
         return Elsewhere(away < IN_SOCKET_M, self.positions, lambda copies: with_attributes(copies, **there))
 
-    @property
-    def size(self) -> int:
-        return self.root.shape[1]
-
     def hypotheses(self, data: Seen) -> Iterator[Hypothesis]:
         fix = "measure the distance again, and check the unit of the positions and the scale of the device"
         for block in self.sockets.blocks:

@@ -156,17 +156,17 @@ class NewSetUp:
         readings = reading_sets(self.readings, devices)
         if told is not None and len(told.rows) == len(seen):
             return told.y, None, told.noise_model, of_told, Placement(sets)
-        rows, old = stacked(self.data.q, told, readings, seen.shape[1]), self.fitted.noise
+        (y, sensor, observe), old = stacked(self.data.q, told, readings, seen.shape[1]), self.fitted.noise
         variance = old.covariance.diagonal(dim1=1, dim2=2)[old.visible].median()  # of what was measured, m^2
-        total = torch.diag_embed(variance.expand_as(rows.y))
+        total = torch.diag_embed(variance.expand_as(y))
         if told is not None:
             own, size = total[told.rows], of_told.shape[1]
             own[:, :size, :size] = of_told
             total[told.rows] = own
-        if rows.noise_model.stated:
-            total = larger(total, rows.noise_model.known)
-        sensor = rows.noise_model.without_known
-        return rows.y, rows.observe, sensor, without_hidden(total, sensor.visible), Placement((*sets, *readings))
+        if sensor.stated:
+            total = larger(total, sensor.known)
+        sensor = sensor.without_known
+        return y, observe, sensor, without_hidden(total, sensor.visible), Placement((*sets, *readings))
 
     def _coordinates(
         self, own: Coordinates, T: Tensor, seen: Tensor, usual: UsualNoise
