@@ -44,7 +44,9 @@ from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.noise import Noise
+from diffeo_calib.maps.observation import LinearFunctionals, Observation
 from diffeo_calib.process.scales import DEVIATIONS, FOUND, SCALES, GearLine, Hyperparameters
 from diffeo_calib.robots.tree import Tree
 
@@ -274,25 +276,19 @@ def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
 
     Rows that carry payloads have a nominal map of their own; elsewhere the robot carries the median of them.
     """
-    problem = _problem(data, scales, data.noise_of_any_row(scales))
-    return problem if data.told is data else _problem(data.told, scales, problem.new_noise).standing_for(problem)
+    how: Any = {"joint_kernel": scales.joint_kernel(data.space), "task_kernel": scales.task_kernel()}
+    how |= {"markers": data.nominal.geometry.markers, "prior_variance": data.prior_variance(scales)}
+    how |= {"new_noise": data.noise_of_any_row(scales)}
 
+    def problem(y: Tensor, noise: Noise, nominal: GeometryMap, observe: Observation | None) -> Problem:
+        own = Problem(nominal.typical, data.x, y, noise=noise, observe=observe, **how)
+        return own.with_nominal_of_rows(nominal)
 
-def _problem(data: TangentData, scales: Hyperparameters, noise: Tensor | None) -> Problem:
-    """The same with all numbers of the rows; ``noise`` (m, m) of a new measurement, m^2."""
-    problem = Problem(
-        data.nominal.typical,
-        data.x,
-        data.y,
-        joint_kernel=scales.joint_kernel(data.space),
-        task_kernel=scales.task_kernel(),
-        noise=Noise(data.weighted_noise(scales), data.shared),
-        markers=data.nominal.geometry.markers,
-        prior_variance=data.prior_variance(scales),
-        new_noise=noise,
-        observe=data.observe,
-    )
-    return problem.with_nominal_of_rows(data.nominal)
+    whole = problem(data.y, Noise(data.weighted_noise(scales), data.shared), data.nominal, data.observe)
+    if data.basis is None:
+        return whole
+    told, noise = LinearFunctionals(data.basis.mT), Noise(data.noise_of_numbers(scales), data.in_numbers(data.shared))
+    return problem(told.value(data.y), noise, data.nominal.changed(rigid=True), told).standing_for(whole)
 
 
 MOST_REACH = 1.5

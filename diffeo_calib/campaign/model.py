@@ -121,7 +121,7 @@ class Around:
 
     def noise(self, data: TangentData) -> Tensor:
         """(N, R, R) of what rows tell, m^2."""
-        return data.told.weighted_noise(self.scales)
+        return data.noise_of_numbers(self.scales)
 
     def given(self, before: Conditional, data: TangentData) -> Process:
         """What is known after more rows."""
@@ -389,7 +389,8 @@ class CampaignModel:
             order = [{a: b, b: a}.get(k, k) for k in range(each.shape[1])]
             values.append((f"markers {a} and {b} seem to be exchanged", each[:, order].flatten(1)))
         for words, other in values:
-            yield words, seen._replace(error=seen.error + seen.numbers.of_table(own.in_numbers(other - own.y)))
+            away = seen.numbers.of_table(own.in_numbers((other - own.y)[..., None]))[:, 0]
+            yield words, seen._replace(error=seen.error + away)
         q, chain = table.q[-1], self.around.placed.registration.geometry.chain
         turning = torch.tensor(chain.periodic, dtype=torch.bool, device=HOST)
         joints = {

@@ -176,12 +176,6 @@ class Source:
         """(N, n) joint values, rad or m."""
         return read_joints(self.sheet.path, replace(self.table, joints=self.joints, kinds=self.robot.kinds))
 
-    def within_limits(self) -> bool:
-        """Whether the values of the joints lie within the limits, in more than a small part of these."""
-        (low, high), q = self.robot.limits.unbind(1), self.q
-        part = (q.amax(0) - q.amin(0)) / (high - low)
-        return bool(((q >= low) & (q <= high)).all()) and float(part.max()) > SMALLEST_PART
-
 
 def ranked(ways: Iterable[Source]) -> list[Source]:
     """Ways to read a table, the one that leaves the least first."""
@@ -294,9 +288,12 @@ def with_units(source: Source) -> Source:
     if not all(periodic) and (found[0].left > DOUBTFUL or not is_clear(found)):
         others = ranked([*found, *source.in_units(slides=True)])
         found = others if is_clear(others) else found
-    if not any(periodic) and (chosen := [one for one in found if one.left < inf and one.within_limits()]):
-        # all lengths in another unit are another size, which the rows do not show
-        found, why = chosen, ", by the limits of the joints: the numbers leave it open"
+    if not any(periodic):  # all lengths in another unit are another size, which the rows do not show
+        low, high = source.robot.limits.unbind(1)
+        values = [(one, one.q) for one in found if one.left < inf]
+        inside = [(one, q.amax(0) - q.amin(0)) for one, q in values if bool(((q >= low) & (q <= high)).all())]
+        if chosen := [one for one, moved in inside if float((moved / (high - low)).max()) > SMALLEST_PART]:
+            found, why = chosen, ", by the limits of the joints: the numbers leave it open"
     excluded, named = found[-1].left == inf, [one for one in found if not one.other_units()]
     if not is_clear(found) and 0 < len(named) < len(found) and named[0].left < CLEAR_RATIO * found[0].left:
         found, why = named, ", by the names of the columns: the numbers leave it open" + why

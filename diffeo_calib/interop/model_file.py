@@ -77,15 +77,12 @@ def load(
     """
     known, (header, tensors) = _checked(kernels), read(Path(path))
     try:
-        model = rebuild(header, tensors, nominal, known)
+        return rebuild(header, tensors, nominal, known)
     except (ModelFileError, MissingArgumentError):
         raise
     except (*UNSOUND, DiffeoCalibError) as error:
         what = f"{path} has contents that do not fit together ({error})"
         raise ModelFileError.of(what, fix="save the model again") from error
-    for own in model.placement if isinstance(model, CalibratedKinematics) else ():
-        own.warn_if_unknown()
-    return model
 
 
 def _checked(kernels: object) -> KernelClasses:

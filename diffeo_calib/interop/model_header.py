@@ -10,7 +10,7 @@ model.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -27,7 +27,7 @@ from diffeo_calib.kernels.base import Kernel, SumKernel
 from diffeo_calib.kernels.profiles import PROBED_R2, Profile, probe
 from diffeo_calib.kernels.radial import PROBE, RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
+from diffeo_calib.kinematics.nominal import GeometryMap, PositionErrors, SessionMarkers
 from diffeo_calib.kinematics.provenance import Provenance, Summary, entries_of, record_of
 from diffeo_calib.kinematics.registered_map import RegisteredMap, Registration
 from diffeo_calib.kinematics.tool import tool_transform
@@ -37,7 +37,6 @@ from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap, SmoothMap
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import NO_PAYLOAD, Payload
-from diffeo_calib.robots.position_errors import PositionErrors
 from diffeo_calib.robots.se3 import rigid
 from diffeo_calib.robots.tree import robot_from_config
 from diffeo_calib.sensors.kinds import stored_devices
@@ -141,9 +140,8 @@ def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:
     robot: Header = {"kind": "robot", **chain.to_config(), "elastic": nominal.elasticity is not None}
     if len(set(geometry.on)) > 1 or geometry.on[0] != chain.tips[0]:
         robot["on"] = list(geometry.on)
-    robot |= {name: list(map(list, given)) for name, given in asdict(nominal.own).items() if given}
-    if nominal.payload is not None:
-        carried = nominal.payload
+    robot |= {name: list(map(list, given)) for name, given in nominal.own._asdict().items() if given}
+    if carried := nominal.load:
         robot["payload"] = {"link": carried.link, "mass": float(carried.masses), "unit": carried.unit}
     return robot, {name: getattr(geometry, name) for name in GEOMETRY}
 
@@ -167,7 +165,7 @@ def _tensors_of_rows(fitted: FittedMap) -> Tensors:
         found |= zip(SESSIONS, (shared, sessions.session.to(torch.float64), sessions.tools), strict=True)
     elif shared.shape[2]:
         found[SHARED] = shared
-    if isinstance(nominal, GeometryMap) and nominal.elasticity is not None and nominal.payload is not None:
+    if isinstance(nominal, GeometryMap) and nominal.elasticity is not None and nominal.load:
         rows = by_row.load if isinstance(by_row, GeometryMap | SessionMarkers) else NO_PAYLOAD
         if not rows.by_row:
             raise InputError.of("the model cannot be saved: the payloads of its rows are not known")
@@ -269,8 +267,8 @@ def _rebuild_nominal(
         raise MissingArgumentError.of("`nominal` was given, but the file holds its robot", fix="leave it out")
     robot, on = robot_from_config(description, source), tuple(description.get("on", ()))
     geometry = Geometry(robot, **{name: tensors[name] for name in GEOMETRY}, on=on)
-    payload, carried = None, description.get("payload")
-    if carried is not None:
+    payload = NO_PAYLOAD
+    if carried := description.get("payload"):
         mass = torch.tensor(carried["mass"], dtype=torch.float64, device=HOST)
         payload = Payload(carried["link"], mass, float(carried["unit"]))
     waves = tuple((int(joint), float(frequency)) for joint, frequency in description.get("waves", ()))
@@ -325,8 +323,7 @@ def _rebuild_rows(nominal: NominalMap, tensors: Tensors) -> GeometryMap | Sessio
         raise InputError.of("sessions of rows", expected="a robot", got="a plain function")
     if not isinstance(nominal, GeometryMap):
         return None
-    laden = nominal.payload
-    by_row = None if laden is None else nominal.with_payload(laden.weighing(tensors[PAYLOADS[0]]))
+    by_row = nominal.with_payload(nominal.load.weighing(tensors[PAYLOADS[0]])) if nominal.load else None
     if SESSIONS[1] not in tensors:
         return by_row
     whole = tensors["session"].round().to(torch.int64)

@@ -115,8 +115,6 @@ class FittedDevice(NamedTuple):
 def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[PredictedReadings]:
     """Predicted readings at q (N, n) of every device that a model knows, see :meth:`predict_readings`."""
     fitted: FittedMap = model.map
-    for own in model.placement:
-        own.warn_if_unknown()
     sets = [own for own in model.placement if own.reads and len(q)]
     markers = [own for own in model.placement if own.kind == MountedMarkers.kind]
     found = [one for own in markers for one in _mounted(model, own, q, noise=noise)]

@@ -3,24 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import wrapped
-from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.gravity import GravitySag
 from diffeo_calib.robots.payload import NO_PAYLOAD, Payload
-from diffeo_calib.robots.position_errors import PositionErrors
 from diffeo_calib.robots.se3 import skew
 from diffeo_calib.runtime.build import axis_waves, gear_waves
 from diffeo_calib.runtime.chain import Waves, wave_angles, wave_slopes, wave_sums
 
 TURNS_FROM = 3
 """Place of the first rotation in a twist; the translations are before it."""
+
+
+class PositionErrors(NamedTuple):
+    """Errors of joints that depend on their own position.
+
+    Waves of reduction gears, at multiples of their ratio, add C cos(w x) + S sin(w x) to the value x of an active
+    joint, taken on a line and not on a circle: w need not be an integer. Straightness, scale, roll, pitch and yaw of a
+    guide, or the wobble of a bearing, shift and turn the frame before a moving joint, in addition to its constant error
+    twist:
+
+        tau(x) = sum_k c_k cos(k pi (x - low) / (high - low)),    k = 1 ... K.
+
+    They are smooth functions of a Gaussian process on [low, high] (A. Solin, S. Sarkka, "Hilbert space methods for
+    reduced-rank Gaussian process regression", 2020), constant beyond.
+    """
+
+    waves: tuple[tuple[int, float], ...] = ()  # active joint, of which there may be several; w, rad per unit of it
+    axes: tuple[tuple[int, float, float, int], ...] = ()  # moving joint; low, high, rad or m; count K
+
+
 NO_ERRORS = PositionErrors()
 
 
@@ -36,9 +54,6 @@ class GeometryMap(NominalMap):
         own: errors of joints that depend on their own position.
         payload: known masses that the robot carries, for an elastic one.
         rigid: whether markers are points of frames, three each, which move as a whole: what bends them has no effect.
-
-    Raises:
-        InputError: errors of joints that are not there, or a payload of a robot that does not bend.
     """
 
     def __init__(
@@ -47,20 +62,17 @@ class GeometryMap(NominalMap):
         *,
         elastic: bool = False,
         own: PositionErrors = NO_ERRORS,
-        payload: Payload | None = None,
+        payload: Payload = NO_PAYLOAD,
         rigid: bool = False,
     ) -> None:
         n, n_all = geometry.chain.n, geometry.chain.moving
-        own.check(n, n_all)
-        load = payload or NO_PAYLOAD
-        if load and not elastic:
-            raise InputError.of("a payload of a rigid robot", expected="elastic=True", fix="leave the payload out")
         self.geometry = geometry
         self.elasticity = GravitySag(geometry.chain, payload) if elastic else None
-        self.own, self.rigid = own, rigid
+        self.own, self.rigid, self.load = own, rigid, payload
         tables = {"waves": gear_waves(own.waves, n), "axes": axis_waves(own.axes, n_all)}
         self._tables = {name: Waves(*map(torch.from_numpy, table)) for name, table in tables.items()}
-        sizes = self.elasticity.size if self.elasticity else 0, *own.sizes
+        sag, crooked = self.elasticity.size if self.elasticity else 0, sum(6 * count for *_, count in own.axes)
+        sizes = sag, 2 * len(own.waves), crooked  # C and S of each wave in turn; of axes c_1 of six components first
         ends = [geometry.size + sum(sizes[:k]) for k in range(len(sizes) + 1)]
         self.parts: dict[str, slice] = dict(zip(("sag", "waves", "axes"), map(slice, ends, ends[1:]), strict=True))
         self.sag, self.parameters = self.parts["sag"], ends[-1]
@@ -77,28 +89,18 @@ class GeometryMap(NominalMap):
         """The same parameters around another geometry of the same chain."""
         return self.changed(geometry=geometry)
 
-    def with_payload(self, load: Payload | None) -> GeometryMap:
+    def with_payload(self, load: Payload) -> GeometryMap:
         """The same map with other masses of its payload."""
-        return self if load is self.load else self.changed(payload=load or None)
+        return self if load is self.load else self.changed(payload=load)
 
     def changed(self, **changes: Any) -> GeometryMap:
         """The same map with other arguments."""
-        own = {"geometry": self.geometry, "own": self.own, "payload": self.payload, "rigid": self.rigid}
+        own = {"geometry": self.geometry, "own": self.own, "payload": self.load, "rigid": self.rigid}
         return GeometryMap(elastic=self.elasticity is not None, **own | changes)
 
     def around(self, nominal: GeometryMap) -> GeometryMap:
         """Another nominal map under the payloads of the rows of this one."""
         return nominal.with_payload(self.load)
-
-    @property
-    def payload(self) -> Payload | None:
-        """The known masses that the robot carries."""
-        return None if self.elasticity is None else self.elasticity.payload
-
-    @property
-    def load(self) -> Payload:
-        """The same, :data:`NO_PAYLOAD` for none."""
-        return self.payload or NO_PAYLOAD
 
     def rows(self, index: Tensor | slice) -> GeometryMap:
         """The map at some of the rows whose payloads it knows."""
@@ -273,16 +275,9 @@ class SessionMarkers(NominalMap):
         nominal: k0 of the newest session; with payloads, under those of the rows.
         session: (N,) number of each row's session, the oldest is 0.
         tools: (sessions, P, 3) markers at theta = 0 in the tip's frame, m.
-
-    Raises:
-        InputError: a session without markers.
     """
 
     def __init__(self, nominal: GeometryMap, session: Tensor, tools: Tensor) -> None:
-        if tools.shape[1:] != nominal.geometry.tool.shape or int(session.min()) < 0 or int(session.max()) >= len(tools):
-            expected = f"numbers below {len(tools)}, markers like {tuple(nominal.geometry.tool.shape)}"
-            got = f"up to {int(session.max())}, {tuple(tools.shape[1:])}"
-            raise InputError.of("sessions of the rows", expected=expected, got=got)
         self.nominal, self.session, self.tools = nominal, session, tools
         self.parameters, self.turns, self.places = nominal.parameters, nominal.turns, nominal.places
         self.maps = [nominal.with_geometry(nominal.geometry.with_tool(tool)) for tool in tools]

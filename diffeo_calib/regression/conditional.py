@@ -47,9 +47,11 @@ class Features:
     unknown: Tensor  # D (u, M r)
 
     @cached_property
-    def fields(self) -> Tensor:
-        """(M r, M r) prior covariance by the fields."""
-        return self.at.fields.gram()
+    def by_fields(self) -> Tensor:
+        """(M r, M r) covariance by the fields apart from all parameters, F - V^T V."""
+        fields = self.at.fields.gram()
+        with large_work(fields.numel()):
+            return fields.addmm_(self.known.T, self.known, alpha=-1.0)
 
     def beside(self, known: Tensor, unknown: Tensor) -> Features:
         """These, and others (k, M r) and (u, M r)."""
@@ -68,11 +70,12 @@ class Features:
 
     def between(self, other: Features | None = None) -> Tensor:
         """Covariance (M r, M' r') with others, by default themselves."""
-        fields = self.fields.clone() if other is None else self.at.fields.gram(other.at.fields)
-        theirs = self if other is None else other
+        if other is None:
+            return self.by_fields.addmm(self.unknown.T, self.unknown)
+        fields = self.at.fields.gram(other.at.fields)
         with large_work(fields.numel()):
-            fields.addmm_(self.known.T, theirs.known, alpha=-1.0)
-            return fields.addmm_(self.unknown.T, theirs.unknown)
+            fields.addmm_(self.known.T, other.known, alpha=-1.0)
+            return fields.addmm_(self.unknown.T, other.unknown)
 
 
 class Conditional(ABC):
@@ -97,8 +100,7 @@ class Conditional(ABC):
         """
         at = self.features(new.at) if at is None else at
         known, unknown = new.there(at.known.T), new.there(at.unknown.T)
-        F = new.with_noise(at.fields, noise)
-        factor = Factor.of(F.addmm_(known, known.T, alpha=-1.0), unknown)
+        factor = Factor.of(new.with_noise(at.by_fields, noise), unknown)
         return Process(self, new, known, factor, factor.white(new.target[:, None])[:, 0])
 
     def posterior(self, at: Linearisation) -> Tensor:
@@ -188,9 +190,8 @@ class Process(Conditional):
 
     def given(self, new: Numbers, noise: Tensor, at: Features | None = None) -> Process:
         at = self.features(new.at) if at is None else at
-        F, known = new.with_noise(at.fields, noise), new.there(at.known.T)
-        L, k = lower_root(F.addmm_(known, known.T, alpha=-1.0)), self.known.shape[1]
-        unknown = new.there(self.before.features(new.at).unknown.T) - known[:, k:] @ self.factor.W
+        L, k = lower_root(new.with_noise(at.by_fields, noise)), self.known.shape[1]
+        known, unknown = new.there(at.known.T), new.there(vars(at)["mixed"].T)
         right = torch.cat([(new.target - known[:, k:] @ self.alpha)[:, None], unknown], 1)
         right = torch.linalg.solve_triangular(L, right, upper=False)
         return replace(
@@ -208,18 +209,22 @@ class Process(Conditional):
 
     def features(self, at: Linearisation, sooner: Features | None = None) -> Features:
         """Features of a linearisation; ``sooner``: the same by the first of these rows alone."""
-        found, L, k = self.before.features(at), self.factor.L, self.known.shape[1]
-        known = found.known[:0] if sooner is None else sooner.known[k:]
-        if (n := len(known)) < len(L):
-            cross = self.numbers.gram(at, n).addmm_(self.known[n:], found.known, alpha=-1.0)
-            cross.addmm_(L[n:, :n], known, alpha=-1.0)
-            with large_work(cross.numel()):
-                known = torch.cat([known, torch.linalg.solve_triangular(L[n:, n:], cross, upper=False)])
-        unknown = found.unknown - self.factor.W.T @ known
-        unknown = torch.linalg.solve_triangular(self.factor.B, unknown, upper=False)
-        new = Features(at, torch.cat([found.known, known]), unknown)
+        found = self.before.features(at) if sooner is None else sooner
+        L, k, mixed = self.factor.L, self.known.shape[1], found.unknown
         if sooner is not None:
-            vars(new).update({name: value for name, value in vars(sooner).items() if name == "fields"})
+            mixed = vars(sooner)["mixed"]
+        if (n := len(found.known) - k) == len(L):
+            return found
+        cross = self.numbers.gram(at, n).addmm_(self.known[n:], found.known[:k], alpha=-1.0)
+        cross.addmm_(L[n:, :n], found.known[k:], alpha=-1.0)
+        with large_work(cross.numel()):
+            more = torch.linalg.solve_triangular(L[n:, n:], cross, upper=False)
+        mixed = mixed - self.factor.W[n:].T @ more
+        unknown = torch.linalg.solve_triangular(self.factor.B, mixed, upper=False)
+        new = Features(at, torch.cat([found.known, more]), unknown)
+        vars(new)["mixed"] = mixed  # D before the factor of the unknowns, to which later rows add theirs
+        if "by_fields" in vars(found):
+            vars(new)["by_fields"] = found.by_fields.addmm(more.T, more, alpha=-1.0)
         return new
 
     def mean(self, at: Features) -> Tensor:

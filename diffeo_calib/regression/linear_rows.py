@@ -79,6 +79,11 @@ class LinearRows:
         """(M, R) how far each row is from its prediction by the model and all other rows, m; NaN where hidden."""
         return self.shown(torch.linalg.solve(self.precisions, self.solved[..., None])[..., 0])
 
+    @property
+    def left_out_squares(self) -> Tensor:
+        """(M,) their squares in units of their covariance."""
+        return (self.solved * self.left_out).nansum(1)
+
     def shown(self, values: Tensor) -> Tensor:
         """Values (M, R) or (M R,), NaN where hidden."""
         return values.view(self.residual.shape).masked_fill(~self.visible, nan)

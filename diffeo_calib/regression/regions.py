@@ -9,14 +9,13 @@ with a scale s and degrees of freedom nu. Few rows determine neither, so that bo
 of a new error whose s and nu are distributed as the rows say: with few rows it widens by itself, as Student's t does.
 Of many rows their own 95 % quantile says more than any distribution: outliers, and noise that is small in most rows and
 large in some, are no Student's t. The factor is the geometric mean of both, the quantile with the weight of the rows
-and the distribution with that of :attr:`RegionPrior.rows`. Constants and this rule were chosen on simulated arms of
+and the distribution with that of :data:`ROWS`. Constants and this rule were chosen on simulated arms of
 eleven kinds and three real series.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from math import exp, inf, log
 
 import numpy as np
@@ -33,24 +32,19 @@ BLOCK = 1 << 16  # numbers of a likelihood that are added at once
 FACTORS = 0.01, 1e4  # between which the factor is sought
 
 
-@dataclass(frozen=True)
-class RegionPrior:
-    """Prior of the scale of errors: log-normal distributions."""
+FREEDOM, FREEDOM_EFOLDS = 40.0, 0.8
+"""Log-normal prior of nu: its centre, and the standard deviation of its logarithm."""
+ROWS = 60.0
+"""Number of independent errors whose quantile counts as much as the distribution."""
+SCALE_EFOLDS, OTHER_DATE = 0.8, 2.0
+"""Standard deviation of log s around zero, of a calibration's own scales and on another date.
 
-    scale_efolds: float = 0.8  # standard deviation of log s around zero
-    freedom: float = 40.0  # centre of nu
-    freedom_efolds: float = 0.8  # standard deviation of its logarithm
-    rows: float = 60.0  # number of independent errors whose quantile counts as much as the distribution
-
-
-REGION_PRIOR = RegionPrior()
-OTHER_DATE = RegionPrior(scale_efolds=2.0)
-"""On another date a robot may have changed by any amount: variances of 1 to 50 times the old ones are usual, and a
+There a robot may have changed by any amount: variances of 1 to 50 times the old ones are usual, and a
 prior as narrow as that of a calibration's own scales takes a third of the factor from ten rows that ask for 50."""
 
 
 def region_scale(
-    squares: Tensor, dim: int | Tensor, weights: Tensor | None = None, prior: RegionPrior = REGION_PRIOR
+    squares: Tensor, dim: int | Tensor, weights: Tensor | None = None, efolds: float = SCALE_EFOLDS
 ) -> float:
     """Factor on all covariances with which their 95 % regions hold 95 % of new errors.
 
@@ -58,7 +52,7 @@ def region_scale(
         squares: d^2 of errors that took no part, of any shape; NaN where nothing was measured.
         dim: k, coordinates of each error, the same for all or of the shape of ``squares``.
         weights: number of independent errors that each stands for; all one by default.
-        prior: see :class:`RegionPrior`.
+        efolds: standard deviation of log s before these errors.
 
     Returns:
         one if there are no errors at all, above one or below.
@@ -69,12 +63,12 @@ def region_scale(
     values = squares[seen].numpy(force=True)
     dims = np.full(len(values), dim) if isinstance(dim, int) else dim[seen].numpy(force=True)
     shares = np.ones(len(values)) if weights is None else weights[seen].double().numpy(force=True)
-    density = _posterior(values, dims, shares, prior)
+    density = _posterior(values, dims, shares, efolds)
     counts = {int(k): float(shares[dims == k].sum() / shares.sum()) for k in np.unique(dims)}
     high = smallest(lambda at: _held(exp(at), counts, density) >= CONFIDENCE, *map(log, FACTORS))
     number = float(shares.sum())
     own = _log_quantile(values / np.array([chi2_above(1.0 - CONFIDENCE, k) for k in dims]), shares)
-    return float(np.exp((number * own + prior.rows * high) / (number + prior.rows)))
+    return float(np.exp((number * own + ROWS * high) / (number + ROWS)))
 
 
 def smallest(holds: Callable[[float], bool], low: float, high: float) -> float:
@@ -120,10 +114,10 @@ def student_likelihood(squares: Tensor, dim: Tensor, freedoms: Tensor, shares: T
     return value
 
 
-def _posterior(values: np.ndarray, dims: np.ndarray, shares: np.ndarray, prior: RegionPrior) -> np.ndarray:
+def _posterior(values: np.ndarray, dims: np.ndarray, shares: np.ndarray, efolds: float) -> np.ndarray:
     """Probability of every pair of nu and s: (len(FREEDOMS), len(SCALES))."""
     nu, s = FREEDOMS[:, None], SCALES
-    logs = -0.5 * (np.log(nu / prior.freedom) / prior.freedom_efolds) ** 2 - 0.5 * (np.log(s) / prior.scale_efolds) ** 2
+    logs = -0.5 * (np.log(nu / FREEDOM) / FREEDOM_EFOLDS) ** 2 - 0.5 * (np.log(s) / efolds) ** 2
     d2, k, count, freedoms = map(torch.from_numpy, (values, dims, shares, FREEDOMS))
     likelihood = torch.stack([student_likelihood(d2 / each, k, freedoms, count) for each in s.tolist()], 1).numpy()
     logs = logs + likelihood - 0.5 * (dims @ shares) * np.log(s)

@@ -32,7 +32,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.robots.payload import Payload
+from diffeo_calib.robots.payload import NO_PAYLOAD, Payload
 from diffeo_calib.robots.tree import BASE, Tree
 from diffeo_calib.runtime.chain import Compliance, Masses, load_slopes, loads
 
@@ -42,7 +42,7 @@ class GravitySag:
 
     Args:
         chain: the nominal robot; its nominal frames make the features.
-        payload: masses at a tip or at a branch without markers (`load`); None without.
+        payload: masses at a tip or at a branch without markers (`load`).
 
     Attributes:
         compliances: all compliances, those under the payload last; their features follow each other in the coefficients
@@ -50,11 +50,9 @@ class GravitySag:
         joints: (K,) the moving joint of every coefficient.
         own: (K,) True for a compliance along the joint's own motion, False for a lateral one.
         loaded: (K,) True for the coefficients of the payload, the last ones.
-
-    Raises InputError: a payload at another link.
     """
 
-    def __init__(self, chain: Tree, payload: Payload | None = None) -> None:
+    def __init__(self, chain: Tree, payload: Payload = NO_PAYLOAD) -> None:
         self.chain, self.payload = chain, payload
         self.compliances = (*chain.arrays.compliances, *(_under_payload(chain, payload.link) if payload else ()))
         self._masses = Masses(*map(torch.from_numpy, Masses.of(self.compliances, chain.arrays)))
@@ -74,7 +72,7 @@ class GravitySag:
         """(K,) which coefficients are of which part of the sag, by name; that of a payload only with one."""
         own, loaded = self.own, self.loaded
         found = {"gravity on joints": own & ~loaded, "gravity on links": ~own & ~loaded}
-        return found | ({"payload": loaded} if self.payload is not None else {})
+        return found | ({"payload": loaded} if self.payload else {})
 
     def features(self, q: Tensor) -> Tensor:
         """Feature values [m; 1 for forces on prismatic joints]: q (N, n) -> (N, K)."""
@@ -109,7 +107,7 @@ class GravitySag:
 
         The payload then is one of the unknown masses at its place. Raises InputError: one that differs between rows.
         """
-        if self.payload is None:
+        if not self.payload:
             return w
         if self.payload.by_row:
             raise InputError.of("a payload of every row", expected="one for all", fix="choose one: with_payload(mass)")
@@ -131,8 +129,7 @@ class GravitySag:
     def _loads(self, q: Tensor) -> Tensor:
         """(N or 1, compliances) the load of each in units: the payload where that is the load, else 1."""
         loaded = torch.tensor([one.loaded for one in self.compliances], dtype=torch.bool, device=q.device)
-        amounts = 1.0 if self.payload is None else self.payload.amounts(q)
-        return torch.where(loaded, amounts, q.new_ones(1, 1))
+        return torch.where(loaded, self.payload.amounts(q), q.new_ones(1, 1))
 
     def _frames(self, q: Tensor) -> Tensor:
         """All places in the ground's frame: (N, F, 4, 4)."""
@@ -142,9 +139,6 @@ class GravitySag:
 
 def _under_payload(chain: Tree, link: str) -> list[Compliance]:
     """The compliances of a robot under a load at one link, where they carry it."""
-    if link not in chain.ends:
-        fix = "name a tip, or the end of a branch that was given as `load`"
-        raise InputError.of("the link of the payload", expected=" or ".join(chain.ends), got=link, fix=fix)
     place = chain.moving + list(chain.ends).index(link)
     seen, moved = _representative(chain, place), chain.arrays.moved[place]
     found = [one for one in chain.arrays.compliances if moved[one.joint] and (not one.places or seen in one.places)]

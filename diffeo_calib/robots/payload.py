@@ -26,13 +26,9 @@ class Payload:
     masses: Tensor  # of the robot everywhere (), or of N rows (N,), in any unit
     unit: float  # the mass, in the same unit, that counts as one: coefficients are sags under it. Positive.
 
-    def __post_init__(self) -> None:
-        if not self.unit > 0:
-            raise InputError.of("the unit of a payload", expected="a positive mass", got=self.unit)
-
     @classmethod
-    def of_rows(cls, robot: Tree, masses: Tensor | None, at: str | None) -> Payload | None:
-        """The masses (N,) that a robot carried in N rows, the largest of which counts as one; None if not known.
+    def of_rows(cls, robot: Tree, masses: Tensor | None, at: str | None) -> Payload:
+        """The masses (N,) that a robot carried in N rows, the largest of which counts as one; NO_PAYLOAD if not known.
 
         Args:
             robot: n joints. masses: in any unit. at: name of the link that carried them; by default the only tip.
@@ -41,7 +37,7 @@ class Payload:
         and no load of the robot. Warns DiffeoCalibWarning: the payload never changes.
         """
         if masses is None:
-            return None
+            return NO_PAYLOAD
         largest, link = float(masses.max()), robot.tip if at is None else at
         if largest == 0:
             raise MeasurementError.of("all payloads are 0", fix="leave them out")
@@ -135,9 +131,9 @@ def check_unladen(masses: Tensor | None, what: str, *, fix: str) -> None:
         raise MeasurementError.of(what, expected="no payloads", got="a column of masses", fix=fix)
 
 
-def joined_masses(before: Payload | None, after: Payload | None) -> Tensor | None:
+def joined_masses(before: Payload, after: Payload) -> Tensor | None:
     """The masses of the rows of one payload and then of another one; None where either is not known."""
-    return None if before is None or after is None else torch.cat([before.masses, after.masses.to(before.masses)])
+    return torch.cat([before.masses, after.masses.to(before.masses)]) if before and after else None
 
 
 def common_mass(first: float | None, second: float | None) -> float | None:
@@ -182,9 +178,9 @@ def with_load(robot: Tree, name: str, place: object, on: str | None = None) -> T
     return Tree(robot.name, robot.base, joints, parents, ends, drivers=robot.drivers, source=robot.source)
 
 
-def payload_sentence(payload: Payload | None) -> str:
+def payload_sentence(payload: Payload) -> str:
     """For which payload a model holds: that of its fit where none was known."""
-    if payload is None:
+    if not payload:
         return "the model holds for the payload of the fit"
     heaviest = f"payloads up to {payload.unit:g} are part of the model"
     return heaviest if payload.by_row else f"{heaviest}, and the pictures are for {float(payload.masses):g}"

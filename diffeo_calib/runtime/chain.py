@@ -4,7 +4,7 @@
 
 the product over the joints l on the path to the tip, A_l the constant transform of moving joint l with its geometric
 error, tau_l(q) its error twist: a constant, gravity sag and errors of its axis (robots/geometry.py,
-robots/gravity.py, robots/position_errors.py).
+robots/gravity.py, kinematics/nominal.py).
 J_l = C + S sin q + D cos q + L q.
 """
 

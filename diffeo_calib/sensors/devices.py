@@ -123,9 +123,6 @@ class Extrinsics(ABC):
         """What is known of each of them, in the frame of the model."""
         return []
 
-    def warn_if_unknown(self) -> None:  # noqa: B027
-        """Warn of devices that cannot be used, and say what to do."""
-
     @property
     def elsewhere(self) -> Tensor:
         """(D,) boolean: set-ups in another frame than the model's, or with other markers."""

@@ -102,8 +102,7 @@ class Evaluation:
     @property
     def label(self) -> str:
         """The same for one number, for axes."""
-        kinds = {ERRORS: "position error", SPREAD: "spread within sockets", ORIENTATION: "orientation error"}
-        return kinds.get(self.what, f"error of {self.kind}s")
+        return self.title.lower().replace("errors", "error", 1)
 
     @property
     def shown(self) -> tuple[str, float]:

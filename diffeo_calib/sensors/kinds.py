@@ -82,14 +82,6 @@ class Unregistered(Extrinsics):
         """As the file says it."""
         return self.read_kind
 
-    def warn_if_unknown(self) -> None:
-        what = f"the model has {len(self.names)} devices of the kind {self.kind!r}, which is not registered here"
-        fix = (
-            "import the module that registers it (`diffeo_calib.sensors.kinds.register`) and load the model again, or "
-        )
-        fix += "install its package"
-        warn_user(sentence(f"{what}: their readings are not predicted", fix=fix))
-
     def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
         fix = "import the module that registers it, and load the model again"
         raise InputError.of(f"devices of the kind {self.kind!r} in a model", got="a kind not registered", fix=fix)
@@ -106,6 +98,9 @@ def stored_devices(entry: Any, rows: int) -> Extrinsics:
 
     Raises:
         InputError: entries that do not fit together.
+
+    Warns:
+        DiffeoCalibWarning: devices of a kind that nobody registered.
     """
     if not isinstance(entry, dict) or set(entry) - {"shown"} != set(ENTRIES):
         raise InputError.of("the entry placement", expected=sorted(ENTRIES), got=sorted(entry))
@@ -118,7 +113,12 @@ def stored_devices(entry: Any, rows: int) -> Extrinsics:
     inside = bool(((numbers >= 0) & (numbers < rows)).all() & ((device >= 0) & (device < len(names))).all())
     if len(numbers) != len(device) or not inside:
         raise InputError.of("the rows of the devices of a model", expected=f"numbers below {rows}")
-    found = {**known_kinds(), **WITHOUT_READINGS}.get(entry["kind"], partial(Unregistered, read_kind=entry["kind"]))
+    found: Any = {**known_kinds(), **WITHOUT_READINGS}.get(entry["kind"])
+    if found is None:
+        found = partial(Unregistered, read_kind=entry["kind"])
+        what = f"the model has {len(names)} devices of the kind {entry['kind']!r}, which is not registered here"
+        fix = "import the module that registers it (`diffeo_calib.sensors.kinds.register`) and load the model again, "
+        warn_user(sentence(f"{what}: their readings are not predicted", fix=fix + "or install its package"))
     return found(names, constants, deviations, numbers, device, _shown(entry.get("shown")))
 
 

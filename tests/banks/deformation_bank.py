@@ -16,13 +16,12 @@ from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.kernels.base import SumKernel
 from diffeo_calib.kernels.profiles import PROFILES
 from diffeo_calib.kernels.radial import RadialKernel
-from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.nominal import GeometryMap, PositionErrors
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.robots import Geometry
-from diffeo_calib.robots.position_errors import PositionErrors
 from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.robots.tree import Tree
 

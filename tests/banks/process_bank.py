@@ -38,7 +38,7 @@ class Case:
     @cached_property
     def noise(self) -> Tensor:
         """(N, R, R) weighted."""
-        return self.data.told.weighted_noise(self.scales)
+        return self.data.noise_of_numbers(self.scales)
 
     @cached_property
     def numbers(self) -> Numbers:
@@ -53,16 +53,12 @@ class Case:
     @cached_property
     def fields(self) -> Tensor:
         """Prior covariance by the fields of all numbers of the table, hidden ones too: (N R, N R)."""
-        whole = self.data.told.linearisation(self.scales)
-        assert whole.sensitivity is not None
-        return replace(whole, sensitivity=torch.zeros_like(whole.sensitivity)).gram()
+        return self.numbers.at.fields.gram()
 
     @cached_property
     def unknowns(self) -> Tensor:
         """(N R, K) their derivatives by the unknowns."""
-        told = self.data.told
-        S = torch.cat([told.sensitivities, told.shared], 2)
-        return S.flatten(0, 1)
+        return self.numbers.at.sensitivity.flatten(0, 1)
 
     @cached_property
     def posterior(self) -> Process:

@@ -112,10 +112,16 @@ def weighted(setting: Setting, seed: int = 0) -> TangentData:
     return replace(data, theta=theta, tails=Tails(4.0, weights))
 
 
+def prior_covariance(data: TangentData, scales: dc.Hyperparameters) -> Tensor:
+    """Of all numbers of the rows, hidden ones too, by fields, unknowns and shared shifts: (N r, N r)."""
+    at = data.numbers(scales).at
+    S = at.sensitivity.flatten(0, 1)
+    return at.fields.gram() + (S * data.unknowns_variance(scales)) @ S.T
+
+
 def covariance(data: TangentData, scales: dc.Hyperparameters) -> Tensor:
-    """Of all numbers of the rows, hidden ones too, by fields, unknowns, shared shifts and noise: (N m, N m)."""
-    shared = data.shared.flatten(0, 1)
-    return data.linearisation(scales).gram() + torch.block_diag(*data.weighted_noise(scales)) + shared @ shared.T
+    """The same with noise."""
+    return prior_covariance(data, scales) + torch.block_diag(*data.noise_of_numbers(scales))
 
 
 # --- formulas -----------------------------------------------------------------------------------------------------

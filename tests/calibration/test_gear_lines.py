@@ -49,7 +49,7 @@ def second(first: dc.CalibrationResult) -> dc.CalibrationResult:
 
 
 def with_scales(model: CalibratedKinematics, scales: torch.Tensor | None) -> CalibratedKinematics:
-    return model._with(scales=scales)
+    return model.changed(scales=scales)
 
 
 def test_scales_are_those_of_the_other_model_but_for_one_factor(

@@ -31,7 +31,7 @@ def test_exact_model_is_conditioned_on_the_seen_coordinates_alone() -> None:
     model = fit(problem, GaussNewton(tolerance=1e-9)).model
     value, at = model.geodesic.linearised_value(one.data.x)
     G, R = at.gram(), torch.block_diag(*model.noise.covariance)
-    seen = one.data.told.visible.flatten()
+    seen = one.data.visible.flatten()
     p = model.geodesic.end_momenta.reshape(-1)
     residual = (problem.y - value).flatten()
     assert_close(R[seen][:, seen] @ p[seen], residual[seen], rtol=1e-5, atol=1e-11)  # p = R^-1 (y - k1)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import chi2
-from tangent_bank import Setting, built, covariance, normal
-from tangent_bank import weighted as weighted_setting
+from tangent_bank import Setting, built, covariance, normal, prior_covariance
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -20,7 +19,6 @@ from diffeo_calib.calibration.scales.leave_one_out import (
     LeaveOneOut,
     cross_validated_inflation,
     leave_one_out,
-    left_out_squares,
     motions,
     random_folds,
 )
@@ -98,14 +96,15 @@ def test_weights_are_those_of_the_errors_under_the_posterior(
 ) -> None:
     """Conditioned on everything: the mean error, and the uncertainty of the signal. One round, from given weights."""
     case: Chosen = request.getfixturevalue(name)
-    data = case.conditioned().told
-    n, m = data.y.shape
-    G, total = data.linearisation(case.scales).gram(), covariance(data, case.scales)
+    data = case.conditioned()
+    n, m = data.target.shape
+    G, total = prior_covariance(data, case.scales), covariance(data, case.scales)
     target = data.target.flatten()
     gain = torch.linalg.solve(total, G).mT
     residual, uncertain = target - gain @ target, G - gain @ G
     moments = torch.outer(residual, residual) + (uncertain + uncertain.mT) / 2
     blocks = torch.stack([moments[m * i : m * (i + 1), m * i : m * (i + 1)] for i in range(n)])
+    blocks = data.blocks_in_coordinates(blocks)
     expected = reweight(data.noise_model.squares(data.noise(case.scales), blocks), data.noise_model.freedom)
     monkeypatch.setattr(one_out, "ROUNDS", 1)
     monkeypatch.setattr(one_out, "gross_weights", lambda *_: None)
@@ -117,24 +116,26 @@ def test_weights_are_those_of_the_errors_under_the_posterior(
 @pytest.mark.parametrize("name", ["clean", "pair", "framed"])
 def test_leave_one_out_is_refitting_without_the_row(name: str, request: pytest.FixtureRequest) -> None:
     case: Chosen = request.getfixturevalue(name)
-    whole = case.conditioned()
-    data, found = whole.told, leave_one_out(whole, case.scales)
-    n, m = data.y.shape
-    G, total, noise = data.linearisation(case.scales).gram(), covariance(data, case.scales), data.noise(case.scales)
-    assert found.errors.shape == whole.y.shape
+    data = case.conditioned()
+    found = leave_one_out(data, case.scales)
+    n, m = data.target.shape
+    G, total = prior_covariance(data, case.scales), covariance(data, case.scales)
+    noise = data.blocks_in_numbers(data.noise(case.scales))
+    assert found.errors.shape == data.y.shape
     assert found.squares.shape == (n, data.noise_model.bodies)
-    assert found.count == data.y.numel()
+    assert found.count == data.target.numel()
     scale = float(found.errors.abs().max())
     for row in range(0, n, 5):
         own = slice(m * row, m * (row + 1))
         rest = torch.cat([torch.arange(m * row), torch.arange(m * (row + 1), m * n)])
         gain = torch.linalg.solve(total[rest][:, rest], G[rest][:, own]).mT
         error = data.target[row] - gain @ data.target.flatten()[rest]
-        of_row = whole.rows(torch.tensor([row]))
-        assert_close(found.errors[row], of_row.in_coordinates(error[None])[0], rtol=0, atol=1e-8 * scale)
+        of_row = data.rows(torch.tensor([row]))
+        assert_close(found.errors[row], of_row.in_coordinates(error[None, :, None])[0, :, 0], rtol=0, atol=1e-8 * scale)
         predicted = G[own, own] - gain @ G[rest][:, own] + noise[row]
         sensor = data.noise_model.rows(torch.tensor([row]))
-        expected = sensor.squares(predicted[None], torch.outer(error, error)[None])
+        both = (of_row.blocks_in_coordinates(one[None]) for one in (predicted, torch.outer(error, error)))
+        expected = sensor.squares(*both)
         assert_close(found.squares[row], expected[0], rtol=1e-7, atol=1e-8)
     trace = float(torch.linalg.solve(total, G).trace())  # of the matrix that makes fitted values from measured ones
     assert found.effective == pytest.approx(trace, rel=1e-6)
@@ -154,9 +155,6 @@ def test_several_blocks_are_predicted_one_by_one(pair: Chosen, monkeypatch: pyte
     assert torch.equal(again.errors, found.errors)
     assert not torch.allclose(other.errors, found.errors, rtol=1e-3, atol=0)
     assert float(found.errors.square().mean()) > 0.8 * float(whole.errors.square().mean())  # fewer rows predict worse
-    later, fresh = data.with_tails(pair.data.tails), replace(data, tails=pair.data.tails)  # kept blocks get its weights
-    blocks = (leave_one_out(each, pair.scales, seed=3) for each in (later, fresh))
-    assert_close(*(each.errors for each in blocks), rtol=0, atol=1e-12)
 
 
 def doubled(values: Tensor) -> Tensor:
@@ -183,40 +181,8 @@ def test_few_data_inflate_the_regions_as_student_s_t_does() -> None:
 # --- folds ------------------------------------------------------------------------------------------------------------
 
 
-def narrow(setting: Setting) -> TangentData:
-    """With weights of any size, and a narrow prior of the base: G + R spans eight powers of ten with the usual."""
-    return replace(weighted_setting(setting), place_deviation=1e-3)
-
-
 def groups(data: TangentData) -> Tensor:
     return torch.arange(len(data.x))
-
-
-def parted(data: TangentData, *parts: Tensor) -> Tensor:
-    """(N,) the number of each row's part, negative for none."""
-    numbers = torch.full((len(data.x),), -1, dtype=torch.int64)
-    for number, rows in enumerate(parts):
-        numbers[rows] = number
-    return numbers
-
-
-def test_folds_are_predicted_from_all_other_rows(setting: Setting) -> None:
-    """By the formulas for conditional Gaussians, one marker or pose after the other."""
-    whole, scales, rows = narrow(setting), setting.scales, torch.tensor([1, 4, 7])
-    data, new = whole.told, whole.blocks_in_numbers(whole.noise_of_new_rows(scales))
-    m = data.y.shape[1]
-    inside = torch.isin(torch.arange(data.y.numel()) // m, rows)
-    K, y = covariance(data, scales), data.target.flatten()
-    gain = torch.linalg.solve(K[~inside][:, ~inside], K[~inside][:, inside]).T
-    errors = (y[inside] - gain @ y[~inside]).view(3, m, 1)
-    spread = (K[inside][:, inside] - gain @ K[~inside][:, inside]).view(3, m, 3, m)
-    own = torch.stack([spread[k, :, k] for k in range(3)])
-    part = data.rows(rows)
-    predicted = own - part.weighted_noise(scales) + new[rows]
-    expected = part.noise_model.squares(predicted, errors @ errors.mT)
-    found = left_out_squares(whole, scales, parted(whole, rows))
-    assert_close(found[rows], expected, rtol=1e-4, atol=1e-6)
-    assert bool(found[[0, 2, 3]].isnan().all())
 
 
 def test_rows_along_motions_and_repeats_belong_together() -> None:

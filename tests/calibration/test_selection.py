@@ -143,7 +143,7 @@ def log_density(matrix: Tensor, target: Tensor) -> float:
 
 def test_posterior_is_likelihood_times_prior(setting: Setting) -> None:
     scales, data = shaken(setting.scales, 2), weighted(setting, 2)
-    nominal, theta, x = data.told.nominal, data.theta, data.x
+    nominal, theta, x = data.nominal.changed(rigid=True) if data.basis is not None else data.nominal, data.theta, data.x
     total = tangent_covariance(scales, nominal, theta, x)
     total += torch.block_diag(*noise_covariance(scales, setting, theta, data.tails.weights))
     target = (data.y - nominal(x, theta) + nominal.sensitivities(x, theta) @ theta).flatten()

@@ -238,7 +238,8 @@ def test_the_command_ends_at_its_target_and_goes_on(tmp_path: Path, lines: list[
     assert "line 23 left out" in done.out
     kept = [line for number, line in enumerate(lines) if number != WRONG + 1]
     assert (tmp_path / "accepted.csv").read_text() == "".join(kept)
-    assert command(*words, "--tolerance", "50mm").code == 0
+    assert command(*words, "--tolerance", "50mm", "--accepted", tmp_path / "accepted.csv").code == 0
+    assert (tmp_path / "accepted.csv").read_text() == "".join(kept)  # rows after the one left out are still those
 
 
 def test_rows_that_are_there_before_are_judged_as_with_once(

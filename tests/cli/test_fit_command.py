@@ -11,9 +11,8 @@ import torch
 from command_bank import FORMAT, STAGES, Command, Outcome, Site
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.outliers import Outlier
+from diffeo_calib.calibration.diagnostics.outliers import Outlier, outlier_lines
 from diffeo_calib.calibration.findings import parts
-from diffeo_calib.cli.printed import outlier_lines
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
@@ -40,15 +39,6 @@ def test_fit_prints_three_stages_in_training_and_held_out(
     assert model.report["outliers"] == 0
     rms, most, before = (f"{fitted.numbers(stage, '12 held out')[k]:.3f}" for stage, k in VERDICT)
     assert fitted.out.startswith(f"held out: {rms} mm RMS, 95 % below {most} (12 rows; geometry alone {before} mm RMS)")
-
-
-@pytest.mark.slow
-def test_fit_equals_calibrate(site: Site, model: dc.CalibratedKinematics) -> None:
-    train, test = site.data.split(0.7, seed=0)
-    expected = dc.calibrate(site.arm.nominal, train).model
-    # The CSV's last digit is not the same, and the search for scales ends a little elsewhere.
-    torch.testing.assert_close(model(test.q), expected(test.q), rtol=0, atol=1e-5)
-    assert expected.report.keys() == model.report.keys()
 
 
 def test_fit_prints_the_solver_and_what_each_part_explains_if_asked(

@@ -55,28 +55,6 @@ def test_from_a_campaign_file_to_errors(sockets: Path, command: Command, monkeyp
     assert "expected absolute error" in done.out
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ([*SOCKETS, "--position", "x,y,z"], "no column ['x', 'y', 'z']"),
-        ([*SOCKETS, "--std", "s"], "--std beside `socket`; leave it out"),
-        (["--distance", "a,b=50", "--distance-std", "1", "--position", "x,y,z"], "--distance-std without --socket"),
-        ([*SOCKETS[:2], "--distance", "a=50", *SOCKETS[4:]], r"--distance a=50: expected A,B=LENGTH"),
-        (["--socket", "place,socket", "--distance", "a,b=50"], "--distance without --distance-std"),
-        ([*SOCKETS[:2], "--distance", "a,c=50", *SOCKETS[4:]], "a known distance: expected names of two sockets"),
-        ([*SOCKETS[:2], "--distance", "a,b=50000", *SOCKETS[4:]], "check the unit of `distances`"),
-    ],
-)
-def test_refused_sockets(
-    options: list[str], message: str, sockets: Path, command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(sockets)
-    done = command("fit", "t.csv", *ROBOT, *DEG, *options, "-o", "none.safetensors")
-    assert done.code in (1, 2)
-    assert message in " ".join(done.err.split())
-    assert not Path("none.safetensors").exists()
-
-
 @pytest.mark.usefixtures("given_scales")
 def test_a_wrong_distance_is_warned_of(sockets: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(sockets)
@@ -84,13 +62,6 @@ def test_a_wrong_distance_is_warned_of(sockets: Path, command: Command, monkeypa
     done = command("fit", "t.csv", *ROBOT, *DEG, *options, "-o", "warned.safetensors")
     assert done.code == 0
     assert "the known distance of the sockets 'spot" in " ".join(done.err.split())
-
-
-def test_one_of_both_is_required(sockets: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(sockets)
-    done = command("fit", "t.csv", *ROBOT, *DEG, "-o", "none.safetensors")
-    assert done.code == 2
-    assert "--position" in done.err
 
 
 WIRE = ["--reading", "distance=wire", "--session", "anchor"]
@@ -133,23 +104,28 @@ def test_a_number_that_names_a_column_is_that_column(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ([], "name the position columns, or those of --socket or --reading"),
+        ([*SOCKETS, "--position", "x,y,z"], "no column ['x', 'y', 'z']"),
+        ([*SOCKETS, "--std", "s"], "--std beside `socket`; leave it out"),
+        (["--distance", "a,b=50", "--distance-std", "1", "--position", "x,y,z"], "--distance-std without --socket"),
+        ([*SOCKETS[:2], "--distance", "a=50", *SOCKETS[4:]], r"--distance a=50: expected A,B=LENGTH"),
+        (["--socket", "place,socket", "--distance", "a,b=50"], "--distance without --distance-std"),
+        ([*SOCKETS[:2], "--distance", "a,c=50", *SOCKETS[4:]], "a known distance: expected names of two sockets"),
+        ([*SOCKETS[:2], "--distance", "a,b=50000", *SOCKETS[4:]], "check the unit of `distances`"),
         ([*WIRE, "--position", "x,y,z"], "no column ['x', 'y', 'z']"),
         (["--reading", "length=wire"], "--reading length=wire: expected distance=COLUMN"),
         (["--reading", "distance=wire,anchor"], "--reading distance=wire,anchor: expected"),
         (["--reading", "image=u,v"], "--reading image=u,v: expected distance=COLUMN"),
         (["--reading", "image=u,v,0,1,2,3"], "focal lengths FX, FY are positive"),
         (["--reading", "image=u,v,9,9,2,x"], "--reading image=u,v,9,9,2,x: expected"),
-        (
-            ["--reading", "distance=0"],
-            "--reading distance=0: expected a distance above 0; write the length of the ball bar",
-        ),
+        (["--reading", "distance=0"], "expected a distance above 0; write the length of the ball bar"),
         (["--reading", "distance=wire", "--tip", "tool"], "tool"),
     ],
 )
-def test_refused_readings(
-    options: list[str], message: str, wires: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+def test_refused_rows(
+    options: list[str], message: str, sockets: Path, wires: Path, command: Command, *, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(wires)
+    monkeypatch.chdir(wires if "--reading" in options else sockets)
     done = command("fit", "t.csv", *ROBOT, *DEG, *options, "-o", "none.safetensors")
     assert done.code in (1, 2)
     assert message in " ".join(done.err.split())

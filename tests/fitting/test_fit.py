@@ -32,7 +32,9 @@ def test_fits_that_need_more_memory_than_is_free_are_refused(
     monkeypatch: pytest.MonkeyPatch, linear: LinearSolver, controls: int | None
 ) -> None:
     monkeypatch.setattr(checks, "free_memory", lambda: 2**10)
-    with pytest.raises(InputError, match=r"more memory than is free: expected [\d.]+ GiB, got 0\.0 GiB free"):
+    with pytest.raises(
+        InputError, match=r"more memory than is free: expected [\d.]+ GiB, got 0\.0 GiB free; fit .*controls=500"
+    ):
         dc.fit(rr_problem(5), dc.GaussNewton(linear=linear), dc.RK4(1), controls=controls)
 
 

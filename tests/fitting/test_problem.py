@@ -14,6 +14,7 @@ import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.problem import Problem, tangent
 from diffeo_calib.flows.integrators import RK4
+from diffeo_calib.regression.conditional import Process
 from diffeo_calib.robots import elastic_rr
 
 
@@ -92,6 +93,25 @@ def test_residuals_by_their_definitions(problem: Problem) -> None:
     covariance, error = problem.noise.covariance, problem.y - deformation.z1
     gap = p_end - torch.stack([torch.linalg.solve(c, r) for c, r in zip(covariance, error, strict=True)])
     assert problem.end_residual(deformation) == pytest.approx(float(gap.norm() / p_end.norm()), rel=1e-10)
+
+
+@every_problem
+def test_the_tangent_model_is_written_out_and_the_first_gauss_newton_iterate(problem: Problem) -> None:
+    """Its factor is that of G + R, its target y - k0."""
+    nominal, x, theta = problem.spec.nominal, problem.x, torch.zeros_like(problem.spec.prior_variance)
+    k0, dk0 = nominal(x, theta), torch.block_diag(*nominal.jacobian(x, theta))
+    z, S = k0.reshape(-1, problem.spec.task_dim), nominal.sensitivities(x, theta).flatten(0, 1)
+    G = dk0 @ problem.spec.joint_kernel.matrix(x, x) @ dk0.T + problem.spec.task_kernel.matrix(z, z)
+    expected = G + (S * problem.spec.prior_variance) @ S.T + torch.block_diag(*problem.noise.covariance)
+    regression = tangent(problem)
+    assert isinstance(regression.conditional, Process)
+    found = regression.conditional.about(regression.target)
+    torch.testing.assert_close(found.factor.matrix, expected, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(regression.target, problem.y - k0, rtol=0, atol=1e-15)
+    torch.testing.assert_close(found.mu, torch.linalg.solve(expected, (problem.y - k0).flatten()), rtol=1e-8, atol=1e-8)
+    first = dc.GaussNewton(max_iterations=1).solve(problem, RK4(2)).momenta
+    for actual, wanted in zip(first.tensors, regression.momenta().tensors, strict=True):
+        torch.testing.assert_close(actual, wanted, rtol=1e-8, atol=1e-9)
 
 
 def test_problem_takes_arrays_and_lists() -> None:
@@ -174,6 +194,10 @@ BAD: dict[str, tuple[dict[str, object], str]] = {
     "noise per coordinate": ({"noise": [0.1, 0.1]}, "`noise` has the wrong shape"),
     "asymmetric noise": ({"noise": asymmetric()}, "`noise`: expected symmetric positive definite.*first at row 3"),
     "indefinite noise": ({"noise": indefinite()}, "`noise`: expected symmetric.*first at row 2"),
+    "words as new noise": ({"new_noise": "x"}, "`new_noise` cannot be read as numbers"),
+    "new noise of 5 coordinates": ({"new_noise": torch.eye(5)}, r"`new_noise` has the wrong shape: expected \(2, 2\)"),
+    "asymmetric new noise": ({"new_noise": [[1.0, 0.5], [0.0, 1.0]]}, "`new_noise`: expected a symmetric positive"),
+    "indefinite new noise": ({"new_noise": [[1.0, 0.0], [0.0, -1.0]]}, "`new_noise`: expected a symmetric positive"),
     "nominal is no function": ({"nominal": 3}, "`nominal`: expected a function"),
     "nominal of another shape": (
         {"nominal": planar_two_markers},
@@ -222,26 +246,3 @@ def test_controls_equal_to_the_data_are_the_problem_itself() -> None:
     assert fit.energy == dc.fit(problem, integrator=dc.RK4(2)).energy
     assert not problem.with_controls(problem.x.clone()).reduced
     assert problem.with_controls(problem.x[:7]).reduced
-
-
-@pytest.mark.parametrize(
-    ("covariance", "message"),
-    [
-        ("x", "`new_noise` cannot be read as numbers"),
-        (torch.eye(5), r"`new_noise` has the wrong shape: expected \(2, 2\)"),
-        ([[1.0, 0.5], [0.0, 1.0]], "`new_noise`: expected a symmetric positive definite"),
-        ([[1.0, 0.0], [0.0, -1.0]], "`new_noise`: expected a symmetric positive definite"),
-    ],
-)
-def test_the_noise_of_a_new_measurement_is_checked(covariance: object, message: str) -> None:
-    x = elastic_rr.grid(3)
-    with pytest.raises(InputError, match=message):
-        dc.Problem(
-            elastic_rr.nominal,
-            x,
-            elastic_rr.real(x),
-            joint_kernel=K_V,
-            task_kernel=K_W,
-            noise=0.01,
-            new_noise=covariance,
-        )

@@ -11,11 +11,9 @@ from robots_bank import CHAINS, draw, every_chain
 from torch import Tensor
 from torch.testing import assert_close
 
-from diffeo_calib.common.errors import InputError
-from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.nominal import GeometryMap, PositionErrors
 from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.robots import Chain
-from diffeo_calib.robots.position_errors import PositionErrors
 
 N = 4
 
@@ -125,17 +123,3 @@ def test_an_axis_shifts_and_turns_the_frame_before_its_joint() -> None:
     found, theta = crooked(x, torch.cat([theta, c.flatten()])), torch.cat([theta, c.flatten()])
     assert_close(found, geometry.points(x, errors).flatten(1), rtol=0, atol=1e-13)
     assert_close(crooked.jacobian(x, theta), by_rows(crooked(x.requires_grad_(), theta), x), rtol=0, atol=1e-12)
-
-
-def test_waves_and_axes_that_cannot_be() -> None:
-    for waves in ((-1, 5.0), (0, 0.0), (0, float("nan"))):
-        with pytest.raises(InputError, match="waves of gears"):
-            PositionErrors((waves,))
-    for axis in ((-1, 0.0, 1.0, 2), (0, 1.0, 1.0, 2), (0, float("nan"), 1.0, 2), (0, 0.0, 1.0, 0)):
-        with pytest.raises(InputError, match="errors of axes"):
-            PositionErrors(axes=(axis,))
-    chain = CHAINS["arm"]
-    geometry = geometry_of(chain)
-    for own, what in ((PositionErrors(((chain.n, 5.0),)), "gear waves"), (PositionErrors((), ((9, 0, 1, 2),)), "axes")):
-        with pytest.raises(InputError, match=f"joints of {what}"):
-            GeometryMap(geometry, own=own)

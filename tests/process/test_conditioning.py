@@ -70,16 +70,16 @@ def test_predictions_are_those_of_the_whole_covariance(case: Case) -> None:
     first, second, new = cut(case)
     known = first.data.process(case.scales).given(second.numbers, second.noise)
     mean, covariance = noiseless(known, new)
-    count, R = len(case.data.x), case.data.told.y.shape[1]
+    count, R = len(case.data.x), case.data.size
     K = case.fields + case.unknowns @ torch.diag(case.variance) @ case.unknowns.T
-    noise = torch.block_diag(*case.data.told.weighted_noise(case.scales))
+    noise = torch.block_diag(*case.noise)
 
     def cells(part: Case, k: int) -> Tensor:
         return torch.arange(k, count, 3)[part.numbers.owner] * R + part.numbers.cells % R
 
     at, to = torch.cat([cells(first, 0), cells(second, 1)]), cells(new, 2)
     gain = torch.linalg.solve((K + noise)[at][:, at], K[at][:, to]).T
-    target = case.data.told.target.flatten()
+    target = case.data.target.flatten()
     close(mean, gain @ target[at], 1e-6)
     close(covariance, K[to][:, to] - gain @ K[at][:, to], 1e-6)
 

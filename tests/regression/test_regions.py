@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.stats import chi2, f
 
-from diffeo_calib.regression.regions import OTHER_DATE, REGION_PRIOR, region_scale
+from diffeo_calib.regression.regions import OTHER_DATE, SCALE_EFOLDS, region_scale
 
 
 def share(factor: float, squares: np.ndarray, k: int) -> float:
@@ -51,12 +51,12 @@ def test_few_errors_of_another_date_may_have_any_size() -> None:
     rng, new = np.random.default_rng(4), 50 * np.random.default_rng(5).chisquare(3, 20_000)
     few = [torch.from_numpy(50 * rng.chisquare(3, 10)) for _ in range(20)]
     own, other = (
-        np.mean([share(region_scale(each, 3, prior=p), new, 3) for each in few]) for p in (REGION_PRIOR, OTHER_DATE)
+        np.mean([share(region_scale(each, 3, efolds=p), new, 3) for each in few]) for p in (SCALE_EFOLDS, OTHER_DATE)
     )
     assert own < 0.93
     assert 0.94 < other < 0.985
     usual = torch.from_numpy(rng.chisquare(3, 10))
-    assert region_scale(usual, 3, prior=OTHER_DATE) == pytest.approx(region_scale(usual, 3), rel=0.15)
+    assert region_scale(usual, 3, efolds=OTHER_DATE) == pytest.approx(region_scale(usual, 3), rel=0.15)
 
 
 def test_repeats_with_shares_count_as_one() -> None:

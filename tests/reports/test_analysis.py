@@ -18,6 +18,7 @@ from diffeo_calib.reports.analysis import predictions
 from diffeo_calib.reports.analysis.findings import find
 from diffeo_calib.reports.analysis.predictions import SHARES, FitRows, Predictions, forecast
 from diffeo_calib.reports.analysis.stages import Deviations, repeats_of, stages_of
+from diffeo_calib.reports.html.sections import trust
 from diffeo_calib.reports.html.sentences import advice
 from diffeo_calib.reports.plots.errors import draw_before_after, draw_distributions
 from diffeo_calib.sensors.errors import Evaluation
@@ -107,7 +108,7 @@ def test_found_shares_of_a_perfect_model_are_the_claimed_ones(arm: Case) -> None
     factor = torch.linalg.cholesky(seen.covariance)
     draws = torch.randn(seen.away.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     perfect = seen.predicted + (factor @ draws[..., None])[..., 0]
-    exact = Predictions(seen.data, perfect, seen.predicted, seen.covariance, seen.errors, left_out=False)
+    exact = Predictions(seen.data, perfect, seen.predicted, seen.covariance, seen.errors)
     np.testing.assert_allclose([exact.coverage(share) for share in SHARES.tolist()], SHARES, atol=0.07)
     squares = exact.squares.flatten().numpy()
     assert exact.coverage(0.8) == np.mean(squares <= chi2.ppf(0.8, 3))
@@ -151,7 +152,7 @@ def test_stages_from_a_model_are_those_of_its_calibration(
 @pytest.mark.parametrize("name", ["arm", *(pytest.param(name, marks=pytest.mark.slow) for name in ("pair", "posed"))])
 def test_expected_errors_are_those_the_model_claims(name: str, request: pytest.FixtureRequest) -> None:
     case: Case = request.getfixturevalue(name)
-    found = Deviations.of(case.model).planned(case.model)
+    found = Deviations.of(case.model)
     if name == "posed":
         variance = case.model.predict_poses(found.q, noise=False)[1][:, :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1)
     else:
@@ -178,6 +179,7 @@ def test_outliers_and_moved_markers_are_named(arm: Case) -> None:
     points[17] += 0.005
     found = find(arm.model, dc.Measurements(test.q, points))
     assert [one.row for one in found.outliers] == [17]
+    assert trust(found).text[0].startswith("1 of 60 rows look wrong")
     assert found.moved == []
     turned = find(arm.model, dc.Measurements(test.q, test.points + torch.tensor([0.003, 0.0, 0.0])))
     assert any("measuring device" in text for text in turned.moved)
@@ -187,11 +189,11 @@ def test_rows_of_the_fit_are_left_out_of_new_rows(arm: Case) -> None:
     test = arm.test[:60]
     both = dc.Measurements.joined([arm.train, test])
     found = find(arm.model, both)
-    assert not found.predictions.left_out
+    assert found.new
     assert len(found.predictions) == len(test)
     assert found.errors["calibrated"].rms == pytest.approx(dc.evaluate(arm.model, test).rms)
     same = find(arm.model, arm.train)
-    assert same.predictions.left_out
+    assert not same.new
     assert len(same.predictions) == len(arm.train)
 
 
@@ -239,7 +241,7 @@ def test_rows_that_placed_a_model_are_not_new(arm: Case) -> None:
     shifted = dc.Measurements(test.q, test.points + torch.tensor([0.3, 0.1, -0.2]))
     registered = arm.model.registered(shifted[:12])
     assert len(find(registered, shifted).predictions) == len(shifted) - 12
-    assert find(registered, shifted[:12]).predictions.left_out
+    assert not find(registered, shifted[:12]).new
 
 
 def test_neighbours_and_copies_are_no_repeats(arm: Case) -> None:

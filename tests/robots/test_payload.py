@@ -59,17 +59,11 @@ def test_masses_are_counted_in_units() -> None:
 
 def test_wrong_payloads() -> None:
     arm = SimulatedArm().nominal
-    with pytest.raises(InputError, match="the link of the payload: expected flange, got wrist"):
-        laden(arm, link="wrist")
     with pytest.raises(InputError, match="payloads of 5 rows: expected one for each, got 3 configurations"):
         laden(arm).features(draw(3, 6))
     sag = laden(arm)
     with pytest.raises(InputError, match="a payload of every row"):
         sag.folded(draw(sag.size))
-    with pytest.raises(InputError, match="a payload of a rigid robot"):
-        GeometryMap(Geometry.nominal(arm, 1), payload=sag.payload)
-    with pytest.raises(InputError, match="the unit of a payload"):
-        Payload("flange", MASSES, 0.0)
 
 
 def test_a_payload_beside_the_flange_sits_where_it_is_said() -> None:
@@ -122,4 +116,4 @@ def test_a_map_of_payloads_at_rows_and_elsewhere() -> None:
 def test_payloads_of_rows_that_cannot_be(masses: Tensor, at: str | None, message: str) -> None:
     with pytest.raises(InputError, match=message):
         Payload.of_rows(SimulatedArm(0).nominal, masses, at)
-    assert Payload.of_rows(SimulatedArm(0).nominal, None, None) is None
+    assert not Payload.of_rows(SimulatedArm(0).nominal, None, None)

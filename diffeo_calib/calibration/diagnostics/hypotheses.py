@@ -49,7 +49,7 @@ class SampledRows(NamedTuple):
 
     def distances(self, effects: Tensor, u: Tensor) -> Tensor:
         """(N, B) motions, m, of the points, or numbers, of each row by unknowns (U,) with effects (N, R, U)."""
-        motion = self.data.in_coordinates(effects @ u)
+        motion = self.data.in_coordinates(effects) @ u
         return motion.unflatten(1, (-1, 3 if motion.shape[1] % 3 == 0 else motion.shape[1])).norm(dim=2)
 
     def likeliest_size(self, E: Tensor) -> tuple[float, float]:

@@ -130,8 +130,7 @@ def best_of(found: Iterable[Candidate], rows: SampledRows) -> Finding | None:
     fix, columns = best.fix, None
     if best.opens and moved < OPENED_M:
         fix += f"; the model holds for {best.opens}"
-        numbers = rows.process.numbers.in_table(best.columns).unbind(2)
-        columns = torch.stack([rows.data.in_coordinates(one) for one in numbers], 2)
+        columns = rows.data.in_coordinates(rows.process.numbers.in_table(best.columns))
         columns = OPENED_M * columns / columns[columns.any(2)].square().sum(1).mean().sqrt()
     return Finding(sentence(best.what, expected=best.expected, got=got, fix=fix), columns)
 

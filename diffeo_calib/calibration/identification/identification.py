@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from math import inf, nan, sqrt
 from typing import Any, NamedTuple
 
@@ -196,25 +195,6 @@ class Rows:
 
     geometry: Geometry  # the start
     parts: tuple[MeasuredPoints | ReadRows, ...]  # the rows of every kind
-    rigid: bool = False  # whether errors of joints and base stay zero, so that only the markers move on their tips
-
-    @cached_property
-    def tips(self) -> list[Tensor]:
-        """Poses (N, P, 4, 4) of the markers' tips at the rows of every part, without errors."""
-        return [self.geometry.marker_poses(own.q) for own in self.parts]
-
-    def points(self, theta: Tensor) -> list[Tensor]:
-        """The markers (N, P, 3) at the rows of every part, m."""
-        if not self.rigid:
-            return [self.geometry.points(own.q, theta) for own in self.parts]
-        tool = self.geometry.tool + theta[self.geometry.slices["tool"]].view(-1, 3)
-        return [(T[..., :3, :3] @ tool[..., None])[..., 0] + T[..., :3, 3] for T in self.tips]
-
-    def by_errors(self, theta: Tensor, root: Tensor) -> list[Tensor]:
-        """Derivatives (N, P, 3, f) of these by unknowns u, theta = root u."""
-        if not self.rigid:
-            return [self.geometry.sensitivities(own.q, theta) @ root for own in self.parts]
-        return [T[..., :3, :3] @ root[self.geometry.slices["tool"]].unflatten(0, (-1, 3)) for T in self.tips]
 
     @property
     def freedom(self) -> list[int]:
@@ -223,15 +203,15 @@ class Rows:
 
     def errors(self, theta: Tensor, shifts: Tensor) -> list[Tensor]:
         """Predicted minus measured numbers (N, B, d) of every part, m."""
-        each = zip(self.parts, self.points(theta), shifts.split(self.freedom), strict=True)
-        return [own.errors(points, own_shifts) for own, points, own_shifts in each]
+        each = zip(self.parts, shifts.split(self.freedom), strict=True)
+        return [own.errors(self.geometry.points(own.q, theta), some) for own, some in each]
 
     def slopes(self, theta: Tensor, shifts: Tensor, root: Tensor) -> list[Tensor]:
         """Derivatives of all numbers by the unknowns u (f,), theta = root u, then by all shifts."""
         sizes, found, f = self.freedom, [], root.shape[1]
-        each = zip(self.parts, self.points(theta), self.by_errors(theta, root), shifts.split(sizes), strict=True)
-        for place, (own, points, by_errors, own_shifts) in enumerate(each):
-            slopes = own.slopes(points, by_errors, own_shifts)
+        for place, (own, some) in enumerate(zip(self.parts, shifts.split(sizes), strict=True)):
+            by_errors = self.geometry.sensitivities(own.q, theta) @ root  # (N, P, 3, f) of the markers
+            slopes = own.slopes(self.geometry.points(own.q, theta), by_errors, some)
             around = sum(sizes[:place]), sum(sizes[place + 1 :])
             found.append(torch.cat([slopes[..., :f], torch.nn.functional.pad(slopes[..., f:], around)], 3))
         return found

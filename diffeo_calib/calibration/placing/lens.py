@@ -47,12 +47,8 @@ class CameraErrors(DeviceSet):
         """Those of the images of a table beside a model, none for other tables; arguments as of :meth:`of_table`."""
         return [cls(BoardCameras.of_rows(rows, one.seen_by), one) for one in data.shared_errors()]
 
-    @property
-    def size(self) -> int:
-        return self.shared.slopes.shape[2]
-
     def effects(self, data: Seen) -> Tensor:
-        found = data.y.new_zeros(*data.y.shape, self.size)
+        found = data.y.new_zeros(*data.y.shape, self.shared.slopes.shape[2])
         found[self.rows, : self.shared.slopes.shape[1]] = self.shared.slopes
         return found
 

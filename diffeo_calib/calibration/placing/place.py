@@ -82,20 +82,17 @@ class Told(NamedTuple):
     noise_model: NoiseModel
 
 
-class StackedRows(NamedTuple):
-    """N rows: what they report (N, R), m, zero where absent, how they were measured, and what that is of the points."""
-
-    y: Tensor
-    noise_model: NoiseModel
-    observe: Stacked
-
-
-def stacked(q: Tensor, own: Told | None, readings: Sequence[ReadingDevices], dim: int) -> StackedRows:
+def stacked(
+    q: Tensor, own: Told | None, readings: Sequence[ReadingDevices], dim: int
+) -> tuple[Tensor, NoiseModel, Stacked]:
     """Rows that tell coordinates, and readings of the last marker, in one layout.
 
     Args:
         q: (N, n) configurations of all rows. own: the rows that tell coordinates. readings: devices and their rows.
         dim: coordinates m of the points of a row.
+
+    Returns:
+        What they report (N, R), m, zero where absent, how they were measured, and what that is of the points.
     """
     N, size = len(q), max([one.data.values.shape[1] for one in readings] + ([own.noise_model.size] if own else []))
     bodies = own.noise_model.bodies if own else 1
@@ -121,8 +118,7 @@ def stacked(q: Tensor, own: Told | None, readings: Sequence[ReadingDevices], dim
         if one.data.std is not None:
             metres = one.devices.metres[one.device][:, None]
             known[one.rows[:, None], one.numbers, one.numbers] = (one.data.std * metres).square()
-    noise = NoiseModel(visible, kinds, known, modes, slack)
-    return StackedRows(y, noise, Stacked(N, bodies * size, dim, parts))
+    return y, NoiseModel(visible, kinds, known, modes, slack), Stacked(N, bodies * size, dim, parts)
 
 
 LOG = logging.getLogger(__name__)
@@ -182,9 +178,8 @@ class Placed:
         Args:
             fitted: the fit. fitted_map: its map, with the covariances of the model. chosen: its scales and rows.
         """
-        centre = chosen.data.points.unflatten(1, (-1, 3)).mean((0, 1))
-        here = torch.eye(4, dtype=centre.dtype, device=centre.device)
-        placement = self.placement.settled(fitted, fitted_map, centre, here, chosen=chosen)
+        here = torch.eye(4, dtype=chosen.data.y.dtype, device=chosen.data.y.device)
+        placement = self.placement.settled(fitted, fitted_map, chosen.data, here, chosen=chosen)
         own = self.coordinates
         if own is not None:
             table = with_markers(own.table, self.registration.geometry.markers)
@@ -203,7 +198,7 @@ class Placed:
         """The rows around the geometric calibration, weighted by its residuals; with effects (N, R, U) of unknowns."""
         geometry, theta = self.registration.geometry, self.identification.theta
         payload = Payload.of_rows(geometry.chain, self.data.payload, self.data.payload_at)
-        elastic = payload is not None or not is_cartesian(geometry.chain)
+        elastic = bool(payload) or not is_cartesian(geometry.chain)
         nominal = GeometryMap(geometry, elastic=elastic, payload=payload)
         theta = torch.cat([theta, theta.new_zeros(nominal.parameters - geometry.size)])
         data = self._rows(nominal, theta)
@@ -225,20 +220,14 @@ class Placed:
             away = model.with_payload(mass)(table.q).detach() - table.points
             labels.append(OtherLabel(f"a payload of {mass:g}", table.masses != mass, away.norm(dim=-1).nanmean(1)))
         errors = (seen - table.points).norm(dim=-1).nanmean(1)
-        fit = [flags & one.applies & (one.errors < gates.REMAINING_UNDER_LABEL * errors) for one in labels]
-        count, rows, label = max(
-            zip([int(one.sum()) for one in fit], fit, labels, strict=True),
-            key=lambda one: one[0],
-            default=(0, flags, None),
-        )
-        if label is None or count < gates.LABEL_ROWS:
+        fit = [(flags & one.applies & (one.errors < gates.REMAINING_UNDER_LABEL * errors), one) for one in labels]
+        rows, label = max(fit, key=lambda one: int(one[0].sum()), default=(flags, None))
+        if label is None or (count := int(rows.sum())) < gates.LABEL_ROWS:
             return None
         lines = few(table.line_numbers[rows.to(table.line_numbers.device)].tolist(), 5)
         before, after = (1e3 * float(each[rows].median()) for each in (errors, label.errors))
-        what, expected = (
-            f"{count} rows look wrong and fit {label.name}: lines {lines}",
-            "rows that fit under their own label",
-        )
+        what = f"{count} rows look wrong and fit {label.name}: lines {lines}"
+        expected = "rows that fit under their own label"
         got = f"median errors of {before:.3g} mm, and of {after:.3g} mm so"
         return sentence(what, expected=expected, got=got, fix="correct these labels")
 
@@ -291,12 +280,12 @@ class Placed:
                 return own
             weights[0], weighed = own.tails.weights, [self.coordinates.rows, *weighed]
             told = Told(self.coordinates.rows, own.y, own.noise_model)
-        rows = stacked(self.data.q, told, self.readings, 3 * nominal.geometry.markers)
-        every = self.data.q.new_ones(len(self.data), rows.noise_model.bodies)
+        y, noise, observe = stacked(self.data.q, told, self.readings, 3 * nominal.geometry.markers)
+        every = self.data.q.new_ones(len(self.data), noise.bodies)
         for some, each in zip(weighed, weights, strict=True):
             every[some, : each.shape[1]] = each
-        numbers = rows.y, rows.noise_model, Tails(found.freedom, every)
-        return TangentData(nominal, theta, self.data.q, *numbers, observe=rows.observe, beside=own)
+        numbers = y, noise, Tails(found.freedom, every)
+        return TangentData(nominal, theta, self.data.q, *numbers, observe=observe, beside=own)
 
     def _coordinates(self, nominal: GeometryMap, theta: Tensor, own: Coordinates) -> TangentData:
         """Rows that tell coordinates, of the markers that they show."""

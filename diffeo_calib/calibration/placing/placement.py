@@ -106,11 +106,6 @@ class DeviceSet(ABC):
         """The same devices with other rows (M,), each of one of them."""
         return replace(self, devices=replace(self.devices, rows=rows, device=device))
 
-    @property
-    @abstractmethod
-    def size(self) -> int:
-        """Number c of shifts that are not known."""
-
     @abstractmethod
     def effects(self, data: Seen) -> Tensor:
         """Uncertainty of the devices, as effects of unit variance that rows share: (N, R, c), m."""
@@ -180,14 +175,15 @@ class Placement(tuple[DeviceSet, ...]):
         """Effects of all devices, side by side: (N, R, c)."""
         return torch.cat([data.y.new_zeros(*data.y.shape, 0), *(own.effects(data) for own in self)], 2)
 
-    def settled(self, fitted: Fit, around: FittedMap, centre: Tensor, transform: Tensor, **known: Any) -> Placement:
+    def settled(self, fitted: Fit, around: FittedMap, data: Seen, transform: Tensor, **known: Any) -> Placement:
         """All devices where a fit puts them, whose last shifts are theirs.
 
         Args:
-            fitted: the fit. around: its map, with the covariances of the model.
-            centre, transform, known: see :class:`Settled`.
+            fitted: the fit. around: its map, with the covariances of the model. data: its rows.
+            transform, known: see :class:`Settled`.
         """
-        sets, shifts, sizes = list[DeviceSet](), fitted.shifts, [own.size for own in self]
+        sets, shifts, sizes = list[DeviceSet](), fitted.shifts, [own.effects(data).shape[2] for own in self]
+        centre = data.points.unflatten(1, (-1, 3)).mean((0, 1))
         whole = around.shift_covariance() if len(shifts) else shifts[:, None]
         numbers = torch.arange(len(shifts) - sum(sizes), len(shifts), device=shifts.device)
         for own, part in zip(self, numbers.split(sizes), strict=True):

@@ -33,7 +33,6 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.devices import Devices, Hypothesis, check_devices
 from diffeo_calib.sensors.kinds import kind_of
@@ -62,10 +61,6 @@ class ReadingDevices(DeviceSet):
     devices: Devices
     data: Readings
     frame: str
-
-    @property
-    def size(self) -> int:
-        return self.devices.freedom
 
     @property
     def numbers(self) -> Tensor:
@@ -141,8 +136,7 @@ def register_readings(bare: Geometry, tables: Sequence[Readings]) -> Identificat
     if best.worst[0] > most:
         warn_user(sentence(UNEXPLAINED, **best.said(most), fix=CHECK))
     noise = float(torch.cat([own.flatten() for own in best.errors]).square().mean().sqrt())
-    rows = Rows(best.stage.geometry, tuple(map(ReadRows, tables, best.stage.devices)), rigid=True)
-    return described(rows, [noise] * len(tables), adrift=True)
+    return described(best.rows, [noise] * len(tables), adrift=True)
 
 
 def rough_error(bare: Geometry, tables: Sequence[Readings]) -> float:
@@ -158,7 +152,7 @@ class RoughFit(NamedTuple):
     """
 
     worst: tuple[float, str]
-    stage: Identification
+    rows: Rows
     errors: list[Tensor]
 
     def said(self, most: float) -> dict[str, str]:
@@ -177,7 +171,7 @@ def _rough_fits(bare: Geometry, tables: Sequence[Readings], balls: Tensor) -> li
     found.sort(key=itemgetter(0))
     for best in found[:1]:  # a device may be lost where the ball was far away: all anew around the ball that was found
         with suppress(InputError):
-            found.append(_rough_fit(bare, tables, best.stage.geometry.tool[0]))
+            found.append(_rough_fit(bare, tables, best.rows.geometry.tool[0]))
     return sorted(found, key=itemgetter(0))
 
 
@@ -185,7 +179,7 @@ def _rough_fit(bare: Geometry, tables: Sequence[Readings], ball: Tensor) -> Roug
     """Ball and devices, from these in closed form around a ball (3,), errors of joints zero."""
     geometry = bare.with_tool(ball[None])
     devices = [kind_of(data).at(data, geometry.points(data.q)[:, 0]) for data in tables]
-    rows = Rows(geometry, tuple(map(ReadRows, tables, devices)), rigid=True)
+    rows = Rows(geometry, tuple(map(ReadRows, tables, devices)))
     sigma = torch.full((sum(map(len, tables)),), ROUGH_M, dtype=torch.float64, device=HOST)
     root = Prior().root(geometry, range(geometry.slices["tool"].start))
     fit = solve(rows, sigma, root, max_nfev=STARTS_STEPS, loss="soft_l1")
@@ -194,7 +188,10 @@ def _rough_fit(bare: Geometry, tables: Sequence[Readings], ball: Tensor) -> Roug
         for data, errors in zip(tables, fit.errors, strict=True)
         for number, name in enumerate(data.names)
     )
-    return RoughFit(worst, rows.found(fit, ROUGH_M, Prior(), Tails(inf, torch.ones_like(sigma))), fit.errors)
+    moved = (
+        one for own, some in zip(rows.parts, fit.shifts.split(rows.freedom), strict=True) for one in own.devices(some)
+    )
+    return RoughFit(worst, Rows(geometry.absorb(fit.theta), tuple(map(ReadRows, tables, moved))), fit.errors)
 
 
 def ball_of(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Geometry | None:

@@ -156,11 +156,6 @@ class Sessions(DeviceSet):
         session = session.to(points.device)
         return torch.cat([own * (session == number)[:, None, None] for number in self.others], dim=2)
 
-    @property
-    def size(self) -> int:
-        """Numbers of each session but the reference."""
-        return len(self.others) * self.devices.increments_each
-
     def effects(self, data: Seen) -> Tensor:
         places, by_tool = data.points.unflatten(1, (-1, 3)), data.by_tool[..., : 3 * self.markers]
         centre = places.mean((0, 1)) if self.centre is None else self.centre
@@ -235,11 +230,6 @@ class Drift(DeviceSet):
         ends = values.amin(0), values.amax(0), *values.new_zeros(3, len(nothing))
         known = KnownDrift(data.covariate_names, torch.cat([torch.stack(ends, 1), nothing], 1), nothing, joints=joints)
         return [cls(known, known.ramp(data), data.q)]
-
-    @property
-    def size(self) -> int:
-        """Shift, turn, growth and joint offsets for each column."""
-        return self.devices.sizes.numel()
 
     def effects(self, data: Seen) -> Tensor:
         places = data.points.unflatten(1, (-1, 3))

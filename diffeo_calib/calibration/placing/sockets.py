@@ -146,10 +146,6 @@ class SocketDevices(DeviceSet):
         there = {"socket": nearest, "sockets": self.sockets}
         return Elsewhere(away < IN_SOCKET_M, self.positions, lambda copies: with_attributes(copies, **there))
 
-    @property
-    def size(self) -> int:
-        return self.root.shape[1]
-
     def hypotheses(self, data: Seen) -> Iterator[Hypothesis]:
         fix = "measure the distance again, and check the unit of the positions and the scale of the device"
         for block in self.sockets.blocks:
@@ -323,7 +319,7 @@ def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> 
     wide = torch.eye(places.shape[2], dtype=places.dtype, device=places.device)
     noise, every = seen.new_noise[-3:, -3:].expand(N, -1, -1), torch.ones_like(predicted, dtype=torch.bool)
     rows = LinearRows(middles - predicted, places, own, noise, every, wide, wide[0] * 0.0, wide * 0.0)
-    squares = (rows.solved * rows.left_out).sum(1).masked_fill(~judged, torch.nan)
+    squares = rows.left_out_squares.masked_fill(~judged, torch.nan)
     bad = torch.zeros(N, model.markers, dtype=torch.bool, device=own.device)
     bad[:, -1] = excluded(squares, torch.full_like(squares, 3.0), least=0.0)
     distances = rows.left_out.norm(dim=1)[:, None].expand(-1, model.markers)

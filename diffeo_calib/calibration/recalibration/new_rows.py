@@ -156,17 +156,17 @@ class NewSetUp:
         readings = reading_sets(self.readings, devices)
         if told is not None and len(told.rows) == len(seen):
             return told.y, None, told.noise_model, of_told, Placement(sets)
-        rows, old = stacked(self.data.q, told, readings, seen.shape[1]), self.fitted.noise
+        (y, sensor, observe), old = stacked(self.data.q, told, readings, seen.shape[1]), self.fitted.noise
         variance = old.covariance.diagonal(dim1=1, dim2=2)[old.visible].median()  # of what was measured, m^2
-        total = torch.diag_embed(variance.expand_as(rows.y))
+        total = torch.diag_embed(variance.expand_as(y))
         if told is not None:
             own, size = total[told.rows], of_told.shape[1]
             own[:, :size, :size] = of_told
             total[told.rows] = own
-        if rows.noise_model.stated:
-            total = larger(total, rows.noise_model.known)
-        sensor = rows.noise_model.without_known
-        return rows.y, rows.observe, sensor, without_hidden(total, sensor.visible), Placement((*sets, *readings))
+        if sensor.stated:
+            total = larger(total, sensor.known)
+        sensor = sensor.without_known
+        return y, observe, sensor, without_hidden(total, sensor.visible), Placement((*sets, *readings))
 
     def _coordinates(
         self, own: Coordinates, T: Tensor, seen: Tensor, usual: UsualNoise
@@ -350,7 +350,7 @@ class NewRows:
         dim = self.noise_model.freedom
         if (weights := gross_weights(squares, dim)) is not None:  # gross rows are named, and say nothing of the robot
             squares = squares.masked_fill(weights < OUTLIER_WEIGHT, torch.nan)
-        return max(1.0, region_scale(squares, dim, prior=OTHER_DATE))
+        return max(1.0, region_scale(squares, dim, efolds=OTHER_DATE))
 
     @property
     def placed_residual(self) -> Tensor:
@@ -367,8 +367,7 @@ class NewRows:
     @property
     def excess(self) -> float:
         """Root mean square of the left-out errors of the better half of the rows in units of the expected ones."""
-        squares = (self.given.solved * self.given.left_out).nansum(1) / self.given.visible.sum(1)
-        return float(squares.median().sqrt())
+        return float((self.given.left_out_squares / self.visible.sum(1)).median().sqrt())
 
     def by_kind(self, errors: Tensor) -> Evaluations:
         """Errors (M, R) of the numbers of all rows, m, NaN where nothing was measured, in the unit of each kind."""

@@ -220,7 +220,7 @@ def _of_rows(by_row: NominalMap | None, after: GeometryMap) -> NominalMap | None
     if isinstance(by_row, SessionMarkers):
         tools = torch.cat([by_row.tools, after.geometry.tool[-1:].expand(len(by_row.tools), 1, 3)], 1)
         return SessionMarkers(after.with_payload(by_row.load), by_row.session, tools)
-    return after.with_payload(by_row.payload) if isinstance(by_row, GeometryMap) else by_row
+    return after.with_payload(by_row.load) if isinstance(by_row, GeometryMap) else by_row
 
 
 Marker = Literal["evidence", "same", "moved", "other"]

@@ -201,7 +201,7 @@ def _sessions(tool: Tensor, new: NewRows, newest: GeometryMap) -> SessionMarkers
         session, tools, by_row = by_row.session, by_row.tools, by_row.nominal
     latest = torch.full((len(new.q),), len(tools), dtype=torch.int64, device=x.device)
     if isinstance(by_row, GeometryMap):
-        newest = newest.under(joined_masses(by_row.payload, new.marks.fitted.payload))
+        newest = newest.under(joined_masses(by_row.load, new.marks.fitted.load))
     return SessionMarkers(newest, torch.cat([session, latest]), torch.cat([tools, newest.geometry.tool[None]]))
 
 

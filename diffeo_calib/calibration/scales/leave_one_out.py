@@ -40,8 +40,6 @@ from diffeo_calib.regression.regions import region_factor, region_scale
 
 BLOCK_COORDINATES = KEPT_COORDINATES
 """Measured coordinates of one block: a few hundred poses predict another pose nearly as well as thousands do."""
-KEPT_BLOCKS = 4 * BLOCK_COORDINATES
-"""Measured coordinates up to which blocks are kept with their covariances, which all weights have in common."""
 ROUNDS = 8
 """Largest number of steps of expectation maximisation."""
 WEIGHT_CHANGE = 0.01
@@ -82,15 +80,15 @@ def weighed(data: TangentData, scales: Hyperparameters, seed: int = 0) -> Tangen
     Args:
         data: the measurements, with the weights to begin with. scales: held fixed. seed: draws the blocks.
     """
-    told, tails = data.told, data.tails
+    tails = data.tails
     for _ in range(ROUNDS):
         squares = torch.empty_like(tails.weights)
-        for rows, part in _parts(told, seed):
+        for rows, part in _parts(data, seed):
             squares[rows] = _expected_squares(part, scales, tails.rows(rows))
-        before, tails = tails, reweight(squares, told.noise_model.freedom)
+        before, tails = tails, reweight(squares, data.noise_model.freedom)
         if _settled(before, tails):
             break
-    return data.with_tails(_among_gross(told, scales, tails, seed))
+    return data.with_tails(_among_gross(data, scales, tails, seed))
 
 
 def _among_gross(data: TangentData, scales: Hyperparameters, tails: Tails, seed: int) -> Tails:
@@ -112,16 +110,17 @@ def _settled(before: Tails, after: Tails) -> bool:
 
 def leave_one_out(data: TangentData, scales: Hyperparameters, seed: int = 0) -> LeaveOneOut:
     """Leave-one-out errors in closed form; arguments as of :func:`weighed`."""
-    told = data.told
-    errors, squares = torch.empty_like(told.y), torch.empty_like(told.tails.weights)
-    effective = []
-    for rows, part in _parts(told, seed):
+    errors, squares = torch.empty_like(data.y), torch.empty_like(data.tails.weights)
+    effective, count = [], 0
+    for rows, part in _parts(data, seed):
         every = torch.arange(len(rows), device=rows.device)
         errors[rows], squares[rows] = left_out_rows(part, scales, every, part.noise(scales))
-        inverse = part.numbers(scales).blocks(part.process(scales).inverse)
-        effective.append(part.coordinates - float((part.weighted_noise(scales) * inverse).sum()))
-    errors = data.in_coordinates(errors).masked_fill(~data.visible, nan)
-    return LeaveOneOut(errors, squares, effective[0] if len(effective) == 1 else None, told.coordinates)
+        process = part.process(scales)
+        noise = float((part.noise_of_numbers(scales) * process.numbers.blocks(process.inverse)).sum())
+        effective.append(len(process.mu) - noise)
+        count += len(process.mu)
+    errors = errors.masked_fill(~data.visible, nan)
+    return LeaveOneOut(errors, squares, effective[0] if len(effective) == 1 else None, count)
 
 
 def variance_ratio(data: TangentData, left_out: LeaveOneOut) -> float:
@@ -130,23 +129,13 @@ def variance_ratio(data: TangentData, left_out: LeaveOneOut) -> float:
 
 
 def _parts(data: TangentData, seed: int) -> Iterator[tuple[Tensor, TangentData]]:
-    """Row numbers and data of random blocks of about equal size, each with about so many coordinates at most.
-
-    A single one is the data themselves, with the matrices that they keep; a few are kept with the data.
-    """
-    count, every = -(-data.y.numel() // BLOCK_COORDINATES), torch.arange(len(data.x), device=data.x.device)
+    """Row numbers and data of random blocks of about equal size; a single one is the data, with what they keep."""
+    count = -(-len(data.x) * data.size // BLOCK_COORDINATES)
     if count == 1:
-        yield every, data
+        yield torch.arange(len(data.x), device=data.x.device), data
         return
-    parts = vars(data).setdefault("blocks", {})
-    if seed not in parts:
-        order = torch.randperm(len(data.x), generator=seeded(seed), device=HOST)
-        found = ((rows, data.rows(rows)) for rows in order.to(every.device).tensor_split(count))
-        if data.y.numel() > KEPT_BLOCKS:
-            yield from found
-            return
-        parts[seed] = list(found)
-    yield from parts[seed]
+    order = torch.randperm(len(data.x), generator=seeded(seed), device=HOST).to(data.x.device)
+    yield from ((rows, data.rows(rows)) for rows in order.tensor_split(count))
 
 
 def _expected_squares(part: TangentData, scales: Hyperparameters, tails: Tails) -> Tensor:
@@ -154,8 +143,8 @@ def _expected_squares(part: TangentData, scales: Hyperparameters, tails: Tails) 
     part.expected(scales)  # the same for all weights
     data = part.with_tails(tails)
     process, noise = data.process(scales), data.weighted_noise(scales)
-    inverse = process.numbers.blocks(process.inverse)
-    residual = noise @ process.numbers.in_table(process.mu)[:, :, None]
+    inverse = data.blocks_in_coordinates(process.numbers.blocks(process.inverse))
+    residual = noise @ data.in_coordinates(process.numbers.in_table(process.mu)[:, :, None])
     moments = residual @ residual.mT + noise - noise @ inverse @ noise
     return data.noise_model.squares(data.noise(scales), moments)
 
@@ -169,8 +158,8 @@ def left_out_rows(data: TangentData, scales: Hyperparameters, part: Tensor, new:
     """
     process, own = data.process(scales), data.weighted_noise(scales)
     errors, covariance = process.left_out(part[process.numbers.owner])
-    errors = process.numbers.in_table(errors)
-    predicted = process.numbers.blocks(covariance) - own + new
+    errors = data.in_coordinates(process.numbers.in_table(errors)[:, :, None])[:, :, 0]
+    predicted = data.blocks_in_coordinates(process.numbers.blocks(covariance)) - own + new
     predicted = torch.where(part[:, None, None] < 0, own, predicted)
     return errors, data.noise_model.squares(predicted, errors[:, :, None] * errors[:, None])
 
@@ -300,4 +289,4 @@ def left_out_squares(data: TangentData, scales: Hyperparameters, part: Tensor) -
 
     NaN for hidden markers, and for rows of no part.
     """
-    return left_out_rows(data.told, scales, part, data.blocks_in_numbers(data.noise_of_new_rows(scales)))[1]
+    return left_out_rows(data, scales, part, data.noise_of_new_rows(scales))[1]

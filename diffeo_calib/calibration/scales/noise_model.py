@@ -135,12 +135,6 @@ class NoiseModel:
         """
         return block_diagonal(torch.linalg.qr(self.modes).Q) if self.of_poses else None
 
-    def along(self, basis: Tensor) -> NoiseModel:
-        """That of six numbers of every pose, those of :attr:`rigid_basis`."""
-        modes = torch.linalg.qr(self.modes).Q.mT @ self.modes
-        visible = self.seen.repeat_interleave(FREEDOM_OF_POSES, 1)
-        return replace(self, modes=modes, known=basis.mT @ self.known @ basis, visible=visible)
-
     @cached_property
     def all_visible(self) -> bool:
         """Whether every number was measured."""

@@ -107,7 +107,7 @@ def select(
                 lengths = {"coupled_lengthscale": SHORT * centre.coupled_lengthscale}
                 noise = {"joint_noise": SHORT * centre.joint_noise, "sensor_noise": SHORT * centre.sensor_noise}
                 starts.append(replace(centre, **lengths, **noise))
-            wanted = int(FIRST * (FIRST_COORDINATES / subset.target.numel()) ** 2)
+            wanted = int(FIRST * (FIRST_COORDINATES / subset.y.numel()) ** 2)
             search.climb(starts, iterations or min(max(wanted, FEWEST_FIRST), MOST_FIRST))
     except KeyboardInterrupt:
         return Selection(search.best, "search interrupted, the best so far are kept", interrupted=True)
@@ -136,7 +136,7 @@ def log_posterior(logarithms: Tensor, centre: Hyperparameters, data: TangentData
     numbers, pairs, point = data.numbers(centre), data.pairs, logarithms.detach().clone().requires_grad_()
     with torch.enable_grad():
         scales = centre.from_logarithms(point)
-        noise = data.told.weighted_noise(scales)
+        noise = data.noise_of_numbers(scales)
         variance, values = data.unknowns_variance(scales), pairs.values(scales)
     F, S = numbers.with_noise(pairs.matrix(values), noise.detach()), numbers.S
     wide = variance.detach() * S.square().amax(0) > LARGEST_GAIN * F.diagonal().min()

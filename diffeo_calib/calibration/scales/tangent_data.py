@@ -19,17 +19,16 @@ from torch import Tensor
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.kernels.spaces import Space
-from diffeo_calib.kinematics.nominal import GeometryMap, rigid_motions
+from diffeo_calib.kinematics.nominal import GeometryMap, PositionErrors, rigid_motions
 from diffeo_calib.maps.deformation import ModelSpec
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity, Numbers
 from diffeo_calib.maps.noise import without_hidden
-from diffeo_calib.maps.observation import LinearFunctionals, Observation
+from diffeo_calib.maps.observation import Observation
 from diffeo_calib.process.scales import Hyperparameters, Pairs
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.conditional import BeforeData, Features, Process
 from diffeo_calib.regression.regions import region_factor
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.robots.position_errors import PositionErrors
 
 T = TypeVar("T")
 HELD_VARIANCE = 1e-18
@@ -118,8 +117,9 @@ class TangentData:
 
     @cached_property
     def target(self) -> Tensor:
-        """(N, m) measured minus model at zero fields and zero theta, m."""
-        return self.y - self.values + self.sensitivities @ self.theta
+        """(N, r) of what rows tell, measured minus model at zero fields and zero theta, m."""
+        away = (self.y - self.values)[:, :, None]
+        return (self.in_numbers(away) + self.motions_in_numbers(self.sensitivities) @ self.theta[:, None])[:, :, 0]
 
     @property
     def visible(self) -> Tensor:
@@ -135,42 +135,37 @@ class TangentData:
 
     @cached_property
     def basis(self) -> Tensor | None:
-        """(N, m, r) orthonormal columns of the numbers of :attr:`told`; None where these are those of the rows."""
+        """(N, m, r) orthonormal columns of the numbers that rows tell; None where these are those of the rows.
+
+        Of every pose six numbers, m, for nine coordinates of its points. These are exactly rigid, and those of k0 are.
+        Only psi would bend them, by less than the slack of the noise model, so that the other three numbers hardly say
+        anything; matrices are 2.25 times as large with them, and their factors 3.4 times as dear.
+        """
         return None if self.observe is not None else self.noise_model.rigid_basis
 
-    @cached_property
-    def told(self) -> TangentData:
-        """The same rows with all that they tell: of every pose six numbers, m, for nine coordinates of its points.
-
-        The points of a measured pose are exactly rigid, and those of k0 are. Only psi would bend them, by less than the
-        slack of the noise model, so that the other three numbers hardly say anything; matrices are 2.25 times as large
-        with them, and their factors 3.4 times as dear.
-        """
-        basis = self.basis
-        if basis is None:
-            return self
-        to = basis.mT
-        numbers = {"y": self.in_numbers(self.y), "noise_model": self.noise_model.along(basis)}
-        numbers["shared"] = to @ self.shared
-        observe, nominal = LinearFunctionals(to), self.nominal.changed(rigid=True)
-        other = replace(self, **numbers, observe=observe, nominal=nominal)
-        vars(other).update(points=self.points, jacobian=to @ self.jacobian)
-        return other
+    @property
+    def size(self) -> int:
+        """r."""
+        return self.y.shape[1] if self.basis is None else self.basis.shape[2]
 
     def in_numbers(self, values: Tensor) -> Tensor:
-        """Values of all coordinates (N, m) as those of :attr:`told`: (N, r)."""
-        return values if self.basis is None else (self.basis.mT @ values[:, :, None])[:, :, 0]
+        """Values of all coordinates (N, m, U) as those of the numbers: (N, r, U)."""
+        return values if self.basis is None else self.basis.mT @ values
 
-    def in_coordinates(self, numbers: Tensor) -> Tensor:
-        """The inverse of :meth:`in_numbers`, for rigid motions: (N, r) -> (N, m)."""
-        return numbers if self.basis is None else (self.basis @ numbers[:, :, None])[:, :, 0]
+    def in_coordinates(self, values: Tensor) -> Tensor:
+        """The inverse of :meth:`in_numbers`, for rigid motions: (N, r, U) -> (N, m, U)."""
+        return values if self.basis is None else self.basis @ values
 
     def blocks_in_numbers(self, blocks: Tensor) -> Tensor:
-        """Covariances of all coordinates (N, m, m) as those of :attr:`told`: (N, r, r)."""
+        """Covariances of all coordinates (N, m, m) as those of the numbers: (N, r, r)."""
         return blocks if self.basis is None else self.basis.mT @ blocks @ self.basis
 
+    def blocks_in_coordinates(self, blocks: Tensor) -> Tensor:
+        """The inverse of :meth:`blocks_in_numbers`, for rigid motions: (N, r, r) -> (N, m, m)."""
+        return blocks if self.basis is None else self.basis @ blocks @ self.basis.mT
+
     def motions_in_numbers(self, motions: Tensor) -> Tensor:
-        """Derivatives of all coordinates (N, m, U) in those of :attr:`told` (N, r, U), less what bends poses of k0.
+        """Derivatives of all coordinates (N, m, U) in those of the numbers (N, r, U), less what bends poses of k0.
 
         What bends it would look like a turn where the measured pose is turned against k0: by the very error of the row.
         """
@@ -221,22 +216,17 @@ class TangentData:
     def with_tails(self, tails: Tails) -> TangentData:
         """The same measurements with other weights."""
         other = self._variant(tails=tails)
-        same = vars(self).keys() & {"pairs", "_numbers", "_expected"}
+        same = vars(self).keys() & {"basis", "pairs", "_numbers", "_expected"}
         vars(other).update({name: vars(self)[name] for name in same})
-        blocks = vars(self).get("blocks", {})  # of calibration/scales/leave_one_out.py
-        kept = {key: [(rows, own.with_tails(tails.rows(rows))) for rows, own in each] for key, each in blocks.items()}
-        vars(other)["blocks"] = kept
-        told = vars(self).get("told")
-        if told is not None and told is not self:
-            vars(other).update(basis=self.basis, told=told.with_tails(tails))
         return other
 
     def with_position_errors(self, scales: Hyperparameters) -> TangentData:
         """The same measurements around a map with these gear lines and axes, which add nothing yet."""
         own = PositionErrors(tuple((line.joint, line.frequency) for line in scales.lines), scales.axes)
         nominal = self.nominal.changed(own=own)
-        smooth = self.theta[: nominal.sag.stop]
-        other = self._variant(nominal=nominal, theta=torch.cat([smooth, smooth.new_zeros(sum(own.sizes))]))
+        theta = self.theta.new_zeros(nominal.parameters)
+        theta[: nominal.sag.stop] = self.theta[: nominal.sag.stop]
+        other = self._variant(nominal=nominal, theta=theta)
         vars(other).pop("sensitivities", None)
         return other
 
@@ -280,6 +270,10 @@ class TangentData:
         """R_i with the weights of the tails: (N, m, m), m^2."""
         return self.noise_model.weighted(self.noise(scales), self.tails)
 
+    def noise_of_numbers(self, scales: Hyperparameters) -> Tensor:
+        """The same of what rows tell: (N, r, r), m^2."""
+        return self.blocks_in_numbers(self.weighted_noise(scales))
+
     def noise_of_any_row(self, scales: Hyperparameters) -> Tensor:
         """Covariance (m, m) of a new measurement of all coordinates, m^2, see :meth:`NoiseModel.typical`.
 
@@ -310,16 +304,19 @@ class TangentData:
         """All that the rows tell; the shifts that they share are the last unknowns."""
 
         def told() -> Numbers:
-            own = self.told
-            at = own.linearisation(scales).with_columns(own.shared, own.sensitivities.shape[2])
-            return Numbers.of(at, own.target, own.visible)
+            S, at = self.motions_in_numbers(self.sensitivities), self.linearisation(scales)
+            at = at if self.basis is None else replace(at.projected(self.basis.mT), sensitivity=S)
+            shown = self.visible
+            if self.basis is not None:
+                shown = self.noise_model.seen.repeat_interleave(self.size // self.noise_model.bodies, 1)
+            return Numbers.of(at.with_columns(self.in_numbers(self.shared), S.shape[2]), self.target, shown)
 
         return self._kept("_numbers", scales, told)
 
     @cached_property
     def pairs(self) -> Pairs:
         """The covariance of the numbers by the fields, hidden ones too, for many scales."""
-        return Pairs(self.x, self.points, self.told.jacobian, self.told.slopes, self.space)
+        return Pairs(self.x, self.points, self.in_numbers(self.jacobian), self.in_numbers(self.slopes), self.space)
 
     def unknowns_variance(self, scales: Hyperparameters) -> Tensor:
         """(K,) prior variances of theta and of the shifts."""
@@ -337,8 +334,8 @@ class TangentData:
         """What is known by these rows with their weights."""
 
         def given() -> Process:
-            noise = self.told.weighted_noise(scales)
-            return self.prior(scales).given(self.numbers(scales), noise, self.expected(scales))
+            noise, at = self.noise_of_numbers(scales), self.expected(scales)
+            return self.prior(scales).given(self.numbers(scales), noise, at)
 
         return self._kept("_process", scales, given)
 
@@ -349,6 +346,6 @@ class TangentData:
             return last[1]
         vars(self)[name] = None  # before there are two
         value = compute()
-        if self.y.numel() <= KEPT_COORDINATES:
+        if len(self.x) * self.size <= KEPT_COORDINATES:
             vars(self)[name] = scales, value
         return value

@@ -49,7 +49,6 @@ class Live:
     given: CampaignOptions
     table: GrowingTable = field(init=False)  # the file
     columns: Columns = field(init=False)  # those of its joints
-    owner: list[int] = field(default_factory=list)  # the line of each row
     lines: list[bytes] = field(default_factory=list)  # all that were judged
     waiting: list[bytes] = field(default_factory=list)  # those that were there at the start and were not
     said: list[tuple[bool, bool]] = field(default_factory=list)  # whether each row is accepted, and to be repeated
@@ -100,8 +99,7 @@ class Live:
         for entry in self.journal.entries:
             if "row" in entry:
                 verdicts[entry["row"]] |= {name: entry[name] for name in KEPT if name in entry}
-        readable = [line for line, entry in zip(lines, known, strict=False) if "rows" in entry]
-        self.owner = [number for number, entry in enumerate(known) for _ in entry.get("rows", [])]
+        readable = [line if "rows" in entry else b"\n" for line, entry in zip(lines, known, strict=False)]
         if verdicts:
             self.campaign.resume(self._read(readable), [Verdict(row, **one) for row, one in enumerate(verdicts)])
             self.say(f"going on after {len(known)} lines{expected(self.campaign)}", self.state())
@@ -180,7 +178,7 @@ class Live:
         """Do what a user decided about the rows of a line; InputError for no such line or decision."""
         if what not in DECISIONS:
             raise InputError.of("a decision about a row", expected=f"one of {few(DECISIONS)}", got=str(what))
-        rows = [row for row, owner in enumerate(self.owner) if owner + 2 == line]
+        rows = [one.row for one in self.campaign.verdicts if one.line == line]
         if not rows:
             numbers = f", 2 to {len(self.lines) + 1}" if self.lines else "; there is none yet"
             expected = f"a line of {self.source.csv} with a row{numbers}"
@@ -210,7 +208,6 @@ class Live:
         try:
             verdicts = self.campaign.add(self._read([line], first=number))
             entry["rows"] = [{name: getattr(one, name) for name in KEPT} for one in verdicts]
-            self.owner += [number] * len(verdicts)
         except DiffeoCalibError as error:
             entry["unreadable"] = self.unreadable[number] = str(error)
         self._keep(line)
@@ -233,12 +230,11 @@ class Live:
 
     def answer(self, number: int) -> Entry:
         """Outcome of a line."""
-        known, found = self.campaign.verdicts, dict[str, Any](line=number + 2)
+        known, found = self.campaign.verdicts, {"line": number + 2}
         if number in self.unreadable:
             return found | {"error": f"line {number + 2} left out: {self.unreadable[number]}"}
-        rows = [row for row, owner in enumerate(self.owner) if owner == number]
-        found = known[rows[0]].entry() | found
-        found["text"] = "\n".join(str(known[row]) for row in rows)
+        own = [one for one in known if one.line == number + 2]
+        found = own[0].entry() | found | {"text": "\n".join(map(str, own))}
         revised, self.late = dict.fromkeys([*self.late, *self.revised]), []
         return found | {"revised": [{"line": known[row].line, "accepted": known[row].accepted} for row in revised]}
 
@@ -321,8 +317,8 @@ def run(given: CampaignOptions) -> None:
         code = _followed(live, given, inbox, page)
         _end(live)
     if given.accepted is not None:
-        numbers = dict.fromkeys(live.owner[row] for row in campaign.accepted)
-        write_whole(given.accepted, live.table.header + b"".join(live.lines[number] for number in numbers))
+        numbers = dict.fromkeys(campaign.verdicts[row].line for row in campaign.accepted)
+        write_whole(given.accepted, live.table.header + b"".join(live.lines[number - 2] for number in numbers))
     if code:
         raise typer.Exit(code)
 

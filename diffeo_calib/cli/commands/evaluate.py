@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics.outliers import outlier_lines
 from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge
 from diffeo_calib.cli import models, printed
 from diffeo_calib.cli.console import out, plain, progress_bar, say
@@ -90,7 +91,7 @@ def run(options: EvaluateOptions) -> None:
         raise MeasurementError(judged.refusal)
     positions = 0 if found.positions is None else len(found.positions.errors)
     which = "rows" if judged.rows == positions else f"rows, evenly chosen of {positions},"
-    say(*printed.outlier_lines(judged.outliers, judged.rows, which))
+    say(*outlier_lines(judged.outliers, judged.rows, which))
     for text in judged.causes:
         warn_user(text)
     if limit is not None:
@@ -106,7 +107,12 @@ def _show(model: CalibratedKinematics, found: Evaluations, used: Tensor, seen: M
         of_rows = {"in all": errors}
         if own.any() and not own.all():
             of_rows |= {"used in the fit": errors.rows(own), "not used in the fit": errors.rows(~own)}
-        of_devices, what = _by_device(errors), "session" if positions else "device"
+        of_devices, what = dict[str, Evaluation](), "session" if positions else "device"
+        present = [one for one in dict.fromkeys(errors.devices) if one and errors.what != SPREAD]
+        if errors.what != READINGS or len(present) > 1:
+            for one in present:  # sockets have no errors of their own
+                mask = torch.tensor([device == one for device in errors.devices], dtype=torch.bool, device=HOST)
+                of_devices[one] = errors.rows(mask)
         expected = expected_rms(model, seen, errors.errors.shape[1]) if positions and seen is not None else None
         labels = of_rows | {f"of {what} '{plain(device)}'": some for device, some in of_devices.items()}
         rows = {(f"{some.count} {label}",): some for label, some in labels.items()}
@@ -114,15 +120,6 @@ def _show(model: CalibratedKinematics, found: Evaluations, used: Tensor, seen: M
         entries = {label.replace("in all", "all").replace(" ", "_"): some for label, some in of_rows.items()}
         named[kind] = entries | ({f"in_{what}s": of_devices} if of_devices else {})
     record.add(files={}, **entries_by_kind(named))
-
-
-def _by_device(errors: Evaluation) -> dict[str, Evaluation]:
-    """The errors of each set-up, or of each of several devices; sockets have no errors of their own."""
-    present = [name for name in dict.fromkeys(errors.devices) if name] if errors.what != SPREAD else []
-    if errors.what == READINGS and len(present) < 2:
-        return {}
-    masks = {name: [own == name for own in errors.devices] for name in present}
-    return {name: errors.rows(torch.tensor(mask, dtype=torch.bool, device=HOST)) for name, mask in masks.items()}
 
 
 def _residuals(found: Evaluations, used: Tensor, source: MeasuredTable) -> Iterator[list[float | str]]:
@@ -201,7 +198,12 @@ def run_predict(given: PredictOptions) -> None:
     """
     kinematics, output = models.load_kinematics(given.model), given.output
     say(*models.provenance_lines(kinematics))
-    table = of_robot(_written_as_read(kinematics, given), kinematics.robot)
+    units = {name: getattr(given, name) for name in Units.names()}
+    typed = Rows(**units, convention=given.convention, rotation_angle=given.rotation_angle, payload=given.payload)
+    read = models.as_fitted(kinematics, typed)
+    own = typed if given.length and given.angle else read  # the predictions are by default written as the rows were
+    rows = Rows(convention=own.convention, rotation_angle=own.rotation_angle, payload=own.payload)
+    table = of_robot(with_rows(table_format(read), rows), kinematics.robot)
     with_poses = kinematics.lever is not None
     if not with_poses and (table.convention or table.rotation_angle):
         what = "--convention and --rotation-angle say how orientations are written, but this model has none"
@@ -243,16 +245,6 @@ def run_predict(given: PredictOptions) -> None:
         own = replace(turned, joints=(), position=[[prefix + axis for axis in "xyz"] for prefix in prefixes])
         own = replace(own, rotation_std=None, **dict.fromkeys(BESIDE))
         say(f"`evaluate` and `fit` read these poses with {shlex.join(options_of(own))}")
-
-
-def _written_as_read(model: CalibratedKinematics, given: PredictOptions) -> TableFormat:
-    """The format of the predictions, by default that of the fit."""
-    units = {name: getattr(given, name) for name in Units.names()}
-    typed = Rows(**units, convention=given.convention, rotation_angle=given.rotation_angle, payload=given.payload)
-    read = models.as_fitted(model, typed)
-    own = typed if given.length and given.angle else read
-    rows = Rows(convention=own.convention, rotation_angle=own.rotation_angle, payload=own.payload)
-    return with_rows(table_format(read), rows)
 
 
 @dataclass(frozen=True)

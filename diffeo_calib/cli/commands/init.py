@@ -80,7 +80,13 @@ def run(given: InitOptions) -> None:
         Choice("output", csv.with_suffix(".safetensors").name, "the model"),
         Choice("report", csv.with_suffix(".html").name, "the report"),
     ]
-    unused = [name for name in sheet.header if name not in _used(choices)]
+    columns = [choice.value for choice in choices if choice.name in COLUMNS]
+    columns += [str(choice.value).partition("=")[0] for choice in choices if choice.name == "robot-pose"]
+    texts = [str(text) for value in columns for text in (value if isinstance(value, list) else [value])]
+    used = {IMAGE, *POINT, *PIXEL, CAMERA} if any(text.startswith(CORNERS) for text in texts) else set[str]()
+    for name in (name for text in texts for name in text.rpartition("=")[2].split(",")):
+        used |= {*(re.findall(r"\{([^{}]+)\}", name) or [name])}
+    unused = [name for name in sheet.header if name not in used]
     lines = [
         "# Options of `diffeo-calib fit`, proposed by `diffeo-calib init`: check every line.",
         *(choice.line() for choice in choices),
@@ -95,15 +101,6 @@ def run(given: InitOptions) -> None:
     say(*lines)
     fill_in = ", fill in the lines that say `uncomment`" * any("uncomment" in line for line in lines)
     say(f"campaign: {output}; check it{fill_in}, then run: diffeo-calib fit {output}")
-
-
-def _used(choices: list[Choice]) -> set[str]:
-    columns = [choice.value for choice in choices if choice.name in COLUMNS]
-    columns += [str(choice.value).partition("=")[0] for choice in choices if choice.name == "robot-pose"]
-    texts = [str(text) for value in columns for text in (value if isinstance(value, list) else [value])]
-    corners = {IMAGE, *POINT, *PIXEL, CAMERA} if any(text.startswith(CORNERS) for text in texts) else set[str]()
-    names = (name for text in texts for name in text.rpartition("=")[2].split(","))
-    return corners | {name for each in names for name in re.findall(r"\{([^{}]+)\}", each) or [each]}
 
 
 def _commanded(robot: Path | None, sheet: Sheet) -> Source | None:

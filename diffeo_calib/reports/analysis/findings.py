@@ -176,7 +176,7 @@ def find(
     seen: Predictions | None = shown["predictions"]
     columns = _columns(None if seen is None else seen.data, against)
     progress("analysis", 3, STEPS)
-    deviations = Deviations.of(model).planned(model)
+    deviations = Deviations.of(model)
     progress("analysis", STEPS, STEPS)
     return Findings(
         model,

@@ -33,7 +33,6 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import POINTS
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import Process
-from diffeo_calib.sensors.coordinates import sensor_of
 from diffeo_calib.sensors.errors import Evaluation
 
 WHOLE_COORDINATES = 4500
@@ -226,16 +225,12 @@ class Predictions:
     predicted: Tensor  # (N, B, 3) of a model that has not seen the row, m
     covariance: Tensor  # (N, B, 3, 3) of a new measurement as the model claims it, m^2
     errors: Evaluation  # distances, and angles where poses were measured
-    left_out: bool  # whether these are rows of the fit, each predicted by all others
 
     @classmethod
-    def of(cls, model: CalibratedKinematics, data: Measurements | None = None) -> Predictions:
-        """Predictions of rows that took no part in the fit; by default those of the fit, each by all others."""
-        if data is None:
-            return cls.of_fit(FitRows(model))
-        sensor_of(data).check(data, model)
+    def of(cls, model: CalibratedKinematics, data: Measurements) -> Predictions:
+        """Predictions of rows that took no part in the fit."""
         seen = data.bodies.predicted(model.at_payloads(data.payload), data.q)
-        return cls(data, data.origins, seen.origins, seen.places, _errors(seen.points, data), left_out=False)
+        return cls(data, data.origins, seen.origins, seen.places, _errors(seen.points, data))
 
     @classmethod
     def of_fit(cls, rows: FitRows) -> Predictions:
@@ -244,7 +239,7 @@ class Predictions:
         points = rows.points - errors.unflatten(1, (-1, 3))
         found = _errors(points, data)
         predicted, covariance = data.bodies.claimed(points, covariance, rows.linearised[0].unflatten(1, (-1, 3)))
-        return cls(data, data.origins, predicted, covariance, found, left_out=True)
+        return cls(data, data.origins, predicted, covariance, found)
 
     def __len__(self) -> int:
         return len(self.measured)

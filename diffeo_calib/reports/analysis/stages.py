@@ -71,36 +71,29 @@ class Deviations:
     measured_deviation: Tensor  # (K,) the same there, m
     error: ExpectedError  # what the model expects in all, as every command says it
 
-    # poses that would lower the deviations most, in the order of the moves; None unless they were planned
+    # poses that would lower the deviations most, in the order of the moves; None if it is not known what measured
     next: Plan | None = None
 
     @classmethod
-    def of(cls, model: CalibratedKinematics, seed: int = 0) -> Deviations:
+    def of(cls, model: CalibratedKinematics) -> Deviations:
         """The deviations of a model at random configurations."""
         fitted = model.configurations.to(HOST)
         low, high = (torch.clamp(end, *model.robot.limits.unbind(1)) for end in (fitted.amin(0), fitted.amax(0)))
-        draws = torch.rand(CONFIGURATIONS, len(low), generator=seeded(seed), dtype=low.dtype, device=HOST)
+        draws = torch.rand(CONFIGURATIONS, len(low), generator=seeded(0), dtype=low.dtype, device=HOST)
         q, fitted = low + draws * (high - low), fitted[:: -(-len(fitted) // MEASURED)]
-        return cls(q, claimed(model, q), fitted, claimed(model, fitted), ExpectedError.of(model))
-
-    def planned(self, model: CalibratedKinematics, seed: int = 0) -> Deviations:
-        """The same with poses that would lower the deviations most, if it is known what measured the rows of the fit.
-
-        A device that cannot measure everywhere, such as a camera, and where hardly any configuration can be drawn at
-        random, is asked for those of the fit.
-        """
+        found = cls(q, claimed(model, q), fitted, claimed(model, fitted), ExpectedError.of(model))
         try:
             sensors = sensor_of(model)
         except InputError:  # a file of an early version
-            return self
-        options = [self.q]
+            return found
+        options = [q]
         for sensor in sensors:
             if sensor.reached(model.geometry.base):
                 try:
-                    options.append(drawn(model, [sensor], CONFIGURATIONS, model.geometry.tool, seed=seed))
-                except InputError:
+                    options.append(drawn(model, [sensor], CONFIGURATIONS, model.geometry.tool))
+                except InputError:  # such as of a camera, which cannot see everywhere
                     options.append(model.configurations.to(HOST))
-        return replace(self, next=plan(model, torch.cat(options), NEXT, target=self.q[:TARGETS]))
+        return replace(found, next=plan(model, torch.cat(options), NEXT, target=q[:TARGETS]))
 
 
 def claimed(model: CalibratedKinematics, q: Tensor) -> Tensor:

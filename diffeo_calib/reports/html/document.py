@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FOLDER = Path(__file__).parent
-DOT = 0.2
-"""Length of a stroke, in the units of the drawing (1/72 inch), below which it is a dot."""
 VARIABLES = ("ink", "faint", "grid", "grey", "orange", "blue", "green", "purple")
 """Variables of the page's style that replace the colours of this name."""
 
@@ -74,15 +72,7 @@ class Picture:
             svg = re.sub(getattr(style, variable.upper()), f"var(--{variable})", svg, flags=re.IGNORECASE)
         svg = re.sub(r"font: ([0-9.]+)px [^;\"]*", r"font-size: \1px", svg)
         svg = re.sub(r'\b(?:d|x|y|transform)="[^"]*"', lambda found: re.sub(r"(\.\d{2})\d+", r"\1", found[0]), svg)
-        svg = re.sub(r"M (\S+) (\S+)\nL (\S+) \2\n", _dot, re.sub(r"\s*\n\s*", "\n", svg))
-        styles = dict[str, str]()  # of many markers, each written once
-
-        def short(found: re.Match[str]) -> str:
-            return f'{found[1]}class="{styles.setdefault(found[2], f"{name}-{len(styles)}")}"'
-
-        svg = re.sub(r'(<use [^>]*)style="([^"]*)"', short, svg)
-        rules = "".join(f".{key}{{{own}}}" for own, key in styles.items())
-        return svg.replace(">", f"><style>{rules}</style>", 1) if rules else svg
+        return re.sub(r"\s*\n\s*", "\n", svg)
 
 
 class Table(NamedTuple):
@@ -119,12 +109,6 @@ def page(**parts: Any) -> str:
         parts[name] = (FOLDER / file).read_text(encoding="utf-8")
     text = made.get_template("report.html.jinja").render(parts)
     return re.sub(r"(?<=\d) (?=(?:%|mm|m)\b|%)", "\u00a0", text)  # numbers stay with their units
-
-
-def _dot(stroke: re.Match[str]) -> str:
-    """A stroke that is too short to be seen as one of no length, whose round ends are a dot."""
-    x, y, end = stroke.groups()
-    return f"M{x} {y}h0" if abs(float(end) - float(x)) < DOT else stroke[0]
 
 
 def millimetres(metres: float) -> str:
