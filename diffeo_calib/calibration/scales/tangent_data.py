@@ -218,9 +218,6 @@ class TangentData:
         other = self._variant(tails=tails)
         same = vars(self).keys() & {"basis", "pairs", "_numbers", "_expected"}
         vars(other).update({name: vars(self)[name] for name in same})
-        blocks = vars(self).get("blocks", {})  # of calibration/scales/leave_one_out.py
-        kept = {key: [(rows, own.with_tails(tails.rows(rows))) for rows, own in each] for key, each in blocks.items()}
-        vars(other)["blocks"] = kept
         return other
 
     def with_position_errors(self, scales: Hyperparameters) -> TangentData:
