@@ -22,7 +22,6 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE
-from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.placing.placement import Placement
 from diffeo_calib.calibration.recalibration.find_changes import (
     FEWEST_ROWS,
@@ -45,6 +44,7 @@ from diffeo_calib.calibration.recalibration.new_set_up import (
     weighed,
 )
 from diffeo_calib.calibration.recalibration.register import both_dates, carried_devices, devices_beside
+from diffeo_calib.calibration.result import parts
 from diffeo_calib.common.checks import check_number, check_seed
 from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, as_written, sentence, warn_user
