@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from diffeo_calib.calibration.planning.plan import Plan as Plan
     from diffeo_calib.calibration.planning.plan import plan as plan
     from diffeo_calib.calibration.planning.sensors import Sensor as Sensor
-    from diffeo_calib.calibration.recalibration.compare import Comparison as Comparison
-    from diffeo_calib.calibration.recalibration.compare import compare as compare
+    from diffeo_calib.calibration.recalibration.recalibrate import Comparison as Comparison
     from diffeo_calib.calibration.recalibration.recalibrate import Recalibration as Recalibration
+    from diffeo_calib.calibration.recalibration.recalibrate import compare as compare
     from diffeo_calib.calibration.recalibration.recalibrate import recalibrate as recalibrate
     from diffeo_calib.campaign.campaign import Campaign as Campaign
     from diffeo_calib.common.errors import DiffeoCalibError as DiffeoCalibError

@@ -12,7 +12,6 @@ from rich.console import Console, ConsoleOptions
 from rich.table import Table
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.outliers import Outlier
 from diffeo_calib.calibration.expected_errors import ExpectedError, expected_errors
 from diffeo_calib.calibration.judgement import Accuracy
 from diffeo_calib.cli.console import plain, say, text_table
@@ -27,8 +26,6 @@ from diffeo_calib.sensors.kinds import known_kinds
 
 WIDEST = 1000
 """Characters of the widest table."""
-MOST_OUTLIERS = 10
-"""Most lines about single rows."""
 EXIT_ABOVE = 4
 """The errors are larger than --tolerance."""
 UNITS = {"mm": ("m", 1e3), "um": ("m", 1e6), "m": ("m", 1.0), "px": ("px", 1.0)}
@@ -69,22 +66,6 @@ class ErrorTable:
         else:
             yield self._table(title, angles=False)
             yield self._table(f"Orientation errors in deg {self.of}", errors=False, angles=True)
-
-
-def outlier_lines(outliers: Sequence[Outlier], rows: int, what: str = "training rows") -> Iterator[str]:
-    """Sentences about rows that look wrong, the worst first; ``what`` the ``rows`` are."""
-    flagged = len({outlier.row for outlier in outliers})
-    for place, outlier in enumerate(outliers[:MOST_OUTLIERS]):
-        if place == 0:
-            kept = "" if outlier.weight is None else "; none was dropped"
-            yield f"{flagged} of {rows} {what} look wrong (numbers are lines of the file){kept}:"
-        marker = "" if outlier.marker is None else f", marker {outlier.marker}"
-        marker = f", {plain(outlier.tip)}" if outlier.tip is not None else marker
-        weight = "" if outlier.weight is None else f", weight {outlier.weight:.2g}"
-        size, unit = outlier.shown
-        yield f"  row {outlier.number}{marker}: {size:.3f} {unit} off{weight}; {outlier.reason}"
-    if len(outliers) > MOST_OUTLIERS:
-        yield f"  and {len(outliers) - MOST_OUTLIERS} more"
 
 
 def registration_lines(model: CalibratedKinematics) -> Iterator[str]:

@@ -21,11 +21,11 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from diffeo_calib.common.data_frames import named_columns, real_array
-from diffeo_calib.common.errors import InputError, ModelFileError, as_written
+from diffeo_calib.common.errors import InputError, ModelFileError
 from diffeo_calib.runtime.arrays import TABLEAUS, Array
 from diffeo_calib.runtime.build import calibrated_chain, nominal_chain, recorded_flow, recorded_stages
 from diffeo_calib.runtime.chain import tip_poses
-from diffeo_calib.runtime.program import FRAMES, Program
+from diffeo_calib.runtime.program import Program, check_frame
 
 FORMAT = 3
 """Version of the file layout; files of other versions are refused."""
@@ -126,8 +126,7 @@ class NumpyKinematics:
         return self._at(tip, frame).poses_and_jacobian(self._joints(q), self._tool(tool), frame)[1]
 
     def _at(self, tip: str | None, frame: str) -> Program:
-        if frame not in FRAMES:
-            raise InputError.of("`frame`", expected=" or ".join(map(repr, FRAMES)), got=as_written(frame))
+        check_frame(frame)
         if tip not in (*self.program.tips, None) or (tip is None and len(self.program.tips) > 1):
             fix = f"pass one of {', '.join(self.program.tips)}"
             raise InputError.of("`tip`", expected="the name of a tip", got=tip, fix=fix)

@@ -253,12 +253,6 @@ def export_onnx(
     finally:
         registry.setLevel(level)
     proto = cast(torch.onnx.ONNXProgram, found).model_proto
-    graph: Any = proto.graph
-    symbol = graph.input[0].type.tensor_type.shape.dim[0].dim_param  # torch chose it for the number of rows
-    for value in (*graph.input, *graph.output, *graph.value_info):
-        for size in value.type.tensor_type.shape.dim:
-            if symbol in size.dim_param:
-                size.dim_param = size.dim_param.replace(symbol, "rows")
     for key, value in _description(model, output, frame).items():
         proto.metadata_props.add(key=key, value=value)
     write_whole(path, proto.SerializeToString())

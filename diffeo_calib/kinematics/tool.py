@@ -27,7 +27,7 @@ from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.measurements.poses import mark_points, marks, pose_directions, poses_from_marks, rigid_poses
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime import program
-from diffeo_calib.runtime.program import FRAMES, TOOL_LEVER, Program
+from diffeo_calib.runtime.program import TOOL_LEVER, Program, check_frame
 from diffeo_calib.sensors.set_ups import frame_slopes
 
 LONGEST_TOOL = 1e3
@@ -49,8 +49,7 @@ class ToolKinematics:
     def __init__(
         self, fitted: FittedMap, nominal: GeometryMap, tool: Tensor, frame: str, tip: str | None = None
     ) -> None:
-        if frame not in FRAMES:
-            raise InputError.of("`frame`", expected=" or ".join(map(repr, FRAMES)), got=as_written(frame))
+        check_frame(frame)
         self.fitted, self.nominal, self.tool, self.frame = fitted, nominal, tool, frame
         self.tip = checked_tip(nominal.geometry.chain, tip)
 

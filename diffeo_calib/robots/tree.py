@@ -272,17 +272,11 @@ class Tree:
 
     def moving_values(self, q: Tensor) -> Tensor:
         """Values of all moving joints: q (N, n), checked by :meth:`joint_values` -> (N, n_all) [rad or m]."""
-        if self._uncoupled:
-            return q  # no mimic joints: no product
         return q @ self.coupling.to(q.device).mT + self.coupling_offset.to(q.device)
 
     def by_active(self, slopes: Tensor) -> Tensor:
         """Derivatives by all moving joints (..., n_all) -> by the active ones, mimic joints following (..., n)."""
-        return slopes if self._uncoupled else slopes @ self.coupling.to(slopes.device)
-
-    @property
-    def _uncoupled(self) -> bool:
-        return self.joint_names == self.moving_names
+        return slopes @ self.coupling.to(slopes.device)
 
     def joint_values(self, q: Tensor | ArrayLike) -> Tensor:
         """Check joint values and convert them to float64 (N, n); every public method calls this.

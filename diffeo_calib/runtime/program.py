@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.threads import one_thread
 from diffeo_calib.runtime.arrays import Array, cross
 from diffeo_calib.runtime.chain import CalibratedChain, tip_poses
@@ -78,6 +79,12 @@ class Program:
     def _to(self, frame: str) -> Array:
         """(4, 4) from the measuring frame to another one."""
         return np.eye(4) if frame == "measuring" else inverse(self.chain.start)
+
+
+def check_frame(frame: str) -> None:
+    """Raise InputError unless this is one of :data:`FRAMES`."""
+    if frame not in FRAMES:
+        raise InputError.of("`frame`", expected=" or ".join(map(repr, FRAMES)), got=as_written(frame))
 
 
 def inverse(transform: Array) -> Array:

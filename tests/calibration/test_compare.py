@@ -17,8 +17,8 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.recalibration.compare import Comparison
 from diffeo_calib.calibration.recalibration.find_changes import NOISE_FACTORS, SIZES, likelihood_ratios
+from diffeo_calib.calibration.recalibration.recalibrate import Comparison
 
 OFFSET = 1e-3
 """Of a joint, rad."""

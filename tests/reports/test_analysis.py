@@ -18,6 +18,7 @@ from diffeo_calib.reports.analysis import predictions
 from diffeo_calib.reports.analysis.findings import find
 from diffeo_calib.reports.analysis.predictions import SHARES, FitRows, Predictions, forecast
 from diffeo_calib.reports.analysis.stages import Deviations, repeats_of, stages_of
+from diffeo_calib.reports.html.sections import trust
 from diffeo_calib.reports.html.sentences import advice
 from diffeo_calib.reports.plots.errors import draw_before_after, draw_distributions
 from diffeo_calib.sensors.errors import Evaluation
@@ -178,6 +179,7 @@ def test_outliers_and_moved_markers_are_named(arm: Case) -> None:
     points[17] += 0.005
     found = find(arm.model, dc.Measurements(test.q, points))
     assert [one.row for one in found.outliers] == [17]
+    assert trust(found).text[0].startswith("1 of 60 rows look wrong")
     assert found.moved == []
     turned = find(arm.model, dc.Measurements(test.q, test.points + torch.tensor([0.003, 0.0, 0.0])))
     assert any("measuring device" in text for text in turned.moved)

@@ -18,7 +18,7 @@ from diffeo_calib.calibration.identification.registration import spread
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MOST_NAMES, few, sentence, warn_user
+from diffeo_calib.common.errors import MOST_NAMES, few, printable, sentence, warn_user
 from diffeo_calib.common.quantiles import above_estimated, chi2_above, chi2_median, known, largest_known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.rows import REPEAT_TOLERANCE
@@ -60,6 +60,26 @@ class Outlier:
     def shown(self) -> tuple[float, str]:
         """Size of the error, and its unit."""
         return self.reading or (1e3 * self.distance, "mm")
+
+
+MOST_OUTLIERS = 10
+"""Most lines about single rows."""
+
+
+def outlier_lines(outliers: Sequence[Outlier], rows: int, what: str = "training rows") -> Iterator[str]:
+    """Sentences about rows that look wrong, the worst first; ``what`` the ``rows`` are."""
+    flagged = len({outlier.row for outlier in outliers})
+    for place, outlier in enumerate(outliers[:MOST_OUTLIERS]):
+        if place == 0:
+            kept = "" if outlier.weight is None else "; none was dropped"
+            yield f"{flagged} of {rows} {what} look wrong (numbers are lines of the file){kept}:"
+        marker = "" if outlier.marker is None else f", marker {outlier.marker}"
+        marker = f", {printable(outlier.tip)}" if outlier.tip is not None else marker
+        weight = "" if outlier.weight is None else f", weight {outlier.weight:.2g}"
+        size, unit = outlier.shown
+        yield f"  row {outlier.number}{marker}: {size:.3f} {unit} off{weight}; {outlier.reason}"
+    if len(outliers) > MOST_OUTLIERS:
+        yield f"  and {len(outliers) - MOST_OUTLIERS} more"
 
 
 def excluded(

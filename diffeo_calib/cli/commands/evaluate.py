@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics.outliers import outlier_lines
 from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge
 from diffeo_calib.cli import models, printed
 from diffeo_calib.cli.console import out, plain, progress_bar, say
@@ -90,7 +91,7 @@ def run(options: EvaluateOptions) -> None:
         raise MeasurementError(judged.refusal)
     positions = 0 if found.positions is None else len(found.positions.errors)
     which = "rows" if judged.rows == positions else f"rows, evenly chosen of {positions},"
-    say(*printed.outlier_lines(judged.outliers, judged.rows, which))
+    say(*outlier_lines(judged.outliers, judged.rows, which))
     for text in judged.causes:
         warn_user(text)
     if limit is not None:

@@ -11,7 +11,7 @@ from typing import Any
 import typer
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
-from diffeo_calib.calibration.diagnostics.outliers import Outlier, contradicted
+from diffeo_calib.calibration.diagnostics.outliers import Outlier, contradicted, outlier_lines
 from diffeo_calib.calibration.judgement import check_errors
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC
@@ -67,7 +67,7 @@ def run(given: FitOptions) -> None:
     _show_errors(result, in_train, None if test is None else held_out)
     _show_findings(result, len(train))
     wrong = [] if test is None else _wrong(result, test)
-    say(*printed.outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"))
+    say(*outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"))
     say(*_lines_about_places(result, data, held_out, hand_eye))
     say(*_advice(judged, wrong=bool(wrong), partial=result.partial), f"model: {given.output}")
     if given.report is not None:
@@ -203,7 +203,7 @@ def _show_findings(result: CalibrationResult, rows: int) -> None:
         ]
         title = "What explains how much (RMS over the training rows; parts may cancel)"
         out.print(text_table(title, ["part", "displacement, mm", "angle, mrad (prismatic: mm)"], cells))
-    say(*(wave.sentence for wave in result.gear_lines), *printed.outlier_lines(result.outliers, rows), result.status)
+    say(*(wave.sentence for wave in result.gear_lines), *outlier_lines(result.outliers, rows), result.status)
     if detailed:
         left_out, fitted = result.leave_one_out, result.fit
         if left_out.effective is not None:

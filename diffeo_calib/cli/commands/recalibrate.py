@@ -8,9 +8,8 @@ from typing import Any
 
 import typer
 
-from diffeo_calib.calibration.recalibration.changes import Changes, Offset
-from diffeo_calib.calibration.recalibration.compare import compare
-from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
+from diffeo_calib.calibration.recalibration.find_changes import Changes, Offset
+from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, compare, recalibrate
 from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
 from diffeo_calib.cli.console import progress_bar, say
 from diffeo_calib.cli.declarations import RecalibrateOptions

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from math import isfinite
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.outliers import Outlier
+from diffeo_calib.calibration.diagnostics.outliers import outlier_lines
 from diffeo_calib.common.errors import PACKAGE, printable
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics, measured_words
 from diffeo_calib.kinematics.evaluation import at_payloads
@@ -194,8 +194,6 @@ def _corrections(model: CalibratedKinematics, fit_rows: FitRows) -> Table:
 
 LISTED_ROWS = 5
 """Rows with the largest errors that are listed."""
-MOST_OUTLIERS = 20
-"""Rows that look wrong that are listed."""
 MOST_REPEATS = 12
 """Repeated poses that are listed."""
 
@@ -203,8 +201,7 @@ MOST_REPEATS = 12
 def trust(found: Findings) -> Section:
     """Claimed against found errors, residuals, outliers, learning curve."""
     registered, seen = found.model.registration, found.predictions
-    tables = [_outliers(found.outliers, found.model.on)] if found.outliers else []
-    tables += [_largest(found, own) for own in found.kinds.values()]
+    tables = [_largest(found, own) for own in found.kinds.values()]
     notes = list(found.moved)
     if registered is not None:
         each = f"each predicted by the others {mm(registered.left_out_rms)} mm"
@@ -224,7 +221,8 @@ def trust(found: Findings) -> Section:
         what = found.learning_curve, found.forecast, found.limit if found.repeats else None
         pictures.append(Picture("learning", label, plots.draw_learning_curve, *what))
     pictures += _residuals(found)
-    return Section("trust", "Can I trust it", sentences.judged(found), tables, None, pictures, notes)
+    wrong = list(outlier_lines(found.outliers, 0 if seen is None else len(seen), "rows"))
+    return Section("trust", "Can I trust it", sentences.judged(found), tables, None, pictures, notes, wrong)
 
 
 def _residuals(found: Findings) -> Iterator[Picture]:
@@ -260,16 +258,6 @@ def _largest(found: Findings, own: RowsOfKind) -> Table:
     if own.errors.errors.shape[1] > 1:
         lines.insert(0, ["marker", *(marker_name(int(body[row]), found.model.on) for row in order)])
     return Table(what, ["row", *(str(int(own.lines[row])) for row in order)], lines)
-
-
-def _outliers(outliers: Sequence[Outlier], tips: Sequence[str]) -> Table:
-    rows = [
-        [str(one.number), "" if one.marker is None else marker_name(one.marker, tips), mm(one.distance), one.reason]
-        for one in outliers[:MOST_OUTLIERS]
-    ]
-    more = f" (the worst {MOST_OUTLIERS} of {len(outliers)})" if len(outliers) > MOST_OUTLIERS else ""
-    caption = f"Rows that look wrong{more}; none was dropped"
-    return Table(caption, ["row", "marker", "off by [mm]", "why"], rows, numeric=False)
 
 
 def repeatability(found: Findings) -> Section:
