@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
 import torch
 from product_bank import Case, covered, simulated, simulated_poses, ur10_measurements, ur10_scales
 from table_bank import refused
