@@ -262,10 +262,6 @@ class TangentData:
         """R_i with all weights 1: (N, m, m), m^2."""
         return self.noise_model.covariance(scales, self.jacobian)
 
-    def new_noise(self, scales: Hyperparameters) -> Tensor:
-        """The mean of R_i with all weights 1 and all markers visible: (m, m), m^2."""
-        return self.noise_model.mean_covariance(scales, self.jacobian)
-
     def weighted_noise(self, scales: Hyperparameters) -> Tensor:
         """R_i with the weights of the tails: (N, m, m), m^2."""
         return self.noise_model.weighted(self.noise(scales), self.tails)
