@@ -25,7 +25,7 @@ FLOORS = (
     ("kernels", "kernels: profile + space + matrix; sums, stacks"),
     ("flows", "geodesics, their adjoint, integrators"),
     ("maps", "nominal maps, deformations, linearisation, noise"),
-    ("regression", "the linearised model conditioned on its data"),
+    ("regression", "the linearised model conditioned on its data: one Gaussian process"),
     ("fitting", "problems, solvers, fits of any smooth map"),
     # robots and tables, no kernel
     ("robots", "chains, DH, URDF, geometric errors, gravity sag"),
@@ -35,7 +35,7 @@ FLOORS = (
     # where they meet
     ("kinematics", "a robot's kinematics as maps: nominal, calibrated; errors on measurements"),
     ("paper", "the paper's own formulation"),
-    ("process", "what is known of robot and devices from rows: one Gaussian process"),
+    ("process", "scales of the fields, weights of rows, evidence of unknowns"),
     ("calibration.identification", "registration, geometric errors, joint offsets"),
     ("calibration.scales", "kernel scales by marginal likelihood, leave-one-out"),
     ("calibration.diagnostics", "measurements that cannot be right"),
@@ -91,28 +91,18 @@ def room(module: str) -> str:
     return [*module.split("."), ""][1]
 
 
-def imported_modules(module: str, tree: ast.Module, known: set[str]) -> Iterator[tuple[str, int]]:
+def imported_modules(tree: ast.Module, known: set[str]) -> Iterator[tuple[str, int]]:
     """Yield (module of this package, line) for every import, wherever in the file it stands."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            source = absolute(module, node, known)
+            source = node.module or ""
             submodules = [f"{source}.{alias.name}" for alias in node.names]
             names = [name if name in known else source for name in submodules]
         else:
             continue
         yield from ((name, node.lineno) for name in names if name.split(".")[0] == PACKAGE.name)
-
-
-def absolute(module: str, node: ast.ImportFrom, known: set[str]) -> str:
-    """Resolve ``from ..errors import X``."""
-    if not node.level:
-        return node.module or ""
-    is_folder = any(name.startswith(module + ".") for name in known)
-    parts = module.split(".")
-    base = parts[: len(parts) - node.level + is_folder]
-    return ".".join([*base, node.module] if node.module else base)
 
 
 def floor_mistakes(module: str, imports: list[tuple[str, int]]) -> list[str]:
@@ -150,7 +140,7 @@ def find_cycle(graph: dict[str, set[str]]) -> list[str]:
 
 @cache
 def imports() -> dict[str, list[tuple[str, int]]]:
-    return {name: list(imported_modules(name, tree, set(SOURCES))) for name, tree in trees().items()}
+    return {name: list(imported_modules(tree, set(SOURCES))) for name, tree in trees().items()}
 
 
 MODULES = [name for name in SOURCES if floor(name)]
@@ -186,6 +176,8 @@ def habits(module: str, tree: ast.Module) -> Iterator[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Call) and ast.unparse(node.func) == "print" and floor(module) != "cli":
             yield f"{module}, line {node.lineno}: only cli/ prints: report through a callback or a result"
+        if isinstance(node, ast.ImportFrom) and node.level:
+            yield f"{module}, line {node.lineno}: import by the full name"
         if isinstance(node, ast.Assert):
             yield f"{module}, line {node.lineno}: `python -O` removes assert: raise an error of common.errors"
 

@@ -17,17 +17,12 @@ import numpy as np
 import pytest
 import torch
 from product_bank import Case
-from robots_bank import crooked, draw
+from robots_bank import draw
 from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib
 import diffeo_calib as dc
-from diffeo_calib.robots import SimulatedArm, from_dh, load_urdf, se3
-from diffeo_calib.robots.gravity import GravitySag
-
-URDF = Path(se3.__file__).with_name("simulated_arm.urdf")
-Q = draw(3, 3)
 
 
 @contextmanager
@@ -66,26 +61,6 @@ def same(work: Callable[[], Any]) -> list[Any]:
 def test_the_meta_device_would_be_noticed() -> None:
     with elsewhere(), pytest.raises((RuntimeError, NotImplementedError)):
         draw(3).add(torch.zeros(3))
-
-
-# --- robots -----------------------------------------------------------------------------------------------------------
-
-
-def robots() -> list[Any]:
-    """Turns, a slide, a fixed joint and a mimic joint; a table, a file, and an arm that is measured."""
-    mixed = crooked(["revolute", "prismatic", "fixed", "revolute", "revolute"], {4: {"j0": -1.0}})
-    craig = from_dh([(0.1, 0.2, 0.3), (0.4, 0.5, 0.6, 0.7, "prismatic")], "craig")
-    arm, sag = SimulatedArm(seed=1, markers=2), GravitySag(mixed)
-    chains = load_urdf(URDF, "base_link", "flange"), craig, mixed
-    constants = [
-        [chain.limits, chain.coupling, chain.axes, chain.motion_terms, chain.tip_offsets[0]] for chain in chains
-    ]
-    values = mixed(Q.tolist()), mixed.jacobian(Q), sag.features(Q), sag.twists(Q, draw(sag.size, seed=4))  # pyright: ignore
-    return [constants, *values, *arm.measure(4, seed=2), arm.gravity_torques(Q.repeat(1, 2)), se3.right_jacobian(Q)]
-
-
-def test_robots() -> None:
-    same(robots)
 
 
 # --- models --------------------------------------------------------------------------------------------------

@@ -43,9 +43,8 @@ from diffeo_calib.calibration.diagnostics.plausibility import (
 )
 from diffeo_calib.calibration.diagnostics.row_order import warn_of_contradictions
 from diffeo_calib.calibration.expected_errors import with_open_directions
-from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.placing.place import Placed, place
-from diffeo_calib.calibration.result import CalibrationResult
+from diffeo_calib.calibration.result import CalibrationResult, parts
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.checks import check_count, check_seed
 from diffeo_calib.common.device import outside_inference_mode

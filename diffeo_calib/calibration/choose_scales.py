@@ -199,7 +199,8 @@ def _selected(
 
 def _supported(found: Selection, data: TangentData, seed: int) -> tuple[Selection, TangentData]:
     """The same without amplitudes that the data do not support, and with the weights that follow."""
-    scales = found.scales.supported(data.jacobian, data.new_noise(found.scales))
+    noise = data.noise_model.mean_covariance(found.scales, data.jacobian)
+    scales = found.scales.supported(data.jacobian, noise)
     return replace(found, scales=scales), weighed(data, scales, seed)
 
 

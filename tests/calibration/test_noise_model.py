@@ -114,7 +114,7 @@ def test_hidden_markers_do_not_count() -> None:
 def test_new_noise_is_the_mean_and_what_differs() -> None:
     """Joint noise moves a marker by its lever arms; without it all rows err alike."""
     data, scales = built("two markers").tangent_data, built("two markers").scales
-    each, mean = data.noise(scales), data.new_noise(scales)
+    each, mean = data.noise(scales), data.noise_model.mean_covariance(scales, data.jacobian)
     factor = differing_factor(each, mean, data.visible)
     assert factor > 1.001
     torch.testing.assert_close(robot_problem(data, scales).new_noise, factor * mean, rtol=1e-12, atol=0.0)

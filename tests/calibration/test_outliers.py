@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from product_bank import Case, simulated
+from product_bank import Case, simulated, with_usual_scales
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -127,7 +127,7 @@ def test_reasons_with_three_markers() -> None:
     points[8, 1] += aside(0.002, 8)
     points[13] = points[20]
     data = dc.Measurements(train.q, points)
-    result = dc.calibrate(arm.nominal, data)
+    result = with_usual_scales(arm.nominal, data)
     found = flagged(result)
     assert set(found) == {(5, 0), (5, 2), (8, 1), (13, 0), (13, 1), (13, 2)}
     assert found[5, 0].reason == "markers 0 and 2 seem to be exchanged"

@@ -47,7 +47,7 @@ def data(arm: SimulatedArm, rows: SocketRows) -> dc.Measurements:
 
 @pytest.fixture(scope="module")
 def result(arm: SimulatedArm, data: dc.Measurements) -> Any:
-    return dc.calibrate(arm.nominal, data)
+    return with_usual_scales(arm.nominal, data)
 
 
 def aligned(points: Tensor, truth: Tensor) -> Tensor:

@@ -181,7 +181,7 @@ def result() -> Any:
     """Of rows two of which are wrong; nobody says that a plane is too little for the workspace."""
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*lie near.*")
-        return dc.calibrate(RESTING.nominal, moved(in_their_sockets(2, 3), WRONG))
+        return dc.calibrate(RESTING.nominal, moved(in_their_sockets(2, 3), WRONG), hyperparameters=scales())
 
 
 def moved(data: dc.Measurements, rows: list[int]) -> dc.Measurements:

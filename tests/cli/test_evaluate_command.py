@@ -45,18 +45,6 @@ def test_errors_that_no_robot_has_are_exit_1(
     assert words in done.error
 
 
-def test_the_robots_own_joints_in_another_order_are_a_mistake(
-    fitted: Outcome, site: Site, command: Command, tmp_path: Path
-) -> None:
-    assert fitted.code == 0
-    model, names = site.folder / "model.safetensors", list(site.arm.nominal.joint_names)
-    for words in ([], ["--report", tmp_path / "r.html"]):
-        done = command("evaluate", model, site.csv, *words, *TABLE, "--joints", ",".join(names[::-1]))
-        assert done.code == 1
-        assert f"in another order than the robot's: expected {','.join(names)}, got wrist_roll_joint," in done.error
-        assert "leave it out: columns that are named after the joints are found wherever they are" in done.error
-
-
 def test_absurd_errors_without_a_known_mistake_are_printed(
     fitted: Outcome, site: Site, command: Command, tmp_path: Path
 ) -> None:

@@ -12,7 +12,7 @@ from command_bank import FORMAT, STAGES, Command, Outcome, Site
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.outliers import Outlier, outlier_lines
-from diffeo_calib.calibration.findings import parts
+from diffeo_calib.calibration.result import parts
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm

@@ -75,7 +75,7 @@ REFUSED = {
     r"no moving joint from 'output_link' to 'flange'": given("--base", "output_link"),
     r"do not fit this robot, even with geometric errors.* as the tip": given("--tip", "wrist_link"),
     r"expected 6 columns, in the order .*, got 2": given("--joints", "waist_joint,shoulder_joint"),
-    r"names the robot's joints in another order than the robot's": given(
+    r"in another order than the robot's: expected waist_joint,.*leave it out: columns that are named after": given(
         "--joints", "shoulder_joint,waist_joint,elbow_joint,forearm_roll_joint,wrist_bend_joint,wrist_roll_joint"
     ),
     r"there is no file nowhere.urdf; check the path of --robot": given("--robot", "nowhere.urdf"),

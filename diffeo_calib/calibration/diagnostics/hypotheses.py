@@ -11,14 +11,10 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.kinematics.nominal import rigid_motions
-from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.regression.conditional import Process
 from diffeo_calib.sensors.devices import Hypothesis
 from diffeo_calib.sensors.set_ups import frame_slopes
-
-VARIATION_M = torch.logspace(-6, -2, 41, dtype=torch.float64, device="cpu")
-"""RMS motions of the points by unknowns of which the size is sought."""
 
 
 class SampledRows(NamedTuple):
@@ -43,20 +39,10 @@ class SampledRows(NamedTuple):
         """Effects (N, R, U) on what rows tell, in each row times its code (N,), as those on the numbers (M, U)."""
         return self.process.numbers.of_table(effects if codes is None else effects * codes[:, None, None])
 
-    def of_all(self, one: Hypothesis) -> Hypothesis:
-        """One with effects on the coordinates of all rows of the calibration, as one with those on what these tell."""
-        return one._replace(effects=self.data.motions_in_numbers(one.effects[self.index]))
-
     def distances(self, effects: Tensor, u: Tensor) -> Tensor:
         """(N, B) motions, m, of the points, or numbers, of each row by unknowns (U,) with effects (N, R, U)."""
         motion = self.data.in_coordinates(effects) @ u
         return motion.unflatten(1, (-1, 3 if motion.shape[1] % 3 == 0 else motion.shape[1])).norm(dim=2)
-
-    def likeliest_size(self, E: Tensor) -> tuple[float, float]:
-        """The log odds of unknowns of one size with effects (M, U), and this size."""
-        sizes = VARIATION_M.to(E) / float(E[E.any(1)].square().sum(1).mean().sqrt())
-        odds = Evidence.of(E, self.process).log_odds(sizes.square())
-        return float(odds.max()), float(sizes[odds.argmax()])
 
     def left(self, E: Tensor) -> float:
         """Part of the RMS left-out error that remains beside unknowns of any size with effects (M, U)."""

@@ -372,6 +372,10 @@ def _other_columns(masses: Tensor, lines: Tensor) -> Iterator[tuple[str, Tensor]
 # --- unknowns of one size: numbers that differ from row to row --------------------------------------------------------
 
 
+VARIATION_M = torch.logspace(-6, -2, 41, dtype=torch.float64, device="cpu")
+"""RMS motions of the points by unknowns of which the size is sought."""
+
+
 def variation(data: TangentData, scales: Hyperparameters, hypotheses: Sequence[Hypothesis]) -> tuple[float, str] | None:
     """The likeliest number that differs from row to row, if it is clear: an unknown u_i ~ N(0, s^2) of every row i.
 
@@ -385,8 +389,12 @@ def variation(data: TangentData, scales: Hyperparameters, hypotheses: Sequence[H
     rows = SampledRows.of(data, scales)
 
     def sized(rows: SampledRows, one: Hypothesis) -> tuple[float, float, Hypothesis]:
-        E = torch.nn.functional.one_hot(rows.process.numbers.owner).to(data.x) * rows.columns(rows.of_all(one).effects)
-        return (*rows.likeliest_size(E[:, E.any(0)]), one)
+        own = rows.columns(rows.data.motions_in_numbers(one.effects[rows.index]))
+        E = torch.nn.functional.one_hot(rows.process.numbers.owner).to(own) * own
+        E = E[:, E.any(0)]
+        sizes = VARIATION_M.to(E) / float(E[E.any(1)].square().sum(1).mean().sqrt())
+        odds = Evidence.of(E, rows.process).log_odds(sizes.square())
+        return float(odds.max()), float(sizes[odds.argmax()]), one
 
     found = (sized(rows, one) for one in hypotheses)
     odds, _, best = max(found, key=lambda own: own[0])

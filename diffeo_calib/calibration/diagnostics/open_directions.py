@@ -131,21 +131,6 @@ def without_shared(effects: Tensor, shared: Tensor) -> Tensor:
     return effects - shared @ torch.linalg.lstsq(shared, effects, rcond=1e-6, driver="gelsd").solution
 
 
-def warn_of_size(fix: str, size: float, share: float, expected: float) -> None:
-    """Warn where most of the error that the model expects is the robot's size.
-
-    Args:
-        fix: what to do. size: relative deviation of the size. share: of the expected error. expected: this, m.
-    """
-    if share >= gates.SIZE_SHARE:
-        what = (
-            f"the readings hold too little length: the robot's size is known to {100 * size:.2f} % (one standard "
-            f"deviation), which is {100 * share:.0f} % of the expected error of {1e3 * expected:.2f} mm and rests on "
-            "the robot's description"
-        )
-        warn_user(sentence(what, fix=fix))
-
-
 def warn_of_flat_places(fitted: FittedMap, positions: Tensor, socket: Tensor, place: Tensor, now: float) -> None:
     """Warn of sockets near a plane if one place away from it would make the expected error smaller.
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.open_directions import warn_of_size
+from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import (
     Identification,
@@ -96,9 +96,14 @@ class ReadingDevices(DeviceSet):
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:
         """Warn if most of the expected error is the robot's size."""
-        if model.map.workspace is not None:
-            expected = ExpectedError.of(model)
-            warn_of_size(self.devices.size_fix, expected.size, expected.size_share, expected.workspace)
+        if model.map.workspace is None or (found := ExpectedError.of(model)).size_share < gates.SIZE_SHARE:
+            return
+        what = (
+            f"the readings hold too little length: the robot's size is known to {100 * found.size:.2f} % (one standard "
+            f"deviation), which is {100 * found.size_share:.0f} % of the expected error of {1e3 * found.workspace:.2f} "
+            "mm and rests on the robot's description"
+        )
+        warn_user(sentence(what, fix=self.devices.size_fix))
 
     def sentences(self) -> list[str]:
         return [self.devices.sentence(number, own, self.frame) for number, own in enumerate(self.devices.deviations)]

@@ -322,13 +322,19 @@ def _rms(errors: Tensor) -> float:
     return float(errors.norm(dim=-1).square().nanmean().sqrt())
 
 
-def warn_about(found: Registration, *, outliers: bool = True, excess: bool = True) -> None:
+UNLIKELY = 0.01
+"""Probability of what is said of the markers, below which it is warned of."""
+
+
+def warn_about(found: Registration | None, *, outliers: bool = True, excess: bool = True, marker: str = "") -> None:
     """Warn of outliers, of exchanged markers, of directions that rows do not determine, and of errors that remain.
 
     Args:
-        found: the registration.
+        found: the registration, if a device measured coordinates. marker: what is said of the markers.
         outliers: whether to name the rows that took no part. excess: whether to warn of errors that remain.
     """
+    if found is None:
+        return
     if found.outliers and outliers:
         what = f"{len(found.outliers)} row(s) contradict all others and took no part: row {few(found.outliers)}"
         warn_user(sentence(what, fix="measure these poses again"))
@@ -344,3 +350,6 @@ def warn_about(found: Registration, *, outliers: bool = True, excess: bool = Tru
         what = f"after registration the errors are {found.excess:.1f} times as large as the model leads to expect"
         fix = "something else has changed, or the rows are wrong: measure more poses and calibrate again"
         warn_user(sentence(what, fix=fix))
+    if marker == "same" and found.same_place is not None and found.same_place < UNLIKELY and found.shift is not None:
+        what = f"the rows say that the markers have moved by {1e3 * float(found.shift.norm(dim=1).max()):.2g} mm"
+        warn_user(sentence(f'{what}, although marker="same"', fix="leave `marker` out"))

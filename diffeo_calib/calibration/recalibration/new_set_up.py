@@ -22,7 +22,6 @@ from diffeo_calib.calibration.recalibration.find_place import (
     MARKER_DEVIATIONS,
     UNMOVED_LOG_ODDS,
     find_place,
-    warn_about,
 )
 from diffeo_calib.calibration.recalibration.new_rows import NewRows, NewSetUp, UsualNoise, typical_noise
 from diffeo_calib.common.device import HOST
@@ -233,7 +232,6 @@ USUAL_RATIO = 3e-3
 """Relative error of distances that no robot has."""
 FARTHEST_PAIRS = 0.5
 """Of all pairs of rows, this part with the largest distances is compared."""
-UNLIKELY = 0.01
 
 
 def check_arguments(model: object, new: object, marker: object) -> None:
@@ -284,14 +282,3 @@ def size_ratio(predicted: Tensor, measured: Tensor) -> float:
     )
     far = expected >= expected.quantile(FARTHEST_PAIRS) if len(expected) else expected.bool()
     return float((found[far] / expected[far]).median()) if bool((expected[far] > 0).all()) and len(expected) else 1.0
-
-
-def warn_of_places(set_up: NewSetUp, marker: str, *, outliers: bool, excess: bool) -> None:
-    """Warn of what a registration found, see :func:`warn_about`, and of markers that are said to be the same."""
-    found = set_up.registration
-    if found is None:
-        return
-    warn_about(found, outliers=outliers, excess=excess)
-    if marker == "same" and found.same_place is not None and found.same_place < UNLIKELY and found.shift is not None:
-        what = f"the rows say that the markers have moved by {1e3 * float(found.shift.norm(dim=1).max()):.2g} mm"
-        warn_user(sentence(f'{what}, although marker="same"', fix="leave `marker` out"))

@@ -22,7 +22,6 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE
-from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.placing.placement import Placement
 from diffeo_calib.calibration.recalibration.find_changes import (
     FEWEST_ROWS,
@@ -33,7 +32,7 @@ from diffeo_calib.calibration.recalibration.find_changes import (
     hidden_offsets,
     usual_drift,
 )
-from diffeo_calib.calibration.recalibration.find_place import find_place
+from diffeo_calib.calibration.recalibration.find_place import find_place, warn_about
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows, NewSetUp
 from diffeo_calib.calibration.recalibration.new_set_up import (
     Marker,
@@ -41,10 +40,10 @@ from diffeo_calib.calibration.recalibration.new_set_up import (
     check_other_table,
     knows_ball,
     place_again,
-    warn_of_places,
     weighed,
 )
 from diffeo_calib.calibration.recalibration.register import both_dates, carried_devices, devices_beside
+from diffeo_calib.calibration.result import parts
 from diffeo_calib.common.checks import check_number, check_seed
 from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, as_written, sentence, warn_user
@@ -180,7 +179,7 @@ def recalibrate(
     if groups := dict.fromkeys(one.where for one in changes.found if one.where):  # no model holds for all of them
         what = f"the new rows do not belong to one robot: only {' and '.join(groups)} deviates from the old model"
         warn_user(sentence(what, fix="check what happened between them, and recalibrate with the rows since then"))
-    warn_of_places(before, marker, outliers=False, excess=not drifts)
+    warn_about(before.registration, outliers=False, excess=not drifts, marker=marker)
     if drift == "tested":
         drifts = [*drifts, *usual_drift(rows, drifts)]
     if drifts:
@@ -355,7 +354,8 @@ def compare(
         rows = _predicted_rows(model, under_mass(other, payload).to(HOST))
     changes, _ = find_changes(rows, level=level, seed=seed)
     if measured:
-        warn_of_places(rows.set_up, marker, outliers=not changes.found, excess=not changes.found)
+        unchanged = not changes.found
+        warn_about(rows.set_up.registration, outliers=unchanged, excess=unchanged, marker=marker)
     q = model.configurations  # what is usual is expected at the rows of its fit
     _, covariance = model.predict(q[:: -(-len(q) // MOST_USUAL)], noise=False)
     variance = float(covariance.diagonal(dim1=-2, dim2=-1).mean().clamp(min=0))

@@ -40,8 +40,6 @@ from diffeo_calib.regression.regions import region_factor, region_scale
 
 BLOCK_COORDINATES = KEPT_COORDINATES
 """Measured coordinates of one block: a few hundred poses predict another pose nearly as well as thousands do."""
-KEPT_BLOCKS = 4 * BLOCK_COORDINATES
-"""Measured coordinates up to which blocks are kept with their covariances, which all weights have in common."""
 ROUNDS = 8
 """Largest number of steps of expectation maximisation."""
 WEIGHT_CHANGE = 0.01
@@ -131,23 +129,13 @@ def variance_ratio(data: TangentData, left_out: LeaveOneOut) -> float:
 
 
 def _parts(data: TangentData, seed: int) -> Iterator[tuple[Tensor, TangentData]]:
-    """Row numbers and data of random blocks of about equal size, each with about so many coordinates at most.
-
-    A single one is the data themselves, with the matrices that they keep; a few are kept with the data.
-    """
-    count, every = -(-len(data.x) * data.size // BLOCK_COORDINATES), torch.arange(len(data.x), device=data.x.device)
+    """Row numbers and data of random blocks of about equal size; a single one is the data, with what they keep."""
+    count = -(-len(data.x) * data.size // BLOCK_COORDINATES)
     if count == 1:
-        yield every, data
+        yield torch.arange(len(data.x), device=data.x.device), data
         return
-    parts = vars(data).setdefault("blocks", {})
-    if seed not in parts:
-        order = torch.randperm(len(data.x), generator=seeded(seed), device=HOST)
-        found = ((rows, data.rows(rows)) for rows in order.to(every.device).tensor_split(count))
-        if len(data.x) * data.size > KEPT_BLOCKS:
-            yield from found
-            return
-        parts[seed] = list(found)
-    yield from parts[seed]
+    order = torch.randperm(len(data.x), generator=seeded(seed), device=HOST).to(data.x.device)
+    yield from ((rows, data.rows(rows)) for rows in order.tensor_split(count))
 
 
 def _expected_squares(part: TangentData, scales: Hyperparameters, tails: Tails) -> Tensor:

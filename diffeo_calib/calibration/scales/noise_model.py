@@ -123,22 +123,13 @@ class NoiseModel:
         return replace(self, known=torch.zeros_like(self.known))
 
     @property
-    def of_poses(self) -> bool:
-        """Whether all bodies are poses of points."""
-        return self.modes.shape[1] == self.bodies and self.size > FREEDOM_OF_POSES
-
-    @property
     def rigid_basis(self) -> Tensor | None:
         """(N, R, 6 B) orthonormal columns, all motions of rigid poses; None unless all bodies are poses.
 
         Errors of poses, and what moves them, are such motions: the other numbers of their points tell nothing.
         """
-        return block_diagonal(torch.linalg.qr(self.modes).Q) if self.of_poses else None
-
-    @cached_property
-    def all_visible(self) -> bool:
-        """Whether every number was measured."""
-        return bool(self.visible.all())
+        of_poses = self.modes.shape[1] == self.bodies and self.size > FREEDOM_OF_POSES
+        return block_diagonal(torch.linalg.qr(self.modes).Q) if of_poses else None
 
     @cached_property
     def kind_count(self) -> int:
@@ -172,7 +163,7 @@ class NoiseModel:
     def covariance(self, scales: Hyperparameters, jacobian: Tensor) -> Tensor:
         """R_i without tails: Jacobian of k0 (N, R, n) -> (N, R, R) in m^2; absent numbers carry no information."""
         total = self._of_all(scales, jacobian) + self._of_bodies(scales)
-        return total if self.all_visible else without_hidden(total, self.visible)
+        return total if bool(self.visible.all()) else without_hidden(total, self.visible)
 
     def mean_covariance(self, scales: Hyperparameters, jacobian: Tensor) -> Tensor:
         """The mean of R_i without tails, everything visible: (R, R) in m^2."""

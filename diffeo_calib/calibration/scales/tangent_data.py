@@ -218,9 +218,6 @@ class TangentData:
         other = self._variant(tails=tails)
         same = vars(self).keys() & {"basis", "pairs", "_numbers", "_expected"}
         vars(other).update({name: vars(self)[name] for name in same})
-        blocks = vars(self).get("blocks", {})  # of calibration/scales/leave_one_out.py
-        kept = {key: [(rows, own.with_tails(tails.rows(rows))) for rows, own in each] for key, each in blocks.items()}
-        vars(other)["blocks"] = kept
         return other
 
     def with_position_errors(self, scales: Hyperparameters) -> TangentData:
@@ -264,10 +261,6 @@ class TangentData:
     def noise(self, scales: Hyperparameters) -> Tensor:
         """R_i with all weights 1: (N, m, m), m^2."""
         return self.noise_model.covariance(scales, self.jacobian)
-
-    def new_noise(self, scales: Hyperparameters) -> Tensor:
-        """The mean of R_i with all weights 1 and all markers visible: (m, m), m^2."""
-        return self.noise_model.mean_covariance(scales, self.jacobian)
 
     def weighted_noise(self, scales: Hyperparameters) -> Tensor:
         """R_i with the weights of the tails: (N, m, m), m^2."""

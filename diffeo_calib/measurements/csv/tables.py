@@ -286,11 +286,11 @@ def rereadings(data: Any) -> Iterator[dict[str, Any]]:
     if data.frames is None or data.lever is None:
         return
     lever, on, seen_from_tool = data.lever, data.on or (), data.board is not None
-    written = inverse_poses(data.frames) if seen_from_tool else data.frames
+    seen = inverse_poses if seen_from_tool else torch.clone  # there and back
+    written = seen(data.frames)
 
     def reread(frames: Tensor, words: str, option: str = "") -> dict[str, Any]:
-        points = points_of_frames(inverse_poses(frames) if seen_from_tool else frames, lever)
-        return {"points": points, "words": words, "option": option, "on": on}
+        return {"points": points_of_frames(seen(frames), lever), "words": words, "option": option, "on": on}
 
     turns, places = written[..., :3, :3], written[..., :3, 3]
     yield reread(inverse_poses(written), NOT_INVERTED if seen_from_tool else INVERTED)
@@ -308,13 +308,11 @@ def with_coordinate(data: Any, marker: int, axis: int, values: Tensor) -> Tensor
     points, values = data.points.clone(), values.to(data.points.device)
     if data.frames is None:
         points[:, marker, axis] = values.where(~points[:, marker, axis].isnan(), torch.nan)
-    elif data.board is not None and data.lever is not None:
-        written = inverse_poses(data.frames)
-        written[:, 0, axis, 3] = values
-        return points_of_frames(inverse_poses(written), data.lever)
-    else:
-        points[:, POINTS * marker : POINTS * (marker + 1), axis] += (values - data.frames[:, marker, axis, 3])[:, None]
-    return points
+        return points
+    seen = inverse_poses if data.board is not None else torch.clone
+    written = seen(data.frames)
+    written[:, marker, axis, 3] = values
+    return points_of_frames(seen(written), data.lever)
 
 
 def numeric_table(data: Any) -> tuple[Columns | None, Mapping[str, Tensor]]:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.findings import Part
+from diffeo_calib.calibration.result import Part
 from diffeo_calib.common.errors import shown
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.transmission import smooth_transmission
