@@ -6,20 +6,22 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.main import command_line
 from diffeo_calib.cli.options import Links, Robot, Rows
-from diffeo_calib.cli.tables import Given, MeasuredTable, as_at_the_fit, measured_table, rows_in_table, tool_frame
+from diffeo_calib.cli.tables import Given, MeasuredTable, as_at_the_fit, measured_table, rows_in_table, stated_numbers
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.common.files import read_regular
 from diffeo_calib.interop.model_file import load
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.csv.files import read_poses
 from diffeo_calib.measurements.csv.joints import PoseColumns
-from diffeo_calib.measurements.poses import POINTS, by_frame
-from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.measurements.poses import POINTS, by_frame, rotation_matrices
+from diffeo_calib.measurements.table_format import TableFormat, numbers_of
 from diffeo_calib.robots.cartesian import cartesian
 from diffeo_calib.robots.dh_file import DHFile
 from diffeo_calib.robots.tree import Tree
@@ -151,7 +153,15 @@ def tool_in_tip(model: CalibratedKinematics, text: str | None, table: TableForma
     """The tool centre point of --tool in the tip's frame: (4, 4) m; the model's own without a text."""
     if text is None:
         return model.tool
-    tool = tool_frame(text.removeprefix(MEASURED), table)
+    convention = table.convention or "rotvec"
+    count = 3 + numbers_of(convention)
+    expected = f"X,Y,Z, or {count} numbers with the rotation as {convention!r}, separated by commas"
+    values = stated_numbers("--tool", text.removeprefix(MEASURED), (3, count), expected)
+    tool = torch.eye(4, dtype=torch.float64, device=HOST)
+    tool[:3, 3] = torch.tensor(values[:3], dtype=torch.float64, device=HOST) / table.per_metre
+    if len(values) == count:
+        angle = table.rotation_angle or table.angle
+        tool[:3, :3] = rotation_matrices([values[3:]], convention, angle=angle, place="--tool".format)[0]
     if (length := float(tool[:3, 3].norm())) > model.robot.reach:
         what, fix = f"--tool is {length:g} m long, more than the robot reaches", "check the unit (--length)"
         if length > LONGEST_TOOL_PER_REACH * model.robot.reach:

@@ -14,7 +14,6 @@ from math import isfinite
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
-import torch
 import typer
 from torch import Tensor
 
@@ -22,7 +21,6 @@ from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.main import add_to_command_line
 from diffeo_calib.cli.options import CORNERS, Rows, Targets, Units, has
-from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.files import PROGRAM
 from diffeo_calib.measurements.csv.cells import number
@@ -31,8 +29,8 @@ from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
 from diffeo_calib.measurements.csv.sensors import ImageColumns, ReadingColumns, SocketColumns, columns_of
-from diffeo_calib.measurements.poses import by_frame, rotation_matrices
-from diffeo_calib.measurements.table_format import LEVER, TableFormat, numbers_of
+from diffeo_calib.measurements.poses import by_frame
+from diffeo_calib.measurements.table_format import LEVER, TableFormat
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.kinds import known_kinds
@@ -240,20 +238,6 @@ def targets_of(path: Path, table: TableFormat, given: Targets, tools: int) -> Te
         what = f"file '{path}', line {few(sorted({*lines} - {*data.line_numbers.tolist()}))}"
         raise InputError.of(what, expected="a target", got="empty cells", fix="fill them in, or remove the lines")
     return data.points if data.poses is None else by_frame(data.poses)
-
-
-def tool_frame(text: str, table: TableFormat) -> Tensor:
-    """A tool centre point X,Y,Z, or X,Y,Z and a rotation in the convention of a table: (4, 4) m."""
-    convention = table.convention or "rotvec"
-    count = 3 + numbers_of(convention)
-    expected = f"X,Y,Z, or {count} numbers with the rotation as {convention!r}, separated by commas"
-    values = stated_numbers("--tool", text, (3, count), expected)
-    frame = torch.eye(4, dtype=torch.float64, device=HOST)
-    frame[:3, 3] = torch.tensor(values[:3], dtype=torch.float64, device=HOST) / table.per_metre
-    if len(values) == count:
-        angle = table.rotation_angle or table.angle
-        frame[:3, :3] = rotation_matrices([values[3:]], convention, angle=angle, place="--tool".format)[0]
-    return frame
 
 
 def of_robot(table: TableFormat, robot: Tree) -> TableFormat:

@@ -10,10 +10,13 @@ import torch
 from inclinometer import AXES, Inclinometers
 from laser_line import DIRECTIONS, POINTS, Beams
 from math_bank import normal
+from product_bank import Case
 from torch import Tensor
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table_format import LEVER
@@ -22,6 +25,7 @@ from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.height import Planes
 from diffeo_calib.sensors.image import Cameras
 from diffeo_calib.sensors.kinds import stored_devices
+from diffeo_calib.sensors.places import placed
 from diffeo_calib.sensors.range import FixedPoints
 from diffeo_calib.sensors.sockets import SocketPlaces
 from diffeo_calib.sensors.tool_frames import Contacts, HeldTools, Trackers
@@ -94,7 +98,9 @@ def test_slopes_are_derivatives(kind: type[Devices]) -> None:
     seen = there.observation(number)
     expected = change(lambda h: seen.value(points + h * shift))
     assert_close((seen.slope(points) @ shift[..., None])[..., 0], expected, rtol=1e-6, atol=1e-8)
-    expected = change(lambda h: there.moved(h * step).observation(number).value(points))
+    expected = change(
+        lambda h: there.shifted((h * step / there.deviations).flatten()).observation(number).value(points)
+    )
     assert_close(
         (there.by_increments(points, number) @ step[number][..., None])[..., 0], expected, rtol=1e-6, atol=1e-8
     )
@@ -127,3 +133,92 @@ def test_sets_of_devices_are_taken_apart_joined_and_written(kind: type[Devices])
     assert both.beside(first).stored() == both.stored()
     assert stored_devices(there.stored(), ROWS).stored() == there.stored()
     assert len(there.sentences()) == 2
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_wrong_rows_hardly_move_devices(kind: type[Devices]) -> None:
+    there, data, points = exact(kind)
+    wrong = data.values.clone()
+    wrong[5:8] += 0.2 / there.metres[data.device[5:8], None]
+    wrong = replace(data, values=wrong)
+    found = kind.at(wrong, points).refined(wrong, points)
+    assert float(found.errors(data, points).abs().max()) < 2e-3
+
+
+@pytest.mark.parametrize("spread", [0.0, 1e-4, 5e-3, 0.3])
+def test_planes_are_found_by_a_ball_that_stays_near_them(spread: float) -> None:
+    """Heights of a ball that touches them do not differ; points err by 1 mm."""
+    normals = torch.nn.functional.normalize(normal(1, 3, seed=4), dim=1)[0]
+    heights = spread * normal(ROWS, seed=5)
+    across = normal(ROWS, 3, seed=6)
+    z = across - (across @ normals - heights)[:, None] * normals + 1e-3 * normal(ROWS, 3, seed=7)
+    found = Planes.start(heights[:, None], z)[:3] @ normals
+    assert float(found if spread > 1e-3 else found.abs()) > 1 - 1e-4
+
+
+def test_a_stated_camera_is_right_handed_and_looks_at_its_point() -> None:
+    numbers = normal(9, 6, seed=5)
+    R, t = Cameras.stated(numbers)[:, :12].view(9, 3, 4).split([3, 1], 2)
+    assert_close(torch.linalg.det(R), torch.ones(9, dtype=torch.float64))
+    assert_close(R.mT @ t, -numbers[:, :3, None])
+    line = numbers[:, 3:] - numbers[:, :3]
+    assert_close(R[:, 2], line / line.norm(dim=1, keepdim=True))
+
+
+def test_pixels_are_metres_at_the_mean_depth_and_back() -> None:
+    there, data, points = exact(Cameras)
+    focal, centre, names = torch.tensor([800.0, 900.0]), torch.tensor([1.0, 2.0]), list(data.device_names)
+    known = {"focal": tuple(focal.tolist()), "centre": tuple(centre.tolist())}
+    data = dc.Readings.images(data.q, data.values * focal + centre, names, **known)
+    devices = placed(data, points[:, None])
+    assert isinstance(devices, Cameras)
+    depth = there._seen(there.constants[data.device], points)[:, 2]
+    for number in range(2):
+        assert float(devices.metres[number]) == pytest.approx(float(depth[data.device == number].mean()), rel=1e-6)
+    error = torch.full((ROWS, 2), 0.01 / 850.0, dtype=torch.float64)  # a hundredth of a pixel
+    moved = replace(data, values=data.values + error)
+    assert data.unit == ("px", 850.0)
+    shown = devices.in_unit(moved, devices.errors(moved, points))
+    assert_close(shown, torch.full_like(shown, 0.01), rtol=1e-6, atol=1e-9)
+
+
+def test_what_is_refused() -> None:
+    devices, data, points = exact(FixedPoints)
+    with pytest.raises(MeasurementError, match="expected distances of left, right, got heights of left, right"):
+        devices.errors(exact(Planes)[1], points)
+    rows = [*range(0, 60, 2), 1, 3, 5]
+    with pytest.raises(MeasurementError, match="at least 8 rows of each device, got 'right' in 3 rows"):
+        placed(data.rows(rows), points[rows, None])
+    for wrong, size, focal in (("`focal`", 2, 0.0), ("pixels", 3, 1.0)):
+        with pytest.raises(MeasurementError, match=wrong):
+            dc.Readings.images(data.q, torch.zeros(ROWS, size), focal=(focal, 1.0), centre=(0.0, 0.0))
+    with pytest.raises(InputError, match="row 3 is at its fixed point"):
+        devices.errors(data, devices.constants[data.device, :3] + torch.arange(3.0, -57.0, -1.0).double()[:, None])
+    assert dc.evaluate(lambda _: points[:, None], data).rms < 1e-9
+
+
+def test_a_model_of_a_marker_does_not_know_the_ball(arm: Case) -> None:
+    data = dc.Readings.distances(arm.result.model.configurations[:20], 1.0)
+    with pytest.raises(InputError, match="a model of such readings"):
+        dc.evaluate(arm.result.model, data)
+
+
+def test_readings_that_are_noise() -> None:
+    _, images, points = exact(Cameras)
+    with pytest.raises(MeasurementError, match=r"no place of the devices explains the readings.*behind its camera"):
+        placed(replace(images, values=3.0 * normal(ROWS, 2, seed=3)), points[:, None])
+    _, data, points = exact(FixedPoints)
+    with pytest.warns(dc.DiffeoCalibWarning, match="no place of the devices explains the readings: expected residuals"):
+        placed(replace(data, values=9.0 * normal(ROWS, 1, seed=6).abs()), points[:, None])
+
+
+def test_cameras_start_in_front_of_points_that_are_not_those() -> None:
+    """Eight images each, points of a ball that is thought elsewhere: projection alone puts some behind the camera."""
+    truth, data, _ = exact(Cameras)
+    data = data.rows(torch.arange(16))
+    for seed in range(20):
+        real = 0.7 * normal(16, 3, seed=seed).clamp(-2, 2)
+        values = truth.observation(data.device).value(real) / truth.metres[data.device][:, None]
+        thought = real + 0.3 * normal(16, 3, seed=seed + 100)
+        found = Cameras.at(replace(data, values=values), thought)
+        assert float(found._seen(found.constants[data.device], thought)[:, 2].min()) > 0
