@@ -25,7 +25,7 @@ FLOORS = (
     ("kernels", "kernels: profile + space + matrix; sums, stacks"),
     ("flows", "geodesics, their adjoint, integrators"),
     ("maps", "nominal maps, deformations, linearisation, noise"),
-    ("regression", "the linearised model conditioned on its data"),
+    ("regression", "the linearised model conditioned on its data: one Gaussian process"),
     ("fitting", "problems, solvers, fits of any smooth map"),
     # robots and tables, no kernel
     ("robots", "chains, DH, URDF, geometric errors, gravity sag"),
@@ -35,7 +35,7 @@ FLOORS = (
     # where they meet
     ("kinematics", "a robot's kinematics as maps: nominal, calibrated; errors on measurements"),
     ("paper", "the paper's own formulation"),
-    ("process", "what is known of robot and devices from rows: one Gaussian process"),
+    ("process", "scales of the fields, weights of rows, evidence of unknowns"),
     ("calibration.identification", "registration, geometric errors, joint offsets"),
     ("calibration.scales", "kernel scales by marginal likelihood, leave-one-out"),
     ("calibration.diagnostics", "measurements that cannot be right"),

@@ -135,12 +135,6 @@ class Seen(NamedTuple):
         """Some of them, (R,) boolean."""
         return Seen(self.numbers, self.error[wanted], self.covariance[wanted][:, wanted])
 
-    def given(self, wanted: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
-        """Errors, m, and covariance, m^2, of some numbers given others: masks (R,) of both."""
-        cross = self.covariance[wanted][:, known]
-        gain = torch.linalg.solve(self.covariance[known][:, known], cross.T).T
-        return self.error[wanted] - gain @ self.error[known], self.covariance[wanted][:, wanted] - gain @ cross.T
-
     def measure(self, freedom: int) -> Measure:
         """Their distance, with so many degrees of freedom."""
         square = float(self.error @ torch.linalg.solve(self.covariance, self.error))
@@ -170,9 +164,11 @@ def find_change(
     known, doubted = flags
     owner, found = seen.numbers.owner, []
     for first in range(len(numbers) - gates.ROWS_AFTER_CHANGE + 1):
-        after = (owner >= first) & doubted[owner]
-        error, covariance = seen.given(after, (owner < first) & known[owner])
-        factor = torch.linalg.cholesky(covariance)
+        after, before = (owner >= first) & doubted[owner], (owner < first) & known[owner]
+        used, count = seen.some(before | after), int(before.sum())
+        factor = torch.linalg.cholesky(used.covariance)
+        white, factor = torch.linalg.solve_triangular(factor, used.error[:, None], upper=False), factor[count:, count:]
+        error = factor @ white[count:, 0]  # given those before
         for one in hypotheses:
             E = seen.numbers.of_table(one.effects)[after]
             spare = len(E) - E.shape[1]

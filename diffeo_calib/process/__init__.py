@@ -1,1 +1,1 @@
-"""What is known of a robot and its devices from the rows that were measured: one Gaussian process."""
+"""What rows are conditioned with: scales of the fields, weights of heavy tails, evidence of unknowns."""

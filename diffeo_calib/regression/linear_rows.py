@@ -89,8 +89,10 @@ class LinearRows:
         return values.view(self.residual.shape).masked_fill(~self.visible, nan)
 
     def log_evidence(self, scale: float = 1.0) -> float:
-        """log N(r; S mu, scale K), but for a constant."""
-        return self.factor.log_density(self.target, self.solved.flatten() / scale)
+        """log N(r; S mu, scale V + S P S^T), but for a constant."""
+        target, roots = self.target / scale**0.5, self.slopes @ torch.linalg.cholesky(self.prior / scale)
+        factor = self.factor if scale == 1.0 else Factor.of(self.V, roots)
+        return factor.log_density(target, factor.solve(target[:, None])[:, 0])
 
     @cached_property
     def gain(self) -> Tensor:

@@ -20,7 +20,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from threading import Thread
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 from diffeo_calib.campaign.campaign import Campaign, Next
 from diffeo_calib.campaign.feeds import DECISIONS, Inbox
@@ -118,21 +118,13 @@ class _Handler(BaseHTTPRequestHandler):
 
     server: Page
 
-    def parse_request(self) -> bool:
-        """Split the path too; 400 where that is impossible."""
-        if not super().parse_request():
-            return False
-        try:
-            self._parts = urlsplit(self.path)
-        except ValueError:
-            self.send_error(400)
-            return False
-        self._query = parse_qs(self._parts.query)
-        return True
+    @property
+    def _query(self) -> dict[str, list[str]]:
+        return parse_qs(self.path.partition("?")[2])
 
     def do_GET(self) -> None:
         """The page, or what it shows."""
-        path = self._parts.path
+        path = self.path.partition("?")[0]
         if not self._allowed():
             self.send_error(403)
         elif path == "/":
@@ -146,15 +138,15 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         """A decision about a row, such as /reject?line=N."""
-        line = self._query.get("line", [""])[0]
+        path, line = self.path.partition("?")[0], self._query.get("line", [""])[0]
         if not self._allowed() or self.headers.get("X-Campaign") is None:
             self.send_error(403)
-        elif self._parts.path not in PATHS:
+        elif path not in PATHS:
             self.send_error(404)
         elif not re.fullmatch("[0-9]{1,9}", line):
             self.send_error(400)
         else:
-            self.server.decisions.put({"do": self._parts.path[1:], "line": int(line)})
+            self.server.decisions.put({"do": path[1:], "line": int(line)})
             self._begin("text/plain")
 
     def log_message(self, *_: object) -> None:

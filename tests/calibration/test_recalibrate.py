@@ -109,6 +109,16 @@ def test_a_worn_joint_is_named_and_followed(arm: Case) -> None:
     assert 0.88 < covered(found.model, test) <= 1.0
 
 
+def test_another_tool_of_a_worn_robot_is_found() -> None:
+    """Large errors are no reason to seek the marker at its old place, 110 mm away."""
+    worn = arm().worn(1, 12.0)
+    worn.truth = replace(worn.truth, tool=worn.truth.tool + torch.tensor([0.1, -0.05, 0.03], dtype=torch.float64))
+    found = dc.recalibrate(old(), measured(worn, 12))
+    assert found.marker == "other"
+    assert "shoulder_joint has changed by 2." in found.status
+    assert rms(found.model, worn) < 3e-3
+
+
 def test_outliers_hardly_count() -> None:
     new = measured(rows=12)
     away = torch.zeros_like(new.points)

@@ -62,7 +62,7 @@ def test_only_this_machine_under_its_own_name(page: Page) -> None:
         assert answer(page, "POST", f"/reject?line={line}", **mine) == 400
     with socket.create_connection(page.server_address[:2], timeout=10) as raw:
         raw.sendall(b"GET http://[/ HTTP/1.0\r\n\r\n")
-        assert b" 400 " in raw.makefile("rb").readline()
+        assert b" 403 " in raw.makefile("rb").readline()
     assert page.decisions.empty()
     assert answer(page, "POST", "/reject?line=3", **mine) == 200
     assert answer(page, "POST", "/accept?line=4", **mine) == 200

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from math import log
 from pathlib import Path
 from typing import Any
 
@@ -397,6 +398,10 @@ def test_evidence_and_left_out_errors_are_those_of_the_whole_covariance() -> Non
     covariance = one.C + torch.block_diag(*one.noise) + one.slopes @ one.prior @ one.slopes.T
     density = MultivariateNormal(one.slopes @ one.mean, covariance)
     assert_close(one.log_evidence(), float(density.log_prob(one.residual.flatten())))
+    scaled = covariance + 8.0 * (one.C + torch.block_diag(*one.noise))  # nine times the errors, the same places
+    density = MultivariateNormal(one.slopes @ one.mean, scaled)
+    apart = float(density.log_prob(one.residual.flatten())) - one.log_evidence(9.0)
+    assert_close(apart, -0.5 * M * R * log(9.0))
     for row in range(M):
         own = torch.arange(M * R) // R == row
         gain = covariance[own][:, ~own] @ torch.linalg.inv(covariance[~own][:, ~own])

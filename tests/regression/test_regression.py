@@ -213,16 +213,13 @@ def with_parameters(problem: Problem, at: GeodesicDeformation, x: Tensor, wide: 
 
 
 @every_seen
-def test_parameters_apart_are_the_formula(problem: Problem) -> None:
-    at, x = deformed(problem), uniform(7, 2, seed=20)
-    data, queries = (with_parameters(problem, at, points, 2.0) for points in (problem.x, x))
-    expected, prior = naive_covariance(problem, data, queries), float(naive_gram(queries, queries).diagonal().max())
-    regression = Process.of_rows(data, problem.noise)
-    close(regression.covariance(queries), expected, prior, 1e-10)
-    values, K = normal(len(data.gram()), 3, seed=8), data.gram() + matrix_of(problem)
-    solved = regression.factor.solve(values)
-    torch.testing.assert_close(solved, torch.linalg.solve(K, values), rtol=1e-6, atol=1e-6)
-    C = torch.stack([regression.factor.of_white(column) for column in torch.eye(len(K), dtype=torch.float64)], 1)
+def test_solving_beside_parameters_is_that_of_the_whole_matrix(problem: Problem) -> None:
+    at = deformed(problem)
+    data = with_parameters(problem, at, problem.x, 2.0)
+    factor, K = Process.of_rows(data, problem.noise).factor, data.gram() + matrix_of(problem)
+    values = normal(len(K), 3, seed=8)
+    torch.testing.assert_close(factor.solve(values), torch.linalg.solve(K, values), rtol=1e-6, atol=1e-6)
+    C = torch.stack([factor.of_white(column) for column in torch.eye(len(K), dtype=torch.float64)], 1)
     torch.testing.assert_close(C.T @ K @ C, torch.eye(len(K), dtype=torch.float64), rtol=0, atol=1e-6)
 
 
@@ -353,7 +350,6 @@ def test_unknown_free_memory_refuses_nothing(monkeypatch: pytest.MonkeyPatch) ->
 def test_auto_takes_conjugate_gradients_for_large_problems() -> None:
     assert iterative.choose("auto", iterative.MAX_DENSE) == "cholesky"
     assert iterative.choose("auto", iterative.MAX_DENSE + 1) == "cg"
-    assert iterative.predicted_memory("cg", 100_000) < iterative.predicted_memory("cholesky", 100_000) / 30
     with pytest.raises(InputError, match="`linear`: expected auto, cholesky, cg, got 'lu'"):
         dc.fit(PROBLEMS["rr"], dc.GaussNewton(linear="lu"), dc.RK4(1))  # pyright: ignore[reportArgumentType]
 

@@ -22,7 +22,7 @@ from torch.nn.functional import pad
 
 from diffeo_calib.calibration.planning.candidates import ranges_around
 from diffeo_calib.calibration.planning.knowledge import Scene, without_positions
-from diffeo_calib.cameras.images import Camera, expected, sees
+from diffeo_calib.cameras.images import expected, sees
 from diffeo_calib.common.checks import as_tensor, check_number
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -237,33 +237,25 @@ class BoardImages(Sensor):
     name: str = ""  # of the camera
     # lens, board and what its images showed
     seen: BoardCamera = None  # pyright: ignore[reportAssignmentType]  # always given
-    rows: Tensor = None  # pyright: ignore[reportAssignmentType]  # (M,) of the fit that it measured
+    set_up: SetUp = None  # pyright: ignore[reportAssignmentType]  # of its last session
+    rows: Tensor = None  # pyright: ignore[reportAssignmentType]  # (M,) of the fit in that session
 
-    @property
-    def camera(self) -> Camera:
-        """Lens and board."""
-        return self.seen.camera
+    @classmethod
+    def last(cls, model: CalibratedKinematics, name: str, seen: BoardCamera, rows: Tensor) -> BoardImages:
+        """Of a camera that measured these rows (M,) of the fit, in its last session.
 
-    @cached_property
-    def _last(self) -> tuple[SetUp, Tensor]:
-        """The set-up of its last session, and the rows of that.
-
-        Where no row says it, that of its last set-up, by a recalibration; the model's in the place of a registration.
+        Where no row says it, in its last set-up, by a recalibration; in the model's place where it was registered.
         """
-        sets = [own for own in self.model.placement if own.kind in TRANSFORMS and self.model.registration is None]
+        known: Any = {"model": model, "name": name, "seen": seen}
+        sets = [own for own in model.placement if own.kind in TRANSFORMS and model.registration is None]
         for own in sets:
-            here = torch.isin(own.rows, self.rows)
+            here = torch.isin(own.rows, rows)
             if bool(here.any()):
                 number = int(own.device[here][own.rows[here].argmax()])
-                rows = self.rows[torch.isin(self.rows, own.rows[own.device == number])]
-                return SetUp.of(self.model, own.names[number]), rows
-        names = (name for own in sets for name in reversed(own.names) if name.partition("/")[0] == self.name)
-        return SetUp.of(self.model, next(names, None)), self.rows
-
-    @property
-    def set_up(self) -> SetUp:
-        """Where it is."""
-        return self._last[0]
+                rows = rows[torch.isin(rows, own.rows[own.device == number])]
+                return cls(**known, set_up=SetUp.of(model, own.names[number]), rows=rows)
+        names = (word for own in sets for word in reversed(own.names) if word.partition("/")[0] == name)
+        return cls(**known, set_up=SetUp.of(model, next(names, None)), rows=rows)
 
     @cached_property
     def lens(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -272,10 +264,9 @@ class BoardImages(Sensor):
         The unknowns are the shifts of the fit; new ones beside a registration, and for images that its poses do not
         explain. The noise is that of a pose beyond that of its corners, m^2.
         """
-        fitted, (set_up, rows) = self.model.map, self._last
-        root = self.camera.root
+        fitted, rows, root = self.model.map, self.rows, self.seen.camera.root
         little = SMALLEST_REST_M**2 * torch.eye(9, dtype=root.dtype, device=root.device)
-        if self.camera.view is None:  # of earlier versions
+        if self.seen.camera.view is None:  # of earlier versions
             return root[:, :0], rows[:0], little
         new = root, torch.full_like(root[0], NEW, dtype=torch.int64), little
         if self.model.registration is not None or not len(rows):
@@ -284,8 +275,8 @@ class BoardImages(Sensor):
         if not bool(by_lens.isfinite().all()):  # it was seen from other places since
             return new
         of_fit = fitted.noise.shared[rows][:, :9].clone()
-        if set_up.columns is not None:
-            of_fit[..., set_up.columns] = 0.0
+        if self.set_up.columns is not None:
+            of_fit[..., self.set_up.columns] = 0.0
         effects = torch.linalg.lstsq(by_lens.flatten(0, 1), of_fit.flatten(0, 1), driver="gelsd").solution
         beyond = (fitted.noise.covariance[rows][:, :9, :9] - known).median(0).values
         values, axes = torch.linalg.eigh(0.5 * (beyond + beyond.mT))
@@ -301,12 +292,12 @@ class BoardImages(Sensor):
     def reached(self, base: Tensor) -> dict[str, Any]:
         """By the rigid kinematics, which is quick, and not far beyond the joints of the fit."""
         geometry, ranges = self.model.geometry, ranges_around(self.model.robot, self.model.configurations)
-        return {"keep": lambda q: sees(self.camera, self.boards(geometry.points(q).flatten(1))), "ranges": ranges}
+        return {"keep": lambda q: sees(self.seen.camera, self.boards(geometry.points(q).flatten(1))), "ranges": ranges}
 
     def tells(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Covariances (O, 9, 9), m^2, of images of points (O, 9), m, and effects (O, 9, 14) of lens and board."""
         boards, lever = self.boards(points), self.model.bodies.pose_lever()
-        covariance, effects = expected(self.camera, boards)
+        covariance, effects = expected(self.seen.camera, boards)
         tool, turn, seen = poses_from_marks(points.unflatten(1, (3, 3)), lever), self.set_up.transform[:3, :3].mT, None
         if self.seen.on_tool:
             M = self.set_up.mount
@@ -317,13 +308,13 @@ class BoardImages(Sensor):
 
     def told(self, scene: Scene, among: Tensor) -> Iterator[Told]:
         """Where the camera sees the board."""
-        rows, (root, columns, rest) = among[sees(self.camera, self.boards(scene.points[among]))], self.lens
+        rows, (root, columns, rest) = among[sees(self.seen.camera, self.boards(scene.points[among]))], self.lens
         points, noise, parts = (
             scene.points[rows],
             scene.noise[rows],
             [(columns, scene.noise.new_zeros(len(rows), 9, 0))],
         )
-        if self.camera.view is not None:
+        if self.seen.camera.view is not None:
             noise, by_lens = self.tells(points)
             noise, parts = noise + rest, [(columns, by_lens @ root)]
         if self.set_up.columns is not None:
@@ -343,7 +334,7 @@ def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
     found: list[Sensor] = [] if without_positions(model) else [Positions(of_frames=model.lever is not None)]
     for own in model.placement:
         for k, (name, seen) in enumerate(own.cameras.items()):
-            found.append(BoardImages(model=model, name=name, seen=seen, rows=own.rows[own.device == k]))
+            found.append(BoardImages.last(model, name, seen, own.rows[own.device == k]))
     words = [word for own in model.placement for word in own.names]
     for own in model.placement:
         for number, word in enumerate(own.names if own.seen_points else ()):
