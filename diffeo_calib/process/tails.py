@@ -30,6 +30,8 @@ FREEDOM_CENTRE, FREEDOM_EFOLDS = 4.0, 2.0
 deviation of log nu; wide, since a handful of errors hardly determines the tails."""
 SMALLEST_FREEDOM, GAUSSIAN_FREEDOM = 2.0, 100.0
 """Bound below which the variance would be infinite, and nu from which noise counts as Gaussian."""
+WEIGHT_CHANGE = 0.01
+"""Largest relative change of a weight at which it has converged: gross errors make all weights small at first."""
 FREEDOM_GRID_POINTS = 400
 """Points of the logarithmic grid of nu: steps of one percent."""
 
@@ -46,6 +48,10 @@ class Tails:
     def none(cls, rows: int, markers: int, *, device: torch.device = HOST) -> Tails:
         """Gaussian noise."""
         return cls(inf, torch.ones(rows, markers, dtype=torch.float64, device=device))
+
+    def settled(self, before: Tails) -> bool:
+        """Whether no weight has changed by far in a round."""
+        return float((self.weights / before.weights - 1.0).abs().max()) < WEIGHT_CHANGE
 
     def rows(self, index: Tensor | slice) -> Tails:
         """The tails of some rows."""

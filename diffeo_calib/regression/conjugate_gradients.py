@@ -194,9 +194,10 @@ def condition(
         InputError: the method needs more memory than is free.
         NumericalError: F + R is not positive definite in float64.
     """
-    n, m, _ = noise.covariance.shape
-    method = choose(linear, n * m)
-    check_memory(predicted_memory(method, n * m), f"{n * m} measured coordinates with linear={method!r}")
+    size = noise.covariance.shape[:2].numel()
+    method = choose(linear, size)
+    columns = size if method == "cholesky" else min(MAX_RANK, size)  # four matrices, or factors of the preconditioner
+    check_memory(4 * BYTES_PER_FLOAT * size * columns, f"{size} measured coordinates with linear={method!r}")
     if method == "cholesky":
         return Process.of_rows(linearisation, noise)
     return ConjugateGradientRegression(linearisation, noise, tolerance=tolerance)
@@ -211,8 +212,3 @@ def choose(linear: LinearSolver, size: int) -> LinearSolver:
     if linear not in get_args(LinearSolver):
         raise InputError.of("`linear`", expected=", ".join(get_args(LinearSolver)), got=as_written(linear))
     return linear if linear != "auto" else "cholesky" if size <= MAX_DENSE else "cg"
-
-
-def predicted_memory(linear: LinearSolver, size: int) -> int:
-    """Bytes at the peak of one step: four matrices, or four factors of the preconditioner."""
-    return 4 * BYTES_PER_FLOAT * size * (size if linear == "cholesky" else min(MAX_RANK, size))

@@ -194,7 +194,7 @@ def test_onnx_runs_to_rounding(tmp_path: Path, dtype: torch.dtype) -> None:
     expected = TorchProgram(model, output)(q)
     for some in (slice(0, 1), slice(None)):
         (found,) = session.run([output], {"q": q[some].to(dtype).numpy()})
-        same(torch.from_numpy(found).double(), expected[some], 5e-6 if dtype == torch.float32 else 1e-12)
+        same(torch.from_numpy(found).double(), expected[some], 5e-6 if dtype == torch.float32 else 1e-11)
     assert session.get_inputs()[0].shape[1] == q.shape[1]
     described = session.get_modelmeta().custom_metadata_map
     assert described["units"] == "m, rad"

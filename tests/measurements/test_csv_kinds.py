@@ -393,13 +393,6 @@ def test_what_is_no_marker_is_one_error(change: dict[str, Any], message: str, tm
 # --- written columns ---
 
 
-def write(path: Path, data: Measurements, **options: Any) -> None:
-    """Write in rad and m, with options of the format and of the columns mixed."""
-    columns = {name: options.pop(name) for name in ("joints", "position") if name in options}
-    table: dict[str, Any] = {"length": "m", "angle": "rad"} | options
-    write_measurements(path, data, TableFormat(**table), **columns)
-
-
 def test_written_columns(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     write_measurements(path, Measurements([[0.5]], [[1, 2, 3]]), TableFormat("mm", "rad", ";", ","))
@@ -450,7 +443,7 @@ def test_own_names_of_written_columns(tmp_path: Path) -> None:
     data = Measurements.from_poses([[0.5]], pose, position_std=1e-3, rotation_std=1.0)
     names: dict[str, Any] = {"position": "xyz", "rotation": "abc", "std": "uvw", "rotation_std": "klm"}
     options: dict[str, Any] = {name: list(letters) for name, letters in names.items()}
-    write(path, data, joints=["j"], **options)
+    write_measurements(path, data, SI, joints=["j"], **options)
     assert path.read_text().splitlines() == [
         "j,x,y,z,a,b,c,u,v,w,k,l,m",
         "0.5" + ",0.0" * 6 + ",0.001" * 3 + ",1.0" * 3,
@@ -476,7 +469,7 @@ def test_wrong_option_of_written_poses_is_one_clear_error(
     frames = torch.eye(4, dtype=torch.float64).expand(2, 4, 4)
     data = Measurements.from_poses([[0.0], [1.0]], frames, position_std=1.0) if poses else some(2)
     with pytest.raises(MeasurementError, match=says(*message)):
-        write(tmp_path / "table.csv", data, **options)
+        write_measurements(tmp_path / "table.csv", data, SI, **options)
     assert not (tmp_path / "table.csv").exists()
 
 

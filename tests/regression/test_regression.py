@@ -350,7 +350,6 @@ def test_unknown_free_memory_refuses_nothing(monkeypatch: pytest.MonkeyPatch) ->
 def test_auto_takes_conjugate_gradients_for_large_problems() -> None:
     assert iterative.choose("auto", iterative.MAX_DENSE) == "cholesky"
     assert iterative.choose("auto", iterative.MAX_DENSE + 1) == "cg"
-    assert iterative.predicted_memory("cg", 100_000) < iterative.predicted_memory("cholesky", 100_000) / 30
     with pytest.raises(InputError, match="`linear`: expected auto, cholesky, cg, got 'lu'"):
         dc.fit(PROBLEMS["rr"], dc.GaussNewton(linear="lu"), dc.RK4(1))  # pyright: ignore[reportArgumentType]
 

@@ -85,10 +85,9 @@ class ReadingDevices(DeviceSet):
             yield one._replace(effects=self._of_all_rows(one.effects, data))
 
     def settled(self, found: Settled) -> ReadingDevices:
-        devices, shape = self.devices, (len(self.devices.names), -1)
-        moved = devices.moved(found.shifts.view(shape) * devices.deviations)
-        known = found.covariance.diagonal().clamp(min=0).sqrt().view(shape) * devices.deviations
-        return replace(self, devices=replace(moved, deviations=known))
+        known = found.covariance.diagonal().clamp(min=0).sqrt().view_as(self.devices.deviations)
+        moved = self.devices.shifted(found.shifts)
+        return replace(self, devices=replace(moved, deviations=known * moved.deviations))
 
     def with_rows(self, other: OtherRows) -> ReadingDevices:
         own = next(one for one in other.readings if one.table.column_kind == self.data.column_kind)

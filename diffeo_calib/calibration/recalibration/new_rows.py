@@ -47,8 +47,6 @@ SMALL_STEP = 1e-2
 SETTLED = 1e-9
 """The search for places ends with a step below this, m and rad."""
 ROUNDS = 20
-WEIGHT_CHANGE = 0.01
-"""Largest relative change of a weight at which it has converged."""
 OUTLIER_WEIGHT = 0.2
 """Rows with a smaller weight hardly count."""
 LINEARISED = "seen", "at", "residual", "by_places", "fit_covariance"
@@ -405,9 +403,8 @@ class NewRows:
             error = noise @ given.solved[..., None]
             moments = error @ error.mT + noise - noise @ given.precisions @ noise  # expected, of the noise
             tails = reweight(rows.noise_model.squares(rows.noise, moments), rows.noise_model.freedom)
-            change = float((tails.weights / rows.tails.weights - 1.0).abs().max())
-            rows = rows.changed(tails=tails)
-            if change < WEIGHT_CHANGE:
+            before, rows = rows.tails, rows.changed(tails=tails)
+            if tails.settled(before):
                 break
         return rows
 

@@ -42,8 +42,6 @@ BLOCK_COORDINATES = KEPT_COORDINATES
 """Measured coordinates of one block: a few hundred poses predict another pose nearly as well as thousands do."""
 ROUNDS = 8
 """Largest number of steps of expectation maximisation."""
-WEIGHT_CHANGE = 0.01
-"""Largest relative change of a weight at which it has converged: gross errors make all weights small at first."""
 SMALLEST_FREEDOM = 8.0
 """Lower bound of the degrees of freedom with which the data determine the scale of all variances."""
 
@@ -86,7 +84,7 @@ def weighed(data: TangentData, scales: Hyperparameters, seed: int = 0) -> Tangen
         for rows, part in _parts(data, seed):
             squares[rows] = _expected_squares(part, scales, tails.rows(rows))
         before, tails = tails, reweight(squares, data.noise_model.freedom)
-        if _settled(before, tails):
+        if tails.settled(before):
             break
     return data.with_tails(_among_gross(data, scales, tails, seed))
 
@@ -98,14 +96,9 @@ def _among_gross(data: TangentData, scales: Hyperparameters, tails: Tails, seed:
         if weights is None:
             break
         before, tails = tails, Tails(inf, weights, gross=True)
-        if _settled(before, tails):
+        if tails.settled(before):
             break
     return tails
-
-
-def _settled(before: Tails, after: Tails) -> bool:
-    """Whether no weight has changed by far."""
-    return float((after.weights / before.weights - 1.0).abs().max()) < WEIGHT_CHANGE
 
 
 def leave_one_out(data: TangentData, scales: Hyperparameters, seed: int = 0) -> LeaveOneOut:

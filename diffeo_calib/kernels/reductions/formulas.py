@@ -18,8 +18,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cache, cached_property, reduce
+from dataclasses import dataclass, field
+from functools import cache, reduce
 from itertools import chain
 from typing import Any, ClassVar, NamedTuple
 
@@ -69,6 +69,14 @@ class Formula:
     weigh: Callable[[Leaf, Profile], list[Any]]  # the pairwise scalars w_ij from those of :data:`LEAVES` and a profile
     results: tuple[tuple[Term, ...], ...]  # the terms that every result is the sum of
     reads: tuple[str, ...] = ("features", "momenta")  # the fields of :class:`Points` that it needs of the columns
+    _expanded: list[list[Summand]] = field(init=False)  # the summands of every weight, without repetitions
+
+    def __post_init__(self) -> None:
+        found: dict[int, dict[Summand, None]] = {}
+        for term in chain.from_iterable(self.results):
+            keys = [(term.vector, term.apart)] if term.apart else []
+            found.setdefault(term.weight, {}).update(dict.fromkeys([*keys, (term.vector, None)]))
+        object.__setattr__(self, "_expanded", [list(found[weight]) for weight in sorted(found)])
 
     def summands(self, j: Points) -> list[Tensor]:
         """Factors of every weight: (N, k) each, the vectors b_j and products b_j e_j^T of all its terms."""
@@ -79,15 +87,6 @@ class Formula:
         dim = i.features.shape[-1]
         parts = [_split(s, keys, dim) for s, keys in zip(sums, self._expanded, strict=True)]
         return tuple(reduce(torch.add, [_finished(t, parts[t.weight], i) for t in terms]) for terms in self.results)
-
-    @cached_property
-    def _expanded(self) -> list[list[Summand]]:
-        """The summands of every weight, without repetitions."""
-        found: dict[int, dict[Summand, None]] = {}
-        for term in chain.from_iterable(self.results):
-            keys = [(term.vector, term.apart)] if term.apart else []
-            found.setdefault(term.weight, {}).update(dict.fromkeys([*keys, (term.vector, None)]))
-        return [list(found[weight]) for weight in sorted(found)]
 
 
 def _summand(j: Points, vector: str | None, apart: str | None) -> Tensor:
