@@ -58,11 +58,6 @@ class CFiles:
         """Both files and what they hold."""
         return {self.source: self.texts[0].encode("ascii"), self.header: self.texts[1].encode("ascii")}
 
-    @property
-    def size(self) -> int:
-        """Bytes of the source."""
-        return len(self.texts[0])
-
 
 def write_c(
     model: CalibratedKinematics,

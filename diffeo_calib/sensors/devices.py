@@ -242,8 +242,9 @@ class Devices(Extrinsics):
         by_own = vmap(jacrev(self._read_metres))(own, points)  # (N, r, c)
         return by_own @ vmap(jacrev(self.changed, argnums=1))(self.constants, none)[device]
 
-    def moved(self, increments: Tensor) -> Devices:
-        """The devices after increments (D, k)."""
+    def shifted(self, shifts: Tensor) -> Devices:
+        """The devices after shifts (D k,), increments in units of their deviations."""
+        increments = shifts.view_as(self.deviations) * self.deviations
         return replace(self, constants=vmap(self.changed)(self.constants, increments))
 
     @classmethod
@@ -274,11 +275,6 @@ class Devices(Extrinsics):
     @abstractmethod
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
         """Where a device is in a frame, with standard deviations of its increments (k,)."""
-
-    @classmethod
-    def doubts_unit(cls, data: Readings, errors: Tensor) -> bool:
-        """Whether the errors (N, r), m, of a rough fit make the unit of readings doubtful."""
-        return False
 
     def freed(self) -> Devices | None:
         """The same devices with what was said to be known left open, to test it; None if there is nothing."""
@@ -327,17 +323,13 @@ class Devices(Extrinsics):
         return [self.sentence(number, own, MODEL_FRAME) for number, own in enumerate(self.deviations)]
 
     def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
-        return torch.stack([self.only([name])._carried(T, before, after) for name in self.names])
-
-    def _carried(self, T: Tensor, before: Tensor, after: Tensor) -> Tensor:
-        """Constants (c,) of the device that reads of points (N, P, 3) what this one reads of others, m."""
-        old, new = self.points_of(before), self.points_of(after)
-        own = torch.zeros(len(old), dtype=torch.int64, device=old.device)
+        own = torch.arange(len(self.names), device=before.device).repeat_interleave(len(before))
+        old, new = (self.points_of(points).repeat(len(self.names), 1) for points in (before, after))
         sees = self.sees(old, own)
         old, new, own = old[sees], new[sees], own[sees]
-        values = self.turned(self.observation(own).value(old) / self.metres, T)
-        start = replace(self, constants=self.start(values, self.bodies(new))[None])
-        return start.refined(Readings(self.kind, old[:, :1], values, own, self.names), new).constants[0]
+        values = self.turned(self.observation(own).value(old) / self.metres[own, None], T)
+        data = Readings(self.kind, old[:, :1], values, own, self.names)
+        return replace(self, constants=self.at(data, new).constants).refined(data, new).constants
 
     @property
     def metres(self) -> Tensor:
@@ -385,7 +377,7 @@ class Devices(Extrinsics):
             matrix = torch.cat([(weight * slopes).flatten(0, 1), eye])
             target = torch.cat([(weight[..., 0] * errors).flatten(), eye[0] * 0.0])
             step = torch.linalg.lstsq(matrix, target[:, None]).solution
-            devices = devices.moved(step.view(len(self.names), -1) * self.deviations)
+            devices = devices.shifted(step[:, 0])
         return devices
 
     def open_deviations(self, data: Readings, points: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from math_bank import normal
+from reading_bank import scales
 from table_bank import refused, warned
 from torch import Tensor
 
@@ -25,11 +26,16 @@ ARM, ROWS = SimulatedArm(3), 80
 NOISE = 2e-5
 
 
+def said_of(rows: Any) -> list[str]:
+    """What a calibration warns of, with scales given."""
+    return warned(dc.calibrate, ARM.nominal, rows, hyperparameters=scales())[1]
+
+
 @pytest.mark.parametrize("every", [2, 5])
 def test_tools_that_take_turns_are_named_with_their_rows(every: int) -> None:
     q, y = ARM.measure(ROWS, seed=1)
     y[::every, 0] += ARM.truth.poses(q)[::every, :3, :3] @ torch.tensor([3e-4, 0.0, 4e-4], dtype=torch.float64)
-    (text,) = [one for one in warned(dc.calibrate, ARM.nominal, dc.Measurements(q, y))[1] if "another tool" in one]
+    (text,) = [one for one in said_of(dc.Measurements(q, y)) if "another tool" in one]
     lines = ", ".join(str(every * k) for k in range(5))
     assert text.startswith(f"{ROWS // every} of {ROWS} rows seem to have another tool or marker, 0.")
     assert f"mm away: lines {lines} and" in text
@@ -44,9 +50,8 @@ def test_balls_that_take_turns_are_named_in_readings() -> None:
     fixed = torch.tensor([[1.5, 0.0, 0.5], [0.0, 1.6, 0.1], [-1.2, -1.0, 1.4]], dtype=torch.float64)
     which = torch.arange(120) % 3
     lengths = (ball - fixed[which]).norm(dim=1) + NOISE * normal(120, seed=6)
-    _, said = warned(
-        dc.calibrate, ARM.nominal, dc.Readings.distances(q, lengths, [f"anchor {k}" for k in which.tolist()])
-    )
+    rows = dc.Readings.distances(q, lengths, [f"anchor {k}" for k in which.tolist()])
+    _, said = warned(dc.calibrate, ARM.nominal, rows)  # noise as large as the errors that it finds
     assert any("another tool or marker" in one for one in said), said
 
 
@@ -55,7 +60,7 @@ def payloads(change: Any, rows: int = ROWS) -> list[str]:
     q = ARM.sample(rows, 2)
     y = ARM.true_points(q, masses)
     data = dc.Measurements(q, y + NOISE * normal(*y.shape, seed=3)).with_payload(change(masses.clone()))
-    return [one for one in warned(dc.calibrate, ARM.nominal, data)[1] if "payload" in one]
+    return [one for one in said_of(data) if "payload" in one]
 
 
 @pytest.mark.parametrize(

@@ -46,10 +46,10 @@ def fitted(kind: str) -> Any:
 
 def slopes_of(devices: Any, number: int, z: Tensor) -> tuple[Tensor, Tensor]:
     """Derivatives of a reading by the point and by all increments of unit prior, by central differences."""
+    wide = replace(devices, deviations=z.new_tensor(devices.prior()).expand_as(devices.deviations))
 
     def read(point: Tensor, increments: Tensor) -> Tensor:
-        moved = devices.moved(increments.view(len(devices.names), -1) * z.new_tensor(devices.prior()))
-        return moved.observation(torch.tensor([number])).value(point[None])[0]
+        return wide.shifted(increments).observation(torch.tensor([number])).value(point[None])[0]
 
     none = z.new_zeros(devices.freedom)
 

@@ -203,7 +203,7 @@ def test_lengths_from_another_zero_are_refused_or_warned_about() -> None:
 def test_what_is_refused() -> None:
     arm, data = SimulatedArm(2), readings(SimulatedArm(2), "distance", 60)
     with pytest.warns(dc.DiffeoCalibWarning, match="no place of ball and devices explains"):
-        registered(arm.nominal, dc.Readings.distances(data.q, data.values))  # three devices as one
+        registered(arm.nominal, dc.Readings.distances(data.q[:24], data.values[:24]))  # three devices as one
     kept = data.rows(data.device != 1)
     assert kept.names == ("device 0", "device 2")
     assert set(kept.device.tolist()) == {0, 1}

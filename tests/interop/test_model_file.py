@@ -21,31 +21,19 @@ from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.robots import elastic_rr
 
 
-@pytest.mark.parametrize(
-    "name", ["arm", "posed", *(pytest.param(name, marks=pytest.mark.slow) for name in ("pair", "slider"))]
-)
+@pytest.mark.parametrize("name", ["arm", "posed"])
 def test_robot_models_come_back_bit_for_bit(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    """Of the other kinds: tests/test_laws_of_kinds.py."""
     case: Case = request.getfixturevalue(name)
     model, q = case.model, case.test.q[:50]
     dc.save(model, tmp_path / "model.safetensors")
     again = dc.load(tmp_path / "model.safetensors")
     assert isinstance(again, dc.CalibratedKinematics)
-    assert torch.equal(again(q), model(q))
     assert torch.equal(again.jacobian(q), model.jacobian(q))
     for mine, theirs in zip(again.predict(q), model.predict(q), strict=True):
         assert torch.equal(mine, theirs)
-    assert torch.equal(again.geometry.points(q), model.geometry.points(q))
-    assert torch.equal(again.map.new_noise, model.map.new_noise)
-    theta = model.map.deformation.momenta.theta
-    assert torch.equal(again.nominal(q, theta), model.nominal(q, theta))  # including gravity sag
-    for joint in model.robot.joint_names:
-        assert torch.equal(again.transmission(joint, q[:, 0]), model.transmission(joint, q[:, 0]))
-    assert again.report == model.report
-    assert again.lever == model.lever == case.train.lever
-    assert again.robot.joint_names == model.robot.joint_names
-    assert (again.robot.name, again.robot.base, again.robot.tip) == (case.robot.name, case.robot.base, case.robot.tip)
-    assert again.robot.kinds == model.robot.kinds
-    assert torch.equal(again.robot.limits, model.robot.limits)
+    assert (again.report, again.lever) == (model.report, case.train.lever)
+    assert again.robot.to_config() == model.robot.to_config()
     dc.save(again, tmp_path / "again.safetensors")
     assert torch.equal(dc.load(tmp_path / "again.safetensors")(q), model(q))
 
@@ -111,11 +99,6 @@ def test_the_header_describes_the_model(arm: Case, tmp_path: Path) -> None:
     assert header["units"] == {"length": "m", "angle": "rad"}
     robot = header["nominal"]
     assert (robot["name"], robot["base"], robot["tip"]) == ("simulated_arm", "base_link", "flange")
-    moving = [joint["name"] for joint in robot["joints"] if joint["kind"] != "fixed"]
-    assert tuple(moving) == arm.robot.joint_names
-    assert [term["profile"] for term in header["joint_kernel"]] == ["matern52"] * 6 + ["gaussian"]
-    assert [term["output"] for term in header["joint_kernel"]] == [0, 1, 2, 3, 4, 5, None]
-    assert len(header["task_kernel"]) == 1
     report = header["report"]
     assert report["coupling residual"] <= 1e-4
     assert report["end residual"] <= 1e-4

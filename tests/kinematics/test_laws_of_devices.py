@@ -98,7 +98,9 @@ def test_slopes_are_derivatives(kind: type[Devices]) -> None:
     seen = there.observation(number)
     expected = change(lambda h: seen.value(points + h * shift))
     assert_close((seen.slope(points) @ shift[..., None])[..., 0], expected, rtol=1e-6, atol=1e-8)
-    expected = change(lambda h: there.moved(h * step).observation(number).value(points))
+    expected = change(
+        lambda h: there.shifted((h * step / there.deviations).flatten()).observation(number).value(points)
+    )
     assert_close(
         (there.by_increments(points, number) @ step[number][..., None])[..., 0], expected, rtol=1e-6, atol=1e-8
     )

@@ -173,8 +173,7 @@ class ReadRows(NamedTuple):
         return self.around.freedom
 
     def devices(self, shifts: Tensor) -> tuple[Devices, ...]:
-        around = self.around  # shifts are in units of their deviations
-        return (around.moved(shifts.view(len(around.names), -1) * around.deviations),)
+        return (self.around.shifted(shifts),)
 
     def errors(self, points: Tensor, shifts: Tensor) -> Tensor:
         return -self.devices(shifts)[0].errors(self.data, self.around.points_of(points))[:, None]

@@ -173,7 +173,7 @@ def _write_programs(
     """
     frame, named = given.frame or "base", not (tool is None and given.frame is None)
     if source is not None:
-        files = f"{source.source} ({source.size / MEGABYTE:.1f} MB), {source.header.name}"
+        files = f"{source.source} ({len(source.texts[0]) / MEGABYTE:.1f} MB), {source.header.name}"
         yield f"c: {files}: {', '.join(source.functions)}, in the frame {frame!r}"
     output = "tool_poses" if named else "points"
     what = f"poses of the tool in the frame {frame!r}" if named else "markers in the measuring frame"
