@@ -267,6 +267,8 @@ def _rebuild_nominal(
         raise MissingArgumentError.of("`nominal` was given, but the file holds its robot", fix="leave it out")
     robot, on = robot_from_config(description, source), tuple(description.get("on", ()))
     geometry = Geometry(robot, **{name: tensors[name] for name in GEOMETRY}, on=on)
+    if not isinstance(description["elastic"], bool):
+        raise InputError.of("the entry elastic", expected="true or false", got=description["elastic"])
     payload = NO_PAYLOAD
     if carried := description.get("payload"):
         mass = torch.tensor(carried["mass"], dtype=torch.float64, device=HOST)

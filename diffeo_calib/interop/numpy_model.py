@@ -22,7 +22,7 @@ from safetensors import SafetensorError, safe_open
 
 from diffeo_calib.common.data_frames import named_columns, real_array
 from diffeo_calib.common.errors import InputError, ModelFileError
-from diffeo_calib.runtime.arrays import TABLEAUS, Array
+from diffeo_calib.runtime.arrays import MOST_STEPS, TABLEAUS, Array
 from diffeo_calib.runtime.build import calibrated_chain, nominal_chain, recorded_flow, recorded_stages
 from diffeo_calib.runtime.chain import tip_poses
 from diffeo_calib.runtime.program import Program, check_frame
@@ -188,13 +188,14 @@ def _numbers(value: object, name: str) -> Array:
 
 
 def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
-    nominal, integrator = header["nominal"], header["integrator"]
+    nominal, integrator, steps = header["nominal"], header["integrator"], header["integrator"]["steps"]
     kernels = header["joint_kernel"], header["task_kernel"]
     own = ", ".join(term["kernel"] for terms in kernels for term in terms if "kernel" in term)
     for wrong, what, expected, got in (
         (nominal["kind"] != "robot", "the model", "that of a robot", "a plain function"),
         (integrator["kind"] not in TABLEAUS, "the time stepping", "fixed steps, of RK4 or RK8", integrator["kind"]),
         (own, "the model's kernels", "kernels of this package", own),
+        (type(steps) is not int or not 1 <= steps <= MOST_STEPS, "the time steps", f"1 to {MOST_STEPS}", steps),
     ):
         if wrong:
             raise InputError.of(what, expected=expected, got=got, fix="use `dc.load`")
@@ -209,7 +210,7 @@ def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
     k0 = calibrated_chain(
         chain, arrays["base"], arrays["joint_errors"], theta, sag if nominal["elastic"] else None, **errors
     )
-    tableau, steps = TABLEAUS[integrator["kind"]](), integrator["steps"]
+    tableau = TABLEAUS[integrator["kind"]]()
     joint, xi = recorded_stages(kernels[0], arrays["x"], arrays["momenta_x"], tableau, steps)
     tip, markers = tip_poses(k0, xi[0])[:, on], tool + shifts  # (N, P, 4, 4); of every control those of its session
     if "session" in arrays:

@@ -7,9 +7,9 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from math import inf
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
-from diffeo_calib.common.errors import PACKAGE, InputError, printable
+from diffeo_calib.common.errors import PACKAGE, InputError, as_written, printable
 
 HASH_SHOWN = 12
 """Digits of a hash that a sentence shows."""
@@ -167,9 +167,21 @@ def record_of(kind: type[Record], entries: Mapping[str, Any], **given: Any) -> R
     """A dataclass of the entries of a file, and of other fields that are ``given``.
 
     Raises:
-        TypeError: an entry is missing or unknown.
+        TypeError: an entry is missing or unknown, or its value has another type than the field.
     """
     known: dict[str, str] = {one.metadata.get("name", one.name): one.name for one in fields(kind)}  # pyright: ignore[reportArgumentType]
-    plain = {name: inf if value == INFINITE else value for name, value in entries.items()}
-    values = {known.get(name, name): tuple(own) if isinstance(own, list) else own for name, own in plain.items()}
-    return kind(**values, **given)
+    hints, values = get_type_hints(kind), {known.get(name, name): value for name, value in entries.items()}
+    return kind(**{name: _read(value, hints.get(name, object), name) for name, value in values.items()}, **given)
+
+
+def _read(value: Any, hint: Any, name: str) -> Any:
+    """A value of a file as its type says: a float, an int, text, true or false, a tuple of these, or None."""
+    if get_origin(hint) is tuple and isinstance(value, list):
+        return tuple(_read(one, get_args(hint)[0], name) for one in value)
+    kinds = get_args(hint) or (hint,)
+    if value == INFINITE and float in kinds:
+        return inf
+    accepted = (*kinds, int) if float in kinds else kinds  # a whole number may stand for a float
+    if isinstance(value, bool) is not (bool in kinds) or not isinstance(value, accepted):
+        raise TypeError(f"the entry {name!r} is {as_written(value)}")
+    return float(value) if float in kinds and value is not None else value

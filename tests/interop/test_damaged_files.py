@@ -162,6 +162,11 @@ WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
     "one joint less": (("nominal", "joints", 0, "kind"), "fixed", "joint_errors"),
     "mimic of no joint": (("nominal", "joints", 0, "mimic"), {"nose": 1.0}, "mimics 'nose'"),
     "one active joint less": (("nominal", "joints", 1, "mimic"), {"waist_joint": 1.0}, "must have shape (N, 5)"),
+    "elastic of a word": (("nominal", "elastic"), "no", "the entry elastic: expected true or false, got no"),
+    "command of a number": (("provenance", "command"), 5, "the entry 'command' is 5"),
+    "note of a list": (("provenance", "note"), ["x"], "the entry 'note' is ['x']"),
+    "error of a word": (("report", "geometry rms [m]"), "large", "the entry 'geometry_rms' is 'large'"),
+    "rows of a truth value": (("report", "rows"), True, "the entry 'rows' is True"),
     "rigid, with elastic coefficients": (("nominal", "elastic"), False, "`theta` has the wrong shape"),
 }
 
@@ -231,6 +236,13 @@ def test_wrong_tensors(name: str, editor: Editor) -> None:
 @pytest.mark.parametrize(("key", "value"), [("task_dim", 2), ("task_dim", 1), ("integrator", True)])
 def test_entries_that_do_not_match_the_tensors(key: str, value: object, editor: Editor) -> None:
     refused(editor.write(set_entry(key, value=value)))
+
+
+@pytest.mark.parametrize("steps", [0, 0.5, True, 10**5, 10**30])
+def test_the_reader_without_torch_bounds_the_time_steps(steps: object, editor: Editor) -> None:
+    """Its work grows with them: 10^5 steps would take minutes."""
+    with pytest.raises(ModelFileError, match="the time steps: expected 1 to 1024"):
+        dc.interop.load_numpy(editor.write(set_entry("integrator", "steps", value=steps)))
 
 
 def test_a_forged_flow_has_no_predictions(editor: Editor) -> None:
