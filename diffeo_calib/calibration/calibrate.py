@@ -190,7 +190,9 @@ def calibrate(
             warn_user(text)
         devices, bodies = placed.placement.hypotheses(chosen.data, CHANGE), placed.placement.bodies
         judged = chosen.data, chosen.selection.scales, chosen.left_out, placed.data.line_numbers
-        best = judge(*judged, devices=devices, bodies=bodies, opens=not chosen.selection.interrupted)
+        best = judge(
+            *judged, placed.data.row_names, devices=devices, bodies=bodies, opens=not chosen.selection.interrupted
+        )
         if best and best.columns is not None:
             chosen = choose(placed.tangent_data(best.columns), measurements, *stages)
         LOG.info("scales: %s", chosen.selection.status)

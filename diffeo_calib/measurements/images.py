@@ -40,6 +40,7 @@ class ImageTable(SocketTable):
     BY_IMAGE = ("corners", "seen_by", *OF_POSES)
     corners: Tensor | None = None  # (N, K, 5), see :meth:`from_images`; None without images
     cameras: Mapping[str, Camera] = MappingProxyType({})  # lens and board that they show, by the names of the cameras
+    image_names: Mapping[int, str] = MappingProxyType({})  # by the line of the file where the image begins
     seen_by: Tensor | None = None  # (N,) int64, number of the camera of each image
     pose_covariance: Tensor | None = None  # (N, 6, 6) of the errors of the poses
     # (N, 6, c) effects of c errors of unit variance that all images share: of lenses and board
@@ -104,6 +105,13 @@ class ImageTable(SocketTable):
         columns |= errors_of_poses(poses, *errors, camera_on_tool=camera_on_tool)
         data = with_attributes(cls.from_poses(angles, poses, joints, **named), **columns)
         return data.with_sessions(seen_by, remounted=camera_on_tool)
+
+    @property
+    def row_names(self) -> list[str]:
+        """Lines of the file, and the image of each where a table of corners names it."""
+        names = self.image_names if self.file_sha256 else {}  # lines of joined files are told apart no more
+        lines = zip(super().row_names, self.line_numbers.tolist(), strict=True)
+        return [f"{row} ({names[line]})" if line in names else row for row, line in lines]
 
     @property
     def camera(self) -> Camera | None:

@@ -80,6 +80,11 @@ class Observations(RowGroups):
         return self._texts([part.device_names for part in self.parts])
 
     @property
+    def row_names(self) -> list[str]:
+        """(N,) how texts name the rows."""
+        return self._texts([part.row_names for part in self.parts])
+
+    @property
     def session_names(self) -> tuple[str, ...]:
         """Names of the devices and set-ups, in order of first appearance."""
         return tuple(dict.fromkeys(name for name in self.device_names if name))

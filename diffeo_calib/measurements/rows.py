@@ -112,6 +112,11 @@ class RowGroups:
         column, names = self.NUMBERED
         return checks.texts_of(getattr(self, column), getattr(self, names), len(self))
 
+    @property
+    def row_names(self) -> list[str]:
+        """(N,) how texts name the rows: by their lines, images by their files too."""
+        return [f"row {line}" for line in self.line_numbers.tolist()]
+
     def beside_images(self) -> list[tuple[Any, Tensor]]:
         """These rows as they stand beside images of a board with the same tool: tables, and row numbers (M,) here."""
         return [(self, *self.index)]

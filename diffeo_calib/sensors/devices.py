@@ -276,11 +276,6 @@ class Devices(Extrinsics):
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
         """Where a device is in a frame, with standard deviations of its increments (k,)."""
 
-    @classmethod
-    def doubts_unit(cls, data: Readings, errors: Tensor) -> bool:
-        """Whether the errors (N, r), m, of a rough fit make the unit of readings doubtful."""
-        return False
-
     def freed(self) -> Devices | None:
         """The same devices with what was said to be known left open, to test it; None if there is nothing."""
         return None

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import few
-from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.sensors.devices import (
     Devices,
     across,
@@ -19,8 +18,6 @@ from diffeo_calib.sensors.devices import (
 
 LEAST_NORMAL = 0.5
 """Length of a normal by least squares from which heights tell the points apart."""
-UNIT_RATIO, CORRELATED = 10.0, 0.5
-"""Factor between measured and found heights that is doubted, and their correlation that shows it."""
 FLAT_SHARE = 0.2
 """Smallest singular value of the planes' normals, relative to the largest, from which directions differ."""
 PARALLEL_SINE = 0.1
@@ -74,18 +71,6 @@ class Planes(Devices):
         turn, shift = 1e3 * float(deviations[:2].norm()), 1e3 * float(deviations[2])
         what = f"plane '{self.names[number]}' in {frame}: normal {numbers_text(normal)} +- {turn:.2f} mrad"
         return f"{what}, {1e3 * distance:.3f} +- {shift:.3f} mm from the origin"
-
-    @classmethod
-    def doubts_unit(cls, data: Readings, errors: Tensor) -> bool:
-        """By how much the ball's heights change per change of the measured ones, where they change together."""
-        measured, predicted = data.values[:, 0], (data.values + errors)[:, 0]
-        whose = torch.nn.functional.one_hot(data.device, len(data.names)).to(measured)
-        mean = whose / whose.sum(0)
-        measured, predicted = (values - whose @ (mean.mT @ values) for values in (measured, predicted))
-        together, size = float(measured @ predicted), float(measured.norm() * predicted.norm())
-        if together < CORRELATED * size or size == 0.0:
-            return False
-        return not 1 / UNIT_RATIO < together / float(measured.square().sum()) < UNIT_RATIO
 
     def open_sentences(self) -> Iterator[tuple[str, str]]:
         """Directions that no plane faces."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 from simulated_camera import BOARD_PRIOR, HEIGHT, LENS, WIDTH, CameraArm, camera_arm
@@ -10,6 +12,9 @@ from table_bank import warned
 
 import diffeo_calib as dc
 from diffeo_calib.common.device import seeded
+from diffeo_calib.measurements.csv.files import read_observations
+from diffeo_calib.measurements.csv.sensors import ImageColumns
+from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.se3 import twist_transform
 
 IMAGES, NOISE_PX = 40, 0.1
@@ -25,6 +30,7 @@ def calibrated(arm: CameraArm, focus: float = 0.0) -> tuple[dc.CalibrationResult
     outside = (pixels < 0).any(2) | (pixels > torch.tensor([WIDTH - 1, HEIGHT - 1])).any(2)
     corners = torch.cat([corners[..., :3], pixels], 2).masked_fill(outside[..., None], torch.nan)
     data = dc.Measurements.from_images(q, corners, (WIDTH, HEIGHT), arm.arm.nominal.joint_names, board=BOARD_PRIOR)
+    data = data.with_columns(image_names={row: f"{row}.png" for row in range(len(data))}, file_sha256="of a table")
     return warned(dc.calibrate, arm.arm.nominal, data)
 
 
@@ -51,4 +57,20 @@ def test_a_camera_that_slips_on_its_mount_is_named() -> None:
     slipped[IMAGES // 2 :] = twist_transform(twist) @ slipped[IMAGES // 2 :]
     _, said = calibrated(replace(ARM, boards=slipped))
     assert len(said) == 1
-    assert "the camera on the tool seems to have moved by about" in said[0]
+    assert re.search(r"camera on the tool seems to have moved by about .* near row (\d+) \(\1.png\)", said[0])
+
+
+def test_rows_of_a_table_of_corners_are_named_by_their_images(tmp_path: Path) -> None:
+    q, corners = ARM.shown(NOISE_PX, 2)
+    lines = ["a,b,c,d,e,f,image,board_x,board_y,u,v"]
+    for row, (angles, seen) in enumerate(zip(q.tolist(), corners, strict=True)):
+        shown = seen[~seen.isnan().any(1)][:, [0, 1, 3, 4]].tolist()
+        lines += [",".join([*map(repr, angles), f"{row}.png", *map(repr, corner)]) for corner in shown]
+    (tmp_path / "t.csv").write_text("\n".join(lines))
+    table = TableFormat(
+        "m", "rad", joints=tuple("abcdef"), readings=(ImageColumns((WIDTH, HEIGHT), camera_on_tool=True),)
+    )
+    found = read_observations(tmp_path / "t.csv", table)
+    first, last = found.line_numbers[[0, -1]].tolist()
+    assert found.rows([-1]).row_names == [f"row {last} ({len(q) - 1}.png)"]
+    assert dc.Observations.joined([found]).row_names[0] == f"row {first} (0.png)"

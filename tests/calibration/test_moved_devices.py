@@ -264,6 +264,6 @@ def test_three_set_ups_are_no_drift() -> None:
     q, points = arm.measure(90, seed=1)
     steps = (torch.arange(90, dtype=torch.float64) // 30)[:, None, None]
     text = told(arm, q, points + 4e-4 * steps * torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64), given=False)
-    found = re.search(r"moved more than once, near rows (\d+) and (\d+)", text)
+    found = re.search(r"moved more than once, near row (\d+) and row (\d+)", text)
     assert found is not None, text
     assert [int(row) for row in found.groups()] == pytest.approx([30, 60], abs=3)

@@ -104,7 +104,7 @@ def test_outliers_are_named_by_their_lines_in_the_file(site: Site, command: Comm
 
 
 def test_many_outliers_are_cut_short() -> None:
-    found = [Outlier(k, None if k % 2 else 1, k + 2, 0.05 - 1e-3 * k, 1e-3, "odd") for k in range(13)]
+    found = [Outlier(k, None if k % 2 else 1, k + 2, f"row {k + 2}", 0.05 - 1e-3 * k, 1e-3, "odd") for k in range(13)]
     lines = list(outlier_lines(found, 100))
     assert lines[0].startswith("13 of 100 training rows look wrong")
     assert lines[1] == "  row 2, marker 1: 50.000 mm off, weight 0.001; odd"
@@ -112,7 +112,7 @@ def test_many_outliers_are_cut_short() -> None:
     assert len(lines) == 12
     assert lines[-1] == "  and 3 more"
     assert list(outlier_lines([], 100)) == []
-    twice = [Outlier(4, k, 6, 0.01, 0.1, "odd") for k in (0, 1)]
+    twice = [Outlier(4, k, 6, "row 6", 0.01, 0.1, "odd") for k in (0, 1)]
     assert next(iter(outlier_lines(twice, 9))).startswith("1 of 9 training rows")
 
 

@@ -93,6 +93,7 @@ def judge(
     scales: Hyperparameters,
     left_out: LeaveOneOut,
     lines: Tensor,
+    names: Sequence[str],
     *,
     devices: Iterable[Hypothesis] = (),
     bodies: Mapping[str, str] = MappingProxyType({}),
@@ -102,15 +103,17 @@ def judge(
 
     Args:
         data, scales, left_out: the rows of a calibration, its scales and left-out errors. lines: (N,) of the rows in
-            their file: their order is that of the measurements. devices: what may change of devices in unknown places.
-            bodies: better names of the measuring device and of what is on the tool. opens: whether it may be opened.
+            their file: their order is that of the measurements. names: (N,) of the rows, in words. devices: what may
+            change of devices in unknown places. bodies: better names of the measuring device and of what is on the
+            tool. opens: whether it may be opened.
     """
     rows, lines = SampledRows.of(data, scales), lines.to(data.x.device)
     if len(rows.index) < 4 * gates.CHANGE_ROWS:
         return None
     changes, own = changes_of(rows.data, devices, rows.index), lines[rows.index]
     named = [one._replace(name=bodies.get(one.name, one.name)) for one in changes]
-    found = [*changed(rows, named, own, excess=max(1.0, variance_ratio(data, left_out)))]
+    own_names = [names[row] for row in rows.index.tolist()]
+    found = [*changed(rows, named, own, own_names, excess=max(1.0, variance_ratio(data, left_out)))]
     if len(own) >= gates.MIXED_ROWS:
         found += [own for one in changes if one.name == MARKERS for own in two_tools(rows, one.effects, lines)]
         found += other_payloads(rows, data, lines)
@@ -175,9 +178,9 @@ class Change(NamedTuple):
 
 
 def changed(
-    rows: SampledRows, hypotheses: Sequence[Hypothesis], lines: Tensor, *, excess: float = 1.0
+    rows: SampledRows, hypotheses: Sequence[Hypothesis], lines: Tensor, names: Sequence[str], *, excess: float = 1.0
 ) -> Iterator[Candidate]:
-    """The clearest change during the measurements; arguments as of :func:`changes`, and lines (N,) of the rows."""
+    """The clearest change during the measurements; arguments as of :func:`changes` and :func:`judge`."""
     process, order = rows.process, lines.argsort()
     found = [*changes(hypotheses, process, order, excess=excess)]
     best = max(found, key=lambda one: one.evidence)
@@ -194,7 +197,7 @@ def changed(
     ]
     words = ", or ".join(dict.fromkeys(one.words(rows) for one in (best, *others)))
     words += " (these rows do not tell which)" * bool(others)
-    words += " over the rows" if best.row is None else f" near row {int(lines[order[best.row]])}"
+    words += " over the rows" if best.row is None else f" near {names[order[best.row]]}"
     kept, advice = ("the rows before it", fix) if sudden else ("the middle of the rows", SLOW)
     yield Candidate(words, expected, advice, rows.columns(E, best.codes), gates.WORTH, opens=kept)
     if sudden:
@@ -205,9 +208,9 @@ def changed(
         beside = process.opened(rows.columns(E, _from(order, first)))
         first, second = _likeliest(*scans([E], beside, order)), first
     if abs(first - second) >= gates.CHANGE_ROWS:
-        near = " and ".join(str(int(lines[order[row]])) for row in sorted((first, second)))
+        near = " and ".join(names[order[row]] for row in sorted((first, second)))
         columns = torch.cat([rows.columns(E, _from(order, row)) for row in (first, second)], 1)
-        words = f"{what} seems to have moved more than once, near rows {near}"
+        words = f"{what} seems to have moved more than once, near {near}"
         yield Candidate(words, expected, fix, columns, gates.WORTH**2, opens="the rows before them")
 
 

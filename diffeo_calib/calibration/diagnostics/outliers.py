@@ -40,7 +40,7 @@ class Outlier:
         row: number of the row in the measurements.
         marker: number of the marker; None if there is only one, or if poses were measured.
         tip: name of the tip, of poses on several; else None.
-        number: line of the row in its file, see :attr:`Measurements.line_numbers`.
+        number: line of the row in its file, see :attr:`Measurements.line_numbers`. name: of the row, in words.
         distance: from its prediction by all other rows, m; of readings in m at the tool.
         weight: its weight in the fit, about 1 for inliers; None if it took no part in the fit.
         reason: probable cause, in words.
@@ -50,6 +50,7 @@ class Outlier:
     row: int
     marker: int | None
     number: int
+    name: str
     distance: float
     weight: float | None
     reason: str
@@ -77,7 +78,7 @@ def outlier_lines(outliers: Sequence[Outlier], rows: int, what: str = "training 
         marker = f", {printable(outlier.tip)}" if outlier.tip is not None else marker
         weight = "" if outlier.weight is None else f", weight {outlier.weight:.2g}"
         size, unit = outlier.shown
-        yield f"  row {outlier.number}{marker}: {size:.3f} {unit} off{weight}; {outlier.reason}"
+        yield f"  {printable(outlier.name)}{marker}: {size:.3f} {unit} off{weight}; {outlier.reason}"
     if len(outliers) > MOST_OUTLIERS:
         yield f"  and {len(outliers) - MOST_OUTLIERS} more"
 
@@ -129,8 +130,9 @@ def outliers(
         unit, per_unit = shown.shown
         for number in bad[one.rows, 0].nonzero()[:, 0].tolist():
             row, line = int(one.rows[number]), int(one.data.line_numbers[number])
-            reading = per_unit * float(shown.errors[number, 0]), unit
-            found.append(Outlier(row, None, line, float(sizes[number]), float(weights[row, 0]), FAR, reading=reading))
+            reading, size = (per_unit * float(shown.errors[number, 0]), unit), float(sizes[number])
+            name, weight = one.data.row_names[number], float(weights[row, 0])
+            found.append(Outlier(row, None, line, name, size, weight, FAR, reading=reading))
     return sorted(found, key=lambda outlier: -outlier.distance)
 
 
@@ -161,11 +163,11 @@ def found_outliers(
         return []
     labels = data.bodies.labels(data, model.on)
     data = data if labels[0][1] is None else data.with_tips([str(tip) for _, tip in labels])
-    predicted, found = model.at_payloads(data.payload)(data.q).detach(), list[Outlier]()
+    predicted, found, names = model.at_payloads(data.payload)(data.q).detach(), list[Outlier](), data.row_names
     for row, body in bad.nonzero().tolist():
         (marker, tip), weight = labels[body], None if weights is None else float(weights[row, body])
         reason, line = _reason(row, body, data, predicted, bad), int(data.line_numbers[row])
-        found.append(Outlier(row, marker, line, float(distances[row, body]), weight, reason, tip))
+        found.append(Outlier(row, marker, line, names[row], float(distances[row, body]), weight, reason, tip))
     return sorted(found, key=lambda outlier: -outlier.distance)
 
 

@@ -46,8 +46,9 @@ BALLS_TRIED, BALL_SPREAD_M = 24, 0.15
 UNEXPLAINED = "no place of ball and devices explains the readings"
 CHECK = "check the units of the readings (mm or m) and of the joints (deg or rad), the order of the joints, "
 CHECK += "and which device each row names; or measure more rows with each device"
-LARGEST_SHARE, FAR_BETTER = 0.02, 0.2
-"""Median residual, relative to the robot's reach, that belongs to a robot; part of it that the right unit leaves."""
+LARGEST_SHARE, DOUBTED_SHARE, FAR_BETTER = 0.02, 0.002, 0.2
+"""Median residuals, relative to the robot's reach, that belong to a robot, and from which the other unit is tried; the
+part that the right unit leaves."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,16 +128,14 @@ def register_readings(bare: Geometry, tables: Sequence[Readings]) -> Identificat
         DiffeoCalibWarning: readings that no place of ball and devices explains in either unit.
     """
     most, found = LARGEST_SHARE * bare.chain.reach, _rough_fits(bare, tables, bare.tool[:1])
-    if found and found[0].worst[0] > most:
+    if found and found[0].worst[0] > DOUBTED_SHARE * bare.chain.reach:
         _refuse_another_unit(bare, tables, found[0])
     if not found or found[0].worst[0] > most:
         balls = BALL_SPREAD_M * torch.randn(BALLS_TRIED, 3, dtype=torch.float64, generator=seeded(0), device=HOST)
         found = sorted([*found, *_rough_fits(bare, tables, balls)], key=itemgetter(0))
     if not found:
         raise MeasurementError.of(UNEXPLAINED, fix=CHECK)
-    best, each = found[0], zip(tables, found[0].errors, strict=True)
-    if any(kind_of(data).doubts_unit(data, own[:, 0]) for data, own in each):
-        _refuse_another_unit(bare, tables, best)
+    best = found[0]
     if best.worst[0] > most:
         warn_user(sentence(UNEXPLAINED, **best.said(most), fix=CHECK))
     noise = float(torch.cat([own.flatten() for own in best.errors]).square().mean().sqrt())

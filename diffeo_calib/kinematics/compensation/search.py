@@ -114,20 +114,16 @@ class Search:
         good = gain > 1e-4
         taken = rows[good]
         self.q[taken], self.poses[taken], self.cost[taken] = moved[good], seen[good], cost[good]
-        self._adapt(rows, gain)
+        damping, growth = self.damping[rows], self.growth[rows]  # by Nielsen's rule
+        factor = np.maximum(1.0 / 3.0, 1.0 - (2.0 * np.minimum(gain, 1.0) - 1.0) ** 3)
+        self.damping[rows] = np.maximum(np.where(good, damping * factor, damping * growth), LEAST_DAMPING)
+        self.growth[rows] = np.where(good, 2.0, 2.0 * growth)
         still = np.abs(step).max(1, initial=0.0) <= SETTLED_STEP
         still |= np.abs(promised) <= np.maximum(SMALLEST_GAIN, noise)
         still |= good & reached(self.targets.take(rows), seen)
         still |= (cost > SLOWEST_CONTRACTION * before) & (not self.exact)
         self._linearise(rows[good & ~still])
         self.todo = rows[~still]
-
-    def _adapt(self, rows: Array, gain: Array) -> None:
-        """Less damping after good steps, more after bad ones (Nielsen's rule)."""
-        good, damping, growth = gain > 1e-4, self.damping[rows], self.growth[rows]
-        factor = np.maximum(1.0 / 3.0, 1.0 - (2.0 * np.minimum(gain, 1.0) - 1.0) ** 3)
-        self.damping[rows] = np.maximum(np.where(good, damping * factor, damping * growth), LEAST_DAMPING)
-        self.growth[rows] = np.where(good, 2.0, 2.0 * growth)
 
     def _linearise(self, rows: Array) -> None:
         """Gradient, and the Hessian made positive definite."""

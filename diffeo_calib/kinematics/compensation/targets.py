@@ -256,14 +256,10 @@ def tool_functions(model: CalibratedKinematics, tools: Mapping[str, Tensor], fra
     """Kinematics of tools (4, 4) on these tips in a frame, "base" or "measuring"; kept for later calls."""
     known = _ready.setdefault(model, {})
     key = frame, *((tip, tool.numpy().tobytes()) for tip, tool in tools.items())
-    if key not in known:
-        if len(known) >= MOST_TOOLS:
-            known.clear()
-        known[key] = _functions(model, tools, frame)
-    return known[key]
-
-
-def _functions(model: CalibratedKinematics, tools: Mapping[str, Tensor], frame: str) -> ToolFunctions:
+    if key in known:
+        return known[key]
+    if len(known) >= MOST_TOOLS:
+        known.clear()
     robot, geometry, device = model.robot, model.geometry, model.configurations.device
     each = [ToolKinematics(model.map, model.nominal, tool, frame, tip) for tip, tool in tools.items()]
 
@@ -277,6 +273,7 @@ def _functions(model: CalibratedKinematics, tools: Mapping[str, Tensor], frame: 
     ends[numbers] = ends[numbers] @ np.stack([tool.numpy() for tool in tools.values()])
     chain = replace(chain, tips=ends)
     poses, jacobian = (partial(by_tool, of) for of in (ToolKinematics.poses, ToolKinematics.jacobian))
-    length = 0.25 * robot.reach if isfinite(robot.reach) else SOME_LENGTH
-    rough = lambda q: chain.poses_and_jacobian(q)[1][:, numbers]  # noqa: E731
-    return ToolFunctions(poses, jacobian, rough, robot.moving == robot.n, length)
+    serial, length = robot.moving == robot.n, 0.25 * robot.reach if isfinite(robot.reach) else SOME_LENGTH
+    return known.setdefault(
+        key, ToolFunctions(poses, jacobian, lambda q: chain.poses_and_jacobian(q)[1][:, numbers], serial, length)
+    )

@@ -408,6 +408,7 @@ class ImageColumns(SensorColumns):
         if CAMERA in rows.texts:
             known["seen_by"] = first.named(CAMERA, "the name of the camera")
         data = Measurements.from_images(first.q, corners, self.camera, rows.columns.joints.texts, **known)
+        data = data.with_columns(image_names=dict(zip(first.lines, images, strict=True)))
         set_ups = first.devices(self.device, "a name")
         return (data if set_ups is None else data.with_sessions(set_ups)), first
 
