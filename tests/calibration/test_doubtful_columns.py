@@ -40,7 +40,6 @@ HELD = {
     "hidden markers": ("position", "marker3_z"),
     "poses": ("pose", "z"),
     "heights": ("height", "height"),
-    "distances": ("distance", "distance"),
     "images": ("image", "v"),
     "images and a tracker": ("marker", "marker 2"),
     "inclinations": ("inclination", "inclination 2"),
