@@ -4,8 +4,9 @@ With everything else kept, the rows see the model through a small motion of the 
 new_rows.py, after a start in closed form (robots/placement.py). A marker either stayed where it was (within 0.01 mm),
 moved a little (1 mm), or is another one (0.3 m): the marginal likelihood of the rows chooses. The base may be anywhere.
 
-Leaving row j out lowers the quadratic form of the rows by mu_j^T (K^-1)_jj^-1 mu_j. Compared with what remains, this is
-an F test (externally studentised residuals), so that an outlier does not hide itself.
+Leaving rows J out lowers their quadratic form by mu_J^T (K^-1)_JJ^-1 mu_J. Compared with what remains, this is an F
+test (externally studentised residuals), so that an outlier does not hide itself. Single rows are tried first, then
+pairs, which may hide each other.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from diffeo_calib.calibration.recalibration.new_rows import NewRows, NewSetUp, U
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few, sentence, warn_user
-from diffeo_calib.common.quantiles import above_estimated, known
+from diffeo_calib.common.quantiles import known
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.registered_map import (
@@ -107,11 +108,11 @@ def find_place(
     while True:
         odds = _odds(found)
         best = found[max(odds, key=odds.__getitem__)]
-        worst = worst_row(best)
-        if worst is None or len(outliers) + 1 > LARGEST_OUTLIER_PART * len(some):
+        worst = worst_rows(best)
+        if not worst or len(outliers) + len(worst) > LARGEST_OUTLIER_PART * len(some):
             break
-        outliers.append(int(kept[worst]))
-        stay = (torch.arange(len(kept), device=kept.device) != worst).nonzero()[:, 0]
+        outliers += kept[worst].tolist()
+        stay = kept.new_tensor([row for row in range(len(kept)) if row not in worst])
         kept, found = kept[stay], {name: rows.kept(stay).settled() for name, rows in found.items()}
     said = {
         "lever": search.data.lever,
@@ -260,6 +261,7 @@ def _odds(found: dict[str, NewRows]) -> dict[str, float]:
 
 PRIOR_FREEDOM = 10.0
 """The model's own covariance counts as an estimate of the scale with so many degrees of freedom."""
+MOST_PAIRS = 800
 FALSE_ALARM_PROBABILITY = 0.001
 """Probability that clean rows have an outlier."""
 
@@ -276,13 +278,27 @@ def scale_of(rows: NewRows, falls: Tensor | float = 0.0, coordinates: Tensor | i
     return ((given.target @ given.solved.flatten() - falls).clamp(min=0.0) + PRIOR_FREEDOM) / freedom, freedom
 
 
-def worst_row(rows: NewRows) -> int | None:
-    """The row that contradicts all others most, by an F test of what they leave; None if chance explains it."""
-    falls, coordinates = rows.given.left_out_squares, rows.visible.sum(1)
-    variances, freedom = scale_of(rows, falls, coordinates)
-    worst, level = int((falls / variances / coordinates).argmax()), FALSE_ALARM_PROBABILITY / len(rows)
-    limit = above_estimated(level, float(coordinates[worst]), float(freedom[worst]))
-    return worst if len(rows) > LEAST_POINTS and float(falls[worst] / variances[worst]) > limit else None
+def worst_rows(rows: NewRows) -> list[int]:
+    """The one or two rows that contradict all others, or none."""
+    from scipy.special import fdtrc  # noqa: PLC0415  # slow to import, not needed to use a model
+
+    given = rows.given
+    M, m = given.residual.shape
+    for size in (1, 2):
+        sets = torch.combinations(torch.arange(M, device=given.residual.device), size)
+        if M - size < LEAST_POINTS or len(sets) > MOST_PAIRS:
+            continue
+        at = (sets[..., None] * m + torch.arange(m, device=sets.device)).flatten(1)  # (K, size m)
+        blocks, chosen = given.factor.inverse[at[:, :, None], at[:, None, :]], given.solved.flatten()[at]
+        falls = (chosen * torch.linalg.solve(blocks, chosen[..., None])[..., 0]).sum(1)
+        coordinates = given.visible.sum(1)[sets].sum(1).to(falls)
+        variances, freedom = scale_of(rows, falls, coordinates)
+        ratios = falls / coordinates / variances
+        chances = torch.from_numpy(fdtrc(*(each.numpy(force=True) for each in (coordinates, freedom, ratios))))
+        best = int(ratios.masked_fill((chances > chances.min()).to(ratios.device), 0.0).argmax())  # of equal chances
+        if float(chances[best]) * len(sets) < FALSE_ALARM_PROBABILITY:
+            return sets[best].tolist()
+    return []
 
 
 def _record(best: NewRows, said: dict[str, object], *, known: bool) -> Registration:
