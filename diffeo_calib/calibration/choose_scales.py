@@ -198,7 +198,7 @@ def _selected(
 
 
 def _supported(found: Selection, data: TangentData, seed: int) -> tuple[Selection, TangentData]:
-    """The same without amplitudes that the data do not support, and with the weights that follow."""
+    """Drop amplitudes that the data do not support, and with the weights that follow."""
     noise = data.noise_model.mean_covariance(found.scales, data.jacobian)
     scales = found.scales.supported(data.jacobian, noise)
     return replace(found, scales=scales), weighed(data, scales, seed)
@@ -214,7 +214,7 @@ def _with_position_errors(
     seed: int,
     progress: Progress,
 ) -> tuple[Hyperparameters, Selection, TangentData]:
-    """The same with the gear lines, then the axes, that the data show: the rest follows from what is left."""
+    """Add the gear lines, then the axes, that the data show; choose the other scales again for what is left."""
     for stage in ("gear lines",) * (poses >= gear_lines.FEWEST_POSES) + ("axes",):
         if found.interrupted:
             break
@@ -255,7 +255,7 @@ POSES, COORDINATES = 300, 1500
 
 
 def with_payload_factor(data: TangentData, scales: Hyperparameters, seed: int = 0) -> Hyperparameters:
-    """The same scales with the likeliest factor; unchanged without payload.
+    """Set the likeliest payload factor; scales without payload stay.
 
     Args:
         data: the measurements. scales: all other scales. seed: draws the poses if there are many.

@@ -89,7 +89,7 @@ class ExpectedError:
 
     @classmethod
     def of(cls, model: CalibratedKinematics) -> ExpectedError:
-        """That of a model."""
+        """Expected error of a model."""
         fitted, q, found = model.map, model.map.everywhere, OpenPlaces.of(model.map)
         shown, own, some = _shown(model), fitted.unregistered, _some_rows(fitted.x)
 
@@ -196,7 +196,7 @@ class OpenPlaces:
 
     @classmethod
     def of(cls, fitted: FittedMap) -> OpenPlaces:
-        """Those of a fitted map, by the rows of its registration if it has one."""
+        """Open directions of a fitted map, by the rows of its registration if it has one."""
         root, anywhere, rows = _places(fitted)
         A, B = ((S @ root) / S.shape[0] ** 0.5 for S in (anywhere, rows))
         noise = fitted.new_noise.diagonal().mean()
@@ -267,7 +267,7 @@ BASE_PER_DEVIATION = 3.0
 
 
 def with_open_directions(fitted: FittedMap, measurements: Measurements, registration: Identification) -> FittedMap:
-    """The same map whose covariances hold in directions that the rows leave open; the map itself if there are none.
+    """A map whose covariances hold in directions that the rows leave open; the map itself if there are none.
 
     No prior variance of theta is smaller than before.
 

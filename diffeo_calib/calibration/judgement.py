@@ -49,7 +49,7 @@ def check_errors(model: CalibratedKinematics, found: Evaluation, usual: float) -
 
 @dataclass(frozen=True)
 class JudgedRows(Judgement):
-    """The same, and the positions that look wrong among ``rows`` evenly chosen ones."""
+    """Judged errors, and the positions that look wrong among ``rows`` evenly chosen ones."""
 
     outliers: Sequence[Outlier] = ()
     rows: int = 0

@@ -102,7 +102,7 @@ class View:
 
     @classmethod
     def of(cls, seen: Tensor, poses: Tensor, points: Tensor) -> View:
-        """That of images that showed corners ``seen`` (N, .) of a board at poses (N, 4, 4), m, with corners (K, 3)."""
+        """Views of images that showed corners ``seen`` (N, .) of a board at poses (N, 4, 4), m, with corners (K, 3)."""
         away, cosine = _towards(poses, points)
         side = float(cosine.median().sign()) or 1.0
         facing = side * max(float((side * cosine).min()), 0.0)
@@ -116,7 +116,7 @@ class View:
 
     @property
     def numbers(self) -> list[float]:
-        """All of it."""
+        """All constants."""
         return [float(self.fewest), self.near, self.far, self.facing, *self.points.flatten().tolist()]
 
     @classmethod

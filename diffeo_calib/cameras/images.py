@@ -137,7 +137,7 @@ class Camera:
         )
 
     def held(self) -> Camera:
-        """The same with a lens that is known exactly."""
+        """Hold the lens at its values."""
         root = self.root.clone()
         root[: len(LENS)] = 0.0
         return replace(self, root=root)
@@ -337,7 +337,7 @@ class _Normal(NamedTuple):
 
 
 def inverses(A: Tensor) -> Tensor:
-    """Of matrices (N, 6, 6) whose rows have different units."""
+    """Inverses of matrices (N, 6, 6) whose rows have different units."""
     size = A.diagonal(dim1=1, dim2=2).rsqrt()
     return size[..., None] * torch.linalg.inv(size[..., None] * A * size[:, None]) * size[:, None]
 

@@ -160,7 +160,7 @@ class Around:
         return self._sees(self.like, self.candidates)
 
     def with_open_candidates(self, count: int, seed: int) -> Around:
-        """The same with ``count`` candidates that can be measured, drawn where some of these cannot; else itself."""
+        """Draw ``count`` candidates that can be measured where some of the present ones cannot."""
         geometry, places = self.placed.identification.geometry, [own.places for own in self._elsewhere]
         chain, base = geometry.chain, geometry.base
         how: Any = {"ranges": ranges_around(chain, self.placed.data.q), "keep": partial(self._sees, self.like)}

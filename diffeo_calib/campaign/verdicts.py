@@ -93,7 +93,7 @@ class Verdict:
         return text if self.change is None else f"{text}; {self.change}"
 
     def entry(self) -> dict[str, Any]:
-        """The same for programs: lengths in mm, and the sentence."""
+        """The verdict for programs: lengths in mm, and the sentence."""
         same = {name: getattr(self, name) for name in ("line", "fits", "accepted", "cause")}
         sizes = {"error_mm": 1e3 * self.error, "usual_mm": 1e3 * self.expected}
         change = None if self.change is None else {k: v for k, v in asdict(self.change).items() if k != "row"}

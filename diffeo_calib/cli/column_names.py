@@ -77,7 +77,7 @@ class Group(NamedTuple):
         return frozenset(self.before + self.after)
 
     def says(self, *roles: str) -> frozenset[str]:
-        """Those of these words that have one of some roles."""
+        """Words that have one of some roles."""
         return self.shared & frozenset[str]().union(*(WORDS[role] for role in roles))
 
     @property
@@ -141,5 +141,5 @@ def groups(names: Sequence[str], labels: Sequence[str]) -> Iterator[Group]:
 
 
 def whole(names: Sequence[str], labels: Sequence[str]) -> Iterator[Group]:
-    """Those that have all of the labels."""
+    """Columns that have all of the labels."""
     return (group for group in groups(names, labels) if len(group.names) == len(labels))

@@ -71,7 +71,7 @@ def _is_place(group: Group) -> bool:
 
 
 def machine_of(bodies: Sequence[Body]) -> Body:
-    """That of the machine: by words of the names, reported ones before wished ones; else the first.
+    """Columns of the machine: by words of the names, reported ones before wished ones; else the first.
 
     What is only said to be measured is the machine's where something else was seen as well.
     """

@@ -154,7 +154,7 @@ class Interrupts:
         signal.signal(signal.SIGINT, self._handle)
 
     def watching(self, progress: Progress, note: Callable[[str], object]) -> Progress:
-        """The same callback, which raises KeyboardInterrupt once after a Ctrl-C; ``note`` prints the answer to that."""
+        """A callback that raises KeyboardInterrupt once after a Ctrl-C; ``note`` prints the answer to that."""
         self._note = note
 
         def step(task: str, done: int, total: int) -> None:

@@ -213,7 +213,7 @@ class Body(NamedTuple):
 
     @property
     def words(self) -> set[str]:
-        """Of the names of the place."""
+        """Words of the names of the place."""
         return {word for name in self.place for word in column(name).words}
 
 
@@ -317,7 +317,7 @@ class Choice(NamedTuple):
     sure: bool = True
 
     def line(self) -> str:
-        """As TOML; as a comment where the user is to decide."""
+        """A line of TOML; a comment where the user is to decide."""
         values = self.value if isinstance(self.value, list) else [self.value]
         written = [json.dumps(value, ensure_ascii=False) for value in values]
         text = f"[{', '.join(written)}]" if isinstance(self.value, list) else written[0]
@@ -344,7 +344,7 @@ class RowColumns:
 
     @property
     def markers(self) -> list[list[str]]:
-        """Those of positions."""
+        """Columns of positions."""
         return [own.place for own in self.bodies]
 
     @property
@@ -358,7 +358,7 @@ class RowColumns:
         return any(text.startswith(CORNERS) for text in self.readings)
 
     def entries(self, folder: Path) -> Iterator[Choice]:
-        """Those that name them, in a campaign in a folder."""
+        """Entries of a campaign in a folder that name them."""
         if self.markers:
             names = [",".join(triple) for triple in self.markers]
             yield Choice("position", names, f"{len(names)} marker(s), by their names")

@@ -231,7 +231,7 @@ def refuse_gone(words: Sequence[str]) -> None:
 
 
 def expanded(arguments: Sequence[str]) -> list[str]:
-    """The same command line with a campaign file written out, for `campaign` without what only `fit` knows."""
+    """The command line with a campaign file written out, for `campaign` without what only `fit` knows."""
     words = list(arguments)
     at = _place_of_command(words)
     if len(words) < at + 2 or words[at] not in (COMMAND, LIVE) or not words[at + 1].lower().endswith(SUFFIX):

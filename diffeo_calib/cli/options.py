@@ -78,7 +78,7 @@ class Option(NamedTuple):
 
     @classmethod
     def of(cls, own: Field[Any], hint: Any) -> Option:
-        """That of a field."""
+        """The option of a field."""
         kind, how = own.metadata["kind"], dict(own.metadata["how"])
         if not how["help"]:
             how["help"] = described().get(own.name, "") + " Repeatable." * has(hint, list)

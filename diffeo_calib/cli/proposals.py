@@ -80,11 +80,11 @@ class Source:
     said: tuple[Choice, ...] = ()  # entries of the campaign that were decided so far
 
     def into(self, **formats: Any) -> Source:
-        """The same in another format."""
+        """Read the table in another format."""
         return replace(self, table=replace(self.table, **formats))
 
     def saying(self, *choices: Choice) -> Source:
-        """The same with more entries, in place of those of the same names."""
+        """Add entries, in place of those of the same names."""
         names = {choice.name for choice in choices if choice.name}
         return replace(self, said=(*(one for one in self.said if one.name not in names), *choices))
 

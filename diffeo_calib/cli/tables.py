@@ -60,7 +60,7 @@ def table_format(units: Units) -> TableFormat:
 
 
 def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
-    """The same format with the columns that options name, but for readings; lever in the unit of length."""
+    """Add the columns that options name, but for readings; lever in the unit of length."""
     Rows.check_together(vars(rows))
     as_typed = "convention", "rotation_angle", "remounted", "payload", "time", "temperature", "session", "marker"
     return replace(
@@ -241,7 +241,7 @@ def targets_of(path: Path, table: TableFormat, given: Targets, tools: int) -> Te
 
 
 def of_robot(table: TableFormat, robot: Tree) -> TableFormat:
-    """The same format with the joints of a robot, in columns that it names, or else after them; or with its poses."""
+    """Name the joints of a robot, in columns that it names, or else after them; or with its poses."""
     joints, own = table.joints, list(robot.joint_names)
     if isinstance(joints, PoseColumns):
         count = robot.n if joints.is_program else len(joints.columns) if not joints.convention else POSE_JOINTS
@@ -261,7 +261,7 @@ def of_robot(table: TableFormat, robot: Tree) -> TableFormat:
 
 
 def as_written(table: TableFormat) -> TableFormat:
-    """The same format with the columns in which joints, or the poses of a machine, are written."""
+    """Name the columns in which joints, or the poses of a machine, are written."""
     joints = table.joints
     return replace(table, joints=joints.written) if isinstance(joints, PoseColumns) else table
 

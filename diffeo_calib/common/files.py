@@ -232,7 +232,7 @@ def bring_to_disk(file: IO[bytes]) -> None:
 
 
 def _take_permissions(part: Path, target: Path) -> None:
-    """Those of the existing file, and its owner where that is possible; of a new file the usual ones."""
+    """Take the permissions of the existing file, and its owner where that is possible; of a new file the usual ones."""
     if not target.exists():
         mask = os.umask(0o022)  # the mask can only be read by setting it
         os.umask(mask)

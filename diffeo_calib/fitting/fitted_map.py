@@ -412,14 +412,14 @@ class FittedMap:
 
     @of_origin
     def with_motions(self) -> Conditional:
-        """The same with what the data leave open."""
+        """Add what the data leave open to the covariances."""
         root = self.open_directions
         many = root.shape[1]
         return Opened(self.by_data, self.columns - many, root.new_ones(many)) if many else self.by_data
 
     @of_origin
     def conditional(self) -> Conditional:
-        """The same without rigid motions where no device saw them."""
+        """The conditional, without rigid motions where no device saw them."""
         if self.workspace is None:
             return self.with_motions
         at, base = self.geodesic.linearise(self.workspace), self.geodesic.spec.nominal.places[:6]

@@ -118,7 +118,7 @@ class Descent:
 
     @property
     def gradient(self) -> Tensor:
-        """Of the energy by the variables, after :meth:`closure`."""
+        """Gradient of the energy by the variables, after :meth:`closure`."""
         return self.variables.grad  # pyright: ignore[reportReturnType]
 
     def begin(self) -> None:

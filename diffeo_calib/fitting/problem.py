@@ -189,7 +189,7 @@ class Problem:
         return self if nominal is self.spec.nominal else self._with(spec=replace(self.spec, at_controls=nominal))
 
     def standing_for(self, whole: Problem) -> Problem:
-        """The same problem, whose fits lead to the maps of another one with the same unknowns.
+        """Let fits lead to the maps of another problem with the same unknowns.
 
         It has the same optimum, and fewer numbers: functionals of the coordinates that the other one has, which tell
         all there is to know.

@@ -94,7 +94,7 @@ class _Derivative(torch.autograd.Function):
 
 
 class _ForwardDerivative(_Derivative):
-    """The same in forward mode too, which torch.compile refuses to record."""
+    """Derivative in forward mode too, which torch.compile refuses to record."""
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Tensor:
@@ -178,7 +178,7 @@ class MaternProfile(_Shipped):
             raise InputError.of("`nu` of a Matern kernel", expected="1.5, 2.5 or 3.5", got=self.nu)
 
     def spectral_density(self, w2: Tensor, dim: int) -> Tensor:
-        """That of Student's t: proportional to (2 nu + w2)^-(nu + dim / 2)."""
+        """Density of Student's t: proportional to (2 nu + w2)^-(nu + dim / 2)."""
         power = self.nu + 0.5 * dim
         scale = gamma(power) / gamma(self.nu) * pi ** (-0.5 * dim) * (2.0 * self.nu) ** self.nu
         return scale * (2.0 * self.nu + w2) ** -power

@@ -116,7 +116,7 @@ class HandEye:
     def of_each(
         cls, model: CalibratedKinematics, *, camera_on_tool: bool, geometry: Geometry | None = None
     ) -> dict[str, HandEye]:
-        """That of every camera, of several fixed ones every session's, by name; arguments as of :meth:`of`."""
+        """Result for every camera, of several fixed ones every session's, by name; arguments as of :meth:`of`."""
         cameras = [name for own in model.placement for name in own.cameras] or [ONLY_CAMERA]
         known = {"camera_on_tool": camera_on_tool, "geometry": geometry}
         if len(cameras) == 1:
@@ -126,7 +126,7 @@ class HandEye:
 
     @classmethod
     def of_fit(cls, model: CalibratedKinematics) -> dict[str, HandEye]:
-        """The same where the model's images, or the command that made it, say where the camera is; else nothing."""
+        """Result where the model's images, or the command that made it, say where the camera is; else nothing."""
         made, seen = model.provenance, [one for own in model.placement for one in own.cameras.values()]
         words = shlex.split(made.command or "") if made is not None else []
         on_tool = seen[0].on_tool if seen else "--camera-on-tool" in words

@@ -40,7 +40,7 @@ class Provenance:
 
     @classmethod
     def now(cls, measurements: Any, note: str = "") -> Provenance:
-        """That of a model fitted now to these measurements.
+        """Provenance of a model fitted now to these measurements.
 
         Raises:
             InputError: see :func:`check_note`.

@@ -196,7 +196,7 @@ class RegisteredMap(FittedMap):
 
     @cached_property
     def conditional(self) -> Conditional:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """That of the fit, with what the registration found from it."""
+        """The conditional of the fit, with what the registration found from it."""
         found, first, x = self.registration, self.fitted.columns, self.deformation.x
         at = self.at_registration.linearise(found.q.to(x))
         own, columns = (found.gain.to(x), range(first, first + len(found.covariance))), found.covariance.to(x)

@@ -35,7 +35,7 @@ class Momenta:
         return self.joint, self.task, self.theta
 
     def flatten(self) -> Tensor:
-        """All unknowns as one vector."""
+        """The unknowns as one vector."""
         return torch.cat([t.flatten() for t in self.tensors])
 
     def to(self, device: torch.device | str) -> Momenta:

@@ -123,7 +123,7 @@ class Linearisation:
         return total
 
     def _own_gram(self) -> Tensor:
-        """The same with itself: the blocks on and below the diagonal, and their transposes."""
+        """Prior covariance with itself: the blocks on and below the diagonal, and their transposes."""
         count, m, _ = self.sensitivity.shape
         rows = torch.arange(count, device=self.sensitivity.device)
         if count <= GRAM_ROWS:

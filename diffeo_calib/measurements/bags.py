@@ -213,7 +213,7 @@ def _messages(bag: Path, wanted: tuple[str, ...], optional: str = "") -> Iterato
 
 
 def _time(message: Any, topic: str) -> float:
-    """Of the header, s."""
+    """Time of the header, s."""
     header = getattr(message, "header", None)
     if header is None:
         fix = "record the stamped kind of message"

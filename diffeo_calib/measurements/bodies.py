@@ -85,7 +85,7 @@ class Bodies:
         return Predicted(pose_math.points_of_frames(frames, self.lever), mean, covariance, NUMBERS)
 
     def written(self, model: Any, q: Tensor) -> tuple[Tensor, Tensor]:
-        """The same as files hold it: markers (N, B, 3) m, or poses; covariances."""
+        """The columns as files hold them: markers (N, B, 3) m, or poses; covariances."""
         return model.predict(q) if self.lever is None else model.predict_poses(q)
 
     def origins(self, points: Tensor) -> Tensor:
@@ -130,7 +130,7 @@ class Bodies:
         return pose_math.pose_jacobian(data.frames, self.lever, data.board).nan_to_num(0.0)
 
     def modes_of(self, data: Any, points: Tensor) -> Tensor | None:
-        """The same of other rows of the device, whose points (K, P, 3) are known, m: a camera sees its board there."""
+        """Modes of other rows of the device, whose points (K, P, 3) are known, m: a camera sees its board there."""
         if self.lever is None:
             return None
         frames, seen = pose_math.frames_of_points(points, self.lever), seen_board(data)

@@ -147,7 +147,7 @@ class ImageTable(SocketTable):
         return True if self.board is not None else False if self.cameras or (commanded and self.lever) else None
 
     def shared_errors(self) -> Iterator[SharedErrors]:
-        """Those of images; none of other rows."""
+        """Errors that images share; none of other rows."""
         shared, own, lever = self.pose_shared, self.pose_covariance, self.lever
         if self.seen_by is not None and shared is not None and own is not None and lever is not None:
             slopes = pose_jacobian(self.frames, lever, self.board)[:, 0]

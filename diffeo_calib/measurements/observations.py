@@ -147,7 +147,7 @@ class Observations(RowGroups):
         return torch.cat(list(values))[torch.cat(self.index).argsort().to(values[0].device)]
 
     def _texts(self, texts: Sequence[Sequence[str]]) -> list[str]:
-        """The same for texts."""
+        """Join texts."""
         found = [text for own in texts for text in own]
         return [found[place] for place in torch.cat(self.index).argsort().tolist()]
 

@@ -118,7 +118,7 @@ class RowGroups:
         return [f"row {line}" for line in self.line_numbers.tolist()]
 
     def beside_images(self) -> list[tuple[Any, Tensor]]:
-        """These rows as they stand beside images of a board with the same tool: tables, and row numbers (M,) here."""
+        """Rows as they stand beside images of a board with the same tool: tables, and row numbers (M,) here."""
         return [(self, *self.index)]
 
     def rows(self, index: object) -> Self:
@@ -147,7 +147,7 @@ class RowGroups:
         return data_frame(columns, self.line_numbers.numpy())
 
     def doubted(self, doubt: bool = True) -> Self:
-        """The same table, after warnings about exact copies of rows and joint values that look like degrees."""
+        """Warn about exact copies of rows and joint values that look like degrees."""
         pairs = self.copies() if doubt else []
         if pairs:
             where = f"first row {pairs[0][1]}, of row {pairs[0][0]}"
@@ -173,7 +173,7 @@ class RowGroups:
 
     @classmethod
     def of_one_layout(cls, tables: Sequence[Self]) -> Sequence[Self]:
-        """The same tables with the same columns, those of a few being empty, and set-ups or devices numbered alike."""
+        """Give tables the same columns, those of a few being empty, and set-ups or devices numbered alike."""
         column, texts = cls.NUMBERED
         names = tuple(dict.fromkeys(name for table in tables for name in getattr(table, texts)))
         found = []

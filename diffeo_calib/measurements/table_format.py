@@ -284,7 +284,7 @@ def by_frame(what: str, names: object, expected: str, *counts: int) -> tuple[tup
 
 
 def _prefixed(prefixes: Sequence[str], names: Sequence[str], before: str = "") -> Names:
-    """The same names for each prefix."""
+    """The names behind each prefix."""
     return [[f"{before}{prefix}{name}" for name in names] for prefix in prefixes]
 
 

@@ -40,7 +40,7 @@ class Factor:
 
     @classmethod
     def of(cls, F: Tensor, H: Tensor) -> Factor:
-        """Of F + H H^T.
+        """Factor F + H H^T.
 
         Raises:
             NumericalError: it is not positive definite in float64.
@@ -51,7 +51,7 @@ class Factor:
             return cls(L, W, W.T @ W)
 
     def joined(self, cross: Tensor, L: Tensor, W: Tensor) -> Factor:
-        """That of these and m more numbers.
+        """The factor of these and m more numbers.
 
         Args:
             cross: (M, m) L^-1 times their covariance with these, without H. L: (m, m) of what these leave of theirs.
@@ -62,7 +62,7 @@ class Factor:
         return Factor(whole, torch.cat([self.W, W]), self._gram + W.T @ W)
 
     def beside(self, H: Tensor) -> Factor:
-        """That of K + H H^T for more features (M, k), with its inverse by that of K (M. Woodbury, 1950)."""
+        """The factor of K + H H^T for more features (M, k), with its inverse by that of K (M. Woodbury, 1950)."""
         W, V = torch.cat([self.W, self.white(H)], 1), self.inverse @ H
         other = Factor(self.L, W, W.T @ W)
         root = torch.linalg.cholesky(torch.eye(H.shape[1], dtype=H.dtype, device=H.device) + H.T @ V)

@@ -58,7 +58,7 @@ class Features:
         return replace(self, known=torch.cat([self.known, known]), unknown=torch.cat([self.unknown, unknown]))
 
     def rows(self, index: Tensor) -> Features:
-        """Those of some configurations (B,)."""
+        """Features of some configurations (B,)."""
         M = len(self.at.sensitivity)
         known, unknown = (part.unflatten(1, (M, -1))[:, index].flatten(1) for part in (self.known, self.unknown))
         return Features(self.at.rows(index), known, unknown)
@@ -145,7 +145,7 @@ class BeforeData(Conditional):
 
 
 class Opened(Conditional):
-    """The same with more unknowns, of which the data so far say nothing.
+    """A conditional with more unknowns, of which the data so far say nothing.
 
     Args:
         before: without them. first: number of the first of their columns.
@@ -339,7 +339,7 @@ class Estimated(Conditional):
 
 
 def without_rigid_motions(before: Conditional, reference: Linearisation, base: Sequence[int]) -> Estimated:
-    """The same conditional without rigid motions, see :class:`Estimated`.
+    """A conditional without rigid motions, see :class:`Estimated`.
 
     Args:
         before: with them. reference: linearisation at X. base: numbers of the six parameters that move the base.

@@ -61,7 +61,7 @@ class LinearRows:
 
     @cached_property
     def factor(self) -> Factor:
-        """Of K."""
+        """Factor of K."""
         return Factor.of(self.V, self.slopes @ torch.linalg.cholesky(self.prior))
 
     @cached_property

@@ -214,7 +214,7 @@ def _right(sizes: Sequence[float]) -> bool:
 
 
 def _kind(row: Mapping[str, str]) -> str:
-    """Of a joint; empty if its name is unknown."""
+    """Kind of a joint; empty if its name is unknown."""
     slides = VALUE.search(re.sub(r"\s", "", row["d"].lower())) is not None
     return KINDS.get(row.get("kind", "").lower() or ("p" if slides else "r"), "")
 

@@ -132,7 +132,7 @@ class GravitySag:
         return torch.where(loaded, self.payload.amounts(q), q.new_ones(1, 1))
 
     def _frames(self, q: Tensor) -> Tensor:
-        """All places in the ground's frame: (N, F, 4, 4)."""
+        """Places in the ground's frame: (N, F, 4, 4)."""
         places, ground = self.chain.places(q), self.chain.ground_place
         return places if ground is None else torch.linalg.inv(places[:, ground])[:, None] @ places
 

@@ -40,7 +40,7 @@ class Waves(NamedTuple):
     effects: Any  # (K, J r) c_k in the r components of its joint l, zero in those of the others
 
     def times(self, coefficients: Any) -> Waves:
-        """These, with units (K, J) of their joints for effects, with coefficients (K r,)."""
+        """Multiply by units (K, J) of their joints for effects, with coefficients (K r,)."""
         each = coefficients.reshape(len(self.joints), 1, -1)
         return self._replace(effects=(self.effects[:, :, None] * each).reshape(len(self.joints), -1))
 
@@ -180,7 +180,7 @@ class Masses(NamedTuple):
 
     @classmethod
     def of(cls, compliances: Sequence[Compliance], robot: NominalChain) -> Masses:
-        """Those of some compliances of a robot."""
+        """Effects of some compliances of a robot."""
         pairs = [(k, c.joint, place) for k, c in enumerate(compliances) for place in c.places or (c.joint,)]
         k, joint, place = np.array(pairs, dtype=int).reshape(-1, 3).T
         joints, units = np.array([c.joint for c in compliances], dtype=int), np.eye(len(robot.offsets))

@@ -69,7 +69,7 @@ class Table:
 
     @property
     def coefficients(self) -> Array:
-        """Of (x - knot)^0 ... (x - knot)^5 in every cell: (6, K)."""
+        """Coefficients of (x - knot)^0 ... (x - knot)^5 in every cell: (6, K)."""
         h, (left, right) = np.diff(self.knots), (self.values[:-1].T, self.values[1:].T)
         f, d, c = left[0], left[1] * h, left[2] * h**2
         df, dd, dc = right[0] - f - d - 0.5 * c, right[1] * h - d - c, right[2] * h**2 - c

@@ -61,7 +61,7 @@ class BoardCamera:
 
     @property
     def numbers(self) -> Tensor:
-        """All of it as the constants of a device."""
+        """The constants of a device."""
         camera, unknowns = self.camera, self.camera.unknowns
         own = [float(self.on_tool), camera.width, camera.height, camera.half_size, camera.noise]
         own += [*astuple(self.explained), *([] if camera.view is None else camera.view.numbers)]

@@ -138,7 +138,7 @@ class Extrinsics(ABC):
         return self.kind == other.kind
 
     def only(self, names: Collection[str]) -> Self:
-        """Those with some names, and their rows."""
+        """Keep devices with some names, and their rows."""
         own = tuple(name for name in self.names if name in names)
         kept = [self.names.index(name) for name in own]
         places = [own.index(name) if name in own else -1 for name in self.names]
@@ -147,7 +147,7 @@ class Extrinsics(ABC):
         return replace(self, names=own, constants=self.constants[kept], deviations=self.deviations[kept], **values)
 
     def beside(self, other: Self) -> Self:
-        """These, and those of the same kind under other names."""
+        """Add devices of the same kind under other names."""
         if not self.names:
             return other
         other = other.only({*other.names} - {*self.names})
@@ -277,7 +277,7 @@ class Devices(Extrinsics):
         """Where a device is in a frame, with standard deviations of its increments (k,)."""
 
     def freed(self) -> Devices | None:
-        """The same devices with what was said to be known left open, to test it; None if there is nothing."""
+        """Leave open what was said to be known, to test it; None if there is nothing."""
         return None
 
     def check_freed(self, noise: float, free_noise: float) -> None:

@@ -101,7 +101,7 @@ class Evaluation:
 
     @property
     def label(self) -> str:
-        """The same for one number, for axes."""
+        """What one number is, for axes."""
         return self.title.lower().replace("errors", "error", 1)
 
     @property
@@ -133,7 +133,7 @@ class Evaluation:
 
     @property
     def each(self) -> list[Evaluation]:
-        """These, and those of orientations."""
+        """Errors of positions, and of orientations if there are any."""
         return [self] if self.orientation is None else [self, self.orientation]
 
     def __repr__(self) -> str:
@@ -229,7 +229,7 @@ class Evaluations(Mapping[str, Evaluation]):
     def of(
         cls, found: Iterable[tuple[Evaluation, Tensor]], count: int, placed: Sequence[str] = (), numbers: int = 0
     ) -> Evaluations:
-        """Those of rows of one kind each, with their row numbers (M,); of several of one kind: distance, distance 2.
+        """Errors of rows of one kind each, with their row numbers (M,); of several of one kind: distance, distance 2.
 
         A kind whose rows all show no error, alone in their sockets, is left out.
         """

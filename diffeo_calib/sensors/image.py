@@ -145,7 +145,7 @@ def _by_projection(values: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _by_parallel_rays(values: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
-    """The same by a camera far away (scaled orthography), whose images are linear in points around zero.
+    """Start by a camera far away (scaled orthography), whose images are linear in points around zero.
 
     Source: D. DeMenthon, L. Davis, "Model-based object pose in 25 lines of code", IJCV 15, 1995, section 2.
     """

@@ -79,7 +79,7 @@ class Unregistered(Extrinsics):
 
     @property
     def kind(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """As the file says it."""
+        """The kind that the file says."""
         return self.read_kind
 
     def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:

@@ -43,7 +43,7 @@ class KnownDrift(Extrinsics):
 
     @classmethod
     def of(cls, model: Any) -> KnownDrift | None:
-        """That of a model; None without one, and for other kinematics.
+        """Drift of a model; None without one, and for other kinematics.
 
         Raises:
             InputError: numbers that do not fit the robot's joints.

@@ -44,7 +44,7 @@ class Places:
 
 
 def joined(devices: Iterable[Extrinsics]) -> dict[str, Any]:
-    """All devices of each kind."""
+    """Join devices of each kind."""
     found = dict[str, Any]()
     for own in devices:
         found[own.kind] = found[own.kind].beside(own) if own.kind in found else own
@@ -75,7 +75,7 @@ def fitting_devices(data: Readings, points: Tensor) -> Devices:
 
 
 def placed(data: Readings, points: Tensor) -> Devices:
-    """The same for rows that a user passes.
+    """Place the devices of rows that a user passes.
 
     Raises:
         MeasurementError: too few rows of a device. Warns: readings that no place of it explains.

@@ -44,7 +44,7 @@ class FixedPoints(Devices):
 
     @classmethod
     def columns(cls) -> dict[str, tuple[str, ...]]:
-        """Of absolute lengths, and of those with an unknown zero."""
+        """Columns of absolute lengths, and of those with an unknown zero."""
         zero = "displacement", "wire", "draw_wire", "interferometer"
         return {"distance": ("distance", "dist", "range", "bar"), "displacement": zero}
 

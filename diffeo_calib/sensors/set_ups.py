@@ -76,7 +76,7 @@ class SetUps(Extrinsics):
 
     @classmethod
     def among(cls, known: Mapping[str, Any], turns: Turns | None) -> Self:
-        """Those of this kind among the devices that a model knows, by kind."""
+        """Set-ups of this kind among the devices that a model knows, by kind."""
         none = torch.zeros(0, 0, dtype=torch.float64, device=HOST)
         return replace(known.get(cls.kind, cls((), none, none)), turns=turns)
 
@@ -106,7 +106,7 @@ class SetUps(Extrinsics):
         return data
 
     def after(self, known: SetUps) -> Self:
-        """These, found in rows that :meth:`in_any_frame` of others had changed."""
+        """Set-ups that were found in rows that :meth:`in_any_frame` of others had changed."""
         return self
 
     @property
@@ -134,7 +134,7 @@ class SetUps(Extrinsics):
         return replace(self, constants=constants, deviations=deviations)
 
     def with_reference(self, reference: int) -> Self:
-        """The same, one of them the model's."""
+        """Make one of them the model's."""
         own = torch.arange(len(self.names), device=HOST)[:, None] == reference
         constants, deviations = torch.where(own, self.same, self.constants), self.deviations.masked_fill(own, 0.0)
         return replace(self, constants=constants, deviations=deviations)

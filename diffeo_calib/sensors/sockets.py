@@ -57,7 +57,7 @@ class SocketPlaces(Devices):
         return cls(tuple(known.names[number] for number in numbers.tolist()), middles, torch.stack(each))
 
     def same_set(self, other: Extrinsics) -> bool:
-        """All sockets are of one set."""
+        """Sockets are all of one set."""
         return self.kind == other.kind
 
     def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:

@@ -45,7 +45,7 @@ class Trackers(Devices):
 
     @classmethod
     def start(cls, values: Tensor, bodies: Tensor) -> Tensor:
-        """As of a robot whose tip has these poses."""
+        """The place of a robot whose tip has these poses."""
         found = place(bodies[:, None], values[:, None])
         return torch.cat([found.base[:3].flatten(), found.tool[0]])
 

@@ -74,7 +74,7 @@ class Convention:
         return found
 
     def of_columns(self, matrix: Tensor, offset: Tensor, angle: str, per_metre: float) -> Convention:
-        """The same for cells (N, c) of columns where the joint values that were read are ``matrix @ cells + offset``.
+        """Conventions of cells (N, c) of columns where the joint values that were read are ``matrix @ cells + offset``.
 
         Args:
             matrix: (n, c). offset: (n,), in the units of the table. angle, per_metre: these units.
@@ -123,7 +123,7 @@ def conventions(
         return Convention(robot, matrix, offset, left(data.q @ matrix.mT + offset))
 
     def rigid(starts: _Starts) -> Iterator[_Starts]:
-        """Those (1,) that are good in a rigid frame too, one for each pattern of signs."""
+        """Conventions that are good in a rigid frame too, one for each pattern of signs."""
         kept = list[Tensor]()
         for row, pattern in enumerate(starts.matrix.sign()):
             known = len(kept) == EXAMINED or any(torch.equal(pattern, one) for one in kept)

@@ -31,7 +31,7 @@ class SampledRows(NamedTuple):
 
     @classmethod
     def of(cls, data: TangentData, scales: Hyperparameters) -> SampledRows:
-        """Those of a calibration with these scales."""
+        """Hypotheses of a calibration with these scales."""
         index, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed=0)
         return cls(some, index, some.process(scales), scales)
 

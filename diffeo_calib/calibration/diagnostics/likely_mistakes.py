@@ -208,7 +208,7 @@ def _units_of_length() -> Iterator[tuple[float, float, str]]:
 
 
 def longer_chains(robot: Tree, data: Measurements) -> Iterator[Reading]:
-    """The same with joints below the given tip, for which the table has columns whose values vary."""
+    """Chains with joints below the given tip, for which the table has columns whose values vary."""
     columns, table = numeric_table(data)
     if columns is None or robot.source is None or len(robot.tips) > 1:
         return

@@ -94,12 +94,12 @@ class Identification:
 
     @property
     def tails(self) -> Tails:
-        """Of the first kind of rows, such as those that tell coordinates."""
+        """Tails of the first kind of rows, such as those that tell coordinates."""
         return Tails(self.freedom, self.weights[0])
 
 
 def with_ball(geometry: Geometry, ball: Geometry) -> Geometry:
-    """The same robot with the marker of another geometry of it, a ball, as one more."""
+    """Add the marker of another geometry of the same robot, a ball."""
     return geometry.with_tool(torch.cat([geometry.tool, ball.tool]), (*geometry.on, *ball.on))
 
 

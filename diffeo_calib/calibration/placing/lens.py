@@ -44,7 +44,7 @@ class CameraErrors(DeviceSet):
 
     @classmethod
     def around(cls, data: Measurements, rows: Tensor) -> list[Any]:
-        """Those of the images of a table beside a model, none for other tables; arguments as of :meth:`of_table`."""
+        """Cameras of the images of a table beside a model, none for other tables; arguments as of :meth:`of_table`."""
         return [cls(BoardCameras.of_rows(rows, one.seen_by), one) for one in data.shared_errors()]
 
     def effects(self, data: Seen) -> Tensor:
@@ -78,7 +78,7 @@ class LensAndBoard(CameraErrors):
     def of_table(
         cls, data: Measurements, rows: Tensor, registration: Identification, sessions: Sequence[Sessions] = ()
     ) -> list[Any]:
-        """That of the images of a table, none for other tables.
+        """Cameras of the images of a table, none for other tables.
 
         Args:
             data: in the frame of one session. rows: (M,) numbers in the whole table. registration: of all of them.
@@ -143,7 +143,7 @@ class LensAndBoard(CameraErrors):
         return next(iter(self.devices.cameras.values())).on_tool
 
     def widened(self, table: Measurements) -> LensAndBoard:
-        """The same with the noise of the images as a table of them has it now."""
+        """Take the noise of the images from a table."""
         (shared,) = table.shared_errors()
         cameras = {
             name: replace(own, explained=replace(own.explained, corners=_corners(shared, number)))

@@ -173,7 +173,7 @@ class Placed:
         return [own.elsewhere(row, points, self.placement) for own in self.placement]
 
     def settled(self, fitted: Fit, fitted_map: FittedMap, chosen: ChosenScales) -> Placed:
-        """The same with the devices where a fit puts them, and with all markers of the model.
+        """Move the devices to where a fit puts them, and with all markers of the model.
 
         Args:
             fitted: the fit. fitted_map: its map, with the covariances of the model. chosen: its scales and rows.
@@ -232,12 +232,12 @@ class Placed:
         return sentence(what, expected=expected, got=got, fix="correct these labels")
 
     def drifting(self) -> Placed | None:
-        """The same with what may drift with columns of the table; None without such columns."""
+        """Add what may drift with columns of the table; None without such columns."""
         drift = Drift.of_table(self.data, self.registration.geometry.chain)
         return replace(self, placement=Placement((*self.placement, *drift))) if drift else None
 
     def widened(self, data: TangentData, scales: Hyperparameters) -> tuple[Placed, str] | None:
-        """The same with what differs from row to row as noise of these, in a sentence; None if nothing clearly does."""
+        """Count what differs from row to row as their noise, in a sentence; None if nothing clearly does."""
         found = variation(data, scales, self.placement.hypotheses(data, ROW))
         if found is None or self.coordinates is None:
             return None

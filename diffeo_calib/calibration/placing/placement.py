@@ -79,7 +79,7 @@ class DeviceSet(ABC):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the devices."""
+        """Names of the devices."""
         return self.devices.names
 
     @property
@@ -99,11 +99,11 @@ class DeviceSet(ABC):
         return found
 
     def of_rows(self: S, rows: Tensor) -> S:
-        """The same among more rows, of which these (M,) are those here."""
+        """Renumber the rows: ``rows`` (M,) are their numbers in a larger table."""
         return self.measuring(rows[self.rows], self.device)
 
     def measuring(self: S, rows: Tensor, device: Tensor) -> S:
-        """The same devices with other rows (M,), each of one of them."""
+        """Give the devices other rows (M,), each measured by one of them."""
         return replace(self, devices=replace(self.devices, rows=rows, device=device))
 
     @abstractmethod
@@ -116,7 +116,7 @@ class DeviceSet(ABC):
 
     @abstractmethod
     def with_rows(self: S, other: OtherRows) -> S:
-        """The same devices with other rows in place of their own; MeasurementError for other devices."""
+        """Replace the rows of the devices; MeasurementError for other devices."""
 
     def at_places(self, table: T) -> T:
         """Rows that tell coordinates where these devices put them."""
@@ -156,14 +156,14 @@ class DeviceSet(ABC):
 
 
 class Placement(tuple[DeviceSet, ...]):
-    """All devices of a calibration, a set of each kind."""
+    """The devices of a calibration, a set of each kind."""
 
     def one(self, kind: type[S]) -> S | None:
         """The first set of a kind; None without one."""
         return next((own for own in self if isinstance(own, kind)), None)
 
     def hypotheses(self, data: Seen, about: str) -> list[Hypothesis]:
-        """Those about one of :class:`Hypothesis`: what all devices are said to hold, or what of them may change."""
+        """Hypotheses about a subject of :class:`Hypothesis`: what devices are said to hold, or what of them may change."""
         return [one for own in self for one in own.hypotheses(data) if one.about == about]
 
     @property
@@ -176,7 +176,7 @@ class Placement(tuple[DeviceSet, ...]):
         return torch.cat([data.y.new_zeros(*data.y.shape, 0), *(own.effects(data) for own in self)], 2)
 
     def settled(self, fitted: Fit, around: FittedMap, data: Seen, transform: Tensor, **known: Any) -> Placement:
-        """All devices where a fit puts them, whose last shifts are theirs.
+        """Move the devices to where a fit puts them; its last shifts are theirs.
 
         Args:
             fitted: the fit. around: its map, with the covariances of the model. data: its rows.

@@ -221,7 +221,7 @@ class Drift(DeviceSet):
 
     @classmethod
     def of_table(cls, data: Measurements | Readings | Observations, chain: Tree) -> list[DeviceSet]:
-        """That of all columns of a table which are not constant; none without any."""
+        """A drift with every column of a table that is not constant; none without any."""
         values = data.covariates
         if values is None or not bool((values.amax(0) > values.amin(0)).all()):
             return []

@@ -127,7 +127,7 @@ class SocketDevices(DeviceSet):
         return effects
 
     def found(self, data: Measurements, stage: Identification) -> SocketDevices:
-        """The same around the places that a geometric calibration of rows found, whose first shifts are theirs."""
+        """Move the sockets to the places that a geometric calibration found; its first shifts are theirs."""
         resting = data.socket_rows()
         warn_of_wrong_sockets(resting, stage.geometry.points(resting.q)[:, -1])
         return SocketDevices.around(data, self.positions + (self.root @ stage.shifts[0]).view(-1, 3))

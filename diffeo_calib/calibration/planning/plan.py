@@ -181,7 +181,7 @@ class Plan:
         return data_frame(own | ({"device": list(self.devices)} if self.devices else {}))
 
     def write(self, path: str | PathLike[str], table: TableFormat) -> None:
-        """The same as :meth:`to_csv` for a format that is given as one object, which may name the joints otherwise."""
+        """Write as :meth:`to_csv` does, in a format given as one object, which may name the joints otherwise."""
         columns = Columns.of(replace(table.joints_only(), joints=table.joints or self.joint_names, kinds=self.kinds))
         devices = [[name] for name in self.devices] or [[]] * len(self)
         values = columns.joints_from_si(self.q).round(decimals=JOINT_DIGITS).tolist()

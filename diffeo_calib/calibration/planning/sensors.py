@@ -62,7 +62,7 @@ class Options(NamedTuple):
 
     @classmethod
     def of(cls, scene: Scene, told: Sequence[Told]) -> Options:
-        """All of them; what some do not report is noise of 1 m that nothing moves."""
+        """Join rows of all sensors; what some do not report is noise of 1 m that nothing moves."""
         r, width, found = max(one.slopes.shape[1] for one in told), scene.columns, []
         for number, one in enumerate(told):
             new = one.columns == NEW

@@ -54,7 +54,7 @@ LINEARISED = "seen", "at", "residual", "by_places", "fit_covariance"
 
 
 class UsualNoise(NamedTuple):
-    """Of a row that tells coordinates."""
+    """Usual noise of a row that tells coordinates."""
 
     block: Tensor  # (m, m) m^2
     factor: float  # on the variances of poses of the fit; 0 where the fit or the rows have other bodies
@@ -78,7 +78,7 @@ class NewSetUp:
 
     @property
     def nominal(self) -> GeometryMap:
-        """That of the old map."""
+        """Nominal map of the old model."""
         return robot_map(self.fitted)
 
     @property
@@ -215,7 +215,7 @@ class NewRows:
 
     @property
     def nominal(self) -> GeometryMap:
-        """That of the old map."""
+        """Nominal map of the old model."""
         return self.set_up.nominal
 
     @property
@@ -305,7 +305,7 @@ class NewRows:
         )
 
     def evidence(self, root: Tensor) -> Evidence:
-        """Of unknowns with these effects (M, R, c)."""
+        """Evidence of unknowns with these effects (M, R, c)."""
         E = root.flatten(0, 1)
         return Evidence(E.T @ self.given.solved.flatten(), E.T @ self.given.factor.solve(E))
 
@@ -375,7 +375,7 @@ class NewRows:
     # --- the same rows otherwise ---
 
     def changed(self, **changes: object) -> NewRows:
-        """The same rows with another noise or prior; what does not change is computed once."""
+        """Change the noise or the prior; what does not change is computed once."""
         other = replace(self, **changes)
         vars(other).update({name: getattr(self, name) for name in LINEARISED})
         return other
@@ -396,7 +396,7 @@ class NewRows:
         return self.changed(drifts=torch.cat([self.drifts, *(root.flatten(0, 1) for root in roots)], 1))
 
     def with_weights(self) -> NewRows:
-        """The same rows with the weights of Student's t, by expectation maximisation."""
+        """Weigh the rows by Student's t, by expectation maximisation."""
         rows = self
         for _ in range(ROUNDS):
             noise, given = rows.weighted_noise, rows.given

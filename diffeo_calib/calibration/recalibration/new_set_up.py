@@ -189,7 +189,7 @@ def _place_of_device(
 
 
 def with_ball(fitted: FittedMap, ball: Tensor, tip: str, deviation: float) -> FittedMap:
-    """The same map with a ball as its last marker.
+    """Add a ball as the last marker of a map.
 
     Args:
         fitted: the map. ball: (3,) where it roughly is in the frame of a tip, m.

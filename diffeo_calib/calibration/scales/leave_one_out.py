@@ -224,7 +224,7 @@ def cross_validated_inflation(
 def inflation_by_places(
     data: TangentData, scales: Hyperparameters, place: Tensor, shared: Tensor, groups: Tensor
 ) -> float:
-    """The same factor for rows in sockets, a fold for each place, scales kept.
+    """Inflation by rows in sockets, a fold for each place, scales kept.
 
     The ratio is that of the places. How uncertain it is follows from all that shows how large errors elsewhere are:
     each place is one degree of freedom, and so is each configuration that a device measured.

@@ -84,7 +84,7 @@ class NoiseModel:
 
     @classmethod
     def of(cls, data: Measurements, residual: float) -> NoiseModel:
-        """That of measured coordinates; ``residual`` is that of the geometric calibration per coordinate, m."""
+        """Noise of measured coordinates; ``residual`` is that of the geometric calibration per coordinate, m."""
         size, visible, known = data.bodies.points, data.visible.repeat_interleave(3, 1), data.covariance
         plain = cls.alike(len(data), data.markers // size, 3 * size)
         known, modes = plain.known if known is None else known, data.bodies.modes(data)
@@ -98,7 +98,7 @@ class NoiseModel:
         return cls(visible, kinds, known, plain.modes if modes is None else modes, slack)
 
     def rows(self, index: Tensor) -> NoiseModel:
-        """That of some configurations."""
+        """Noise of some configurations."""
         own = self.visible[index], self.kinds[index], self.known[index], self.modes[index]
         return NoiseModel(*own, self.slack, self.smallest_noise)
 
@@ -119,7 +119,7 @@ class NoiseModel:
 
     @property
     def without_known(self) -> NoiseModel:
-        """The same of rows whose noise is not known beforehand."""
+        """Forget the noise that is known beforehand."""
         return replace(self, known=torch.zeros_like(self.known))
 
     @property
@@ -171,7 +171,7 @@ class NoiseModel:
         return self._of_all(scales, jacobian).mean(0) + own
 
     def typical(self, scales: Hyperparameters, jacobian: Tensor, freedom: float) -> Tensor:
-        """The same (R, R), inflated so that its 95 % region holds 95 %: by heavy tails, and where the rows differ."""
+        """Mean covariance (R, R), whose 95 % region holds 95 %: inflated by heavy tails, and where the rows differ."""
         mean = self.mean_covariance(scales, jacobian)
         between_rows = differing_factor(self.covariance(scales, jacobian), mean, self.visible)
         return mean * between_rows * region_factor(freedom, int(self.freedom.max()))

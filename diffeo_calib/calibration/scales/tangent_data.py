@@ -207,21 +207,21 @@ class TangentData:
 
     @property
     def good(self) -> TangentData:
-        """The same without what is more likely gross: by its weights it would hold the noise where it was."""
+        """Leave out what is more likely gross: by its weights it would hold the noise where it was."""
         if not self.tails.gross:
             return self
         gross = (self.tails.weights < 0.5).repeat_interleave(self.noise_model.size, 1)
         return self._variant(noise_model=replace(self.noise_model, visible=self.visible & ~gross))
 
     def with_tails(self, tails: Tails) -> TangentData:
-        """The same measurements with other weights."""
+        """Change the weights."""
         other = self._variant(tails=tails)
         same = vars(self).keys() & {"basis", "pairs", "_numbers", "_expected"}
         vars(other).update({name: vars(self)[name] for name in same})
         return other
 
     def with_position_errors(self, scales: Hyperparameters) -> TangentData:
-        """The same measurements around a map with these gear lines and axes, which add nothing yet."""
+        """Add gear lines and axes to the map, which add nothing yet."""
         own = PositionErrors(tuple((line.joint, line.frequency) for line in scales.lines), scales.axes)
         nominal = self.nominal.changed(own=own)
         theta = self.theta.new_zeros(nominal.parameters)

@@ -172,7 +172,7 @@ def _read(robot: Path, sheet: Sheet, arm: Arm) -> Source:
 
 
 def _with_tip(robot: Path, source: Source, arm: Arm) -> Source:
-    """The same without joints at the end that no marker follows, and why the tip is there."""
+    """Drop joints at the end that no marker follows, and say why the tip is there."""
     left_out = list[str]()
     moved = (source.q.amax(0) - source.q.amin(0)).tolist()
     while len(arm.joints) > 1 and source.value("joints"):

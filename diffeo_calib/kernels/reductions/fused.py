@@ -155,7 +155,7 @@ class Compiled(NamedTuple):
     function: Callable[..., None]
 
     def totals(self, rows: Points | None, columns: Points, mine: Chosen = list) -> Tensor:
-        """All sums without factors (outputs, count), or the parts of a process: the shares of all add up to them.
+        """Sums without factors (outputs, count), or the parts of a process: the shares of all add up to them.
 
         Args:
             rows: the M points at which sums are evaluated; None for the columns themselves.

@@ -52,7 +52,7 @@ class Vector:
 
     @property
     def suffix(self) -> str:
-        """Of the names of functions of such vectors."""
+        """Suffix of the names of functions of such vectors."""
         return f"v{self.lanes}f64"
 
 
@@ -155,7 +155,7 @@ class Program:
 
     @cached_property
     def rows(self) -> int:
-        """Of a block."""
+        """Rows of a block."""
         return next((rows for outputs, rows in ROWS if self.count <= outputs), 1)
 
     @cached_property
@@ -327,7 +327,7 @@ class _Block:
         return Points(**found)
 
     def _address(self, code: Code, k: int, array: str, length: str, point: str) -> str:
-        """Of the number at a point in the k-th line of an array whose lines have a length."""
+        """Address of the number at a point in the k-th line of an array whose lines have a length."""
         number = code.value(f"add i64 {code.value(f'mul i64 {length}, {k}')}, {point}")
         return code.value(f"getelementptr double, ptr {array}, i64 {number}")
 

@@ -161,7 +161,7 @@ class Symbol:
         return self * self
 
     def _positive_multiple(self) -> Symbol:
-        """The same with a positive scale."""
+        """The value with a positive scale."""
         return self if self.scale > 0.0 else self._new(1.0, "scale", self.node, number=self.scale)
 
     def _refuse(self, *_: object) -> Any:

@@ -74,7 +74,7 @@ class Targets:
 
     @property
     def weight(self) -> float:
-        """Of each axis: a turn by an angle moves two of three axes, but the single one of a direction."""
+        """Weight of each axis: a turn by an angle moves two of three axes, but the single one of a direction."""
         return 0.5 if self.axes.shape[3] == 3 else 1.0
 
     @cached_property
@@ -93,7 +93,7 @@ class Targets:
         return np.array(([1.0] * 3 + [length / self.lever] * self.across.shape[-2]) * self.tools)
 
     def errors(self, poses: Array) -> Array:
-        """Of poses (N, T, 4, 4), (N, T k) with k = 3 + r: p* - p in m, and L times the turn that remains.
+        """Errors of poses (N, T, 4, 4), (N, T k) with k = 3 + r: p* - p in m, and L times the turn that remains.
 
         -slopes^T errors = grad f; zero where a tool is free.
         """
@@ -101,7 +101,7 @@ class Targets:
         return self._joined(self._shift(poses)[..., None], turn)[..., 0]
 
     def slopes(self, jacobian: Array) -> Array:
-        """Of Jacobians (N, T, 6, n), (N, T k, n): the decrease of the errors, to first order near the target."""
+        """Slopes by Jacobians (N, T, 6, n), (N, T k, n): the decrease of the errors, to first order near the target."""
         v = jacobian[:, :, :3]
         return self._joined(v if self.along is None else self.along @ v, jacobian[:, :, 3:])
 

@@ -210,7 +210,7 @@ class TextTable(NamedTuple):
         return [cells[place] for _, cells in self.rows]
 
     def without(self, names: Sequence[str]) -> TextTable:
-        """The same without some columns."""
+        """Drop some columns."""
         kept = [k for k, name in enumerate(self.header) if name not in names]
         rows = [(line, [cells[k] for k in kept]) for line, cells in self.rows]
         return TextTable([self.header[k] for k in kept], rows)

@@ -54,7 +54,7 @@ class RowsOfKind(NamedTuple):
 
     @property
     def errors(self) -> Evaluation:
-        """Those of the model."""
+        """Errors of the model."""
         return list(self.stages.values())[-1]
 
 
