@@ -353,7 +353,7 @@ def diagonal_gram(values: Tensor, left: Tensor, right: Tensor) -> Tensor:
 
 
 def component_gram(components: Iterable[tuple[int, Tensor]], left: Tensor, right: Tensor) -> Tensor:
-    """As :func:`diagonal_gram`, from components that are added first, so that no term of a sum needs a large matrix: (M k, N l).
+    """The same by components that are added first, so that no term of a sum needs a large matrix: (M k, N l).
 
     Args:
         components: numbers c of components and their values K(x_i, y_j)_cc, (N Q, M).

@@ -163,7 +163,7 @@ class Placement(tuple[DeviceSet, ...]):
         return next((own for own in self if isinstance(own, kind)), None)
 
     def hypotheses(self, data: Seen, about: str) -> list[Hypothesis]:
-        """Hypotheses about a subject of :class:`Hypothesis`: what devices are said to hold, or what of them may change."""
+        """Hypotheses about a subject of :class:`Hypothesis`: what devices are said to hold, or what may change."""
         return [one for own in self for one in own.hypotheses(data) if one.about == about]
 
     @property
