@@ -246,7 +246,7 @@ class Numbers:
     def in_table(self, values: Tensor) -> Tensor:
         """The inverse, zero where nothing was measured: (M, ...) -> (N, R, ...)."""
         if not self.all_there:
-            values = values.new_zeros(self.shape.numel(), *values.shape[1:]).index_copy(0, self.cells, values)
+            values = values.new_zeros(self.shape.numel(), *values.shape[1:]).index_copy_(0, self.cells, values)
         return values.unflatten(0, self.shape)
 
     def with_noise(self, matrix: Tensor, noise: Tensor) -> Tensor:
@@ -257,7 +257,10 @@ class Numbers:
 
     def square(self, matrix: Tensor) -> Tensor:
         """A matrix (M, M) as that of the table, zero where nothing was measured: (N R, N R)."""
-        return self.in_table(self.in_table(matrix).flatten(0, 1).T).flatten(0, 1).T
+        if self.all_there:
+            return matrix
+        wide = matrix.new_zeros(len(matrix), self.shape.numel()).index_copy_(1, self.cells, matrix)
+        return self.in_table(wide).flatten(0, 1)
 
     def blocks(self, matrix: Tensor) -> Tensor:
         """The blocks (N, R, R) of each row in a matrix (M, M), zero where nothing was measured."""
