@@ -25,6 +25,9 @@ NOTHING = np.zeros(0)
 MOST_TABULATED = 1500
 """With more controls, tables would take longer to make than they save: the time grows with the square."""
 
+MOST_TERMS = 1000
+"""Of the errors of an axis: more are no smooth function, and a file with 10^9 would fill the memory."""
+
 
 def nominal_chain(robot: Mapping[str, Any]) -> NominalChain:
     """The robot that is described as in model files (Tree.to_config).
@@ -142,6 +145,9 @@ def calibrated_chain(
 
 def gear_waves(waves: Sequence[Sequence[float]], n: int) -> Waves:
     """Cosine and sine of every wave, of which joint and frequency are given, in the value of one of n active joints."""
+    for joint, w in waves:
+        if not (0 <= joint < n and 0 < w < np.inf):
+            raise RobotError.of("gear waves", expected=f"joints below {n}, positive frequencies", got=(joint, w))
     table = np.array([(joint, w, s, -np.inf, np.inf) for joint, w in waves for s in (0.0, 0.5 * np.pi / w)])
     return _waves(table, n)
 
@@ -152,6 +158,10 @@ def axis_waves(axes: Sequence[Sequence[float]], n_all: int) -> Waves:
     Args:
         axes: number of one of ``n_all`` moving joints, low, high and count of each.
     """
+    for a, low, high, K in axes:
+        if not (0 <= a < n_all and -np.inf < low < high < np.inf and 0 < K <= MOST_TERMS):
+            expected = f"joints below {n_all}, ranges, and 1 to {MOST_TERMS} terms"
+            raise RobotError.of("errors of axes", expected=expected, got=(a, low, high, K))
     found = [(a, k * np.pi / (high - low), low, low, high) for a, low, high, K in axes for k in range(1, int(K) + 1)]
     return _waves(np.array(found), n_all)
 

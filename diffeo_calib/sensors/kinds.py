@@ -114,9 +114,11 @@ def stored_devices(entry: Any, rows: int) -> Extrinsics:
     if len(numbers) != len(device) or not inside:
         raise InputError.of("the rows of the devices of a model", expected=f"numbers below {rows}")
     found: Any = {**known_kinds(), **WITHOUT_READINGS}.get(entry["kind"])
-    if found is None:
+    differs = found is not None and found.reads and deviations.shape[1] != found.increments_each
+    if found is None or differs:
         found = partial(Unregistered, read_kind=entry["kind"])
         what = f"the model has {len(names)} devices of the kind {entry['kind']!r}, which is not registered here"
+        what += f" with {deviations.shape[1]} increments" * differs
         fix = "import the module that registers it (`diffeo_calib.sensors.kinds.register`) and load the model again, "
         warn_user(sentence(f"{what}: their readings are not predicted", fix=fix + "or install its package"))
     return found(names, constants, deviations, numbers, device, _shown(entry.get("shown")))

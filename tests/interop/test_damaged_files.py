@@ -169,6 +169,8 @@ WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
     "part of a list": (("report", "geometry [m]"), [], "the entry 'geometry [m]' is []"),
     "urdf of a list": (("urdf",), ["<robot/>"], "the entry urdf: expected the text of a file, got list"),
     "negative payload": (("nominal", "payload"), {"mass": -1.0, "unit": 2.0}, "mass of the payload: expected a number"),
+    "wave of no joint": (("nominal", "waves"), [[6, 3.0]], "gear waves: expected joints below 6, positive frequencies"),
+    "axis of many terms": (("nominal", "axes"), [[0, -1.0, 1.0, 10**9]], "errors of axes: expected joints below 6"),
     "rows of a truth value": (("report", "rows"), True, "the entry 'rows' is True"),
     "rigid, with elastic coefficients": (("nominal", "elastic"), False, "`theta` has the wrong shape"),
 }

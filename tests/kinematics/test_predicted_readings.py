@@ -16,6 +16,7 @@ import diffeo_calib as dc
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kinematics.device_readings import PredictedReadings
 from diffeo_calib.sensors import kinds
+from diffeo_calib.sensors.range import FixedPoints
 
 KINDS = ("distances", "heights", "images", "several kinds")
 
@@ -126,5 +127,8 @@ def test_devices_of_a_kind_that_is_not_registered_are_warned_of(tmp_path: Any, m
     with pytest.warns(dc.DiffeoCalibWarning, match=words):
         model: Any = dc.load(tmp_path / "m.safetensors")
     assert model.predict_readings(kind.q(2)) == []
+    monkeypatch.setitem(kinds.KINDS, "height", FixedPoints)
+    with pytest.warns(dc.DiffeoCalibWarning, match="is not registered here with 3 increments"):
+        dc.load(tmp_path / "m.safetensors")
     with pytest.raises(dc.DiffeoCalibError, match=r"kind 'height' in a model.*load the model again"):
         model.placement[0].carried(torch.eye(4), torch.zeros(0), torch.zeros(0), torch.zeros(0))
