@@ -75,7 +75,7 @@ class Bodies:
         return on[:: self.points]
 
     def frames(self, geometry: Any) -> list[tuple[str, Tensor]]:
-        """Measured frames (4, 4) in the frames of their tips, m, with what they are; none where markers were measured."""
+        """Measured frames (4, 4) in the frames of their tips, m, with what they are; none for markers."""
         if self.lever is None:
             return []
         found = zip(self.tips(geometry.on), pose_math.frames_of_points(geometry.tool[None], self.lever)[0], strict=True)
