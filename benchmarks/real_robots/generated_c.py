@@ -101,7 +101,7 @@ def records(model: dc.CalibratedKinematics, folder: Path, runs: int) -> Iterator
     files, seconds = timed(lambda: write_c(model, folder / "robot.c", frame="measuring"))
     compiled = files.source.with_suffix(".o")
     file: Record = {"write_s": seconds, "compile_s": timed(lambda: built(["-c", files.source, "-o", compiled]))[1]}
-    file |= {"source_mb": files.size / 1e6, "object_mb": compiled.stat().st_size / 1e6}
+    file |= {"source_mb": len(files.texts[0]) / 1e6, "object_mb": compiled.stat().st_size / 1e6}
     q, tool = configurations(model, ROWS).numpy(), model.tool.numpy()
     in_c = c_times(files, q, model.markers, runs)
     in_python, nominal = numpy_queries(model, tool), pinocchio_queries(model.robot, tool)

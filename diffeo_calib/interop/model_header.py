@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import as_tensor, check_covariance, positive
+from diffeo_calib.common.checks import as_tensor, check_covariance, check_number, positive
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, ModelFileError, few, warn_user
 from diffeo_calib.fitting.fitted_map import FittedMap
@@ -250,7 +250,7 @@ def _check(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
 
 
 def _rebuild_nominal(
-    description: Header, tensors: Tensors, nominal: Callable[[Tensor], Tensor] | None, source: str | None
+    description: Header, tensors: Tensors, nominal: Callable[[Tensor], Tensor] | None, source: object
 ) -> NominalMap:
     if description["kind"] == "function":
         if nominal is None:
@@ -265,12 +265,16 @@ def _rebuild_nominal(
         raise ModelFileError.of("the kind of nominal map", expected="robot or function", got=description["kind"])
     if nominal is not None:
         raise MissingArgumentError.of("`nominal` was given, but the file holds its robot", fix="leave it out")
+    if not isinstance(source, str | None):
+        raise InputError.of("the entry urdf", expected="the text of a file", got=type(source).__name__)
     robot, on = robot_from_config(description, source), tuple(description.get("on", ()))
     geometry = Geometry(robot, **{name: tensors[name] for name in GEOMETRY}, on=on)
     if not isinstance(description["elastic"], bool):
         raise InputError.of("the entry elastic", expected="true or false", got=description["elastic"])
     payload = NO_PAYLOAD
     if carried := description.get("payload"):
+        for name, least in (("mass", -1e-300), ("unit", 0.0)):
+            check_number(carried[name], f"the {name} of the payload", above=least)
         mass = torch.tensor(carried["mass"], dtype=torch.float64, device=HOST)
         payload = Payload(carried["link"], mass, float(carried["unit"]))
     waves = tuple((int(joint), float(frequency)) for joint, frequency in description.get("waves", ()))

@@ -188,7 +188,7 @@ def _numbers(value: object, name: str) -> Array:
 
 
 def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
-    nominal, integrator, steps = header["nominal"], header["integrator"], header["integrator"]["steps"]
+    nominal, integrator, steps = header["nominal"], header["integrator"], header["integrator"].get("steps")
     kernels = header["joint_kernel"], header["task_kernel"]
     own = ", ".join(term["kernel"] for terms in kernels for term in terms if "kernel" in term)
     for wrong, what, expected, got in (

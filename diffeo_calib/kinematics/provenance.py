@@ -139,11 +139,11 @@ class Summary:
             entries: of a file. positions: whether any was measured: old files have errors of other rows in their place.
 
         Raises:
-            TypeError: an entry is missing or unknown.
+            TypeError: an entry is missing or unknown, or its value has another type.
         """
         own = {one.metadata.get("name", one.name) for one in fields(cls)}
         others = [name for name in entries if name not in own and name.endswith(LENGTH_UNIT)]
-        parts = {name.removesuffix(LENGTH_UNIT): entries[name] for name in others}
+        parts = {name.removesuffix(LENGTH_UNIT): _read(entries[name], float, name) for name in others}
         found = record_of(cls, {k: v for k, v in entries.items() if k not in others}, parts=parts)
         return found if positions else replace(found, **dict.fromkeys(OF_POSITIONS))
 

@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
-from threading import Thread
+from threading import Event, Thread
 from typing import Any
 from urllib.parse import parse_qs
 
@@ -30,6 +30,8 @@ LOCAL = ("127.0.0.1", "localhost")
 PATHS = tuple(f"/{name}" for name in DECISIONS)
 SHOWN_ROWS, SHOWN_POSES = 8, 500
 """The last rows, and poses."""
+LAST_SECONDS = 0.6
+"""Time for a page, which asks twice a second, to see the last state."""
 
 
 class Page(ThreadingHTTPServer):
@@ -46,11 +48,12 @@ class Page(ThreadingHTTPServer):
         self.token = "" if place[0] in LOCAL else secrets.token_urlsafe()
         self.url = f"http://{host}:{port}/" + (f"?token={self.token}" if self.token else "")
         self.decisions = decisions
-        self.state = "{}"
+        self.state, self.seen = "{}", Event()
 
     def publish(self, state: dict[str, Any]) -> None:
         """Show something new on all pages."""
         self.state = json.dumps(state)
+        self.seen.clear()
 
     def handle_error(self, *given: Any) -> None:
         """A cut connection is no event."""
@@ -79,6 +82,8 @@ def served(address: str, decisions: Inbox) -> Iterator[Page]:
     try:
         yield page
     finally:
+        if page.state != "{}":
+            page.seen.wait(LAST_SECONDS)
         page.shutdown()
         page.server_close()
         thread.join()
@@ -132,6 +137,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(files("diffeo_calib.reports.html").joinpath("live.html").read_bytes())
         elif path == "/state":
             self._begin("application/json")
+            self.server.seen.set()
             self.wfile.write(self.server.state.encode())
         else:
             self.send_error(404)

@@ -6,12 +6,14 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 import torch
 from simulated_camera import BOARD_PRIOR, HEIGHT, LENS, WIDTH, CameraArm, camera_arm
-from table_bank import warned
+from table_bank import says, warned
 
 import diffeo_calib as dc
 from diffeo_calib.common.device import seeded
+from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.csv.files import read_observations
 from diffeo_calib.measurements.csv.sensors import ImageColumns
 from diffeo_calib.measurements.table_format import TableFormat
@@ -74,3 +76,13 @@ def test_rows_of_a_table_of_corners_are_named_by_their_images(tmp_path: Path) ->
     first, last = found.line_numbers[[0, -1]].tolist()
     assert found.rows([-1]).row_names == [f"row {last} ({len(q) - 1}.png)"]
     assert dc.Observations.joined([found]).row_names[0] == f"row {first} (0.png)"
+
+
+@pytest.mark.parametrize(("column", "cells"), [("u", "s,0,0,,"), ("board_x", "s,,,5,5"), ("board_y", "s,0,,5,5")])
+def test_a_corner_without_a_number_is_named(column: str, cells: str, tmp_path: Path) -> None:
+    """Beside other kinds of rows, too, where an empty cell may mean that a line holds another kind."""
+    path = tmp_path / "t.csv"
+    path.write_text(f"a,b,x,y,z,image,board_x,board_y,u,v\n1,2,3,4,5,,,,,\n1,2,,,,s,1,1,5,5\n1,2,,,,{cells}\n")
+    table = TableFormat("m", "rad", joints=("a", "b"), position=list("xyz"), readings=(ImageColumns((640, 480)),))
+    with pytest.raises(MeasurementError, match=says("line 4", f"column '{column}'", "an empty cell")):
+        read_observations(path, table)

@@ -192,6 +192,18 @@ def said(robot: dc.Tree, data: dc.Measurements, *, given: bool = True) -> str | 
     return next((text for text in texts if "seems to" in text), None)
 
 
+@pytest.mark.slow
+def test_a_tracker_that_was_knocked_is_noticed() -> None:
+    """0.5 mm from one of 60 rows on, in the order of their numbers; the error of the calibration is 0.04 mm."""
+    arm = SimulatedArm(1)
+    q, points = arm.measure(60, seed=1)
+    text = told(arm, q, from_row(points, 25, torch.tensor([3e-4, 0.0, 4e-4], dtype=torch.float64)), given=False)
+    found = re.match(r"the measuring device.* about ([\d.]+) mm near row (\d+)", str(text))
+    assert found is not None, text
+    assert float(found[1]) == pytest.approx(0.5, rel=0.3)
+    assert abs(int(found[2]) - 25) <= 1
+
+
 @pytest.mark.parametrize(("joint", "size"), [(0, 5e-4), (2, 5e-4), (5, 2e-3)])
 def test_a_joint_that_jumps_is_named_with_row_and_size(joint: int, size: float) -> None:
     """From row 30 of 80 on; of the first and the last joint another cause explains as much."""

@@ -9,6 +9,7 @@ import shutil
 import socket
 from collections.abc import Iterator
 from queue import Queue
+from threading import Timer
 from typing import Any
 from urllib.parse import urlsplit
 from urllib.request import urlopen
@@ -67,6 +68,16 @@ def test_only_this_machine_under_its_own_name(page: Page) -> None:
     assert answer(page, "POST", "/reject?line=3", **mine) == 200
     assert answer(page, "POST", "/accept?line=4", **mine) == 200
     assert decided(page) == [("reject", 3), ("accept", 4)]
+
+
+def test_the_last_state_is_seen() -> None:
+    seen = list[Any]()
+    with served("0", Queue()) as page:
+        page.publish({"state": "reached"})
+        late = Timer(0.3, lambda: seen.append(json.load(urlopen(f"{page.url}state"))))
+        late.start()
+    late.join()
+    assert seen == [{"state": "reached"}]
 
 
 def test_another_address_needs_the_token() -> None:

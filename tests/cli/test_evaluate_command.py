@@ -6,7 +6,10 @@ import hashlib
 import json
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +19,7 @@ from kind_bank import UNITS, kind_named
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.cli.printed import registration_lines
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.poses import angle_between, rotation_matrices
 from diffeo_calib.robots.se3 import twist_transform
@@ -299,11 +303,15 @@ def test_register_prints_and_writes_the_registered_model(
     assert "with each row left out in turn" in done.out
     assert "the measuring frame of the model, seen from the new one: " in done.out
     assert "marker in the frame of 'flange': " in done.out
+    assert "unmoved with probability" in done.out
     assert f"registered model: {output}" in done.out
     there = dc.load(output)
     assert isinstance(there, dc.CalibratedKinematics)
     assert there.registration is not None
     torch.testing.assert_close(there.registration.transform, MOVE, rtol=0, atol=3e-3)
+    worn: Any = SimpleNamespace(registration=replace(there.registration, excess=5.0), on=there.on)
+    said = "\n".join(registration_lines(worn))
+    assert ("unmoved with" in said, "what else has changed is in them" in said) == (False, True)
     assert there.provenance == model.provenance
     rest = table(site, tmp_path / "rest.csv", MOVE, 30, seed=10)
     again = command("evaluate", output, rest, *TABLE)

@@ -210,6 +210,7 @@ def test_set_ups_are_evaluated_each_in_its_place(
     still, placed = written
     assert placed["kinds"]["socket"] == still["kinds"]["socket"]
     assert placed["errors"]["all"]["rows"] == TRACKED
+    assert sum(own["rows"] for own in placed["errors"]["in_sessions"].values()) == TRACKED
     assert placed["errors"]["all"]["rms_m"] <= still["errors"]["all"]["rms_m"]
     a, b = (torch.tensor(placed["session_transforms"][name], dtype=torch.float64) for name in "ab")
     torch.testing.assert_close(

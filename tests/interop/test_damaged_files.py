@@ -166,6 +166,9 @@ WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
     "command of a number": (("provenance", "command"), 5, "the entry 'command' is 5"),
     "note of a list": (("provenance", "note"), ["x"], "the entry 'note' is ['x']"),
     "error of a word": (("report", "geometry rms [m]"), "large", "the entry 'geometry_rms' is 'large'"),
+    "part of a list": (("report", "geometry [m]"), [], "the entry 'geometry [m]' is []"),
+    "urdf of a list": (("urdf",), ["<robot/>"], "the entry urdf: expected the text of a file, got list"),
+    "negative payload": (("nominal", "payload"), {"mass": -1.0, "unit": 2.0}, "mass of the payload: expected a number"),
     "rows of a truth value": (("report", "rows"), True, "the entry 'rows' is True"),
     "rigid, with elastic coefficients": (("nominal", "elastic"), False, "`theta` has the wrong shape"),
 }

@@ -76,6 +76,8 @@ def test_positions_take_the_smallest_motion(arm: Case) -> None:
     found = dc.compensate(arm.model, targets, q, tool=tool_frame())
     assert int(found.reached.sum()) > 95
     assert found.angle_miss is None
+    for weights in (torch.full((6,), 1e6), torch.tensor([1.0, 1.0, 1.0, 1.0, 1.0, 1e5])):  # far from the cost of a miss
+        assert int(dc.compensate(arm.model, targets, q, tool=tool_frame(), weights=weights).reached.sum()) > 95
     away = (arm.model.tool_poses(found.q, tool_frame())[:, :3, 3] - targets).norm(dim=1)
     assert float(away[found.reached].max()) <= 1e-9
     free = found.reached & (found.correction.abs() < BOUND - 1e-9).all(1)

@@ -23,7 +23,7 @@ from diffeo_calib.measurements.csv.files import (
     write_measurements,
     write_predictions,
 )
-from diffeo_calib.measurements.csv.sensors import ImageColumns, ReadingColumns, SocketColumns
+from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.poses import rotation_matrices
@@ -161,16 +161,6 @@ def test_set_ups_are_not_written_into_another_column(tmp_path: Path) -> None:
     data = KINDS["all"]()
     with pytest.raises(MeasurementError, match=says("distinct names", "socket")):
         write_measurements(tmp_path / "t.csv", data, SI, session="socket")
-
-
-@pytest.mark.parametrize(("column", "cells"), [("u", "s,0,0,,"), ("board_x", "s,,,5,5"), ("board_y", "s,0,,5,5")])
-def test_a_corner_without_a_number_is_named(column: str, cells: str, tmp_path: Path) -> None:
-    """Beside other kinds of rows, too, where an empty cell may mean that a line holds another kind."""
-    path = tmp_path / "t.csv"
-    path.write_text(f"a,b,x,y,z,image,board_x,board_y,u,v\n1,2,3,4,5,,,,,\n1,2,,,,s,1,1,5,5\n1,2,,,,{cells}\n")
-    table = replace(SI, joints=NAMES, position=list("xyz"), readings=(ImageColumns((640, 480)),))
-    with pytest.raises(MeasurementError, match=says("line 4", f"column '{column}'", "an empty cell")):
-        read_observations(path, table)
 
 
 LINES = """a,b,x,y,z,d,u,v,spot,who,sd

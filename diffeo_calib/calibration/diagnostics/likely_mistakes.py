@@ -20,7 +20,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.conventions import Convention, conventions
-from diffeo_calib.calibration.identification.registration import can_register, distances, register_near, spread
+from diffeo_calib.calibration.identification.registration import can_register, register, spread
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import (
     LONGEST_NAME,
@@ -42,6 +42,9 @@ from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.tree import Tree, robot_from_config
 from diffeo_calib.robots.urdf import moving_joints_below, read_urdf
 
+GROSS_MEDIANS, KEPT_ROWS, TRIMMINGS = 3.0, 0.75, 2
+"""Distance, in medians, beyond which the rows that are the farthest off may spoil a registration: it is repeated with
+the share of rows that are closest, at most so often."""
 MOST_COLUMNS = 4
 """Most columns that are tried in the place of another one: every try is a registration."""
 NO_MISTAKE_FOUND = (
@@ -77,18 +80,26 @@ Group = Callable[[Tree, Measurements], Iterator[Reading]]
 def registered(reading: Reading) -> tuple[float, float]:
     """Median distance after registration of a random subset of the rows, m, infinite if that cannot be done; spread.
 
-    Gross outliers take no part.
+    Two rounds at most register again without the quarter of the rows that is farthest off, as long as a row is gross
+    (P. Rousseeuw, K. Van Driessen, "Computing LTS regression for large data sets", 2006).
     """
     q, points = reading.q, reading.points
     rows = torch.randperm(len(q), generator=seeded(0), device=HOST)[: gates.REGISTERED_ROWS]
     if len(known(points)) < 2 * (6 + 3 * points.shape[1]) or not can_register(points[rows]):
         return inf, 1.0
-    some = Measurements.of_points(q[rows], points[rows], reading.on or None, None)
-    try:
-        found = register_near(reading.robot, some, torch.ones_like(rows, dtype=torch.bool), reading.on)
-    except DiffeoCalibError:
-        return inf, 1.0
-    return float(distances(found.geometry, some).nanmedian()), spread(points)
+    q, points, typical = q[rows], points[rows], inf
+    kept = torch.ones(len(q), dtype=torch.bool, device=q.device)
+    for _ in range(1 + TRIMMINGS):
+        try:
+            geometry = register(reading.robot, q[kept], points[kept], reading.on).geometry
+        except DiffeoCalibError:
+            break
+        off = (geometry.points(q) - points).norm(dim=-1)
+        typical, worst = min(typical, float(off.nanmedian())), off.nan_to_num(0.0).amax(1)
+        if float(worst.max()) <= GROSS_MEDIANS * typical:
+            break
+        kept = worst <= worst.quantile(KEPT_ROWS)
+    return typical, spread(reading.points) if typical < inf else 1.0
 
 
 def residual_of(robot: Tree, data: Measurements) -> float:

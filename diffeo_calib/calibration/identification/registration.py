@@ -238,7 +238,7 @@ def register_inliers(robot: Tree, data: Measurements) -> tuple[Identification, T
     """Base and markers from the rows that are no gross outliers, and a first guess (N,) of these rows."""
     on = marker_tips(robot, data)
     inliers = _inliers(robot, data, on)
-    return register_near(robot, data, inliers, on), inliers
+    return _registered_by(robot, data, inliers, on), inliers
 
 
 def distances(geometry: Geometry, data: Measurements) -> Tensor:
@@ -257,7 +257,7 @@ def spread(points: Tensor) -> float:
     return float(squares[squares <= GROSS_DISTANCES**2 * squares.nanmedian()].mean().sqrt())
 
 
-def register_near(robot: Tree | Geometry, data: Measurements, inliers: Tensor, on: tuple[str, ...]) -> Identification:
+def _registered_by(robot: Tree | Geometry, data: Measurements, inliers: Tensor, on: tuple[str, ...]) -> Identification:
     """Registration without gross outliers, from a first guess (N,) of the inliers; ``on``: tips of the markers."""
     for _ in range(GROSS_ROUNDS):
         registration = register(robot, data.q[inliers], data.points[inliers], on)
@@ -277,7 +277,7 @@ def with_large_offsets(data: Measurements, registration: Identification, inliers
     if before <= EXAMINED * size or len(data) < 2 * (2 + chain.n):
         return registration
     offsets = find_joint_offsets(geometry, data.q[inliers], data.points[inliers])
-    again = register_near(with_joint_offsets(geometry, offsets), data, inliers, geometry.on)
+    again = _registered_by(with_joint_offsets(geometry, offsets), data, inliers, geometry.on)
     after = float(distances(again.geometry, data).nanmedian())
     explained = after <= min(REMAINING * before, ACCEPTED * size)
     turned = offsets[torch.tensor(chain.periodic, dtype=torch.bool, device=offsets.device)]

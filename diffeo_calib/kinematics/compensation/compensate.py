@@ -152,8 +152,8 @@ def compensate(
             joint in rad or m. Default 1 degree, 0.02 m if prismatic; ten times that where rows start at the row before.
         limits: (n, 2) lower and upper limit of each joint, rad or m; those of the robot by default. A start beyond a
             limit is brought back if the bound allows it.
-        weights: (n,) cost of each joint's motion, where a redundant robot has a choice; 1 by default, per rad^2 or m^2,
-            and joints that move no tip with a target stay, such as those of another arm.
+        weights: (n,) cost of each joint's motion per rad^2 or m^2, in units of the smallest, where a redundant robot
+            has a choice; 1 by default, and joints that move no tip with a target stay, such as those of another arm.
         lever: m that a turn of one radian counts as where position and orientation cannot both be reached.
         path: whether the rows follow each other, so that their corrections may change at a limited rate only. Joint
             limits come before the rate.

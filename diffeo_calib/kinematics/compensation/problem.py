@@ -108,7 +108,8 @@ def mobilities(chain: Tree, weights: object, tips: Sequence[str], aimed: Array) 
         coupling = chain.coupling.numpy()
         moving = np.stack([(coupling[chain.path_to(tip).numpy()] != 0).any(0) for tip in tips])  # (T, n)
         return np.any(aimed[:, :, None] & moving, axis=1).astype(np.float64)
-    return np.tile(1.0 / positive(weights, "weights", (chain.n,)).numpy(), (len(aimed), 1))
+    costs = positive(weights, "weights", (chain.n,)).numpy()
+    return np.tile(costs.min() / costs, (len(aimed), 1))
 
 
 ROWS_AT_ONCE = 4096

@@ -6,7 +6,7 @@ Minimises
 
 f from the targets, W the inverse mobilities. The second term is worth less than 0.2 um for a motion of a degree: it
 decides between commands that are equally good. Newton steps in a trust region (Levenberg and Marquardt; K. Madsen,
-H. Nielsen, O. Tingleff, "Methods for non-linear least squares problems", 2004), each near the minimum of its quadratic
+H. Nielsen, O. Tingleff, "Methods for non-linear least squares problems", 2004), each the minimum of its quadratic
 model in the box. A calibrated robot differs from its geometric model by about 1e-3, so that steps with the geometric
 Jacobian, which is quick, contract the error by 100 each: they come first, the exact Hessian where they do not suffice.
 """
@@ -26,10 +26,10 @@ MOTION_COST = 1e-10
 LEAST_MOBILITY = 1e-9
 QUICK_STEPS, MOST_NEWTON_STEPS, LAST_STEPS = 6, 100, 2
 SLOWEST_CONTRACTION = 0.1
-"""A quick step must leave less than this fraction of the cost."""
+"""A quick step must leave less than this fraction of the squared miss, which motion has no part in."""
 SETTLED_STEP = 1e-12
 """No joint moves by more than this any more, rad or m."""
-NEAR_TARGET_M = 1e-6
+NEAR_TARGET_M = 1e-4
 """Errors below this, in m, are worth a last search for the target itself."""
 LEAST_DAMPING, START_DAMPING = 1e-12, 1e-9
 ROUNDING = 1e-15
@@ -73,7 +73,7 @@ def box_search(tool: ToolFunctions, targets: Targets, q: Array, box: Box) -> tup
             if not len(search.todo):
                 break
             search.step()
-    search.finish()
+        search.finish()
     return search.q, search.poses, reached(targets, search.poses)
 
 
@@ -107,7 +107,8 @@ class Search:
         moved = np.clip(at + step, box.low, box.high)
         seen = self.tool.poses(moved)
         cost = self._cost(rows, moved, seen)
-        before = self.cost[rows]
+        goal, before = self.targets.take(rows), self.cost[rows]
+        missed = goal.cost(self.poses[rows])
         noise = ROUNDING * before
         promised = -np.einsum("ni,ni->n", slope + 0.5 * (damped @ step[:, :, None])[:, :, 0], step)
         gain = (before - cost + noise) / (np.abs(promised) + noise + 1e-300)
@@ -120,8 +121,9 @@ class Search:
         self.growth[rows] = np.where(good, 2.0, 2.0 * growth)
         still = np.abs(step).max(1, initial=0.0) <= SETTLED_STEP
         still |= np.abs(promised) <= np.maximum(SMALLEST_GAIN, noise)
-        still |= good & reached(self.targets.take(rows), seen)
-        still |= (cost > SLOWEST_CONTRACTION * before) & (not self.exact)
+        still |= good & reached(goal, seen)
+        if not self.exact:
+            still |= goal.cost(seen) > SLOWEST_CONTRACTION * missed
         self._linearise(rows[good & ~still])
         self.todo = rows[~still]
 
@@ -153,10 +155,13 @@ class Search:
         if not len(rows):
             return
         goal, box, q, seen = self.targets.take(rows), self.box.take(rows), self.q[rows], self.poses[rows]
-        free = (q > box.low) & (q < box.high)
+        jacobian, ease = (
+            self.tool.jacobian if self.exact else self.tool.rough,
+            np.sqrt(box.mobility) * ((q > box.low) & (q < box.high)),
+        )
         for _ in range(LAST_STEPS):
-            slopes = goal.slopes(self.tool.jacobian(q)) * free[:, None]
-            q = np.clip(q + (np.linalg.pinv(slopes) @ goal.errors(seen)[:, :, None])[:, :, 0], box.low, box.high)
+            inverse = ease[:, :, None] * np.linalg.pinv(goal.slopes(jacobian(q)) * ease[:, None])
+            q = np.clip(q + (inverse @ goal.errors(seen)[:, :, None])[:, :, 0], box.low, box.high)
             seen = self.tool.poses(q)
         there = reached(goal, seen)
         self.q[rows[there]], self.poses[rows[there]] = q[there], seen[there]
@@ -176,15 +181,21 @@ def _convex(hessian: Array, blocked: Array) -> Array:
 
 
 def _step_in_box(H: Array, g: Array, low: Array, high: Array) -> Array:
-    """(N, n) near the minimum of 1/2 s^T H s + g^T s in a box: joints that would leave it stay at its end."""
-    s, fixed = np.zeros_like(g), low >= high
-    for _ in range(g.shape[1]):
-        free = ~fixed
-        reduced = H * (free[:, :, None] & free[:, None, :]) + fixed[:, :, None] * np.eye(g.shape[1])
-        way = -np.linalg.solve(reduced, ((g + (H @ (s * fixed)[:, :, None])[:, :, 0]) * free)[:, :, None])[:, :, 0]
-        s = np.where(fixed, s, way)
-        hit = (s < low) | (s > high)
-        s, fixed = np.clip(s, low, high), fixed | hit
-        if not hit.any():
+    """(N, n) minimum of 1/2 s^T H s + g^T s in a box: all joints change to the end that they lead to, or away from it.
+
+    After n such steps one joint at a time, with which the search ends (J. Judice, F. Pires, "A block principal pivoting
+    algorithm for large-scale strictly monotone linear complementarity problems", 1994).
+    """
+    n, held, side = g.shape[1], low >= high, np.zeros(g.shape, dtype=np.int64)
+    for turn in range(5 * n):
+        free = (side == 0) & ~held
+        s = np.where(free, 0.0, np.where(side > 0, high, low))
+        reduced = H * (free[:, :, None] & free[:, None, :]) + ~free[:, :, None] * np.eye(n)
+        s -= np.linalg.solve(reduced, ((g + (H @ s[:, :, None])[:, :, 0]) * free)[:, :, None])[:, :, 0]
+        wish = s - (g + (H @ s[:, :, None])[:, :, 0]) / np.einsum("nii->ni", H)
+        wished = np.where(wish > high, 1, np.where(wish < low, -1, 0))
+        wrong = (wished != side) & ~held
+        if not wrong.any():
             break
-    return s
+        side = np.where(wrong & ((turn < n) | (wrong.cumsum(1) == 1)), wished, side)
+    return np.clip(s, low, high)

@@ -384,11 +384,11 @@ class ImageColumns(SensorColumns):
         names = rows.named(IMAGE, "the name of the image")
         if CAMERA in rows.texts:
             names = [f"{camera}/{image}" for camera, image in zip(rows.texts[CAMERA], names, strict=True)]
-        images: dict[str, list[int]] = {}
+        images, q = dict[str, list[int]](), rows.q
         for row, name in enumerate(names):
             images.setdefault(name, []).append(row)
         for name, own in images.items():
-            other = (rows.q[own] != rows.q[own[0]]).any(1).nonzero()[:, 0].tolist()
+            other = (q[own] != q[own[0]]).any(1).nonzero()[:, 0].tolist()
             if other:
                 what = f"file '{rows.path}', image '{name}'"
                 got = f"other ones in line {few([rows.lines[own[row]] for row in other])}"
