@@ -74,6 +74,13 @@ class Bodies:
         """The tip of each body, of those of all points."""
         return on[:: self.points]
 
+    def frames(self, geometry: Any) -> list[tuple[str, Tensor]]:
+        """Measured frames (4, 4) in the frames of their tips, m, with what they are; none for markers."""
+        if self.lever is None:
+            return []
+        found = zip(self.tips(geometry.on), pose_math.frames_of_points(geometry.tool[None], self.lever)[0], strict=True)
+        return [(f"measured frame in the frame of {tip}", frame) for tip, frame in found]
+
     def predicted(self, model: Any, q: Any, *, noise: bool = True) -> Predicted:
         """Prediction of a calibrated model at configurations (N, n), by default of new measurements."""
         if self.lever is None:

@@ -16,9 +16,11 @@ from product_bank import Case, usual_scales
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError
 from diffeo_calib.measurements.csv.files import write_measurements
+from diffeo_calib.measurements.poses import rotation_matrices
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.reports.analysis.findings import Findings, find
+from diffeo_calib.reports.html.sections import record
 from diffeo_calib.reports.html.sentences import verdict
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.tables import divided
@@ -61,6 +63,14 @@ def test_pictures_are_figures_by_name(arm: Case) -> None:
     assert {"distributions-0", "before-after-0", "expected-0", "parts", "transmission-5", "coverage"} <= set(found)
     (axes,) = found["distributions-0"].axes
     assert (axes.get_xlabel(), len(axes.lines)) == ("position error [mm]", 3)
+
+
+def test_the_record_holds_frames_in_full(posed: Case) -> None:
+    texts = [line.split(": ")[1].split() for line in record(posed.model, None).text if "rx ry rz" in line]
+    for text, frame in zip(texts, (posed.model.geometry.base, posed.model.measured_frame), strict=True):
+        numbers = torch.tensor(list(map(float, text)), dtype=torch.float64)
+        torch.testing.assert_close(numbers[:3], frame[:3, 3], rtol=0, atol=1e-7)
+        torch.testing.assert_close(rotation_matrices(numbers[None, 3:], "rotvec")[0], frame[:3, :3], rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("name", ["arm", *(pytest.param(name, marks=pytest.mark.slow) for name in ("slider",))])

@@ -19,6 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from math import degrees, inf
+from operator import itemgetter
 from typing import NamedTuple
 
 import torch
@@ -36,6 +37,7 @@ from diffeo_calib.kinematics.registered_map import robot_map
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.process.evidence import Evidence
+from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.conditional import roots
 from diffeo_calib.robots.tree import Tree
 
@@ -397,28 +399,33 @@ LOG_SIZES = torch.linspace(-12.0, 4.0, 65, dtype=torch.float64, device="cpu")
 """Logarithms of the s^2 that are tried."""
 
 
-def usual_drift(rows: NewRows, named: Sequence[ChangedPart]) -> list[ChangedPart]:
-    """What may differ between the dates, besides what a test named: temperature, wear and screws change everything.
+def with_usual_drift(rows: NewRows, named: Sequence[ChangedPart]) -> list[ChangedPart]:
+    """What differs between the dates: what a test named, and all else: temperature, wear and screws change everything.
 
     Errors of geometry, load and transmissions may differ from the old ones by s^2 times their old prior variance; s^2
-    maximises the evidence of the new rows with a wide prior below one percent.
+    maximises the evidence of the new rows with a wide prior below one percent. Where nothing was named it has to be
+    clear. A change of everything looks like one of a part: what was named stays only where the rows are likelier so.
 
     Args:
-        rows: the new rows as the old model sees them. named: parts that have changed, which are free already.
+        rows: the new rows as the old model sees them. named: parts that have changed.
     """
-    free = {each.name for each in named}
-    parts = [part for part in parts_of(rows.fitted) if part.name not in free]
-    if not parts:
-        return []
-    known, root = [each.root(rows.at) for each in named], torch.cat([part.root(rows.at) for part in parts], 2)
-    doubted, sizes, size = rows.drifting([*known, root]).with_weights(), LOG_SIZES.exp().to(rows.y), 0.0
+    if not (parts := parts_of(rows.fitted)):
+        return [*named]
+    root, sizes = torch.cat([part.root(rows.at) for part in parts], 2), LOG_SIZES.exp().to(rows.y)
     prior = -0.5 * ((sizes.log() - USUAL_LOG) / EFOLDS).square()
-    for weighed, least in ((rows, gates.DRIFT_ODDS_OF_INLIERS), (doubted, gates.DRIFT_ODDS)):
-        odds = rows.changed(tails=weighed.tails).drifting(known).evidence(root).log_odds(sizes) + prior
-        if float(odds.max()) < least:
-            return []
-        size = float(sizes[odds.argmax()])
-    return [replace(part, variance=size) for part in parts]
+
+    def likeliest(tails: Tails, kept: Sequence[ChangedPart]) -> tuple[float, float, float]:
+        """Log evidence, that relative to no such drift, and s^2 beside some of the named parts."""
+        own = rows.changed(tails=tails).drifting([each.root(rows.at) for each in kept])
+        odds = own.evidence(root).log_odds(sizes) + prior
+        return own.given.log_evidence() + float(odds.max()), float(odds.max()), float(sizes[odds.argmax()])
+
+    doubted = rows.drifting([*(each.root(rows.at) for each in named), root]).with_weights().tails
+    found = [(likeliest(doubted, kept), kept) for kept in ([named, []] if named else [[]])]
+    (_, odds, size), kept = max(found, key=itemgetter(0))
+    if not named and (odds < gates.DRIFT_ODDS or likeliest(rows.tails, [])[1] < gates.DRIFT_ODDS_OF_INLIERS):
+        return []
+    return [*kept, *(replace(part, variance=size) for part in parts)]
 
 
 RANK_TOLERANCE = 1e-9

@@ -30,7 +30,7 @@ from diffeo_calib.calibration.recalibration.find_changes import (
     Offset,
     find_changes,
     hidden_offsets,
-    usual_drift,
+    with_usual_drift,
 )
 from diffeo_calib.calibration.recalibration.find_place import find_place, warn_about
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows, NewSetUp
@@ -181,7 +181,7 @@ def recalibrate(
         warn_user(sentence(what, fix="check what happened between them, and recalibrate with the rows since then"))
     warn_about(before.registration, outliers=False, excess=not drifts, marker=marker)
     if drift == "tested":
-        drifts = [*drifts, *usual_drift(rows, drifts)]
+        drifts = with_usual_drift(rows, drifts)
     if drifts:
         rows = rows.drifting([each.root(rows.at) for each in drifts]).with_weights()
     warn_of_contradictions(rows, rows.excess if before.registration is None else before.registration.excess)

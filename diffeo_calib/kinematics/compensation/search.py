@@ -163,7 +163,9 @@ class Search:
             inverse = ease[:, :, None] * np.linalg.pinv(goal.slopes(jacobian(q)) * ease[:, None])
             q = np.clip(q + (inverse @ goal.errors(seen)[:, :, None])[:, :, 0], box.low, box.high)
             seen = self.tool.poses(q)
-        there = reached(goal, seen)
+            there = reached(goal, seen)
+            if there.all():
+                break
         self.q[rows[there]], self.poses[rows[there]] = q[there], seen[there]
 
 

@@ -16,6 +16,7 @@ from diffeo_calib.kinematics.evaluation import at_payloads
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_sentences
 from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.measurements.bodies import placement_lines
+from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.reports.analysis.findings import Findings, RowsOfKind
 from diffeo_calib.reports.analysis.predictions import FitRows, Predictions
 from diffeo_calib.reports.analysis.stages import STANDARD_REPEATS, Kinematics
@@ -310,5 +311,9 @@ def record(model: CalibratedKinematics, data_sha256: str | None) -> Section:
         lines.append(f"optimum       {certificate}")
         lines.append(f"status        {summary.status}; scales: {summary.scales}")
     lines += map(printable, placement_lines(model.geometry, poses=model.lever is not None, ball=model.ball))
+    frames = [("robot base in the measuring frame", model.geometry.base), *model.bodies.frames(model.geometry)]
+    for what, frame in frames:  # a thousandth of a degree is 50 um at 3 m
+        numbers = *frame[:3, 3].tolist(), *rotation_numbers(frame[None, :3, :3], "rotvec")[0].tolist()
+        lines.append(f"{printable(what)}, x y z rx ry rz [m, rad]: {' '.join(f'{number:.7f}' for number in numbers)}")
     lines += hand_eye_sentences(HandEye.of_fit(model))
     return Section("record", "Record", "Everything needed to make this model again.", text=lines)
