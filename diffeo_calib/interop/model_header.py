@@ -332,9 +332,10 @@ def _rebuild_rows(nominal: NominalMap, tensors: Tensors) -> GeometryMap | Sessio
     by_row = nominal.with_payload(nominal.load.weighing(tensors[PAYLOADS[0]])) if nominal.load else None
     if SESSIONS[1] not in tensors:
         return by_row
-    whole = tensors["session"].round().to(torch.int64)
-    if bool((whole != tensors["session"]).any()):
-        raise InputError.of("the tensor session", expected="whole numbers", got=tensors["session"][:5].tolist())
+    given, count = tensors["session"], len(tensors["session_tools"])
+    whole = given.round().to(torch.int64)
+    if bool(((whole != given) | (whole < 0) | (whole >= count)).any()):
+        raise InputError.of("the tensor session", expected=f"whole numbers below {count}", got=given[:5].tolist())
     return SessionMarkers(by_row or nominal, whole, tensors["session_tools"])
 
 
