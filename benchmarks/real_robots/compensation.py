@@ -117,7 +117,7 @@ def geometric_commands(geometry: Geometry, tool: Tensor, targets: Tensor, start:
         spin = targets[:, :3, :3] @ poses[:, :3, :3].mT
         turn = 0.5 * torch.stack([spin[:, i, j] - spin[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], 1)
         error = torch.cat([(targets - poses)[:, :3, 3], turn], 1)
-        slopes = pose_slopes(points, placed.jacobian(q), LEVER)
+        slopes = pose_slopes(points, placed.jacobian(q))
         q = q + torch.linalg.lstsq(slopes, error[..., None]).solution[..., 0].clamp(-0.1, 0.1)
     away = (poses_from_marks(placed.points(q), LEVER) - targets)[:, :3, 3].norm(dim=1)
     return q, (away < 1e-9) & ((q - start).abs().amax(1) < 0.02)

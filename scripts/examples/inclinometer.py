@@ -18,8 +18,8 @@ from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.sensors.devices import Devices, across, least_squares, numbers_text
 from diffeo_calib.sensors.kinds import register
 
-RANGE_RAD = 1.0
-"""Largest angle that it measures."""
+RANGE_RAD, SQUARE_RAD = 1.0, 0.01
+"""Largest angle that it measures; how far its axes may be from a right angle."""
 
 
 @register
@@ -35,6 +35,12 @@ class Inclinometers(Devices):
     stated_as = "XX,XY,XZ,YX,YY,YZ,UX,UY,UZ"
     seen_points, numbers_each, increments_each = 3, 2, 6
     metres_each, unit = 0.1, ("mrad", 1e3)
+
+    @classmethod
+    def prior(cls, offset_std: float = 0.0) -> list[float]:
+        """Mounted anyhow, with axes at about a right angle."""
+        turns = super().prior(offset_std)
+        return [*turns[:3], SQUARE_RAD, *turns[4:]]
 
     @staticmethod
     def read(constants: Tensor, body: Tensor) -> Tensor:
@@ -61,7 +67,8 @@ class Inclinometers(Devices):
         products = torch.stack([least_squares(columns, sine).view(3, 3) for sine in values.sin().unbind(1)])
         up = torch.linalg.svd(products.flatten(0, 1)).Vh[0]
         up = up * up[2].sign()  # the other sign reads the same with axes turned by 180 degrees
-        return cls.stated(torch.cat([(products @ up).flatten(), up])[None])[0]
+        x, y = torch.nn.functional.normalize(products @ up, dim=1)
+        return cls.stated(torch.cat([x, y - (x @ y) * x, up])[None])[0]
 
     def sees(self, points: Tensor, device: Tensor) -> Tensor:
         """Within its range."""
