@@ -12,13 +12,14 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.checks import check_count, check_seed
 from diffeo_calib.common.device import HOST, outside_inference_mode, seeded
 from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.flows.integrators import RK4
 from diffeo_calib.maps.deformation import ModelSpec
-from diffeo_calib.maps.noise import Noise
+from diffeo_calib.maps.noise import Noise, without_hidden
 
 SPREAD = 3.0  # of the logarithms around the scales given: a factor of 20
 FAILED = 1e30  # value of the objective where it has none: finite, so that the line search turns back
@@ -28,7 +29,7 @@ NUMBERS = 1500  # measured numbers of the random rows that stand for all rows wh
 @small_work()
 @outside_inference_mode
 def choose_scales(problem: Problem, *, iterations: int = 100, seed: int = 0) -> Problem:
-    """The same problem with the likeliest scales near those given: of kernels, parameters theta and noise.
+    """Set the likeliest scales of kernels, parameters theta and noise, near those given.
 
     Every length scale and variance of a radial kernel, or of a sum of these, is chosen by itself; a kernel of another
     class keeps its own. One factor is common to the prior deviations of theta, and one to the noise. Variances
@@ -39,9 +40,13 @@ def choose_scales(problem: Problem, *, iterations: int = 100, seed: int = 0) -> 
         seed: draws the rows that are used where there are more than :data:`NUMBERS` numbers.
 
     Raises:
-        InputError: a problem with fewer control points than data. NumericalError: the covariance of the measurements is
-            not positive definite in float64 with the scales given.
+        InputError: no problem, or one with fewer control points than data. NumericalError: the covariance of the
+            measurements is not positive definite in float64 with the scales given.
     """
+    if not isinstance(problem, Problem):
+        raise InputError.of("`problem`", expected="a dc.Problem", got=type(problem).__name__)
+    check_count(iterations, "`iterations`")
+    check_seed(seed)
     if problem.reduced:
         raise InputError.of("`problem`", expected="all data as control points", got=f"{len(problem.controls)} controls")
     count = max(1, NUMBERS // problem.y.shape[1])
@@ -50,14 +55,18 @@ def choose_scales(problem: Problem, *, iterations: int = 100, seed: int = 0) -> 
     at_rest = some.deform(some.zero(), RK4(1))
     lin, slopes, target = at_rest.linearise(), some.slopes(at_rest), (some.y - some.values(at_rest)).flatten()
     lin, R = lin if slopes is None else lin.projected(slopes), some.noise
-    blocks, shared = torch.block_diag(*R.covariance), R.shared.flatten(0, 1)
+    shared = R.shared.flatten(0, 1)
     logs = target.new_zeros(2 + sum(kernel.scales for kernel, _ in lin.sides), requires_grad=True)
     search = torch.optim.LBFGS([logs], max_iter=iterations, line_search_fn="strong_wolfe")
 
     def objective() -> Tensor:
         search.zero_grad()
         spec, factor = _scaled(some.spec, logs)
-        G = replace(lin, spec=spec).gram(replace(lin)) + factor * blocks + shared @ shared.mT
+        G = (
+            replace(lin, spec=spec).gram(replace(lin))
+            + torch.block_diag(*without_hidden(factor * R.covariance, R.visible))
+            + shared @ shared.mT
+        )
         L, info = torch.linalg.cholesky_ex(G)
         if int(info):
             return target.new_full((), FAILED)
@@ -73,7 +82,7 @@ def choose_scales(problem: Problem, *, iterations: int = 100, seed: int = 0) -> 
             )
     spec, factor = _scaled(problem.spec, logs.detach())
     new_noise = None if problem.new_noise is None else factor * problem.new_noise
-    noise = Noise(factor * problem.noise.covariance, problem.noise.shared)
+    noise = Noise(without_hidden(factor * problem.noise.covariance, problem.noise.visible), problem.noise.shared)
     return problem._with(spec=spec, noise=noise, new_noise=new_noise)
 
 

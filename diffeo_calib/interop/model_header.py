@@ -42,6 +42,8 @@ from diffeo_calib.robots.tree import robot_from_config
 from diffeo_calib.sensors.kinds import stored_devices
 
 UNITS = {"length": "m", "angle": "rad"}
+LARGEST_PARAMETER = 1e6
+"""Of a robot, m or rad: beyond it results have no correct digits."""
 ENTRIES = {"format", "units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report", "lever"}
 OPTIONAL = {"tool", "tool_tip", "urdf", "provenance", "registration", "ball", "placement"}
 """Entries of every header, and those that it may have or not."""
@@ -246,6 +248,10 @@ def _check(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
             as_tensor(tensors[name], name, shape, empty=size == 0)
     if size:
         positive(tensors["prior_variance"], "prior_variance", (size,))
+    if robot is not None and size and (largest := float(tensors["theta"].abs().max())) > LARGEST_PARAMETER:
+        raise InputError.of("the tensor theta", expected=f"at most {LARGEST_PARAMETER:g}", got=f"{largest:.3g}")
+    if "scales" in tensors and bool((tensors["scales"] < 0).any()):
+        raise InputError.of("the tensor scales", expected="no negative number", got=float(tensors["scales"].min()))
     check_covariance(tensors["new_noise"], "the tensor new_noise")
 
 

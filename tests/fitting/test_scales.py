@@ -9,6 +9,7 @@ from torch.func import jacrev, vmap
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.fitting.scales import SPREAD
+from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.robots import elastic_rr
 
 SIGMA = 0.01
@@ -81,10 +82,29 @@ def test_chosen_scales_are_the_likeliest() -> None:
             assert density(other, given, logs + moved) < best + 1e-4
 
 
+def test_hidden_coordinates_stay_hidden() -> None:
+    given = arm()
+    gone = torch.zeros(100, 2, dtype=torch.bool).index_fill(0, torch.arange(0, 100, 7), True) & torch.tensor(
+        [True, False]
+    )
+    noise = Noise(without_hidden(given.noise.covariance, ~gone))
+    kernels = {"joint_kernel": given.spec.joint_kernel, "task_kernel": given.spec.task_kernel}
+    odd, even = (
+        dc.choose_scales(dc.Problem(elastic_rr.nominal, X, torch.where(gone, Y + off, Y), noise=noise, **kernels))
+        for off in (0.0, 5.0)
+    )
+    torch.testing.assert_close(odd.noise.covariance, even.noise.covariance, rtol=0.02, atol=0)
+    assert torch.equal(odd.noise.visible, ~gone)
+
+
 def test_what_is_not_chosen_stays() -> None:
     found = dc.choose_scales(arm())
     assert float(found.spec.task_kernel.terms[1].variance) == 0.0  # pyright: ignore[reportAttributeAccessIssue]
     assert found.x is X or torch.equal(found.x, X)
+    with pytest.raises(InputError, match=r"`problem`: expected a dc.Problem, got Tensor"):
+        dc.choose_scales(X)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match="`iterations`"):
+        dc.choose_scales(arm(), iterations=0)
     with pytest.raises(InputError, match="expected all data as control points, got 5 controls"):
         dc.choose_scales(arm().with_controls(X[:5]))
     twice, kernels = [torch.cat([own, own]) for own in (X, Y)], (found.spec.joint_kernel, found.spec.task_kernel)

@@ -225,6 +225,7 @@ WRONG_TENSORS: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
     "one row less in p": ("momenta_y", lambda t: t[:-1]),
     "one row less in the noise": ("noise", lambda t: t[:-1]),
     "prior negative": ("prior_variance", lambda t: -t),
+    "parameters of a million metres": ("theta", lambda t: t + 2e6),
     "momenta not finite": ("momenta_y", lambda t: t * float("nan")),
     "x flat": ("x", lambda t: t.flatten()),
     "noise flat": ("noise", lambda t: t.flatten()),
