@@ -403,8 +403,9 @@ def with_usual_drift(rows: NewRows, named: Sequence[ChangedPart]) -> list[Change
     """What differs between the dates: what a test named, and all else: temperature, wear and screws change everything.
 
     Errors of geometry, load and transmissions may differ from the old ones by s^2 times their old prior variance; s^2
-    maximises the evidence of the new rows with a wide prior below one percent. Where nothing was named it has to be
-    clear. A change of everything looks like one of a part: what was named stays only where the rows are likelier so.
+    maximises the evidence of the new rows with a wide prior below one percent. It has to be clear unless gravity or
+    the geometry are named: one worn joint changes nothing else. A change of everything looks like one of a part: what
+    was named stays only where the rows are likelier so.
 
     Args:
         rows: the new rows as the old model sees them. named: parts that have changed.
@@ -423,7 +424,9 @@ def with_usual_drift(rows: NewRows, named: Sequence[ChangedPart]) -> list[Change
     doubted = rows.drifting([*(each.root(rows.at) for each in named), root]).with_weights().tails
     found = [(likeliest(doubted, kept), kept) for kept in ([named, []] if named else [[]])]
     (_, odds, size), kept = max(found, key=itemgetter(0))
-    if not named and (odds < gates.DRIFT_ODDS or likeliest(rows.tails, [])[1] < gates.DRIFT_ODDS_OF_INLIERS):
+    if odds < gates.DRIFT_ODDS and all(each.joint is not None for each in named):
+        return [*named]
+    if not named and likeliest(rows.tails, [])[1] < gates.DRIFT_ODDS_OF_INLIERS:
         return []
     return [*kept, *(replace(part, variance=size) for part in parts)]
 
