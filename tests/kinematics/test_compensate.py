@@ -138,6 +138,33 @@ def scipy_cost(case: Case, start: Tensor, target: Tensor) -> float:
     return 1e-6 * float(done.cost)
 
 
+def gradient(case: Case, q: Tensor, targets: Tensor) -> Tensor:
+    """(N, n) of 1/2 |p* - p|^2 + LEVER^2 (1 - cos angle), from the rotation vector of the angle."""
+    poses, J = case.model.tool_poses(q, tool_frame()), case.model.tool_jacobian(q, tool_frame())
+    spin = targets[:, :3, :3] @ poses[:, :3, :3].mT
+    turn = 0.5 * torch.stack([spin[:, i, j] - spin[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], 1)
+    shift = (targets - poses)[:, :3, 3]
+    return -(J[:, :3].mT @ shift[..., None] + LEVER**2 * J[:, 3:].mT @ turn[..., None])[..., 0]
+
+
+def test_the_nearest_command_in_the_box(arm: Case) -> None:
+    """First-order conditions: no allowed motion of a joint lowers the miss."""
+    q = near_wrist_singularity(arm, 100)
+    targets = intended(arm, q)
+    found = dc.compensate(arm.model, targets, q, tool=tool_frame())
+    assert inside(arm, found)
+    missed = ~found.reached
+    assert int(missed.sum()) > 50
+    slope = gradient(arm, found.q, targets)[missed]
+    low = torch.maximum(arm.robot.limits[:, 0], q - BOUND)[missed]
+    high = torch.minimum(arm.robot.limits[:, 1], q + BOUND)[missed]
+    at = found.q[missed]
+    blocked = ((at <= low + 1e-12) & (slope > 0)) | ((at >= high - 1e-12) & (slope < 0))
+    scale = gradient(arm, q, targets)[missed].norm(dim=1)
+    assert bool(blocked.any(1).all())
+    assert float((torch.where(blocked, 0.0, slope).norm(dim=1) / scale).max()) < 1e-6
+
+
 def test_against_another_bounded_solver(arm: Case) -> None:
     q = near_wrist_singularity(arm, 4)
     targets = intended(arm, q)
