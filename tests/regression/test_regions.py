@@ -48,7 +48,7 @@ def test_few_errors_widen_regions_and_none_leave_them() -> None:
 def test_few_errors_of_another_date_may_have_any_size() -> None:
     """Ten errors of 50 times the variance: the prior of a calibration's own scales leaves new ones outside."""
     rng, new = np.random.default_rng(4), 50 * np.random.default_rng(5).chisquare(3, 20_000)
-    few = [torch.from_numpy(50 * rng.chisquare(3, 10)) for _ in range(8)]
+    few = [torch.from_numpy(50 * rng.chisquare(3, 10)) for _ in range(12)]
     own, other = (
         np.mean([share(region_scale(each, 3, efolds=p), new, 3) for each in few]) for p in (SCALE_EFOLDS, OTHER_DATE)
     )
