@@ -40,7 +40,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 def test_a_bag_becomes_a_table(bag: Bag, tmp_path: Path, command: Command) -> None:
     times, q = motion(130)
     bag.poses(times - 0.437, place(q))
-    done = command("record", bag.write(tmp_path / "bag"), "--seen", PLACES, "-o", tmp_path / "run.csv")
+    done = command("record", bag.write(tmp_path / "bag"), PLACES, "-o", tmp_path / "run.csv")
     assert done.code == 0, done.err
     table = rows(tmp_path / "run.csv")
     found = np.array([[float(row[name]) for name in NAMES] for row in table])
@@ -67,7 +67,7 @@ def test_joints_are_joined_by_name(tmp_path: Path, command: Command, bag: Bag) -
         made.topics.pop(PLACES, None)
         made.poses(times, place(q))
         name = f"{len(made.topics[JOINTS][1])}{len(more)}"
-        done = command("record", made.write(tmp_path / name), "--seen", PLACES, "-o", tmp_path / "run.csv", *more)
+        done = command("record", made.write(tmp_path / name), PLACES, "-o", tmp_path / "run.csv", *more)
         assert done.code == 0, done.err
         table = rows(tmp_path / "run.csv")
         np.testing.assert_allclose([[float(row[k]) for k in NAMES] for row in table], PLACES_RAD, rtol=0, atol=5e-4)
@@ -75,7 +75,7 @@ def test_joints_are_joined_by_name(tmp_path: Path, command: Command, bag: Bag) -
         assert "lamp" not in table[0]
         assert ("left out" in done.err and "lamp" in done.err) == ("claw" in table[0])
     path = tmp_path / name
-    done = command("record", path, "--seen", PLACES, "-o", tmp_path / "no.csv", "--joints", f"{JOINTS}:a,elbow")
+    done = command("record", path, PLACES, "-o", tmp_path / "no.csv", "--joints", f"{JOINTS}:a,elbow")
     assert done.code == 1
     assert "expected elbow, got a, b" in done.err
 
@@ -96,7 +96,7 @@ def test_frames_are_chained(tmp_path: Path, command: Command, bag: Bag) -> None:
         ("world>/ball", turned),
         ("ball>camera", -moved),
     ):
-        done = command("record", path, "--seen", f"/tf:{frames}", "-o", tmp_path / "run.csv")
+        done = command("record", path, f"/tf:{frames}", "-o", tmp_path / "run.csv")
         assert done.code == 0, done.err
         assert "without rotations" in done.out
         found = np.array([[float(row[k]) for k in "xyz"] for row in rows(tmp_path / "run.csv")])
@@ -107,7 +107,7 @@ def test_frames_are_chained(tmp_path: Path, command: Command, bag: Bag) -> None:
         (":cube", ["cube of"]),
         (":camera", ["camera"]),
     ):
-        done = command("record", path, "--seen", f"/tf{frames}", "-o", tmp_path / "no.csv")
+        done = command("record", path, f"/tf{frames}", "-o", tmp_path / "no.csv")
         assert done.code == 1, frames
         assert all(word in done.err for word in (*words, "/tf:PARENT>CHILD")), done.err
 
@@ -133,12 +133,12 @@ def test_bags_of_ros_1_are_read_by_their_file(tmp_path: Path, command: Command) 
                 known, kinds, (state(header, NAMES, q[k], nothing, nothing), point(header, at)), strict=True
             ):
                 writer.write(own, int(1e9 * time), store.serialize_ros1(message, kind))
-    done = command("record", path, "--seen", PLACES, "-o", tmp_path / "run.csv")
+    done = command("record", path, PLACES, "-o", tmp_path / "run.csv")
     assert done.code == 0, done.err
     found = [[float(row[name]) for name in NAMES] for row in rows(tmp_path / "run.csv")]
     np.testing.assert_allclose(found, PLACES_RAD, rtol=0, atol=5e-4)
     for wrong in (tmp_path, path.rename(tmp_path / "one.rosbag")):
-        done = command("record", wrong, "--seen", PLACES, "-o", tmp_path / "no.csv")
+        done = command("record", wrong, PLACES, "-o", tmp_path / "no.csv")
         assert done.code == 1
         assert "rosbags-convert" in done.err
 
@@ -147,7 +147,7 @@ def test_images_of_stops_and_their_joints(bag: Bag, tmp_path: Path, command: Com
     moving = MIDDLES + 0.5 * (STAND_S + MOVE_S)
     bag.packed([*MIDDLES[1:], *moving, START_S - 1], PNG)
     out = tmp_path / "joints.csv"
-    done = command("record", bag.write(tmp_path / "bag"), "--seen", PICTURES, "-o", out)
+    done = command("record", bag.write(tmp_path / "bag"), PICTURES, "-o", out)
     assert done.code == 0, done.err
     assert "4 images" in done.out
     assert "1 stops without" in done.out
@@ -203,7 +203,7 @@ def test_bags_that_hold_something_else_are_named(bag: Bag, tmp_path: Path, comma
         (tmp_path / "none", PLACES, [], ["none"]),
     ]
     for path, topic, more, words in cases:
-        done = command("record", path, "--seen", topic, "-o", tmp_path / "run.csv", *more)
+        done = command("record", path, topic, "-o", tmp_path / "run.csv", *more)
         assert done.code == 1, (topic, done.out)
         assert all(word in done.err for word in words), (words, done.err)
         assert not (tmp_path / "run.csv").exists()
