@@ -45,13 +45,13 @@ class Recorder:
     def table(self, bag: Bag | Path, seen: str, *more: str) -> tuple[Any, list[dict[str, str]]]:
         """What the command says, and the rows of its table."""
         path = bag.write(self.folder / f"bag{id(bag)}") if isinstance(bag, Bag) else bag
-        done = self.command("record", path, "--seen", seen, "-o", self.folder / "run.csv", *more)
+        done = self.command("record", path, seen, "-o", self.folder / "run.csv", *more)
         assert done.code == 0, done.err
         with (self.folder / "run.csv").open(newline="", encoding="utf-8") as file:
             return done, list(csv.DictReader(file))
 
     def refused(self, path: Path, seen: str, *words: str, more: Sequence[str] = ()) -> None:
-        done = self.command("record", path, "--seen", seen, "-o", self.folder / "no.csv", *more)
+        done = self.command("record", path, seen, "-o", self.folder / "no.csv", *more)
         assert done.code == 1, (seen, done.out)
         assert all(word in done.err for word in words), (words, done.err)
         assert not (self.folder / "no.csv").exists()
