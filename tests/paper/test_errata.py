@@ -18,12 +18,6 @@ from diffeo_calib.paper.eulerian import Eulerian, EulerianProblem
 from diffeo_calib.robots import elastic_rr
 
 
-def test_errata_are_in_one_frozen_place() -> None:
-    assert Eulerian() == Eulerian(printed_sign=False, printed_jacobian=True, printed_divergence=False)
-    with pytest.raises(AttributeError):
-        Eulerian().printed_sign = True  # pyright: ignore[reportAttributeAccessIssue]
-
-
 @pytest.fixture(scope="module")
 def bed() -> dc.Problem:
     return rr_problem(8)

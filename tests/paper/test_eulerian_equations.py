@@ -102,11 +102,7 @@ def test_16_against_loops() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("equations", [Eulerian(), CORRECTED], ids=name)
-@pytest.mark.parametrize(
-    "integrator",
-    [dc.RK4(2), dc.RK8(1), dc.TorchDiffEq("rk4", step_size=0.5), dc.TorchDiffEq("dopri5", step_size=1.0)],
-    ids=repr,
-)
+@pytest.mark.parametrize("integrator", [dc.RK4(2), dc.TorchDiffEq("dopri5", step_size=1.0)], ids=repr)
 def test_20_is_17_with_the_point_added(equations: Eulerian, integrator: Integrator) -> None:
     """A point without momentum, carried from the start, ends where (20), (21) put it; so does a data point."""
     xi = uniform(3, 2, seed=8)
@@ -119,7 +115,7 @@ def test_20_is_17_with_the_point_added(equations: Eulerian, integrator: Integrat
     torch.testing.assert_close(base(base.x), base.z1, rtol=0, atol=1e-10)
 
 
-EXACT_GRADIENT = [(e, i, 1e-7) for e in SWITCHES for i in (dc.RK4(2), dc.RK8(1))]
+EXACT_GRADIENT = [*((e, dc.RK4(2), 1e-7) for e in SWITCHES), (CORRECTED, dc.RK8(1), 1e-7)]
 OTHERS = [
     (CORRECTED, dc.TorchDiffEq("rk4", step_size=0.5), 1e-7),
     (CORRECTED, dc.TorchDiffEq("dopri8", adjoint=True, step_size=1.0), 1e-5),
