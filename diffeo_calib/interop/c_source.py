@@ -192,8 +192,6 @@ def c_source(
             "markers": len(program.markers),
             "generated": f"{GENERATED} {package_version()}",
             "lanes": LANES,
-            "tree": nominal.before.tolist() != list(range(-1, joints)),  # more than joints that follow one another
-            "parents": nominal.before[: joints + len(chain.tips)],
             "on_path": nominal.ancestors[joints:][: len(chain.tips)] * 1,
             "groups": runs,
             "program_tip": program.tip,
@@ -207,12 +205,9 @@ def c_source(
             "waves": chain.waves,
             "axis_waves": chain.axes,
             "moving": joints,
-            "slides": not nominal.revolute.all(),
-            "coupled": not np.array_equal(nominal.coupling, np.eye(joints)) or bool(nominal.coupling_offset.any()),
             "sag": None if chain.sag is None else _sag_constants(nominal, chain.sag),
             "markers_in_flange": program.markers,
             "tool_points": tool_points(tool),
-            "framed": not np.array_equal(frame, np.eye(4)),
             "frame": frame,
             "limits": limits,
         }
