@@ -44,25 +44,16 @@ print(json.dumps([late, unchanged, not pykeops.verbose, config.get_cpp_env_flags
 """
 
 
-def test_import_is_late_silent_and_leaves_the_environment_alone(tmp_path: Path) -> None:
+def test_import_is_late_and_silent_and_leaves_the_environment_alone(tmp_path: Path) -> None:
+    """Every set of flags has its own cache folder; variables of the user are respected."""
     late, unchanged, silent, flags, folder = in_a_process(LOAD, XDG_CACHE_HOME=str(tmp_path))
-    assert late
-    assert unchanged
-    assert silent
-    assert flags == keops.CXXFLAGS
+    assert (late, unchanged, silent, flags) == (True, True, True, keops.CXXFLAGS)
     assert Path(folder).parent == tmp_path / "diffeo_calib"
-
-
-def test_flags_and_folder_of_the_user_are_respected(tmp_path: Path) -> None:
-    wanted = {"CXXFLAGS": "-DOWN_FLAG", "KEOPS_CACHE_FOLDER": str(tmp_path / "own")}
-    assert in_a_process(LOAD, **wanted) == [True, True, True, *wanted.values()]
-
-
-def test_every_set_of_flags_has_its_own_cache_folder(tmp_path: Path) -> None:
-    flags = "-O1", "-O2"
-    folders = [in_a_process(LOAD, XDG_CACHE_HOME=str(tmp_path), CXXFLAGS=own)[-1] for own in flags]
-    assert folders[0] != folders[1]
-    assert Path(folders[0]).is_dir()
+    *known, flags, other = in_a_process(LOAD, XDG_CACHE_HOME=str(tmp_path), CXXFLAGS="-DOWN_FLAG")
+    assert (*known, flags) == (True, True, True, "-DOWN_FLAG")
+    assert other != folder
+    assert Path(other).is_dir()
+    assert in_a_process(LOAD, KEOPS_CACHE_FOLDER=str(tmp_path / "own"))[-1] == str(tmp_path / "own")
 
 
 def test_without_a_folder_that_can_be_made_there_is_one_for_the_process() -> None:
