@@ -200,7 +200,7 @@ def _text(path: Path, sep: str) -> tuple[str, list[str]]:
 
 
 def _code_page(data: bytes) -> str:
-    """The code page of a text that is not in UTF-8: Chinese has pairs of high bytes, Japanese begins them with others."""
+    """The code page of a text that is not UTF-8: Chinese has pairs of high bytes, Japanese begins them with others."""
     words = re.findall(rb"[\x80-\xff]+", data)
     if all(len(word) % 2 == 0 and min(word) > 0xA0 for word in words):
         return "gb18030"
