@@ -61,7 +61,6 @@ from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.regression.conjugate_gradients import MAX_DENSE
-from diffeo_calib.robots.payload import check_same_load
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import CHANGE, VALUE
 
@@ -89,7 +88,9 @@ def check_controls(controls: Controls, measurements: Table) -> None:
     """Raise InputError unless this is a number of configurations, 'auto' or 'all'."""
     if not isinstance(controls, str):
         check_count(controls, "`controls`", most=len(measurements))
-        check_same_load(measurements.payload, "`controls`", controls, fix="leave `controls` out, or pass fewer rows")
+        if measurements.payload is not None:
+            fix = "leave `controls` out, or pass fewer rows"
+            raise InputError.of("`controls` of measurements with payloads", expected="'all'", got=controls, fix=fix)
     elif controls not in ("auto", "all"):
         raise InputError.of("`controls`", expected="a number, 'auto' or 'all'", got=as_written(controls))
 
@@ -213,7 +214,7 @@ def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: P
 
 def _count(controls: Controls, data: TangentData) -> int | None:
     """Number of configurations that carry momenta; None for all."""
-    if controls == "all" or (controls == "auto" and data.nominal.by_row):
+    if controls == "all" or (controls == "auto" and data.nominal.load.by_row):
         return None
     if controls == "auto":
         return AUTO_CONTROLS if data.y.numel() > MAX_DENSE and len(data.x) > AUTO_CONTROLS else None
