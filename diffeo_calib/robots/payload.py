@@ -119,6 +119,12 @@ class Payload:
 NO_PAYLOAD = Payload("", torch.zeros((), dtype=torch.float64, device=HOST), 1.0)
 
 
+def check_same_load(masses: Tensor | None, what: str, got: object, *, fix: str) -> None:
+    """Raise InputError for what rows with payloads of their own do not allow."""
+    if masses is not None:
+        raise InputError.of(f"{what} of measurements with payloads", expected="'all'", got=got, fix=fix)
+
+
 def check_unladen(masses: Tensor | None, what: str, *, fix: str) -> None:
     """Raise MeasurementError for masses of rows that cannot have any."""
     if masses is not None:
