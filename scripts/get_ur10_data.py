@@ -131,7 +131,7 @@ def write(folder: Path, content: bytes) -> Path:
     files = {FILE: content, "LICENSE.md": LICENCE.encode(), URDF: urdf().encode(), "dataset.json": described}
     try:
         if target.is_dir() and any(target.iterdir()):
-            if any(not (target / name).is_file() or (target / name).read_bytes() != data for name, data in files.items()):
+            if any(not (own := target / name).is_file() or own.read_bytes() != data for name, data in files.items()):
                 sys.exit(f"error: '{target}' exists with other contents; choose another folder, or remove it first.")
             return target
         staging.mkdir(parents=True)
