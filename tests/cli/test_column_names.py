@@ -107,6 +107,7 @@ def test_which_columns_are_the_joints() -> None:
     assert [one.names[0] for one in found] == ["q_meas_1", "q_1", "q_cmd_1"]
     assert "reported: 'meas'" in found[0].how
     assert "commanded" in found[2].how
+    assert guess_joints([*series("q_{}"), "q of many more words than any label has"], SIX)[0].names == series("q_{}")
     equal = guess_joints([*series("A{}"), *series("J{}")], SIX)
     assert len({one.rank for one in equal}) == 1 < len(equal), "names alone do not tell"
     names = [f"{name}.pos" for name in ARM if name != "forearm"]
@@ -131,6 +132,8 @@ def test_poses_as_matrices() -> None:
         ("tvec[2]", ("tvec", "z"), ""),
         ("current_joint_1", ("actual", "joint", "1"), ""),
         ("joint_current_1 [A]", ("joint", "current", "1", "a"), ""),
+        ("关节1(度)", ("关节", "1"), "deg"),
+        ("X坐标(毫米)", ("x", "坐标"), "mm"),
     ],
 )
 def test_words_and_units(name: str, words: tuple[str, ...], unit: str) -> None:
