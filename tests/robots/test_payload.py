@@ -85,8 +85,8 @@ def test_a_map_of_payloads_at_rows_and_elsewhere() -> None:
     chain = SimulatedArm(0).nominal
     payload = Payload(chain.tips[0], MASSES, UNIT)
     whole = GeometryMap(Geometry.nominal(chain), elastic=True, payload=payload)
-    assert whole.by_row
-    assert not whole.typical.by_row
+    assert whole.load.by_row
+    assert not whole.typical.load.by_row
     q, theta = draw(len(MASSES), chain.n), 1e-3 * torch.ones(whole.parameters, dtype=torch.float64)
     every = whole(q, theta)
     some = torch.tensor([1, 3])
