@@ -83,17 +83,14 @@ class Deviations:
         q, fitted = low + draws * (high - low), fitted[:: -(-len(fitted) // MEASURED)]
         found = cls(q, claimed(model, q), fitted, claimed(model, fitted), ExpectedError.of(model))
         try:
-            sensors = sensor_of(model)
+            sensors = [one for one in sensor_of(model) if one.reached(model.geometry.base)]
         except InputError:  # a file of an early version
             return found
-        options = [q]
-        for sensor in sensors:
-            if sensor.reached(model.geometry.base):
-                try:
-                    options.append(drawn(model, [sensor], CONFIGURATIONS, model.geometry.tool))
-                except InputError:  # such as of a camera, which cannot see everywhere
-                    options.append(model.configurations.to(HOST))
-        return replace(found, next=plan(model, torch.cat(options), NEXT, target=q[:TARGETS]))
+        try:
+            reached = drawn(model, sensors, CONFIGURATIONS, model.geometry.tool) if sensors else q[:0]
+        except InputError:  # such as of a camera, which cannot see everywhere
+            reached = model.configurations.to(HOST)
+        return replace(found, next=plan(model, torch.cat([q, reached]), NEXT, target=q[:TARGETS]))
 
 
 def claimed(model: CalibratedKinematics, q: Tensor) -> Tensor:
