@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 import torch
 from product_bank import Case
-from robots_bank import draw
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -56,11 +55,6 @@ def same(work: Callable[[], Any]) -> list[Any]:
         else:
             assert one == other
     return expected
-
-
-def test_the_meta_device_would_be_noticed() -> None:
-    with elsewhere(), pytest.raises((RuntimeError, NotImplementedError)):
-        draw(3).add(torch.zeros(3))
 
 
 # --- models --------------------------------------------------------------------------------------------------

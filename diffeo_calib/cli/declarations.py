@@ -105,13 +105,12 @@ class RecordOptions(Command):
     """
 
     bag: Path = argument("Folder of a ROS 2 bag, or file of a ROS 1 bag.", "BAG")
-    seen: str = option("Stamped points or poses, /tf:CHILD or '/tf:PARENT>CHILD'; or images.", "TOPIC", MISSING)
+    seen: str = argument("Stamped points or poses, /tf:CHILD or '/tf:PARENT>CHILD'; or images.", "TOPIC")
     output: Path = written("Table to write.", "CSV", MISSING)
     joints: str = option("Joint states; TOPIC:NAME,NAME takes some joints.", "TOPIC", "/joint_states")
-    still: float = option("Largest motion of a joint at a stop.", default=0.001, min=1e-09)
-    shortest: float = option("Shortest stop in seconds.", default=0.5, min=0.01)
+    still: str = option("Largest motion of a joint at a stop; shortest stop in s.", "MOTION[,SECONDS]", "0.001,0.5")
     offset: float | None = option(
-        "Seconds to add to the times of --seen; by default estimated from all motions, 0 for images."
+        "Seconds to add to the times of TOPIC; by default estimated from all motions, 0 for images."
     )
 
 
@@ -364,10 +363,9 @@ class RecalibrateOptions(Command, Rows):
     old: Path = argument(OLD, "OLD")
     other: Path = argument("Table of new measurements, or another model file of the same robot.", "OTHER")
     output: Path | None = written("Calibrate anew, and write the model to this file.", "MODEL")
-    marker_freedom: Literal["evidence", "same", "moved", "other"] = option(
-        "Whether the markers are the same (0.05 mm: nobody touched them), have moved a little (1 mm: remounted) or are "
-        "other ones (anywhere); by default the rows decide.",
-        default="evidence",
+    free: Literal["base", "remounted", "both"] | None = option(
+        "What else may have moved: the device alone (base: nobody touched the markers, 0.05 mm), remounted markers too "
+        "(1 mm), or both anywhere (other markers); by default the rows decide."
     )
     seed: int = option("Seed of the tests for changes.", **SEED)
     note: str = option(NOTE, "TEXT", "")

@@ -72,6 +72,9 @@ GONE = {
     "--tool-from": "write --tool measured:X,Y,Z[,...] for a tool in the measured frame",
     "--with-tables": "leave it out: what is written beside --correction-tables is for use together with them",
     "--figure": "write --report, whose page shows the same pictures",
+    "--marker-freedom": "write --free base (same markers), --free remounted (moved) or --free both (other)",
+    "--seen": "name the topic as an argument behind the bag",
+    "--shortest": "write it behind that of --still: --still MOTION,SECONDS",
     "--drift": "write `evaluate MODEL CSV --free both -o NEW` where nothing but device and markers may have changed",
     "--ur-hash": "write --ur-kinematics over a copy of the robot's own calibration file, whose hash it keeps",
 }

@@ -66,7 +66,7 @@ def read_bag(bag: Path, joints: str, seen: str) -> tuple[Recording, list[str], R
             places.append([_time(message, topic), *_place(message, topic)])
     known, names = _joined(states, [word.strip() for word in wanted.split(",") if word.strip()], joints)
     if frames and not edges:
-        raise MeasurementError.of(f"frames of {seen}", expected="transforms (TFMessage)", fix=f"write --seen {seen}")
+        raise MeasurementError.of(f"frames of {seen}", expected="transforms (TFMessage)", fix=f"name the topic {seen}")
     return known, names, _moving(edges, fixed, frames, seen) if edges else _recording(places, seen)
 
 
@@ -123,7 +123,7 @@ def _moving(edges: Mapping[_Edge, _Rows], fixed: Collection[_Edge], frames: str,
     paths = [path for one in parents if (path := _path(edges, one, child))]
     moved = [edge for edge, _ in paths[0] if edge not in fixed] if len(paths) == 1 else []
     if not moved:
-        expected = f"one moving frame, as --seen '{topic}:CHILD' or '{topic}:PARENT>CHILD'"
+        expected = f"one moving frame, as '{topic}:CHILD' or '{topic}:PARENT>CHILD'"
         got = f"{frames or 'none'} of {few(['>'.join(edge) for edge in edges if edge not in fixed], 20)}"
         raise MeasurementError.of(f"the frame in {topic}", expected=expected, got=got)
     tables = {edge: _recording(edges[edge], f"{'>'.join(edge)} in {topic}") for edge in moved}

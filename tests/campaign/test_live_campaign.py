@@ -9,21 +9,21 @@ import pytest
 import torch
 from kind_bank import kind_named, marked
 from product_bank import usual_scales
+from table_bank import refused
 from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.placing.place import place
-from diffeo_calib.campaign.model import limit_of, with_joints
+from diffeo_calib.campaign.model import limit_of
 from diffeo_calib.campaign.verdicts import Verdict
-from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.robots import SimulatedArm
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 ARM = SimulatedArm(3, markers=2)
-ROWS = 34
+ROWS = 24
 MM = 1e-3
 
 
@@ -34,8 +34,9 @@ def measured() -> tuple[Tensor, Tensor]:
 
 @pytest.fixture(scope="module")
 def running(measured: tuple[Tensor, Tensor]) -> dc.Campaign:
-    """A campaign of right rows. Tests copy it."""
-    campaign = dc.Campaign(ARM.nominal, candidates=ARM.sample(40, seed=8), target=ARM.sample(30, seed=9))
+    """A campaign of right rows, whose goal is far. Tests copy it."""
+    known: Any = {"candidates": ARM.sample(40, seed=8), "target": ARM.sample(30, seed=9)}
+    campaign = dc.Campaign(ARM.nominal, goal=1e-6, **known)
     campaign.add(*(part[:ROWS] for part in measured))
     return campaign
 
@@ -52,54 +53,35 @@ def after(running: dc.Campaign, q: Tensor, y: Tensor) -> tuple[dc.Campaign, list
     return campaign, campaign.add(q, y)
 
 
-def test_right_rows_are_accepted_and_the_error_shrinks(running: dc.Campaign) -> None:
+def test_right_rows_are_accepted_and_the_error_shrinks(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
     assert running.accepted == list(range(ROWS))
-    assert [one.fits for one in running.verdicts[:12]] == [None] * 12
-    assert all(one.fits for one in running.verdicts[12:])
+    assert [one.fits for one in running.verdicts] == [None] * 12 + [True] * (ROWS - 12)
     early, late = (running.verdicts[row].expected_error for row in (12, ROWS - 1))
-    assert late < 0.5 * early  # pyright: ignore
+    assert late < 0.7 * early  # pyright: ignore
     model = running.result(hyperparameters=usual_scales(ARM.nominal)).model
     true = float((model(running.target) - ARM.true_points(running.target)).square().sum(-1).mean().sqrt())
     assert 0.3 < true / late < 2  # pyright: ignore
-
-
-def test_rows_that_came_before_the_first_model_are_judged_by_it(measured: tuple[Tensor, Tensor]) -> None:
-    q, y = (part[:24].clone() for part in measured)
-    y[20] += 50 * MM
-    candidates = ARM.sample(20, seed=8)
-    campaign = dc.Campaign(ARM.nominal, candidates=candidates, target=candidates, background=True)
-    campaign.add(q, y)
-    campaign.repeat(23)
-    campaign.wait()
-    assert [one.row for one in campaign.verdicts if one.fits is None] == list(range(12))
-    assert [one.row for one in campaign.verdicts if not one.accepted] == [20, 23]
-    assert [one.row for one in campaign.verdicts if one.again] == [23]
-
-
-def test_the_result_is_that_of_the_accepted_rows(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
     campaign = copy.deepcopy(running)
     campaign.reject(5)
     rows = [row for row in range(ROWS) if row != 5]
     assert campaign.accepted == rows
-    scales = usual_scales(ARM.nominal)
-    found = campaign.result(hyperparameters=scales)
-    alone = dc.calibrate(ARM.nominal, dc.Measurements(measured[0][rows], measured[1][rows]), hyperparameters=scales)
-    q = ARM.sample(20, seed=1)
-    assert torch.equal(found.model(q), alone.model(q))
-    assert torch.equal(found.model.predict(q)[1], alone.model.predict(q)[1])
+    found: Any = campaign.rows()
+    assert_close((found.q, found.points), tuple(part[rows] for part in measured), rtol=0, atol=0)
     for row in rows:
         campaign.reject(row)
     assert (campaign.accepted, campaign.expected_error, campaign.next(1)) == ([], None, None)
 
 
-def test_a_model_without_rows_of_its_devices_ends(measured: tuple[Tensor, Tensor]) -> None:
-    rows = dc.Measurements(*(part[:16] for part in measured)).with_sessions(["a"] * 14 + ["b"] * 2)
-    campaign = begun(rows.rows(slice(0, 14)), ARM.nominal, candidates=ARM.sample(5, seed=8))
-    campaign.add(rows.rows(slice(14, 16)))
-    assert campaign.expected_error is not None
-    for row in range(14):
-        campaign.reject(row)
-    assert (campaign.accepted, campaign.expected_error) == ([14, 15], None)
+def test_rows_that_came_before_the_first_model_are_judged_by_it(measured: tuple[Tensor, Tensor]) -> None:
+    q, y = (part[:18].clone() for part in measured)
+    y[15] += 50 * MM
+    campaign = dc.Campaign(ARM.nominal, candidates=ARM.sample(20, seed=8), background=True)
+    campaign.add(q, y)
+    campaign.repeat(17)
+    campaign.wait()
+    assert [one.row for one in campaign.verdicts if one.fits is None] == list(range(12))
+    assert [one.row for one in campaign.verdicts if not one.accepted] == [15, 17]
+    assert [one.row for one in campaign.verdicts if one.again] == [17]
 
 
 def test_mistakes_of_one_row_are_named_and_left_out(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
@@ -127,14 +109,14 @@ def test_mistakes_of_one_row_are_named_and_left_out(running: dc.Campaign, measur
 def test_a_moved_device_and_a_joint_are_named_and_their_rows_taken_out(
     running: dc.Campaign, measured: tuple[Tensor, Tensor]
 ) -> None:
-    q, y = (torch.cat([own[ROWS:], more]) for own, more in zip(measured, ARM.measure(6, seed=11), strict=True))
+    q, y = (torch.cat([own[ROWS:], more]) for own, more in zip(measured, ARM.measure(2, seed=11), strict=True))
     away = torch.tensor([0.5 * MM, -0.3 * MM, 0.4 * MM], dtype=y.dtype)
     other = q + torch.tensor([0, 2e-3, 0, 0, 0, 0], dtype=q.dtype)
-    cases = {"device": (q, y + away), ARM.nominal.joint_names[1]: (q, ARM.true_points(other))}
+    cases = {"device": (q, y + away), ARM.nominal.joint_names[1]: (q[:7], ARM.true_points(other[:7]))}
     for words, rows in cases.items():
         campaign, (verdict,) = after(running, *(part[:1] for part in rows))
         assert verdict.change is None, "a single wrong row is no change of six unknowns some rows before"
-        verdicts = [*campaign.add(*(part[1:18] for part in rows))]  # more than are looked at together
+        verdicts = [*campaign.add(*(part[1:] for part in rows))]  # of the device more than are looked at together
         change = next(one.change for one in verdicts[::-1] if one.change is not None)
         assert words in (change.cause, *change.others)[0], (words, str(verdicts[-1]))
         assert change.row == ROWS
@@ -181,16 +163,18 @@ def test_a_row_to_be_repeated_is_left_out_and_its_pose_comes_first(running: dc.C
 
 
 def test_bad_input_is_refused_and_nothing_is_lost(running: dc.Campaign) -> None:
-    campaign = copy.deepcopy(running)
-    for mistake in (lambda: campaign.add(5), lambda: campaign.reject(ROWS), lambda: dc.Campaign(3)):  # pyright: ignore
-        with pytest.raises(InputError):
-            mistake()
-    with pytest.raises(MeasurementError):
-        campaign.add(torch.zeros(1, 3, dtype=torch.float64), torch.zeros(1, 2, 3, dtype=torch.float64))
-    assert len(campaign) == ROWS
+    campaign: Any = copy.deepcopy(running)
+    q, y = torch.zeros(1, 3, dtype=torch.float64), torch.zeros(1, 2, 3, dtype=torch.float64)
+    refused(
+        ("`robot`: expected a dc.Tree", lambda: dc.Campaign(3)),  # pyright: ignore
+        ("`goal`", lambda: dc.Campaign(ARM.nominal, goal=0.0)),
+        ("dc.Measurements", lambda: campaign.add(5)),
+        ("differ in n; join rows", lambda: campaign.add(q, y)),
+        (f"`row`: expected 0 to {ROWS - 1}, got {ROWS}", lambda: campaign.reject(ROWS)),
+        ("the accepted rows: expected at least one", lambda: dc.Campaign(ARM.nominal).result()),
+        ("`verdicts`: expected 2, of a new campaign, got 0", lambda: campaign.resume(campaign.table[:2], [])),
+    )
     assert campaign.accepted == list(range(ROWS))
-    with pytest.raises(InputError):
-        dc.Campaign(ARM.nominal).result()
 
 
 BESIDE = ("positions", "poses", "several tips", "markers mounted anew", "mixture", "images of a board", "several kinds")
@@ -243,6 +227,10 @@ def test_set_ups_come_one_after_the_other(measured: tuple[Tensor, Tensor]) -> No
         assert campaign.accepted == [other for other in range(14) if other != row]
         campaign.accept(row)
         assert campaign.expected_error == pytest.approx(before, rel=1e-3)
+    alone = copy.deepcopy(campaign)
+    for row in range(13):
+        alone.reject(row)
+    assert (alone.accepted, alone.expected_error) == ([13], None), "no row of a device that has a place"
     verdicts += campaign.add(second.rows(slice(1, None)).with_sessions(["tuesday"] * 5))
     assert [one.fits for one in verdicts] == [None] * 5 + [True]
     assert campaign.accepted == list(range(19))
@@ -259,26 +247,19 @@ def test_the_limit_holds_95_percent_of_errors() -> None:
     assert limit_of(1.0, S, 0.3) > 1.1 * limit_of(1.0, S, 0.0)
 
 
-def test_a_goal_is_reached_once_the_limit_is_below_it() -> None:
+def test_a_goal_is_reached_once_the_limit_is_below_it(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
     """Near the goal scales are selected at 15 % more rows, else at twice as many."""
-    arm = SimulatedArm(3)
-    places, (q, y) = arm.sample(10, seed=8), arm.measure(20, seed=7)
-    campaign = dc.Campaign(arm.nominal, candidates=places, target=places, goal=1e-6)
-    campaign.add(q[:19], y[:19])
-    assert campaign.error_limit is None
-    assert not campaign.reached
-    campaign.add(q[19], y[19])
-    one: Any = campaign
-    known, limit, model = one.expected_error, one.error_limit, one._model
+    campaign: Any = copy.deepcopy(running)
+    known, limit = campaign.expected_error, campaign.error_limit
     assert 1.1 < limit / known < 2
-    assert not campaign.reached
     for goal, factor, needed in ((1.01 * limit, 1.15, 0), (0.99 * limit, 1.15, 1), (0.5 * known, 2.0, None)):
         campaign.goal = goal
         assert campaign.reached == (needed == 0)
-        assert campaign._next_scales(model) == pytest.approx(factor * 20)
-        assert needed is None or one.next(1).needed == needed
-    with pytest.raises(InputError, match="goal"):
-        dc.Campaign(arm.nominal, goal=0.0)
+        assert campaign._next_scales(campaign._model) == pytest.approx(factor * 20)
+        assert needed is None or campaign.next(1).needed == needed
+    few = begun(dc.Measurements(*(part[:14] for part in measured)), ARM.nominal, candidates=measured[0][:5], goal=1.0)
+    assert few.expected_error is not None
+    assert (few.error_limit, few.reached) == (None, False), "before the scales are selected"
 
 
 @pytest.mark.slow
@@ -296,16 +277,3 @@ def test_next_poses_of_a_ball_are_in_sockets() -> None:
     assert found.expected[5] < found.expected[0]
     none: Any = given.next(5)
     assert len(none.q) == 0
-
-
-def test_a_row_elsewhere_is_in_the_socket_there() -> None:
-    kind = kind_named("mixture")
-    data, placed = kind.data, kind.result.placed
-    resting = (data.socket_numbers >= 0).nonzero()[:, 0]
-    row = int(resting[-1])
-    copies = with_joints(data.rows(torch.full_like(resting, row)), data.q[resting])
-    assert set(copies.row_sockets) == {data.row_sockets[row]}
-    for own in placed.elsewhere(row, data.q[resting]):
-        copies = own.changed(copies)
-        assert bool(own.there.all())
-    assert copies.row_sockets == data.rows(resting).row_sockets

@@ -54,7 +54,7 @@ def test_other_markers_that_the_rows_leave_open(files: dict[str, str], tmp_path:
     """The tool is only turned about the vertical, which does not show how high the marker is."""
     q = CAMPAIGNS["tool turned about the vertical"](simulated(1)[0], 12, torch.Generator().manual_seed(5))
     table = written(tmp_path / "upright.csv", q)
-    options = *TABLE, "--marker-freedom", "other"
+    options = *TABLE, "--free", "both"
     found = command("recalibrate", files["old.safetensors"], table, *options, "-o", str(tmp_path / "new.safetensors"))
     compared = command("recalibrate", files["old.safetensors"], table, *options)
     for done in (found, compared):

@@ -65,15 +65,6 @@ def test_invalid_control_points_are_refused(controls: object, message: str) -> N
         dc.fit(rr_problem(5), controls=controls)
 
 
-def test_choice_of_control_points_covers_the_workspace() -> None:
-    problem = rr_problem(10)
-    rows = choose_controls(problem, 30)
-    assert len(set(rows.tolist())) == 30
-    turn = problem.x[:, None, :] - problem.x[rows][None]
-    gap = (2 - 2 * turn.cos()).sum(-1).amin(1).sqrt()
-    assert float(gap.max()) <= 1.6  # chord to the nearest control; the grid's own spacing is 0.62
-
-
 @pytest.mark.slow
 def test_a_coarse_fit_that_stops_before_the_optimum_says_how_to_continue() -> None:
     """With large deformations and few control points Gauss-Newton's step is approximate; L-BFGS continues from it."""

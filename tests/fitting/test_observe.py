@@ -13,8 +13,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.fitting.problem import Problem, tangent
-from diffeo_calib.maps.noise import Noise
+from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.maps.observation import LinearFunctionals, Observation, ReadPoints
 from diffeo_calib.robots import elastic_rr
 
@@ -92,36 +91,6 @@ def _gradient(problem: Problem, found: dc.Fit | None) -> Tensor:
     at = (problem.zero() if found is None else found.momenta).flatten().clone().requires_grad_()
     total = problem.energy(problem.deform(problem.zero().unflatten(at), dc.RK8(2))).total
     return torch.autograd.grad(total, at)[0]
-
-
-def test_an_unknown_constant_is_a_shift_that_rows_share() -> None:
-    """A plane of unknown height, marginalised, against the same with the height as a parameter of a large grid."""
-    observe = LinearFunctionals(torch.tensor([[[0.0, 1.0]]]).double().repeat(ROWS, 1, 1), torch.zeros(ROWS, 1).double())
-    problem = problem_of(observe)
-    true, wrong = 0.0, 0.02
-    shifted = problem.y + wrong
-    shared = -0.1 * torch.ones(ROWS, 1, 1, dtype=torch.float64)
-    kernels: dict[str, Any] = {"joint_kernel": K_V, "task_kernel": K_W}
-    noise = Noise(1e-6 * torch.ones(ROWS, 1, 1, dtype=torch.float64), shared)
-    unknown = Problem(elastic_rr.nominal, problem.x, shifted, noise=noise, observe=observe, **kernels)
-    energies = {}
-    for height in (true, 0.01, wrong, 0.03):
-        given = Problem(elastic_rr.nominal, problem.x, shifted - height, noise=1e-3, observe=observe, **kernels)
-        energies[height] = tangent_energy(given) + 0.5 * (height / 0.1) ** 2
-    # tangent energies are quadratic in the height: their minimum is the marginal's
-    h = torch.tensor(list(energies), dtype=torch.float64)
-    values = torch.tensor(list(energies.values()), dtype=torch.float64)
-    c = torch.linalg.solve(torch.stack([h[:3] ** 2, h[:3], torch.ones(3, dtype=torch.float64)], 1), values[:3])
-    assert float(c[0] * h[3] ** 2 + c[1] * h[3] + c[2]) == pytest.approx(float(values[3]), rel=1e-8)
-    least = float(c[2] - c[1] ** 2 / (4 * c[0]))
-    assert tangent_energy(unknown) == pytest.approx(least, rel=1e-6)
-
-
-def tangent_energy(problem: Problem) -> float:
-    """1/2 target^T (G + R)^-1 target of the tangent model."""
-    found = tangent(problem, "cholesky")
-    mu = found.conditional.about(found.target).mu.view_as(found.target)  # pyright: ignore[reportAttributeAccessIssue]
-    return 0.5 * float((found.target * mu).sum())
 
 
 def test_what_problems_refuse() -> None:

@@ -74,14 +74,6 @@ def test_gradient_of_the_energy(problem: Problem) -> None:
     torch.testing.assert_close(gradient @ direction, difference, rtol=1e-7, atol=0)
 
 
-def test_scalar_noise_is_the_papers_weight() -> None:
-    """R = sigma^2 I: 1 / (2 sigma^2) times the sum of squares."""
-    problem = rr_problem(4, noise=0.03)
-    deformation = problem.deform(problem.zero(), RK4(1))
-    squares = float((elastic_rr.nominal(problem.x) - problem.y).square().sum())
-    assert float(problem.energy(deformation).total) == pytest.approx(squares / (2 * 0.03**2), rel=1e-12)
-
-
 @every_problem
 def test_residuals_by_their_definitions(problem: Problem) -> None:
     deformation = deformed(problem)

@@ -12,7 +12,6 @@ from math_bank import (
     K_W,
     few_points,
     planar_two_markers,
-    real_two_markers,
     rr_problem,
     tensor,
     two_marker_problem,
@@ -24,7 +23,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.fitting import gauss_newton
-from diffeo_calib.fitting.gauss_newton import MIXING_DEPTH, Mixing
+from diffeo_calib.fitting.gauss_newton import Mixing
 from diffeo_calib.fitting.problem import Problem, tangent
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.maps.deformation import Momenta
@@ -59,25 +58,16 @@ def test_one_point_in_closed_form() -> None:
     assert fit.energy_drift <= 1e-14
 
 
-def test_certificates_of_a_converged_fit(small: Fit) -> None:
-    assert small.converged
-    assert small.status.startswith("converged")
-    assert small.coupling_residual <= 1e-6
-    assert small.end_residual <= 2e-2
-    assert small.energy == pytest.approx(small.history[-1], rel=1e-12)
-    assert small.data_energy < small.field_energy < small.energy
-    assert small.energy_drift <= 1e-4
-    assert small.integrator == dc.RK4(2)
-
-
 def test_certificates_improve_with_the_time_steps(small: Fit, fine: Fit) -> None:
-    """The residuals of the discretised optimum are time-stepping errors, O(h^4)."""
+    """The residuals of the discretised optimum are time-stepping errors, O(h^4); L-BFGS finds no lower one."""
     assert fine.coupling_residual <= small.coupling_residual / 50
     assert fine.end_residual <= small.end_residual / 50
     assert fine.energy_drift <= small.energy_drift / 50
     assert fine.step_error <= small.step_error / 50
     exact = small.problem.deform(small.momenta, dc.RK4(32)).z1
     assert small.step_error == pytest.approx(float((small.model.deformation.z1 - exact).abs().max()), rel=5e-3)
+    after = dc.fit(fine.problem, dc.LBFGS(max_iterations=5), dc.RK4(8), start=fine.momenta)
+    assert fine.energy * (1 - 1e-8) <= after.energy <= fine.energy
 
 
 def test_optimum_does_not_depend_on_the_start(small: Fit) -> None:
@@ -91,43 +81,6 @@ def test_optimum_does_not_depend_on_the_start(small: Fit) -> None:
         torch.testing.assert_close(
             other.momenta.task, small.momenta.task, rtol=0, atol=1e-4 * float(small.momenta.task.norm())
         )
-
-
-def test_gauss_newton_optimum_is_stationary(fine: Fit) -> None:
-    """The gradient of the discretised energy, relative to that at zero, vanishes at the optimum."""
-    problem = fine.problem
-
-    def gradient(momenta: Momenta) -> Tensor:
-        live = momenta.flatten().requires_grad_()
-        total = problem.energy(problem.deform(momenta.unflatten(live), fine.integrator)).total
-        return torch.autograd.grad(total, live)[0]
-
-    assert float(gradient(fine.momenta).norm()) <= 1e-8 * float(gradient(problem.zero()).norm())
-
-
-def test_several_markers() -> None:
-    fit = dc.fit(two_marker_problem(elastic_rr.grid(7)), dc.GaussNewton(), dc.RK4(2))
-    assert fit.converged
-    assert fit.coupling_residual <= 1e-7
-    assert fit.end_residual <= 1e-6
-    x = uniform(300, 2, seed=30)
-    truth = real_two_markers(x)
-    before, after = (float((guess - truth).norm(dim=1).mean()) for guess in (planar_two_markers(x), fit.model(x)))
-    assert after <= before / 30
-    assert fit.model(x).shape == (300, 4)
-    assert fit.model.jacobian(x).shape == (300, 4, 2)
-
-
-def test_noise_blocks_weigh_the_rows() -> None:
-    """A row with a thousand times the noise has no influence on the fit."""
-    covariance = (0.01**2 * torch.eye(4, dtype=torch.float64)).repeat(12, 1, 1)
-    covariance[5] *= 1e6
-    wrong = two_marker_problem(uniform(12, 2, seed=3), covariance)
-    wrong.y[5] += 1.0
-    fit = dc.fit(wrong, dc.GaussNewton(), dc.RK4(2))
-    rest = [i for i in range(12) if i != 5]
-    assert float((fit.model(wrong.x) - wrong.y)[rest].abs().max()) <= 5e-3
-    assert float((fit.model(wrong.x) - wrong.y)[5].abs().max()) >= 0.5
 
 
 def test_data_without_error_need_no_deformation() -> None:
@@ -195,21 +148,15 @@ def unguarded() -> Problem:
     return Problem(nominal, x, elastic_rr.real(x), joint_kernel=K_V, task_kernel=K_W, noise=0.01)
 
 
-@pytest.mark.parametrize("solver", [dc.GaussNewton(), dc.LBFGS()], ids=["gauss-newton", "lbfgs"])
-def test_a_start_with_too_large_flows_is_reported(solver: dc.GaussNewton | dc.LBFGS) -> None:
-    """With flows too large for their time steps no step helps, and the status says what to change."""
-    problem = unguarded()
-    fit = dc.fit(problem, solver, dc.RK4(1), start=random_start(problem, 3.0))
-    assert not fit.converged
-    assert "use more time steps" in fit.status
-
-
 @pytest.mark.parametrize("integrator", [dc.RK4(1), None], ids=["one step", "chosen steps"])
 @pytest.mark.parametrize("solver", [dc.GaussNewton(), dc.LBFGS()], ids=["gauss-newton", "lbfgs"])
-def test_a_start_whose_flows_overflow_is_no_success(
-    solver: dc.GaussNewton | dc.LBFGS, integrator: dc.RK4 | None
-) -> None:
+def test_a_start_with_too_large_flows_is_reported(solver: dc.GaussNewton | dc.LBFGS, integrator: dc.RK4 | None) -> None:
+    """With flows too large for their time steps no step helps, and the status says what to change."""
     problem = unguarded()
+    if integrator is not None:
+        fit = dc.fit(problem, solver, integrator, start=random_start(problem, 3.0))
+        assert not fit.converged
+        assert "use more time steps" in fit.status
     with suppress(NumericalError):
         assert not dc.fit(problem, solver, integrator, start=random_start(problem, 100.0)).converged
 
@@ -217,15 +164,6 @@ def test_a_start_whose_flows_overflow_is_no_success(
 # --- L-BFGS --------------------------------------------------------------------------------------------------------
 
 Run = Callable[[Momenta, dc.RK4], GeodesicDeformation]
-
-
-def test_lbfgs_stays_at_the_gauss_newton_optimum(small: Fit, fine: Fit) -> None:
-    after = dc.fit(small.problem, dc.LBFGS(max_iterations=10), dc.RK4(2), start=small.momenta)
-    assert after.energy <= small.energy
-    assert after.energy == pytest.approx(small.energy, rel=1e-6)
-    after = dc.fit(fine.problem, dc.LBFGS(max_iterations=5), dc.RK4(8), start=fine.momenta)
-    assert after.energy <= fine.energy
-    assert after.energy == pytest.approx(fine.energy, rel=1e-8)
 
 
 @pytest.mark.slow
@@ -299,12 +237,6 @@ def test_a_linear_iteration_ends_after_one_step_for_each_rate(rates: list[float]
     assert_close(point.task.flatten(), fixed, rtol=1e-9, atol=1e-9)
     assert_close(point.joint, 2.0 * point.task[:, :2], rtol=1e-9, atol=1e-9)
     assert_close(point.theta, point.task.sum(0), rtol=1e-9, atol=1e-9)
-
-
-def test_a_converged_iteration_stays() -> None:
-    """Also after more steps than are kept: differences of steps are rounding then."""
-    point, fixed = iterates([0.5, 0.2], 2 * MIXING_DEPTH)
-    assert_close(point.task.flatten(), fixed, rtol=1e-9, atol=1e-9)
 
 
 def fitted(monkeypatch: pytest.MonkeyPatch, below: float) -> Fit:

@@ -14,7 +14,6 @@ from math_bank import (
     line,
     naive_rk4,
     normal,
-    planar_two_markers,
     rows_jacobian,
     slopes,
     spatial_markers,
@@ -30,7 +29,6 @@ from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.maps.deformation import ModelSpec, Momenta, finite
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.nominal import NominalMap, SmoothMap
-from diffeo_calib.robots import elastic_rr
 
 N = 6
 EMPTY = torch.zeros(0, dtype=torch.float64)
@@ -100,8 +98,6 @@ def _spec(nominal: NominalMap | Callable[[Tensor], Tensor], joint: Kernel, task:
 
 SLIDING = dc.Gaussian([1.1, 0.8], [0.4, 0.3], space=circle(1) * line(1))
 ARMS = {
-    "rr": Arm(_spec(elastic_rr.nominal, K_V, K_W, 2), _torus, 1),
-    "two planar markers": Arm(_spec(planar_two_markers, K_V, K_W, 2), _torus, 2),
     "two spatial markers": Arm(
         _spec(spatial_markers, SLIDING, dc.Matern(0.7, 3.5, 0.6), 3),
         lambda count, seed: uniform(count, 2, seed=seed) * tensor([1.0, 0.1]),
@@ -127,15 +123,10 @@ def test_without_momenta_it_is_the_nominal_map(arm: Arm) -> None:
 
 
 @every_arm
-def test_controls_are_mapped_to_their_own_images(arm: Arm) -> None:
-    deformation = arm.deform()
-    torch.testing.assert_close(deformation(deformation.x), deformation.z1, rtol=0, atol=1e-13)
-
-
-@every_arm
 def test_composition_of_naive_flows(arm: Arm) -> None:
-    """psi(k0(phi^-1(x))) written out with the fields of two naive geodesics."""
+    """psi(k0(phi^-1(x))) written out with the fields of two naive geodesics; controls have their own images."""
     deformation, x = arm.deform(), arm.points(9, 1)
+    torch.testing.assert_close(deformation(deformation.x), deformation.z1, rtol=0, atol=1e-13)
 
     def carried(kernel: Kernel, q: Tensor, a: Tensor, points: Tensor) -> Tensor:
         def field(state: Tensor) -> Tensor:
@@ -173,24 +164,13 @@ def test_tangent_limit(arm: Arm) -> None:
     v = (arm.spec.joint_kernel.matrix(x, x) @ unit.joint.flatten()).view_as(x)
     w = (arm.spec.task_kernel.matrix(marker, marker) @ unit.task.flatten()).view_as(k0)
     first = torch.einsum("imn,in->im", dk0, v) + w + s @ unit.theta
-    sizes = (4e-3, 2e-3, 1e-3)
-    errors = [float((arm.deform(eps).z1 - k0 - eps * first).norm()) for eps in sizes]
+    errors = [float((arm.deform(eps).z1 - k0 - eps * first).norm()) for eps in (4e-3, 2e-3, 1e-3)]
     assert slopes(errors) == pytest.approx([2.0, 2.0], abs=0.15)
-    lin = arm.deform(0.0).linearise()
-    torch.testing.assert_close(arm.deform(0.0).linear_response(lin), torch.zeros_like(k0), rtol=0, atol=0)
-    gram = torch.cat([unit.joint.flatten(), unit.task.flatten(), unit.theta])
-    derivative = central_difference(
-        lambda at: GeodesicDeformation(arm.spec, x, unit.unflatten(at), RK4(2)).z1, torch.zeros_like(gram), gram
-    )
-    torch.testing.assert_close(derivative, first, rtol=1e-8, atol=1e-8)
-
-
-@every_arm
-def test_the_response_elsewhere_is_that_of_the_controls_there(arm: Arm) -> None:
-    deformation = arm.deform()
-    whole = deformation.linear_response(deformation.linearise())
-    some = deformation.linearise(deformation.x[1:4])
-    torch.testing.assert_close(deformation.linear_response(some, elsewhere=True), whole[1:4], rtol=1e-11, atol=1e-12)
+    small = arm.deform(1e-6)  # the response to its own fields, at its controls and elsewhere
+    whole = small.linear_response(small.linearise())
+    torch.testing.assert_close(whole, 1e-6 * first, rtol=1e-4, atol=1e-10)
+    some = small.linear_response(small.linearise(x[1:4]), elsewhere=True)
+    torch.testing.assert_close(some, whole[1:4], rtol=1e-11, atol=1e-18)
 
 
 def perturbed(arm: Arm, x: Tensor, steps: int, eps: float, where: str) -> Tensor:
@@ -219,7 +199,6 @@ def disturbance(points: Tensor) -> Tensor:
     return torch.stack([(1.3 * points.sum(-1) + k).sin() for k in range(points.shape[-1])], -1)
 
 
-@pytest.mark.slow
 @every_arm
 @pytest.mark.parametrize("where", ["x", "y", "theta"])
 def test_linearisation_in_path_space(arm: Arm, where: str) -> None:
@@ -255,31 +234,16 @@ def test_momenta_are_the_end_momentum_transported_to_the_start(arm: Arm) -> None
     torch.testing.assert_close(theta, arm.spec.prior_variance * torch.einsum("imk,im->k", s, mu))
 
 
-def test_a_flow_that_folds_space_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    deformation = ARMS["parameters"].deform(0.2)
-    points, jacobians = deformation.joint_flow.path(deformation.x)
-    flat = [torch.zeros_like(jacobian) for jacobian in jacobians]
-    monkeypatch.setattr(deformation.joint_flow, "path", lambda _: (points, flat))
-    with pytest.raises(NumericalError, match="folds space"):
-        deformation.linearise(deformation.x)
-
-
-@every_arm
-def test_gradient_of_the_end_in_all_momenta(arm: Arm) -> None:
-    """Backpropagation through both flows and the nominal map, compared with finite differences."""
-    x, momenta, weight = arm.points(N, 2), arm.momenta(0.2), normal(N, arm.outputs, seed=9)
-    vector, direction = momenta.flatten(), normal(momenta.flatten().numel(), seed=10)
-
-    def loss(at: Tensor) -> Tensor:
-        return (weight * GeodesicDeformation(arm.spec, x, momenta.unflatten(at), RK4(2)).z1).sum()
-
-    live = vector.clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(loss(live), live)
-    torch.testing.assert_close(gradient @ direction, central_difference(loss, vector, direction), rtol=1e-8, atol=1e-8)
-
-
 @pytest.mark.parametrize("value", [1e200, -1e80, float("inf"), float("nan")])
 def test_ends_too_large_to_compute_with_are_overflows(value: float) -> None:
     """Kinematics refuse them as bad input: a trial step of a fit must end as one that is too long."""
     with pytest.raises(NumericalError, match="the flow overflows: the momenta are too large"):
         finite(tensor([[0.0, value]]), "the flow overflows")
+
+
+def test_a_flow_that_folds_space_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    deformation = ARMS["parameters"].deform(0.2)
+    points, jacobians = deformation.joint_flow.path(deformation.x)
+    monkeypatch.setattr(deformation.joint_flow, "path", lambda _: (points, [0.0 * each for each in jacobians]))
+    with pytest.raises(NumericalError, match="folds space"):
+        deformation.linearise(deformation.x)

@@ -6,7 +6,6 @@ import pytest
 import torch
 from listings import Descent, Discretisation, evaluate, lr_calibration
 from math_bank import few_points, uniform
-from section_5 import section_5
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
@@ -45,20 +44,5 @@ def test_algorithm_2_is_the_fitted_model(equations: Eulerian) -> None:
         evaluate(xi, problem.x, fit.momenta.task[:2], elastic_rr.nominal, *K)
     with pytest.raises(InputError, match="`K_W`"):
         evaluate(xi, problem.x, fit.momenta.task, elastic_rr.nominal, K[0], dc.Gaussian(1.0, [1.0] * 3))
-    with pytest.raises(InputError, match="`K_V`: expected a kernel"):
-        evaluate(xi, problem.x, fit.momenta.task, elastic_rr.nominal, None, K[1])  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match=r"`k\(xi\)`"):
         evaluate(xi * 0 + 7, problem.x, fit.momenta.task, lambda x: elastic_rr.nominal(x) + (6.5 - x).log() * 0, *K)
-    assert [tuple(t.shape) for t in evaluate(xi[:0], problem.x, fit.momenta.task, elastic_rr.nominal, *K)] == [
-        (0, 2),
-        (0, 2, 2),
-    ]
-    at, x, p0 = (t.numpy() for t in (xi, problem.x, fit.momenta.task))
-    by_arrays = evaluate(at, x, p0, elastic_rr.nominal, *K, Discretisation(equations))[0]
-    torch.testing.assert_close(by_arrays, k1, rtol=0, atol=0)
-
-
-@pytest.mark.parametrize("k", [0, 2.5, "16"])
-def test_wrong_sizes_of_the_grid_are_refused(k: object) -> None:
-    with pytest.raises(InputError, match="`k`: expected"):
-        section_5(0.01, k)  # pyright: ignore[reportArgumentType]

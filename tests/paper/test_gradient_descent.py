@@ -28,8 +28,7 @@ def test_finds_the_optimum_of_an_easy_problem(formulation: str, step: float, tol
     assert fit.history[0] == pytest.approx(float(problem.energy(problem.deform(problem.zero(), dc.RK4(1))).total))
 
 
-@pytest.mark.parametrize("step", [100.0, 1e30])
-@pytest.mark.parametrize("formulation", ["exact", "eulerian"])
+@pytest.mark.parametrize(("formulation", "step"), [("exact", 100.0), ("eulerian", 1e30)])
 def test_too_long_a_step_diverges_and_says_so(formulation: str, step: float) -> None:
     solver = dc.GradientDescent(step=step)
     fit = dc.fit(few_points(), solver, dc.RK4(1), formulation=formulation)  # pyright: ignore[reportArgumentType]

@@ -14,8 +14,9 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from diffeo_calib.common.errors import NumericalError
+from diffeo_calib.maps.linearisation import Numbers
 from diffeo_calib.regression.cholesky import Factor
-from diffeo_calib.regression.conditional import Process
+from diffeo_calib.regression.conditional import BeforeData, Opened, Process
 
 
 def close(found: Tensor, expected: Tensor, relative: float) -> None:
@@ -84,68 +85,61 @@ def test_predictions_are_those_of_the_whole_covariance(case: Case) -> None:
     close(covariance, K[to][:, to] - gain @ K[at][:, to], 1e-6)
 
 
-def test_before_any_row(case: Case) -> None:
-    found = case.data.prior(case.scales).covariance_between(case.numbers.at)
-    close(found, case.fields + case.unknowns @ torch.diag(case.variance) @ case.unknowns.T, 1e-12)
-
-
-def test_estimates_are_spread_as_their_covariance_says() -> None:
-    """Measurements that are drawn from the prior: errors of the unknowns, whitened by the posterior, are N(0, 1)."""
-    one = case("one marker")
-    numbers, K = one.numbers, len(one.variance)
-    F = torch.linalg.cholesky(numbers.with_noise(one.fields, one.noise))
-    root, squares = torch.linalg.cholesky(unknowns(one.posterior)[1]), []
-    for seed in range(60):
-        u = one.variance.sqrt() * normal(K, seed=seed)
-        y = numbers.S @ u + F @ normal(len(numbers.target), seed=1000 + seed)
-        drawn = replace(one.data, y=one.data.y + y.view_as(one.data.y) - one.data.target)
-        error = drawn.process(one.scales).estimate - u
-        squares.append(torch.linalg.solve_triangular(root, error[:, None], upper=False).square().mean())
-    assert float(torch.stack(squares).mean()) == pytest.approx(1.0, abs=4.0 * (2.0 / (60 * K)) ** 0.5)
-
-
 # --- one block after the other ------------------------------------------------------------------------------------
 
 
 def test_rows_may_come_in_parts_and_in_any_order(case: Case) -> None:
+    """What was expected before goes on with later rows, whose evidence is a difference."""
     first, second, new = cut(case)
-    prior = case.data.prior(case.scales)
-    both = case.part(torch.arange(len(case.data.x))[torch.arange(len(case.data.x)) % 3 != 2])
+    prior, rows = case.data.prior(case.scales), torch.arange(len(case.data.x))
+    both = case.part(rows[rows % 3 != 2])
     whole = prior.given(both.numbers, both.noise)
     estimate, covariance = unknowns(whole)
     deviation = covariance.diagonal().sqrt()
     scale, expected = torch.outer(deviation, deviation), noiseless(whole, new)
     for a, b in ((first, second), (second, first)):
-        found = prior.given(a.numbers, a.noise).given(b.numbers, b.noise)
+        before = prior.given(a.numbers, a.noise)
+        at = before.features(b.numbers.at)
+        found = before.given(b.numbers, b.noise, at)
         own = unknowns(found)
         close(own[0] / deviation[: len(estimate)], estimate / deviation[: len(estimate)], 1e-9)
         close(own[1] / scale, covariance / scale, 1e-9)
         assert found.evidence == pytest.approx(whole.evidence, rel=1e-9)
         for actual, wanted in zip(noiseless(found, new), expected, strict=True):
             close(actual, wanted, 1e-9)
-        other = found.inverse
-        assert_close(other @ found.numbers.target, found.mu, rtol=0, atol=1e-8 * float(found.mu.abs().max()))
+        assert_close(found.inverse @ found.numbers.target, found.mu, rtol=0, atol=1e-8 * float(found.mu.abs().max()))
+        plain, known = found.features(new.numbers.at), before.features(new.numbers.at)
+        later = found.features(new.numbers.at, known)
+        close(found.mean(later), found.mean(plain), 1e-9)
+        close(later.between(), plain.between(), 1e-9)
+        close(later.between(plain), plain.between(), 1e-9)
+        K, target = b.numbers.with_noise(at.between(), b.noise), b.numbers.there(before.mean(at))
+        normal = torch.distributions.MultivariateNormal(target, (K + K.T) / 2)
+        more = float(normal.log_prob(b.numbers.target))
+        assert found.evidence - before.evidence == pytest.approx(more, rel=1e-7)
 
 
-def test_what_was_expected_before_goes_on_with_later_rows(case: Case) -> None:
-    first, second, new = cut(case)
-    known = first.data.process(case.scales)
-    whole = known.given(second.numbers, second.noise)
-    at = new.numbers.at
-    expected, found = whole.features(at), whole.features(at, known.features(at))
-    close(whole.mean(found), whole.mean(expected), 1e-9)
-    close(found.between(), expected.between(), 1e-9)
-    close(found.between(expected), expected.between(), 1e-9)
+def test_unknowns_that_later_rows_open_are_as_if_they_had_been_there(case: Case) -> None:
+    """Conditioning anew on what is known, twice, is conditioning once: for rows that depend on the new unknowns."""
+    deviations, count = torch.tensor([1e-3, 2e-4], dtype=torch.float64), len(case.variance)
 
+    def with_columns(part: Case, size: float, seed: int) -> Numbers:
+        columns = size * normal(*part.numbers.shape, 2, seed=seed)
+        return replace(part.numbers, at=part.numbers.at.with_columns(columns, count))
 
-def test_evidence_of_later_rows_is_a_difference(case: Case) -> None:
-    first, second, _ = cut(case)
-    before = first.data.process(case.scales)
-    at = before.features(second.numbers.at)
-    after = before.given(second.numbers, second.noise, at)
-    K = second.numbers.with_noise(at.between(), second.noise)
-    normal = torch.distributions.MultivariateNormal(second.numbers.there(before.mean(at)), (K + K.T) / 2)
-    assert after.evidence - before.evidence == pytest.approx(float(normal.log_prob(second.numbers.target)), rel=1e-7)
+    first, *later = cut(case)
+    known = case.data.prior(case.scales).given(first.numbers, first.noise)
+    whole = BeforeData(torch.cat([case.variance.sqrt(), deviations])).given(with_columns(first, 0.0, 0), first.noise)
+    found: Any = Opened(known, count, deviations)
+    for seed, part in enumerate(later):
+        numbers = with_columns(part, 1.0, seed)
+        away = numbers.target - numbers.there(known.mean(known.features(numbers.at)))
+        found, whole = found.given(replace(numbers, target=away), part.noise), whole.given(numbers, part.noise)
+    at = with_columns(first, 1.0, 5).at
+    one, other = found.features(at), whole.features(at)
+    close(known.mean(known.features(at)) + found.mean(one), whole.mean(other), 1e-6)
+    close(one.between(), other.between(), 1e-6)
+    assert found.evidence == pytest.approx(whole.evidence - known.evidence, rel=1e-6)
 
 
 def test_left_out_is_conditioning_without(case: Case) -> None:
@@ -198,7 +192,7 @@ def exactly(F: Tensor, S: Tensor, variance: Tensor, y: Tensor) -> tuple[Tensor, 
 def test_priors_of_a_metre_cost_no_digits() -> None:
     """Beside noise of micrometres; with the whole covariance in float64 half of them would be lost."""
     one = case("one marker")
-    some = Case(replace(one.data, place_deviation=1.0), one.scales).part(torch.arange(9))
+    some = Case(replace(one.data, place_deviation=1.0), one.scales).part(torch.arange(5))
     numbers, found = some.numbers, some.posterior
     F = numbers.with_noise(some.fields, some.noise)
     mu, estimate = exactly(F, numbers.S, some.variance, numbers.target)
@@ -207,17 +201,3 @@ def test_priors_of_a_metre_cost_no_digits() -> None:
     close(found.estimate / deviation, estimate / deviation, 1e-9)
     naive = torch.linalg.solve(F + numbers.S @ torch.diag(some.variance) @ numbers.S.T, numbers.target)
     assert float((naive - mu).abs().max()) > 1e2 * float((found.mu - mu).abs().max())
-
-
-@pytest.mark.parametrize("name", ["one marker", "poses", "mixture"])
-def test_where_the_device_is_thought_does_not_matter(name: str) -> None:
-    """Unknowns with a prior of a metre take up half a metre, and errors of left-out rows stay."""
-    wide = Case(replace(case(name).data, place_deviation=1.0), case(name).scales)
-    numbers, step = wide.numbers, torch.zeros_like(wide.variance)
-    step[:3] = torch.tensor([0.5, -0.3, 0.2])
-    before = wide.posterior
-    moved = replace(numbers, target=numbers.target + numbers.S @ step)
-    after = wide.data.prior(wide.scales).given(moved, wide.noise)
-    one, other = before.left_out(numbers.owner)[0], after.left_out(numbers.owner)[0]
-    assert_close(other, one, rtol=0, atol=1e-7)
-    assert_close((after.estimate - before.estimate)[:3], step[:3], rtol=1e-4, atol=1e-6)

@@ -1,4 +1,4 @@
-"""Scales of kernels, priors and noise: their logarithms, prior variances, and scales derived from them."""
+"""Scales of kernels, priors and noise: what they do to covariances, scales derived from them, and slopes by them."""
 
 from __future__ import annotations
 
@@ -6,52 +6,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tangent_bank import Setting, shaken
+from process_bank import Case
+from tangent_bank import Setting, normal
+from torch import Tensor
 from torch.testing import assert_close
 
-import diffeo_calib as dc
-from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.process.scales import AMPLITUDES, NEGLIGIBLE_DISPLACEMENT, SCALES, GearLine
-
-
-def test_logarithms_round_trip(setting: Setting) -> None:
-    scales = shaken(setting.scales, 0)
-    vector = scales.logarithms()
-    n, moving = setting.data.n, setting.nominal.geometry.chain.moving
-    assert vector.shape == (5 * n + 6 + 2 * moving + 3,)
-    again = scales.from_logarithms(vector)
-    for name in SCALES:
-        assert_close(getattr(again, name), getattr(scales, name), rtol=1e-14, atol=0)
-
-
-def test_amplitudes_are_marked_where_they_are_in_the_vector(setting: Setting) -> None:
-    scales = setting.scales
-    moved = {name: getattr(scales, name) * (2.0 if name in AMPLITUDES else 1.0) for name in SCALES}
-    change = dc.Hyperparameters(**moved).logarithms() - scales.logarithms()
-    assert torch.equal(change > 0.1, scales.amplitudes())
-    assert "sensor_noise" not in AMPLITUDES
-
-
-def test_prior_variance_belongs_to_the_right_parameters(setting: Setting) -> None:
-    nominal, scales = setting.nominal, shaken(setting.scales, 7)
-    assert nominal.elasticity is not None
-    deviations = scales.prior_variance(nominal).sqrt()
-    names = nominal.geometry.parameter_names
-    for name, deviation in zip(names, deviations[: len(names)].tolist(), strict=True):
-        if name.startswith(("base ", "marker ")):
-            assert deviation == pytest.approx(0.1)
-        else:
-            turn = name.endswith("[rad]")
-            assert deviation == pytest.approx(float(scales.rotation_errors if turn else scales.translation_errors))
-    k = len(names)
-    for family in nominal.elasticity.compliances:
-        for entry in range(family.size):
-            size = (scales.compliance if family.own else scales.lateral_compliance)[family.joint]
-            assert float(deviations[k]) == pytest.approx(float(size * scales.gravity[entry % 3]))
-            k += 1
-    assert k == len(deviations)
-    rigid = GeometryMap(nominal.geometry)
-    assert_close(scales.prior_variance(rigid), deviations[: len(names)] ** 2)
+from diffeo_calib.process.scales import NEGLIGIBLE_DISPLACEMENT, SCALES, GearLine, Hyperparameters, Pairs
 
 
 def test_fields_without_support_vanish(setting: Setting) -> None:
@@ -113,3 +73,40 @@ def test_gear_lines_are_parameters_of_the_nominal_map(setting: Setting) -> None:
     assert torch.equal(with_lines.target, data.target)
     again = with_lines.with_position_errors(setting.scales)
     assert_close(again.sensitivities, data.sensitivities, rtol=0, atol=0)
+
+
+def matrix(pairs: Pairs, scales: Hyperparameters) -> Tensor:
+    return pairs.matrix(pairs.values(scales))
+
+
+def test_matrix_is_that_of_the_linearised_model(case: Case) -> None:
+    """Of both fields, and of each by itself, where the other would hide it."""
+    names = {"transmission_amplitude", "coupled_amplitude", "task_amplitude"}
+    for kept in (names, *({name} for name in names)):
+        without = {name: torch.zeros_like(getattr(case.scales, name)) for name in names - kept}
+        alone = replace(case.scales, **without)
+        found, expected = matrix(case.data.pairs, alone), Case(case.data, alone).fields
+        assert float(expected.abs().max()) > 0.0
+        assert_close(found, expected, rtol=0, atol=1e-13 * float(expected.abs().max()))
+        assert_close(found, found.T, rtol=0, atol=1e-14 * float(expected.abs().max()))
+
+
+def test_inner_is_the_sum_with_the_matrix_and_so_is_its_slope(case: Case) -> None:
+    """Of each kind of scale, by central differences."""
+    pairs = case.data.pairs
+    weights = normal(*case.fields.shape, seed=4)
+    point = case.scales.logarithms().requires_grad_()
+    inner = pairs.inner(pairs.values(case.scales.from_logarithms(point)), weights)
+    size = float((weights * matrix(pairs, case.scales)).abs().sum())
+    assert float(inner.detach()) == pytest.approx(float((weights * matrix(pairs, case.scales)).sum()), abs=1e-12 * size)
+    (gradient,) = torch.autograd.grad(inner, point)
+    where = point.detach()
+    for number, of_scale in enumerate(gradient):
+        step = torch.zeros_like(where)
+        step[number] = 1e-3
+
+        def at(times: float, step: Tensor = step) -> float:
+            return float((weights * matrix(pairs, case.scales.from_logarithms(where + times * step))).sum())
+
+        expected = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / 12e-3
+        assert float(of_scale) == pytest.approx(expected, rel=1e-6, abs=1e-9 * size)

@@ -28,7 +28,7 @@ from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.regression import conditional, control_points
 from diffeo_calib.regression import conjugate_gradients as iterative
 from diffeo_calib.regression.conditional import Conditional, Process
-from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegression, partial_cholesky, pivots
+from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegression
 from diffeo_calib.regression.control_points import ControlPointRegression
 from diffeo_calib.robots import elastic_rr
 
@@ -134,9 +134,9 @@ def close(found: Tensor, expected: Tensor, prior: float, rtol: float = 1e-12) ->
 def test_covariance_is_the_formula(
     problem: Problem, way: Callable[[Problem, GeodesicDeformation], Conditional], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also in several blocks of rows, and of linear functions of the coordinates."""
+    """Also in several blocks of rows, of linear functions of the coordinates, and between configurations."""
     at = deformed(problem)
-    data, queries = at.linearise(), at.linearise(uniform(7, 2, seed=20))
+    data, queries, other = at.linearise(), at.linearise(uniform(7, 2, seed=20)), at.linearise(uniform(3, 2, seed=21))
     expected, prior = naive_covariance(problem, data, queries), float(naive_gram(queries, queries).diagonal().max())
     found, tolerance = way(problem, at), 1e-7 if way in (WAYS["iterative"], WAYS["reduced"]) else 1e-10
     close(found.covariance(queries), expected, prior, tolerance)
@@ -145,23 +145,11 @@ def test_covariance_is_the_formula(
     for entries in (conditional.BLOCK_ENTRIES, 3 * found.size * 3, 1):
         monkeypatch.setattr(conditional, "BLOCK_ENTRIES", entries)
         close(found.covariance(queries, directions), wanted, 9 * prior, tolerance)
-
-
-@every_problem
-@full_ways
-def test_covariance_between_queries(
-    problem: Problem, way: Callable[[Problem, GeodesicDeformation], Conditional]
-) -> None:
-    """The formula's block outside of the diagonal, and within one set of queries its whole matrix."""
-    at = deformed(problem)
-    data, one, two = at.linearise(), at.linearise(uniform(4, 2, seed=20)), at.linearise(uniform(3, 2, seed=21))
     total = naive_gram(data, data) + matrix_of(problem)
-    prior = float(naive_gram(one, one).diagonal().max())
-    found, tolerance = way(problem, at), 1e-7 if way in (WAYS["iterative"], WAYS["reduced"]) else 1e-10
-    for other in (two, None):
-        left, right = naive_gram(data, one), naive_gram(data, other or one)
-        expected = naive_gram(one, other or one) - left.T @ torch.linalg.solve(total, right)
-        close(found.covariance_between(one, other), expected, prior, tolerance)
+    for beside in (other, None):
+        left, right = naive_gram(data, queries), naive_gram(data, beside or queries)
+        expected = naive_gram(queries, beside or queries) - left.T @ torch.linalg.solve(total, right)
+        close(found.covariance_between(queries, beside), expected, prior, tolerance)
 
 
 @every_kernel
@@ -170,18 +158,14 @@ def test_any_kernel_in_both_flows(kernel: Kernel) -> None:
     spec = replace(problem.spec, joint_kernel=kernel, task_kernel=kernel)
     at = deformed(problem)
     data, queries = (replace(lin, spec=spec) for lin in (at.linearise(), at.linearise(uniform(5, 2, seed=20))))
-    torch.testing.assert_close(data.gram(queries), naive_gram(data, queries), rtol=1e-12, atol=1e-13)
     directions = normal(5, 3, 4, seed=2)
-    each = torch.block_diag(*directions)
-    projected = queries.projected(directions)
+    each, projected = torch.block_diag(*directions), queries.projected(directions)
     torch.testing.assert_close(data.gram(projected), naive_gram(data, queries) @ each.T, rtol=1e-12, atol=1e-13)
     own = (each @ naive_gram(queries, queries) @ each.T).view(5, 3, 5, 3)
     blocks = torch.stack([own[i, :, i] for i in range(5)])
-    torch.testing.assert_close(projected.own_blocks(), blocks, rtol=1e-12, atol=1e-13)
     some = torch.tensor([4, 0], device=HOST)
     torch.testing.assert_close(projected.rows(some).own_blocks(), blocks[some], rtol=1e-12, atol=1e-13)
-    expected = naive_covariance(problem, data, queries)
-    prior = float(naive_gram(queries, queries).diagonal().max())
+    expected, prior = naive_covariance(problem, data, queries), float(naive_gram(queries, queries).diagonal().max())
     close(Process.of_rows(data, problem.noise).covariance(queries), expected, prior, 1e-10)
 
 
@@ -254,64 +238,38 @@ def mode(found: Any, target: Tensor) -> Momenta:
     return found.mode()[0] if isinstance(found, ControlPointRegression) else found.momenta(target)
 
 
-@pytest.mark.slow
 @every_way
-@every_problem
-def test_same_momenta_as_the_cholesky_factor(problem: Problem, way: Way) -> None:
+@pytest.mark.parametrize("name", ["hidden", "shared shifts"])
+def test_same_momenta_as_the_cholesky_factor(name: str, way: Way, monkeypatch: pytest.MonkeyPatch) -> None:
     """Compared by their effect at the data, since flat directions of the momenta are rounding errors."""
+    problem = PROBLEMS[name]
     at = deformed(problem)
     expected = regress(problem, at, "cholesky")
-    actual = mode(way(problem, at), expected.target)
     reduced = ControlPointRegression(at, problem.x, problem.noise)
     wanted = reduced.response(expected.momenta())
-    torch.testing.assert_close(reduced.response(actual), wanted, rtol=1e-5, atol=1e-5 * float(wanted.abs().max()))
+    for entries in (control_points.BLOCK_ENTRIES, 1):  # of control points all rows at once, and each by itself
+        monkeypatch.setattr(control_points, "BLOCK_ENTRIES", entries)
+        actual = reduced.response(mode(way(problem, at), expected.target))
+        torch.testing.assert_close(actual, wanted, rtol=1e-5, atol=1e-5 * float(wanted.abs().max()))
 
 
 @pytest.mark.parametrize("wide", [1.0, 100.0])
-@every_problem
-def test_covariance_of_a_large_problem(problem: Problem, wide: float, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", ["noise blocks", "shared shifts"])
+def test_covariance_of_a_large_problem(name: str, wide: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """By the factor alone: exact if F explains all of G, without cancellation beside a parameter with a wide prior."""
+    problem = PROBLEMS[name]
     at, model = deformed(problem), replace(problem.spec, prior_variance=torch.tensor([wide], dtype=torch.float64))
     data, queries = (
         replace(lin, spec=model, sensitivity=torch.ones(*lin.sensitivity.shape[:2], 1, dtype=torch.float64))
         for lin in (at.linearise(), at.linearise(uniform(6, 2, seed=20)))
     )
     expected = Process.of_rows(data, problem.noise).covariance(queries)
-    scale = float(expected.abs().max())
     actual = ConjugateGradientRegression(data, problem.noise).covariance(queries)
-    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5 * scale)
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
     monkeypatch.setattr(iterative, "NEGLIGIBLE_VARIANCE_RATIO", 0.03)
     noise = float(problem.noise.covariance.diagonal(dim1=1, dim2=2).mean())
     rough = ConjugateGradientRegression(data, problem.noise).covariance(queries)
-    assert float((rough - expected).diagonal(dim1=1, dim2=2).abs().max()) < noise
-
-
-@every_problem
-def test_the_rest_of_a_partial_cholesky_factor_is_its_residual(problem: Problem) -> None:
-    lin = deformed(problem).linearise()
-    gram = lin.gram()
-    for rank in (4, 12, gram.shape[0]):
-        factor, rest, _ = partial_cholesky(lin, 0.0, -(-rank // problem.y.shape[1]))
-        assert factor.shape[1] <= rank + problem.y.shape[1]
-        gap = gram - factor @ factor.T
-        torch.testing.assert_close(gap.diagonal().clamp(min=0), rest, rtol=0, atol=1e-8 * float(gram.diagonal().max()))
-        assert float(torch.linalg.eigvalsh(gap).min()) >= -1e-9 * float(gram.diagonal().max())
-
-
-def test_partial_cholesky_stops_when_enough_is_explained() -> None:
-    lin = deformed(PROBLEMS["rr"]).linearise()
-    total = float(lin.gram().diagonal().sum())
-    ranks = [partial_cholesky(lin, fraction * total, 1000)[0].shape[1] for fraction in (2.0, 1e-1, 1e-6)]
-    assert ranks[0] == 0
-    assert ranks == sorted(ranks)
-
-
-def test_pivots_are_different_configurations_and_repeatable() -> None:
-    lin = deformed(PROBLEMS["rr"]).linearise()
-    for count in (1, 10, 25):
-        chosen = pivots(lin, count)
-        assert len(set(chosen.tolist())) == count
-        assert bool((chosen == pivots(lin, count)).all())
+    assert 0.0 < float((rough - expected).diagonal(dim1=1, dim2=2).abs().max()) < noise
 
 
 @every_way
@@ -352,19 +310,6 @@ def test_auto_takes_conjugate_gradients_for_large_problems() -> None:
     assert iterative.choose("auto", iterative.MAX_DENSE + 1) == "cg"
     with pytest.raises(InputError, match="`linear`: expected auto, cholesky, cg, got 'lu'"):
         dc.fit(PROBLEMS["rr"], dc.GaussNewton(linear="lu"), dc.RK4(1))  # pyright: ignore[reportArgumentType]
-
-
-@pytest.mark.slow
-@every_problem
-def test_control_points_in_many_blocks_of_data(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One row per block or all rows at once: the same optimum."""
-    at = deformed(problem)
-    whole = ControlPointRegression(at, problem.x, problem.noise, residual=problem.residual)
-    monkeypatch.setattr(control_points, "BLOCK_ENTRIES", 1)
-    each = ControlPointRegression(at, problem.x, problem.noise, residual=problem.residual)
-    torch.testing.assert_close(each.core, whole.core, rtol=1e-8, atol=1e-9)
-    found, wanted = (whole.response(one.mode()[0]) for one in (each, whole))
-    torch.testing.assert_close(found, wanted, rtol=1e-6, atol=1e-8 * float(wanted.abs().max()))
 
 
 @full_ways

@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from diffeo_calib.common.errors import DiffeoCalibWarning, RobotError
+from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, RobotError
 from diffeo_calib.robots import DHRow, from_dh, load_urdf
 from diffeo_calib.robots.tree import robot_from_config
 
@@ -47,15 +47,8 @@ def test_table_multiplies_out_as_the_convention_says(convention: str) -> None:
     torch.testing.assert_close(chain(q)[0], expected, rtol=0, atol=1e-15)
     assert chain.kinds == ("revolute", "prismatic", "revolute")
     assert chain.joint_names == ("joint_1", "joint_2", "joint_3")
-
-
-def test_tuples_are_rows() -> None:
-    rows = [(0.1, 0.4, 0.3), (0.1, 0.4, 0.3, 0.2), (0.1, 0.4, 0.3, 0.2, "prismatic")]
-    same = [DHRow(0.1, 0.4, 0.3), DHRow(0.1, 0.4, 0.3, 0.2), DHRow(0.1, 0.4, 0.3, 0.2, "prismatic")]
-    q = torch.tensor([[0.5, -0.6, 0.7]], dtype=torch.float64)
-    chain = from_dh(rows, names=["a", "b", "c"], name="table")
-    torch.testing.assert_close(chain(q), from_dh(same)(q))
-    assert (chain.name, chain.joint_names) == ("table", ("a", "b", "c"))
+    named = from_dh([(0.1, 0.4, 0.3, 0.2), *rows[1:]], convention, names=["a", "b", "c"], name="table")
+    assert (named.name, named.joint_names) == ("table", ("a", "b", "c"))
 
 
 def test_ur10_table_and_urdf_are_one_robot(ur10_folder: Path) -> None:
@@ -82,6 +75,8 @@ def test_angles_beyond_a_turn_are_angles() -> None:
 def test_millimetres_are_warned_about(row: tuple[float, float, float]) -> None:
     with pytest.warns(DiffeoCalibWarning, match="row 0 of the DH table is .* in mm"):
         from_dh([row])
+    with pytest.warns(DiffeoCalibWarning, match="inf m"), pytest.raises(InputError, match="the origin of joint"):
+        from_dh([(1e308, 0.0, 0.0)])
 
 
 BRANCHED = [

@@ -1,17 +1,12 @@
 """Gravity sag: features against moments of weights, twists and slopes against autograd."""
 
-from dataclasses import replace
-
-import numpy as np
-import pytest
 import torch
-from robots_bank import CHAINS, draw, every_chain
+from robots_bank import draw, every_chain
 from torch import Tensor
 
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.robots import Chain, Geometry, Joint, SimulatedArm
 from diffeo_calib.robots.gravity import GravitySag
-from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.runtime.chain import Compliance
 
 
@@ -56,27 +51,6 @@ def test_centres_of_mass_beside_the_origins_are_nearly_explained() -> None:
 
 
 @every_chain
-def test_directions_are_the_axis_and_two_across_it(chain: Chain) -> None:
-    sag = GravitySag(chain)
-    for joint, axis in enumerate(chain.axes):
-        mine = [f for f in sag.compliances if f.joint == joint]
-        if not mine:  # the tip is on the last axis, at the joint's own origin
-            assert joint == chain.moving - 1
-            assert float(chain.tip_offsets[0][:3, 3].norm()) == 0.0
-            continue
-        (own,) = (f for f in mine if f.own)
-        turning = bool(chain.revolute[joint])
-        assert bool(own.places) == turning
-        part = torch.from_numpy(own.axis)
-        torch.testing.assert_close(part, axis, rtol=0, atol=1e-15)
-        assert float(np.linalg.norm(own.direction)) == pytest.approx(1.0)
-        if not any(f.places for f in mine):  # a slide that ends the chain
-            continue
-        turns = torch.tensor(np.array([f.axis for f in mine if f.places]))
-        torch.testing.assert_close(turns @ turns.mT, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-14)
-
-
-@every_chain
 def test_merged_places_lose_nothing(chain: Chain) -> None:
     """The moment of a weight at any frame beyond a joint is in the span of the joint's features."""
     sag, q = GravitySag(chain), draw(60, chain.n)
@@ -97,23 +71,3 @@ def test_a_robot_without_lever_arms_has_no_sag() -> None:
     assert sag.compliances == ()
     assert sag.size == len(sag.joints) == len(sag.own) == 0
     assert GeometryMap(Geometry.nominal(chain), elastic=True).parameters == Geometry.nominal(chain).size
-
-
-# --- the robot on another base ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["serial", "slides", "mimic joints"])
-def test_turning_the_base_turns_the_loads(name: str) -> None:
-    """On a turned base the sag is the same if the loads turn with it; vertical loads are the same on both bases."""
-    chain, q = CHAINS[name], draw(6, CHAINS[name].n)
-    turn = twist_transform(torch.tensor([0, 0, 0, 0, 0, 0.7], dtype=torch.float64))
-    moving = [joint for joint in chain.joints if joint.kind != "fixed"]
-    first = replace(moving[0], origin=turn @ moving[0].origin)
-    turned = Chain("turned", chain.base, chain.tip, [first, *chain.joints[1:]])
-    sag, other = GravitySag(chain), GravitySag(turned)
-    w = draw(sag.size, seed=8)
-    along = (w.view(-1, 3) @ turn[:3, :3].mT).flatten()
-    torch.testing.assert_close(other.twists(q, along), sag.twists(q, w), rtol=1e-12, atol=1e-13)
-    vertical = torch.zeros_like(w)
-    vertical[2::3] = w[2::3]
-    torch.testing.assert_close(other.twists(q, vertical), sag.twists(q, vertical), rtol=1e-12, atol=1e-13)

@@ -15,7 +15,7 @@ from deformation_bank import errors_of, geometry_of
 from robots_bank import CHAIN, CHAINS, CROOKED, LIFT, draw, every_chain
 from simulated_body import HANDS, URDF_FILE
 from torch import Tensor
-from torch.func import jacfwd, jacrev, jvp, vmap
+from torch.func import jacfwd, jacrev, vmap
 from torch.testing import assert_close
 
 import diffeo_calib as dc
@@ -129,17 +129,6 @@ def test_a_reversed_chain_has_inverse_poses(chain: dc.Chain) -> None:
     assert_close(again(reordered(q, chain, again)), chain(q), rtol=0, atol=1e-13)
 
 
-def test_hand_to_hand_of_a_table_is_that_of_both_arms() -> None:
-    robot = two_arms()
-    held, q = robot.reversed("left"), draw(6, robot.n)
-    both = robot.tip_poses(q)
-    assert_close(held(reordered(q, robot, held)), torch.linalg.inv(both[:, 0]) @ both[:, 1], rtol=0, atol=1e-14)
-    assert held.joint_names[-4:] == ("joint_1", "joint_5", "joint_6", "joint_7")
-    for tip in (None, "middle"):
-        with pytest.raises(RobotError, match=r"`tip`: expected one of left, right"):
-            robot.reversed(tip)
-
-
 @every_robot
 def test_descriptions_come_back(robot: Tree) -> None:
     again = robot_from_config(json.loads(json.dumps(robot.to_config())))
@@ -177,19 +166,6 @@ def test_jacobians_are_derivatives(robot: Tree) -> None:
     assert_close(skew(found[:, :, 3:].mT), spin, rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("name", ["every mimic", "slides"])
-def test_derivatives_pass_through_every_transform(name: str) -> None:
-    chain = ROBOTS[name]
-    q, v = draw(3, chain.n), draw(3, chain.n, seed=1)
-    forward = jvp(chain, (q,), (v,))[1]
-    each = vmap(lambda x, u: jvp(lambda z: chain(z[None])[0], (x,), (u,))[1])(q, v)
-    assert_close(each, forward)
-    weight = draw(3, 4, 4, seed=2)
-    backward = torch.autograd.grad((weight * chain(q.requires_grad_())).sum(), q)[0]
-    assert_close((backward * v).sum(), (weight * forward).sum())
-    assert torch.autograd.gradgradcheck(lambda x: chain.jacobian(x)[:, :3], (q[:1].detach().requires_grad_(),))
-
-
 def laden(robot: Tree) -> GeometryMap:
     """Elastic, with waves and crooked axes, and with a weight at its last end."""
     payload = Payload(list(robot.ends)[-1], torch.tensor(3.0, dtype=torch.float64), 5.0)
@@ -207,15 +183,6 @@ def test_errors_sag_waves_and_axes_have_exact_derivatives(robot: Tree, size: flo
     found = nominal.sensitivities(q, theta)
     assert_close(found, by_theta, rtol=1e-11, atol=1e-12)
     assert nominal.sag.start == nominal.sag.stop or float(found[..., nominal.sag].abs().max()) > 1e-3
-
-
-def test_second_derivatives_exist_at_zero_and_pass_through_vmap() -> None:
-    geometry, q = geometry_of(CHAIN), draw(2, CHAIN.n, seed=6)
-    zero = torch.zeros(geometry.size, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x: geometry.sensitivities(q[:1], x), (zero,))
-    assert torch.autograd.gradcheck(lambda x: geometry.jacobian(x, zero), (q[:1].clone().requires_grad_(),))
-    each = vmap(lambda x: geometry.sensitivities(x[None])[0])(q)
-    assert_close(each, geometry.sensitivities(q))
 
 
 # --- gravity --------------------------------------------------------------------------------------------------------
@@ -302,6 +269,9 @@ def test_a_urdf_read_from_hand_to_hand_is_its_reversed_tree() -> None:
     here, there = own_features(held, reordered(q, both, held)), own_features(read, reordered(q, both, read))
     assert set(here) == set(there)
     assert contained(here, there) < 1e-10
+    for tip in (None, "middle"):
+        with pytest.raises(RobotError, match=r"`tip`: expected one of left_hand, right_hand"):
+            both.reversed(tip)
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 from math import pi
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,15 +37,18 @@ def test_the_parts_add_up() -> None:
     torch.testing.assert_close(parts.gravity, arm.gravity_torques(q) * torch.tensor(COMPLIANCE, dtype=torch.float64))
     bare = SimulatedArm(seed=4, markers=2, geometry=0, transmission=0, gravity=0)
     torch.testing.assert_close(parts.geometry, arm.truth.points(q) - bare.true_points(q))
+    assert not bare.components(q).transmission.any()
+    assert not bare.components(q).gravity.any()
+    for part, least, most in (("geometry", 5e-4, 5e-3), ("transmission", 1e-4, 5e-4), ("gravity", 1e-4, 2e-3)):
+        assert least < float(getattr(parts, part).abs().mean()) < most  # as those of real arms
 
 
-def test_errors_are_of_the_size_of_real_ones() -> None:
-    arm = SimulatedArm()
-    parts = arm.components(arm.sample(2000))
-    assert 0.5e-3 < float(parts.geometry.norm(dim=-1).mean()) < 5e-3
-    assert 1e-4 < float(parts.transmission.std(0).min()) < float(parts.transmission.std(0).max()) < 5e-4
-    assert 5e-4 < float(parts.gravity.abs().max()) < 2e-3
-    assert bool((parts.gravity[:, 0].abs() < 1e-15).all())  # a vertical axis carries no weight
+def test_measurements_have_the_stated_noise() -> None:
+    arm = SimulatedArm(noise=2e-5, markers=3)
+    q, points = arm.measure(2000, seed=1)
+    assert float((points - arm.true_points(q)).std()) == pytest.approx(2e-5, rel=0.03)
+    lower, upper = arm.nominal.limits.unbind(1)
+    assert bool(((q >= lower) & (q <= upper)).all())
 
 
 def test_transmission_errors_are_periodic_and_of_one_joint_each() -> None:
@@ -63,29 +66,6 @@ def test_transmission_errors_are_periodic_and_of_one_joint_each() -> None:
     assert bool(present[1:3].all())
     assert present.sum(0).tolist() == [3] * 6
     assert 1e-4 <= float(waves[present].min()) <= float(waves[present].max()) <= 3e-4
-
-
-@pytest.mark.parametrize("source", ["geometry", "transmission", "gravity"])
-def test_each_source_can_be_switched_off_alone(source: str) -> None:
-    full, off = SimulatedArm(seed=5), cast(dict[str, Any], {source: 0.0})
-    q = full.sample(10)
-    with_it, without = full.components(q), SimulatedArm(seed=5, **off).components(q)
-    for name in ("geometry", "transmission", "gravity"):
-        left = getattr(without, name)
-        expected = torch.zeros_like(left) if name == source else getattr(with_it, name)
-        torch.testing.assert_close(left, expected, rtol=0, atol=1e-15)
-
-
-def test_measurements_have_the_stated_noise() -> None:
-    arm = SimulatedArm(noise=2e-5, markers=3)
-    q, points = arm.measure(2000, seed=1)
-    assert points.shape == (2000, 3, 3)
-    noise = points - arm.true_points(q)
-    assert float(noise.std()) == pytest.approx(2e-5, rel=0.03)
-    lower, upper = arm.nominal.limits.unbind(1)
-    assert bool(((q >= lower) & (q <= upper)).all())
-    q, points = SimulatedArm(noise=0).measure(5)
-    torch.testing.assert_close(points, SimulatedArm().true_points(q), rtol=0, atol=0)
 
 
 def test_one_joint_wears() -> None:

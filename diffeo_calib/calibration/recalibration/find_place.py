@@ -368,4 +368,4 @@ def warn_about(found: Registration | None, *, outliers: bool = True, excess: boo
         warn_user(sentence(what, fix=fix))
     if marker == "same" and found.same_place is not None and found.same_place < UNLIKELY and found.shift is not None:
         what = f"the rows say that the markers have moved by {1e3 * float(found.shift.norm(dim=1).max()):.2g} mm"
-        warn_user(sentence(f'{what}, although marker="same"', fix="leave `marker` out"))
+        warn_user(sentence(f'{what}, although marker="same"', fix="leave this out, in commands --free base"))

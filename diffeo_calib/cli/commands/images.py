@@ -11,6 +11,8 @@ from diffeo_calib.cameras.files import camera_text
 from diffeo_calib.cli.console import progress_bar, say
 from diffeo_calib.cli.declarations import ImagesOptions, RecordOptions
 from diffeo_calib.cli.record import record
+from diffeo_calib.cli.tables import stated_numbers
+from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import shown
 from diffeo_calib.common.files import write_together, write_whole
 from diffeo_calib.measurements.bags import read_bag, read_images
@@ -56,7 +58,11 @@ def run(given: ImagesOptions) -> None:
 
 def run_record(given: RecordOptions) -> None:
     """Find the stops, write them, and say how to go on."""
-    output, offset, limits = given.output, given.offset, StopLimits(joints=given.still, shortest=given.shortest)
+    output, offset = given.output, given.offset
+    values = stated_numbers("--still", given.still, (1, 2), "MOTION, or MOTION,SECONDS such as 0.001,0.5")
+    for value in values:
+        check_number(value, "--still", above=0.0)
+    limits = StopLimits(**dict(zip(("joints", "shortest"), values, strict=False)))
     joints, names, seen = read_bag(given.bag, given.joints, given.seen)
     if seen.values.shape[1]:
         found, offset = stops(joints, seen, limits, offset)

@@ -21,6 +21,9 @@ from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.joint_ranges import repeated_lines, warn_outside_range
 from diffeo_calib.measurements.bodies import placement_lines
 
+MARKERS: dict[str | None, Any] = {None: "evidence", "base": "same", "remounted": "moved", "both": "other"}
+"""Value of --free -> what is assumed of the markers."""
+
 
 def run(given: RecalibrateOptions) -> None:
     """Recalibrate, write the model, say what has changed, and end with the exit code of the fit."""
@@ -28,7 +31,7 @@ def run(given: RecalibrateOptions) -> None:
         return _compare(given)
     model = load_kinematics(given.old)
     source = table_of(model, given.other, given)
-    how: Any = {"marker": given.marker_freedom, "seed": given.seed, "note": given.note}
+    how = {"marker": MARKERS[given.free], "seed": given.seed, "note": given.note}
     say(*provenance_lines(model), *another_date_lines(model))
     with progress_bar() as progress:
         data = source.read(model.robot)
@@ -113,7 +116,7 @@ def _compare(given: RecalibrateOptions) -> None:
         source = table_of(model, other, given)
         say(*provenance_lines(model), *another_date_lines(model))
         rows = source.read(model.robot)
-    found = compare(model, rows, marker=given.marker_freedom, seed=given.seed)
+    found = compare(model, rows, marker=MARKERS[given.free], seed=given.seed)
     kinds = {kind: {"found": one, "expected": found.expectations[kind]} for kind, one in found.errors.items()}
     moved = {} if found.moved is None else {"transform": found.moved.transform}
     record.add(**change_entries(found.changes, found.hidden), **moved, **entries_by_kind(kinds))

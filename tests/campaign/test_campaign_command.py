@@ -1,4 +1,4 @@
-"""What a campaign keeps: nothing is lost and nothing half is taken, whenever it is killed."""
+"""A campaign as a command: what its table and journal keep whenever it is killed, and rows over standard input."""
 
 from __future__ import annotations
 
@@ -7,15 +7,19 @@ import http.client
 import io
 import json
 import os
+import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from command_bank import PROGRAM, Command
+from command_bank import PROGRAM, Command, Outcome
 
 import diffeo_calib as dc
 from diffeo_calib.campaign.feeds import as_line, check_cells, parsed
@@ -25,8 +29,9 @@ from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 
-ROWS = 24
-WRONG = 20
+ARM = SimulatedArm(2)
+ROWS = 21
+WRONG = 14
 """A row whose positions are 1000 times too large."""
 ROW = {"fits": None, "accepted": True, "error": 0.0, "expected": 1e-5, "cause": "", "shown": ["mm", 1000.0]}
 LINE = {"line": 2, "sha": "0", "rows": [ROW]}
@@ -46,21 +51,22 @@ holdout = 0.2
 @pytest.fixture
 def lines(tmp_path: Path) -> list[str]:
     """The lines of a table; its campaign file and robot are beside it."""
-    arm = SimulatedArm(2)
-    q, points = arm.measure(ROWS, seed=1)
+    q, points = ARM.measure(ROWS, seed=1)
     points[WRONG] *= 1e3
-    arm.write_urdf(tmp_path / "robot.urdf")
-    data = dc.Measurements(q, points, arm.nominal.joint_names, doubt=False)
+    ARM.write_urdf(tmp_path / "robot.urdf")
+    data = dc.Measurements(q, points, ARM.nominal.joint_names, doubt=False)
     write_measurements(tmp_path / "all.csv", data, TableFormat("mm", "deg"))
     (tmp_path / "campaign.toml").write_text(CAMPAIGN)
     return (tmp_path / "all.csv").read_text().splitlines(keepends=True)
 
 
-def test_a_torn_line_is_removed_and_the_others_stay(tmp_path: Path) -> None:
+def test_one_process_writes_and_a_torn_line_is_removed(tmp_path: Path) -> None:
     path = tmp_path / "run.journal"
     with Journal(path) as journal:
         assert journal.entries == []
         journal.add(ENTRIES)
+        with pytest.raises(InputError, match="another process"):
+            Journal(path)
     whole = path.read_bytes()
     for torn in [*(whole[:cut] for cut in range(1, whole.find(b"\n"))), bytes(100)]:
         path.write_bytes(whole + torn)
@@ -72,11 +78,6 @@ def test_a_torn_line_is_removed_and_the_others_stay(tmp_path: Path) -> None:
         with Journal(path) as journal:
             assert journal.entries == []
         assert path.read_bytes() == b""
-
-
-def test_a_second_writer_is_refused(tmp_path: Path) -> None:
-    with Journal(tmp_path / "run.journal"), pytest.raises(InputError, match="another process"):
-        Journal(tmp_path / "run.journal")
 
 
 def other_files() -> Iterator[bytes]:
@@ -225,20 +226,21 @@ def test_lines_that_are_no_rows() -> None:
 def test_the_command_ends_at_its_target_and_goes_on(tmp_path: Path, lines: list[str], command: Command) -> None:
     (tmp_path / "run.csv").write_text("".join(lines[:15]) + lines[15][:20])
     words = ["campaign", tmp_path / "campaign.toml", "--once"]
-    first = command(*words, "--tolerance", "1um")
-    assert first.code == 4
+    accepted = [*words, "--accepted", tmp_path / "accepted.csv"]
+    assert command(*words, "--tolerance", "1um").code == 4
     (tmp_path / "run.csv").write_text("".join([*lines[:3], "1,2,three\n", *lines[3:]]))
     assert "changed after" in command(*words).error
-    (tmp_path / "run.csv").write_text("".join([*lines[:22], "1,2,three\n", *lines[22:]]))
-    done = command(*words, "--accepted", tmp_path / "accepted.csv")
+    (tmp_path / "run.csv").write_text("".join([*lines[:18], "1,2,three\n", *lines[18:21]]))
+    done = command(*accepted)
     assert done.code == 0
-    assert "going on after 14 lines" in done.out
+    for words in ("going on after 14 lines", "mm as m", "line 19 left out"):
+        assert words in done.out
     assert "row 15 " not in done.out
-    assert "mm as m" in done.out
-    assert "line 23 left out" in done.out
     kept = [line for number, line in enumerate(lines) if number != WRONG + 1]
-    assert (tmp_path / "accepted.csv").read_text() == "".join(kept)
-    assert command(*words, "--tolerance", "50mm", "--accepted", tmp_path / "accepted.csv").code == 0
+    assert (tmp_path / "accepted.csv").read_text() == "".join(kept[:-1])
+    with (tmp_path / "run.csv").open("a") as file:
+        file.write(lines[21])
+    assert command(*accepted, "--tolerance", "50mm").code == 0
     assert (tmp_path / "accepted.csv").read_text() == "".join(kept)  # rows after the one left out are still those
 
 
@@ -248,19 +250,19 @@ def test_rows_that_are_there_before_are_judged_as_with_once(
     """Also without a row that comes later; a line that cannot be read is named by its place in the table."""
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"")))
     wrong = ",".join(["1000"] * len(lines[0].split(","))) + "\n"
-    (tmp_path / "run.csv").write_text("".join([*lines[:16], wrong, *lines[16:18], "x" + lines[18]]))
+    (tmp_path / "run.csv").write_text("".join([*lines[:14], wrong, lines[14], "x" + lines[18]]))
     accepted = []
     for how, known in (("--once", "mm expected"), ("--stdin", '"expected_error_mm": 0.')):  # the latter answers in JSON
         done = command("campaign", tmp_path / "campaign.toml", how, "--accepted", tmp_path / "accepted.csv")
         assert done.code == 0
-        assert "row 17 looks wrong" in done.out
-        assert known in done.out
-        assert "run.csv', line 20" in done.out
+        for words in ("row 15 looks wrong", known, "run.csv', line 17"):
+            assert words in done.out
         accepted.append((tmp_path / "accepted.csv").read_text())
         (tmp_path / "run.csv.journal").unlink()
-    assert accepted[0] == accepted[1]
+    assert accepted[0] == accepted[1] == "".join([*lines[:14], lines[14]])
 
 
+@pytest.mark.slow
 def test_it_ends_while_a_program_may_still_send_rows(tmp_path: Path, lines: list[str]) -> None:
     (tmp_path / "run.csv").write_text("".join(lines[:4]))
     words = [sys.executable, "-c", PROGRAM, "campaign", "campaign.toml", "--once", "--stdin"]
@@ -301,7 +303,7 @@ def test_a_campaign_goes_on_as_it_was_begun(tmp_path: Path, lines: list[str], co
 
 @pytest.mark.slow
 def test_a_row_rejected_on_the_page_is_rejected_in_the_journal(tmp_path: Path, lines: list[str]) -> None:
-    (tmp_path / "run.csv").write_text("".join(lines[:17]))
+    (tmp_path / "run.csv").write_text("".join(lines[:14]))
     words = ["campaign", "campaign.toml", "--stdin", "--page", "0"]
     process = subprocess.Popen(
         [sys.executable, "-u", "-c", PROGRAM, *words],
@@ -312,7 +314,7 @@ def test_a_row_rejected_on_the_page_is_rejected_in_the_journal(tmp_path: Path, l
     )
     assert process.stdout is not None
     address = urlsplit(json.loads(process.stdout.readline())["shown"])
-    assert any("row 17" in line for line in process.stdout)
+    assert any("row 14" in line for line in process.stdout)
     connection = http.client.HTTPConnection(address.hostname or "", address.port, timeout=60)
     connection.request("POST", "/reject?line=7", headers={"X-Campaign": "1"})
     assert connection.getresponse().status == 200
@@ -324,5 +326,143 @@ def test_a_row_rejected_on_the_page_is_rejected_in_the_journal(tmp_path: Path, l
         time.sleep(0.1)
     out = process.communicate(timeout=120)[0]
     ended = json.loads(out.splitlines()[-1])
-    assert (ended["accepted_rows"], ended["rows"]) == (15, 16)
+    assert (ended["accepted_rows"], ended["rows"]) == (12, 13)
     assert json.loads(journal.read_text().splitlines()[-1])["decided"] is True
+
+
+# --- rows over standard input: answered one by one, none taken in twice or by half -----------------------------------
+
+
+WORDS = ["--position", "x,y,z", "--length", "m", "--angle", "rad", "--base", "base_link", "--tip", "flange"]
+
+
+def row(number: int, **more: Any) -> bytes:
+    """A row as a line."""
+    q, y = ARM.measure(1, seed=number)
+    values = dict(zip([*ARM.nominal.joint_names, "x", "y", "z"], [*q[0].tolist(), *y[0, 0].tolist()], strict=True))
+    return (json.dumps({"id": number, **values, **more}) + "\n").encode()
+
+
+Answers = list[dict[str, Any]]
+
+
+@pytest.fixture
+def run(tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Outcome, Answers]]:
+    """Runs a campaign that is sent lines; its answers, and the last line."""
+    ARM.write_urdf(tmp_path / "robot.urdf")
+
+    def sent(lines: Iterable[bytes], *words: object) -> tuple[Outcome, Answers]:
+        failed: list[BaseException] = []
+
+        def buffer() -> Iterator[bytes]:
+            try:
+                yield from lines
+            except BaseException as error:  # in a thread of its own
+                failed.append(error)
+
+        monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=buffer()))
+        robot = ["--robot", tmp_path / "robot.urdf", *WORDS, "--accepted", tmp_path / "accepted.csv"]
+        done = command("campaign", tmp_path / "run.csv", *robot, "--stdin", *words)
+        for error in failed:
+            raise error
+        return done, [json.loads(line) for line in done.out.splitlines()]
+
+    return sent
+
+
+def test_every_row_is_answered_and_taken_once(tmp_path: Path, run: Callable[..., tuple[Outcome, Answers]]) -> None:
+    lines = [row(0), row(1), row(2), row(2), row(3), row(5), row(6), row(7, unknown=1), row(8, x="wide")]
+    lines += [b'{"do": "reject", "line": %d}\n' % number for number in (11, 3)]
+    lines += [b"{}\n", b"GET / HTTP/1.1\n", row(4)[:-20]]
+    done, answers = run([b"{}\n", *lines])
+    assert done.code == 0
+    assert (answers[0]["rows"], answers[0]["next"]) == (0, [])
+    taken = [(0, 2), (1, 3), (2, 4), (2, 4), (3, 5), (5, 6), (6, 7)]
+    assert [(one["id"], one["line"]) for one in answers[1:8]] == taken
+    assert all(f"row {one['line']}: " in one["text"] for one in answers[1:8])
+    assert all(one["fits"] is None and one["accepted"] for one in answers[1:8])
+    for one, words in zip(answers[8:11], ("columns unknown", "wide", "2 to 7"), strict=True):
+        assert words in one["error"], one
+    assert answers[11]["accepted_rows"] == answers[12]["accepted_rows"] == 5
+    assert all("JSON" in one["error"] for one in answers[13:15])
+    assert answers[15]["ended"]
+    table = (tmp_path / "run.csv").read_text().splitlines()
+    assert [line.split(",")[0] for line in table] == ["id", "0", "1", "2", "3", "5", "6"]
+    assert (tmp_path / "accepted.csv").read_text().splitlines() == table[:2] + table[3:]
+    _, (_, again, _) = run([row(6)])
+    assert (again["line"], again["accepted_rows"]) == (7, 5)
+
+
+def test_every_view_of_nothing(run: Callable[..., tuple[Outcome, Answers]]) -> None:
+    """A page before any row; each of what is sent first ended the campaign once."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        page = free.getsockname()[1]
+
+    @contextmanager
+    def asked(method: str, path: str) -> Iterator[http.client.HTTPResponse]:
+        connection = http.client.HTTPConnection("127.0.0.1", page, timeout=60)
+        connection.request(method, path, headers={"X-Campaign": "1"})
+        yield connection.getresponse()
+        connection.close()
+
+    def shown(text: str) -> int:
+        """Number of poses on the page when it says something."""
+        for _ in range(600):
+            with asked("GET", "/state") as answer:
+                state = json.load(answer)
+            if state.get("state", "").startswith(text):
+                return len(state["done"])
+            time.sleep(0.1)
+        return -1
+
+    def lines() -> Iterator[bytes]:
+        yield from (b"{}\n", b'{"do": "reject", "line": 2}\n', b'{"joint_1": 1}\n')
+        for method, path in (("GET", "/"), *(("POST", f"/{what}?line=2") for what in ("accept", "reject", "repeat"))):
+            with asked(method, path) as answer:
+                assert answer.status == 200
+        assert shown("0 of 0 rows accepted; no model yet") == 0
+        yield row(0)
+        assert shown("1 of 1") == 1
+        yield b'{"do": "repeat", "line": 2}\n'
+
+    done, (_, first, decision, unreadable, *clicked, taken, repeated, _) = run(lines(), "--page", page)
+    assert done.code == 0, done.err
+    assert first["rows"] == 0
+    assert all("there is none yet" in one["error"] for one in (decision, *clicked))
+    assert "header" in unreadable["error"]
+    assert (taken["line"], len(repeated["next"])) == (2, 1)
+
+
+def test_rows_under_an_id_of_others(tmp_path: Path, run: Callable[..., tuple[Outcome, Answers]]) -> None:
+    """A program that counts anew loses no row in silence, also after the campaign was started again."""
+    first = [row(0), row(1), row(2, id="two"), row(1), row(1, id="1"), row(2, id="two")]
+    other = [row(3, id=1), row(3, id="1"), row(3, id="two"), row(3, id=None), row(3, id="")]
+    for again in (0, 1):
+        done, answers = run([*first, *other])
+        assert done.code == 0
+        answers = answers[again:-1]
+        assert [one.get("line") for one in answers] == [2, 3, 4, 3, 3, 4, *5 * [None]]
+        assert all("whose values are others" in one["error"] for one in answers[6:9])
+        assert all("leave it out" in one["error"] for one in answers[9:])
+    assert len((tmp_path / "run.csv").read_text().splitlines()) == 4
+
+
+def test_a_table_that_another_program_edits(tmp_path: Path, run: Callable[..., tuple[Outcome, Answers]]) -> None:
+    """The next row lost its first characters, and was accepted."""
+    path = tmp_path / "run.csv"
+
+    def lines() -> Iterator[bytes]:
+        yield from map(row, range(3))
+        journal = tmp_path / "run.csv.journal"
+        while not journal.exists() or journal.read_text().count('"line": ') < 3:
+            time.sleep(0.05)
+        whole = path.read_text()
+        path.write_text(whole[:-20] + whole[-17:])
+        yield row(3)
+
+    done, answers = run(lines())
+    assert done.code == 1
+    assert "was changed" in done.error
+    assert [one["line"] for one in answers if "error" not in one] == [2, 3, 4]
+    assert path.read_text().count("\n") == 4
