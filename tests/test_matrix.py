@@ -143,16 +143,7 @@ FORMS = (
     "images of a board",
 )
 """Kinds whose models differ in form: in their markers, tips, poses, payload and tool."""
-PROPOSED = (
-    "positions",
-    "hidden markers",
-    "sessions",
-    "payloads",
-    "ball in sockets",
-    "mixture",
-    "heights",
-    "inclinations",
-)
+PROPOSED = ("positions", "hidden markers", "sessions", "payloads", "ball in sockets", "mixture", "heights")
 """Kinds whose tables differ for `init`, which takes seconds; the tests of the command have poses, images and wires."""
 Verb = Callable[[Bench], None]
 VERBS: dict[str, tuple[Verb, tuple[str, ...]]] = {}

@@ -83,14 +83,15 @@ class Deviations:
         q, fitted = low + draws * (high - low), fitted[:: -(-len(fitted) // MEASURED)]
         found = cls(q, claimed(model, q), fitted, claimed(model, fitted), ExpectedError.of(model))
         try:
-            sensors = [one for one in sensor_of(model) if one.reached(model.geometry.base)]
+            somewhere = [sensor for sensor in sensor_of(model) if sensor.reached(model.geometry.base)]
         except InputError:  # a file of an early version
             return found
+        options = [q]
         try:
-            reached = drawn(model, sensors, CONFIGURATIONS, model.geometry.tool) if sensors else q[:0]
+            options += [drawn(model, somewhere, CONFIGURATIONS, model.geometry.tool)] if somewhere else []
         except InputError:  # such as of a camera, which cannot see everywhere
-            reached = model.configurations.to(HOST)
-        return replace(found, next=plan(model, torch.cat([q, reached]), NEXT, target=q[:TARGETS]))
+            options.append(model.configurations.to(HOST))
+        return replace(found, next=plan(model, torch.cat(options), NEXT, target=q[:TARGETS]))
 
 
 def claimed(model: CalibratedKinematics, q: Tensor) -> Tensor:
