@@ -12,52 +12,9 @@ from tangent_bank import built, normal
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import robot_problem
-from diffeo_calib.calibration.scales.noise_model import NoiseModel, differing_factor
+from diffeo_calib.calibration.scales.noise_model import differing_factor
 from diffeo_calib.maps.noise import HIDDEN_VARIANCE
-from diffeo_calib.measurements.poses import mark_jacobian
-from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.regression.regions import region_factor
-
-
-def poses(count: int, seed: int = 0) -> Tensor:
-    """Frames in general position."""
-    found = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
-    found[:, :3, :3] = turned(normal(count, 3, seed=seed))
-    found[:, :3, 3] = normal(count, 3, seed=seed + 1)
-    return found
-
-
-def turned(vectors: Tensor) -> Tensor:
-    x, y, z = vectors.unbind(1)
-    zero = torch.zeros_like(x)
-    rows = [torch.stack(row, 1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
-    return torch.linalg.matrix_exp(torch.stack(rows, 1))
-
-
-def pose_sensor(rows: int, slack: float = 2e-6) -> NoiseModel:
-    return replace(NoiseModel.alike(rows, 1, 9), modes=mark_jacobian(poses(rows), LEVER)[:, None], slack=slack)
-
-
-def covariances(rows: int, m: int, seed: int) -> Tensor:
-    """Blocks of any kind that are positive definite."""
-    root = normal(rows, m, m, seed=seed)
-    return root @ root.mT + 0.1 * torch.eye(m, dtype=torch.float64)
-
-
-def test_squares_of_poses() -> None:
-    """The shift and turn that fit the points' errors best, in units of their own covariance."""
-    sensor = pose_sensor(4)
-    covariance, errors = covariances(4, 9, seed=10), normal(4, 9, seed=11)
-    found = sensor.squares(covariance, errors[:, :, None] * errors[:, None])
-    assert found.shape == (4, 1)
-    for row in range(4):
-        modes = sensor.modes[row, 0]
-        normal_matrix = modes.mT @ modes
-        to_body = torch.linalg.solve(normal_matrix, modes.mT)
-        twist = to_body @ errors[row]
-        expected = float(twist @ torch.linalg.inv(to_body @ covariance[row] @ to_body.mT) @ twist)
-        assert float(found[row, 0]) == pytest.approx(expected, rel=1e-9)
-
 
 # --- new measurements where the noise differs from row to row ---------------------------------------------------------
 
@@ -93,12 +50,6 @@ def test_regions_hold_95_percent_of_a_mixture() -> None:
         factor = differing_factor(each, mean, everywhere(each))
         assert share(errors, mean) < 0.93
         assert share(errors, factor * mean) == pytest.approx(0.95, abs=0.01)
-
-
-def test_few_rows_of_large_noise_never_narrow_the_regions() -> None:
-    each = torch.eye(3, dtype=torch.float64).repeat(100, 1, 1)
-    each[0] *= 1e6
-    assert differing_factor(each, each.mean(0), everywhere(each)) == pytest.approx(1.0, abs=1e-12)
 
 
 def test_hidden_markers_do_not_count() -> None:

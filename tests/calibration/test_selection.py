@@ -28,8 +28,6 @@ from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.scales import selection
 from diffeo_calib.calibration.scales.selection import (
-    LARGEST_AMPLITUDE_RATIO,
-    LOG_RANGE,
     LogPosterior,
     defaults,
     log_posterior,
@@ -41,17 +39,6 @@ from diffeo_calib.process.scales import AMPLITUDES, SCALES
 from diffeo_calib.robots import Chain, Geometry, Joint, SimulatedArm
 
 # --- defaults ---------------------------------------------------------------------------------------------------------
-
-
-def test_defaults_are_usable_scales(setting: Setting) -> None:
-    scales, noise = setting.scales, setting.identification.noise
-    assert bool(torch.isfinite(scales.logarithms()).all())
-    assert float(scales.sensor_noise) < noise
-    assert noise / 2.0 < 10 * float(scales.transmission_amplitude.max())
-    ratio = float(scales.transmission_amplitude.max() / scales.transmission_amplitude.min())
-    assert ratio <= LARGEST_AMPLITUDE_RATIO * 1.001
-    moving = setting.nominal.geometry.chain.moving
-    assert scales.compliance.shape == scales.lateral_compliance.shape == (moving,)
 
 
 def test_the_unit_of_length_does_not_matter() -> None:
@@ -79,12 +66,11 @@ def test_the_unit_of_length_does_not_matter() -> None:
     assert bool((grown.joint_noise > 0).all())
 
 
-def test_a_joint_without_motion_or_lever_has_finite_scales() -> None:
+def test_joints_without_motion_or_lever_have_finite_scales() -> None:
+    """Also of a robot whose axes all meet at its tip, with and without sag."""
     setting = built("sliding")
     data, x, prior = setting.tangent_data, setting.data.q.clone(), setting.identification.prior
     x[:, 2] = 0.3
-    scales = defaults(replace(data, x=x), 1e-4, prior)
-    assert bool(torch.isfinite(scales.logarithms()).all())
     levers = data.nominal.jacobian(x, data.theta)
     levers[..., 5] = 0.0  # no lever at all
 
@@ -93,27 +79,16 @@ def test_a_joint_without_motion_or_lever_has_finite_scales() -> None:
             return levers
 
     blind = replace(data, nominal=Blind(setting.nominal.geometry, elastic=True), x=x)
-    amplitude = defaults(blind, 1e-4, prior).transmission_amplitude
+    scales = [defaults(replace(data, x=x), 1e-4, prior), defaults(blind, 1e-4, prior)]
+    amplitude = scales[1].transmission_amplitude
     assert float(amplitude[5]) <= 3.01 * float(amplitude.min())
-
-
-def test_a_robot_that_cannot_bend_has_finite_scales() -> None:
-    """Without gravity sag, and with one that has no features: all axes meet at the tip."""
-    origin = torch.eye(4, dtype=torch.float64)
-    joints = [
-        Joint("a", "revolute", origin),
-        Joint("b", "revolute", origin, torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)),
-    ]
-    arm = Chain("ball", "floor", "hand", joints)
-    geometry = replace(Geometry.nominal(arm), tool=torch.tensor([[0.1, 0.2, 0.3]], dtype=torch.float64))
-    setting = built("sliding")
+    origin, axis = torch.eye(4, dtype=torch.float64), torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    arm = Chain("ball", "floor", "hand", [Joint("a", "revolute", origin), Joint("b", "revolute", origin, axis)])
     for elastic in (False, True):
-        nominal = GeometryMap(geometry, elastic=elastic)
+        nominal = GeometryMap(Geometry.nominal(arm).with_tool(axis[None]), elastic=elastic)
         theta = torch.zeros(nominal.parameters, dtype=torch.float64)
-        data = replace(setting.tangent_data, nominal=nominal, theta=theta, x=normal(10, 2, seed=1))
-        scales = defaults(data, 1e-4, setting.identification.prior)
-        assert bool(torch.isfinite(scales.logarithms()).all())
-        assert scales.prior_variance(nominal).shape == (nominal.parameters,)
+        scales.append(defaults(replace(data, nominal=nominal, theta=theta, x=normal(10, 2, seed=1)), 1e-4, prior))
+    assert all(bool(torch.isfinite(one.logarithms()).all()) for one in scales)
 
 
 # --- log posterior ----------------------------------------------------------------------------------------------------
@@ -202,20 +177,6 @@ def test_axes_of_a_commanded_frame_have_like_scales() -> None:
     assert float(posterior(one).gradient @ step) == pytest.approx((above - below) / 2, rel=1e-4)
 
 
-def test_a_singular_covariance_has_no_posterior() -> None:
-    setting = built("two markers")
-    scales = setting.scales
-    # next to no noise and an amplitude of e^25 defaults: G + R is singular in float64
-    mute = replace(
-        scales,
-        sensor_noise=scales.sensor_noise * 1e-9,
-        joint_noise=scales.joint_noise * 1e-9,
-        task_amplitude=scales.task_amplitude * math.exp(25),
-        task_lengthscale=scales.task_lengthscale * 1e4,
-    )
-    assert log_posterior(mute.logarithms(), scales, setting.tangent_data) is None
-
-
 def test_unknowns_beside_the_covariance_or_in_it_agree(setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
     data, point = weighted(setting), shaken(setting.scales, 2).logarithms()
     found = []
@@ -227,19 +188,6 @@ def test_unknowns_beside_the_covariance_or_in_it_agree(setting: Setting, monkeyp
     assert inside is not None
     assert beside.likelihood == pytest.approx(inside.likelihood, rel=1e-6)
     torch.testing.assert_close(beside.gradient, inside.gradient, rtol=1e-3, atol=1e-3)
-
-
-def test_a_wide_prior_costs_no_digits(setting: Setting) -> None:
-    """Of ten or a hundred metres: the likelihood then falls by the logarithm of the prior alone, the gradient stays."""
-    scales = setting.scales
-    wide = [
-        log_posterior(scales.logarithms(), scales, replace(weighted(setting), place_deviation=d)) for d in (1e1, 1e2)
-    ]
-    assert wide[0] is not None
-    assert wide[1] is not None
-    free = (wide[0].likelihood - wide[1].likelihood) / math.log(1e1)
-    assert free == pytest.approx(round(free), abs=1e-2)
-    torch.testing.assert_close(wide[0].gradient, wide[1].gradient, rtol=1e-4, atol=1e-4)
 
 
 def value(setting: Setting, scales: dc.Hyperparameters) -> float:
@@ -260,18 +208,6 @@ def interrupting(calls: int) -> Callable[..., None]:
     return progress
 
 
-@pytest.mark.slow
-def test_select_is_better_than_the_default_and_reports_its_likelihood(setting: Setting) -> None:
-    selection = select(setting.scales, setting.tangent_data)
-    assert value(setting, selection.scales) > value(setting, setting.scales) + 1.0
-    found = log_posterior(selection.scales.logarithms(), setting.scales, setting.tangent_data)
-    assert selection.likelihood == pytest.approx(found.likelihood, rel=1e-9)
-    assert f"likelihood {found.likelihood:.1f} on {len(setting.data)} poses" in selection.status
-    assert not selection.interrupted
-    moved = selection.scales.logarithms() - setting.scales.logarithms()
-    assert float(moved.abs().max()) <= LOG_RANGE + 1e-9
-
-
 def test_a_given_start_is_where_the_search_begins() -> None:
     """After a single evaluation the best scales are the start."""
     setting = built("mimic joint")
@@ -285,7 +221,7 @@ def test_a_given_start_is_where_the_search_begins() -> None:
 def test_interrupted_later_keeps_the_best_so_far() -> None:
     """The line search overshoots at times; the scales that are kept never get worse."""
     setting, kept = built("two markers"), []
-    for calls in range(2, 16):
+    for calls in range(2, 12):
         selection = select(setting.scales, setting.tangent_data, progress=interrupting(calls))
         assert selection.interrupted
         kept.append(value(setting, selection.scales))

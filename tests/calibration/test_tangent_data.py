@@ -5,19 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 from tangent_bank import Setting, built, covariance, noise_covariance, normal, shaken, tangent_covariance, weighted
 from torch import Tensor
 from torch.testing import assert_close
 
-import diffeo_calib as dc
 from diffeo_calib.calibration.choose_scales import robot_problem
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.measurements.poses import mark_jacobian
-from diffeo_calib.robots import SimulatedArm
 
 
 def test_covariance_and_target_are_those_written_out(setting: Setting) -> None:
@@ -51,21 +48,6 @@ def test_rows_are_those_of_the_whole(setting: Setting) -> None:
     assert_close(some.target, data.target[rows], rtol=0, atol=1e-14)
 
 
-def test_samples_are_drawn_by_the_seed() -> None:
-    arm = SimulatedArm(seed=6)
-    data = Setting(arm.nominal, dc.Measurements(*arm.measure(200))).tangent_data
-    first, same, other = (data.sample(150, 900, seed)[1].x for seed in (0, 0, 1))
-    assert first.shape == (150, 6)
-    assert len(torch.unique(first, dim=0)) == 150
-    assert torch.equal(first, same)
-    assert not torch.equal(first, other)
-    assert [len(data.sample(150, most, 0)[1].x) for most in (90, 1)] == [30, 1]
-    assert torch.equal(data.sample(500, 900000, 3)[0], torch.arange(200))
-    rows, some = data.sample(20, 900, 4)
-    assert torch.equal(some.x, data.x[rows])
-    assert rows.tolist() == sorted(rows.tolist())
-
-
 def test_what_is_kept_is_that_of_its_scales_and_weights(setting: Setting) -> None:
     """Whatever was asked for before: other scales, other weights, other measurements, fewer rows."""
     first, second = shaken(setting.scales, 1), shaken(setting.scales, 2)
@@ -83,11 +65,6 @@ OPEN_M = 1e-3
 """Noise of what bends the points of a pose, that tells nothing: a thousand times what the fields bend."""
 
 
-@pytest.fixture(scope="module")
-def posed() -> Setting:
-    return built("posed")
-
-
 def naive(setting: Setting, data: TangentData) -> tuple[Tensor, Tensor]:
     """G and R of nine coordinates a pose, of which motions that bend its points are hardly known: (9 N, 9 N) each."""
     frames = setting.data.frames
@@ -98,8 +75,9 @@ def naive(setting: Setting, data: TangentData) -> tuple[Tensor, Tensor]:
     return G, torch.block_diag(*R)
 
 
-def test_six_numbers_say_what_nine_coordinates_do(posed: Setting) -> None:
+def test_six_numbers_say_what_nine_coordinates_do() -> None:
     """Mean and covariance of k1 at the rows, by numpy with nine coordinates a pose."""
+    posed = built("posed")
     data = replace(posed.tangent_data, y=posed.tangent_data.y + 1e-5 * normal(12, 9, seed=3))
     G, R = naive(posed, data)
     nominal = data.nominal.changed(rigid=True)
@@ -116,22 +94,18 @@ def test_six_numbers_say_what_nine_coordinates_do(posed: Setting) -> None:
     assert_close(left, basis.T @ (G - covariance) @ basis, rtol=0, atol=1e-3 * float(left.abs().max()))
 
 
-def test_the_fit_of_six_numbers_is_that_of_nine(posed: Setting) -> None:
+def test_the_fit_of_six_numbers_is_that_of_nine() -> None:
     """Nine coordinates keep the points rigid by the slack, which is worth a small part of the noise of a pose."""
+    posed = built("posed")
     data, scales = posed.tangent_data, posed.scales
     problem = robot_problem(data, scales)
     maps = [fit(each, GaussNewton(tolerance=1e-6)).model for each in (problem, problem.whole)]
+    geometry = posed.nominal.geometry  # whose points nothing bends
+    tool = geometry.tool + maps[0].deformation.momenta.theta[geometry.slices["tool"]].view(-1, 3)
+    assert_close(torch.pdist(tool), torch.pdist(geometry.tool), rtol=1e-6, atol=0)
     x = data.x + 0.3
     (six, covariance), (nine, _) = (each.predict(x, noise=False) for each in maps)
     deviation = covariance.diagonal(dim1=1, dim2=2).sqrt()
     assert float((six - nine).abs().max() / deviation.mean()) < 0.05
     assert maps[0].slopes is None
     assert maps[0].noise.covariance.shape == (12, 9, 9)
-
-
-def test_nothing_bends_the_tool(posed: Setting) -> None:
-    model = fit(robot_problem(posed.tangent_data, posed.scales), GaussNewton(tolerance=1e-6)).model
-    geometry = posed.nominal.geometry
-    tool = geometry.tool + model.deformation.momenta.theta[geometry.slices["tool"]].view(-1, 3)
-    before, after = (torch.pdist(points) for points in (geometry.tool, tool))
-    assert_close(after, before, rtol=1e-6, atol=0)
