@@ -15,7 +15,6 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales import axis_errors
 from diffeo_calib.calibration.scales.axis_errors import with_axis_errors
 from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.process.scales import axis_deviations
@@ -97,7 +96,7 @@ def configurations(rows: int, seed: int) -> Tensor:
     return torch.from_numpy(rng.uniform((-2, -2, 0, -2, -2, -2), (2, 2, 0.6, 2, 2, 2), (rows, 6)))
 
 
-def test_a_bent_slide_is_part_of_the_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bent_slide_is_part_of_the_model(tmp_path: Path) -> None:
     """True errors and regions at other poses; beyond the measured range regions widen; files hold all."""
     robot, q, new = sliding_robot(), configurations(60, 1), configurations(200, 2)
     noise = 2e-5 * np.random.default_rng(3).standard_normal((60, 1, 3))
@@ -125,8 +124,4 @@ def test_a_bent_slide_is_part_of_the_model(tmp_path: Path, monkeypatch: pytest.M
     assert_close(again.predict(far)[1], result.model.predict(far)[1], rtol=1e-9, atol=0)
     found = load_numpy(tmp_path / "model.safetensors")(far)
     np.testing.assert_allclose(found, result.model(far).numpy(), rtol=0, atol=1e-12)
-    monkeypatch.setattr(axis_errors, "ODDS", float("inf"))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        without = dc.calibrate(robot, data).model.predict(new, noise=False)[0]
-    assert float(errors.norm()) < 0.8 * float((without - slid(new)).norm())
+    assert float(errors.square().sum(1).mean().sqrt()) < 7.5e-5  # 8.2e-5 without the axis

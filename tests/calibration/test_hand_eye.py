@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from functools import cache
-from pathlib import Path
 from typing import Any
 
-import jsonschema
 import pytest
 import torch
-from command_bank import Command
 from golden_bank import usual_scales
 from kind_bank import rigid_rms
 from simulated_camera import BOARD, CAMERA, CameraArm, camera_arm
@@ -26,10 +22,8 @@ from diffeo_calib.calibration.scales.noise_model import with_best_seen_point
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_sentences
-from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.poses import inverse_poses
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.reports.results import SCHEMA
 from diffeo_calib.robots.se3 import rotation, twist_transform
 
 ROWS, TEST_ROWS = 60, 100
@@ -100,28 +94,6 @@ def test_the_other_direction_is_named(seen: CameraArm) -> None:
     data = seen.measured(POSITION_STD, ROTATION_STD)[:ROWS]
     with pytest.raises(MeasurementError, match=says("camera in the board's frame already", "camera_on_tool")):
         dc.calibrate(seen.arm.nominal, dc.Measurements.from_poses(data.q, held(data.poses), camera_on_tool=True))
-
-
-@pytest.mark.slow
-def test_the_commands_read_boards(seen: CameraArm, command: Command, tmp_path: Path) -> None:
-    csv, urdf, model, found = (tmp_path / name for name in ("a.csv", "a.urdf", "a.safetensors", "a.json"))
-    seen.arm.write_urdf(urdf)
-    write_measurements(csv, seen.measured(POSITION_STD, ROTATION_STD)[:40], TABLE)
-    done = command("fit", csv, "--robot", urdf, *OPTIONS, "--camera-on-tool", "-o", model, "--json", found)
-    assert done.code == 0, done.err
-    assert "camera in the frame of 'flange' (hand-eye transform): " in done.out
-    assert done.out.count("(standard deviations)") == 2
-    written = json.loads(found.read_text(encoding="utf-8"))
-    jsonschema.validate(written, SCHEMA)
-    written = written["results"]["hand_eye"]
-    board = torch.tensor(written["board_in_base"]["pose_m"], dtype=torch.float64)
-    away = (board[:3, 3] - torch.tensor(BOARD, dtype=torch.float64)).abs()
-    assert bool((away < 5 * torch.tensor(written["board_in_base"]["position_std_m"])).all())
-    done = command("fit", csv, "--robot", urdf, *OPTIONS, "-o", model)
-    assert done.code == 1
-    assert "--camera-on-tool" in done.error
-    done = command("fit", csv, "--robot", urdf, *OPTIONS[:2], *OPTIONS[8:], "--camera-on-tool", "-o", model)
-    assert "--camera-on-tool without --rotation" in done.error
 
 
 NEW_ROWS = 40

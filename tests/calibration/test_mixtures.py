@@ -121,19 +121,6 @@ def test_the_sockets_are_in_the_frame_of_the_device(arm: SimulatedArm, result: A
     assert not any("smaller than the true error" in line for line in found.sentences())
 
 
-def test_equivariance_under_motions_of_the_device(
-    arm: SimulatedArm, mixture: dc.Measurements, scales: dc.Hyperparameters, result: Any
-) -> None:
-    """Another frame of the tracker is another frame of everything that was found."""
-    T = twist_transform(torch.tensor([0.4, -0.2, 0.9, 0.3, 1.1, -0.5], dtype=torch.float64))
-    moved = with_attributes(mixture, points=mixture.points @ T[:3, :3].mT + T[:3, 3])
-    first, second = result, dc.calibrate(arm.nominal, moved, hyperparameters=scales)
-    q = arm.sample(20, seed=1)
-    torch.testing.assert_close(second.model(q), first.model(q) @ T[:3, :3].mT + T[:3, 3], rtol=0, atol=2e-6)
-    places = first.sockets.positions @ T[:3, :3].mT + T[:3, 3]
-    torch.testing.assert_close(second.sockets.positions, places, rtol=0, atol=2e-6)
-
-
 def test_the_noise_of_sockets_is_searched(tangent: TangentData) -> None:
     """One more scale, whose slope is that of the log posterior."""
     centre = defaults(tangent, 3e-4, Prior())
@@ -240,15 +227,6 @@ def test_rows_of_a_noisy_kind_take_nothing_from_precise_ones() -> None:
     precise, noisy = found[1].weights
     assert 0.5 < float(precise.median()) < 1.5
     assert 0.5 < float(noisy.median()) < 1.5
-
-
-def test_the_ball_of_a_robot_that_errs_by_centimetres() -> None:
-    """Its readings are not doubted: a warning fails this test."""
-    arm = SimulatedArm(seed=2, geometry=40, markers=2)
-    q, points = arm.measure(60, seed=4)
-    tracked = dc.Measurements(q, points[:, 1:], arm.nominal.joint_names)
-    placed = place(arm.nominal, dc.Measurements.joined([tracked, readings(arm, "image", 90)]), silent)
-    assert placed.registration.rms > 20 * placed.identification.rms
 
 
 # --- tables of several kinds ------------------------------------------------------------------------------------------

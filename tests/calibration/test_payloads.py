@@ -57,14 +57,6 @@ def test_sag_under_other_payloads_is_predicted(rows: dc.Measurements, result: An
     assert {part.name: part.displacement for part in result.parts}["payload"] > 1e-4
 
 
-def test_every_row_is_predicted_with_its_own_payload(result: Any, other: dc.Measurements) -> None:
-    found = dc.evaluate(result.model, other)
-    for mass in (1.0, 6.0, 8.5):
-        own = other.payload == mass
-        expected = other.points[own] - result.model.with_payload(mass)(other.q[own])
-        torch.testing.assert_close(found.away[own], expected, rtol=0, atol=1e-12)
-
-
 def test_queries_of_a_laden_model_agree(result: Any, other: dc.Measurements) -> None:
     """Values by NumPy and by torch, derivatives, covariances and compensation, under another payload."""
     model, q = result.model.with_payload(7.5), other.q[:5]
@@ -112,9 +104,3 @@ def test_payloads_that_cannot_be(rows: dc.Measurements, result: Any, other: dc.M
         ("row 1: expected a mass of 0 or more, got -2", lambda: rows[:2].with_payload([1.0, -2.0])),
         ("payload", lambda: rows.with_payload([1.0, 2.0])),
     )
-
-
-def test_one_payload_in_all_rows_is_warned_about() -> None:
-    q, points = ARM.measure(14, seed=4)
-    with pytest.warns(DiffeoCalibWarning, match="all rows carry the same payload"):
-        with_usual_scales(ARM.nominal, dc.Measurements(q, points).with_payload(6.0))

@@ -8,14 +8,11 @@ first harmonic of its transmission error are both sines of the same angle.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from product_bank import Case, calibrated, simulated, ur10_measurements, ur10_scales
-from table_bank import refused
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -121,27 +118,6 @@ def test_transmission_alone(only_transmission: Case) -> None:
     assert only_transmission.held_out()[2] < 0.03 * 1e-3
 
 
-@pytest.mark.parametrize("name", ["gravity", "geometry"])
-def test_one_source_of_error_alone(name: str) -> None:
-    other = "geometry" if name == "gravity" else "gravity"
-    case, source = calibrated(40, transmission=0, **{other: 0}), truth(transmission=0, **{other: 0})
-    found, q = sizes(case), case.train.q
-    if name == "gravity":
-        deflected = rms(pushed(source, q, source.components(q).gravity))
-        assert deflected > 0.5
-        assert found["gravity on joints"] == pytest.approx(deflected, rel=0.05)
-    else:
-        beyond_registration = 1e3 * register(source.nominal, q, source.truth.points(q)).rms
-        assert found["geometry"] == pytest.approx(beyond_registration, rel=0.02)
-        assert found["gravity on joints"] < 0.015
-    assert sum(transmissions(case).values()) < 0.02
-    for nothing in ("gravity on links", "coupled joint errors", "task space"):
-        assert found[nothing] < 0.015, nothing
-    assert wrong_geometry(case, source) < 0.04
-    _, geometry, diffeomorphic = case.held_out()
-    assert diffeomorphic < (0.06e-3 if name == "gravity" else 1.05 * geometry)
-
-
 def test_transmission_is_what_moves_the_markers(arm: Case) -> None:
     """To first order: the flow's momenta along the joint's own kernel, whatever the other joints are."""
     values = torch.linspace(-3, 3, 7, dtype=torch.float64)
@@ -164,23 +140,6 @@ def test_transmission_of_a_slide_is_in_metres(slider: Case) -> None:
     assert float(difference.norm() / wave.norm()) < 0.15
     (part,) = [part for part in slider.result.parts if part.name == "transmission of slide"]
     assert part.angle == pytest.approx(4e-4 / math.sqrt(2), rel=0.4)  # with its mean value, which is free
-
-
-def test_transmission_of_no_joint_or_of_nonsense(arm: Case) -> None:
-    def of(values: Any, joint: Any = "elbow_joint") -> Callable[[], object]:
-        return lambda: arm.model.transmission(joint, values)
-
-    refused(
-        *(
-            (r"`joint`: expected waist_joint, shoulder_joint, .*got", of([0.0], joint))
-            for joint in ("elbow", "", 2, None)
-        ),
-        *(("`values` has the wrong shape", of(values)) for values in ([[0.0, 1.0]], 0.3, torch.zeros(2, 6))),
-        *((r"1 value\(s\) that are not finite", of(values)) for values in ([math.nan], [0.0, math.inf])),
-        ("`values` cannot be read as numbers", of("home")),
-    )
-    assert arm.model.transmission("elbow_joint", []).shape == (0,)
-    assert arm.model.transmission("elbow_joint", [0, 1]).dtype == torch.float64
 
 
 def split_by_first_joint(data: dc.Measurements) -> tuple[dc.Measurements, dc.Measurements]:
