@@ -72,14 +72,6 @@ def test_lens_and_board_are_found_with_the_robot() -> None:
     assert float(deviations[UNKNOWNS.index("scale")]) < 0.999 * float(before.deviations[UNKNOWNS.index("scale")])
 
 
-def test_a_mirrored_board_is_the_same_board_from_behind() -> None:
-    corners: Any = data().corners
-    mirrored = corners.clone()
-    mirrored[..., 0] *= -1
-    found = dc.calibrate(arm().arm.nominal, of_corners(mirrored), hyperparameters=SCALES)
-    assert abs(error_mm(found.model) / error_mm(calibrated().model) - 1) < 0.05
-
-
 def test_a_board_of_nearly_the_right_size_is_named() -> None:
     corners: Any = data().corners
     wrong = corners.clone()

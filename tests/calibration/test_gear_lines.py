@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from math import pi
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -59,14 +58,6 @@ def test_scales_are_those_of_the_other_model_but_for_one_factor(
     factor = float(ours.sensor_noise / theirs.sensor_noise)
     torch.testing.assert_close(ours.vector, theirs.inflated(factor).vector)
     assert "1 other model" in second.selection.status
-
-
-def test_scales_survive_the_file_and_its_placing(first: dc.CalibrationResult, tmp_path: Path) -> None:
-    dc.save(first.model, tmp_path / "model.safetensors")
-    loaded = dc.load(tmp_path / "model.safetensors")
-    assert isinstance(loaded, CalibratedKinematics)
-    for model in (first.model, loaded, loaded.with_tool([0.0, 0.0, 0.1])):
-        torch.testing.assert_close(model.scales, first.selection.scales.vector)
 
 
 def test_means_are_quadratic_of_deviations_and_geometric_of_others(first: dc.CalibrationResult) -> None:

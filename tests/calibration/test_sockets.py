@@ -12,16 +12,20 @@ from product_bank import with_usual_scales
 from reading_bank import scales
 from simulated_sockets import SocketRows, rest_in_sockets
 from table_bank import refused
+from tangent_bank import covariance
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration, check_sockets
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.placing.sockets import SocketDevices
+from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places, leave_one_out
+from diffeo_calib.calibration.scales.selection import Selection, defaults
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.result import silent
-from diffeo_calib.regression.conditional import Estimated
+from diffeo_calib.regression.regions import region_factor
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
 
@@ -56,12 +60,6 @@ def aligned(points: Tensor, truth: Tensor) -> Tensor:
     return points @ T[:3, :3].mT + T[:3, 3] - truth
 
 
-def gauge(model: dc.CalibratedKinematics) -> Estimated:
-    found = model.map.conditional
-    assert isinstance(found, Estimated)
-    return found
-
-
 def test_far_more_accurate_than_geometry_and_as_accurate_as_predicted(arm: SimulatedArm, result: Any) -> None:
     q = arm.sample(500, seed=9)
     truth = arm.true_points(q)[:, 0]
@@ -87,7 +85,7 @@ def test_the_sockets_are_where_they_are(result: Any, rows: SocketRows) -> None:
 
 def test_covariances_by_the_projection_written_out(arm: SimulatedArm, result: Any) -> None:
     model, q = result.model, arm.sample(4, seed=3)
-    found, at = gauge(model), model.map.geodesic.linearise(q)
+    found, at = model.map.conditional, model.map.geodesic.linearise(q)
     both = model.map.geodesic.linearise(torch.cat([q, found.reference.at.joint[0].points]))
     C = found.before.covariance_between(both)
     B = both.sensitivity.flatten(0, 1)[:, :6]
@@ -106,10 +104,6 @@ def placed(arm: SimulatedArm, data: dc.Measurements) -> Placed:
 
 def test_places_left_out_by_leaving_them_out(data: dc.Measurements, placed: Placed) -> None:
     """Closed form against a regression without the rows of the place."""
-    from diffeo_calib.calibration.choose_scales import ChosenScales
-    from diffeo_calib.calibration.scales.leave_one_out import leave_one_out
-    from diffeo_calib.calibration.scales.selection import Selection, defaults
-
     tangent, devices = placed.tangent_data(), placed.placement.one(SocketDevices)
     scales = defaults(tangent, placed.identification.noise, placed.identification.prior)
     chosen = ChosenScales(Selection(scales, "defaults"), tangent, leave_one_out(tangent, scales))
@@ -128,12 +122,6 @@ def test_places_left_out_by_leaving_them_out(data: dc.Measurements, placed: Plac
 
 def test_deviations_grow_where_places_contradict_each_other(data: dc.Measurements, placed: Placed) -> None:
     """The ratio of squared errors of left-out places, by conditioning on the rows of the others."""
-    from tangent_bank import covariance
-
-    from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places
-    from diffeo_calib.calibration.scales.selection import defaults
-    from diffeo_calib.regression.regions import region_factor
-
     tangent, found = placed.tangent_data(), placed.identification
     scales = defaults(tangent, 0.3 * found.noise, found.prior)
     K, r, total = covariance(tangent, scales), tangent.target.flatten(), 0.0
@@ -238,13 +226,6 @@ def test_rows_in_a_wrong_socket_are_named(plain: SimulatedArm, some: SocketRows)
         place(plain.nominal, table(some, tuple(names)), silent)
 
 
-@pytest.mark.filterwarnings("ignore:the known distance")
-def test_names_that_say_nothing_are_warned_about(plain: SimulatedArm, some: SocketRows) -> None:
-    names = tuple(some.names[(7 * row) % 36] for row in range(36))
-    with pytest.warns(dc.DiffeoCalibWarning, match="the ball is in no socket"):
-        place(plain.nominal, table(some, names), silent)
-
-
 def test_a_tool_that_never_turns_or_tilts(plain: SimulatedArm, some: SocketRows) -> None:
     def still(q: torch.Tensor) -> torch.Tensor:
         return q + 1e-4 * torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype)
@@ -262,27 +243,24 @@ def test_a_tool_that_never_turns_or_tilts(plain: SimulatedArm, some: SocketRows)
 
 def test_tables_that_cannot_be_made(some: SocketRows) -> None:
     wrong: Any = table
+    named, pair = "expected 36 names, one per row, got", "expected names of two sockets"
     refused(
-        ("`sockets`: expected 36 names, one per row, got 1", lambda: wrong(some, ("0/0",))),
+        (f"{named} 1", lambda: wrong(some, ("0/0",))),
         (r"18 row\(s\) have no name, the first is row 1", lambda: wrong(some, ("0/0", " ") * 18)),
         (r"1 row\(s\) have no name", lambda: wrong(some, [None, *some.names[1:]])),
-        ("expected 36 names, one per row, got 'abcd'", lambda: wrong(some, "abcd")),
-        ("expected 36 names, one per row, got 5", lambda: wrong(some, 5)),
+        (f"{named} 'abcd'", lambda: wrong(some, "abcd")),
+        (f"{named} 5", lambda: wrong(some, 5)),
         ("`distances`: expected a dictionary, got .*0.05", lambda: wrong(some, distances=[("0", "1", 0.05)])),
         ("`distance_std` without `distances`", lambda: wrong(some, distances=None)),
         ("`distance_std`: expected a positive number in m, got None", lambda: wrong(some, distance_std=None)),
         ("`distance_std`: expected a positive number", lambda: wrong(some, distance_std=-1.0)),
-        ("the distance of .* expected metres above 0", lambda: wrong(some, distances={("0", "1"): 0.0})),
-        ("expected names of two sockets, got .*'0/0', '0/1'", lambda: wrong(some, distances={("0", "7"): 0.1})),
-        ("a known distance: expected names of two sockets", lambda: wrong(some, distances={("0", "0"): 0.1})),
-        ("expected one value", lambda: wrong(some, distances={("0", "1"): 0.05, ("0/0", "0/1"): 0.06})),
+        ("the distance of .* expected metres above 0", lambda: wrong(some, distances={PAIR: 0.0})),
+        (f"{pair}, got .*'0/0', '0/1'", lambda: wrong(some, distances={("0", "7"): 0.1})),
+        (f"a known distance: {pair}", lambda: wrong(some, distances={("0", "0"): 0.1})),
+        ("expected one value", lambda: wrong(some, distances={PAIR: 0.05, ("0/0", "0/1"): 0.06})),
     )
-
-
-def test_distances_by_name(some: SocketRows) -> None:
-    known: Any = table(some, distances={("0", "1"): 0.05, ("0/0", "2/1"): 0.7}).sockets
+    known = wrong(some, distances={PAIR: 0.05, ("0/0", "2/1"): 0.7}).sockets
     assert known.distances == ((0, 1, 0.05), (2, 3, 0.05), (4, 5, 0.05), (0, 5, 0.7))
-    assert known.place_names == ("0", "1", "2")
 
 
 def test_splits_hold_out_whole_places(some: SocketRows) -> None:

@@ -43,20 +43,8 @@ def test_few_poses_with_many_repeats_are_few_poses() -> None:
     error = (test.points - mean)[:, 0, :, None]
     squares = (error.mT @ torch.linalg.solve(covariance[:, 0], error)).flatten()
     assert float((squares < 7.81).double().mean()) > 0.85
-
-
-@pytest.mark.slow
-def test_repeats_do_not_break_the_fit() -> None:
-    arm, train, test = simulated(15)
-    rng, q = np.random.default_rng(1), train.q.repeat(3, 1)
-    points = arm.true_points(q) + 2e-5 * torch.from_numpy(rng.standard_normal((len(q), 1, 3)))
-    read = q + 1e-6 * torch.from_numpy(rng.standard_normal(tuple(q.shape)))
-    many = dc.calibrate(arm.nominal, dc.Measurements(read, points))
-    assert many.fit.converged
-    assert many.outliers == []
-    assert held_out(many, test) < dc.evaluate(many.identification.geometry.points, test).rms
-    noise = many.selection.scales.sensor_noise  # the spread of the repeats determines the noise
-    assert float(noise) == pytest.approx(2e-5, rel=0.3)
+    with pytest.warns(DiffeoCalibWarning, match="too few to select scales"):  # which the registration fits exactly
+        dc.calibrate(arm.nominal, dc.Measurements(train.q[:3], train.points[:3], std=2e-5))
 
 
 @pytest.mark.slow
@@ -72,14 +60,6 @@ def test_deviations_of_each_coordinate(arm: Case) -> None:
     noise = given.model.map.noise.covariance.diagonal(dim1=1, dim2=2)
     assert float(noise[:, 0].min()) > 4e-4**2
     assert float(noise[:, 1:].max()) < 2e-4**2
-
-
-@pytest.mark.slow
-def test_few_poses_with_honest_deviations_are_not_refused() -> None:
-    """Base and marker alone fit three poses exactly, which does not contradict the deviations."""
-    arm, train, _ = simulated(3)
-    with pytest.warns(DiffeoCalibWarning, match="too few to select scales"):
-        dc.calibrate(arm.nominal, dc.Measurements(train.q, train.points, std=2e-5))
 
 
 def random_chain(joints: int) -> dc.Chain:
