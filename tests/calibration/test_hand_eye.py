@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 import torch
 from golden_bank import usual_scales
-from kind_bank import rigid_rms
 from simulated_camera import BOARD, CAMERA, CameraArm, camera_arm
 from simulated_head import CAMERA as HEAD_CAMERA
 from simulated_head import CAMERA_AWAY, SeeingHead
@@ -107,18 +106,6 @@ def head() -> SeeingHead:
 @cache
 def calibrated() -> Any:
     return dc.calibrate(head().robot, head().images(50, 0.1), hyperparameters=usual_scales(head().robot))
-
-
-@pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
-def test_errors_of_neck_and_arm_are_found() -> None:
-    new = head().q[-NEW_ROWS:]
-    truth = head().true_points(new)
-    nominal, found = (
-        1e3 * rigid_rms(points.detach(), truth)
-        for points in (calibrated().registration.geometry.points(new), calibrated().model(new))
-    )
-    assert nominal > 0.5
-    assert found < 0.2 * nominal
 
 
 @pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows

@@ -32,7 +32,6 @@ from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.rows import with_attributes
-from diffeo_calib.measurements.sockets import Sockets
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.sensors.places import fitting_devices
@@ -125,7 +124,6 @@ def test_the_noise_of_sockets_is_searched(tangent: TangentData) -> None:
     """One more scale, whose slope is that of the log posterior."""
     centre = defaults(tangent, 3e-4, Prior())
     point, step = centre.logarithms() + 0.1, 1e-4
-    assert len(point) == len(replace(centre, other_noise=None).logarithms()) + 1
     found = log_posterior(point, centre, tangent)
     values = []
     for sign in (-1.0, 1.0):
@@ -135,23 +133,6 @@ def test_the_noise_of_sockets_is_searched(tangent: TangentData) -> None:
         values.append(there.likelihood + there.prior)
     assert abs(float(found.gradient[-1])) > 1.0
     assert float(found.gradient[-1]) == pytest.approx((values[1] - values[0]) / (2 * step), rel=1e-5)
-    wider = centre.inflated(2.0).other_noise
-    assert float(wider) == 2.0 * float(centre.other_noise)
-
-
-def test_evaluation_of_each_kind(result: Any, tracked: Any, resting: Any, mixture: Any) -> None:
-    new, model, summary = tracked.rows(slice(TRACKED, None)), result.model, result.model.summary
-    positions, spread, both = (dc.evaluate(model, rows) for rows in (new, resting, mixture))
-    assert positions.rms == pytest.approx(rms(model(new.q)[:, 0] - new.points[:, 0]), rel=1e-9)
-    assert positions.rms < 3e-4
-    assert both["position"].count == TRACKED
-    assert both.rms == pytest.approx(dc.evaluate(model, mixture.device_rows()).rms, rel=1e-12)
-    assert both.rms == pytest.approx(summary.diffeomorphic_rms, rel=1e-12)
-    assert both["socket"].rms == pytest.approx(spread.rms, rel=1e-12)
-    assert len(both["socket"].distances) == len(spread.distances) == 4
-    left_out = result.leave_one_out.errors
-    assert result.left_out_rms == pytest.approx(rms(left_out[:TRACKED, :3]), rel=1e-9)
-    assert result.left_out["socket"].rms == pytest.approx(rms(left_out[TRACKED:, 3:]), rel=1e-9)
 
 
 def test_several_set_ups_of_the_device(
@@ -187,15 +168,6 @@ def test_rows_in_sockets_join_a_mixture(mixture: dc.Measurements, resting: dc.Me
     other = dc.Measurements.from_sockets(some.q, ["x/0"] * 10, some.joint_names)
     with pytest.raises(MeasurementError, match="the tables differ in sockets;"):
         dc.Measurements.joined([mixture, other])
-
-
-@pytest.mark.filterwarnings("ignore:the place of marker 1 on 'flange'")
-def test_rows_of_another_robot(arm: SimulatedArm, tracked: dc.Measurements, resting: dc.Measurements) -> None:
-    bend = torch.zeros(6, dtype=torch.float64)
-    bend[4] = 0.05
-    other = with_attributes(resting, q=resting.q + bend, sockets=Sockets(resting.sockets.names))
-    with pytest.warns(dc.DiffeoCalibWarning, match="do not fit the robot whose positions were measured"):
-        place(arm.nominal, dc.Measurements.joined([tracked, other]), silent)
 
 
 def test_refused(arm: SimulatedArm, tracked: Any, resting: Any) -> None:

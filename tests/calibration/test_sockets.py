@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from kind_bank import kind_named
 from product_bank import with_usual_scales
 from reading_bank import scales
 from simulated_sockets import SocketRows, rest_in_sockets
@@ -17,13 +18,13 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.choose_scales import ChosenScales
-from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration, check_sockets
+from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.placing.sockets import SocketDevices
 from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places, leave_one_out
 from diffeo_calib.calibration.scales.selection import Selection, defaults
-from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.regression.regions import region_factor
 from diffeo_calib.robots import SimulatedArm
@@ -167,18 +168,6 @@ def test_a_size_that_is_not_the_robots_is_warned_about(arm: SimulatedArm, rows: 
     assert result.expected.workspace > 3e-3
 
 
-def test_evaluation_of_rows_in_sockets(result: Any, data: dc.Measurements) -> None:
-    some = data.rows(data.socket < 3)  # type: ignore[operator]
-    found = dc.evaluate(result.model, some)
-    points = result.model(some.q)[:, 0]
-    middles = [points[some.socket == s].mean(0) for s in range(3)]
-    squares = [(points[some.socket == s] - m).square().sum(1) for s, m in enumerate(middles)]
-    assert found.rms == pytest.approx(float(torch.cat(squares).mean().sqrt()), rel=1e-9)
-    (distance,) = found.distances
-    assert (distance.first, distance.second, distance.known) == ("0/0", "0/1", 0.05)
-    assert distance.error == pytest.approx(float((middles[0] - middles[1]).norm()) - 0.05, abs=1e-12)
-
-
 # --- rows that cannot be right ----------------------------------------------------------------------------------------
 
 PAIR = ("0", "1")
@@ -210,6 +199,12 @@ def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows
         ("sockets: expected at least 9, got 6", staged(table(some, **bare).rows([0, 1, 6, 7, 12, 13]))),
         (r"expected about (49|50)\..* mm, by the robot, got 5e\+04 mm", staged(table(some, distances={PAIR: 50.0}))),
         ("check the unit of `distances`", staged(table(some, distances={PAIR: 5e-5}))),
+        ("rows with sockets: expected no sessions", staged(table(some).with_sessions(["a"] * 18 + ["b"] * 18))),
+        ("rows with sockets: expected no payloads", staged(table(some).with_payload(2.0))),
+        *(
+            ("calibrated with measured positions", lambda verb=verb: verb(kind_named("positions").model, table(some)))
+            for verb in (dc.evaluate, dc.CalibratedKinematics.registered)
+        ),
     )
     for options, words in (
         (bare, "the size of the robot rests on its description"),
@@ -272,20 +267,3 @@ def test_splits_hold_out_whole_places(some: SocketRows) -> None:
     assert sorted(len(held) for _, held in data.folds(3)) == [12, 12, 12]
     with pytest.raises(MeasurementError, match="expected at least 4 places with sockets, got 3"):
         data.folds(4)
-
-
-def test_no_position_is_made_up(plain: SimulatedArm, some: SocketRows, tmp_path: object) -> None:
-    data = table(some)
-    assert bool(data.points.isnan().all())
-    assert "6 sockets" in repr(data)
-    assert data.sha256 != table(some, distance_std=1e-5).sha256
-    names = tuple(reversed(some.names))
-    assert data.sha256 != table(some, names).sha256
-    tracked = with_usual_scales(plain.nominal, dc.Measurements(*plain.measure(15, seed=2))).model
-    for verb in (dc.evaluate, dc.CalibratedKinematics.registered):
-        with pytest.raises(InputError, match="calibrated with measured positions"):
-            verb(tracked, data)
-    with pytest.raises(MeasurementError, match="rows with sockets: expected no sessions"):
-        dc.calibrate(plain.nominal, data.with_sessions(["a"] * 18 + ["b"] * 18))
-    with pytest.raises(MeasurementError, match="rows with sockets: expected no payloads"):
-        check_sockets(plain.nominal, data.with_payload(2.0))

@@ -7,7 +7,6 @@ first harmonic of its transmission error are both sines of the same angle.
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import pytest
@@ -129,17 +128,6 @@ def test_transmission_is_what_moves_the_markers(arm: Case) -> None:
         kernel = (1 + away + away**2 / 3) * (-away).exp()  # Matern 5/2
         expected = scales.transmission_amplitude[index] ** 2 * kernel @ deformation.momenta.joint[:, index]
         torch.testing.assert_close(curve, expected, rtol=1e-9, atol=1e-15)
-
-
-def test_transmission_of_a_slide_is_in_metres(slider: Case) -> None:
-    """A spindle whose pitch error has a period of 0.3 m and an amplitude of 0.4 mm."""
-    values = torch.linspace(0.05, 0.55, 100, dtype=torch.float64)
-    found = slider.model.transmission("slide", values)
-    wave = 4e-4 * (2 * math.pi / 0.3 * values).sin()
-    difference = (found - found.mean()) - (wave - wave.mean())
-    assert float(difference.norm() / wave.norm()) < 0.15
-    (part,) = [part for part in slider.result.parts if part.name == "transmission of slide"]
-    assert part.angle == pytest.approx(4e-4 / math.sqrt(2), rel=0.4)  # with its mean value, which is free
 
 
 def split_by_first_joint(data: dc.Measurements) -> tuple[dc.Measurements, dc.Measurements]:
