@@ -22,8 +22,6 @@ from diffeo_calib.cameras.board import BoardPrior
 from diffeo_calib.cameras.images import UNKNOWNS
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
-from diffeo_calib.measurements.csv.files import read_observations, write_measurements
-from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
@@ -112,17 +110,6 @@ def test_the_lens_of_another_camera_is_refused() -> None:
     other[:2] *= 1.5
     with pytest.raises(MeasurementError, match=r"with the given camera.*1890"):
         of_corners(corners, camera=replace(known, unknowns=other))
-
-
-def test_lines_of_an_image_with_other_joints_are_refused(tmp_path: Any) -> None:
-    path = tmp_path / "corners.csv"
-    table = write_measurements(path, data(), TableFormat("mm", "deg", camera_on_tool=True))
-    lines = path.read_text().splitlines()
-    cells = lines[3].split(",")
-    cells[1] = "12.5"
-    path.write_text("\n".join([*lines[:3], ",".join(cells), *lines[4:]]))
-    with pytest.raises(MeasurementError, match=r"image '0'.*line 4"):
-        read_observations(path, table)
 
 
 # --- beside a tracker, and beside a ball in sockets -------------------------------------------------------------------

@@ -12,8 +12,6 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.fitting.result import silent
-from diffeo_calib.kernels.base import SumKernel
-from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.process.scales import SCALES
 
 CERTIFICATE = 1e-4
@@ -82,19 +80,6 @@ def test_noise_free_data_can_be_calibrated() -> None:
     case = calibrated(40, transmission=0, gravity=0, noise=0)
     assert case.held_out()[2] < 1e-6
     assert case.result.fit.converged
-
-
-@pytest.mark.slow
-def test_a_prismatic_joint(slider: Case) -> None:
-    registration, geometry, diffeomorphic = slider.held_out()
-    assert geometry < 0.5 * registration
-    assert diffeomorphic < 0.2 * geometry
-    sound(slider)
-    kernel = slider.model.map.deformation.spec.joint_kernel
-    assert isinstance(kernel, SumKernel)
-    for term in kernel.terms:  # the slide is a line in every one of them, not a circle of 2 pi metres
-        assert isinstance(term, RadialKernel)
-        assert term.periodic == (True, True, False, True, True, True)
 
 
 def test_twelve_poses_are_selected_on() -> None:
@@ -185,9 +170,3 @@ def test_ctrl_c_ends_the_search_beside_what_may_drift(arm: Case) -> None:
     data = arm.train.with_covariates(time=torch.arange(len(arm.train)))
     assert dc.calibrate(arm.robot, data, progress=progress).interrupted
     assert tasks.count("hyper-parameters") <= 2, "no second search"
-
-
-def test_ctrl_c_before_there_is_anything_to_keep(arm: Case) -> None:
-    for task in ("registration", "geometry"):
-        with pytest.raises(KeyboardInterrupt):
-            dc.calibrate(arm.robot, arm.train, progress=interrupting(task, 0))

@@ -12,12 +12,8 @@ from simulated_camera import BOARD, CAMERA, CameraArm, camera_arm
 from simulated_head import CAMERA as HEAD_CAMERA
 from simulated_head import CAMERA_AWAY, SeeingHead
 from table_bank import held, says
-from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.identification.identification import identify
-from diffeo_calib.calibration.identification.registration import register
-from diffeo_calib.calibration.scales.noise_model import with_best_seen_point
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_sentences
@@ -45,18 +41,6 @@ def from_corner(data: dc.Measurements) -> dc.Measurements:
     shift[:3, 3] = -torch.tensor(MIDDLE, dtype=torch.float64, device=HOST)
     boards = inverse_poses(held(data.poses)) @ shift
     return dc.Measurements.from_poses(data.q, boards, data.joint_names, camera_on_tool=True)
-
-
-@pytest.mark.slow
-def test_the_best_seen_point_is_where_position_and_rotation_err_independently(seen: CameraArm) -> None:
-    data = from_corner(seen.measured(POSITION_STD, ROTATION_STD))
-    found = identify(register(seen.arm.nominal, data.q, data.points).geometry, data.q, data.points)
-    moved = held(with_best_seen_point(data, found).board) - held(data.board)
-    points = (held(data.poses)[:, :3, :3] @ moved[..., None])[..., 0]
-    assert_close(points, points[:1].expand_as(points), rtol=0, atol=1e-12)
-    assert float((points[0] - torch.tensor(MIDDLE, dtype=torch.float64)).norm()) < 0.05
-    known = dc.Measurements.from_poses(data.q, held(data.poses), camera_on_tool=True, position_std=1e-4)
-    assert with_best_seen_point(known, found) is known, "known deviations are those of the origin"
 
 
 @pytest.mark.slow

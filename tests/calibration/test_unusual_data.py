@@ -135,20 +135,6 @@ def identified(data: dc.Measurements) -> Identification:
     return identify(register(ARM.nominal, data.q, data.points).geometry, data.q, data.points)
 
 
-@pytest.mark.usefixtures("few")
-def test_geometry_of_a_sample_weighs_all_rows(data: dc.Measurements, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = identified(data)
-    assert found.tails.weights.shape == (ROWS, 1)
-    assert int(found.tails.weights.argmin()) == WRONG
-    monkeypatch.undo()
-    whole = identified(data)
-    assert found.noise == pytest.approx(whole.noise, rel=0.5)
-    assert not torch.equal(found.theta, whole.theta)
-    others = ARM.sample(200, seed=9)
-    apart = (found.geometry.points(others) - whole.geometry.points(others)).norm(dim=-1)
-    assert float(apart.square().mean().sqrt()) < whole.rms
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("few")
 def test_calibration_of_many_rows(data: dc.Measurements) -> None:

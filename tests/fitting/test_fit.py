@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import pairwise
 from math import nan, pi
 from typing import Any
@@ -125,13 +124,6 @@ def test_default_integrator_is_fine_enough(small: dc.Fit) -> None:
     assert stopped.integrator.intervals <= 2, "before the optimum, the end residual does not measure the time steps"
 
 
-def test_what_was_measured_follows_without_a_matrix_of_all_rows() -> None:
-    problem = rr_problem(5)
-    model = replace(dc.fit(problem, integrator=dc.RK4(4)).model, y=None)
-    torch.testing.assert_close(model.measured(), problem.y, rtol=0, atol=1e-7)
-    assert "by_data" not in vars(model)
-
-
 # --- fits with fewer control points than measurements ---------------------------------------------------------------
 
 
@@ -149,15 +141,6 @@ def test_few_control_points_fit_many_data() -> None:
     solver = dc.LBFGS(max_iterations=20)
     after = dc.fit(problem, solver, dc.RK4(2), controls=fit.problem.controls, start=fit.momenta)
     assert fit.energy * (1 - 1e-6) <= after.energy <= fit.energy
-
-
-def test_the_covariance_of_a_coarse_model_is_not_smaller_than_that_of_the_full_one() -> None:
-    problem = rr_problem(8)
-    x = uniform(10, 2, seed=5)
-    full, coarse = (dc.fit(problem, integrator=dc.RK4(2), controls=c).model for c in (None, 40))
-    wide, narrow = (torch.diagonal(m.predict(x, noise=False)[1], dim1=1, dim2=2) for m in (coarse, full))
-    assert bool((wide >= -1e-9).all())
-    assert float((wide - narrow).min()) >= -0.2 * float(narrow.max())
 
 
 def test_interrupting_the_start_of_a_coarse_fit_keeps_it() -> None:
