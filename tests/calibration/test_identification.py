@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import inf
 from typing import Any
 
@@ -89,23 +88,6 @@ def test_left_out_points_are_predicted_by_the_others() -> None:
         squares.append(float((alone.points(q[row : row + 1]) - points[row]).square().sum()))
     assert found.left_out == pytest.approx((sum(squares) / 25) ** 0.5, rel=0.1)
     assert found.left_out > 1.5 * found.rms
-
-
-def test_scales_of_the_joint_errors_are_found() -> None:
-    """Translations and rotations apart: one arm of each kind."""
-    arm = SimulatedArm(seed=3, transmission=0, gravity=0, noise=1e-5)
-    q = arm.sample(200)
-    start = replace(Geometry.nominal(arm.nominal, 2), tool=draw(2, 3, seed=1, size=0.1))
-    for translation, rotation_size in ((1e-3, 1e-4), (1e-4, 1e-3)):
-        theta = torch.zeros(start.size, dtype=torch.float64)
-        twists = draw(6, 6, seed=2) * torch.tensor([translation] * 3 + [rotation_size] * 3, dtype=torch.float64)
-        theta[start.slices["joints"]] = twists.flatten()
-        points = start.points(q, theta) + draw(200, 2, 3, seed=3, size=1e-5)
-        prior = identify(start, q, points).prior
-        larger, smaller = sorted((prior.translation, prior.rotation), reverse=True)
-        assert larger == pytest.approx(1e-3, rel=0.5)
-        assert smaller < 4e-4  # the smaller one is still falling when the noise has settled
-        assert (prior.translation > prior.rotation) == (translation > rotation_size)
 
 
 class Ahead:

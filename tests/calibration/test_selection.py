@@ -174,19 +174,6 @@ def test_axes_of_a_commanded_frame_have_like_scales() -> None:
     assert found == pytest.approx([-0.5 * change**2, -0.5 * change**2 * (1 / 9 + 6 / 9 / selection.AXES**2)])
 
 
-def test_unknowns_beside_the_covariance_or_in_it_agree(setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
-    data, point = weighted(setting), shaken(setting.scales, 2).logarithms()
-    found = []
-    for gain in (0.0, 1e300):
-        monkeypatch.setattr(selection, "LARGEST_GAIN", gain)
-        found.append(log_posterior(point, setting.scales, data))
-    beside, inside = found
-    assert beside is not None
-    assert inside is not None
-    assert beside.likelihood == pytest.approx(inside.likelihood, rel=1e-6)
-    torch.testing.assert_close(beside.gradient, inside.gradient, rtol=1e-3, atol=1e-3)
-
-
 def value(setting: Setting, scales: dc.Hyperparameters) -> float:
     """Log posterior, up to a constant."""
     found = log_posterior(scales.logarithms(), setting.scales, setting.tangent_data)

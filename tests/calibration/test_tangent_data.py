@@ -9,7 +9,7 @@ import pytest
 import torch
 from kind_bank import kind_named
 from scipy.stats import chi2
-from tangent_bank import Setting, built, covariance, noise_covariance, normal, shaken, tangent_covariance, weighted
+from tangent_bank import Setting, built, noise_covariance, normal, shaken, tangent_covariance, weighted
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -43,15 +43,6 @@ def test_noise_is_that_written_out(setting: Setting) -> None:
     for weights, actual in ((ones, data.noise(scales)), (data.tails.weights, data.weighted_noise(scales))):
         expected = noise_covariance(scales, setting, data.theta, weights)
         assert_close(actual, expected, rtol=1e-6, atol=1e-7 * float(expected.abs().max()))
-
-
-def test_rows_are_those_of_the_whole(setting: Setting) -> None:
-    data, rows = weighted(setting), torch.tensor([5, 0, 7])
-    some, m = data.rows(rows), data.size
-    index = (rows[:, None] * m + torch.arange(m)).flatten()
-    whole, part = covariance(data, setting.scales), covariance(some, setting.scales)
-    assert_close(part, whole[index][:, index], rtol=0, atol=1e-13 * float(whole.abs().max()))
-    assert_close(some.target, data.target[rows], rtol=0, atol=1e-14)
 
 
 def test_what_is_kept_is_that_of_its_scales_and_weights(setting: Setting) -> None:
@@ -164,15 +155,6 @@ def test_hidden_markers_do_not_count() -> None:
     other = torch.where(seen[:, :, None] & seen[:, None], each, torch.eye(6, dtype=torch.float64))
     mean = each.mean(0)
     assert differing_factor(hidden, mean, seen) == pytest.approx(differing_factor(other, mean, seen), rel=1e-12)
-
-
-def test_new_noise_is_the_mean_and_what_differs() -> None:
-    """Joint noise moves a marker by its lever arms; without it all rows err alike."""
-    data, scales = built("two markers").tangent_data, built("two markers").scales
-    each, mean = data.noise(scales), data.noise_model.mean_covariance(scales, data.jacobian)
-    factor = differing_factor(each, mean, data.visible)
-    assert factor > 1.001
-    torch.testing.assert_close(robot_problem(data, scales).new_noise, factor * mean, rtol=1e-12, atol=0.0)
 
 
 @pytest.mark.slow
