@@ -22,6 +22,8 @@ from diffeo_calib.cameras.board import BoardPrior
 from diffeo_calib.cameras.images import UNKNOWNS
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
+from diffeo_calib.measurements.csv.files import read_observations, write_measurements
+from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
@@ -112,6 +114,17 @@ def test_the_lens_of_another_camera_is_refused() -> None:
         of_corners(corners, camera=replace(known, unknowns=other))
 
 
+def test_lines_of_an_image_with_other_joints_are_refused(tmp_path: Any) -> None:
+    path = tmp_path / "corners.csv"
+    table = write_measurements(path, data(), TableFormat("mm", "deg", camera_on_tool=True))
+    lines = path.read_text().splitlines()
+    cells = lines[3].split(",")
+    cells[1] = "12.5"
+    path.write_text("\n".join([*lines[:3], ",".join(cells), *lines[4:]]))
+    with pytest.raises(MeasurementError, match=r"image '0'.*line 4"):
+        read_observations(path, table)
+
+
 # --- beside a tracker, and beside a ball in sockets -------------------------------------------------------------------
 
 
@@ -165,3 +178,13 @@ def test_sockets_are_where_they_are() -> None:
         length = float((places[first] - places[first + 1]).norm())
         assert abs(length - 0.05) < 4 * float(std[first : first + 2].norm())
     assert float(std.max()) < 1e-3
+
+
+def test_known_distances_that_are_not_used_are_named() -> None:
+    rows = with_sockets()[1]
+    resting = dc.Measurements.from_sockets(
+        rows.parts[1].q, rows.parts[1].device_names, distances={("0", "1"): 0.05}, distance_std=1e-5
+    )
+    images: Any = camera_arm(60).images(0.1)
+    with pytest.warns(dc.DiffeoCalibWarning, match="distances between sockets"):
+        dc.Observations.joined([images.with_joint_names(rows.joint_names), resting.with_joint_names(rows.joint_names)])

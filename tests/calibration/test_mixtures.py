@@ -26,6 +26,7 @@ from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.measurements.sockets import Sockets
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
 
@@ -161,6 +162,15 @@ def test_rows_in_sockets_join_a_mixture(mixture: dc.Measurements, resting: dc.Me
     other = dc.Measurements.from_sockets(some.q, ["x/0"] * 10, some.joint_names)
     with pytest.raises(MeasurementError, match="the tables differ in sockets;"):
         dc.Measurements.joined([mixture, other])
+
+
+@pytest.mark.filterwarnings("ignore:the place of marker 1 on 'flange'")
+def test_rows_of_another_robot(arm: SimulatedArm, tracked: dc.Measurements, resting: dc.Measurements) -> None:
+    bend = torch.zeros(6, dtype=torch.float64)
+    bend[4] = 0.05
+    other = with_attributes(resting, q=resting.q + bend, sockets=Sockets(resting.sockets.names))
+    with pytest.warns(dc.DiffeoCalibWarning, match="do not fit the robot whose positions were measured"):
+        place(arm.nominal, dc.Measurements.joined([tracked, other]), silent)
 
 
 def test_refused(arm: SimulatedArm, tracked: Any, resting: Any) -> None:

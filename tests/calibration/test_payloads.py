@@ -11,7 +11,9 @@ from product_bank import with_usual_scales
 from table_bank import refused
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.common.errors import DiffeoCalibWarning
+from diffeo_calib.fitting.result import silent
 from diffeo_calib.robots import SimulatedArm
 
 pytestmark = pytest.mark.slow  # several calibrations
@@ -104,3 +106,9 @@ def test_payloads_that_cannot_be(rows: dc.Measurements, result: Any, other: dc.M
         ("row 1: expected a mass of 0 or more, got -2", lambda: rows[:2].with_payload([1.0, -2.0])),
         ("payload", lambda: rows.with_payload([1.0, 2.0])),
     )
+
+
+def test_one_payload_in_all_rows_is_warned_about() -> None:
+    q, points = ARM.measure(14, seed=4)
+    with pytest.warns(DiffeoCalibWarning, match="all rows carry the same payload"):
+        place(ARM.nominal, dc.Measurements(q, points).with_payload(6.0), silent).tangent_data()

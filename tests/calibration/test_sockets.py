@@ -221,6 +221,13 @@ def test_rows_in_a_wrong_socket_are_named(plain: SimulatedArm, some: SocketRows)
         place(plain.nominal, table(some, tuple(names)), silent)
 
 
+@pytest.mark.filterwarnings("ignore:the known distance")
+def test_names_that_say_nothing_are_warned_about(plain: SimulatedArm, some: SocketRows) -> None:
+    names = tuple(some.names[(7 * row) % 36] for row in range(36))
+    with pytest.warns(dc.DiffeoCalibWarning, match="the ball is in no socket"):
+        place(plain.nominal, table(some, names), silent)
+
+
 def test_a_tool_that_never_turns_or_tilts(plain: SimulatedArm, some: SocketRows) -> None:
     def still(q: torch.Tensor) -> torch.Tensor:
         return q + 1e-4 * torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import pytest
 import torch
 from product_bank import Case, calibrated, simulated
+from table_bank import refused
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -92,3 +93,14 @@ def test_transmission_is_what_moves_the_markers(arm: Case) -> None:
         kernel = (1 + away + away**2 / 3) * (-away).exp()  # Matern 5/2
         expected = scales.transmission_amplitude[index] ** 2 * kernel @ deformation.momenta.joint[:, index]
         assert_close(arm.model.transmission(name, values), expected, rtol=1e-9, atol=1e-15)
+
+
+def test_transmission_of_no_joint_or_of_nonsense(arm: Case) -> None:
+    of = arm.model.transmission
+    refused(
+        (r"`joint`: expected waist_joint, shoulder_joint, .*got", lambda: of("elbow", [0.0])),
+        ("`values` has the wrong shape", lambda: of("elbow_joint", 0.3)),
+        (r"1 value\(s\) that are not finite", lambda: of("elbow_joint", [torch.nan])),
+        ("`values` cannot be read as numbers", lambda: of("elbow_joint", "home")),
+    )
+    assert of("elbow_joint", []).shape == (0,)
