@@ -25,6 +25,8 @@ TABLE = ["--position", POSITION, "--length", "mm", "--angle", "deg", "--sep", ";
 ROTATION = ["--rotation", "a,b,c", "--convention", "xyz", "--rotation-angle", "deg"]
 FORMAT = TableFormat("mm", "deg", ";", ",")
 """That of TABLE."""
+NOTE = "arm 7 [left], spring check; serial 4711 é"
+"""Of the fitted model of the site."""
 STAGES = ("nominal", "geometric", "calibrated")
 
 FEW_CONFIGURATIONS = 100

@@ -36,6 +36,11 @@ def some(rows: int, n: int = 2, markers: int = 1, seed: int = 0) -> Measurements
     return Measurements(rng.uniform(-3, 3, (rows, n)), rng.uniform(-2, 2, (rows, markers, 3)))
 
 
+def values(*shape: int, seed: int = 0) -> Tensor:
+    """Normal random numbers."""
+    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator("cpu").manual_seed(seed))
+
+
 def read_table(path: Path, joints: Any, position: Any, table: TableFormat, **how: Any) -> Measurements:
     """Positions or poses in a format; options are those of the columns, and duplicates."""
     duplicates = how.pop("duplicates", "error")
@@ -75,3 +80,8 @@ def warned(call: Callable[..., T], *arguments: Any, **options: Any) -> tuple[T, 
 def says(*parts: str) -> str:
     """Pattern of a message that holds all parts, in any order."""
     return "(?s)" + "".join(f"(?=.*{re.escape(part)})" for part in parts)
+
+
+def in_order(text: str) -> str:
+    """Pattern of a message that holds the parts between " ... " one after another."""
+    return ".*".join(map(re.escape, text.split(" ... ")))

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from golden_bank import usual_scales
+from product_bank import usual_scales
 from simulated_camera import BOARD, CAMERA, CameraArm, camera_arm
 from simulated_head import CAMERA as HEAD_CAMERA
 from simulated_head import CAMERA_AWAY, SeeingHead

@@ -43,19 +43,12 @@ def image(number: int = 0, blur_px: float = 0.6) -> np.ndarray:
     return rendered(boards(8, seed=4)[number], texture(), blur_px=blur_px, seed=number)
 
 
-def pixel_errors(number: int) -> np.ndarray:
-    numbers, pixels = FOUND.corners(image(number))
-    pose = boards(8, seed=4)[number]
-    truth = CAMERA.pixels(pose[None], torch.from_numpy(FOUND.points[numbers])[None])[0].numpy()
-    return pixels - truth
-
-
 # --- corners --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("number", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_corners_are_found_to_hundredths_of_a_pixel(number: int) -> None:
-    errors = pixel_errors(number)
+def test_corners_are_found_to_hundredths_of_a_pixel() -> None:
+    numbers, pixels = FOUND.corners(image())
+    errors = pixels - CAMERA.pixels(boards(8, seed=4)[:1], torch.from_numpy(FOUND.points[numbers])[None])[0].numpy()
     assert len(errors) >= 8
     assert float(np.abs(np.median(errors, 0)).max()) < 0.03
     assert float(np.median(np.abs(errors))) < 0.04
@@ -72,19 +65,18 @@ def test_other_boards_are_found(text: str, corners: int) -> None:
     assert abs(spans[0] / spans[1] - 1) < 0.02
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "charuco:5000x5000:0.03:0.02:DICT_4X4_50",
-        "charuco:5x7",
-        "chess:7x5:0.03",
-        "charuco:5x7:a:b:DICT_5X5_100",
-        "tag:0.1:DICT_9:3",
-    ],
-)
-def test_other_texts_are_refused(text: str) -> None:
-    with pytest.raises(InputError, match="board"):
-        Board.of(text)
+def test_texts_of_boards() -> None:
+    assert len(Board.of("charuco:5x7:0.04:0.03:5X5_100").points) == 24, "a dictionary needs no prefix"
+    for text, message in (
+        ("charuco:5000x5000:0.03:0.02:DICT_4X4_50", "more than 10000 squares"),
+        ("charuco:5x7", "the board: expected"),
+        ("chess:7x5:0.03", "the board: expected"),
+        ("charuco:5x7:a:b:DICT_5X5_100", "the board charuco.*could not convert"),
+        ("tag:0.1:DICT_9:3", "dictionary"),
+        ("charuco:5x7:0.04:0.03:4X4_10O", r"DICT_4X4_100.*got.*4X4_10O"),
+    ):
+        with pytest.raises(InputError, match=message):
+            Board.of(text)
 
 
 def seen_grid(text: str, number: int = 0, squares: bool = False) -> np.ndarray:
@@ -117,10 +109,8 @@ GRID = "aruco:{}:0.05:0.015:DICT_5X5_250{}"
     ("real", "said"),
     [
         (GRID.format("5x4", ":0:right-up"), GRID.format("5x4", "")),
-        (GRID.format("4x5", ":0:right-down"), GRID.format("5x4", "")),
         (GRID.format("3x4", ":0:down-right"), GRID.format("3x4", "")),
         (GRID.format("4x3", ":30:left-up"), GRID.format("4x3", "")),
-        (GRID.format("4x3", ":2:right-down"), GRID.format("4x3", "")),
     ],
 )
 def test_another_layout_is_refused_and_named(real: str, said: str) -> None:
@@ -230,11 +220,12 @@ def test_ctrl_c_among_images_leaves_the_files(folder: Path, command: Command, mo
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
-@pytest.mark.slow
-def test_another_dictionary_is_named(folder: Path) -> None:
+def test_another_dictionary_is_named(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "0.png"), texture()[:230, :290])
+    (tmp_path / "joints.csv").write_text("image,q1\n0.png,1\n")
     other = Board.of(BOARD.replace("DICT_5X5_100", "DICT_4X4_50"))
     with pytest.raises(MeasurementError, match="DICT_5X5"):
-        read_folders([folder], folder / "joints.csv", other)
+        read_folders([tmp_path], tmp_path / "joints.csv", other)
 
 
 def test_images_without_rows_are_refused(folder: Path) -> None:
@@ -283,19 +274,13 @@ def test_any_column_of_file_names_pairs_rows_with_images(folder: Path) -> None:
     assert [(one.name, one.cells) for one in found.used] == [("2.png", ["30"]), ("0.png", ["10"])]
 
 
-def test_a_dictionary_needs_no_prefix_and_an_unknown_one_is_named() -> None:
-    assert len(Board.of("charuco:5x7:0.04:0.03:5X5_100").points) == 24
-    with pytest.raises(InputError, match=r"DICT_4X4_100.*got.*4X4_10O"):
-        Board.of("charuco:5x7:0.04:0.03:4X4_10O")
-
-
 def test_folders_of_two_cameras_become_one_table(tmp_path: Path, command: Command) -> None:
-    seen = {"left": (0, 1, 2), "right": (1, 2, 3)}
+    seen = {"left": (0, 1), "right": (1, 2)}
     for camera, numbers in seen.items():
         (tmp_path / camera).mkdir()
         for k in numbers:
             cv2.imwrite(str(tmp_path / camera / f"{k}.png"), image(k))
-    (tmp_path / "joints.csv").write_text("image,q1\n" + "\n".join(f"{k}.png,{k}" for k in range(4)))
+    (tmp_path / "joints.csv").write_text("image,q1\n" + "\n".join(f"{k}.png,{k}" for k in range(3)))
     folders, out = (tmp_path / "left", tmp_path / "right"), tmp_path / "corners.csv"
     done = command("images", *folders, tmp_path / "joints.csv", "--board", BOARD, "--length", "mm", "-o", out)
     assert done.code == 0, done.err

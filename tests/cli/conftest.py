@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_bank import Command, Outcome, Site, make_site, run_process
+from command_bank import NOTE, Command, Outcome, Site, make_site, run_process
 from commanded_bank import write_columns
 from init_bank import ARM, NAMES, ROWS, Proposed
 from server_bank import Server
+from shared_bank import shared
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -31,7 +32,15 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
 @pytest.fixture(scope="session")
 def fitted(site: Site) -> Outcome:
     """One real fit in a process of its own, with its model."""
-    return run_process(*site.fit(site.csv, site.folder / "model.safetensors"))
+    path = site.folder / "model.safetensors"
+
+    def make() -> tuple[Outcome, bytes]:
+        done = run_process(*site.fit(site.csv, path, "--note", NOTE))
+        return done, path.read_bytes()
+
+    done, content = shared("fitted site", make)
+    path.write_bytes(content)
+    return done
 
 
 @pytest.fixture(scope="session")
@@ -52,8 +61,13 @@ def small_site(tmp_path_factory: pytest.TempPathFactory) -> Site:
 def sound(small_site: Site) -> bytes:
     """A model file of the small site."""
     path = small_site.folder / "sound.safetensors"
-    with pytest.warns(dc.DiffeoCalibWarning, match="10 poses are too few"):
-        dc.save(dc.calibrate(small_site.arm.nominal, small_site.data.rows(slice(10))).model, path)
+
+    def make() -> bytes:
+        with pytest.warns(dc.DiffeoCalibWarning, match="10 poses are too few"):
+            dc.save(dc.calibrate(small_site.arm.nominal, small_site.data.rows(slice(10))).model, path)
+        return path.read_bytes()
+
+    path.write_bytes(shared("sound site", make))
     return path.read_bytes()
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 import runpy
+from collections.abc import Callable
+from functools import partial
 from math import pi
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,8 @@ from diffeo_calib.robots.se3 import transforms
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 MEASURED = ["--position", "x,y,z", "--length", "mm", "--angle", "deg"]
+SEEN = ["--position", "tx,ty,tz", "--rotation", "qx,qy,qz,qw", "--convention", "quat_xyzw", "--camera-on-tool"]
+POSE = "X,Y,Z,RX,RY,RZ"
 
 
 def poses_table(path: Path, commanded: Tensor, found: Tensor, convention: str = "xyz", angle: str = "deg") -> Path:
@@ -40,33 +44,137 @@ def poses_table(path: Path, commanded: Tensor, found: Tensor, convention: str = 
     return write_columns(path, **poses, tx_ty_tz=1e3 * found[:, :3, 3], qw_qx_qy_qz=quaternions)
 
 
-def hand_eye_table(path: Path, convention: str = "xyz", angle: str = "deg", *, camera_on_tool: bool = True) -> Path:
-    return poses_table(path, flange(), seen(flange(), camera_on_tool=camera_on_tool), convention, angle)
+def from_the_tool(path: Path, commanded: Tensor, convention: str = "xyz", angle: str = "deg") -> Path:
+    return poses_table(path, commanded, seen(commanded, camera_on_tool=True), convention, angle)
 
 
-@pytest.mark.parametrize(
-    ("convention", "angle", "camera_on_tool"),
-    [("xyz", "deg", True), ("ZYX", "deg", False), ("rotvec", "rad", True), ("quat_wxyz", "rad", False)],
-)
-def test_init_finds_what_the_numbers_mean(
-    convention: str, angle: str, camera_on_tool: bool, tmp_path: Path, init: Any
-) -> None:
-    table = hand_eye_table(tmp_path / "t.csv", convention, angle, camera_on_tool=camera_on_tool)
-    found, _ = init(table)
-    assert found["robot-pose"].endswith(f"={convention}")
-    assert found["robot-pose"].startswith("X,Y,Z,")
-    assert [found[name] for name in ("convention", "rotation", "length")] == ["quat_xyzw", "qx,qy,qz,qw", "mm"]
-    assert found["angle"] == angle or convention.startswith("quat")
-    assert found.get("camera-on-tool", False) is camera_on_tool
+def hand_eye_table(path: Path) -> Path:
+    return from_the_tool(path, flange())
 
 
-def test_init_finds_poses_in_inches(tmp_path: Path, init: Any) -> None:
-    table = hand_eye_table(tmp_path / "t.csv")
-    header, *rows = cells(table)
+def fixed_camera(path: Path, convention: str) -> Path:
+    return poses_table(path, flange(), seen(flange(), camera_on_tool=False), convention)
+
+
+# --- what `init` finds ---
+
+
+def places(rows: int = 20, axes: int = 3, size: float = 1.0) -> Tensor:
+    return size * torch.rand(rows, axes, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+
+def in_inches(path: Path) -> Path:
+    header, *rows = cells(hand_eye_table(path))
     lines = [header, *([*(str(float(cell) / 25.4) for cell in row[:3]), *row[3:]] for row in rows)]
-    table.write_text("\n".join(map(",".join, lines)) + "\n", encoding="utf-8")
-    found, _ = init(table)
-    assert (found["joint-length"], found["length"], found["robot-pose"]) == ("inch", "mm", "X,Y,Z,RX,RY,RZ=xyz")
+    path.write_text("\n".join(map(",".join, lines)) + "\n", encoding="utf-8")
+    return path
+
+
+def turned_about_z(path: Path) -> Path:
+    """Small turns about x: the order of the angles does not matter."""
+    commanded = flange()
+    axes = torch.stack([0 * commanded[:, 0, 3], 0 * commanded[:, 0, 3], drawn(len(commanded), seed=4)], 1)
+    commanded[:, :3, :3] = turned(axes) @ turned(1e-4 * drawn(len(commanded), 3, seed=5))
+    return from_the_tool(path, commanded)
+
+
+def at_one_place(path: Path) -> Path:
+    """No motion of the flange has a shift, which sets the scale of the others."""
+    commanded = flange()
+    commanded[:, :3, 3] = commanded[0, :3, 3]
+    return from_the_tool(path, commanded)
+
+
+def without_turns(path: Path) -> Path:
+    """Every convention explains the rows."""
+    commanded = flange()
+    commanded[:, :3, :3] = commanded[0, :3, :3]
+    return from_the_tool(path, commanded, "rotvec")
+
+
+def rotations_first(path: Path) -> Path:
+    """With a row without a board."""
+    commanded, found = flange(), seen(flange(), camera_on_tool=True)
+    turns = [rotation_numbers(own[:, :3, :3], *how) for own, how in ((commanded, ("xyz",)), (found, ("quat_xyzw",)))]
+    poses = {"RX_RY_RZ": turns[0].rad2deg(), "X_Y_Z": 1e3 * commanded[:, :3, 3]}
+    write_columns(path, **poses, qx_qy_qz_qw=turns[1], tx_ty_tz=1e3 * found[:, :3, 3])
+    lines = path.read_text(encoding="utf-8").splitlines()
+    lines[3] = ",".join([*lines[3].split(",")[:6], *[""] * 7])
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def in_opencv(path: Path, found: Tensor) -> Path:
+    """A fixed camera, and rotation vectors of both, m and rad."""
+    columns = {}
+    for place, turn, own in (("TCP_{}", "TCP_r{}", flange()), ("tvec_{}", "rvec_{}", found)):
+        columns["|".join(map(place.format, "xyz"))] = own[:, :3, 3]
+        columns["|".join(map(turn.format, "xyz"))] = rotation_numbers(own[:, :3, :3], "rotvec")
+    return write_columns(path, **columns)
+
+
+def noisy(path: Path, noise: float = 0.0, wrong: tuple[int, ...] = (), flipped: tuple[int, ...] = ()) -> Path:
+    """Noise of a degree makes radians that are read as degrees likelier: all turns are small, and what they leave.
+
+    Rows are off by 30 degrees and 10 cm, or show the board from its other end.
+    """
+    found = seen(flange(), camera_on_tool=False)
+    found[:, :3, :3] = turned(noise * drawn(len(found), 3, seed=11)) @ found[:, :3, :3]
+    off = list(wrong)
+    found[off, :3, :3] = turned(torch.full((1, 3), 0.3, dtype=torch.float64)) @ found[off, :3, :3]
+    found[off, :3, 3] += 0.1
+    half = transforms(turned(torch.tensor([[0.0, 0.0, pi]])), torch.tensor([[0.2, 0.15, 0.0]]))
+    found[list(flipped)] = found[list(flipped)] @ half
+    return in_opencv(path, found)
+
+
+def of_places(path: Path, size: float = 1.0, per_metre: float = 1.0, measured: float = 1.0) -> Path:
+    own = places(size=size)
+    return write_columns(path, cmdx_cmdy_cmdz=per_metre * own, x_y_z=measured * bent(own))
+
+
+def of_two_markers(path: Path) -> Path:
+    own = places()
+    markers = {"left_x|left_y|left_z": bent(own), "right_x|right_y|right_z": bent(own) + 0.1}
+    return write_columns(path, cmdx_cmdy_cmdz=own, **markers)
+
+
+TOOL = {"rotation": "qx,qy,qz,qw", "convention": "quat_xyzw", "length": "mm", "camera-on-tool": True}
+FIXED = {**TOOL, "camera-on-tool": None}
+QUATERNIONS = {**FIXED, "robot-pose": "X,Y,Z,q0,q1,q2,q3=quat_wxyz"}
+SOME = {"robot-pose": f"{POSE}=xyz"}
+OPENCV = {"robot-pose": "TCP_x,TCP_y,TCP_z,TCP_rx,TCP_ry,TCP_rz=rotvec", "angle": "rad", "convention": "rotvec"}
+OPENCV |= {"rotation": "rvec_x,rvec_y,rvec_z", "rotation-angle": "rad"}
+TWO = {"position": ["left_x,left_y,left_z", "right_x,right_y,right_z"], "length": "m"}
+OPEN = {"robot-pose": None, "convention": None, "rotation-angle": None}
+EITHER = [f'# robot-pose = "{POSE}={name}"' for name in ("xyz", "XYZ")]
+IN_INCHES = {"joint-length": "inch", "length": "mm"}
+READ: dict[str, tuple[Callable[[Path], Path], dict[str, Any], list[str]]] = {
+    "fixed angles": (hand_eye_table, {**TOOL, **SOME, "angle": "deg"}, []),
+    "Euler angles": (partial(fixed_camera, convention="ZYX"), {**FIXED, "robot-pose": f"{POSE}=ZYX"}, []),
+    "quaternions": (partial(fixed_camera, convention="quat_wxyz"), QUATERNIONS, []),
+    "inches": (in_inches, {**SOME, **IN_INCHES}, []),
+    "turned about one axis": (turned_about_z, {}, EITHER),
+    "turned at one place": (at_one_place, {}, [f'robot-pose = "{POSE}=xyz"']),  # among others
+    "never turned": (without_turns, OPEN, []),
+    "rotations first": (rotations_first, {**SOME, "rotation": "qx,qy,qz,qw", "camera-on-tool": True}, []),
+    "two wrong rows": (partial(noisy, wrong=(5, 14)), OPENCV, []),
+    "a degree and wrong rows": (partial(noisy, noise=0.017, wrong=(5, 6)), OPENCV, []),
+    "flipped boards": (partial(noisy, flipped=(4, 13)), OPENCV, []),
+    "two markers": (of_two_markers, TWO, []),
+    "5 mm, or 5 m": (partial(of_places, size=5.0), {"length": None}, ['# length = "m"', '# length = "mm"']),
+    "metres": (partial(of_places, size=15.0, measured=1e3), {"joint-length": "m", "length": "mm"}, []),
+    "15 inches": (partial(of_places, size=0.381, per_metre=1000 / 25.4, measured=1e3), IN_INCHES, []),
+}
+"""What is in a table -> how it is written; entries, None for one that is missing or open; texts."""
+
+
+@pytest.mark.parametrize("what", READ)
+def test_init_finds_what_the_numbers_mean(what: str, tmp_path: Path, init: Any) -> None:
+    write, expected, texts = READ[what]
+    found, text = init(write(tmp_path / "t.csv"))
+    assert {name: found.get(name) for name in expected} == expected
+    assert all(words in text for words in texts)
 
 
 @pytest.mark.parametrize(
@@ -79,63 +187,29 @@ def test_init_finds_poses_in_inches(tmp_path: Path, init: Any) -> None:
         ("x_ist y_ist z_ist x_soll y_soll z_soll", "x_soll"),
         ("cam_x cam_y cam_z x y z", "x"),
         ("board_x board_y board_z tcp_x tcp_y tcp_z", "tcp_x"),
-        ("target_TCP_pose_0 target_TCP_pose_1 target_TCP_pose_2 target_TCP_pose_3 target_TCP_pose_4 target_TCP_pose_5 "
-         "actual_TCP_pose_0 actual_TCP_pose_1 actual_TCP_pose_2 actual_TCP_pose_3 actual_TCP_pose_4 actual_TCP_pose_5 "
-         "x y z", "actual_TCP_pose_0"),
+        (" ".join(f"{own}_TCP_pose_{k}" for own in ("target", "actual") for k in range(6)) + " x", "actual_TCP_pose_0"),
         (" ".join(f"O_T_EE_{k}" for k in range(16)) + " tag_x tag_y tag_z", "O_T_EE_12"),
     ],
-)  # fmt: skip
+)
 def test_whose_columns_are_the_machine_s(names: str, machine: str, tmp_path: Path) -> None:
     pose = transforms(turned(drawn(4, 3, seed=2)), drawn(4, 3, seed=3)).mT.flatten(1)  # by columns
     values = torch.cat([pose if "O_T_EE" in names else drawn(4, 0, seed=1), drawn(4, 30, seed=1)], 1)
-    table = write_columns(tmp_path / "t.csv", **{"|".join(names.split()): values[:, : len(names.split())]})
+    own = names.split()
+    table = write_columns(tmp_path / "t.csv", **{"|".join(own): values[:, : len(own)]})
     found = commanded_poses.poses_in(guess_sheet(table))
     assert commanded_poses.machine_of(found).place[0] == machine
 
 
 def test_a_robot_whose_joints_the_table_lacks(tmp_path: Path, init: Any) -> None:
-    table = hand_eye_table(tmp_path / "t.csv")
     SimulatedArm().write_urdf(tmp_path / "arm.urdf")
-    found, text = init(table, tmp_path / "arm.urdf")
+    found, text = init(hand_eye_table(tmp_path / "t.csv"), tmp_path / "arm.urdf")
     assert "not used, no column is named after its joints" in text
-    assert found["robot-pose"] == "X,Y,Z,RX,RY,RZ=xyz"
-
-
-@pytest.mark.slow
-def test_hand_eye_in_two_commands(tmp_path: Path, command: Command) -> None:
-    table = hand_eye_table(tmp_path / "t.csv")
-    assert command("init", table, "-o", tmp_path / "c.toml").code == 0
-    done = command(
-        "fit", tmp_path / "c.toml", "--holdout", "0", "--json", tmp_path / "f.json", "--report", tmp_path / "r"
-    )
-    assert done.code == 0, done.error
-    assert "camera in the frame of" in (tmp_path / "r").read_text(encoding="utf-8")
-    for name, link, truth in (("camera", "in_tip", CAMERA), ("board", "in_base", BOARD)):
-        found = json.loads((tmp_path / "f.json").read_text(encoding="utf-8"))["results"]["hand_eye"][f"{name}_{link}"]
-        away = torch.tensor(found["pose_m"], dtype=torch.float64)[:3, 3] - truth[:3, 3]
-        assert bool((away.abs() < 4 * torch.tensor(found["position_std_m"])).all())
-        assert float(away.norm()) < 1e-3
-    model = tmp_path / "t.safetensors"
-    done = command("export", model, "--camera", tmp_path / "camera")
-    assert done.code == 0, done.error
-    text = (tmp_path / "camera" / "easy_handeye2.calib").read_text(encoding="utf-8")
-    assert 'calibration_type: "eye_in_hand"' in text
-    x = float(text.partition("x: ")[2].partition("\n")[0])
-    assert x == pytest.approx(float(CAMERA[0, 3]), abs=1e-3)
-    # the same poses again: predicted and planned under the names of the table, and corrected by little
-    assert command("predict", model, table, "-o", tmp_path / "p.csv").code == 0
-    assert command("plan", model, "-n", "3", "-o", tmp_path / "n.csv").code == 0
-    done = command("correct", model, table, "-o", tmp_path / "d.csv")
-    assert done.code == 0, done.error
-    (header, *before), (_, *after) = cells(table), cells(tmp_path / "d.csv")
-    for one, other in zip(before, after, strict=True):
-        assert [float(cell) for cell in other[:6]] == pytest.approx([float(cell) for cell in one[:6]], abs=0.5)
-    assert cells(tmp_path / "n.csv")[0] == [*header[:6], "rank"]
+    assert found["robot-pose"] == f"{POSE}=xyz"
 
 
 def test_places_measured_in_a_plane(tmp_path: Path, init: Any) -> None:
     """The third name is no column but 0; a table that counts its columns from 0 is no such table."""
-    commanded = torch.rand(30, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    commanded = places(30, 2)
     measured = commanded + 1e-3 * (4 * commanded.flip(1)).sin() + 2e-5 * drawn(30, 2, seed=2)
     table = write_columns(tmp_path / "t.csv", **{"cmdx_cmdy": 1e3 * commanded, "measx_measy": 1e3 * measured})
     found, _ = init(table)
@@ -147,164 +221,80 @@ def test_places_measured_in_a_plane(tmp_path: Path, init: Any) -> None:
     with pytest.raises(MeasurementError, match=r"no column \['0'\]"):
         dc.read_measurements(table, machine, ["0", "measx", "measy"], length="mm", angle="deg")
     table.write_text("q,u,v,x,y\n10,.2,.3,.4,.5\n20,,,.6,.7\n30,.4,.5,,\n")  # hidden where u and v, or x and y, are
-    places = [["u", "v", "0"], ["x", "y", "0"]]
-    seen = dc.read_measurements(table, np.array(["q"]), places, length="m", angle="deg").points
-    assert seen.nan_to_num(-1.0).flatten(1).tolist() == [
+    bodies = [["u", "v", "0"], ["x", "y", "0"]]
+    points = dc.read_measurements(table, np.array(["q"]), bodies, length="m", angle="deg").points
+    hidden = [-1] * 3
+    assert points.nan_to_num(-1.0).flatten(1).tolist() == [
         [0.2, 0.3, 0, 0.4, 0.5, 0],
-        [-1] * 3 + [0.6, 0.7, 0],
-        [0.4, 0.5, 0] + [-1] * 3,
+        [*hidden, 0.6, 0.7, 0],
+        [0.4, 0.5, 0, *hidden],
     ]
 
 
-@pytest.mark.slow
-def test_the_error_field_of_a_gantry(tmp_path: Path, command: Command, init: Any) -> None:
-    commanded = torch.rand(80, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    measured = bent(commanded) + 2e-5 * drawn(80, 3, seed=2)
-    table = write_columns(tmp_path / "t.csv", **{"cmdx_cmdy_cmdz": 1e3 * commanded, "x_y_z": 1e3 * measured})
-    init(table)
-    assert 'robot-pose = "cmdx,cmdy,cmdz"' in (tmp_path / "c.toml").read_text(encoding="utf-8")
-    done = command("fit", tmp_path / "c.toml", "--report", tmp_path / "r.html")
-    assert done.code == 0, done.error
-    report = (tmp_path / "r.html").read_text(encoding="utf-8")
-    assert "Why" in report
-    assert "Gravity" not in report
-    alone = write_columns(tmp_path / "commanded.csv", x_y_z=1e3 * commanded[:5])
-    done = command("predict", tmp_path / "t.safetensors", alone, "--robot-pose", "x,y,z", "-o", tmp_path / "p.csv")
-    assert done.code == 0, done.error
-    assert cells(tmp_path / "p.csv")[0][:6] == ["x", "y", "z", "predicted_x", "predicted_y", "predicted_z"]
-    done = command(
-        "export", tmp_path / "t.safetensors", "--field", tmp_path / "f.csv", "--grid", "4x4x2", "--length", "m"
-    )
-    assert done.code == 0, done.error
-    field = torch.tensor([[float(cell) for cell in row] for row in cells(tmp_path / "f.csv")[1:]])
-    assert field.shape == (32, 9)
-    place, add, std = field.double().split(3, 1)
-    assert without_frames(bent(place + add), place) < 0.15 * without_frames(bent(place), place)
-    model = dc.load(tmp_path / "t.safetensors")
-    expected = model.predict(place, noise=False)[1][:, 0].diagonal(dim1=1, dim2=2).sqrt()
-    assert_close(std, expected, rtol=0.05, atol=1e-7)  # the device stands upright
+# --- hand-eye ---
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--robot", "arm.urdf"], "--robot, --base or --tip beside --robot-pose"),
-        (["--joints", "X,Y,Z,RX,RY,RZ"], "--joints beside --robot-pose"),
-    ],
-)
-def test_options_that_exclude_each_other(options: list[str], message: str, tmp_path: Path, command: Command) -> None:
-    table = hand_eye_table(tmp_path / "t.csv")
-    (tmp_path / "arm.urdf").write_text("<robot/>", encoding="utf-8")
-    given = ["--robot-pose", "X,Y,Z,RX,RY,RZ=xyz", "--length", "mm", "--angle", "deg", "--position", "tx,ty,tz"]
-    words = [str(tmp_path / word) if word.endswith(".urdf") else word for word in options]
-    done = command("fit", table, *given, *words, "-o", tmp_path / "m")
-    assert done.code == 1
-    assert message in done.error
-
-
-def test_a_size_that_is_a_machine_in_two_units(tmp_path: Path, init: Any) -> None:
-    """Within 5 mm, or 5 m: the user says which."""
-    commanded = 5.0 * torch.rand(20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    table = write_columns(tmp_path / "t.csv", cmdx_cmdy_cmdz=commanded, x_y_z=bent(commanded))
-    _, text = init(table)
-    assert '# length = "m"' in text
-    assert '# length = "mm"' in text
-
-
-@pytest.mark.parametrize(("per_metre", "unit"), [(1.0, "m"), (1000 / 25.4, "inch")])
-def test_what_was_measured_tells_the_size_of_the_machine(
-    per_metre: float, unit: str, tmp_path: Path, init: Any
-) -> None:
-    commanded = 15.0 / per_metre * torch.rand(20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    table = write_columns(tmp_path / "t.csv", cmdx_cmdy_cmdz=per_metre * commanded, x_y_z=1e3 * bent(commanded))
-    found, _ = init(table)
-    assert (found["joint-length"], found["length"]) == (unit, "mm")
-
-
-def test_a_fixed_camera_and_columns_of_opencv(tmp_path: Path, command: Command, init: Any) -> None:
-    commanded = flange()
-    measured = seen(commanded, camera_on_tool=False)
-    turns = [rotation_numbers(own[:, :3, :3], "rotvec") for own in (commanded, measured)]
-    poses = {"TCP_x|TCP_y|TCP_z": commanded[:, :3, 3], "TCP_rx|TCP_ry|TCP_rz": turns[0]}
-    poses |= {"tvec_x|tvec_y|tvec_z": measured[:, :3, 3], "rvec_x|rvec_y|rvec_z": turns[1]}
-    table = write_columns(tmp_path / "t.csv", **poses)
-    _, text = init(table)
-    assert 'rotation = "rvec_x,rvec_y,rvec_z"' in text
-    done = command("fit", tmp_path / "c.toml", "--holdout", "0", "--json", tmp_path / "f.json")
-    assert done.code == 0, done.error
-    found = json.loads((tmp_path / "f.json").read_text(encoding="utf-8"))["results"]["hand_eye"]
-    for name, truth in (("camera_in_base", BOARD), ("board_in_tip", CAMERA)):
+def check_hand_eye(path: Path, **truths: Tensor) -> None:
+    """Transforms of `fit --json`, to their deviations."""
+    found = json.loads(path.read_text(encoding="utf-8"))["results"]["hand_eye"]
+    for name, truth in truths.items():
         away = torch.tensor(found[name]["pose_m"], dtype=torch.float64)[:3, 3] - truth[:3, 3]
         assert bool((away.abs() < 4 * torch.tensor(found[name]["position_std_m"])).all())
+        assert float(away.norm()) < 1e-3
 
 
-def test_two_markers_of_a_machine_with_commanded_places(tmp_path: Path, init: Any) -> None:
-    commanded = torch.rand(20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    markers = {"left_x|left_y|left_z": bent(commanded), "right_x|right_y|right_z": bent(commanded) + 0.1}
-    table = write_columns(tmp_path / "t.csv", **{"cmdx_cmdy_cmdz": commanded, **markers})
-    found, _ = init(table)
-    assert found["position"] == ["left_x,left_y,left_z", "right_x,right_y,right_z"]
-    assert found["length"] == "m"
+@pytest.mark.slow
+@pytest.mark.usefixtures("given_scales")
+def test_hand_eye_in_two_commands(tmp_path: Path, command: Command) -> None:
+    """And the same poses again: predicted and planned under the names of the table, and corrected by little."""
+    table, model, out = hand_eye_table(tmp_path / "t.csv"), tmp_path / "t.safetensors", tmp_path / "f.json"
+    assert command("init", table, "-o", tmp_path / "c.toml").code == 0
+    done = command("fit", tmp_path / "c.toml", "--holdout", "0", "--json", out, "--report", tmp_path / "r")
+    assert done.code == 0, done.error
+    assert "camera in the frame of" in (tmp_path / "r").read_text(encoding="utf-8")
+    check_hand_eye(out, camera_in_tip=CAMERA, board_in_base=BOARD)
+    done = command("export", model, "--camera", tmp_path / "camera")
+    assert done.code == 0, done.error
+    text = (tmp_path / "camera" / "easy_handeye2.calib").read_text(encoding="utf-8")
+    assert 'calibration_type: "eye_in_hand"' in text
+    x = float(text.partition("x: ")[2].partition("\n")[0])
+    assert x == pytest.approx(float(CAMERA[0, 3]), abs=1e-3)
+    assert command("predict", model, table, "-o", tmp_path / "p.csv").code == 0
+    assert command("plan", model, "-n", "3", "-o", tmp_path / "n.csv").code == 0
+    done = command("correct", model, table, "-o", tmp_path / "d.csv")
+    assert done.code == 0, done.error
+    (header, *before), (_, *after) = cells(table), cells(tmp_path / "d.csv")
+    for one, other in zip(before, after, strict=True):
+        assert [float(cell) for cell in other[:6]] == pytest.approx([float(cell) for cell in one[:6]], abs=0.5)
+    assert cells(tmp_path / "n.csv")[0] == [*header[:6], "rank"]
+    written = []  # a tool is a rotation vector whatever the poses are, and commands by default as the poses
+    for convention, options in (("xyz", []), ("rotvec", ["--convention", "rotvec", "--rotation-angle", "deg"])):
+        tool = ["--tool", "0,0,100,20,30,40", *options]
+        assert command("correct", model, table, *tool, "-o", tmp_path / "c.csv").code == 0
+        header, *rows = cells(tmp_path / "c.csv")
+        at = header.index("command_z") + 1
+        turns = [[float(cell) for cell in row[at : at + 3]] for row in rows]
+        written.append(rotation_matrices(turns, convention, angle="deg"))
+    assert_close(*written, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize(("stated", "angle"), [("XYZ", "deg"), ("xyz", "rad"), ("rotvec", "deg")])
-def test_poses_in_another_convention_are_refused_with_the_right_one(
-    stated: str, angle: str, tmp_path: Path, command: Command
-) -> None:
-    table = hand_eye_table(tmp_path / "t.csv")
-    measured = ["--position", "tx,ty,tz", "--rotation", "qx,qy,qz,qw", "--convention", "quat_xyzw", "--camera-on-tool"]
-    pose = ["--robot-pose", f"X,Y,Z,RX,RY,RZ={stated}", "--length", "mm", "--angle", angle]
-    done = command("fit", table, *pose, *measured, "-o", tmp_path / "m")
-    assert done.code == 1
-    assert "the commanded poses fit with --robot-pose X,Y,Z,RX,RY,RZ=xyz --angle deg" in done.err
+@pytest.mark.usefixtures("given_scales")
+def test_a_fixed_camera_and_columns_of_opencv(tmp_path: Path, command: Command, init: Any) -> None:
+    init(in_opencv(tmp_path / "t.csv", seen(flange(), camera_on_tool=False)))
+    done = command("fit", tmp_path / "c.toml", "--holdout", "0", "--json", tmp_path / "f.json")
+    assert done.code == 0, done.error
+    check_hand_eye(tmp_path / "f.json", camera_in_base=BOARD, board_in_tip=CAMERA)
 
 
-def test_conventions_that_the_rows_do_not_tell_apart(tmp_path: Path, init: Any) -> None:
-    """Turns about z, small ones about x: the order of the angles does not matter."""
-    commanded = flange()
-    axes = torch.stack([0 * commanded[:, 0, 3], 0 * commanded[:, 0, 3], drawn(len(commanded), seed=4)], 1)
-    commanded[:, :3, :3] = turned(axes) @ turned(1e-4 * drawn(len(commanded), 3, seed=5))
-    table = poses_table(tmp_path / "t.csv", commanded, seen(commanded, camera_on_tool=True))
-    _, text = init(table)
-    assert '# robot-pose = "X,Y,Z,RX,RY,RZ=xyz"' in text
-    assert '# robot-pose = "X,Y,Z,RX,RY,RZ=XYZ"' in text
-
-
-@pytest.mark.parametrize(
-    ("text", "name", "message"),
-    [
-        (None, "f", r"'own.py' cannot be read \(No such file or directory\)"),
-        ("1 +", "f", "'own.py' does not run: got SyntaxError"),
-        ("f = 1 / 0", "f", "'own.py' does not run: got ZeroDivisionError"),
-        ("f = None", "f", "the file 'own.py': expected a function f"),
-        ("def f(q): return q @ q", "f", "own.py:f of 5 rows: got RuntimeError"),
-        ("def f(q): return q[:, :1].expand(-1, 4)", "f", r"returns: expected places \(5, k\).* got \(5, 4\)"),
-        ("def f(q): return q[:4]", "f", r"returns: expected places \(5, k\).* got \(4, 2\)"),
-        ("def f(q): return 1.0", "f", r"returns: expected places \(5, k\).* got \(\)"),
-        ("def f(q): return q[0]", "f", r"returns: expected places \(5, k\).* got \(2,\)"),
-        ("def f(q): return (q - q[2:3]).log()", "f", "of row .*2.*: expected finite numbers"),
-    ],
-)
-def test_functions_that_are_none(
-    text: str | None, name: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    joints._module.cache_clear()
-    if text is not None:
-        (tmp_path / "own.py").write_text(text, encoding="utf-8")
-    with pytest.raises(MeasurementError, match=message):
-        PoseColumns.of(f"a,b=own.py:{name}").poses(drawn(5, 2, seed=0))
-
-
+@pytest.mark.usefixtures("given_scales")
 def test_poses_of_a_tool_that_never_tilts(tmp_path: Path, command: Command) -> None:
     """The camera's place along the axis is open, which is said, and the next poses tilt."""
     commanded = flange()
     turn = torch.stack([*torch.zeros(2, len(commanded), dtype=torch.float64), drawn(len(commanded), seed=4)], 1)
     commanded[:, :3, :3] = turned(turn) @ torch.tensor(DOWN, dtype=torch.float64)
-    table = poses_table(tmp_path / "t.csv", commanded, seen(commanded, camera_on_tool=True), "rotvec", "rad")
-    measured = ["--position", "tx,ty,tz", "--rotation", "qx,qy,qz,qw", "--convention", "quat_xyzw", "--camera-on-tool"]
-    pose = ["--robot-pose", "X,Y,Z,RX,RY,RZ=rotvec", "--length", "mm", "--angle", "rad"]
-    done = command("fit", table, *pose, *measured, "-o", tmp_path / "m")
+    table = from_the_tool(tmp_path / "t.csv", commanded, "rotvec", "rad")
+    pose = ["--robot-pose", f"{POSE}=rotvec", "--length", "mm", "--angle", "rad"]
+    done = command("fit", table, *pose, *SEEN, "-o", tmp_path / "m")
     assert done.code in (0, 2), done.error
     assert re.search(r"is known to \d+ mm only: turn the tool about several axes", done.err)
     assert command("plan", tmp_path / "m", "-n", "4", "-o", tmp_path / "n.csv").code == 0
@@ -314,46 +304,68 @@ def test_poses_of_a_tool_that_never_tilts(tmp_path: Path, command: Command) -> N
     assert float((z @ z.mT).min()) < 0.97
 
 
-def test_rotations_before_places_and_rows_without_a_board(tmp_path: Path, init: Any) -> None:
-    commanded = flange()
-    found = seen(commanded, camera_on_tool=True)
-    turns = [rotation_numbers(own[:, :3, :3], *how) for own, how in ((commanded, ("xyz",)), (found, ("quat_xyzw",)))]
-    poses = {"RX_RY_RZ": turns[0].rad2deg(), "X_Y_Z": 1e3 * commanded[:, :3, 3]}
-    table = write_columns(tmp_path / "t.csv", **poses, qx_qy_qz_qw=turns[1], tx_ty_tz=1e3 * found[:, :3, 3])
-    lines = table.read_text(encoding="utf-8").splitlines()
-    lines[3] = ",".join([*lines[3].split(",")[:6], *[""] * 7])
-    table.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    proposed, _ = init(table)
-    assert (proposed["robot-pose"], proposed["rotation"]) == ("X,Y,Z,RX,RY,RZ=xyz", "qx,qy,qz,qw")
-    assert proposed["camera-on-tool"]
+@pytest.mark.parametrize(
+    ("pose", "options", "message"),
+    [
+        *(
+            (f"{POSE}={convention}", ["--angle", angle], f"poses fit with --robot-pose {POSE}=xyz --angle deg")
+            for convention, angle in (("XYZ", "deg"), ("xyz", "rad"))
+        ),
+        (f"{POSE}=xyz", ["--angle", "deg", "--robot", "t.csv"], "--robot, --base or --tip beside --robot-pose"),
+        (f"{POSE}=xyz", ["--angle", "deg", "--joints", POSE], "--joints beside --robot-pose"),
+    ],
+)
+def test_poses_that_are_refused(pose: str, options: list[str], message: str, command: Command, tmp_path: Path) -> None:
+    table = hand_eye_table(tmp_path / "t.csv")
+    given = ["--robot-pose", pose, "--length", "mm", *(table if word == "t.csv" else word for word in options), *SEEN]
+    done = command("fit", table, *given, "-o", tmp_path / "m")
+    assert done.code == 1
+    assert message in done.err
 
 
-def test_a_flange_that_turns_at_one_place(tmp_path: Path, init: Any) -> None:
-    """No motion of the flange has a shift, which sets the scale of the others."""
-    commanded = flange()
-    commanded[:, :3, 3] = commanded[0, :3, 3]
-    table = poses_table(tmp_path / "t.csv", commanded, seen(commanded, camera_on_tool=True))
-    assert 'robot-pose = "X,Y,Z,RX,RY,RZ=xyz"' in init(table)[1]  # among others: these rows do not tell
+# --- machines that err ---
+
+
+@pytest.mark.slow
+def test_the_error_field_of_a_gantry(tmp_path: Path, command: Command, init: Any) -> None:
+    commanded = places(80)
+    measured = bent(commanded) + 2e-5 * drawn(80, 3, seed=2)
+    init(write_columns(tmp_path / "t.csv", **{"cmdx_cmdy_cmdz": 1e3 * commanded, "x_y_z": 1e3 * measured}))
+    done = command("fit", tmp_path / "c.toml", "--report", tmp_path / "r.html")
+    assert done.code == 0, done.error
+    report = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "Why" in report
+    assert "Gravity" not in report
+    alone = write_columns(tmp_path / "commanded.csv", x_y_z=1e3 * commanded[:5])
+    done = command("predict", tmp_path / "t.safetensors", alone, "--robot-pose", "x,y,z", "-o", tmp_path / "p.csv")
+    assert done.code == 0, done.error
+    assert cells(tmp_path / "p.csv")[0][:6] == ["x", "y", "z", "predicted_x", "predicted_y", "predicted_z"]
+    written = ["--field", tmp_path / "f.csv", "--grid", "4x4x2", "--length", "m"]
+    assert command("export", tmp_path / "t.safetensors", *written).code == 0
+    field = torch.tensor([[float(cell) for cell in row] for row in cells(tmp_path / "f.csv")[1:]])
+    assert field.shape == (32, 9)
+    place, add, std = field.double().split(3, 1)
+    assert without_frames(bent(place + add), place) < 0.15 * without_frames(bent(place), place)
+    expected = dc.load(tmp_path / "t.safetensors").predict(place, noise=False)[1][:, 0].diagonal(dim1=1, dim2=2).sqrt()
+    assert_close(std, expected, rtol=0.05, atol=1e-7)  # the device stands upright
 
 
 def slides(z: float) -> tuple[Tensor, Tensor]:
     """Places that two slides of a machine went to, at a height, and where it was: it sinks along x, m."""
-    places = torch.rand(40, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    places[:, 2] = z
-    measured = bent(places) + 2e-5 * drawn(40, 3, seed=2)
-    measured[:, 2] += 3e-4 * (4.0 * places[:, 0]).sin()
-    return places, measured
+    went = places(40)
+    went[:, 2] = z
+    measured = bent(went) + 2e-5 * drawn(40, 3, seed=2)
+    measured[:, 2] += 3e-4 * (4.0 * went[:, 0]).sin()
+    return went, measured
 
 
 def test_a_slide_that_stood_still_is_corrected(tmp_path: Path, command: Command) -> None:
-    places, measured = slides(0.1)
-    table = write_columns(tmp_path / "t.csv", cmdx_cmdy_cmdz=1e3 * places, x_y_z=1e3 * measured)
-    pose = ["--robot-pose", "cmdx,cmdy,cmdz", *MEASURED]
-    done = command("fit", table, *pose, "--holdout", "0", "-o", tmp_path / "m.safetensors")
+    went, measured = slides(0.1)
+    table, model = tmp_path / "t.csv", tmp_path / "m.safetensors"
+    write_columns(table, cmdx_cmdy_cmdz=1e3 * went, x_y_z=1e3 * measured)
+    done = command("fit", table, "--robot-pose", "cmdx,cmdy,cmdz", *MEASURED, "--holdout", "0", "-o", model)
     assert done.code in (0, 3), done.error
-    done = command(
-        "export", tmp_path / "m.safetensors", "--field", tmp_path / "f.csv", "--grid", "5x3x2", "--length", "mm"
-    )
+    done = command("export", model, "--field", tmp_path / "f.csv", "--grid", "5x3x2", "--length", "mm")
     assert done.code == 0, done.error
     header, *rows = cells(tmp_path / "f.csv")
     added = torch.tensor([float(row[header.index("add_z [mm]")]) for row in rows])
@@ -361,8 +373,8 @@ def test_a_slide_that_stood_still_is_corrected(tmp_path: Path, command: Command)
 
 
 def test_a_table_with_two_slides_is_corrected_where_it_can_move(tmp_path: Path, command: Command, init: Any) -> None:
-    places, measured = slides(0.0)
-    table = write_columns(tmp_path / "t.csv", cmdx_cmdy=1e3 * places[:, :2], x_y_z=1e3 * measured)
+    went, measured = slides(0.0)
+    table = write_columns(tmp_path / "t.csv", cmdx_cmdy=1e3 * went[:, :2], x_y_z=1e3 * measured)
     assert init(table)[0]["robot-pose"] == "cmdx,cmdy"
     done = command("fit", tmp_path / "c.toml", "--holdout", "0")
     assert done.code in (0, 3), done.error
@@ -371,7 +383,7 @@ def test_a_table_with_two_slides_is_corrected_where_it_can_move(tmp_path: Path, 
     header, *rows = cells(tmp_path / "p.csv")
     assert {row[header.index("status")] for row in rows} == {"reached"}
     sent = torch.tensor([[*map(float, row[:2]), 0.0] for row in rows], dtype=torch.float64) / 1e3
-    assert without_frames(bent(sent), places) < 0.15 * without_frames(bent(places), places)
+    assert without_frames(bent(sent), went) < 0.15 * without_frames(bent(went), went)
     model: Any = dc.load(tmp_path / "t.safetensors")
     at, *ends = torch.zeros(3, 1, 2, dtype=torch.float64) + torch.eye(3, 2, dtype=torch.float64).roll(1, 0)[:, None]
     here, x, y = (model.tool_poses(one, frame="measuring")[0, :3, 3] for one in (at, *ends))
@@ -384,87 +396,55 @@ def test_a_table_with_two_slides_is_corrected_where_it_can_move(tmp_path: Path, 
     assert float(stopped.miss) > 0.02  # what lies above counts nothing, what lies aside does
 
 
-def test_nothing_is_sure_where_the_machine_never_turns(tmp_path: Path, init: Any) -> None:
-    """Every convention explains the rows."""
-    commanded = flange()
-    commanded[:, :3, :3] = commanded[0, :3, :3]
-    found = seen(commanded, camera_on_tool=True)
-    turns = rotation_numbers(commanded[:, :3, :3], "rotvec"), rotation_numbers(found[:, :3, :3], "rotvec")
-    poses = {"X_Y_Z": 1e3 * commanded[:, :3, 3], "RX_RY_RZ": turns[0]}
-    table = write_columns(
-        tmp_path / "t.csv", **poses, tx_ty_tz=1e3 * found[:, :3, 3], **{"rvec_x|rvec_y|rvec_z": turns[1]}
-    )
-    proposed, _ = init(table)
-    assert not {"robot-pose", "convention", "rotation-angle"} & {*proposed}
-
-
-def test_a_tool_is_a_rotation_vector_whatever_the_poses_are(tmp_path: Path, command: Command, init: Any) -> None:
-    table = hand_eye_table(tmp_path / "t.csv")
-    init(table)
-    assert command("fit", tmp_path / "c.toml").code == 0
-    written = []
-    for convention in ("xyz", "rotvec"):  # by default that of the poses
-        options = ["--convention", convention, "--rotation-angle", "deg"] if convention == "rotvec" else []
-        tool = ["--tool", "0,0,100,20,30,40", *options]
-        assert command("correct", tmp_path / "t.safetensors", table, *tool, "-o", tmp_path / "c.csv").code == 0
-        header, *rows = cells(tmp_path / "c.csv")
-        at = header.index("command_z") + 1
-        turns = [[float(cell) for cell in row[at : at + 3]] for row in rows]
-        written.append(rotation_matrices(turns, convention, angle="deg"))
-    assert_close(*written, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("noise", "wrong", "flipped"),
-    [(0.017, [], []), (0.0, [5], []), (0.0, [5, 14], []), (0.017, [5, 6], []), (0.0, [], [4, 13])],
-)
-def test_noise_of_a_degree_and_wrong_rows(
-    noise: float, wrong: list[int], flipped: list[int], tmp_path: Path, init: Any
-) -> None:
-    """Radians that are read as degrees make all turns small, and with these what they leave.
-
-    Rows are off by 30 degrees and 10 cm, or show the board from its other end.
-    """
-    commanded = flange()
-    found = seen(commanded, camera_on_tool=False)
-    found[:, :3, :3] = turned(noise * drawn(len(found), 3, seed=11)) @ found[:, :3, :3]
-    found[wrong, :3, :3] = turned(torch.full((1, 3), 0.3, dtype=torch.float64)) @ found[wrong, :3, :3]
-    found[wrong, :3, 3] += 0.1
-    half = transforms(turned(torch.tensor([[0.0, 0.0, pi]])), torch.tensor([[0.2, 0.15, 0.0]]))
-    found[flipped] = found[flipped] @ half
-    turns = [rotation_numbers(own[:, :3, :3], "rotvec") for own in (commanded, found)]
-    poses = {"X_Y_Z": commanded[:, :3, 3], "RX_RY_RZ": turns[0], "tx_ty_tz": found[:, :3, 3]}
-    proposed, _ = init(write_columns(tmp_path / "t.csv", **poses, **{"rvec_x|rvec_y|rvec_z": turns[1]}))
-    assert (proposed["robot-pose"], proposed["angle"]) == ("X,Y,Z,RX,RY,RZ=rotvec", "rad")
-    assert (proposed["convention"], proposed["rotation-angle"]) == ("rotvec", "rad")
-
-
 # --- functions in place of a robot: `--robot-pose A,B,...=FILE.py:NAME` ---
 
 
-@pytest.fixture(scope="module")
-def delta(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a delta robot, its table and its program."""
-    place = tmp_path_factory.mktemp("delta")
-    write_commanded_tables(place)
-    return place
-
-
-def test_a_function_in_place_of_a_robot(
-    delta: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, r"'own.py' cannot be read \(No such file or directory\)"),
+        ("1 +", "'own.py' does not run: got SyntaxError"),
+        ("f = 1 / 0", "'own.py' does not run: got ZeroDivisionError"),
+        ("f = None", "the file 'own.py': expected a function f"),
+        ("def f(q): return q @ q", "own.py:f of 5 rows: got RuntimeError"),
+        ("def f(q): return q[:, :1].expand(-1, 4)", r"returns: expected places \(5, k\).* got \(5, 4\)"),
+        ("def f(q): return q[:4]", r"returns: expected places \(5, k\).* got \(4, 2\)"),
+        ("def f(q): return 1.0", r"returns: expected places \(5, k\).* got \(\)"),
+        ("def f(q): return (q - q[2:3]).log()", "of row .*2.*: expected finite numbers"),
+    ],
+)
+def test_functions_that_are_none(
+    text: str | None, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(delta)
-    pose, model = ["--robot-pose", "q1,q2,q3=my_delta.py:kinematics"], tmp_path / "m.safetensors"
-    done = command("fit", "delta.csv", *pose, *MEASURED, "--json", tmp_path / "f.json", "-o", model)
+    monkeypatch.chdir(tmp_path)
+    joints._module.cache_clear()
+    if text is not None:
+        (tmp_path / "own.py").write_text(text, encoding="utf-8")
+    with pytest.raises(MeasurementError, match=message):
+        PoseColumns.of("a,b=own.py:f").poses(drawn(5, 2, seed=0))
+
+
+@pytest.mark.usefixtures("given_scales")
+def test_a_function_in_place_of_a_robot(tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which a campaign file names beside it; a model file starts no program."""
+    monkeypatch.chdir(tmp_path)
+    write_commanded_tables(tmp_path)
+    pose, model = ["--robot-pose", "q1,q2,q3=my_delta.py:kinematics"], "m.safetensors"
+    entries = {"csv": "delta.csv", "robot-pose": pose[1], "position": "x,y,z", "length": "mm", "angle": "deg"}
+    Path("c.toml").write_text("\n".join(f'{name} = "{value}"' for name, value in entries.items()), encoding="utf-8")
+    (tmp_path / "elsewhere").mkdir()
+    with monkeypatch.context() as patch:
+        patch.chdir(tmp_path / "elsewhere")
+        done = command("fit", tmp_path / "c.toml", "-o", tmp_path / model)
     assert done.code == 0, done.error
     done = command("evaluate", model, "delta.csv")
     assert done.code == 1
-    assert "type it again, a model file starts no program: --robot-pose q1,q2,q3=my_delta.py:kinematics" in done.error
-    done = command("predict", model, "delta.csv", *pose, "-o", tmp_path / "p.csv")
+    assert "type it again, a model file starts no program: --robot-pose q1,q2,q3=" in done.error
+    done = command("predict", model, "delta.csv", *pose, "-o", "p.csv")
     assert done.code == 0, done.error
-    done = command("predict", model, "delta.csv", "--robot-pose", "q1,q2,q3", "-o", tmp_path / "q.csv")
+    done = command("predict", model, "delta.csv", "--robot-pose", "q1,q2,q3", "-o", "q.csv")
     assert "type it again, a model file starts no program" in done.error  # joint values are no places
-    (header, *rows), (_, *measured) = cells(tmp_path / "p.csv"), cells(delta / "delta.csv")
+    (header, *rows), (_, *measured) = cells(Path("p.csv")), cells(Path("delta.csv"))
     assert header[:6] == ["x", "y", "z", "predicted_x", "predicted_y", "predicted_z"]
     found = torch.tensor([[float(cell) for cell in row[:6]] for row in rows], dtype=torch.float64)
     q = torch.tensor([[float(cell) for cell in row[:3]] for row in measured], dtype=torch.float64)
@@ -472,28 +452,16 @@ def test_a_function_in_place_of_a_robot(
     nominal, exact = kinematics(q), 1.001 * kinematics(q + torch.tensor([0.1, -0.05, 0.08]))  # without noise
     assert_close(found[:, :3], nominal, rtol=0, atol=1e-6)
     assert float((found[:, 3:] - exact).norm(dim=1).mean()) < 0.2 * without_frames(nominal, exact)
-    assert command("plan", model, "-n", "3", *pose, "-o", tmp_path / "n.csv").code == 0
-    assert cells(tmp_path / "n.csv")[0] == ["x", "y", "z", "rank"]
-    done = command("correct", model, "targets.csv", *pose, "-o", tmp_path / "c.csv")
+    assert command("plan", model, "-n", "3", *pose, "-o", "n.csv").code == 0
+    assert cells(Path("n.csv"))[0] == ["x", "y", "z", "rank"]
+    done = command("correct", model, "targets.csv", *pose, "-o", "c.csv")
     assert done.code == 0, done.error
-    header, *rows = cells(tmp_path / "c.csv")
+    header, *rows = cells(Path("c.csv"))
     assert {row[header.index("status")] for row in rows} == {"reached"}
     corrected = [[float(row[header.index(axis)]) for axis in "xyz"] for row in rows]
     assert "q1" not in header  # of the program before
-    again = write_columns(tmp_path / "again.csv", x_y_z=torch.tensor(corrected, dtype=torch.float64))
-    places = ["--robot-pose", "x,y,z", "--length", "mm", "--angle", "deg"]
-    assert command("predict", model, again, *places, "-o", tmp_path / "a.csv").code == 0
-    reached = [[float(cell) for cell in row[3:6]] for row in cells(tmp_path / "a.csv")[1:]]
+    again = write_columns(Path("again.csv"), x_y_z=torch.tensor(corrected, dtype=torch.float64))
+    assert command("predict", model, again, "--robot-pose", "x,y,z", *MEASURED[2:], "-o", "a.csv").code == 0
+    reached = [[float(cell) for cell in row[3:6]] for row in cells(Path("a.csv"))[1:]]
     wanted = nominal[:5] - nominal[:5].mean(0)
-    away = torch.tensor(reached, dtype=torch.float64)
-    assert without_frames(wanted, away) < 0.05  # of the frame of the device
-
-
-def test_a_campaign_file_names_a_function_beside_it(delta: Path, tmp_path: Path, command: Command) -> None:
-    entries = {"csv": "delta.csv", "robot-pose": "q1,q2,q3=my_delta.py:kinematics", "position": "x,y,z"}
-    lines = [f'{name} = "{value}"' for name, value in {**entries, "length": "mm", "angle": "deg"}.items()]
-    (delta / "c.toml").write_text("\n".join(lines), encoding="utf-8")
-    done = command("fit", delta / "c.toml", "-o", tmp_path / "m.safetensors")
-    assert done.code == 0, done.error
-    done = command("evaluate", tmp_path / "m.safetensors", delta / "delta.csv", *MEASURED)
-    assert "type it again" in done.error
+    assert without_frames(wanted, torch.tensor(reached, dtype=torch.float64)) < 0.05  # of the frame of the device

@@ -6,19 +6,21 @@ from pathlib import Path
 
 import pytest
 import torch
-from command_bank import Command, Outcome, Site
+from command_bank import Command, Outcome
 from export_bank import configurations, own_poses
+from product_bank import Case
 
 import diffeo_calib as dc
+from diffeo_calib.robots import SimulatedArm
 
 OLD = Path(__file__).parents[1] / "interop" / "data" / "robot_format_3.safetensors"
 
 
-@pytest.fixture(scope="session")
-def path(fitted: Outcome, site: Site) -> Path:
-    """A model that `fit` wrote."""
-    assert fitted.code == 0
-    return site.folder / "model.safetensors"
+@pytest.fixture
+def path(arm: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    found = tmp_path_factory.mktemp("model") / "model.safetensors"
+    dc.save(arm.model, found)
+    return found
 
 
 def row(done: Outcome, label: str) -> list[float]:
@@ -27,8 +29,8 @@ def row(done: Outcome, label: str) -> list[float]:
     return [float(cell) for cell in line.split("│")[2:-1] if cell.strip()]
 
 
-def test_a_corrected_urdf(path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
-    done = command("export", path, "--urdf", tmp_path / "new.urdf")
+def test_a_corrected_urdf(arm: Case, path: Path, command: Command, tmp_path: Path) -> None:
+    model, done = arm.model, command("export", path, "--urdf", tmp_path / "new.urdf")
     assert (done.code, done.err.strip()) == (0, "")
     rigid = dc.interop.rigid_kinematics(model)
     chain = dc.load_urdf(tmp_path / "new.urdf", "base_link", "flange")
@@ -47,9 +49,9 @@ def test_a_corrected_urdf(path: Path, model: dc.CalibratedKinematics, command: C
 
 
 @pytest.mark.slow
-def test_all_files_of_one_command(path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
+def test_all_files_of_one_command(arm: Case, path: Path, command: Command, tmp_path: Path) -> None:
     """The same bytes as the Python functions write, and one row for each in the printed table."""
-    ours, theirs = tmp_path / "ours", tmp_path / "theirs"
+    model, ours, theirs = arm.model, tmp_path / "ours", tmp_path / "theirs"
     for folder in (ours, theirs):
         folder.mkdir()
     done = command(
@@ -75,41 +77,37 @@ def test_all_files_of_one_command(path: Path, model: dc.CalibratedKinematics, co
     assert "DH rows with Hayati's beta, next to parallel axes: elbow_joint" in done.out
 
 
-def test_only_universal_robots_have_their_file(path: Path, command: Command, tmp_path: Path) -> None:
-    done = command("export", path, "--urdf", tmp_path / "a.urdf", "--ur-kinematics", tmp_path / "ur.yaml")
-    assert done.code == 1
-    assert "expected shoulder_pan_joint, shoulder_lift_joint" in done.error
-    assert list(tmp_path.iterdir()) == [], "nothing is written where one file cannot be made"
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--urdf a.urdf --tool 0,0,1", "--tool without --c or --torch or --onnx"),
+        ("--dh d.csv --dh-convention khalil", "'khalil' is not one of"),
+        ("--dh same --joint-offsets same", "same is the file of --dh"),
+        ("--c u.c --joint-offsets u.h", "--c (its header) u.h is the file of --joint-offsets"),
+        ("", "name at least one file to write: --urdf"),
+        ("--urdf a.urdf --ur-kinematics ur.yaml", "expected shoulder_pan_joint, shoulder_lift_joint"),
+    ],
+)
+def test_options_that_do_not_belong_together(
+    words: str, message: str, path: Path, command: Command, tmp_path: Path, *, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is written where one file cannot be made."""
+    monkeypatch.chdir(tmp_path)
+    done = command("export", path, *words.split())
+    assert done.code in (1, 2)
+    assert message in " ".join(done.err.split())
+    assert list(tmp_path.iterdir()) == []
 
 
-def test_options_that_do_not_belong_together(path: Path, command: Command, tmp_path: Path) -> None:
-    for options, words in (
-        (["--urdf", "a.urdf", "--tool", "0,0,1"], "--tool without --c or --torch or --onnx"),
-        (["--dh", "d.csv", "--dh-convention", "khalil"], "'khalil' is not one of"),
-    ):
-        done = command("export", path, *options)
-        assert done.code in (1, 2)
-        assert words in " ".join(done.err.split())
-    same = tmp_path / "same.csv"
-    done = command("export", path, "--dh", same, "--joint-offsets", same)
-    assert done.code == 1
-    assert "is the file of --dh" in done.error
-
-
-def test_old_files_need_the_urdf(site: Site, command: Command, tmp_path: Path) -> None:
-    new = tmp_path / "new.urdf"
+def test_old_files_need_the_urdf(command: Command, tmp_path: Path) -> None:
+    new, urdf = tmp_path / "new.urdf", tmp_path / "arm.urdf"
+    SimulatedArm(seed=1).write_urdf(urdf)
     done = command("export", OLD, "--urdf", new)
     assert done.code == 1
     assert "does not hold the URDF that it was fitted with" in done.error
     assert "--robot URDF" in done.error
     assert not new.exists()
-    done = command("export", OLD, "--urdf", new, "--robot", site.urdf)
+    done = command("export", OLD, "--urdf", new, "--robot", urdf)
     assert (done.code, done.err.strip()) == (0, "")
     assert "from the projection of the model" in done.out
     assert dc.load_urdf(new, "base_link", "flange").n == 6
-
-
-def test_at_least_one_file(path: Path, command: Command) -> None:
-    done = command("export", path)
-    assert done.code == 2
-    assert "name at least one file to write: --urdf" in done.err

@@ -14,12 +14,12 @@ import torch
 from math_bank import CASES, Case, normal, rr_problem, two_marker_problem
 from product_bank import Case as ArmCase
 from second_device_bank import PLACES, Place, SecondDevice, at
-from sum_bank import apart, every_formula, every_profile, mapped, points, torch_backends
+from sum_bank import apart, every_formula, mapped, points, torch_backends
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.flows.geodesic import Flow, energy
-from diffeo_calib.kernels.profiles import Profile
+from diffeo_calib.kernels.profiles import MaternProfile
 from diffeo_calib.kernels.reductions import backends
 from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.kernels.reductions.formulas import Formula
@@ -64,21 +64,15 @@ def test_kernels_move_with_all_their_numbers(case: Case) -> None:
 
 @every_place
 @every_formula
-@every_profile
 @torch_backends
-def test_sums(place: Place, formula: Formula, profile: Profile, backend: Backend) -> None:
-    i, j = apart()
-    many = points(300, 3)
-    expected = [
-        *backends.evaluate(formula, profile, i, j, backend),
-        *backends.evaluate(formula, profile, None, many, backend),
-    ]
+def test_sums(place: Place, formula: Formula, backend: Backend) -> None:
+    (i, j), many, profile = apart(), points(300, 3), MaternProfile(2.5)
+    sides = (i, j), (None, many)
+    expected = [value for side in sides for value in backends.evaluate(formula, profile, *side, backend)]
     with at(place) as name:
-        there = [mapped(p, lambda t: t.to(name)) for p in (i, j, many)]
-        found = [
-            *backends.evaluate(formula, profile, there[0], there[1], backend),
-            *backends.evaluate(formula, profile, None, there[2], backend),
-        ]
+        i, j, many = (mapped(p, lambda t: t.to(name)) for p in (i, j, many))
+        sides = (i, j), (None, many)
+        found = [value for side in sides for value in backends.evaluate(formula, profile, *side, backend)]
         for one, other in zip(found, expected, strict=True):
             tolerance = 1e-9 * float(other.abs().max())
             torch.testing.assert_close(place.bring(one), other, rtol=0, atol=tolerance)  # tiles differ by device

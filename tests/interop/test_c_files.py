@@ -1,4 +1,4 @@
-"""The generated files as C: names, memory, threads, warnings, C++, the example of the header, and refusals."""
+"""The generated files as C: results, the Newton step, names, memory, threads, warnings, C++, and refusals."""
 
 from __future__ import annotations
 
@@ -7,21 +7,28 @@ import shutil
 import subprocess
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from c_bank import C99, COMPILER, CPLUSPLUS, STRICT, CModel, compiled, needs_compiler
 from deformation_bank import model_of
-from robots_bank import CHAINS
+from robots_bank import CHAINS, draw
+from scipy.spatial.transform import Rotation
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.interop import CFiles, write_c
 from diffeo_calib.interop.c_source import array, number
 from diffeo_calib.kinematics.provenance import Provenance
+from diffeo_calib.robots.se3 import twist_transform
 
 FUNCTIONS = ("markers", "tool_pose", "newton_step")
+TOOL = twist_transform(draw(6, seed=6)).numpy()
+HOME = np.array([0.3, -0.8, 1.1, 0.4, 0.9, -0.2])
+LIMIT = 1.2
 MAIN = """
 #include <stdio.h>
 #include "robot.h"
@@ -43,26 +50,211 @@ CORRECTED = """
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> CFiles:
-    return write_c(model_of(CHAINS["mimic joints"]), tmp_path_factory.mktemp("c") / "robot.c")
+def model() -> dc.CalibratedKinematics:
+    """The six-axis arm with a tool, and joints that all have limits."""
+    model = model_of(CHAINS["arm"]).with_tool(TOOL)
+    limited = [replace(joint, lower=-LIMIT, upper=LIMIT) for joint in model.robot.joints]
+    model.robot = dc.Chain("limited", model.robot.base, model.robot.tip, limited)
+    return model
 
 
-def undefined_and_defined(library: Path) -> tuple[set[str], dict[str, str]]:
-    """Names that an object file needs, and those that it has with their sections."""
-    listing = subprocess.run(["nm", library], capture_output=True, text=True, check=True, timeout=60).stdout
-    words = [line.split() for line in listing.splitlines()]
-    needed = {word[1].partition("@")[0] for word in words if len(word) == 2 and word[0] == "U"}
-    return needed, {word[2]: word[1] for word in words if len(word) == 3}
+@pytest.fixture(scope="module")
+def files(model: dc.CalibratedKinematics, tmp_path_factory: pytest.TempPathFactory) -> CFiles:
+    return write_c(model, tmp_path_factory.mktemp("c") / "robot.c")
+
+
+@pytest.fixture(scope="module")
+def arm(files: CFiles) -> CModel:
+    """Compiled once."""
+    return CModel(files.source, 6, 2)
+
+
+# --- Results ------------------------------------------------------------------------------------------------------
 
 
 @needs_compiler
-def test_calls_from_several_threads(files: CFiles) -> None:
-    made = CModel(files.source, 3, 2)
-    each = np.random.default_rng(5).uniform(-1, 1, (2, 400, 3))
-    expected = [made.poses_and_jacobian(rows) for rows in each]
+def test_results_are_in_the_base_frame_and_periodic(model: dc.CalibratedKinematics, arm: CModel) -> None:
+    """Tables continue periodically, at their ends too."""
+    q, base = draw(5, 6, seed=5), model.geometry.base
+    q[:, 1] = torch.tensor([-1e-17, 0.0, 2 * np.pi, -2 * np.pi, 40.0])
+    poses, slopes = arm.poses_and_jacobian(q.numpy())
+    np.testing.assert_allclose(poses, model.tool_poses(q), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(slopes, model.tool_jacobian(q), rtol=0, atol=1e-9)
+    points = arm.points(q.numpy())
+    np.testing.assert_allclose(points, (model(q) - base[:3, 3]) @ base[:3, :3], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(arm.points(q.numpy() + 2 * np.pi), points, rtol=0, atol=1e-12)
+
+
+@needs_compiler
+def test_no_numbers_from_none(arm: CModel) -> None:
+    """Joint values that are not finite give results that are not finite, no position of another configuration."""
+    for bad in (np.nan, np.inf, -np.inf):
+        for joint in range(6):
+            q = np.zeros((1, 6))
+            q[0, joint] = bad
+            points, slopes = arm.points_and_jacobian(q)
+            assert np.isnan(points).all()
+            assert np.isnan(slopes).any()
+            assert np.isnan(arm.poses(q)[0, :3]).all()
+            after, error = arm.newton_step(q[0], np.eye(4))
+            assert np.isnan(error)
+            assert np.isnan(after).all()
+
+
+@needs_compiler
+def test_calls_from_several_threads(arm: CModel) -> None:
+    each = np.random.default_rng(5).uniform(-1, 1, (2, 50, 6))
+    expected = [arm.poses_and_jacobian(rows) for rows in each]
     with ThreadPoolExecutor(2) as threads:
-        for number, found in enumerate(threads.map(made.poses_and_jacobian, [*each] * 9)):
-            np.testing.assert_equal(found, expected[number % 2])
+        for count, found in enumerate(threads.map(arm.poses_and_jacobian, [*each] * 5)):
+            np.testing.assert_equal(found, expected[count % 2])
+
+
+# --- The Newton step: trust region, joint limits, singularities ---------------------------------------------------
+
+
+def pose_at(made: CModel, q: np.ndarray) -> np.ndarray:
+    return made.poses(q[None])[0]
+
+
+def errors_of_steps(made: CModel, q: np.ndarray, target: np.ndarray, steps: int) -> list[float]:
+    errors = []
+    for _ in range(steps):
+        q, error = made.newton_step(q, target)
+        errors.append(error)
+    return errors
+
+
+def linearised(made: CModel, q: np.ndarray, target: np.ndarray, weight: float) -> tuple[np.ndarray, np.ndarray]:
+    """The error of the pose, and its slope by the joints, rotations weighted."""
+    poses, slopes = made.poses_and_jacobian(q[None])
+    turn = Rotation.from_matrix(target[:3, :3] @ poses[0, :3, :3].T).as_rotvec()
+    error = np.concatenate([target[:3, 3] - poses[0, :3, 3], weight * turn])
+    return error, np.diag([1.0, 1.0, 1.0, weight, weight, weight]) @ slopes[0]
+
+
+@needs_compiler
+def test_steps_converge_quadratically(arm: CModel) -> None:
+    for seed in range(5):
+        start = HOME + 0.1 * draw(6, seed=seed).numpy().clip(-1, 1)
+        target = pose_at(arm, (start + 0.05 * draw(6, seed=10 + seed).numpy()).clip(-LIMIT, LIMIT))
+        errors = errors_of_steps(arm, start, target, 8)
+        assert errors[0] > 1e-2
+        assert errors[-1] < 1e-13
+        ratios = [after / before**2 for before, after in pairwise(errors) if after > 1e-12]
+        assert max(ratios) < 100.0
+
+
+@needs_compiler
+@pytest.mark.parametrize("weight", [0.1, 1.0])
+def test_a_free_step_is_newtons(arm: CModel, weight: float) -> None:
+    target = pose_at(arm, HOME + 0.02)
+    e, J = linearised(arm, HOME, target, weight)
+    after, error = arm.newton_step(HOME, target, weight, bound=1.0)
+    np.testing.assert_allclose(error, np.linalg.norm(e), rtol=1e-12)
+    np.testing.assert_allclose(after - HOME, np.linalg.solve(J, e), rtol=0, atol=1e-6)
+
+
+@needs_compiler
+@pytest.mark.parametrize("bound", [1e-3, 0.03])
+@pytest.mark.parametrize("weight", [0.0, 0.1])
+def test_a_bounded_step_is_the_best_of_its_length(arm: CModel, weight: float, bound: float) -> None:
+    """On the bound the gradient is parallel to the step."""
+    target = pose_at(arm, HOME + 0.1)
+    e, J = linearised(arm, HOME, target, weight)
+    step = arm.newton_step(HOME, target, weight, bound)[0] - HOME
+    np.testing.assert_allclose(np.linalg.norm(step), bound, rtol=1e-3)
+    gradient = J.T @ (e - J @ step)
+    np.testing.assert_allclose(gradient @ step, np.linalg.norm(gradient) * np.linalg.norm(step), rtol=1e-3)
+
+
+@needs_compiler
+@pytest.mark.parametrize("angle", [1e-9, 0.3, 3.0, np.pi - 1e-7, np.pi])
+def test_errors_of_large_rotations(arm: CModel, angle: float) -> None:
+    """Up to half a turn, where the rotation vector is hard to read from the matrix."""
+    start = pose_at(arm, HOME)
+    for axis in [*np.eye(3), *draw(10, 3, seed=2).numpy()]:
+        target = start.copy()
+        target[:3, :3] = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix() @ start[:3, :3]
+        np.testing.assert_allclose(arm.newton_step(HOME, target, weight=2.0)[1], 2.0 * angle, rtol=1e-7, atol=1e-14)
+
+
+@needs_compiler
+def test_joints_stop_at_their_limits(arm: CModel) -> None:
+    """The rest of the joints then does its best: the gradient in these vanishes in the end."""
+    wanted = HOME.copy()
+    wanted[2] = LIMIT + 0.2
+    target, q = pose_at(arm, wanted), HOME
+    for _ in range(50):
+        q, error = arm.newton_step(q, target)
+        assert (np.abs(q) <= LIMIT).all()
+    assert q[2] == LIMIT
+    assert error > 1e-4
+    e, J = linearised(arm, q, target, 0.1)
+    gradient = J.T @ e
+    assert gradient[2] > 0  # it would go on
+    assert (gradient * np.sign(q))[np.abs(q) == LIMIT].min() > 0
+    assert np.abs(gradient[np.abs(q) < LIMIT]).max() < 1e-9
+
+
+@needs_compiler
+def test_joints_beyond_their_limits_come_back_and_the_rest_makes_up_for_them(arm: CModel) -> None:
+    q = HOME.copy()
+    q[0], q[4] = LIMIT + 0.3, -LIMIT - 0.05
+    target = pose_at(arm, q)
+    for _ in range(8):
+        before, (q, _) = q, arm.newton_step(q, target)
+        assert np.linalg.norm(q - before) <= 0.1 * (1 + 1e-12)
+    assert (np.abs(q) <= LIMIT).all()
+    q = HOME.copy()
+    q[0] = LIMIT + 0.01
+    target = pose_at(arm, q + 0.001)
+    e, J = linearised(arm, q, target, 0.1)
+    expected = np.linalg.lstsq(J[:, 1:], e + 0.01 * J[:, 0], rcond=None)[0]
+    after, _ = arm.newton_step(q, target, bound=10.0)
+    assert after[0] == LIMIT
+    np.testing.assert_allclose(after[1:] - q[1:], expected, rtol=0, atol=1e-5)
+
+
+@needs_compiler
+@pytest.mark.parametrize("bound", [-1.0, 0.0, 1e-4, 0.5])
+def test_no_step_is_longer_than_the_bound(arm: CModel, bound: float) -> None:
+    """Far targets, and targets out of reach."""
+    for seed in range(10):
+        target = twist_transform(draw(6, seed=seed, size=3.0)).numpy()
+        after, error = arm.newton_step(HOME, target, bound=bound)
+        assert np.linalg.norm(after - HOME) <= max(bound, 0.0) * (1 + 1e-12)
+        assert error > 0.1
+
+
+@needs_compiler
+def test_near_singularities_steps_stay_small(arm: CModel) -> None:
+    """Wrist axes in one plane: a shift across them asks for infinite joint velocities."""
+    q = np.zeros(6)
+    direction = np.linalg.svd(arm.poses_and_jacobian(q[None])[1][0])[0][:, -1]
+    target = pose_at(arm, q)
+    target[:3, 3] += 5e-4 * direction[:3] / np.linalg.norm(direction[:3])
+    after, error = arm.newton_step(q, target, bound=0.02)
+    assert np.linalg.norm(after - q) <= 0.02 * (1 + 1e-12)
+    assert np.linalg.norm(linearised(arm, after, target, 0.1)[0]) <= error
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", ["one joint", pytest.param("gantry", marks=pytest.mark.slow)])
+def test_robots_of_fewer_joints(name: str, tmp_path: Path) -> None:
+    """They reach the poses that they can reach; another frame and prefix."""
+    chain, tool = CHAINS[name], TOOL[:3, 3]
+    model = model_of(chain)
+    files = write_c(model, tmp_path / "m.c", tool=tool, frame="measuring", prefix="left_arm")
+    assert files.functions == ("left_arm_markers", "left_arm_tool_pose", "left_arm_newton_step")
+    made, goal = CModel(files.source, chain.n, 2, files.prefix), 0.2 * torch.ones(1, chain.n, dtype=torch.float64)
+    target = made.poses(goal.numpy())
+    np.testing.assert_allclose(target, model.tool_poses(goal, tool, "measuring"), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(made.points(goal.numpy()), model(goal), rtol=0, atol=1e-12)
+    assert errors_of_steps(made, 0.1 * np.ones(chain.n), target[0], 10)[-1] < 1e-13
+
+
+# --- The files ----------------------------------------------------------------------------------------------------
 
 
 @needs_compiler
@@ -71,7 +263,10 @@ def test_names_and_memory(files: CFiles) -> None:
     """Only the documented names are global; mathematics alone is needed; no data can be written."""
     target = files.source.with_suffix(".o")
     compiled([COMPILER, *C99, "-fno-stack-protector", "-c", files.source, "-o", target])
-    needed, defined = undefined_and_defined(target)
+    listing = subprocess.run(["nm", target], capture_output=True, text=True, check=True, timeout=60).stdout
+    words = [line.split() for line in listing.splitlines()]
+    needed = {word[1].partition("@")[0] for word in words if len(word) == 2 and word[0] == "U"}
+    defined = {word[2]: word[1] for word in words if len(word) == 3}
     assert needed <= {"sin", "cos", "sincos", "exp", "sqrt", "fmod", "atan2", "fabs", "memset", "memcpy", "memmove"}
     assert {name for name, kind in defined.items() if kind.isupper() and kind != "R"} == set(files.functions)
     assert files.functions == tuple(f"robot_{name}" for name in FUNCTIONS)
@@ -81,18 +276,17 @@ def test_names_and_memory(files: CFiles) -> None:
 @needs_compiler
 @pytest.mark.skipif(CPLUSPLUS is None, reason="no C++ compiler")
 def test_the_files_are_cplusplus_too(files: CFiles, tmp_path: Path) -> None:
-    compiled([CPLUSPLUS, "-std=c++11", *STRICT, "-x", "c++", "-c", files.source, "-o", tmp_path / "robot.o"])
+    compiled([CPLUSPLUS, "-std=c++11", *STRICT, "-O0", "-x", "c++", "-c", files.source, "-o", tmp_path / "robot.o"])
 
 
 @needs_compiler
-def test_the_example_of_the_header(tmp_path: Path) -> None:
-    files = write_c(model_of(CHAINS["arm"]), tmp_path / "robot.c")
+def test_the_example_of_the_header(files: CFiles, arm: CModel, tmp_path: Path) -> None:
     text = files.header.read_text()
     example = text[text.index(" * Example") : text.index(" */\n#ifndef")]
     lines = [line[7:] for line in example.splitlines() if line.startswith(" *     ")]
     (tmp_path / "main.c").write_text(MAIN.format(functions="\n".join(lines), body=CORRECTED))
-    program = tmp_path / "main"
-    compiled([COMPILER, *C99, "-o", program, tmp_path / "main.c", files.source, "-lm"])
+    program, here = tmp_path / "main", ["-I", files.header.parent, f"-Wl,-rpath,{arm.path.parent}"]
+    compiled([COMPILER, *C99, *here, "-o", program, tmp_path / "main.c", arm.path, "-lm"])
     subprocess.run([program], check=True, timeout=60)
 
 
@@ -100,7 +294,7 @@ def test_the_example_of_the_header(tmp_path: Path) -> None:
 @needs_compiler
 def test_undefined_behaviour_and_addresses(files: CFiles, tmp_path: Path) -> None:
     main = """
-    double q[3] = {0.1, 0.2, 0.3}, p[6], J[18], T[16], K[18];
+    double q[6] = {0.1, 0.2, 0.3}, p[6], J[36], T[16], K[36];
     int step;
     for (step = 0; step < 100; ++step) {
         robot_markers(q, p, J), robot_tool_pose(q, T, K), T[3] += 1e-3;
@@ -130,26 +324,21 @@ def test_numbers_come_back_bit_for_bit() -> None:
     assert (number(float("inf")), number(float("-inf")), number(3)) == ("HUGE_VAL", "-HUGE_VAL", "3")
 
 
-def test_the_header_tells_joints_limits_frame_and_tool(tmp_path: Path) -> None:
-    model = model_of(CHAINS["slides"]).with_tool([0.0, 0.1, 0.2])
-    limited = [replace(joint, lower=-1.5) if joint.name == "j1" else joint for joint in model.robot.joints]
-    model.robot = dc.Chain("slides", model.robot.base, model.robot.tip, limited)
-    files = write_c(model, tmp_path / "robot.c")
-    text = files.header.read_text()
-    for line in ("q[0]  j0 [m]: no limits", "q[1]  j1 [rad]: -1.5 to inf", "the robot's base", "0 1 0 0.1; 0 0 1 0.2"):
-        assert line in text
-
-
 @needs_compiler
-def test_names_cannot_end_a_comment(tmp_path: Path) -> None:
-    model = model_of(CHAINS["one joint"])
-    joint = replace(model.robot.joints[0], name="j */ /* ??/\n\\ \u2603 /*/")
+def test_the_header_tells_what_it_is_of_and_names_cannot_end_a_comment(tmp_path: Path) -> None:
+    model = model_of(CHAINS["one joint"]).with_tool([0.0, 0.1, 0.2])
+    joint = replace(model.robot.joints[0], name="j */ /* ??/\n\\ \u2603 /*/", lower=-1.5, upper=float("inf"))
+    slide = replace(joint, kind="prismatic", name="j0", lower=-float("inf"))
     model.robot = dc.Chain("*/ #error", model.robot.base, model.robot.tip, [joint])
     model.provenance = Provenance("2026-11-22T10:00:00+00:00", "0.1", "ab" * 32, 'serial */ 17\nof "two"')
     files = write_c(model, tmp_path / "my-robot 2.c")
     assert files.prefix == "my_robot_2"
-    assert "fitted 2026-11-22" in files.header.read_text()
+    text = files.header.read_text()
+    for words in ("fitted 2026-11-22", "[rad]: -1.5 to inf", "the robot's base", "0 1 0 0.1; 0 0 1 0.2"):
+        assert words in text
     compiled([COMPILER, *C99, "-c", files.source, "-o", tmp_path / "robot.o"])
+    model.robot = dc.Chain("slide", model.robot.base, model.robot.tip, [slide])
+    assert "q[0]  j0 [m]: no limits" in write_c(model, tmp_path / "slide.c").header.read_text()
 
 
 @pytest.mark.parametrize(
@@ -167,13 +356,9 @@ def test_names_cannot_end_a_comment(tmp_path: Path) -> None:
 def test_refusals(path: str, options: dict, message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=re.escape(message)):
         write_c(model_of(CHAINS["one joint"]), tmp_path / path, **options)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_models_without_constant_stages(tmp_path: Path) -> None:
-    model = model_of(CHAINS["one joint"], dc.TorchDiffEq())
     with pytest.raises(InputError, match="cannot be written as C"):
-        write_c(model, tmp_path / "model.c")
+        write_c(model_of(CHAINS["one joint"], dc.TorchDiffEq()), tmp_path / "model.c")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_files_of_other_origin_stay(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import two_arms_bank
 from c_bank import CModel, c_model, needs_compiler
 from deformation_bank import deformation_of, model_of
@@ -26,6 +25,7 @@ from diffeo_calib.robots.dh import DHRow
 from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.runtime import build
 from diffeo_calib.runtime.program import Program
+from diffeo_calib.runtime.tables import JointTables, PeriodicSum, tabulate
 
 ROWS = 5
 TOOL = twist_transform(draw(6, seed=6)).numpy()
@@ -85,35 +85,22 @@ def far_away(chain: dc.Chain) -> GeodesicDeformation:
 
 CASES: dict[str, Callable[[], GeodesicDeformation]] = {
     **{f"{name} with sag": lambda chain=chain: deformation_of(chain) for name, chain in CHAINS.items()},
-    **{f"{name}, rigid": lambda chain=chain: deformation_of(chain, elastic=False) for name, chain in CHAINS.items()},
     **{
         f"{profile} on {where}": lambda p=profile, chain=CHAINS[robot]: deformation_of(chain, p, integrator=dc.RK8(1))
         for profile in PROFILES
         for robot, where in (("gantry", "lines"), ("arm", "circles"))  # the second in tables
     },
-    **{
-        f"waves of the {name}": lambda c=CHAINS[name]: deformation_of(c, waves=True) for name in ("arm", "mimic joints")
-    },
+    "rigid": lambda: deformation_of(CHAINS["mimic slides"], elastic=False),
+    "waves of the arm": lambda: deformation_of(CHAINS["arm"], waves=True),
     "waves, no sag": lambda: deformation_of(CHAINS["mimic slides"], elastic=False, waves=True),
     "no momenta": lambda: scaled(deformation_of(CHAINS["serial"]), 0, 0),
-    "psi alone": lambda: scaled(deformation_of(CHAINS["serial"]), 0, 1),
+    "psi alone, with waves": lambda: scaled(deformation_of(CHAINS["mimic joints"], waves=True), 0, 1),
     "phi alone": lambda: scaled(deformation_of(CHAINS["serial"]), 1, 0),
-    "waves alone": lambda: scaled(deformation_of(CHAINS["arm"], waves=True), 0, 1),
-    "two steps": lambda: deformation_of(CHAINS["mimic slides"], integrator=dc.RK4(2)),
     "large sag": lambda: scaled(deformation_of(CHAINS["serial"]), 1, 1, 20.0),  # rotations are no longer a series
     "far away": lambda: far_away(CHAINS["serial"]),
 }
-QUICK = ("slides with sag", "mimic joints with sag", "mimic slides, rigid", "matern52 on lines", "matern72 on circles")
-QUICK += (
-    "waves of the arm",
-    "waves, no sag",
-    "waves alone",
-    "psi alone",
-    "phi alone",
-    "no momenta",
-    "large sag",
-    "far away",
-)
+QUICK = ("slides with sag", "rigid", "matern52 on lines", "waves of the arm", "no momenta", "psi alone, with waves")
+QUICK += ("phi alone", "large sag")
 """Those that are compiled in a default run."""
 
 
@@ -127,12 +114,10 @@ def cases() -> list:
 def test_points_slopes_and_poses(by: str, case: str, tmp_path: Path) -> None:
     deformation = CASES[case]()
     agree(by, deformation, tmp_path, 1e-11 if case in ("large sag", "far away") else 1e-12)
-    flows = made(deformation).joint_flow, made(deformation).task_flow
-    if "alone" in case or case == "no momenta":
-        assert [flow.vanishes for flow in flows] == [case != "phi alone", case in ("phi alone", "no momenta")]
-    if by == "c":
+    if by == "c":  # without what vanishes
         text = (tmp_path / "generated.c").read_text()
-        assert [f"{name}_flow" in text for name in ("joint", "task")] == [not flow.vanishes for flow in flows]
+        flows = "psi alone" not in case and case != "no momenta", case not in ("no momenta", "phi alone")
+        assert tuple(f"{name}_flow" in text for name in ("joint", "task")) == flows
         assert [name in text for name in ("add_gears", "axis_waves")] == ["waves" in case] * 2
 
 
@@ -175,13 +160,17 @@ TREES = {
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", ["two arms", *(pytest.param(n, marks=pytest.mark.slow) for n in list(TREES)[1:])])
-@pytest.mark.parametrize("tip", [0, -1])
+@pytest.mark.parametrize(
+    ("name", "tip"),
+    [
+        ("two arms", -1),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("hand to hand", 0), ("slides on a torso", 0))),
+    ],
+)
 def test_branches_bend_a_common_torso(name: str, tip: int, tmp_path: Path) -> None:
     """Every branch weighs on the joints before it; a joint of another branch moves the tip by its sag alone."""
     robot = TREES[name](two_arms_bank.robot(tmp_path))
-    deformation = deformation_of(robot, integrator=dc.RK4(1))
-    agree("c", deformation, tmp_path, tip=robot.tips[tip])
+    agree("c", deformation_of(robot, integrator=dc.RK4(1)), tmp_path, tip=robot.tips[tip])
     assert "on_path" in (tmp_path / "generated.c").read_text()
 
 
@@ -208,58 +197,29 @@ def test_the_tip_of_the_tool_is_named(tmp_path: Path) -> None:
     assert "frame of the tip right" in files.header.read_text()
 
 
-@pytest.fixture(scope="module")
-def arm(tmp_path_factory: pytest.TempPathFactory) -> tuple[dc.CalibratedKinematics, CModel]:
-    """A model of the six-axis arm with its tool in the base frame."""
-    model, path = model_of(CHAINS["arm"]).with_tool(TOOL), tmp_path_factory.mktemp("c") / "arm-1.c"
-    files = write_c(model, path)
-    return model, CModel(files.source, 6, 2, files.prefix)
+# --- Tables of periodic functions ---------------------------------------------------------------------------------
 
 
-@needs_compiler
-def test_results_in_the_base_frame(arm: tuple[dc.CalibratedKinematics, CModel]) -> None:
-    model, made = arm
-    q = draw(ROWS, 6, seed=5)
-    poses, slopes = made.poses_and_jacobian(q.numpy())
-    near(poses, model.tool_poses(q).numpy(), 1e-12)
-    near(slopes, model.tool_jacobian(q).numpy(), 1e-9)
-    base = model.geometry.base
-    near(made.points(q.numpy()), ((model(q) - base[:3, 3]) @ base[:3, :3]).numpy(), 1e-12)
+def periodic_sum(profile: str, lengthscale: float = 0.3, count: int = 40) -> PeriodicSum:
+    """A sum with angles over several turns, some of them equal."""
+    rng = np.random.default_rng(0)
+    angles = np.concatenate([rng.uniform(-7, 7, count - 2), [1.0, 1.0]])
+    return PeriodicSum(profile, lengthscale, angles, 1e-3 * rng.normal(size=count))
 
 
-@needs_compiler
-def test_results_in_the_measuring_frame(tmp_path: Path) -> None:
-    model, q = model_of(CHAINS["serial"]), draw(ROWS, 4, seed=5)
-    files = write_c(model, tmp_path / "m.c", tool=TOOL[:3, 3], frame="measuring", prefix="left_arm")
-    assert files.functions == ("left_arm_markers", "left_arm_tool_pose", "left_arm_newton_step")
-    made = CModel(files.source, 4, 2, files.prefix)
-    near(made.poses(q.numpy()), model.tool_poses(q, TOOL[:3, 3], "measuring").numpy(), 1e-12)
-    near(made.points(q.numpy()), model(q).numpy(), 1e-12)
+@pytest.mark.parametrize("profile", [name for name in PROFILES if name != "matern32"])
+def test_tables_interpolate_sums_of_several_kernels(profile: str) -> None:
+    """Everywhere, also across 0 and at the controls, not only midway between the knots."""
+    exact = [periodic_sum(profile), periodic_sum("gaussian", 0.5)]
+    table = tabulate(exact)
+    assert table is not None
+    tables, x = JointTables.of((1,), ((table,),), 2), np.concatenate([np.linspace(-9.0, 9.0, 5001), exact[0].angles])
+    values, slopes = tables.velocity_and_jacobian(0, np.stack([np.zeros_like(x), x], axis=1))
+    wanted = sum(one.derivatives(x) for one in exact)
+    near(values[:, 1], wanted[:, 0], 3e-13)
+    near(slopes[:, 1, 1], wanted[:, 1], 1e-9)
+    assert not values[:, 0].any()
 
 
-@needs_compiler
-def test_no_numbers_from_none(arm: tuple[dc.CalibratedKinematics, CModel]) -> None:
-    """Joint values that are not finite give results that are not finite, no position of another configuration."""
-    _, made = arm
-    for bad in (np.nan, np.inf, -np.inf):
-        for joint in range(6):
-            q = np.zeros((1, 6))
-            q[0, joint] = bad
-            points, slopes = made.points_and_jacobian(q)
-            assert np.isnan(points).all()
-            assert np.isnan(slopes).any()
-            assert np.isnan(made.poses(q)[0, :3]).all()
-            after, error = made.newton_step(q[0], np.eye(4))
-            assert np.isnan(error)
-            assert np.isnan(after).all()
-
-
-@needs_compiler
-def test_whole_turns(arm: tuple[dc.CalibratedKinematics, CModel]) -> None:
-    """Tables continue periodically, at their ends too."""
-    model, made = arm
-    q = torch.zeros(5, 6, dtype=torch.float64)
-    q[:, 1] = torch.tensor([-1e-17, 0.0, 2 * np.pi, -2 * np.pi, 40.0])
-    near(made.points(q.numpy()), made.points(q.numpy() + 2 * np.pi), 1e-12)
-    base = model.geometry.base
-    near(made.points(q.numpy()), ((model(q) - base[:3, 3]) @ base[:3, :3]).numpy(), 1e-12)
+def test_functions_that_are_too_rough_have_no_table() -> None:
+    assert tabulate([periodic_sum("gaussian", lengthscale=1e-4, count=400)]) is None

@@ -68,7 +68,7 @@ def test_what_is_made_is_closed_to_others_whatever_the_umask(tmp_path: Path) -> 
     assert {stat.S_IMODE(one.stat().st_mode) for one in (folder, folder.parent)} == {0o700}
 
 
-def _writable(mode: int, levels: int) -> Callable[[Path], None]:
+def _mode(mode: int, levels: int) -> Callable[[Path], None]:
     return lambda own: (own, *own.parents)[levels].chmod(mode)
 
 
@@ -76,48 +76,42 @@ def _foreign(levels: int) -> Callable[[Path], None]:
     return lambda own: os.chown((own / "code", own, *own.parents)[levels], STRANGER, -1)
 
 
-def _link_to_a_writable_folder(own: Path) -> None:
-    elsewhere = own.parents[2] / "elsewhere"
-    own.rename(elsewhere)
-    own.symlink_to(elsewhere)
-    elsewhere.chmod(0o777)
+def _link(levels: int, mode: int) -> Callable[[Path], None]:
+    """A folder in place of which there is a link to it."""
+
+    def put(own: Path) -> None:
+        place, elsewhere = (own, *own.parents)[levels], own.parents[2] / "elsewhere"
+        place.rename(elsewhere)
+        place.symlink_to(elsewhere)
+        elsewhere.chmod(mode)
+
+    return put
 
 
-UNSAFE = {
-    "writable by the group": _writable(0o775, 0),
-    "writable by all": _writable(0o777, 0),
-    "writable by all, sticky": _writable(0o1777, 0),
-    "a folder above it writable by the group": _writable(0o770, 1),
-    "the cache writable by all": _writable(0o777, 2),
-    "a link": _link_to_a_writable_folder,
+UNSAFE: dict[str, Callable[[Path], None]] = {
+    "writable by the group": _mode(0o775, 0),
+    "writable by all": _mode(0o777, 0),
+    "writable by all, sticky": _mode(0o1777, 0),
+    "a folder above it writable by the group": _mode(0o770, 1),
+    "the cache writable by all": _mode(0o777, 2),
+    "a link to a writable folder": _link(0, 0o777),
 }
 FOREIGN = {"a file": _foreign(0), "the folder": _foreign(1), "a folder above it": _foreign(2), "the cache": _foreign(3)}
+SAFE = {"a shared folder that keeps files of their owners": _mode(0o1777, 2), "a link to the cache": _link(2, 0o755)}
 
 
-@pytest.mark.parametrize("case", UNSAFE)
-def test_a_folder_that_others_can_write_to_is_not_used(case: str, tmp_path: Path) -> None:
-    UNSAFE[case](kept(tmp_path / "cache"))
+@pytest.mark.parametrize("case", [*UNSAFE, *(pytest.param(case, marks=as_root) for case in FOREIGN)])
+def test_a_folder_that_others_can_write_to_or_own_is_not_used(case: str, tmp_path: Path) -> None:
+    (UNSAFE | FOREIGN)[case](kept(tmp_path / "cache"))
     passing(tmp_path)
 
 
-@as_root
-@pytest.mark.parametrize("case", FOREIGN)
-def test_what_belongs_to_another_user_is_not_used(case: str, tmp_path: Path) -> None:
-    FOREIGN[case](kept(tmp_path / "cache"))
-    passing(tmp_path)
-
-
-def test_a_shared_folder_that_keeps_files_of_their_owners_is_used(tmp_path: Path) -> None:
-    """As /tmp does."""
+@pytest.mark.parametrize("case", SAFE)
+def test_a_folder_that_nobody_else_can_replace_is_used(case: str, tmp_path: Path) -> None:
+    """As /tmp is."""
     own = kept(tmp_path / "cache")
-    (tmp_path / "cache").chmod(0o1777)
-    assert cache_folder.cache_folder(NAME) == own
-
-
-def test_a_link_to_a_folder_of_the_user_is_followed(tmp_path: Path) -> None:
-    own = kept(tmp_path / "elsewhere")
-    (tmp_path / "cache").symlink_to(tmp_path / "elsewhere")
-    assert cache_folder.cache_folder(NAME) == own
+    SAFE[case](own)
+    assert cache_folder.cache_folder(NAME) == own.resolve()
 
 
 @pytest.mark.parametrize("home", ["", "relative"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import socket
@@ -66,16 +65,12 @@ def test_torchrun_gives_every_rank_the_numbers_of_one_process(tmp_path: Path) ->
         env=ENVIRONMENT, capture_output=True, text=True, timeout=PATIENCE, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    records = [json.loads((tmp_path / f"record_{rank}.json").read_text()) for rank in range(2)]
-    for rank, record in enumerate(records):
-        assert (record["rank"], record["count"], record["same"]) == (rank, 2, True)
-        assert record["errors"]["sums"] < 1e-12
-        assert record["errors"]["flow"] < 1e-12
-        assert record["errors"]["fits"] < 1e-8  # conjugate gradients stop at 1e-11; momenta are ill-conditioned
-    found = [torch.load(tmp_path / f"found_{rank}.pt") for rank in range(2)]
-    for name, tensors in found[0].items():
-        for one, other in zip(tensors, found[1][name], strict=True):
+    first, second = (torch.load(tmp_path / f"found_{rank}.pt") for rank in range(2))
+    bounds = {"sums": 1e-12, "flow": 1e-12, "fits": 1e-8}  # conjugate gradients stop at 1e-11
+    for name, bound in bounds.items():
+        for one, other, alone in zip(first[name], second[name], first["alone"][name], strict=True):
             assert torch.equal(one, other), name
+            assert float((one - alone).norm()) <= bound * float(alone.norm()), name
 
 
 @pytest.mark.slow
@@ -99,7 +94,7 @@ def test_ranks_with_other_data_are_refused(tmp_path: Path) -> None:
 # --- In one process ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 5])
+@pytest.mark.parametrize("count", [1, 3])
 @pytest.mark.parametrize("formula", [FIELD, GRADIENT])
 def test_shares_add_up(count: int, formula: Formula) -> None:
     """Of points with themselves and with others, for small and for large tiles, and for compiled loops."""
@@ -114,15 +109,6 @@ def test_shares_add_up(count: int, formula: Formula) -> None:
         if compiled is not None:
             total = torch.stack([compiled.totals(rows, many, mine) for mine in ranks]).sum(0)
             torch.testing.assert_close(compiled.results(total, len(at.features)), expected, rtol=1e-12, atol=1e-10)
-
-
-def test_work_is_dealt_evenly() -> None:
-    """Rows of a triangle: their areas differ by less than one row, and every row belongs to one rank."""
-    rows = list(range(64))
-    dealt = [Ranks(own, 4).mine(rows) for own in range(4)]
-    assert sorted(row for part in dealt for row in part) == rows
-    areas = [sum(64 - row for row in part) for part in dealt]
-    assert max(areas) == min(areas)
 
 
 def test_one_process_needs_torchrun(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from math_bank import normal, torch_threads
+from math_bank import normal
 from sum_bank import assert_same, every_formula
 from torch import Tensor
 
@@ -15,9 +15,8 @@ import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kernels.profiles import PROFILES, CauchyProfile, GaussianProfile, MaternProfile, Profile
 from diffeo_calib.kernels.reductions import backends, fourier
-from diffeo_calib.kernels.reductions.formulas import FIELD, HESSIAN_PRODUCT, Formula, Points
+from diffeo_calib.kernels.reductions.formulas import FIELD, Formula, Points
 
-ACCURACIES = (1e-2, 1e-4, 1e-7)
 COUNT = 4000
 TORUS = dc.PerJoint([0.8, 1.5], [1.0, 1.0], dc.Space((True, True)))
 smooth = pytest.mark.parametrize("profile", [GaussianProfile(), MaternProfile(3.5)], ids=lambda p: p.name)
@@ -31,37 +30,28 @@ def cloud(count: int, dim: int, side: float, seed: int, outputs: int = 2) -> Poi
     return Points(at, u, dx, du)
 
 
-def scales(formula: Formula, columns: Points) -> float:
-    """The sum of absolute momenta, times the number of terms that a result adds up."""
-    terms = 1.0 if formula is FIELD else 2.0 * columns.momenta.shape[1] * columns.features.shape[1]
-    return terms * len(columns.features)
-
-
 @smooth
 @every_formula
 @pytest.mark.parametrize(("dim", "side"), [(1, 6.0), (2, 1.5)])
-@pytest.mark.parametrize("accuracy", [1e-2, 1e-4])
-def test_errors_stay_below_the_accuracy(
-    profile: Profile, formula: Formula, dim: int, side: float, accuracy: float
-) -> None:
+def test_errors_stay_below_the_accuracy(profile: Profile, formula: Formula, dim: int, side: float) -> None:
     rows, columns = cloud(COUNT, dim, side, 1), cloud(COUNT, dim, side, 2)
-    found = fourier.sums(formula, profile, rows, columns, accuracy)
-    if dim == 1 or isinstance(profile, GaussianProfile):
-        assert found is not None
-    if found is not None:
-        exact = backends.evaluate(formula, profile, rows, columns, backend="tiled")
-        assert_same(found, exact, accuracy * scales(formula, columns))
+    # of absolute momenta, times the number of terms that a result adds up
+    terms = 1.0 if formula is FIELD else 2.0 * columns.momenta.shape[1] * dim
+    exact = backends.evaluate(formula, profile, rows, columns)
+    for accuracy in (1e-2, 1e-4):
+        found = fourier.sums(formula, profile, rows, columns, accuracy)
+        assert found is not None or (dim == 2 and isinstance(profile, MaternProfile))
+        assert_same(found or exact, exact, accuracy * terms * COUNT)
 
 
 @smooth
-@pytest.mark.parametrize("accuracy", ACCURACIES)
-@pytest.mark.parametrize("side", [0.1, 1.0, 20.0])
+@pytest.mark.parametrize("accuracy", [1e-2, 1e-7])
+@pytest.mark.parametrize("side", [0.1, 20.0])
 def test_a_kernel_is_bounded_at_all_distances(profile: Profile, accuracy: float, side: float) -> None:
     """Between the corners of the box the copies of the kernel are nearest."""
     waves = fourier.Lattice.of(profile, torch.tensor([side], dtype=torch.float64), accuracy)
-    if waves is None:
-        pytest.skip("the lattice would be too large")
     apart = torch.linspace(-side, side, 501, dtype=torch.float64)[:, None]
+    assert waves is not None
     assert waves.error(profile, apart) < accuracy
 
 
@@ -125,15 +115,6 @@ def test_points_that_are_not_finite(value: float, lengthscale: float) -> None:
     found, exact = (dc.Gaussian(lengthscale).using("tiled", accuracy).field(None, q, a) for accuracy in (1e-3, None))
     assert bool(found.isnan().any())
     assert torch.equal(found.isnan(), exact.isnan())
-
-
-def test_threads_do_not_matter() -> None:
-    columns, found = cloud(COUNT, 2, 3.0, 1), []
-    for threads in (1, 2):
-        with torch_threads(threads):
-            found.append(fourier.sums(HESSIAN_PRODUCT, GaussianProfile(), None, columns, 1e-3) or ())
-    assert len(found[0]) == 3
-    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
 
 
 @pytest.mark.parametrize("accuracy", [0.0, 1.0, -1e-3, 1e-15, float("nan"), True, "1e-6", [1e-6], 1e-6 + 0j])

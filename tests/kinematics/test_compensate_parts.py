@@ -1,18 +1,12 @@
-"""Commands for both hands of a small robot: against the model itself, one hand at a time, and finite differences."""
+"""Commands for both hands of a small robot: against the model itself and one hand at a time; mimic joints."""
 
 from __future__ import annotations
-
-import gc
-import weakref
-from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from deformation_bank import model_of
-from product_bank import Case
-from robots_bank import CHAINS, parallelogram
+from robots_bank import parallelogram
 from table_bank import held
 from torch import Tensor
 from torch.testing import assert_close
@@ -21,12 +15,8 @@ from two_arms_bank import HANDS, robot
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.compensation.problem import joint_limits
-from diffeo_calib.kinematics.compensation.targets import Targets, ToolFunctions, tool_functions
 from diffeo_calib.measurements.poses import angle_between
 from diffeo_calib.robots.joint import Joint
-from diffeo_calib.robots.se3 import twist_transform
-from diffeo_calib.runtime.build import calibrated_chain
-from diffeo_calib.runtime.chain import tip_poses
 
 ROWS = 12
 TOOLS = torch.tensor([[0.0, 0.0, 0.1], [0.02, 0.05, 0.0]], dtype=torch.float64)
@@ -135,44 +125,7 @@ def test_wrong_targets_of_both_hands(model: dc.CalibratedKinematics) -> None:
             dc.compensate(model, **{"targets": targets, "start": start, **change})  # pyright: ignore[reportArgumentType]
 
 
-# --- parts of the search: derivatives, limits of mimic joints, models -----------------------------------------------
-
-Array = np.ndarray
-
-
-def rigid(model: dc.CalibratedKinematics, axes: int) -> tuple[ToolFunctions, Targets, Array]:
-    """Rough kinematics of all tips; targets for six rows, far away, a free tip of several in two; joint values."""
-    rng, tips = np.random.default_rng(1), model.robot.tips
-    poses, free = twist_transform(torch.from_numpy(rng.standard_normal((6, len(tips), 6)))).numpy(), np.zeros((6, 2))
-    free[1, 0] = free[4, 1] = len(tips) - 1
-    parts = poses[..., :3, 3], poses[..., :3, :axes], np.eye(3)[:, 3 - axes :]
-    tool = tool_functions(model, {tip: torch.eye(4, dtype=torch.float64) for tip in tips}, "base")
-    chain = calibrated_chain(
-        model.robot.arrays, np.eye(4), model.geometry.joint_errors.numpy(), np.zeros(6 + 6 * model.robot.moving)
-    )
-    tool = replace(tool, poses=partial(tip_poses, chain), jacobian=tool.rough)
-    return tool, Targets(*parts, 0.3, free[:, : len(tips)] > 0), rng.uniform(-2, 2, (6, model.robot.n))
-
-
-@pytest.mark.parametrize("axes", [3, 1, 0])
-@pytest.mark.parametrize("slides", [False, True])
-def test_gradient_and_hessian_of_the_cost(model: dc.CalibratedKinematics, axes: int, slides: bool) -> None:
-    """By central differences."""
-    tool, goal, q = rigid(model_of(CHAINS["slides"], dc.RK4(1)) if slides else model, axes)
-
-    def slope(at: Array) -> Array:
-        return -np.einsum("nkj,nk->nj", goal.slopes(tool.jacobian(at)), goal.errors(tool.poses(at)))
-
-    S = goal.slopes(tool.jacobian(q))
-    hessian, h = S.swapaxes(1, 2) @ S + goal.curvature(tool.jacobian(q), tool.poses(q)), 1e-5
-    for joint, step in enumerate(h * np.eye(q.shape[1])):
-        rise = goal.cost(tool.poses(q + step)) - goal.cost(tool.poses(q - step))
-        np.testing.assert_allclose(slope(q)[:, joint], rise / (2 * h), rtol=0, atol=1e-8)
-        change = (slope(q + step) - slope(q - step)) / (2 * h)
-        np.testing.assert_allclose(hessian[:, :, joint], change, rtol=0, atol=1e-8)
-
-
-# --- limits ---------------------------------------------------------------------------------------------------------
+# --- limits of mimic joints -----------------------------------------------------------------------------------------
 
 
 def limited(mimic: dict[str, float], offset: float, low: float, high: float) -> dc.Chain:
@@ -200,26 +153,3 @@ def test_corrections_stop_at_the_limits_of_joints_that_follow_several() -> None:
     np.testing.assert_allclose(kept[0], [0.55, 0.45])
     np.testing.assert_allclose(kept[[1, 3]], q[[1, 3]])
     assert np.isnan(kept[2]).all()
-
-
-# --- models ---------------------------------------------------------------------------------------------------------
-
-
-def test_a_model_is_forgotten_with_its_last_use(arm: Case) -> None:
-    model = arm.model.with_tool([0.0, 0.0, 0.1])
-    dc.compensate(model, torch.zeros(1, 3), torch.zeros(1, 6))
-    seen = weakref.ref(model)
-    del model
-    gc.collect()
-    assert seen() is None
-
-
-def test_torch_and_numpy_find_the_same_commands(arm: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Models without constants for NumPy are evaluated by torch."""
-    q = arm.test.q[:10]
-    targets = arm.robot(q)
-    found = dc.compensate(arm.model.with_tool(None), targets, q)
-    monkeypatch.setattr("diffeo_calib.kinematics.tool.program_of", lambda _: None)
-    again = dc.compensate(arm.model.with_tool(None), targets, q)
-    assert found.status == again.status
-    torch.testing.assert_close(again.q[found.reached], found.q[found.reached], rtol=0, atol=1e-7)

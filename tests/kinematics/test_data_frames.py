@@ -106,13 +106,11 @@ def test_measurements_of_a_data_frame_know_the_names(table: Table, arm: Case) ->
 # --- results as data frames of pandas -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["arm", "pair"])
-def test_errors_of_every_row(name: str, request: pytest.FixtureRequest) -> None:
-    case: Case = request.getfixturevalue(name)
-    data = case.test[5:25]
-    found = dc.evaluate(case.model, data)
+def test_errors_of_every_row(pair: Case) -> None:
+    data = pair.test[5:25]
+    found = dc.evaluate(pair.model, data)
     frame = found.to_frame()
-    away = (data.points - case.model(data.q)).numpy()
+    away = (data.points - pair.model(data.q)).numpy()
     assert list(frame.columns) == ["row", "marker", "x", "y", "z", "error"]
     assert list(frame["row"]) == [row for row in range(5, 25) for _ in range(data.markers)]
     assert frame.groupby("marker").size().tolist() == [20] * data.markers

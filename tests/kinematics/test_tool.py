@@ -62,28 +62,11 @@ def test_a_model_of_poses_agrees_with_itself(posed: Case) -> None:
     assert float(angle_between(found[:, :3, :3], expected[:, :3, :3]).max()) < 2e-5
 
 
-@pytest.mark.parametrize("frame", FRAMES)
-def test_jacobian_against_central_differences(arm: Case, frame: str) -> None:
-    q, tool, h = arm.test.q[:5], tool_frame(), 1e-5
-    jacobian, poses = arm.model.tool_jacobian(q, tool, frame), arm.model.tool_poses(q, tool, frame)
-    for joint in range(q.shape[1]):
-        step = torch.zeros_like(q)
-        step[:, joint] = h
-        change = (arm.model.tool_poses(q + step, tool, frame) - arm.model.tool_poses(q - step, tool, frame)) / (2 * h)
-        torch.testing.assert_close(jacobian[:, :3, joint], change[:, :3, 3], rtol=0, atol=1e-9)
-        spin = change[:, :3, :3] @ poses[:, :3, :3].mT
-        turning = torch.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], 1)
-        torch.testing.assert_close(jacobian[:, 3:, joint], turning, rtol=0, atol=1e-8)
-
-
 def test_frames_differ_by_the_base_that_was_found(arm: Case) -> None:
     q = arm.test.q[:7]
     base = arm.model.geometry.base
     own, seen = (arm.model.tool_poses(q, tool_frame(), frame) for frame in FRAMES)
     torch.testing.assert_close(base @ own, seen, rtol=0, atol=1e-12)
-    R = torch.block_diag(base[:3, :3], base[:3, :3])
-    slopes = [arm.model.tool_jacobian(q, tool_frame(), frame) for frame in FRAMES]
-    torch.testing.assert_close(R @ slopes[0], slopes[1], rtol=0, atol=1e-12)
 
 
 def test_deviations_are_of_the_size_of_the_errors(arm_200: Case) -> None:
@@ -199,11 +182,3 @@ def test_it_is_what_the_truth_leaves_after_both_are_taught(arm_200: Case) -> Non
     assert left < 0.5 * whole
     assert 0.5 * left < predicted < 2.0 * left
     assert predicted < 0.5 * measuring < 0.5 * in_base
-
-
-def test_rows_alone_and_together_are_the_same(arm: Case) -> None:
-    """What is taught anew is found over the model's configurations, not over the commands."""
-    q = arm.test.q[:3]
-    together = covariance_without_placement(arm.model, q, TOOL)
-    alone = torch.cat([covariance_without_placement(arm.model, row[None], TOOL) for row in q])
-    assert_close(alone, together, rtol=1e-6, atol=1e-16)

@@ -20,7 +20,7 @@ def same(found: Tensor, expected: Tensor, atol: float = 1e-10) -> None:
     torch.testing.assert_close(found, expected, rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("name", CHAINS)
+@pytest.mark.parametrize("name", ["slides", "mimic joints", "mimic slides", "arm"])
 def test_jacobians_of_a_robot(name: str) -> None:
     """In both modes, one row and all rows, at control points too."""
     model = made(name)
@@ -38,9 +38,8 @@ def test_jacobians_of_a_robot(name: str) -> None:
     same(vmap(lambda row: model.jacobian(row[None])[0])(q), expected)
 
 
-@pytest.mark.parametrize("profile", ["cauchy", "matern32"])
-def test_jacobians_of_a_plain_map(profile: str) -> None:
-    model = fitted_plain(profile)
+def test_jacobians_of_a_plain_map() -> None:
+    model = fitted_plain("matern32")
     q = queries(model)
     expected = model.jacobian(q)
     same(vmap(jacrev(lambda row: model(row[None])[0]))(q), expected)
@@ -48,9 +47,8 @@ def test_jacobians_of_a_plain_map(profile: str) -> None:
     same(vmap(lambda row: model.jacobian(row[None])[0])(q), expected)
 
 
-@pytest.mark.parametrize("profile", ["gaussian", "matern72"])
-def test_second_derivatives_against_differences_of_the_jacobian(profile: str) -> None:
-    model, h = made("slides", profile=profile), 1e-5
+def test_second_derivatives_against_differences_of_the_jacobian() -> None:
+    model, h = made("slides", profile="matern72"), 1e-5
     q = queries(model)
     found = vmap(hessian(lambda row: model(row[None])[0]))(q)  # (N, 1, 3, n, n)
     for joint in range(q.shape[1]):

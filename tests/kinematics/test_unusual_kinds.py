@@ -139,12 +139,11 @@ def test_rows_and_seeds(arm: Case) -> None:
                 call(seed=seed)
 
 
-@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
-def test_modes_without_derivatives(mode: Callable[[], Any], arm: Case) -> None:
+def test_inference_mode(arm: Case) -> None:
     """Same results, and what was made there can be differentiated outside."""
     q, few, scales = arm.test.q[:4], arm.train[:14], usual_scales(arm.robot)
     expected = dc.calibrate(arm.robot, few, hyperparameters=scales).model(q)
-    with mode():
+    with torch.inference_mode():
         robot, data = dc.load_urdf(URDF_FILE, "base_link", "flange"), dc.Measurements(few.q * 1, few.points * 1)
         model = dc.calibrate(robot, data, hyperparameters=scales).model
         torch.testing.assert_close(model(q), expected, rtol=0, atol=0)

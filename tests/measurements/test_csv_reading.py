@@ -1,207 +1,259 @@
-"""Tables in CSV files: units, separators, joints alone, and files with every kind of mistake in them."""
+"""Tables as devices, spreadsheets and programs write them: what is unmistakable is read and said."""
 
 from __future__ import annotations
 
-import csv
 import math
 import os
 import threading
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from product_bank import sliding_measurements, sliding_robot
-from table_bank import HEADER, JOINTS, POSITION, ROWS, Reader, read_table, says
+from table_bank import HEADER, JOINTS, POSITION, ROWS, Reader, held, in_order
 from torch.testing import assert_close
 
-import diffeo_calib as dc
-from diffeo_calib.cli.options import Units
-from diffeo_calib.cli.tables import MeasuredTable, of_robot, table_format
+from diffeo_calib.cli.guesses import guess_sheet
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
-from diffeo_calib.measurements.csv.files import read_joints, read_measurements, write_measurements, write_predictions
+from diffeo_calib.measurements.csv.files import read_joints, read_measurements, read_observations
+from diffeo_calib.measurements.csv.lines import read_cells
+from diffeo_calib.measurements.poses import angle_between, rotation_matrices, transforms
 from diffeo_calib.measurements.table_format import TableFormat
 
-
-def test_reads_si(read: Reader) -> None:
-    data = read(
-        "\ufeffname, z,q2 ,y,x,q1\r\nA,3,0.2,2,1,.1\r\n\r\n'B',-3.5,4e-1,2.5,1.5,0.3\r\n"
-    )  # BOM, blank line, order
-    assert_close(data.q, torch.tensor([[0.1, 0.2], [0.3, 0.4]], dtype=torch.float64), rtol=0, atol=0)
-    assert_close(data.points[:, 0], torch.tensor([[1, 2, 3], [1.5, 2.5, -3.5]], dtype=torch.float64), rtol=0, atol=0)
-    assert data.joint_names == ("q1", "q2")
-
-
-def test_columns_may_have_other_names_than_the_robot_s_joints(read: Reader, tmp_path: Path) -> None:
-    robot = SimpleNamespace(joint_names=("slide", "turn"), kinds=("prismatic", "revolute"))
-    expected = read(HEADER + "250,90,1000,0,500\n", kinds=robot.kinds, length="mm", angle="deg")
-    how: dict[str, Any] = {"length": "mm", "angle": "deg"}
-    data = read_measurements(tmp_path / "table.csv", robot, POSITION, joints=JOINTS, **how)
-    assert data.joint_names == robot.joint_names
-    assert torch.equal(data.q, expected.q)
-    with pytest.raises(MeasurementError, match="`joints`"):
-        read_measurements(tmp_path / "table.csv", robot, POSITION, joints=JOINTS[:1], **how)
+quietly = pytest.mark.filterwarnings("ignore::diffeo_calib.common.errors.DiffeoCalibWarning")
+NAMES = [*JOINTS, *POSITION]
+CELLS = [
+    [f"{0.1 * k:.3f}", f"{-0.2 * k:.4f}", f"{1000.5 + k:.2f}", f"{k - 3.25:.3f}", f"{2 + k % 3:.1f}"] for k in range(8)
+]
+EXPECTED = [[float(cell) for cell in row] for row in CELLS]
+FORMAT: dict[str, Any] = {"length": "mm", "angle": "rad"}
 
 
-def test_columns_of_other_joints_are_not_suggested(tmp_path: Path) -> None:
-    joints = ["wrist_1_joint", "wrist_2_joint", "wrist_3_joint"]
-    (tmp_path / "table.csv").write_text("wrist_1_joint,wrist_2_joint,Wrist3,x,y,z\n1,2,3,4,5,6\n")
-    with pytest.raises(MeasurementError, match=r"for 'wrist_3_joint', did you mean Wrist3\.$"):
-        read_measurements(tmp_path / "table.csv", joints, POSITION, length="m", angle="rad")
+def separated(mark: str, rows: list[list[str]]) -> str:
+    return "".join(mark.join(row) + "\n" for row in rows)
 
 
-def test_prismatic_joints_take_the_unit_of_length(read: Reader) -> None:
-    robot = SimpleNamespace(joint_names=("q1", "q2"), kinds=("prismatic", "revolute"))
-    for joints, kinds, unit, slide in (
-        (robot, None, None, 250),
-        (JOINTS, ["prismatic", "continuous"], None, 250),
-        (robot, None, "m", 0.25),
-    ):
-        text = HEADER + f"{slide},90,1000,0,500\n"
-        data = read(text, joints=joints, kinds=kinds, length="mm", angle="deg", joint_length=unit)
-        assert_close(data.q, torch.tensor([[0.25, math.pi / 2]], dtype=torch.float64))
-        assert data.points.tolist() == [[[1.0, 0.0, 0.5]]]
-
-
-SEMICOLONS = HEADER.replace(",", ";")
-WRONG_FILES: dict[str, tuple[str | bytes, dict[str, Any], tuple[str, ...]]] = {
-    "empty": ("", {}, ("empty", "header")),
-    "header only": (HEADER, {}, ("header but no rows", "at least one row")),
-    "ragged": (HEADER + ROWS + "1,2,3\n", {}, ("line 4:", "expected 5 cells", "got 3")),
-    "many ragged": (HEADER + "1\n" * 9, {}, ("line 2, 3, 4, 5, 6 and 4 more",)),
-    "ragged after a quoted line break": ('"q1",q2,x,y,z\n"1\n",2,3,4,5\n1,2\n', {}, ("line 4:", "got 2")),
-    "duplicated header": ("q1,q2,x,y,z,q2\n", {}, ("header", "q2", "more than once")),
-    "misspelt": (HEADER, {"joints": ["Q1", "q22"]}, ("no column ['Q1', 'q22']", "['q1', 'q2'", "mean q1", "mean q2")),
-    "missing": (HEADER, {"position": ["x", "y", "height"]}, ("no column ['height']", "written in the header")),
-    "separator": (SEMICOLONS + "1;2;3;4;5\n", {}, ("single column", "q1;q2;x", "pass sep=';'")),
-    "decimal comma": (
-        SEMICOLONS + "1;2;3;4;5\n1,5;2;3;4;5\n1;2;3,5;4;5,5\n",
-        {"sep": ";"},
-        ("line 3, column 'q1' (and 2 more, on line 4)", "'1,5'", "decimal comma", "decimal=','"),
-    ),
-    "decimal point": (
-        SEMICOLONS + "1.5;2;3;4;5\n",
-        {"sep": ";", "decimal": ","},
-        ("line 2, column 'q1'", "got '1.5'", "decimal point", "decimal='.'"),
-    ),
-    "thousands": (SEMICOLONS + "1;2;1.234;4;5\n", {"sep": ";", "decimal": ","}, ("column 'x'", "thousands")),
-    "word": (HEADER + "1,2,far,4,5\n", {}, ("line 2, column 'x'", "a number", "got 'far'")),
-    "empty cell": (HEADER + ROWS + "1,2,,4,5\n", {}, ("line 4, column 'x'", "finite", "an empty cell")),
-    "nan": (
-        HEADER + "1,2,3,4,NaN\n" * 8,
+PLAIN = separated(",", [NAMES, *CELLS])
+BARE = PLAIN.partition("\n")[2]
+GERMAN = [[cell.replace(".", ",") for cell in row] for row in CELLS]
+GROUPED = [[*row[:2], f"{1000.5 + k:,.2f}", *row[3:]] for k, row in enumerate(CELLS)]
+SWISS = [[cell.replace(",", "\u2019") for cell in row] for row in GROUPED]
+SPACED = [
+    [*own[:2], row[2].replace(",", "\u202f").replace(".", ","), *own[3:]]
+    for own, row in zip(GERMAN, GROUPED, strict=True)
+]
+ALIGNED = "".join("".join(f"{cell:>12}" for cell in row) + "\n" for row in [NAMES, *CELLS])
+SEMICOLONS, COMMAS = {"sep": ";"}, {"sep": ";", "decimal": ","}
+READ: dict[str, tuple[str | bytes, dict[str, str], str]] = {
+    "byte order mark": ("\ufeff" + PLAIN.replace("\n", "\r\n"), {}, ""),
+    "UTF-16": (PLAIN.encode("utf-16"), {}, "text in utf-16"),
+    "Windows": (("Kraft (°), größe\n" + PLAIN).encode("cp1252"), {}, "text in cp1252, not UTF-8"),
+    "Chinese": (("# 关节(度), 坐标(毫米)\n" + PLAIN).encode("gb18030"), {}, "text in gb18030, not UTF-8"),
+    "Japanese": (("# 関節, X座標, 測定\n" + PLAIN).encode("cp932"), {}, "text in cp932, not UTF-8"),
+    "a number sign before the names": ("# " + PLAIN, {}, ""),
+    "as numpy.savetxt writes": ("# " + separated(" ", [NAMES, *CELLS]), {"sep": " "}, ""),
+    "aligned columns": (ALIGNED, {"sep": " "}, ""),
+    "comments": ("# cell 4\n// by hand, today\n" + PLAIN, {}, "line 1, 2 before the header skipped"),
+    "a commented header above the header": ("# q1,q2,x,y,z\n" + PLAIN, {}, "line 1 before the header skipped"),
+    "a preamble": (
+        "Trial,17\nOperator,A. B.,Rate,100,Hz\n\n100\n" + PLAIN,
         {},
-        ("line 2, column 'z' (and 7 more, on line 3, 4, 5, 6, 7 and 2 more)", "'NaN'"),
+        "line 1, 2, 4 before the header skipped",
     ),
-    "mark of a missing reading": (HEADER + "1,2,3,1e30,5\n", {}, ("line 2, column 'y'", "below 1e+12", "1e30")),
-    "duplicates": (
-        HEADER + ROWS + "9,9,9,9,9\n" + ROWS.replace("0.1,", "0.10,"),
+    "a preamble of a spreadsheet": ("Trial,17,,,\nSite,hall,,,\n,,,,\n" + PLAIN, {}, "line 1, 2, 3 before the header"),
+    "units": (PLAIN.replace("z\n", "z\nrad,(rad),[mm],mm,mm\n"), {}, "line 2 holds units"),
+    "comments between rows": (
+        PLAIN.replace("0.200,", "# moved the tripod\n0.200,") + "#9,9,9,9,9\n",
         {},
-        ("2 line(s)", "5 repeats 2, 6 repeats 3", "duplicates='drop'"),
+        "2 line(s) with comments, names or nothing skipped (line 4, 11)",
     ),
-    "quote": (HEADER + '1,2,"3,4,5\n6,7,8,9,10\n', {}, ("line 2", "not valid CSV", "quotes")),
-    "not text": (b"PK\x03\x04\xff\xfe", {}, ("no text but a spreadsheet", "save it as .xlsx or CSV")),
+    "lines of separators": (PLAIN + ",,,,\n" * 3, {}, "3 line(s) with comments, names or nothing skipped"),
+    "trailing separators": (PLAIN.replace("\n", ",\n"), {}, ""),
+    "trailing separators of rows alone": (
+        PLAIN.replace("\n", ";\n").replace("z;", "z").replace(",", ";"),
+        SEMICOLONS,
+        "",
+    ),
+    "decimal commas": (separated(";", [NAMES, *GERMAN]), COMMAS, ""),
+    "thousands": (separated(";", [NAMES, *GROUPED]), SEMICOLONS, ""),
+    "thousands in quotes": (PLAIN.replace("1000.50", '"1,000.50"'), {}, ""),
+    "Swiss thousands": (separated("\t", [NAMES, *SWISS]), {"sep": "\t"}, ""),
+    "thousands and decimal commas": (separated(";", [NAMES, *SPACED]), COMMAS, ""),
+    "minus signs": (PLAIN.replace("-", "\u2212"), {}, ""),
+    "spaces that do not break": (PLAIN.replace(",", "\u00a0,\u00a0"), {}, ""),
+    "columns that spaces align": (separated("   ", [NAMES, *CELLS]), {"sep": " "}, ""),
+    "a column without a name": (
+        separated(",", [["", *NAMES], *([str(k), *row] for k, row in enumerate(CELLS))]),
+        {},
+        "",
+    ),
+    "labels that begin as comments do": (
+        separated(",", [["pose", *NAMES], *([f"#{k}", *row] for k, row in enumerate(CELLS))]),
+        {},
+        "",
+    ),
+    "names again between the rows": (PLAIN + PLAIN, {"duplicates": "drop"}, "or nothing skipped (line 10)"),
+    "another name twice": (separated(",", [[*NAMES, "t", "t"], *([*row, "1", "2"] for row in CELLS)]), {}, ""),
+    "columns that are counted": ("0,1,2,3,4\n" + BARE, {"names": "01234"}, ""),
+    "no names": (BARE, {"names": "12345"}, "no header line: columns are named by their places, 1 to 5"),
+    "a comment and no names": ("# by hand\n" + BARE, {"names": "12345"}, "no header line: columns are named by their"),
+    "no names, trailing separators": (
+        BARE.replace("\n", ",\n"),
+        {"names": "12345"},
+        "no header line: columns are named",
+    ),
 }
 
 
-@pytest.mark.parametrize("name", WRONG_FILES)
-def test_wrong_file_is_one_clear_error(name: str, read: Reader) -> None:
-    text, options, message = WRONG_FILES[name]
-    with pytest.raises(MeasurementError, match=says("table.csv", *message)) as caught:
-        read(text, **options)
-    assert str(caught.value).endswith(".")
-    assert "\n" not in str(caught.value)
+@quietly
+@pytest.mark.parametrize("name", READ)
+def test_what_is_unmistakable_is_read_and_proposed(name: str, read: Reader, tmp_path: Path) -> None:
+    """With the separator and the decimal mark that `init` finds, which sees the same columns."""
+    content, how, note = READ[name]
+    names = [*how.get("names", NAMES)]
+    with pytest.warns(DiffeoCalibWarning) if note else pytest.MonkeyPatch.context() as said:
+        data = read(
+            content, names[:2], names[2:], **FORMAT | {name: own for name, own in how.items() if name != "names"}
+        )
+    assert_close(torch.cat([data.q, 1e3 * data.points[:, 0]], 1).tolist(), EXPECTED, rtol=1e-12, atol=1e-12)
+    if note:
+        assert note in str(said[0].message)  # pyright: ignore[reportIndexIssue]
+    sheet = guess_sheet(tmp_path / "table.csv")
+    assert (sheet.sep, sheet.decimal) == (how.get("sep", ","), how.get("decimal", "."))
+    assert {*names} <= {*sheet.numbers} or "counted" in name
+
+
+def test_what_init_sees_in_odd_tables(tmp_path: Path) -> None:
+    path = tmp_path / "t.csv"
+    path.write_text("".join(f"{k},{line}\n" for k, line in enumerate(BARE.splitlines())))
+    assert guess_sheet(path).numbers == ("2", "3", "4", "5", "6"), "a column that numbers the rows is no joint"
+    path.write_text(separated(";", [NAMES, *CELLS]).replace("1002.50", "1002,50"))
+    sheet = guess_sheet(path)
+    assert "x" not in sheet.numbers
+    assert "line 4, column 'x': expected a number, got '1002,50'; looks like a decimal comma" in sheet.odd
+    path.write_text("3,2,1\n1,2,3\n")
+    assert read_cells(path, ",") == ([*"123"], [(1, [*"321"]), (2, [*"123"])])
+
+
+MARKERS = {
+    "names above the first of three": ",,M1,,,M 2,,\nq1,q2,X,Y,Z,X,Y,Z\n,,mm,mm,mm,mm,mm,mm\n",
+    "names above each": (
+        ",,Marker,Marker,Marker,Marker,Marker,Marker\n,,M1,M1,M1,M 2,M 2,M 2\n,,a0,a0,a0,b1,b1,b1\nq1,q2,X,Y,Z,X,Y,Z\n"
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MARKERS)
+def test_two_lines_of_names_are_joined(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text("Trajectories\n100\n" + MARKERS[name] + separated(",", [[*row, *row[2:]] for row in CELLS]))
+    triples = [[f"{marker}_{axis}" for axis in "XYZ"] for marker in ("M1", "M 2")]
+    with pytest.warns(DiffeoCalibWarning, match="line 1, 2"):
+        data = read_measurements(path, JOINTS, triples, **FORMAT)
+    assert_close(data.points[:, 0], data.points[:, 1], rtol=0, atol=0)
+    assert {name for triple in triples for name in triple} <= {*guess_sheet(path).numbers}
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"length": "km"}, ("`length`", "'m' or 'mm' or 'cm' or 'inch'", "got 'km'")),
-        ({"angle": "degrees"}, ("`angle`", "'rad' or 'deg'", "got 'degrees'")),
-        ({"decimal": "."}, ()),
-        ({"decimal": ";"}, ("`decimal`", "';'")),
-        ({"decimal": ","}, ("`sep` and `decimal`", "different", "sep=';'")),
-        ({"sep": "::"}, ("`sep`", "one character", "'::'")),
-        ({"duplicates": "ignore"}, ("`duplicates`", "'error' or 'keep' or 'drop'")),
-        ({"joints": "q1"}, ("`joints`", "'q1'")),
-        ({"joints": ["q1", "x"]}, ("distinct columns", "x")),
-        ({"position": [["x", "y", "z"]] * 2}, ("`joints` and `position`", "distinct columns", "x")),
-        ({"position": "xyz"}, ("`position`", "three names")),
-        ({"position": [["x", "y", "z"], ["x", "y"]]}, ("`position`",)),
-        (
-            {"kinds": ["revolute"]},
-            ("`joints`: expected 1 columns of joints, one for each of `kinds`, got 2 (['q1', 'q2'])",),
-        ),
-        ({"kinds": ["revolute", "planar"]}, ("`kinds`", "'prismatic'", "got 'planar'")),
-        ({"joint_length": "km"}, ("`joint_length`: expected 'm' or 'mm' or 'cm' or 'inch', got 'km'",)),
-        ({"joint_length": "m"}, ("`joint_length` without the kinds of the joints", "pass the robot, or `kinds`")),
-    ],
+    "content", [b"PK\x03\x04\0\0", PLAIN.replace("0.200,", "0.200,,").encode(), PLAIN.encode() + b'9,"']
 )
-def test_wrong_option_is_one_clear_error(options: dict[str, Any], message: tuple[str, ...], read: Reader) -> None:
-    if not message:
-        assert len(read(HEADER + ROWS, **options)) == 2
-        return
-    with pytest.raises(MeasurementError, match=says(*message)):
-        read(HEADER + ROWS, **options)
+def test_the_reason_of_the_reader_is_that_of_the_proposal(content: bytes, read: Reader, tmp_path: Path) -> None:
+    with pytest.raises(MeasurementError) as reading:
+        read(content)
+    with pytest.raises(MeasurementError) as proposing:
+        guess_sheet(tmp_path / "table.csv")
+    assert str(proposing.value) == str(reading.value)
 
 
-def test_units_must_be_named(tmp_path: Path) -> None:
-    with pytest.raises(TypeError, match="length"):
-        read_measurements(tmp_path, JOINTS, POSITION, angle="rad")  # pyright: ignore[reportCallIssue]
-    with pytest.raises(TypeError, match="angle"):
-        read_measurements(tmp_path, JOINTS, POSITION, length="m")  # pyright: ignore[reportCallIssue]
+def test_marks_of_rows_are_labels_where_all_have_them(read: Reader) -> None:
+    assert len(read(separated(",", [["id", *NAMES], ["#1", *CELLS[0]]]), **FORMAT)) == 1
+    disabled = [NAMES, *([f"#{row[0]}", *row[1:]] for row in CELLS[:6]), *CELLS[6:]]
+    with pytest.warns(DiffeoCalibWarning, match="6 line"):
+        assert len(read(separated(",", disabled), **FORMAT)) == 2
+    damaged = [NAMES, *CELLS[:2], ["#VALUE!", *CELLS[2][1:]], *CELLS[3:]]
+    with pytest.raises(MeasurementError, match="line 4, column 'q1': expected a number, got '#VALUE!'"):
+        read(separated(",", damaged), **FORMAT)
 
 
-def test_a_file_that_cannot_be_opened_is_named(tmp_path: Path) -> None:
-    with pytest.raises(MeasurementError, match=says("nowhere.csv", "does not exist", "folder")):
-        read_measurements(tmp_path / "nowhere.csv", JOINTS, POSITION, length="m", angle="rad")
-    with pytest.raises(MeasurementError, match="is a folder"):
-        read_measurements(tmp_path, JOINTS, POSITION, length="m", angle="rad")
+# --- joints, units and repeats --------------------------------------------------------------------------------------
+
+
+def test_joints_have_names_and_units_of_their_own(read: Reader, tmp_path: Path) -> None:
+    robot = SimpleNamespace(joint_names=("slide", "turn"), kinds=("prismatic", "revolute"))
+    how: dict[str, Any] = {"length": "mm", "angle": "deg"}
+    for slide, own in (
+        (250, {"joints": JOINTS, "kinds": ["prismatic", "continuous"]}),
+        (0.25, {"joints": JOINTS, "kinds": robot.kinds, "joint_length": "m"}),
+    ):
+        data = read(HEADER + f"{slide},90,1000,0,500\n", **own, **how)
+        assert_close(data.q, torch.tensor([[0.25, math.pi / 2]], dtype=torch.float64))
+        assert data.points.tolist() == [[[1.0, 0.0, 0.5]]]
+    (tmp_path / "table.csv").write_text(HEADER + "250,90,1000,0,500\n")
+    data = read_measurements(tmp_path / "table.csv", robot, POSITION, joints=JOINTS, **how)  # pyright: ignore
+    assert data.joint_names == robot.joint_names
+    assert_close(data.q, torch.tensor([[0.25, math.pi / 2]], dtype=torch.float64))
+    with pytest.raises(MeasurementError, match="`joints`"):
+        read_measurements(tmp_path / "table.csv", robot, POSITION, joints=JOINTS[:1], **how)  # pyright: ignore
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("mm", 1e-3), ("cm", 1e-2), ("inch", 0.0254)])
+def test_units_of_length(unit: str, metres: float, read: Reader) -> None:
+    text = HEADER + f"0.5,{','.join(repr(value / metres) for value in (0.4, 1.0, 2.0, 3.0))}\n"
+    data = read(text, length=unit, kinds=["revolute", "prismatic"])
+    assert_close(data.points[0, 0], torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
+    assert float(data.q[0, 1]) == pytest.approx(0.4)
 
 
 def test_duplicates_kept_or_dropped_on_request(read: Reader) -> None:
     text = HEADER + ROWS + ROWS + "9,9,9,9,9\n"
     assert len(read(text, duplicates="keep")) == 5  # asked for: no warning, and warnings are errors here
-    with pytest.warns(DiffeoCalibWarning, match=says("dropped 2 line(s)", "line 4, 5")) as record:
-        data = read(text, duplicates="drop")
+    with pytest.warns(DiffeoCalibWarning, match=in_order("dropped 2 line(s) ... line 4, 5")) as record:
+        assert read(text, duplicates="drop").q[:, 0].tolist() == [0.1, 0.3, 9.0]
     assert len(record) == 1
-    assert data.q[:, 0].tolist() == [0.1, 0.3, 9.0]
 
 
-MIXED: dict[str, Any] = {"kinds": ["prismatic", "revolute"], "angle": "deg"}
+SLIDE: dict[str, Any] = {"kinds": ["prismatic", "revolute"], "angle": "deg"}
+POSED: dict[str, Any] = {"rotation": ["a", "b", "c"], "convention": "XYZ", "rotation_angle": "deg"}
+UNKNOWN = "look like degrees, or like millimetres of a prismatic joint; pass the robot, which knows"
+ODD: list[tuple[str, dict[str, Any], str]] = [
+    ("0,90,1,2,3", {}, "90 rad: they " + UNKNOWN),
+    ("0,90,1,2,3", {"kinds": ["revolute"] * 2}, "90 rad: they look like degrees; pass angle='deg'"),
+    ("0,1.5,1,2,3", {"angle": "deg"}, "1.5 deg: they look like radians; pass angle='rad'"),
+    ("0,1.5,1000,2,3", {}, "1000 m: they look like millimetres; pass length='mm'"),
+    ("0,1.5,1,2,3", {"length": "mm"}, "3 mm: they look like metres; pass length='m'"),
+    (
+        "0.25,90,1000,0,500",
+        SLIDE | {"length": "mm"},
+        "joints reach only 0.25 mm: they look like metres; pass joint_len",
+    ),
+    ("250,90,1,0,0.5", SLIDE | {"length": "m"}, "250 m: they look like millimetres; pass joint_length='mm'"),
+    (
+        "0,1,1,2,3,10,20,30,1",
+        POSED | {"rotation_angle": "rad"},
+        "30 rad: they look like degrees; pass rotation_angle='d",
+    ),
+    ("0,1,1,2,3,1,-2,3,1", POSED, "rotations reach only 3 deg: they look like radians; pass rotation_angle='rad'"),
+    ("0,1,1,2,3,0,4,0,1", POSED | {"convention": "rotvec"}, "only 4 deg: they look like radians"),
+]
 
 
-@pytest.mark.parametrize(
-    ("row", "options", "message"),
-    [
-        ("0,90,1,2,3", {}, ("90 rad", "look like degrees", "angle='deg'")),
-        ("0,1.5,1,2,3", {"angle": "deg"}, ("1.5 deg", "look like radians", "angle='rad'")),
-        ("0,1.5,1000,2,3", {}, ("1000 m", "look like millimetres", "length='mm'")),
-        ("0,1.5,1,2,3", {"length": "mm"}, ("3 mm", "look like metres", "length='m'")),
-        ("0.25,90,1000,0,500", MIXED | {"length": "mm"}, ("joints reach only 0.25 mm: they look like metres; pass j",)),
-        ("250,90,1,0,0.5", MIXED | {"length": "m"}, ("250 m: they look like millimetres; pass joint_length='mm'",)),
-    ],
-)
-def test_unlikely_units_cause_a_warning(
-    row: str, options: dict[str, str], message: tuple[str, ...], read: Reader
-) -> None:
-    with pytest.warns(DiffeoCalibWarning, match=says("table.csv", *message)) as record:
-        read(HEADER + row, **options)
+@pytest.mark.parametrize(("row", "how", "message"), ODD)
+def test_unlikely_units_cause_a_warning(row: str, how: dict[str, Any], message: str, read: Reader) -> None:
+    header = HEADER.rstrip() + ",a,b,c,d\n" if "rotation" in how else HEADER
+    with pytest.warns(DiffeoCalibWarning, match=in_order("table.csv' ... " + message)) as record:
+        read(header + row, **how)
     assert len(record) == 1
     assert Path(record[0].filename).name == "conftest.py"  # where `read` calls the package
 
 
-def test_prismatic_joints_are_not_taken_for_degrees(read: Reader) -> None:
-    read(HEADER + "90,0.1,1000,0,500\n", kinds=["prismatic", "revolute"], length="mm", angle="rad")
-    message = says("look like degrees, or like millimetres of a prismatic joint; pass the robot, which knows")
-    with pytest.warns(DiffeoCalibWarning, match=message):  # the kinds of the joints are not known
-        read(HEADER + "90,0.1,1000,0,500\n", length="mm", angle="rad")
-    with pytest.warns(DiffeoCalibWarning, match=says("look like degrees; pass angle='deg' if they are")):
-        read(HEADER + "90,0.1,1000,0,500\n", kinds=["revolute", "revolute"], length="mm", angle="rad")
-
-
-# --- joints alone ---------------------------------------------------------------------------------
+def test_likely_units_cause_no_warning(read: Reader) -> None:
+    read(HEADER + "90,0.1,1000,0,500\n", kinds=["prismatic", "revolute"], length="mm")
+    header, row = HEADER.rstrip() + ",a,b,c,d\n", "0,1,1,2,3,0,{},0,1"
+    read(header + row.format(0), **POSED)
+    read(header + row.format(6.2832), **POSED | {"rotation_angle": "rad"})
+    read(header + row.format(0), rotation=["a", "b", "c", "d"], convention="quat_xyzw")  # quaternions have no unit
 
 
 def test_joints_alone(tmp_path: Path) -> None:
@@ -209,74 +261,172 @@ def test_joints_alone(tmp_path: Path) -> None:
     path.write_text("slide;time;turn\n250,5;noon;90\n-100;;-45\n")
     robot: Any = SimpleNamespace(joint_names=("turn", "slide"), kinds=("revolute", "prismatic"))
     expected = torch.tensor([[math.pi / 2, 0.2505], [-math.pi / 4, -0.1]], dtype=torch.float64)
-    q = read_joints(path, TableFormat("mm", "deg", ";", ",", joints=robot))
-    assert_close(q, expected, rtol=1e-15, atol=0)
+    assert_close(read_joints(path, TableFormat("mm", "deg", ";", ",", joints=robot)), expected, rtol=1e-15, atol=0)
     with pytest.warns(DiffeoCalibWarning, match=r"prismatic joints reach 250.5 m: they look like millimetres"):
         metres = read_joints(path, TableFormat("m", "deg", ";", ",", joints=["slide"], kinds=["prismatic"]))
     assert_close(metres, torch.tensor([[250.5], [-100.0]], dtype=torch.float64), rtol=0, atol=0)
 
 
-SI = TableFormat("m", "rad", joints=JOINTS)
-
-
 @pytest.mark.parametrize("content", [(HEADER + ROWS + ROWS).encode(), b"PK\x03\x04\xff\xfe"])
-def test_a_pipe_is_read_once(content: bytes, tmp_path: Path, read: Reader) -> None:
+def test_a_pipe_is_read_once(content: bytes, tmp_path: Path) -> None:
     """Joints alone may repeat."""
-    pipe = tmp_path / "pipe"
+    pipe, table = tmp_path / "pipe", TableFormat("m", "rad", joints=JOINTS)
     os.mkfifo(pipe)
     feeder = threading.Thread(target=lambda: pipe.write_bytes(content))
     feeder.start()
     if content.startswith(b"PK"):
-        with pytest.raises(MeasurementError, match=says("no text", "save it as .xlsx or CSV")):
-            read_joints(pipe, SI)
+        with pytest.raises(MeasurementError, match=r"no text.*save it as .xlsx or CSV"):
+            read_joints(pipe, table)
     else:
-        assert_close(read_joints(pipe, SI), read(content, duplicates="keep").q, rtol=0, atol=0)
+        assert read_joints(pipe, table).tolist() == 2 * [[0.1, 0.2], [0.3, 0.4]]
     feeder.join()
-
-
-def test_a_device_without_an_end_is_refused() -> None:
     with pytest.raises(MeasurementError, match="'/dev/zero' is no text but binary"):
-        read_joints("/dev/zero", SI)
+        read_joints("/dev/zero", table)
 
 
-@pytest.mark.parametrize("units", [("mm", "m"), ("m", "mm")])
-def test_what_is_written_is_read_back(units: tuple[str, str], tmp_path: Path) -> None:
-    robot = sliding_robot()
-    data = sliding_measurements(robot, 12)
-    table = TableFormat(units[0], "deg", joint_length=units[1])
-    write_measurements(tmp_path / "t.csv", data, table, joints=robot)
-    again = read_table(tmp_path / "t.csv", robot, ["x", "y", "z"], table)
-    assert_close(again.q, data.q, rtol=1e-14, atol=1e-15)
-    assert_close(again.points, data.points, rtol=1e-14, atol=1e-15)
+# --- markers that were not seen -------------------------------------------------------------------------------------
+
+TWO = [("ax", "ay", "az"), ("bx", "by", "bz")]
+PAIR = "q1,q2,ax,ay,az,bx,by,bz\n"
+SEEN = [[True, True], [True, False], [False, True]]
+HIDDEN = PAIR + "0.1,0.2,1,2,3,4,5,6\n0.3,0.4,1.5,2.5,3.5,{0},{0},{0}\n0.5,0.6,{1},{1},{1},4.5,5.5,6.5\n"
+LOST = ["inf", "1e13", "-3.697314E+28", "-", "----", "hidden", "MISSING", "#N/A", "NULL", "Out of View", "-1.#IND00"]
 
 
-def test_programs_and_predictions_keep_the_unit(tmp_path: Path) -> None:
-    robot, q = sliding_robot(), sliding_measurements(sliding_robot(), 3).q
-    path, table = (tmp_path / "program.csv", table_format(Units(length="mm", angle="deg", joint_length="m")))
-    assert table == TableFormat("mm", "deg", joint_length="m")
-    points = torch.ones(3, 1, 3, dtype=torch.float64)
-    write_predictions(path, [(q, points, 1e-3 * points)], table, joints=robot.joint_names, kinds=robot.kinds)
-    assert_close(read_joints(path, of_robot(table, robot)), q, rtol=1e-14, atol=1e-15)
-    header, first, *_ = list(csv.reader(path.read_text().splitlines()))
-    cells = dict(zip(header, first, strict=True))
-    assert float(cells["slide"]) == pytest.approx(float(q[0, 2]))
-    assert float(cells["x"]) == 1000.0
-    measured = MeasuredTable(path, replace(table, position=[["x", "y", "z"]])).read(robot)
-    assert_close(measured.q, q, rtol=1e-14, atol=1e-15)
+@pytest.mark.parametrize("cell", ["", "nan", " ", *LOST])
+def test_empty_cells_and_usual_marks_hide_a_marker(read: Reader, cell: str) -> None:
+    with pytest.warns(DiffeoCalibWarning) if cell in LOST else pytest.MonkeyPatch.context() as said:
+        data = read(HIDDEN.format(cell, "" if cell in LOST else cell), position=TWO)
+    assert data.visible.tolist() == SEEN
+    assert data.points[0].tolist() == [[1, 2, 3], [4, 5, 6]]
+    if cell in LOST:
+        assert f"'{cell}' (3)" in str(said[0].message)  # pyright: ignore[reportIndexIssue]
+        assert "line 3" in str(said[0].message)  # pyright: ignore[reportIndexIssue]
 
 
-@pytest.mark.slow
-def test_slides_in_the_wrong_unit_are_refused_with_the_unit_named() -> None:
-    robot = sliding_robot()
-    data = sliding_measurements(robot, 15)
-    q = data.q.clone()
-    q[:, 2] *= 1e3
-    with pytest.raises(
-        MeasurementError, match=r"values of prismatic joints seem to be 1000 times too .*\(`joint_length`\)"
-    ):
-        dc.calibrate(robot, dc.Measurements(q, data.points, doubt=False))
+def test_a_line_without_any_marker_is_left_out_and_named(read: Reader) -> None:
+    with pytest.warns(DiffeoCalibWarning, match="no marker was seen in line 5: 1 row"):
+        assert read(HIDDEN.format("", "") + "0.7,0.8,,,,,,\n", position=TWO).visible.tolist() == SEEN
+    with pytest.warns(DiffeoCalibWarning, match="no marker was seen in line 3"):
+        data = read(PAIR + "0.1,0.2,1,2,3,4,5,6\n0.3,0.4,,,,4,5,6\n", position=TWO[0])  # of a single marker
+    assert data.line_numbers.tolist() == [2]
 
 
-def test_tables_with_too_many_columns_are_refused(read: Any) -> None:
-    with pytest.raises(MeasurementError, match="expected at most 50000 columns, got 60000"):
-        read(",".join(["1"] * 60_000) + "\n")
+def lost(*rows: int, mark: str = "0") -> str:
+    cells = [mark, f"{mark}.0", mark]
+    return separated(",", [NAMES, *([*row[:2], *cells] if k in rows else row for k, row in enumerate(CELLS))])
+
+
+@pytest.mark.parametrize(("rows", "mark"), [((3,), "0"), ((2, 5), "0"), ((2, 5), "-9999")])
+def test_a_marker_at_the_origin_far_from_all_rows_was_not_seen(rows: tuple[int, ...], mark: str, read: Reader) -> None:
+    at = ", ".join(str(row + 2) for row in rows)
+    with pytest.warns(DiffeoCalibWarning) as said:
+        data = read(lost(*rows, mark=mark), **FORMAT)
+    assert [text.split(".csv': ")[1] for text in map(str, (one.message for one in said))] == [
+        f"x, y, z are {mark}, {mark}, {mark} in line {at}, far from other rows: taken as not seen",
+        f"no marker was seen in line {at}: {len(rows)} row(s) left out",
+    ]
+    assert data.line_numbers.tolist() == [k + 2 for k in range(8) if k not in rows]
+
+
+def test_a_marker_near_the_origin_or_a_single_one_not_clearly_far_away_stays(read: Reader, tmp_path: Path) -> None:
+    """Tables relative to the first pose begin with it; repeated rows hide no origin either."""
+    near = [[*row[:2], f"{30 * (k - 3)}", f"{(k - 3) ** 2}", "0"] for k, row in enumerate(CELLS)]
+    first = [[*row[:2], f"{30 * k}", f"{k**2}", "0"] for k, row in enumerate(CELLS) if k != 1]
+    beside = [[*row[:2], f"{k - 9999}", f"{k * k - 9999}", "-9999"] for k, row in enumerate(CELLS)]
+    beside[5][2:] = ["-9999", "-9999", "-9999"]  # as in line 2: where rows are
+    for rows in (near, first, beside):
+        assert len(read(separated(",", [NAMES, *rows]), **FORMAT)) == len(rows)
+    assert len(read(lost(3, mark="-9999"), **FORMAT)) == 8
+    (tmp_path / "table.csv").write_text(lost(3))  # rows that come one by one cannot be judged by those that come later
+    table = TableFormat(**FORMAT, joints=JOINTS, position=[tuple(POSITION)])
+    assert len(read_observations(tmp_path / "table.csv", table, growing=True)) == 8
+
+
+# --- poses and deviations -------------------------------------------------------------------------------------------
+
+
+def test_poses_are_read(read: Reader) -> None:
+    text = HEADER.rstrip() + ",a,b,c\n1,2,1000,2000,3000,10,20,-170\n3,4,0,0,0,30,40,50\n"
+    data = read(text, length="mm", **POSED)
+    rotations = rotation_matrices(np.radians([[10, 20, -170], [30, 40, 50]]), "XYZ")
+    expected = transforms(rotations, torch.tensor([[1, 2, 3], [0, 0, 0]], dtype=torch.float64))
+    assert_close(held(data.poses), expected, rtol=0, atol=1e-15)
+    assert (data.lever, data.joint_names, data.std, data.rotation_std) == (0.1, ("q1", "q2"), None, None)
+    assert read(text, length="mm", lever=0.25, **POSED).lever == 0.25  # in m, whatever the file's unit
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["s"], [[3, 3, 3], [3, 3, 3]]),
+        ([["s"], ["t"]], [[3, 3, 3], [4, 4, 4]]),
+        (["s", "t", "u", "v", "w", "k"], [[3, 4, 5], [6, 7, 8]]),
+        ([["s", "t", "u"], ["v", "w", "k"]], [[3, 4, 5], [6, 7, 8]]),
+    ],
+)
+def test_deviations_are_read(names: Any, expected: Any, read: Reader) -> None:
+    """One column for all, one per marker or frame, three per frame; the second frame is hidden in the second row."""
+    text = "q1,x,y,z,a,b,c,X,Y,Z,A,B,C,s,t,u,v,w,k\n0.1,1,2,3,10,20,30,4,5,6,40,50,60,3,4,5,6,7,8\n"
+    flat = [name for group in names for name in group]
+    own = dict(zip("stuvwk", "345678", strict=True))
+    seen = [own[name] if len(flat) == 1 or name in flat[: len(flat) // 2] or name not in flat else "" for name in own]
+    text += f"0.2,1,2,3,10,20,30,,,,,,,{','.join(seen)}\n"
+    both: dict[str, Any] = {"joints": ["q1"], "position": [["x", "y", "z"], ["X", "Y", "Z"]]}
+    turned = POSED | {"rotation": [["a", "b", "c"], ["A", "B", "C"]]}
+    posed = None if len(names) == 6 else read(text, rotation_std=names, **both, **turned)
+    plain = read(text, std=flat, **both)
+    for data, found in ((plain, plain.std), *([(posed, held(posed.rotation_std).rad2deg())] if posed else [])):
+        assert_close(held(found)[0], torch.tensor(expected, dtype=torch.float64))
+        assert_close(held(found)[1, 0], torch.tensor(expected[0], dtype=torch.float64))
+        assert data.points[1, -1].isnan().all()
+        assert held(data.covariance).isfinite().all()
+
+
+UR10_JOINTS = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", *(f"wrist_{k}_joint" for k in (1, 2, 3))]
+UR10: dict[str, Any] = {"length": "mm", "angle": "rad", "sep": ";", "decimal": ","}
+UR10_STD = {
+    "std": [f"measurement_std_{axis}" for axis in "xyz"],
+    "rotation_std": [f"measurement_std_r{axis}" for axis in "xyz"],
+}
+
+
+def relative_spread(measured: torch.Tensor, nominal: torch.Tensor) -> torch.Tensor:
+    """How far turns between poses differ, measured against nominal: neither base nor tool frame matters for angles."""
+    first, others = measured[:1, :3, :3], measured[1:, :3, :3]
+    start, rest = nominal[:1, :3, :3], nominal[1:, :3, :3]
+    turned = angle_between(first.expand_as(others), others) - angle_between(start.expand_as(rest), rest)
+    return turned.abs()
+
+
+def test_ur10_poses_are_read(ur10_folder: Path) -> None:
+    """The convention is right: turns between poses are those between the commanded flange poses."""
+    path = ur10_folder / "measurements_iso_cubes.csv"
+
+    def read(before: str, names: str, turns: list[str], **how: Any) -> Any:
+        own = UR10 | {"rotation": [f"{before}{name}" for name in turns], **how}
+        return read_measurements(path, UR10_JOINTS, [f"{before}{name}" for name in names], **own)
+
+    turned = {"convention": "XYZ", "rotation_angle": "deg"}
+    data = read("measurement_", "xyz", ["rx", "ry", "rz"], **turned, **UR10_STD)
+    goal = {"convention": "xyz", "rotation_angle": "rad", "duplicates": "keep", "length": "m"}
+    commanded = read("Goal ", "xyz", ["roll", "pitch", "yaw"], **goal)
+    assert float(relative_spread(held(data.poses), held(commanded.poses)).max()) < math.radians(0.3)
+    wrong = read("measurement_", "xyz", ["rx", "ry", "rz"], **turned | {"convention": "xyz"})
+    assert float(relative_spread(held(wrong.poses), held(commanded.poses)).max()) > math.radians(0.5)
+    assert_close(held(data.std)[0, 0] * 1e3, torch.tensor([0.00095905, 0.0022901, 0.0019936]).double())
+    assert_close(held(data.rotation_std)[0].rad2deg(), torch.tensor([0.00094925, 0.0014176, 0.0011736]).double())
+    assert torch.linalg.matrix_rank(held(data.covariance), rtol=1e-12).unique().tolist() == [6]
+
+
+def test_fr3_poses_are_read(ur10_folder: Path) -> None:
+    """Matrices of a camera, against those that the controller reports."""
+    path = ur10_folder.parent / "franka_fr3" / "franka_fr3_camera.csv"
+    joints = [f"q{i}_rad" for i in range(1, 8)]
+    matrix = [f"cam_T{i}{j}" for i in range(3) for j in range(3)]
+    options: dict[str, Any] = {"length": "m", "angle": "rad", "convention": "matrix"}
+    data = read_measurements(path, joints, ["cam_T03", "cam_T13", "cam_T23"], rotation=matrix, **options)
+    assert len(data) == 114
+    reported = [f"tcp_{4 * i + j}" for i in range(3) for j in range(3)]
+    tcp = read_measurements(path, joints, ["tcp_3", "tcp_7", "tcp_11"], rotation=reported, **options)
+    assert float(relative_spread(held(data.poses), held(tcp.poses)).median()) < math.radians(1.0)

@@ -4,6 +4,7 @@ import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from zipfile import ZipFile
 
 import numpy as np
@@ -11,14 +12,16 @@ import openpyxl
 import pytest
 import torch
 from scipy.io import savemat
+from table_bank import warned
 
-from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.csv.files import read_measurements
 from diffeo_calib.measurements.csv.lines import CsvLines
 
 ROWS = np.random.default_rng(0).uniform(-1.0, 1.0, (7, 5))
 JOINTS, PLACES = ROWS[:, :2], ROWS[:, 2:]
 UNITS = {"length": "m", "angle": "rad"}
+NAMES = "q_1,q_2", "p_x,p_y,p_z"
 
 
 def _book(path: Path) -> None:
@@ -46,45 +49,37 @@ def _struct(path: Path) -> None:
 
 
 WRITERS: dict[str, tuple[str, Callable[[Path], object], str, str]] = {
-    "a spreadsheet": ("t.xlsx", _book, "q_1,q_2", "p_x,p_y,p_z"),
-    "the sheet with rows": ("t.xlsx", _two_sheets, "q_1,q_2", "p_x,p_y,p_z"),
+    "a spreadsheet": ("t.xlsx", _book, *NAMES),
+    "the sheet with rows": ("t.xlsx", _two_sheets, *NAMES),
     "an array": ("t.npy", lambda path: np.save(path, ROWS), "1,2", "3,4,5"),
-    "an array with names": ("t.npy", _named, "q_1,q_2", "p_x,p_y,p_z"),
-    "arrays": ("t.npz", lambda path: np.savez(path, q=JOINTS, p=PLACES, gain=np.eye(3)), "q_1,q_2", "p_x,p_y,p_z"),
-    "variables": ("t.mat", lambda path: savemat(path, {"q": JOINTS, "p": PLACES}), "q_1,q_2", "p_x,p_y,p_z"),
-    "variables of old": (
-        "t.mat",
-        lambda path: savemat(path, {"q": JOINTS, "p": PLACES}, format="4"),
-        "q_1,q_2",
-        "p_x,p_y,p_z",
-    ),
+    "an array with names": ("t.npy", _named, *NAMES),
+    "arrays": ("t.npz", lambda path: np.savez(path, q=JOINTS, p=PLACES, gain=np.eye(3)), *NAMES),
+    "variables": ("t.mat", lambda path: savemat(path, {"q": JOINTS, "p": PLACES}), *NAMES),
+    "variables of old": ("t.mat", lambda path: savemat(path, {"q": JOINTS, "p": PLACES}, format="4"), *NAMES),
     "a structure": ("t.mat", _struct, "log_q_1,log_q_2", "log_p_x,log_p_y,log_p_z"),
 }
 
 
-@pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")
-@pytest.mark.parametrize("sep", [",", ";"])
+NOTES = {
+    "a spreadsheet": "line 1, 2 before the header skipped",
+    "the sheet with rows": "sheet 'Sheet' read, not notes",
+    "an array": "no header line",
+    "arrays": "arrays gain left out: no numbers or texts of 7 rows",
+}
+
+
 @pytest.mark.parametrize("kind", WRITERS)
-def test_the_rows_are_those_of_a_csv_file(tmp_path: Path, kind: str, sep: str) -> None:
+def test_the_rows_are_those_of_a_csv_file(tmp_path: Path, kind: str) -> None:
+    """Whatever the separator; what was decided is said."""
     name, write, joints, places = WRITERS[kind]
     write(tmp_path / name)
-    data = read_measurements(tmp_path / name, joints.split(","), places.split(","), sep=sep, **UNITS)
-    torch.testing.assert_close(data.q, torch.from_numpy(JOINTS), rtol=1e-15, atol=0.0)  # spreadsheets have 16 digits
-    torch.testing.assert_close(data.points[:, 0], torch.from_numpy(PLACES), rtol=1e-15, atol=0.0)
-
-
-@pytest.mark.parametrize(
-    ("kind", "note"),
-    [
-        ("the sheet with rows", "sheet 'Sheet' read, not notes"),
-        ("arrays", "arrays gain left out: no numbers or texts of 7 rows"),
-    ],
-)
-def test_what_was_decided_is_said(tmp_path: Path, kind: str, note: str) -> None:
-    name, write, joints, places = WRITERS[kind]
-    write(tmp_path / name)
-    with pytest.warns(DiffeoCalibWarning, match=note):
-        read_measurements(tmp_path / name, joints.split(","), places.split(","), **UNITS)
+    for sep in ",;":
+        how: Any = {"sep": sep, **UNITS}
+        data, said = warned(read_measurements, tmp_path / name, joints.split(","), places.split(","), **how)
+        torch.testing.assert_close(data.q, torch.from_numpy(JOINTS), rtol=1e-15, atol=0.0)  # sheets have 16 digits
+        torch.testing.assert_close(data.points[:, 0], torch.from_numpy(PLACES), rtol=1e-15, atol=0.0)
+        assert NOTES.get(kind, "") in " ".join(said)
+        assert bool(said) == (kind in NOTES)
 
 
 def test_lines_are_those_of_the_sheet(tmp_path: Path) -> None:

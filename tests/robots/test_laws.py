@@ -129,17 +129,6 @@ def test_a_reversed_chain_has_inverse_poses(chain: dc.Chain) -> None:
     assert_close(again(reordered(q, chain, again)), chain(q), rtol=0, atol=1e-13)
 
 
-def test_hand_to_hand_of_a_table_is_that_of_both_arms() -> None:
-    robot = two_arms()
-    held, q = robot.reversed("left"), draw(6, robot.n)
-    both = robot.tip_poses(q)
-    assert_close(held(reordered(q, robot, held)), torch.linalg.inv(both[:, 0]) @ both[:, 1], rtol=0, atol=1e-14)
-    assert held.joint_names[-4:] == ("joint_1", "joint_5", "joint_6", "joint_7")
-    for tip in (None, "middle"):
-        with pytest.raises(RobotError, match=r"`tip`: expected one of left, right"):
-            robot.reversed(tip)
-
-
 @every_robot
 def test_descriptions_come_back(robot: Tree) -> None:
     again = robot_from_config(json.loads(json.dumps(robot.to_config())))
@@ -280,6 +269,9 @@ def test_a_urdf_read_from_hand_to_hand_is_its_reversed_tree() -> None:
     here, there = own_features(held, reordered(q, both, held)), own_features(read, reordered(q, both, read))
     assert set(here) == set(there)
     assert contained(here, there) < 1e-10
+    for tip in (None, "middle"):
+        with pytest.raises(RobotError, match=r"`tip`: expected one of left_hand, right_hand"):
+            both.reversed(tip)
 
 
 @pytest.mark.slow

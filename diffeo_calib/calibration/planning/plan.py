@@ -107,7 +107,6 @@ class Plan:
             expected of a calibration with the poses of ranks 1 to 0, 1, ..., count, together with everything measured
             before. An expectation under the scales that the plan started from, without the noise of measurements and
             without rows that are wrong.
-        known_rms: (M,) RMS error of the markers (the origin) expected at every candidate before the plan, m.
         noise_rms: RMS noise of one measured position under the same scales, m; held-out errors contain it, too.
         assumed: whether these scales are only those of usual industrial robots and trackers. Then ``expected_rms`` is a
             guess that may be far off; the choice of the poses depends on it little.
@@ -120,7 +119,6 @@ class Plan:
     rank: Tensor
     rows: Tensor
     expected_rms: Tensor
-    known_rms: Tensor
     noise_rms: float
     assumed: bool
     joint_names: tuple[str, ...]
@@ -263,8 +261,6 @@ def plan(
         posterior = Conditional.given(posterior, Numbers.of(rows.at), rows.noise)  # of any size
     order, variance = scene.choose(posterior, (options.at, options.noise, options.rows), targets, count)
     LOG.info("%d poses chosen of %d", count, len(q))
-    blocks = scene.without_motions(posterior, targets).covariance(scene.at.rows(wanted))
-    blocks = scene.with_second_order(scene.along(blocks))
     noise = 3 * scene.along(scene.noise[targets]).diagonal(dim1=1, dim2=2).mean()
     stated = next((3 * one.std**2 for one in sensors if one.of_positions and one.std is not None), float(noise))
     rows, names = options.rows[order] - int(wanted[0]), [told[k].name for k in options.device[order].tolist()]
@@ -275,7 +271,6 @@ def plan(
         rows=rows[path],
         devices=tuple(names[k] for k in path.tolist()) if len(told) > 1 else (),
         expected_rms=(3 * variance).sqrt(),
-        known_rms=(3 * blocks.diagonal(dim1=1, dim2=2).mean(1)).clamp(min=0.0).sqrt(),
         noise_rms=stated**0.5,
         assumed=isinstance(robot_or_model, Tree) and hyperparameters is None,
         joint_names=robot.joint_names,

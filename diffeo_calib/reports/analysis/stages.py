@@ -84,16 +84,14 @@ class Deviations:
         q, fitted = low + draws * (high - low), fitted[:: -(-len(fitted) // MEASURED)]
         found = cls(q, claimed(model, q), fitted, claimed(model, fitted), ExpectedError.of(model))
         try:
-            sensors = sensor_of(model)
+            somewhere = [sensor for sensor in sensor_of(model) if sensor.reached(model.geometry.base)]
         except InputError:  # a file of an early version
             return found
         options = [q]
-        for sensor in sensors:
-            if sensor.reached(model.geometry.base):
-                try:
-                    options.append(drawn(model, [sensor], CONFIGURATIONS, model.geometry.tool))
-                except InputError:  # such as of a camera, which cannot see everywhere
-                    options.append(model.configurations.to(HOST))
+        try:
+            options += [drawn(model, somewhere, CONFIGURATIONS, model.geometry.tool)] if somewhere else []
+        except InputError:  # such as of a camera, which cannot see everywhere
+            options.append(model.configurations.to(HOST))
         return replace(found, next=plan(model, torch.cat(options), NEXT, target=q[:TARGETS]))
 
 
