@@ -81,36 +81,27 @@ def test_one_process_writes_and_a_torn_line_is_removed(tmp_path: Path) -> None:
 
 
 def other_files() -> Iterator[bytes]:
-    """Files that are no journals."""
-    deep = b'{"begun": ' + 9999 * b"["
+    """Files that are no journals, and what cannot follow the entries of one."""
+    deep, whole = b'{"begun": ' + 9999 * b"[", b"".join(map(as_line, ENTRIES))
     yield from (b"text", b"x,y\n1,2\n", b"x,y\n1,2", b'{"a": 1}\n', b"[]\n", bytes(9), b"\xff\n")
     yield from (deep, deep + b"\n", b'{"begun": 1}\n', b'{"line": 2}\n', b'{"removed": 1}\n')
-
-
-def other_entries() -> Iterator[bytes]:
-    """What cannot follow the entries of a journal."""
-    yield from (b"text", b"text\n", b"7\n", b"null\n", b"\n", as_line(LINE), b'{"row": 0, "error": NaN}\n')
-    yield b'{"row": 0, "error": 1e999}\n'
-    for row in ({"row": 1}, {"row": -1}, {"row": "0"}, {"row": 10**30}, {"line": 3}, {"other": 1}, {"fits": 0}):
-        yield as_line({"row": 0} | row)
+    for tail in (b"text", b"text\n", b"7\n", b"null\n", b"\n", as_line(LINE), b'{"row": 0, "error": NaN}\n'):
+        yield whole + tail
     line = {"line": 3, "sha": "0", "rows": [ROW]}
-    for change in ({"line": "3"}, {"line": 4}, {"sha": 7}, {"rows": []}, {"rows": 7}, {"unreadable": "x"}):
-        yield as_line(line | change)
+    rows = [{"row": 1}, {"row": -1}, {"row": "0"}, {"row": 10**30}, {"line": 3}, {"other": 1}]
     fields = [{"fits": 1}, {"accepted": None}, {"error": "x"}, {"error": -1.0}, {"error": 1e200}, {"cause": None}]
     fields += [{"shown": "mm"}, {"shown": ["mm"]}, {"shown": ["mm", "1"]}, {"decided": 0}, {"again": []}]
-    for field in fields:
-        yield as_line(line | {"rows": [ROW | field]})
-        yield as_line({"row": 0} | field)
-    yield as_line(line | {"rows": [ROW | {"row": 0}]})
-    yield as_line(line | {"rows": [{"fits": True}]})
+    lines = [{"line": "3"}, {"line": 4}, {"sha": 7}, {"rows": []}, {"rows": 7}, {"unreadable": "x"}]
+    lines += [{"rows": [ROW | field]} for field in [*fields, {"row": 0}]] + [{"rows": [{"fits": True}]}]
+    for entry in [*({"row": 0} | own for own in rows + fields), *(line | own for own in lines)]:
+        yield whole + as_line(entry)
 
 
 def test_what_is_no_journal_is_left_as_it_is(tmp_path: Path) -> None:
     """Also through a link; nor is a pipe, which was waited for, a device without an end, or a folder."""
     path, link = tmp_path / "other", tmp_path / "run.csv.journal"
     link.symlink_to(path)
-    whole = b"".join(as_line(one) for one in ENTRIES)
-    for content in [*other_files(), *(whole + tail for tail in other_entries())]:
+    for content in other_files():
         path.write_bytes(content)
         with pytest.raises(InputError, match=r"not the journal of a campaign: got .*; name another table, or move"):
             Journal(link)
