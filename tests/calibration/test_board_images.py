@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 import torch
-from golden_bank import camera_on_tool
 from kind_bank import kind_named, rigid_rms
+from product_bank import usual_scales
 from simulated_camera import BOARD_PRIOR, HEIGHT, WIDTH, CameraArm, camera_arm, true_camera
 from simulated_sockets import rest_in_sockets
 from table_bank import refused, warned
@@ -29,7 +29,7 @@ from diffeo_calib.robots import SimulatedArm
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 
-SCALES = camera_on_tool().scales
+SCALES = usual_scales(SimulatedArm().nominal)
 
 
 @cache
@@ -180,7 +180,7 @@ def test_the_tracker_makes_the_workspace_known() -> None:
     images: Any = kind().data.parts[0]
     alone = dc.calibrate(kind().robot, images, hyperparameters=kind().scales)
     assert kind().result.expected.workspace < 0.5 * alone.expected.workspace
-    q = kind().source.golden.rows.parts[1].q
+    q = kind().source.rows.parts[1].q
     truth = kind().source.truth(q)
     assert rigid_rms(kind().model(q).detach(), truth) < 0.5 * rigid_rms(alone.model(q).detach(), truth)
 

@@ -11,8 +11,8 @@ import jsonschema
 import pytest
 import torch
 from command_bank import Command
-from golden_bank import usual_scales
 from kind_bank import rigid_rms
+from product_bank import usual_scales
 from simulated_camera import BOARD, CAMERA, CameraArm, camera_arm
 from simulated_head import CAMERA as HEAD_CAMERA
 from simulated_head import CAMERA_AWAY, SeeingHead

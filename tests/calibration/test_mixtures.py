@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 import torch
 from kind_bank import rigid_rms
-from mixture_bank import DISTANCES, TRACKED
-from reading_bank import readings
+from reading_bank import DISTANCES, readings
 from reading_bank import scales as usual
 from simulated_sockets import SocketRows, rest_in_sockets
 from table_bank import refused
@@ -36,6 +35,9 @@ from diffeo_calib.measurements.sockets import Sockets
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.sensors.places import fitting_devices
+
+TRACKED = 25
+"""Rows of the tracker in a mixture; the other 20 are new."""
 
 
 @pytest.fixture(scope="module")

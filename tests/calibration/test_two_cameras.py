@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 import torch
 from command_bank import Command
-from golden_bank import camera_on_tool
 from kind_bank import Kind, kind_named
+from product_bank import usual_scales
 from simulated_camera import (
     BOARD_ON_FLANGE,
     BOARD_PRIOR,
@@ -32,6 +32,7 @@ from diffeo_calib.cameras.files import camera_text, read_camera
 from diffeo_calib.cameras.images import UNKNOWNS
 from diffeo_calib.interop.camera_files import camera_files
 from diffeo_calib.kinematics.hand_eye import HandEye
+from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 
 pytestmark = [
@@ -39,7 +40,7 @@ pytestmark = [
     pytest.mark.slow,
 ]
 
-SCALES = camera_on_tool().scales
+SCALES = usual_scales(SimulatedArm().nominal)
 FIXED: Any = {"camera_on_tool": False, "board": BOARD_PRIOR}
 
 

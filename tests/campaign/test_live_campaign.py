@@ -82,6 +82,25 @@ def test_rows_that_came_before_the_first_model_are_judged_by_it(measured: tuple[
     assert [one.row for one in campaign.verdicts if one.again] == [17]
 
 
+def test_rows_that_give_no_model_are_tried_once(
+    measured: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tries = []
+
+    def refused(_: Any, table: Any, *__: Any, **___: Any) -> None:
+        tries.append(len(table))
+        raise dc.DiffeoCalibError("these rows do not say where the device is")
+
+    monkeypatch.setattr("diffeo_calib.campaign.campaign.Around.of", refused)
+    q, y = measured
+    campaign = dc.Campaign(ARM.nominal, candidates=q, target=q)
+    campaign.add(q[:12], y[:12])
+    campaign.reject(0)
+    for row in (12, 13):
+        campaign.add(q[row], y[row])
+    assert tries == [12, 13]
+
+
 def test_mistakes_of_one_row_are_named_and_left_out(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
     q, y = (part[ROWS : ROWS + 1] for part in measured)
     before = measured[0][ROWS - 1]
@@ -147,6 +166,9 @@ def test_a_row_to_be_repeated_is_left_out_and_its_pose_comes_first(running: dc.C
     q = running.table.q
     assert_close(found.q[:2], q[[7, 20]])
     assert (found.again, len(found.rows), len(found.q)) == ([7, 20], 1, 3)
+    other = torch.cat([q[20, :1], q[10, 1:]])
+    campaign.add(other, ARM.true_points(other[None])[0])
+    assert campaign.next(3).again == [7, 20]  # one equal joint makes no repeat  # pyright: ignore
     campaign.add(q[20] + 1e-3, ARM.true_points(q[20:21])[0])
     found = campaign.next(1)
     assert_close(found.q, q[7:8])
@@ -245,7 +267,7 @@ def test_a_goal_is_reached_once_the_limit_is_below_it(running: dc.Campaign, meas
 @pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 def test_next_poses_of_a_ball_are_in_sockets() -> None:
     kind = kind_named("ball in sockets")
-    rows, q = kind.source.golden.rows, kind.q(30)
+    rows, q = kind.source.rows, kind.q(30)
     ball, own = kind.model(rows.q).detach()[:, -1], rows.socket_numbers
     sockets = torch.stack([ball[own == number].mean(0) for number in own.unique()])
     drawn, given = begun(rows, kind.robot, target=q), begun(rows, kind.robot, candidates=q, target=q)
