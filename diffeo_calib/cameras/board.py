@@ -103,30 +103,18 @@ class View:
     @classmethod
     def of(cls, seen: Tensor, poses: Tensor, points: Tensor) -> View:
         """Views of images that showed corners ``seen`` (N, .) of a board at poses (N, 4, 4), m, with corners (K, 3)."""
-        away, cosine = _towards(poses, points)
+        away, cosine = towards(poses, points)
         side = float(cosine.median().sign()) or 1.0
         facing = side * max(float((side * cosine).min()), 0.0)
         return cls(points, int(seen.sum(1).min()), float(away.min()), float(away.max()), facing)
-
-    def allows(self, poses: Tensor) -> Tensor:
-        """(N,) boolean: whether boards at poses (N, 4, 4) are as near, and as little inclined, as those of images."""
-        away, cosine = _towards(poses, self.points)
-        side = -1.0 if self.facing < 0 else 1.0
-        return (away >= self.near) & (away <= self.far) & (side * cosine >= abs(self.facing))
 
     @property
     def numbers(self) -> list[float]:
         """All constants."""
         return [float(self.fewest), self.near, self.far, self.facing, *self.points.flatten().tolist()]
 
-    @classmethod
-    def from_numbers(cls, numbers: Tensor) -> View:
-        """The inverse of :attr:`numbers`."""
-        fewest, near, far, facing = numbers[:4].tolist()
-        return cls(numbers[4:].view(-1, 3), int(fewest), near, far, facing)
 
-
-def _towards(poses: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+def towards(poses: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     """Distances (N,) of the middle of points on boards at poses (N, 4, 4), m, and cosines of z axes to the line."""
     middle = poses[:, :3, :3] @ points.mean(0) + poses[:, :3, 3]
     away = middle.norm(dim=1)

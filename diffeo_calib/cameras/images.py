@@ -22,7 +22,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.cameras.board import BOARD, LENS, BoardPrior, View, board_slopes, project, project_slopes, real_board
+from diffeo_calib.cameras.board import (
+    BOARD,
+    LENS,
+    BoardPrior,
+    View,
+    board_slopes,
+    project,
+    project_slopes,
+    real_board,
+    towards,
+)
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.robots.se3 import nearest_rotations, rotation, skew, transforms
 
@@ -430,8 +440,10 @@ def sees(camera: Camera, poses: Tensor) -> Tensor:
     """
     if camera.view is None:
         return torch.ones(len(poses), dtype=torch.bool, device=poses.device)
-    found = camera.view.allows(poses)
-    found[found.clone()] = shown(camera, poses[found]).sum(1) >= camera.view.fewest
+    view, (away, cosine) = camera.view, towards(poses, camera.view.points)
+    found = (away >= view.near) & (away <= view.far)
+    found &= (-1.0 if view.facing < 0 else 1.0) * cosine >= abs(view.facing)
+    found[found.clone()] = shown(camera, poses[found]).sum(1) >= view.fewest
     return found
 
 

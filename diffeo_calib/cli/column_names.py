@@ -28,7 +28,7 @@ ROLES = {
     "place": "t p pos position trans translation tvec point",
     "tool": "tcp pose ee cartesian cart tool marker point",
     "joint": "q j joint joints jnt axis axes ax a rax achse gelenk theta th qpos jpos pos position positions angle "
-    "angles state states",
+    "angles state states 关节 軸 轴 関節",
     "external": "e ext external extax eax rail track slide linear",
     "machine": "robot flange tcp tool ee eef effector gripper hand command cmd base",
     "seen": "board camera cam marker tracker tag charuco aruco pattern target object world",
@@ -39,7 +39,8 @@ A machine has poses of its own, beside what was seen.
 """
 WORDS = {role: frozenset(words.split()) for role, words in ROLES.items()}
 UNITS = {unit: unit for unit in ("mm", "m", "cm", "um", "inch", "rad", "mrad", "deg", "kg")}
-UNITS |= {"in": "inch", **dict.fromkeys(("degree", "degrees", "grad"), "deg")}
+UNITS |= {"in": "inch", "毫米": "mm", "厘米": "cm", "米": "m", "弧度": "rad"}
+UNITS |= dict.fromkeys(("degree", "degrees", "grad", "度"), "deg")
 LENGTHS = {"mm", "m", "cm", "um", "inch"}
 SAID = WORDS["measured"] | WORDS["wished"] | WORDS["deviation"]
 GLUED = {word: word for word in {*SAID, *WORDS["turn"], "t", "p", "m", "pos", "position", "trans", "tcp"} - {"q"}}
@@ -134,7 +135,7 @@ def groups(names: Sequence[str], labels: Sequence[str]) -> Iterator[Group]:
         seen[words] += 1  # X and x are columns of two groups
         for start, end in combinations(range(len(words) + 1), 2):
             label = "".join(words[start:end]) if end - start <= LONGEST_LABEL else ""
-            if label in wanted:
+            if label and label in wanted:
                 found.setdefault((words[:start], words[end:], seen[words]), {})[label] = name
     for (before, after, _), own in found.items():
         yield Group(before, after, {label: own[label] for label in labels if label in own})

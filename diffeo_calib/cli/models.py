@@ -138,7 +138,8 @@ def another_date_lines(model: CalibratedKinematics) -> Iterator[str]:
     """How a drift of the fit is treated where new rows of another date are compared or joined with it."""
     drift = KnownDrift.of(model)
     if drift is not None:
-        yield f"{drift.of_another_date}: these rows meet the model as it was at {drift.holds()}"
+        what = f"the drift with {' and '.join(drift.names)} is that of the rows of the fit"
+        yield f"{what}: these rows meet the model as it was at {drift.holds()}"
 
 
 LONGEST_TOOL_PER_REACH = 5.0

@@ -171,7 +171,7 @@ def rows_of_other_frames(model: CalibratedKinematics, q: Tensor) -> int:
     """
     if model.registration is not None:
         return 0
-    rows = [own.rows_elsewhere.to(q.device) for own in model.placement]
+    rows = [own.rows[own.elsewhere.to(HOST)[own.device]].to(q.device) for own in model.placement]
     elsewhere = model.configurations[torch.cat(rows)] if rows else model.configurations[:0]
     return int((torch.cdist(q.to(elsewhere), elsewhere, p=torch.inf) < SAME_CONFIGURATION).any(1).sum())
 

@@ -255,5 +255,5 @@ def transform_words(frame: Tensor) -> str:
 
 
 def triple(values: Tensor, digits: str = ".3f") -> str:
-    """Three numbers in words."""
+    """Lengths, or other numbers, in words, separated by blanks."""
     return " ".join(f"{value:{digits}}" for value in values.tolist())

@@ -307,11 +307,6 @@ class RowGroups:
         """(N,) int64, number of the place of each row's socket, -1 for other rows."""
         return self.socket_numbers
 
-    @property
-    def smallest_inflation(self) -> float:
-        """Smallest factor on variances that errors of left-out rows justify: no reading shows every direction."""
-        return 1.0 if self.without_device else 0.0
-
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
         """Labels (N,) int64 0, 1, ... of repeated configurations, in the order of first appearance.
 

@@ -9,6 +9,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
+from itertools import product
 from textwrap import dedent
 from typing import Any
 
@@ -215,27 +216,14 @@ def numbers_of(convention: object, angle: object = "rad", error: type[InputError
         raise error.of("`angle`", expected="'rad' or 'deg'", got=as_written(angle), fix=fix)
     if isinstance(convention, str) and convention in NUMBERS:
         return NUMBERS[convention]
-    if not is_euler(convention):
+    if not isinstance(convention, str) or convention not in EULER:
         fix = "name the convention in which the rotations are written"
         raise error.of("`convention`", expected=CONVENTIONS, got=as_written(convention), fix=fix)
     return 3
 
 
-def is_euler(convention: object) -> bool:
-    """Whether this is an order of Euler angles: three axes of one case, none twice in a row."""
-    if not isinstance(convention, str) or len(convention) != 3:
-        return False
-    one_case = set(convention) <= set("xyz") or set(convention) <= set("XYZ")
-    return one_case and convention[0] != convention[1] != convention[2]
-
-
-EULER = tuple(
-    order
-    for letters in ("xyz", "XYZ")
-    for order in ("".join((a, b, c)) for a in letters for b in letters for c in letters)
-    if is_euler(order)
-)
-"""The 24 orders of Euler angles."""
+EULER = tuple(a + b + c for letters in ("xyz", "XYZ") for a, b, c in product(letters, repeat=3) if a != b != c)
+"""The 24 orders of Euler angles: three axes of one case, none twice in a row."""
 ALL_CONVENTIONS = (*NUMBERS, *EULER)
 
 

@@ -81,7 +81,7 @@ class BoardCamera:
         own, root, unknowns = numbers.split([len(numbers) - SIZE * (SIZE + 1), SIZE * SIZE, SIZE])
         head, view = own[: 5 + EXPLAINED], own[5 + EXPLAINED :]
         on_tool, width, height, half_size, noise, *explained = head.tolist()
-        known = View.from_numbers(view) if len(view) else None
+        known = View(view[4:].view(-1, 3), int(view[0]), *view[1:4].tolist()) if len(view) else None
         camera = Camera(int(width), int(height), half_size, unknowns, root.view(SIZE, SIZE), noise, known)
         return cls(camera, bool(on_tool), Explained(*explained))
 

@@ -156,11 +156,6 @@ class Extrinsics(ABC):
         values = {name: torch.cat([getattr(self, name), getattr(other, name)]) for name in every}
         return replace(self, names=(*self.names, *other.names), shown=self.shown or other.shown, **values)
 
-    @property
-    def rows_elsewhere(self) -> Tensor:
-        """(K,) rows of the fit that were measured in another set-up than the model's, whose frame it has."""
-        return self.rows[self.elsewhere.to(HOST)[self.device]]
-
 
 @dataclass(frozen=True, eq=False)
 class Devices(Extrinsics):
@@ -425,8 +420,3 @@ def moved_pose(rows: Tensor, twist: Tensor) -> Tensor:
     """The rows (..., 12) of a transform after a shift and a turn (..., 6) in the frame that it leads to, m and rad."""
     turn, shift = torch.linalg.matrix_exp(skew(twist[..., 3:])), torch.nn.functional.pad(twist[..., :3, None], (3, 0))
     return (turn @ rows.unflatten(-1, (3, 4)) + shift).flatten(-2)
-
-
-def numbers_text(values: list[float]) -> str:
-    """Lengths with three digits, separated by blanks."""
-    return " ".join(f"{value:.3f}" for value in values)

@@ -9,12 +9,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import few
-from diffeo_calib.sensors.devices import (
-    Devices,
-    across,
-    least_squares,
-    numbers_text,
-)
+from diffeo_calib.measurements.bodies import triple
+from diffeo_calib.sensors.devices import Devices, across, least_squares
 
 LEAST_NORMAL = 0.5
 """Length of a normal by least squares from which heights tell the points apart."""
@@ -64,12 +60,12 @@ class Planes(Devices):
         return torch.cat([normal / normal.norm(), constants[3:] + increments[2:]])
 
     def where(self, number: int) -> str:
-        return f"above the plane of normal {numbers_text(self.constants[number, :3].tolist())}"
+        return f"above the plane of normal {triple(self.constants[number, :3])}"
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
-        *normal, distance = self.constants[number].tolist()
+        normal, distance = self.constants[number, :3], float(self.constants[number, 3])
         turn, shift = 1e3 * float(deviations[:2].norm()), 1e3 * float(deviations[2])
-        what = f"plane '{self.names[number]}' in {frame}: normal {numbers_text(normal)} +- {turn:.2f} mrad"
+        what = f"plane '{self.names[number]}' in {frame}: normal {triple(normal)} +- {turn:.2f} mrad"
         return f"{what}, {1e3 * distance:.3f} +- {shift:.3f} mm from the origin"
 
     def open_sentences(self) -> Iterator[tuple[str, str]]:

@@ -9,6 +9,7 @@ from math import cos
 import torch
 from torch import Tensor
 
+from diffeo_calib.measurements.bodies import triple
 from diffeo_calib.robots.se3 import nearest_rotations, transforms
 from diffeo_calib.sensors.devices import (
     SMALLEST_DISTANCE_M,
@@ -17,7 +18,6 @@ from diffeo_calib.sensors.devices import (
     Devices,
     Hypothesis,
     moved_pose,
-    numbers_text,
     refuse_first,
 )
 
@@ -117,14 +117,14 @@ class Cameras(Devices):
 
     def where(self, number: int) -> str:
         pose = self.poses[number]
-        return f"of the camera at {numbers_text((-1e3 * pose[:3, :3].mT @ pose[:3, 3]).tolist())} mm"
+        return f"of the camera at {triple(-1e3 * pose[:3, :3].mT @ pose[:3, 3])} mm"
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
         pose = self.poses[number]
-        place = (-1e3 * pose[:3, :3].mT @ pose[:3, 3]).tolist()
+        place = triple(-1e3 * pose[:3, :3].mT @ pose[:3, 3])
         shift, turn = 1e3 * float(deviations[:3].norm()), 1e3 * float(deviations[3:].norm())
-        what = f"camera '{self.names[number]}': {numbers_text(place)} +- {shift:.3f} mm in {frame}"
-        return f"{what}, looks along {numbers_text(pose[2, :3].tolist())} +- {turn:.2f} mrad"
+        what = f"camera '{self.names[number]}': {place} +- {shift:.3f} mm in {frame}"
+        return f"{what}, looks along {triple(pose[2, :3])} +- {turn:.2f} mrad"
 
 
 def _by_projection(values: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:

@@ -104,11 +104,6 @@ class KnownDrift(Extrinsics):
         """For which values the model itself holds."""
         return " and ".join(f"{name} {0.5 * (low + high):g}" for name, (low, high) in self.ends.items())
 
-    @property
-    def of_another_date(self) -> str:
-        """Why it is not applied to rows of another date."""
-        return f"the drift with {' and '.join(self.names)} is that of the rows of the fit"
-
     def of_joints(self) -> Iterator[str]:
         """How much drifted with each column, of what is known well, and for what the model holds."""
         for number, (name, (low, high)) in enumerate(self.ends.items()):

@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
+from diffeo_calib.measurements.bodies import triple
 from diffeo_calib.sensors.devices import (
     SMALLEST_DISTANCE_M,
     Devices,
     Hypothesis,
     least_squares,
-    numbers_text,
     refuse_first,
 )
 
@@ -70,12 +70,12 @@ class FixedPoints(Devices):
         refuse_first(near, "is at its fixed point, where a distance has no direction", fix)
 
     def where(self, number: int) -> str:
-        return f"from {numbers_text((1e3 * self.constants[number, :3]).tolist())} mm"
+        return f"from {triple(1e3 * self.constants[number, :3])} mm"
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
-        found, std = (1e3 * self.constants[number]).tolist(), (1e3 * deviations).tolist()
+        found, std = 1e3 * self.constants[number], 1e3 * deviations
         zero = f", its zero at {found[3]:.3f} +- {std[3]:.3f} mm" * bool(self.deviations[number, 3] > FIXED_DEVIATION_M)
-        place = f"{numbers_text(found[:3])} +- {numbers_text(std[:3])} mm in {frame}"
+        place = f"{triple(found[:3])} +- {triple(std[:3])} mm in {frame}"
         return f"fixed point '{self.names[number]}': {place}{zero}"
 
     def freed(self) -> FixedPoints | None:

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.measurements.bodies import triple
 from diffeo_calib.measurements.sockets import NO_SOCKET, Sockets
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.sensors.devices import Devices, Extrinsics, numbers_text
+from diffeo_calib.sensors.devices import Devices, Extrinsics
 
 IN_SOCKET_M = 0.02
 """Largest distance of the ball from the place of a socket, stated roughly, at which it counts as resting there."""
@@ -64,17 +64,15 @@ class SocketPlaces(Devices):
         return self.constants @ T[:3, :3].mT + T[:3, 3]
 
     def where(self, number: int) -> str:
-        return f"{numbers_text((1e3 * self.constants[number]).tolist())} mm"
+        return f"{triple(1e3 * self.constants[number])} mm"
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
         return f"socket '{self.names[number]}': {self.where(number)} in {frame}"
 
 
 def sockets_of(data: Measurements) -> tuple[Tensor, Sockets]:
-    """(N,) numbers of the sockets of rows, and these."""
-    if data.socket is None or data.sockets is None:
-        raise InputError.of("rows in sockets", got=f"{data.kind}s")
-    return data.socket.to(data.points.device), data.sockets
+    """(N,) numbers of the sockets of rows, and these; MeasurementError for rows without any."""
+    return data.socket_numbers.to(data.points.device), data.known_sockets
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from diffeo_calib.measurements.bodies import triple
 from diffeo_calib.measurements.poses import POINTS
 from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.robots.placement import place
 from diffeo_calib.robots.se3 import nearest_rotations
-from diffeo_calib.sensors.devices import Devices, least_squares, moved_pose, numbers_text
+from diffeo_calib.sensors.devices import Devices, least_squares, moved_pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +52,7 @@ class Trackers(Devices):
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
         marker, std = 1e3 * self.constants[number, 12:], 1e3 * deviations[6:]
-        place = f"{numbers_text(marker.tolist())} +- {numbers_text(std.tolist())} mm in the measured frame"
+        place = f"{triple(marker)} +- {triple(std)} mm in the measured frame"
         return f"marker of '{self.names[number]}': {place}; lengths are its own and the board's"
 
 
@@ -78,7 +79,7 @@ class Contacts(Devices):
         return least_squares(columns, (bodies[:, :3, 3] - values).flatten())
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
-        place, ball = (numbers_text((1e3 * part).tolist()) for part in self.constants[number].split(3))
+        place, ball = (triple(1e3 * part) for part in self.constants[number].split(3))
         std = 1e3 * float(deviations[:3].norm())
         what = f"socket '{self.names[number]}': {place} +- {std:.3f} mm in {frame}"
         return f"{what}, the ball at {ball} mm in the measured frame"
@@ -118,7 +119,7 @@ class HeldTools(Devices):
         return torch.cat([R, shift], 1).flatten()
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
-        place = (1e3 * self.constants[number].view(3, 4)[:, 3]).tolist()
+        place = triple(1e3 * self.constants[number].view(3, 4)[:, 3])
         shift, turn = 1e3 * float(deviations[:3].norm()), 1e3 * float(deviations[3:].norm())
-        what = f"held tool '{self.names[number]}': the second hand at {numbers_text(place)} +- {shift:.3f} mm"
+        what = f"held tool '{self.names[number]}': the second hand at {place} +- {shift:.3f} mm"
         return f"{what}, +- {turn:.2f} mrad in the frame of the first"

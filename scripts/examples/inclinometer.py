@@ -12,10 +12,11 @@ import torch
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.measurements.bodies import triple
 from diffeo_calib.measurements.poses import poses_of_triangles
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.robots.simulated_arm import SimulatedArm
-from diffeo_calib.sensors.devices import Devices, across, least_squares, numbers_text
+from diffeo_calib.sensors.devices import Devices, across, least_squares
 from diffeo_calib.sensors.kinds import register
 
 RANGE_RAD, SQUARE_RAD = 1.0, 0.01
@@ -76,7 +77,7 @@ class Inclinometers(Devices):
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
         """Axes, and the upward direction."""
-        x, y, up = (numbers_text(part.tolist()) for part in self.constants[number].split(3))
+        x, y, up = (triple(part) for part in self.constants[number].split(3))
         mounted, level = (1e3 * float(part.norm()) for part in deviations.split((4, 2)))
         what = f"inclinometer '{self.names[number]}': axes {x} and {y} of the tool +- {mounted:.2f} mrad"
         return f"{what}, up is {up} in {frame} +- {level:.2f} mrad"

@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.measurements.bodies import triple
 from diffeo_calib.robots.simulated_arm import SimulatedArm
-from diffeo_calib.sensors.devices import Devices, across, least_squares, numbers_text
+from diffeo_calib.sensors.devices import Devices, across, least_squares
 from diffeo_calib.sensors.kinds import register
 
 
@@ -57,8 +58,8 @@ class Beams(Devices):
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
         """Point and direction."""
         place, shift, turn = 1e3 * self.constants[number, :3], 1e3 * deviations[:2].norm(), 1e3 * deviations[2:].norm()
-        what = f"beam '{self.names[number]}' in {frame} through {numbers_text(place.tolist())} +- {shift:.3f} mm"
-        return f"{what} along {numbers_text(self.constants[number, 3:].tolist())} +- {turn:.2f} mrad"
+        what = f"beam '{self.names[number]}' in {frame} through {triple(place)} +- {shift:.3f} mm"
+        return f"{what} along {triple(self.constants[number, 3:])} +- {turn:.2f} mrad"
 
 
 POINTS = torch.tensor([[0.3, 0.9, 0.2], [-0.9, 0.2, 0.5]], dtype=torch.float64)  # beams in the robot's base, m

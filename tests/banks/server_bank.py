@@ -54,6 +54,7 @@ sys.stdin, sys.stdout, sys.stderr = streams.values()
 sys.__stdin__, sys.__stdout__, sys.__stderr__ = streams.values()
 if task["limit"] is not None:
     import resource
+    sys.dont_write_bytecode = True  # Python would keep half of a module
     resource.setrlimit(resource.RLIMIT_FSIZE, (task["limit"], task["limit"]))
 sys.argv = ["diffeo-calib", *task["arguments"]]
 code = 0

@@ -221,7 +221,7 @@ def test_ctrl_c_among_images_leaves_the_files(folder: Path, command: Command, mo
 
 
 def test_another_dictionary_is_named(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "0.png"), texture())
+    cv2.imwrite(str(tmp_path / "0.png"), texture()[:230, :290])
     (tmp_path / "joints.csv").write_text("image,q1\n0.png,1\n")
     other = Board.of(BOARD.replace("DICT_5X5_100", "DICT_4X4_50"))
     with pytest.raises(MeasurementError, match="DICT_5X5"):

@@ -166,6 +166,7 @@ def test_reported_values_come_before_others_and_commanded_last() -> None:
     assert [one.names[0] for one in found] == ["q_meas_1", "q_1", "q_cmd_1"]
     assert "reported: 'meas'" in found[0].how
     assert "commanded" in guess_joints(series("q_cmd_{}"), SIX)[0].how
+    assert guess_joints([*series("q_{}"), "q of many more words than any label has"], SIX)[0].names == series("q_{}")
     equal = guess_joints([*series("A{}"), *series("J{}")], SIX)
     assert len(equal) == 2
     assert equal[0].rank == equal[1].rank, "names alone do not tell"
@@ -205,6 +206,8 @@ def test_poses_as_matrices(names: list[str], named: bool) -> None:
         ("rvec_0", ("rvec", "x"), ""),
         ("current_joint_1", ("actual", "joint", "1"), ""),
         ("joint_current_1 [A]", ("joint", "current", "1", "a"), ""),
+        ("关节1(度)", ("关节", "1"), "deg"),
+        ("X坐标(毫米)", ("x", "坐标"), "mm"),
     ],
 )
 def test_words_and_units(name: str, words: tuple[str, ...], unit: str) -> None:

@@ -8,7 +8,6 @@ import pytest
 from command_bank import Command
 
 from diffeo_calib.cli.declarations import COMMANDS
-from diffeo_calib.cli.main import GONE
 
 OPTIONS = {
     name: ["--json", *(word for one in options.all() for word in one.names or (one.shown,))]
@@ -65,8 +64,6 @@ def test_help_explains_every_option(name: str, command: Command) -> None:
 )
 def test_former_names_say_what_to_do(former: str, advice: str, command: Command) -> None:
     assert advice in command(*former.split()).err
-    assert not {name.removeprefix("--") for name in GONE} & {*COMMANDS} - {"report"}
-    assert not {*GONE} & {name for one in COMMANDS.values() for option in one.all() for name in option.names}
 
 
 def test_a_campaign_file_with_a_former_name_says_what_to_do(tmp_path: Path, command: Command) -> None:
@@ -75,18 +72,14 @@ def test_a_campaign_file_with_a_former_name_says_what_to_do(tmp_path: Path, comm
 
 
 def test_help_shows_units_defaults_ranges_and_what_is_required(command: Command) -> None:
-    found = entries(command("fit", "--help").out)
-    assert "required" not in found["--robot"]  # or --robot-pose
+    """In words of the command line, though those of tables are of the class in Python."""
+    page = command("fit", "--help").out
+    found, text = entries(page), " ".join(page.split())
+    assert "required" not in found["--robot"] + found["--joints"]  # or --robot-pose
     assert "[required]" in found["CSV"]
-    assert "required" not in found["--joints"]
     assert "default: 0.3" in found["--holdout"]
     assert "0.0<=x<=0.9" in found["--holdout"]
-    assert "<m|mm|cm|inch>" in command("fit", "--help").out
-
-
-def test_help_of_a_table_speaks_of_the_command_line(command: Command) -> None:
-    """Though the words are those of the class in Python."""
-    text = " ".join(command("fit", "--help").out.split())
+    assert "<m|mm|cm|inch>" in page
     assert "Python" not in text.partition("Options:")[2]
     assert text.count("needed where no model knows it") == 2
     assert "all are in the plane of x and y. Repeatable." in text

@@ -10,9 +10,10 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from command_bank import Command, environment, run_process
+from command_bank import environment, run_process
 
 import diffeo_calib as dc
+from diffeo_calib.cli.declarations import COMMANDS
 
 SLOW = ("torch", "numpy", "scipy", "lxml", "yourdfpy", "matplotlib", "pykeops", "safetensors", "llvmlite")
 LIGHT = f"""
@@ -22,13 +23,11 @@ atexit.register(lambda: print("loaded:", *(name for name in {SLOW} if name in sy
 from diffeo_calib.__main__ import main
 main()
 """
-ALL = "fit campaign record evaluate init images predict correct export plan recalibrate demo"
-COMMANDS = ("fit", "evaluate", "predict", "correct", "export", "plan", "demo")
 
 
 @pytest.mark.parametrize(
     "arguments",
-    [["--help"], ["-h"], ["--version"], *([name, flag] for name in COMMANDS for flag in ("--help", "-h"))],
+    [["--help"], ["-h"], ["--version"], ["fit", "--help"], ["demo", "-h"]],
     ids=" ".join,
 )
 def test_help_and_version_load_nothing_slow(arguments: list[str]) -> None:
@@ -41,7 +40,7 @@ def test_help_and_version_load_nothing_slow(arguments: list[str]) -> None:
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        ("diffeo-calib ", ALL.split()),
+        ("diffeo-calib ", [*COMMANDS]),
         ("diffeo-calib pre", ["predict"]),
         ("diffeo-calib fit --ro", ["--robot", "--robot-pose", "--rotation", "--rotation-angle", "--rotation-std"]),
         ("diffeo-calib fit --length ", ["m", "mm", "cm", "inch"]),
@@ -55,19 +54,14 @@ def test_completion_loads_nothing_slow(words: str, expected: list[str]) -> None:
     assert done.out.split() == expected
 
 
-def test_the_script_of_the_completion_asks_the_program() -> None:
+def test_the_script_of_the_completion_asks_the_program(tmp_path: Path) -> None:
     variables = {"_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
     done = run_process("--show-completion", "bash", variables=variables)
     assert done.code == 0
     assert "_DIFFEO_CALIB_COMPLETE=complete_bash" in done.out
     assert re.search(r"^complete .*-F \w+ diffeo-calib$", done.out, re.MULTILINE)
-
-
-def test_the_completion_is_installed(tmp_path: Path) -> None:
-    variables = {"HOME": str(tmp_path), "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
-    done = run_process("--install-completion", "bash", variables=variables)
+    done = run_process("--install-completion", "bash", variables={**variables, "HOME": str(tmp_path)})
     assert done.code == 0
-    assert "bash completion installed in" in done.out
     (script,) = (tmp_path / ".bash_completions").iterdir()
     assert "_DIFFEO_CALIB_COMPLETE=complete_bash" in script.read_text()
     assert str(script) in (tmp_path / ".bashrc").read_text()
@@ -86,10 +80,6 @@ def test_the_console_script_points_into_the_package() -> None:
     found = re.search(r'^diffeo-calib = "(diffeo_calib\.[\w.]+):(\w+)"$', project.read_text("utf-8"), re.MULTILINE)
     assert found is not None
     assert callable(getattr(importlib.import_module(found[1]), found[2]))
-
-
-def test_the_version_is_that_of_the_installation(command: Command) -> None:
-    assert command("--version").out == f"diffeo-calib {version('diffeo_calib')}\n"
     assert version("diffeo_calib") == dc.__version__
 
 

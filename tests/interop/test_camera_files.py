@@ -37,7 +37,7 @@ def on_tool() -> dc.CalibratedKinematics:
 
 @cache
 def fixed() -> dc.CalibratedKinematics:
-    seen = fixed_camera_arm(40)
+    seen = fixed_camera_arm(25)
     data = seen.images(0.1, on_tool=False)
     return dc.calibrate(seen.arm.nominal, data, hyperparameters=camera_on_tool().scales).model
 

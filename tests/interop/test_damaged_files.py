@@ -25,14 +25,14 @@ from diffeo_calib.interop import model_file, model_header
 
 def test_cut_short(sound: bytes, tmp_path: Path) -> None:
     path = tmp_path / "cut.safetensors"
-    for length in [*range(64), *range(64, len(sound), 61), len(sound) - 8, len(sound) - 1]:
+    for length in [*range(64), *range(64, len(sound), 307), len(sound) - 8, len(sound) - 1]:
         path.write_bytes(sound[:length])
         assert "copy or save it again" in refused(path), length
     path.write_bytes(sound + b"\0")
     refused(path)
 
 
-@pytest.mark.parametrize(("part", "stride"), [("header", 13), ("tensors", 29)])
+@pytest.mark.parametrize(("part", "stride"), [("header", 41), ("tensors", 101)])
 def test_flipped_bits(part: str, stride: int, small: dc.CalibratedKinematics, sound: bytes, tmp_path: Path) -> None:
     """Refused, or without effect: e-05 may become E-05, or a 17th digit may change without changing the number."""
     path, q = tmp_path / "flipped.safetensors", simulated(1)[2].q[:3]
@@ -50,42 +50,35 @@ def test_flipped_bits(part: str, stride: int, small: dc.CalibratedKinematics, so
         harmless += 1
         assert part == "header", place
         assert torch.equal(model(q), expected), place
-    assert harmless < 0.02 * len(places)
+    assert harmless <= 0.02 * len(places)
 
 
 def test_files_of_other_kinds(tmp_path: Path) -> None:
-    path = tmp_path / "other"
-    for content, message in (
-        (b"", "cannot be read as a model file"),
-        (b"robot: ur10\n", "cannot be read as a model file"),
-        (b"\x89PNG\r\n\x1a\n" + bytes(100), "cannot be read as a model file"),
-        (pickle.dumps({"model": 1}), "cannot be read as a model file"),
-        (bytes([255] * 8), "cannot be read as a model file"),
+    path, weight = tmp_path / "other", {"weight": torch.zeros(3)}
+    assert "there is no model file" in refused(path)
+    assert "there is no model file" in refused(tmp_path)
+    for content in (
+        b"",
+        b"robot: ur10\n",
+        b"\x89PNG\r\n\x1a\n" + bytes(100),
+        pickle.dumps({"model": 1}),
+        bytes([255] * 8),
     ):
         path.write_bytes(content)
-        assert message in refused(path)
-    save_file({"weight": torch.zeros(3)}, path)
-    assert "is not a diffeo_calib model" in refused(path)
-    save_file({"weight": torch.zeros(3)}, path, metadata={"format": "pt"})
-    assert "is not a diffeo_calib model" in refused(path)
-    for text in ("[]", "null", "3", '"model"'):
-        save_file({"weight": torch.zeros(3)}, path, metadata={model_file.ENTRY: text})
-        assert "is not a diffeo_calib model" in refused(path)
-    save_file({"weight": torch.zeros(3)}, path, metadata={model_file.ENTRY: "{"})
-    assert "cannot be read" in refused(path)
-    save_file({"weight": torch.zeros(3)}, path, metadata={model_file.ENTRY: "{}"})
-    assert "format version None" in refused(path)
+        assert "cannot be read as a model file" in refused(path)
     header = json.dumps({"format": model_header.FORMAT})
-    save_file({"weight": torch.zeros(3)}, path, metadata={model_file.ENTRY: header})
-    assert "checksum" in refused(path)
-    for text, dtype in (("[" * 100_000, torch.float64), (header, torch.bfloat16)):
-        save_file({"weight": torch.zeros(3, dtype=dtype)}, path, metadata={model_file.ENTRY: text})
-        refused(path)
-
-
-def test_missing_files(tmp_path: Path) -> None:
-    assert "there is no model file" in refused(tmp_path / "nowhere.safetensors")
-    assert "there is no model file" in refused(tmp_path)
+    for metadata, message in (
+        (None, "is not a diffeo_calib model"),
+        ({"format": "pt"}, "is not a diffeo_calib model"),
+        *(({model_file.ENTRY: text}, "is not a diffeo_calib model") for text in ("[]", "null", "3", '"model"')),
+        *(({model_file.ENTRY: text}, "cannot be read") for text in ("{", "[" * 100_000)),
+        ({model_file.ENTRY: "{}"}, "format version None"),
+        ({model_file.ENTRY: header}, "checksum"),
+    ):
+        save_file(weight, path, metadata=metadata)
+        assert message in refused(path)
+    save_file({"weight": torch.zeros(3, dtype=torch.bfloat16)}, path, metadata={model_file.ENTRY: header})
+    refused(path)
 
 
 def test_torch_s_own_files_are_not_unpickled(tmp_path: Path) -> None:
@@ -149,6 +142,8 @@ WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
     "unknown integrator": (("integrator", "kind"), "euler", "euler"),
     "dimension of a word": (("task_dim",), "three", "do not fit together"),
     "dimension zero": (("task_dim",), 0, "task_dim"),
+    "dimension of the plane": (("task_dim",), 2, "task_dim"),
+    "integrator is true": (("integrator",), True, "do not fit together"),
     "lever of a model of points": (("lever",), 0.1, "a model of poses: expected three points for each, got 1"),
     "negative lever": (("lever",), -0.1, "`lever`"),
     "lever is true": (("lever",), True, "`lever`"),
@@ -182,24 +177,20 @@ def test_wrong_entries(name: str, editor: Editor) -> None:
     assert message in refused(editor.write(set_entry(*keys, value=value)))
 
 
-@pytest.mark.parametrize(
-    "key", ["units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report", "lever"]
-)
-def test_missing_entries(key: str, editor: Editor) -> None:
-    assert "not understood" in refused(editor.write(lambda header, _: header.pop(key)))
-
-
+NOT_UNDERSTOOD = ("units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report", "lever")
 MISSING: dict[str, Callable[[Any, Any], object]] = {
+    **{k: lambda header, _, k=k: header.pop(k) for k in NOT_UNDERSTOOD},
     **{k: lambda header, _, k=k: header["nominal"]["joints"][0].pop(k) for k in ("lower", "mimic", "mimic_offset")},
     "elastic": lambda header, _: header["nominal"].pop("elastic"),
     **{k: lambda _, tensors, k=k: tensors.pop(k) for k in (*model_header.MOMENTA, *model_header.GEOMETRY)},
 }
-"""Entries of a joint and of elasticity, and tensors."""
+"""Entries of the header, of a joint and of elasticity, and tensors."""
 
 
 @pytest.mark.parametrize("name", MISSING)
 def test_missing_parts(name: str, editor: Editor) -> None:
-    assert f"do not fit together ('{name}')" in refused(editor.write(MISSING[name]))
+    expected = "not understood" if name in NOT_UNDERSTOOD else f"do not fit together ('{name}')"
+    assert expected in refused(editor.write(MISSING[name]))
 
 
 WRONG_TENSORS: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
@@ -237,11 +228,6 @@ WRONG_TENSORS: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
 @pytest.mark.parametrize("name", WRONG_TENSORS)
 def test_wrong_tensors(name: str, editor: Editor) -> None:
     assert "do not fit together" in refused(editor.write(set_tensor(*WRONG_TENSORS[name])))
-
-
-@pytest.mark.parametrize(("key", "value"), [("task_dim", 2), ("task_dim", 1), ("integrator", True)])
-def test_entries_that_do_not_match_the_tensors(key: str, value: object, editor: Editor) -> None:
-    refused(editor.write(set_entry(key, value=value)))
 
 
 @pytest.mark.parametrize("steps", [0, 0.5, True, 10**5, 10**30])

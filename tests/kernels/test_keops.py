@@ -1,152 +1,172 @@
-"""KeOps, really compiled, against the torch backends.
+"""KeOps: really compiled sums against those of one matrix, its environment, and tiled sums where it does not work.
 
-Every formula is compiled with one profile, and profiles with all operations of :class:`Node` with the one formula that
-holds all derivatives: 7 times about 7 s, by two processes at once where KeOps' cache folder is empty.
+Every formula is compiled with one profile, the other operations of profiles with the shortest formula: 6 times about
+7 s where KeOps' cache folder is empty.
 """
 
 from __future__ import annotations
 
+import json
+import os
+import re
 import subprocess
 import sys
-from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from math_bank import Case, case_named, normal
+from math_bank import case_named, normal
+from sum_bank import FORMULAS, assert_same, mapped, points
 from torch import Tensor
 
-from diffeo_calib.kernels.base import Kernel
-from diffeo_calib.kernels.reductions import backends
-from diffeo_calib.kernels.reductions.backends import Backend
+from diffeo_calib.kernels.profiles import CauchyProfile, ConstantProfile, GaussianProfile, MaternProfile, Profile
+from diffeo_calib.kernels.reductions import keops
+from diffeo_calib.kernels.reductions.formulas import FIELD, HESSIAN_PRODUCT, Dense, Formula, Points
+from diffeo_calib.kernels.reductions.keops import Keops
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow  # a compiler, or separate processes
 
-HERE = ("matern-1.5",)
-THERE = ("constant", "output", "gaussian")
-"""Kernels that this process and its helper compile; no profile is in both, so that they never write the same file."""
-CHOSEN = [case_named(name) for name in (*HERE, *THERE)]
-WITH_EVERY_FORMULA, *_ = CHOSEN
-SINGLE = case_named("gaussian")
-
-Method = Callable[[Kernel, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, ...]]
-METHODS: dict[str, Method] = {
-    "field": lambda k, x, c, q, a, dq, da: (k.field(x, q, a),),
-    "field of the controls": lambda k, x, c, q, a, dq, da: (k.field(None, q, a),),
-    "field_and_jacobian": lambda k, x, c, q, a, dq, da: k.field_and_jacobian(x, q, a),
-    "gradient of the controls": lambda k, x, c, q, a, dq, da: k.hamiltonian_gradient(q, a),
-    "gradient": lambda k, x, c, q, a, dq, da: k.gradient(x, c, q, a),
-    "hessian_product": lambda k, x, c, q, a, dq, da: k.hessian_product(q, a, dq, da),
-}
-every_method = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS.keys())
+ROOT = Path(keops.__file__).parents[3]
+ROUGH = MaternProfile(1.5)
+COMPILED = [*((formula, ROUGH) for formula in FORMULAS.values()), (FIELD, CauchyProfile())]
+COMPILED += [(HESSIAN_PRODUCT, ConstantProfile())]  # weights without symbols, and zeros
 
 
-def methods_of(name: str) -> list[str]:
-    """The methods that are compiled for a kernel."""
-    if name == WITH_EVERY_FORMULA.name:
-        return list(METHODS)
-    return ["field"] if name == SINGLE.name else ["hessian_product"]
+def compiled(formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> tuple[Tensor, ...]:
+    found = Keops().reduce(formula, profile, rows, columns)
+    assert found is not None
+    return found
 
 
-every_compiled_sum = pytest.mark.parametrize(
-    ("case", "method"),
-    [pytest.param(case, METHODS[name], id=f"{case.name}-{name}") for case in CHOSEN for name in methods_of(case.name)],
-)
-
-
-def inputs(case: Case, rows: int = 6, columns: int = 5) -> tuple[Tensor, ...]:
-    """x, c; q, a and their directions."""
-    dq, da = normal(2, columns, case.dim, seed=5)
-    x, c = case.points(rows, seed=1), normal(rows, case.dim, seed=4)
-    return x, c, case.points(columns, seed=2), normal(columns, case.dim, seed=3), dq, da
-
-
-def compile_all(names: tuple[str, ...]) -> None:
-    """Run every chosen formula of these kernels once."""
-    for case in map(case_named, names):
-        for name in methods_of(case.name):
-            METHODS[name](case.kernel.using("keops"), *inputs(case))
-    if SINGLE.name in names:
-        METHODS["field"](SINGLE.kernel.using("keops"), *(t.float() for t in inputs(SINGLE)))
-    assert np.float64(1e-310) * 0.5 > 0.0  # flags of the compiler must not flush denormals to zero
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _compiled() -> None:
-    """Compile in two processes in parallel."""
-    command = [
-        sys.executable,
-        "-c",
-        f"import sys; sys.path[:] = {sys.path}; import {__name__} as t; t.compile_all({THERE})",
-    ]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as helper:
-        compile_all(HERE)
-        output, _ = helper.communicate(timeout=900)
-    assert (helper.returncode, output) == (0, ""), "import, compilation and sums are silent"
-
-
-@pytest.fixture
-def only(monkeypatch: pytest.MonkeyPatch) -> Callable[[Backend], None]:
-    """Remove all other backends, so that none can replace this one."""
-
-    def remove(backend: Backend) -> None:
-        for name in set(backends.BACKENDS) - {backend}:
-            monkeypatch.delitem(backends.BACKENDS, name)
-
-    return remove
-
-
-def assert_close(actual: tuple[Tensor, ...], expected: tuple[Tensor, ...], relative: float = 1e-12) -> None:
-    for one, other in zip(actual, expected, strict=True):
-        assert one.dtype == other.dtype
-        torch.testing.assert_close(one, other, rtol=0, atol=relative * float(other.abs().max()))
-
-
-@every_compiled_sum
-@pytest.mark.parametrize("backend", ["tiled", "keops"])
-@pytest.mark.parametrize("size", [(6, 5), (300, 280)])
-def test_backends_agree(
-    case: Case, method: Method, backend: Backend, size: tuple[int, int], only: Callable[[Backend], None]
+@pytest.mark.parametrize(("formula", "profile"), COMPILED, ids=lambda one: one.name)
+def test_compiled_sums_are_those_of_one_matrix(
+    formula: Formula, profile: Profile, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    expected = method(case.kernel.using("dense"), *inputs(case, *size))
-    only(backend)
-    assert_close(method(case.kernel.using(backend), *inputs(case, *size)), expected)
+    """Of strided points too. Import, compilation and sums are silent."""
+    for count, rows in ((5, 6), (280, 300)):
+        i, j = points(rows, 1), points(count, 2)
+        expected = Dense().reduce(formula, profile, i, j)
+        strided = [mapped(p, lambda t: torch.stack([t, t], -1)[..., 0]) for p in (i, j)]
+        assert_same(compiled(formula, profile, *strided), expected, 1e-13 * count)
+        if profile != ROUGH:  # where points coincide its third derivative is singular
+            assert_same(compiled(formula, profile, None, j), Dense().reduce(formula, profile, None, j), 1e-13 * count)
+    assert capfd.readouterr() == ("", "")
 
 
-@every_method
-@pytest.mark.parametrize("size", [(6, 5), (0, 5), (6, 0), (0, 0)])
-def test_strided_and_empty_inputs(method: Method, size: tuple[int, int]) -> None:
-    case = WITH_EVERY_FORMULA
-    strided = [torch.stack([t, t], -1)[..., 0] for t in inputs(case, *size)]
-    expected = method(case.kernel.using("dense"), *inputs(case, *size))
-    torch.testing.assert_close(method(case.kernel.using("keops"), *strided), expected, rtol=1e-12, atol=1e-12)
+def test_single_precision_and_denormal_numbers() -> None:
+    """With `-ffast-math`, loading a compiled formula would flush denormal numbers to zero in the whole process."""
+    i, j = points(6, 1), points(5, 2)
+    (found,) = compiled(FIELD, GaussianProfile(), *(mapped(p, Tensor.float) for p in (i, j)))
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found.double(), *Dense().reduce(FIELD, GaussianProfile(), i, j), rtol=0, atol=1e-5)
+    assert np.float64(1e-310) * 0.5 == 5e-311
+    assert float(torch.tensor(1e-310, dtype=torch.float64) * 0.5) == 5e-311
 
 
-def test_single_precision(only: Callable[[Backend], None]) -> None:
-    single = [t.float() for t in inputs(SINGLE)]
-    expected = METHODS["field"](SINGLE.kernel.using("dense"), *single)
-    only("keops")
-    assert_close(METHODS["field"](SINGLE.kernel.using("keops"), *single), expected, 1e-6)
-
-
-@every_method
-@pytest.mark.parametrize("live", range(6))
-def test_tiled_sums_replace_keops_where_gradients_are_needed(method: Method, live: int) -> None:
+@pytest.mark.parametrize("live", range(4))
+def test_tiled_sums_replace_keops_where_gradients_are_needed(live: int) -> None:
     """For each input. Under no_grad KeOps runs, and nothing is recorded."""
-    case, gradients = WITH_EVERY_FORMULA, []
+    case, gradients = case_named("matern-1.5"), []
+    inputs = case.points(6, seed=1), normal(6, 2, seed=4), case.points(5, seed=2), normal(5, 2, seed=3)
     for backend in ("dense", "keops"):
-        tensors = [t.clone().requires_grad_(k == live) for k, t in enumerate(inputs(case))]
-        results = method(case.kernel.using(backend), *tensors)
-        loss = sum(((normal(*t.shape, seed=k) * t).sum() for k, t in enumerate(results)), 0.0 * tensors[live].sum())
-        gradients.append(torch.autograd.grad(loss, tensors[live]))
+        tensors, kernel = (
+            [t.clone().requires_grad_(k == live) for k, t in enumerate(inputs)],
+            case.kernel.using(backend),
+        )
+        results = kernel.gradient(*tensors)
+        loss = sum((normal(*t.shape, seed=k) * t).sum() for k, t in enumerate(results))
+        gradients += torch.autograd.grad(loss, tensors[live])
         with torch.no_grad():
-            again = method(case.kernel.using(backend), *tensors)
+            again = kernel.gradient(*tensors)
         assert not any(t.requires_grad for t in again)
-        assert_close(again, tuple(t.detach() for t in results))
+        assert_same(again, results, 1e-12)
     torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-12, atol=1e-12)
 
 
-def test_denormal_numbers_are_not_flushed_to_zero() -> None:
-    """With `-ffast-math`, loading a compiled formula would flush them to zero in the whole process."""
-    assert np.float64(1e-310) * 0.5 == 5e-311
-    assert float(torch.tensor(1e-310, dtype=torch.float64) * 0.5) == 5e-311
+# --- The environment ----------------------------------------------------------------------------------------------
+
+
+def in_a_process(code: str, **environment: str) -> Any:
+    """Run code in a separate process with these variables, without the user's for KeOps; return its output as JSON."""
+    kept = {k: v for k, v in os.environ.items() if k not in ("CXX", "CXXFLAGS", "KEOPS_CACHE_FOLDER")}
+    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    command, env = [sys.executable, "-c", code], {**kept, "PYTHONPATH": paths, **environment}
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False, timeout=120)
+    assert (done.returncode, done.stderr) == (0, "")
+    return json.loads(done.stdout)  # fails if anything else is printed
+
+
+LOAD = """
+import json, os, sys
+before = dict(os.environ)
+import diffeo_calib
+late = "pykeops" not in sys.modules
+from diffeo_calib.kernels.reductions import keops
+keops.load()
+import pykeops
+config = pykeops.config.pykeops_base
+unchanged = dict(os.environ) == before
+print(json.dumps([late, unchanged, not pykeops.verbose, config.get_cpp_env_flags(), config.get_keops_cache_folder()]))
+"""
+
+
+def test_import_is_late_and_silent_and_leaves_the_environment_alone(tmp_path: Path) -> None:
+    """Every set of flags has its own cache folder; variables of the user are respected."""
+    late, unchanged, silent, flags, folder = in_a_process(LOAD, XDG_CACHE_HOME=str(tmp_path))
+    assert (late, unchanged, silent, flags) == (True, True, True, keops.CXXFLAGS)
+    assert Path(folder).parent == tmp_path / "diffeo_calib"
+    *known, flags, other = in_a_process(LOAD, XDG_CACHE_HOME=str(tmp_path), CXXFLAGS="-DOWN_FLAG")
+    assert (*known, flags) == (True, True, True, "-DOWN_FLAG")
+    assert other != folder
+    assert Path(other).is_dir()
+    assert in_a_process(LOAD, KEOPS_CACHE_FOLDER=str(tmp_path / "own"))[-1] == str(tmp_path / "own")
+
+
+def test_without_a_folder_that_can_be_made_there_is_one_for_the_process() -> None:
+    code = "import warnings\nwarnings.simplefilter('ignore')" + LOAD
+    folder = Path(in_a_process(code, XDG_CACHE_HOME="/dev/null")[-1])
+    assert folder.name.startswith("diffeo_calib-")
+    assert not folder.exists()
+
+
+FALL_BACK = """
+import json, sys, warnings
+import torch
+if {missing}:
+    sys.modules["pykeops"] = None
+import diffeo_calib as dc
+from diffeo_calib.kernels.reductions import backends, keops
+
+attempts, reduce = [], keops.Keops.reduce
+keops.Keops.reduce = lambda *sum: attempts.append(1) or reduce(*sum)
+kernel = dc.Gaussian(0.8) + dc.Matern(1.1)
+x = torch.linspace(-1.0, 1.0, 10, dtype=torch.float64).view(5, 2)
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    found = [kernel.using("keops").hamiltonian_gradient(x, x) for _ in range(2)]
+for pair in found:
+    torch.testing.assert_close(pair, kernel.using("dense").hamiltonian_gradient(x, x), rtol=1e-13, atol=1e-13)
+texts = [[w.category.__name__, str(w.message)] for w in caught]
+print(json.dumps([texts, len(attempts), backends.choose("keops", 9, 9, torch.device("cpu"))]))
+"""
+NO_FOLDER = {"XDG_CACHE_HOME": "/dev/null", "KEOPS_CACHE_FOLDER": "/dev/null/keops"}
+TROUBLES: dict[str, tuple[dict[str, str], str]] = {
+    "no pykeops": ({}, r"pykeops cannot be imported \(.*\)\."),
+    "no compiler": ({"PATH": ""}, r"KeOps finds no C\+\+ compiler; install g\+\+, or set CXX\."),
+    "no folder for files": (NO_FOLDER, r"pykeops cannot be imported \(.*\)\."),
+    "a compiler that fails": ({"CXX": "false"}, r"KeOps could not compile or run a kernel sum \(.*\)\."),
+}
+
+
+@pytest.mark.parametrize("trouble", TROUBLES)
+def test_without_keops_tiles_run_after_one_warning_and_one_attempt(trouble: str, tmp_path: Path) -> None:
+    environment, message = TROUBLES[trouble]
+    code = FALL_BACK.format(missing=trouble == "no pykeops")
+    warned, attempts, choice = in_a_process(code, **{"XDG_CACHE_HOME": str(tmp_path), **environment})
+    ((category, text),) = warned
+    assert category == "DiffeoCalibWarning"
+    elsewhere = " Kernel sums run in torch instead (backend 'tiled'): slower, the same numbers."
+    assert re.fullmatch(message + re.escape(elsewhere), text)
+    assert (attempts, choice) == (int("fails" in trouble), "tiled")

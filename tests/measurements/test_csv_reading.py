@@ -50,6 +50,8 @@ READ: dict[str, tuple[str | bytes, dict[str, str], str]] = {
     "byte order mark": ("\ufeff" + PLAIN.replace("\n", "\r\n"), {}, ""),
     "UTF-16": (PLAIN.encode("utf-16"), {}, "text in utf-16"),
     "Windows": (("Kraft (°), größe\n" + PLAIN).encode("cp1252"), {}, "text in cp1252, not UTF-8"),
+    "Chinese": (("# 关节(度), 坐标(毫米)\n" + PLAIN).encode("gb18030"), {}, "text in gb18030, not UTF-8"),
+    "Japanese": (("# 関節, X座標, 測定\n" + PLAIN).encode("cp932"), {}, "text in cp932, not UTF-8"),
     "a number sign before the names": ("# " + PLAIN, {}, ""),
     "as numpy.savetxt writes": ("# " + separated(" ", [NAMES, *CELLS]), {"sep": " "}, ""),
     "aligned columns": (ALIGNED, {"sep": " "}, ""),

@@ -147,16 +147,12 @@ class Columns:
         }
         return dict(joints) | found
 
-    def joints_to_si(self, raw: Tensor) -> Tensor:
-        """Joint values (N, n) in rad and m of rows (N, c) in the file's units."""
-        return self.joints.values(raw[:, : len(self.joints.columns)]) / self._per_joint
-
     def joints_from_si(self, q: Tensor) -> Tensor:
         """Joint values (N, n) in rad and m as the cells (N, c) of their columns, in the file's units."""
-        return self.joints.cells(q.cpu() * self._per_joint)
+        return self.joints.cells(q.cpu() * self.per_joint)
 
     @property
-    def _per_joint(self) -> Tensor:
+    def per_joint(self) -> Tensor:
         """(n,) units per rad or m."""
         units = [self.table.joints_per_metre if slides else PER_SI[self.table.angle] for slides in self.prismatic]
         return torch.tensor(units, dtype=torch.float64, device=HOST)

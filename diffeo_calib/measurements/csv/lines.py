@@ -195,7 +195,16 @@ def _text(path: Path, sep: str) -> tuple[str, list[str]]:
     try:
         return data.decode("utf-8-sig"), []
     except UnicodeDecodeError:
-        return data.decode("cp1252", "replace"), ["text in cp1252, not UTF-8"]
+        page = _code_page(data)
+        return data.decode(page, "replace"), [f"text in {page}, not UTF-8"]
+
+
+def _code_page(data: bytes) -> str:
+    """The code page of a text that is not UTF-8: Chinese has pairs of high bytes, Japanese begins them with others."""
+    words = re.findall(rb"[\x80-\xff]+", data)
+    if all(len(word) % 2 == 0 and min(word) > 0xA0 for word in words):
+        return "gb18030"
+    return "cp932" if 2 * sum(0x80 < word[0] < 0xA0 for word in words) > len(words) else "cp1252"
 
 
 class TextTable(NamedTuple):

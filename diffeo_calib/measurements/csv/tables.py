@@ -97,7 +97,8 @@ class FileRows(NamedTuple):
     @property
     def q(self) -> Tensor:
         """(N, n) joint values, rad or m."""
-        return self.columns.joints_to_si(self.raw)
+        joints = self.columns.joints
+        return joints.values(self.raw[:, : len(joints.columns)]) / self.columns.per_joint
 
     def numbers(self, names: Sequence[str]) -> Tensor:
         """(N, k) numbers of some columns, in SI."""
