@@ -38,8 +38,6 @@ HELD = {
     "positions": ("position", "z"),
     "hidden markers": ("position", "marker3_z"),
     "poses": ("pose", "z"),
-    "heights": ("height", "height"),
-    "images": ("image", "v"),
     "images and a tracker": ("marker", "marker 2"),
     "inclinations": ("inclination", "inclination 2"),
 }
@@ -98,10 +96,13 @@ def test_the_height_of_a_planar_robot_may_be_one_value(wrong: int) -> None:
     assert any("one value" in one for one in texts) == bool(wrong)
 
 
-def test_deviations_and_a_few_rows_are_no_stuck_columns() -> None:
+def test_deviations_and_a_few_rows_are_no_stuck_columns_and_others_are() -> None:
     kind = kind_named("positions")
     assert stuck_columns(with_attributes(kind.data, std=torch.full_like(kind.data.points, 2e-5))) == []
     assert stuck_columns(stuck(kind.data.rows(slice(5)), "position")) == []
+    for name, rows, column in (("heights", "height", "height"), ("images", "image", "v")):
+        (found,) = stuck_columns(stuck(kind_named(name).data, rows))
+        assert f"'{column}' of the {rows}s" in found.words
     _, texts = warned(dc.calibrate, kind.robot, stuck(kind.data, "position"), hyperparameters=kind.scales)
     assert any("one value" in one for one in texts)
 
