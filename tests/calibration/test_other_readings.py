@@ -159,7 +159,6 @@ MISTAKES: dict[str, Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]] = {
     "seems to be left-handed": lambda q, y: (q, y[..., [1, 0, 2]]),
     "joints='waist_joint,shoulder_joint,wrist_bend_joint,": lambda q, y: (q[:, [0, 1, 4, 3, 2, 5]], y),
     "pi/180*{elbow_joint},": lambda q, y: (with_joint(q, 2, 180 / math.pi), y),
-    "-{shoulder_joint}": lambda q, y: (with_joint(q, 1, -1.0), y),
     ",{elbow_joint}-90,": lambda q, y: (with_joint(q, 2, 1.0, math.pi / 2), y),
     "-{elbow_joint}": lambda q, y: (with_joint(with_joint(q, 2, -1.0), 4, -1.0), y),
 }
@@ -180,6 +179,7 @@ def test_joints_of_a_slide() -> None:
     assert "1000 times too small: check their unit (`joint_length`)" in advice(robot, read)
 
 
+@pytest.mark.slow
 def test_hidden_markers_do_not_spoil_a_diagnosis(tmp_path: Path) -> None:
     """A column in the place of a coordinate has values where the marker is hidden."""
     arm = SimulatedArm(seed=1, markers=3)
@@ -287,15 +287,10 @@ def test_nothing_is_proposed_for_a_right_table_of_a_wrong_robot() -> None:
     ("meant", "texts"),
     [
         (
-            lambda q: q.index_fill(1, torch.tensor([3]), 0.0) + torch.nn.functional.pad(-q[:, 3:4], (3, 3)),
-            "a,b,c,-{d},e,f,g",
-        ),
-        (
             lambda q: (q + math.pi) * (4096 / 360),
             "360/4096*{a},360/4096*{b}+180,360/4096*{c}+180,360/4096*{d}+180,360/4096*{e}+180,360/4096*{f}+180,"
             "360/4096*{g}",
         ),
-        (lambda q: q * torch.tensor([1, 1, 1, 100, 1, 1, 1]), "a,b,c,1/100*{d},e,f,g"),
         (lambda q: q[:, [0, 1, 2, 5, 4, 3, 6]], "a,b,c,f,e,d,g"),
     ],
 )
