@@ -213,7 +213,7 @@ def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: P
 
 def _count(controls: Controls, data: TangentData) -> int | None:
     """Number of configurations that carry momenta; None for all."""
-    if controls == "all" or (controls == "auto" and data.nominal.by_row):
+    if controls == "all" or (controls == "auto" and data.nominal.load.by_row):
         return None
     if controls == "auto":
         return AUTO_CONTROLS if data.y.numel() > MAX_DENSE and len(data.x) > AUTO_CONTROLS else None

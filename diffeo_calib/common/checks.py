@@ -123,11 +123,11 @@ def check_covariance(matrix: Tensor, what: str) -> None:
         raise InputError.of(what, expected="a symmetric positive definite matrix in m^2")
 
 
-def check_count(value: object, what: str, *, least: int = 1, most: int | None = None) -> None:
-    """Raise InputError unless ``value`` is an integer in range."""
-    good = isinstance(value, int) and not isinstance(value, bool) and value >= least
+def check_count(value: object, what: str, *, most: int | None = None) -> None:
+    """Raise InputError unless ``value`` is an integer from 1 on."""
+    good = isinstance(value, int) and not isinstance(value, bool) and value >= 1
     if not good or (most is not None and isinstance(value, int) and value > most):
-        limit = f"an integer of at least {least}" + ("" if most is None else f" and at most {most}")
+        limit = "an integer of at least 1" + ("" if most is None else f" and at most {most}")
         raise InputError.of(what, expected=limit, got=as_written(value))
 
 

@@ -182,41 +182,33 @@ def c_source(
     for tip, run in groupby(program.on):
         runs.append((tip, first, len(list(run))))
         first += runs[-1][2]
-    contents = (
-        texts
-        | {
-            "stem": stem,
-            "prefix": prefix,
-            "macro": prefix.upper(),
-            "n": chain.n,
-            "markers": len(program.markers),
-            "generated": f"{GENERATED} {package_version()}",
-            "lanes": LANES,
-            "tree": nominal.before.tolist() != list(range(-1, joints)),  # more than joints that follow one another
-            "parents": nominal.before[: joints + len(chain.tips)],
-            "on_path": nominal.ancestors[joints:][: len(chain.tips)] * 1,
-            "groups": runs,
-            "program_tip": program.tip,
-            "flows": flows,
-            "flow_names": [flow["name"] for flow in flows],
-            "profiles": sorted({term["term"].profile for term in terms}),
-            "widths": sorted({term["width"] for term in terms}),
-            "tabulated": any(flow["tables"] for flow in flows),
-            "chain": chain,
-            "nominal": nominal,
-            "waves": chain.waves,
-            "axis_waves": chain.axes,
-            "moving": joints,
-            "slides": not nominal.revolute.all(),
-            "coupled": not np.array_equal(nominal.coupling, np.eye(joints)) or bool(nominal.coupling_offset.any()),
-            "sag": None if chain.sag is None else _sag_constants(nominal, chain.sag),
-            "markers_in_flange": program.markers,
-            "tool_points": tool_points(tool),
-            "framed": not np.array_equal(frame, np.eye(4)),
-            "frame": frame,
-            "limits": limits,
-        }
-    )
+    contents = texts | {
+        "stem": stem,
+        "prefix": prefix,
+        "macro": prefix.upper(),
+        "n": chain.n,
+        "markers": len(program.markers),
+        "generated": f"{GENERATED} {package_version()}",
+        "lanes": LANES,
+        "on_path": nominal.ancestors[joints:][: len(chain.tips)] * 1,
+        "groups": runs,
+        "program_tip": program.tip,
+        "flows": flows,
+        "flow_names": [flow["name"] for flow in flows],
+        "profiles": sorted({term["term"].profile for term in terms}),
+        "widths": sorted({term["width"] for term in terms}),
+        "tabulated": any(flow["tables"] for flow in flows),
+        "chain": chain,
+        "nominal": nominal,
+        "waves": chain.waves,
+        "axis_waves": chain.axes,
+        "moving": joints,
+        "sag": None if chain.sag is None else _sag_constants(nominal, chain.sag),
+        "markers_in_flange": program.markers,
+        "tool_points": tool_points(tool),
+        "frame": frame,
+        "limits": limits,
+    }
     source, header = (_ENVIRONMENT.get_template(f"model.{kind}.jinja").render(contents) for kind in ("c", "h"))
     return source, header
 

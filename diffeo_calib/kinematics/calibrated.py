@@ -34,7 +34,6 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.runtime.program import Program
 from diffeo_calib.sensors.devices import Extrinsics
 
 
@@ -306,7 +305,7 @@ class CalibratedKinematics:
         """
         q = self._joints(q)
         known = self.map.deformation.at_controls(q) if takes_program(q) else None
-        if known is None and (program := self._program_for(q)) is not None:
+        if known is None and (program := program_of(self.map.deformation, q)) is not None:
             return torch.from_numpy(program.points(q.numpy()))
         return (self.map.deformation(q) if known is None else known).unflatten(1, (-1, 3))
 
@@ -346,7 +345,7 @@ class CalibratedKinematics:
     def jacobian(self, q: object) -> Tensor:
         """Exact derivative of the markers by the joints: (N, n) -> (N, P, 3, n), m/rad or m/m; raises like the call."""
         q = self._joints(q)
-        if (program := self._program_for(q)) is not None:
+        if (program := program_of(self.map.deformation, q)) is not None:
             return torch.from_numpy(program.points_and_jacobian(q.numpy())[1])
         return self.map.deformation.jacobian(q).unflatten(1, (-1, 3))
 
@@ -434,10 +433,6 @@ class CalibratedKinematics:
         """
         q = self._joints(start)
         return self.map.inverse(as_tensor(points, "points", (len(q), self.markers, 3), empty=True).flatten(1), q)
-
-    def _program_for(self, q: Tensor) -> Program | None:
-        """The program that answers a query at q; None where torch must."""
-        return program_of(self.map.deformation) if takes_program(q) else None
 
     def changed(self, **changes: Any) -> CalibratedKinematics:
         """A copy with other values of some of the constructor's arguments."""

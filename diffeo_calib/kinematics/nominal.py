@@ -115,11 +115,6 @@ class GeometryMap(NominalMap):
         """The map under the masses () or (N,) of new rows; MeasurementError for payloads on one side only."""
         return self.with_payload(self.load.under(masses))
 
-    @property
-    def by_row(self) -> bool:
-        """Whether the map of every row is another one."""
-        return self.load.by_row
-
     def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
         """Marker positions in m: (N, 3 P)."""
         x = self.turned(x, theta)

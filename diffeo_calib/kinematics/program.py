@@ -30,12 +30,14 @@ def takes_program(q: Tensor) -> bool:
     return plain and not wrapped(q) and not torch.compiler.is_compiling()
 
 
-def program_of(deformation: Deformation) -> Program | None:
-    """The program of a robot's calibrated map, made at its first use.
+def program_of(deformation: Deformation, q: Tensor | None = None) -> Program | None:
+    """The program of a robot's calibrated map, made at its first use; None where torch must answer the query ``q``.
 
     None for maps without constant stages: adaptive time steps, users' kernels, the Eulerian formulation, and maps on
     another device than the CPU.
     """
+    if q is not None and not takes_program(q):
+        return None
     if deformation not in _PROGRAMS:
         _PROGRAMS[deformation] = _program(deformation)
     return _PROGRAMS[deformation]

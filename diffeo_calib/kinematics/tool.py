@@ -21,7 +21,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, as_written, listed
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
-from diffeo_calib.kinematics.program import program_of, takes_program
+from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.kinematics.registered_map import marker_slopes
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.measurements.poses import mark_points, marks, pose_directions, poses_from_marks, rigid_poses
@@ -97,7 +97,7 @@ class ToolKinematics:
 
     def _program_for(self, q: Tensor) -> Program | None:
         """The constants that answer a query; None where torch must."""
-        known = program_of(self.fitted.deformation) if takes_program(q) else None
+        known = program_of(self.fitted.deformation, q)
         return None if known is None else known.at(self.tip)
 
     def _in_frame(self, poses: Tensor) -> Tensor:

@@ -234,17 +234,8 @@ class EulerianDeformation(Deformation):
 def curvature(nominal: NominalMap, x: Tensor, theta: Tensor) -> Tensor:
     """D^2k0 by m n backward passes through the Jacobian: (M, n) -> (M, m, n, n), a constant for autograd."""
     with torch.enable_grad():
-        at = x.detach().requires_grad_()
-        jacobian = nominal.jacobian(at, theta.detach())  # (M, m, n)
-        columns = jacobian.flatten(1).sum(0)
-        rows = [
-            torch.autograd.grad(column, at, retain_graph=True, allow_unused=True, materialize_grads=True)[0]
-            for column in columns
-            if column.requires_grad
-        ]
-    if not rows:  # a linear map
-        return x.new_zeros(*jacobian.shape, x.shape[1])
-    return torch.stack(rows, 1).view(*jacobian.shape, x.shape[1])
+        of_all = torch.autograd.functional.jacobian(lambda at: nominal.jacobian(at, theta.detach()).sum(0), x.detach())
+    return of_all.movedim(2, 0)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 MAX_SHOTS = 20  # largest number of shooting steps; few suffice where shooting converges

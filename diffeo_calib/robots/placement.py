@@ -63,11 +63,10 @@ SMALLEST_DAMPING_M2 = 1e-30
 
 
 class Placement(NamedTuple):
-    """Base (4, 4) and markers (P, 3) in m, and the number of iterations; a marker that is never seen is at its tip."""
+    """Base (4, 4) and markers (P, 3) in m; a marker that is never seen is at its tip."""
 
     base: Tensor
     tool: Tensor
-    iterations: int
 
 
 def place(poses: Tensor, points: Tensor) -> Placement:
@@ -80,7 +79,7 @@ def place(poses: Tensor, points: Tensor) -> Placement:
     """
     seen, eye = ~points.isnan().any(2), torch.eye(points.shape[1], dtype=points.dtype, device=points.device)
     sightings = _Sightings(poses[seen], points[seen], eye.expand(len(points), -1, -1)[seen])
-    base, tool, _ = _solved(sightings, 0.0)
+    base, tool = _solved(sightings, 0.0)
     left = sightings.points - sightings.predicted(tool) @ base[:3, :3].mT - base[:3, 3]
     return _solved(sightings, float(left.square().sum() / (3 * len(tool))) / PLACES.marker_m**2)
 
@@ -130,14 +129,14 @@ def _solved(sightings: _Sightings, weight: float) -> Placement:
     kept = s > UNDETERMINED_MOTION_M * sqrt(S / P)
     U, s, Vt = U[:, kept], s[kept], Vt[kept]
     factor = torch.linalg.qr(both - U @ (U.mT @ both), mode="r").R  # |factor [vec B; -1]|^2 is the sum of squares
-    B, iterations = _best_rotation(factor)
+    B = _best_rotation(factor)
     tool = ((Vt.mT / s) @ (U.mT @ (both[:, :9] @ B.flatten() - both[:, 9]))).reshape(-1, 3)
     base = transforms(B.mT, centre - B.mT @ sightings.predicted(tool).mean(dim=0))
-    return Placement(base, tool, iterations)
+    return Placement(base, tool)
 
 
-def _best_rotation(factor: Tensor) -> tuple[Tensor, int]:
-    """Minimise |factor [vec B; -1]|^2 over rotations by damped Newton steps, all starts at once: best B, steps.
+def _best_rotation(factor: Tensor) -> Tensor:
+    """The rotation B that minimises |factor [vec B; -1]|^2, by damped Newton steps from all starts at once.
 
     Gauss-Newton alone needs a hundred steps where the residuals are large: rows that do not belong to the robot.
     """
@@ -152,7 +151,7 @@ def _best_rotation(factor: Tensor) -> tuple[Tensor, int]:
     curvature = 0.5 * (pairs + pairs.transpose(0, 1))  # d^2 (B exp([w]x)) / dw_c dw_d = B curvature[c, d] at w = 0
     loss = (B.flatten(1) @ F.mT - f).square().sum(1)
     damping = torch.full_like(loss, 1e-3)
-    for step in range(MAX_ITERATIONS):
+    for _ in range(MAX_ITERATIONS):
         r = B.flatten(1) @ F.mT - f
         J = (B[:, None] @ generators).flatten(2) @ F.mT  # (starts, 3, rows)
         H = J @ J.mT
@@ -167,5 +166,5 @@ def _best_rotation(factor: Tensor) -> tuple[Tensor, int]:
         B, loss = torch.where(better[:, None, None], trial, B), torch.where(better, new, loss)
         damping = torch.where(better, damping / 10, damping * 10).clamp(1e-15, 1e6)
         if float(delta[loss.argmin()].norm()) < CONVERGED_TURN_RAD:
-            return B[loss.argmin()], step + 1
-    return B[loss.argmin()], MAX_ITERATIONS
+            break
+    return B[loss.argmin()]

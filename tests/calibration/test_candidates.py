@@ -14,7 +14,6 @@ import pytest
 import torch
 from product_bank import sliding_robot
 from table_bank import refused
-from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.planning.candidates import collision_free
@@ -55,13 +54,6 @@ def test_joints_stay_within_their_limits_and_one_turn() -> None:
     assert bool(((narrow[:, 1] >= -6) & (narrow[:, 1] <= -5) & (narrow[:, 5] == 0.2)).all())
 
 
-def test_draws_follow_the_seed(robot: Chain) -> None:
-    first = dc.candidates(robot, 10)
-    assert torch.equal(first, dc.candidates(robot, 10, seed=0))
-    assert torch.equal(first, dc.candidates(robot, 5000)[:10])
-    assert not torch.equal(first, dc.candidates(robot, 10, seed=1))
-
-
 def test_the_device_sees_the_marker(robot: Chain) -> None:
     position, marker, direction = np.array([2.0, 1.0, 0.5]), np.array([0.05, 0.0, 0.1]), np.array([0.0, 3.0, 4.0])
     tracker = dc.Tracker(position.tolist(), marker.tolist(), direction.tolist(), half_angle=math.radians(30))
@@ -91,25 +83,27 @@ def test_links_and_tool_stay_above_the_floor_and_outside_the_column(robot: Chain
     assert float(robot(below)[inside, 2, 3].min()) >= 0.3
 
 
-def test_the_user_s_own_check_decides(robot: Chain) -> None:
-    shapes = []
+def test_draws_follow_the_seed_and_the_user_s_own_check(robot: Chain) -> None:
+    first = dc.candidates(robot, 10)
+    assert torch.equal(first, dc.candidates(robot, 10, seed=0))
+    assert torch.equal(first, dc.candidates(robot, 5000)[:10])
+    assert not torch.equal(first, dc.candidates(robot, 10, seed=1))
+    kept = dc.candidates(robot, 100, keep=lambda q: (q[:, 0] > 0.5).numpy())
+    assert kept.shape == (100, 6)
+    assert float(kept[:, 0].min()) > 0.5
 
-    def keep(q: Tensor) -> np.ndarray:
-        shapes.append(q.shape)
-        return (q[:, 0] > 0.5).numpy()
 
-    assert float(dc.candidates(robot, 100, keep=keep)[:, 0].min()) > 0.5
-    assert all(shape[1] == 6 for shape in shapes)
-
-
-def test_what_refuses_everything_is_named(robot: Chain) -> None:
-    tracker = dc.Tracker((3.0, 0.0, 0.5), half_angle=math.radians(30))
-    with pytest.raises(dc.DiffeoCalibError, match=r"^`floor` refuses nearly everything: 0 of .* random.*`tracker` 9"):
-        dc.candidates(robot, 5, tracker=tracker, floor=5.0)
-    with pytest.raises(dc.DiffeoCalibError, match=r"^`keep` refuses nearly everything"):
-        dc.candidates(robot, 5, keep=lambda q: q[:, 0] > 100.0, tracker=tracker)
-    with pytest.raises(dc.DiffeoCalibError, match=r"^`tracker` refuses nearly everything: \d+ of"):
-        dc.candidates(robot, 500, tracker=dc.Tracker((3.0, 0.0, 0.5), half_angle=0.01), floor=0.0)
+def test_what_refuses_everything_is_named(robot: Chain, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("diffeo_calib.calibration.planning.candidates.FIRST_DRAWS", 10_000)
+    tracker, narrow = (dc.Tracker((3.0, 0.0, 0.5), half_angle=angle) for angle in (math.radians(30), 0.01))
+    refused(
+        (
+            r"^`floor` refuses nearly everything: 0 of .* random.*`tracker` 9",
+            lambda: dc.candidates(robot, 5, tracker=tracker, floor=5.0),
+        ),
+        ("^`keep` refuses", lambda: dc.candidates(robot, 5, keep=lambda q: q[:, 0] > 100.0, tracker=tracker)),
+        (r"^`tracker` refuses .*: \d+ of", lambda: dc.candidates(robot, 500, tracker=narrow, floor=0.0)),
+    )
 
 
 def test_mistakes_are_one_sentence(robot: Chain) -> None:
@@ -129,16 +123,10 @@ def test_mistakes_are_one_sentence(robot: Chain) -> None:
         ("radius of `column`", drawn(column=(1.0, 2.0, -0.1))),
         ("`floor`", drawn(floor="low")),
         ("`seed`", drawn(seed=-1)),
-    )
-
-
-def test_mistakes_of_trackers_and_slides() -> None:
-    robot: Any = "robot"
-    refused(
         ("`direction` of the tracker", lambda: dc.Tracker((1, 0, 0), direction=(0, 0, 0))),
         ("`half_angle` of the tracker", lambda: dc.Tracker((1, 0, 0), half_angle=4.0)),
         ("joint 'slide' has no limits", lambda: dc.candidates(sliding_robot(), 3)),
-        (r"a dc\.Tree", lambda: dc.candidates(robot, 3)),
+        (r"a dc\.Tree", lambda: dc.candidates("robot", 3)),  # pyright: ignore[reportArgumentType]
     )
 
 
@@ -162,21 +150,16 @@ def folding(tmp_path: Path) -> Chain:
     return dc.load_urdf(path, "base", "three")
 
 
-def test_bodies_of_the_urdf_collide(folding: Chain) -> None:
+def test_bodies_of_the_urdf_collide(folding: Chain, robot: Chain, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pinocchio")
     keep = collision_free(folding)
     q = torch.tensor([[0.3, 0.0, 0.0], [0.0, 2.1, 2.1], [1.0, -2.1, -2.1], [0.0, 2.1, -2.1]], dtype=torch.float64)
     assert keep(q).tolist() == [True, False, False, True]  # a triangle closes, a zigzag does not
     found = dc.candidates(folding, 200, keep=keep)
     assert bool(keep(found).all())
-
-
-def test_collisions_need_pinocchio_and_bodies(folding: Chain, robot: Chain, monkeypatch: pytest.MonkeyPatch) -> None:
-    if pytest.importorskip("pinocchio"):
-        with pytest.raises(dc.DiffeoCalibError, match="has no collision geometry"):
-            collision_free(robot)
-        with pytest.raises(dc.DiffeoCalibError, match="was not read from a URDF"):
-            collision_free(sliding_robot())
+    refused(
+        ("has no collision geometry", lambda: collision_free(robot)),
+        ("was not read from a URDF", lambda: collision_free(sliding_robot())),
+    )
     monkeypatch.setitem(sys.modules, "pinocchio", None)
-    with pytest.raises(dc.DiffeoCalibError, match=r"not installed; pip install .diffeo_calib\[collisions\]"):
-        collision_free(folding)
+    refused((r"not installed; pip install .diffeo_calib\[collisions\]", lambda: collision_free(folding)))

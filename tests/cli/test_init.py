@@ -94,8 +94,12 @@ def test_two_arms_that_explain_the_rows_alike_are_not_guessed(tmp_path: Path, pr
     q, points = rows()
     _, text = proposed(([f"q{k}" for k in range(6)], q), (XYZ, points), robot="two.urdf")
     assert "expected some that explain the rows far better, got left_waist_joint" in text
-    entries, _ = proposed(([f"right_{name}" for name in NAMES], q), (XYZ, points), robot="two.urdf")
-    assert entries["tip"] == "right_flange"
+    assert (
+        proposed(([f"right_{name}" for name in NAMES], q), (XYZ, points), robot="two.urdf")[0]["tip"] == "right_flange"
+    )
+
+
+GIVEN = ["--length", "mm", "--angle", "deg", "--position", "x,y,z"]
 
 
 def test_a_robot_in_macros_and_a_folder_of_images_are_told_what_to_do(
@@ -105,14 +109,13 @@ def test_a_robot_in_macros_and_a_folder_of_images_are_told_what_to_do(
     name_space = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
     (tmp_path / "arm.xacro").write_text(f'<robot name="a" {name_space}><xacro:arm prefix="left"/></robot>')
     (tmp_path / "images").mkdir()
-    units = ["--length", "m", "--angle", "rad", "--position", "x,y,z", "-o", tmp_path / "m.safetensors"]
     for table, robot, message in (
         ("t.csv", "arm.xacro", "expand the xacro file first (`xacro FILE > robot.urdf`)"),
         ("images", "arm.urdf", "is a folder: expected a table; of images of a board run `diffeo-calib images"),
     ):
         asked = command("init", tmp_path / table, tmp_path / robot, "-o", tmp_path / "c.toml")
-        fitted = command("fit", tmp_path / table, "--robot", tmp_path / robot, *units)
-        assert asked.error == fitted.error
+        words = [tmp_path / table, "--robot", tmp_path / robot, *GIVEN, "-o", tmp_path / "m.safetensors"]
+        assert asked.error == command("fit", *words).error
         assert message in asked.error
 
 
@@ -137,15 +140,11 @@ def test_the_convention_that_explains_the_rows(
     q, points = write_dh_arm(tmp_path, convention, scale, "J{}")
     columns = [f"J{k}" for k in range(1, 7)]
     entries, text = proposed((columns, q), (XYZ, points), robot="arm.csv")
-    assert [entries[name] for name in ("robot", "dh-convention", "joints")] == [
-        "arm.csv",
-        convention,
-        ",".join(columns),
-    ]
+    assert (entries["robot"], entries["dh-convention"]) == ("arm.csv", convention)
+    assert entries["joints"] == ",".join(columns)
     assert not {"base", "tip"} & set(entries)
     assert f"lengths in {'m' if scale == 1 else 'mm'}, angles in deg" in reasons(text)["robot"]
-    given = ["--length", "mm", "--angle", "deg", "--position", "x,y,z", "-o", tmp_path / "m.safetensors"]
-    fitted = command("fit", tmp_path / "t.csv", "--robot", tmp_path / "arm.csv", *given)
+    fitted = command("fit", tmp_path / "t.csv", "--robot", tmp_path / "arm.csv", *GIVEN, "-o", tmp_path / "m")
     assert "--dh-convention; `init` finds the one that fits" in fitted.error
 
 
@@ -158,7 +157,7 @@ def test_a_last_row_without_a_joint_and_options_that_do_not_belong(
         file.write("\n0,0.05,0,0\n# standard")
     entries, _ = proposed(([f"joint_{k}" for k in range(1, 7)], q), (XYZ, points), robot="arm.csv")
     assert (entries["tip"], "dh-convention" in entries) == ("joint_6", False)
-    words = ["fit", tmp_path / "t.csv", "--length", "mm", "--angle", "deg", "--position", "x,y,z", "-o", tmp_path / "m"]
+    words = ["fit", tmp_path / "t.csv", *GIVEN, "-o", tmp_path / "m"]
     ARM.write_urdf(tmp_path / "arm.urdf")
     for robot, option, message in (
         ("arm.csv", ["--base", "link"], "--base or --load of a DH table"),
@@ -199,8 +198,10 @@ def test_wished_places_are_known_by_their_numbers_or_names(proposed: Proposed) -
 
 
 @pytest.mark.parametrize("by_rows", [True, False])
-def test_poses_as_sixteen_numbers(by_rows: bool, proposed: Proposed) -> None:
+def test_poses_as_numbers_of_matrices(by_rows: bool, proposed: Proposed) -> None:
+    """Sixteen, or twelve: these keep the last joint though its place does not move."""
     q = rows()[0]
+    q[:, 5] *= 0.1
     poses = ARM.nominal(q.deg2rad())
     poses[:, :3, 3] = 1e3 * poses[:, :3, 3] + noise(ROWS, 3, size=0.5)
     names = [f"O_T_EE[{k}]" for k in range(16)]
@@ -209,15 +210,10 @@ def test_poses_as_sixteen_numbers(by_rows: bool, proposed: Proposed) -> None:
     assert written["position"] == [",".join(names[int(k)] for k in order[:3, 3])]
     assert written["rotation"] == ",".join(names[int(k)] for k in order[:3, :3].flatten())
     assert written["convention"] == "matrix"
-
-
-def test_a_pose_keeps_the_last_joint_though_its_place_does_not_move(proposed: Proposed) -> None:
-    q = rows()[0]
-    q[:, 5] *= 0.1
-    poses = ARM.nominal(q.deg2rad())
-    poses[:, :3, 3] = 1e3 * poses[:, :3, 3] + noise(ROWS, 3, size=0.5)
-    written, _ = proposed((SERIES, q), ([f"T{row}{k}" for row in range(3) for k in range(4)], poses[:, :3].flatten(1)))
-    assert (written["joints"], written["convention"]) == (",".join(SERIES), "matrix")
+    if by_rows:
+        names = [f"T{row}{k}" for row in range(3) for k in range(4)]
+        written, _ = proposed((SERIES, q), (names, poses[:, :3].flatten(1)))
+        assert (written["joints"], written["convention"]) == (",".join(SERIES), "matrix")
 
 
 def test_names_that_contradict_the_numbers_or_lack_a_joint(proposed: Proposed) -> None:
@@ -299,28 +295,22 @@ def test_the_size_of_a_gantry_follows_from_its_limits(
 
 @pytest.mark.slow
 def test_signs_and_a_zero_are_proposed_and_read(tmp_path: Path, command: Command, proposed: Proposed) -> None:
-    read, points = rows()
-    read[:, 1] *= -1
-    read[:, 2] += 90
+    """Meanings that nothing tells apart are for the user."""
+    q, points = rows()
+    read = q * torch.tensor([1.0, -1.0, 1.0, 1.0, 1.0, 1.0]) + torch.tensor([0.0, 0.0, 90.0, 0.0, 0.0, 0.0])
     found, text = proposed((NAMES, read), (XYZ, points))
     expected = f"{NAMES[0]},-{{{NAMES[1]}}},{{{NAMES[2]}}}-90,{','.join(NAMES[3:])}"
     assert found["joints"] == expected
     assert "with the columns as they are" in text
-    given = ["--robot", tmp_path / "arm.urdf", "--base", "base_link", "--tip", "flange", "--position", "x,y,z"]
-    done = command("fit", tmp_path / "t.csv", *given, "--length", "mm", "--angle", "deg", "-o", tmp_path / "m")
+    robot = ["--robot", tmp_path / "arm.urdf", "--base", "base_link", "--tip", "flange"]
+    done = command("fit", tmp_path / "t.csv", *robot, *GIVEN, "-o", tmp_path / "m")
     assert done.code == 1
     assert f"the rows fit with --joints '{expected}'" in done.error
-
-
-@pytest.mark.slow
-def test_meanings_that_nothing_tells_apart_are_for_the_user(proposed: Proposed) -> None:
-    q, points = rows()
     q[:, 4] *= -1
     found, text = proposed((NAMES, q), (XYZ, points))
     assert "joints" not in found
     lines = [line for line in text.splitlines() if line.startswith("# joints = ")]
-    assert len(lines) == 2
-    assert all("uncomment one" in line for line in lines)
+    assert ["uncomment one" in line for line in lines] == [True, True]
 
 
 @pytest.mark.parametrize(
@@ -333,12 +323,12 @@ def test_a_proposal_is_that_of_the_table(written: tuple[str, str, str, str], tmp
     data = dc.Measurements(*arm.measure(60, seed=0), NAMES)
     positions = [("left x", "left y", "left z"), ("right x", "right y", "right z")]
     write_measurements(tmp_path / "t.csv", data, TableFormat(length, angle, sep, decimal), position=positions)
-    out = tmp_path / "sub"
-    out.mkdir()
-    done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", out / "cell.toml")
+    out = tmp_path / "sub" / "cell.toml"
+    out.parent.mkdir()
+    done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", out)
     assert (done.code, done.err) == (0, "")
     assert "the nominal robot leaves, of what the rows vary" in done.out
-    words = expanded(["fit", str(out / "cell.toml")])
+    words = expanded(["fit", str(out)])
     options = dict(zip(words[2::2], words[3::2], strict=True))
     assert os.path.realpath(words[1]) == os.path.realpath(tmp_path / "t.csv")
     assert (options["--length"], options["--angle"], options["--decimal"]) == (length, angle, decimal)

@@ -49,18 +49,15 @@ def test_the_true_joint_comes_closer(arm_200: Case) -> None:
         assert errors[1] < errors[0] / 5, table.joint
 
 
-def test_tables_cover_what_was_measured(arm: Case) -> None:
+def test_tables_cover_what_was_measured_and_say_how_good_interpolation_is(arm: Case) -> None:
     measured = arm.model.configurations
-    for index, table in enumerate(correction_tables(arm.model, turn_step=0.02)):
-        assert (float(table.values[0]), float(table.values[-1])) == tuple(map(float, measured[:, index].aminmax()))
+    for index, table in enumerate(correction_tables(arm.model, turn_step=0.1)):
+        low, high = float(table.values[0]), float(table.values[-1])
+        assert (low, high) == tuple(map(float, measured[:, index].aminmax()))
         steps = table.values.diff()
-        assert float(steps.max()) <= 0.02 + 1e-12
+        assert float(steps.max()) <= 0.1 + 1e-12
         torch.testing.assert_close(steps, steps[:1].expand_as(steps), rtol=0, atol=1e-12)
-
-
-def test_interpolation_is_as_good_as_it_says(arm: Case) -> None:
-    for table in correction_tables(arm.model, turn_step=0.1):
-        finer = torch.linspace(float(table.values[0]), float(table.values[-1]), 3001, dtype=torch.float64)
+        finer = torch.linspace(low, high, 3001, dtype=torch.float64)
         exact = -arm.model.transmission(table.joint, finer)
         exact = -arm.model.transmission(table.joint, finer + exact)
         found = np.interp(finer.numpy(), table.values.numpy(), table.corrections.numpy())
@@ -102,29 +99,23 @@ def test_slides(slider: Case, tmp_path: Path) -> None:
     assert units == ["deg", "deg", "mm", "deg", "deg", "deg"]
 
 
-@pytest.mark.parametrize("angle", ["rad", "deg"])
-def test_files(angle: str, arm: Case, tmp_path: Path) -> None:
-    scale = 1.0 if angle == "rad" else math.pi / 180
-    write_correction_tables(arm.model, tmp_path / "t.csv", angle=angle)
+def test_files(arm: Case, tmp_path: Path) -> None:
+    """In degrees; in mm: test_slides."""
+    write_correction_tables(arm.model, tmp_path / "t.csv", angle="deg")
     rows = read(tmp_path / "t.csv")
     for table in correction_tables(arm.model):
         own = [row for row in rows if row["joint"] == table.joint]
-        assert {row["unit"] for row in own} == {angle}
-        for column, values in (
-            ("value", table.values),
-            ("transmission_error", table.errors),
-            ("correction_to_add", table.corrections),
-        ):
-            found = scale * torch.tensor([float(row[column]) for row in own], dtype=torch.float64)
-            torch.testing.assert_close(found, values, rtol=1e-15, atol=0)
-    write_joint_offsets(arm.model, tmp_path / "o.csv", angle=angle)
-    found = [
-        (row["joint"], row["unit"], scale * float(row["offset_to_add_to_reading"])) for row in read(tmp_path / "o.csv")
-    ]
-    expected = best_joint_offsets(arm.model).offsets.tolist()
-    assert [name for name, _, _ in found] == list(arm.robot.joint_names)
-    assert {unit for _, unit, _ in found} == {angle}
-    assert [value for _, _, value in found] == pytest.approx(expected, rel=1e-15)
+        assert {row["unit"] for row in own} == {"deg"}
+        columns = ("value", "transmission_error", "correction_to_add")
+        for column, values in zip(columns, (table.values, table.errors, table.corrections), strict=True):
+            found = torch.tensor([float(row[column]) for row in own], dtype=torch.float64).deg2rad()
+            torch.testing.assert_close(found, values, rtol=1e-14, atol=0)
+    write_joint_offsets(arm.model, tmp_path / "o.csv", angle="deg")
+    offsets = read(tmp_path / "o.csv")
+    assert [row["joint"] for row in offsets] == list(arm.robot.joint_names)
+    assert {row["unit"] for row in offsets} == {"deg"}
+    found = [math.radians(float(row["offset_to_add_to_reading"])) for row in offsets]
+    assert found == pytest.approx(best_joint_offsets(arm.model).offsets.tolist(), rel=1e-14)
 
 
 def test_wrong_options(arm: Case, tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from export_bank import configurations, own_poses, wrong
-from product_bank import Case
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -18,7 +17,7 @@ import diffeo_calib as dc
 from diffeo_calib.cli.commands.export import HASH
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.interop.ur_kinematics import ur_text, write_ur_kinematics
-from diffeo_calib.robots import Chain, Geometry
+from diffeo_calib.robots import Chain, Geometry, SimulatedArm
 
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 QUARTER = math.pi / 2
@@ -96,22 +95,18 @@ def their_poses(links: dict[str, list[float]], q: Tensor) -> Tensor:
 @pytest.mark.parametrize("size", [0.0, 1e-3, 0.05])
 @pytest.mark.parametrize("prefix", ["", "left_"])
 def test_their_formula_gives_the_geometry_s_poses(prefix: str, size: float, tmp_path: Path) -> None:
-    robot = load(tmp_path / "ur.urdf", urdf(prefix), f"{prefix}tool0", f"{prefix}base_link")
-    geometry, q = wrong(robot, size), configurations(robot)
-    write_ur_kinematics(geometry, tmp_path / "ur.yaml")
-    links, _ = read_yaml(tmp_path / "ur.yaml")
-    torch.testing.assert_close(their_poses(links, q), own_poses(geometry, q), rtol=0, atol=1e-12)
-
-
-def test_any_tip_beyond_the_last_joint(tmp_path: Path) -> None:
-    robot = load(tmp_path / "ur.urdf", urdf(), "fingers")
-    tool = dc.load_urdf(tmp_path / "ur.urdf", "base_link", "tool0")
+    """Of any tip beyond the last joint."""
+    robot = load(tmp_path / "ur.urdf", urdf(prefix), f"{prefix}fingers", f"{prefix}base_link")
+    tool = dc.load_urdf(tmp_path / "ur.urdf", f"{prefix}base_link", f"{prefix}tool0")
     zero = torch.zeros(1, 6, dtype=torch.float64)
-    rest = torch.linalg.inv(tool(zero)[0]) @ robot(zero)[0]
-    geometry, q = wrong(robot), configurations(robot)
-    write_ur_kinematics(geometry, tmp_path / "ur.yaml")
-    links, _ = read_yaml(tmp_path / "ur.yaml")
-    torch.testing.assert_close(their_poses(links, q) @ rest, own_poses(geometry, q), rtol=0, atol=1e-12)
+    for tip, rest in (
+        (tool, torch.eye(4, dtype=torch.float64)),
+        (robot, torch.linalg.inv(tool(zero)[0]) @ robot(zero)[0]),
+    ):
+        geometry, q = wrong(tip, size), configurations(tip)
+        write_ur_kinematics(geometry, tmp_path / "ur.yaml")
+        links, _ = read_yaml(tmp_path / "ur.yaml")
+        torch.testing.assert_close(their_poses(links, q) @ rest, own_poses(geometry, q), rtol=0, atol=1e-12)
 
 
 def test_an_ideal_robot_has_the_numbers_of_their_package(tmp_path: Path) -> None:
@@ -154,10 +149,10 @@ def test_the_real_ur10(ur10_folder: Path, tmp_path: Path) -> None:
     torch.testing.assert_close(rest[0], torch.eye(4, dtype=torch.float64), rtol=0, atol=1e-11)
 
 
-def test_other_robots_are_refused(arm: Case, tmp_path: Path) -> None:
+def test_other_robots_are_refused(tmp_path: Path) -> None:
     new, path = tmp_path / "ur.yaml", tmp_path / "ur.urdf"
     with pytest.raises(RobotError, match=r"the joints of robot 'simulated_arm': expected shoulder_pan_joint, .*--urdf"):
-        write_ur_kinematics(arm.model.geometry, new)
+        write_ur_kinematics(Geometry.nominal(SimulatedArm().nominal), new)
     text = urdf()
     for change, tip, base, message in (
         (("", ""), "tool0", "shoulder_link", r"expected shoulder_pan_joint"),

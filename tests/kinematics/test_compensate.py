@@ -7,6 +7,7 @@ from math import radians
 import numpy as np
 import pytest
 import torch
+from deformation_bank import made
 from product_bank import Case
 from robots_bank import tool_frame
 from torch import Tensor
@@ -99,20 +100,19 @@ def test_positions_with_the_direction_of_an_axis(arm: Case) -> None:
         assert float(turned[found.reached].max()) > 1e-5  # the turn about the axis is free
 
 
-def test_a_slide_has_a_bound_in_metres(slider: Case) -> None:
-    q = slider.test.q[:100]
-    targets = intended(slider, q)
-    found = dc.compensate(slider.model, targets, q, tool=tool_frame(), bound=radians(4.0))
-    assert int(found.reached.sum()) > 50
-    distance, _ = misses(slider, found.q, targets)
-    assert float(distance[found.reached].max()) <= 1e-9
-    largest = found.correction.abs().amax(0)
-    assert float(largest[2]) <= 0.02
-    short = dc.compensate(slider.model, targets, q, tool=tool_frame(), bound=[0.07, 0.07, 1e-5, 0.07, 0.07, 0.07])
-    assert float(short.correction[:, 2].abs().max()) <= 1e-5
-
-
 # --- not reached ----------------------------------------------------------------------------------------------------
+
+
+def test_a_slide_has_a_bound_in_metres() -> None:
+    model = made("slides")
+    slides = ~torch.tensor(model.robot.periodic)
+    q = model.map.x[:6]
+    targets = model.tool_poses(q + 0.015 * torch.sin(50 * q))[:, :3, 3]
+    found = dc.compensate(model, targets, q)
+    assert bool(found.reached.all())
+    assert 0.003 < float(found.correction[:, slides].abs().max()) <= 0.02
+    bounds = torch.where(slides, 1e-5, 0.07)
+    assert float(dc.compensate(model, targets, q, bound=bounds).correction[:, slides].abs().max()) <= 1e-5
 
 
 def near_wrist_singularity(case: Case, rows: int) -> Tensor:
@@ -154,7 +154,10 @@ def test_statuses_of_singular_and_distant_targets(arm: Case) -> None:
     targets = intended(arm, q)
     far = targets.clone()
     far[:, :3, 3] *= 2.0 / far[:, :3, 3].norm(dim=1, keepdim=True)  # the arm reaches 1.5 m at most
+    together = dc.compensate(arm.model, torch.cat([targets, far]), q.repeat(2, 1), tool=tool_frame())
     near = dc.compensate(arm.model, targets, q, tool=tool_frame())
+    torch.testing.assert_close(together.q[:100], near.q, rtol=0, atol=1e-9)  # no row disturbs another one
+    assert together.status[:100] == near.status
     assert set(near.counts) <= {"reached", "singular", "limit"}
     assert near.counts["singular"] > 50
     assert float(near.miss.max()) < 1e-3
@@ -206,18 +209,6 @@ def test_limits_stop_a_row_and_are_named(arm: Case) -> None:
         beyond = float(q[row, joint] - narrow[joint, 1]) > BOUND
         assert bool(found.q[row].isnan().any()) == beyond
     assert found.counts["limit"] > 5
-
-
-def test_one_bad_row_disturbs_no_other(arm: Case) -> None:
-    q = commands(arm, 50, seed=10)
-    targets = intended(arm, q)
-    alone = dc.compensate(arm.model, targets, q, tool=tool_frame())
-    targets[7, :3, 3] = 1e6
-    together = dc.compensate(arm.model, targets, q, tool=tool_frame())
-    others = [row for row in range(50) if row != 7]
-    torch.testing.assert_close(together.q[others], alone.q[others], rtol=0, atol=1e-9)
-    assert together.status[7] == "unreachable"
-    assert [together.status[row] for row in others] == [alone.status[row] for row in others]
 
 
 # --- input ----------------------------------------------------------------------------------------------------------

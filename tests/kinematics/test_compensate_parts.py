@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import gc
-import weakref
-
 import numpy as np
 import pytest
 import torch
 from deformation_bank import model_of
-from product_bank import Case
 from robots_bank import parallelogram
 from table_bank import held
 from torch import Tensor
@@ -129,7 +125,7 @@ def test_wrong_targets_of_both_hands(model: dc.CalibratedKinematics) -> None:
             dc.compensate(model, **{"targets": targets, "start": start, **change})  # pyright: ignore[reportArgumentType]
 
 
-# --- limits of mimic joints, and models -----------------------------------------------------------------------------
+# --- limits of mimic joints -----------------------------------------------------------------------------------------
 
 
 def limited(mimic: dict[str, float], offset: float, low: float, high: float) -> dc.Chain:
@@ -157,12 +153,3 @@ def test_corrections_stop_at_the_limits_of_joints_that_follow_several() -> None:
     np.testing.assert_allclose(kept[0], [0.55, 0.45])
     np.testing.assert_allclose(kept[[1, 3]], q[[1, 3]])
     assert np.isnan(kept[2]).all()
-
-
-def test_a_model_is_forgotten_with_its_last_use(arm: Case) -> None:
-    model = arm.model.with_tool([0.0, 0.0, 0.1])
-    dc.compensate(model, torch.zeros(1, 3), torch.zeros(1, 6))
-    seen = weakref.ref(model)
-    del model
-    gc.collect()
-    assert seen() is None

@@ -1,12 +1,18 @@
-"""Gravity sag: features against moments of weights, twists and slopes against autograd."""
+"""Gravity sag and payloads: features against moments of weights, payloads of known mass."""
 
+import pytest
 import torch
-from robots_bank import draw, every_chain
+from robots_bank import CHAINS, draw, every_chain
+from simulated_body import URDF_FILE
 from torch import Tensor
 
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.robots import Chain, Geometry, Joint, SimulatedArm
+from diffeo_calib.robots import Chain, DHRow, Geometry, Joint, SimulatedArm, from_dh, simulated_arm, with_load
 from diffeo_calib.robots.gravity import GravitySag
+from diffeo_calib.robots.payload import Payload
+from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.chain import Compliance
 
 
@@ -71,3 +77,98 @@ def test_a_robot_without_lever_arms_has_no_sag() -> None:
     assert sag.compliances == ()
     assert sag.size == len(sag.joints) == len(sag.own) == 0
     assert GeometryMap(Geometry.nominal(chain), elastic=True).parameters == Geometry.nominal(chain).size
+
+
+# --- payloads of known mass -------------------------------------------------------------------------------------------
+
+
+MASSES = torch.tensor([0.0, 2.0, 5.0, 5.0, 1.5], dtype=torch.float64)
+UNIT = 5.0
+
+
+def laden(robot: Tree, masses: Tensor = MASSES, link: str | None = None) -> GravitySag:
+    return GravitySag(robot, Payload(link or robot.tips[0], masses, UNIT))
+
+
+BODY = dc.load_urdf(URDF_FILE, "pelvis", ["left_hand"], ["right_hand"])
+PLACES = [*((chain, chain.tip) for chain in CHAINS.values()), (BODY, "left_hand"), (BODY, "right_hand")]
+
+
+@pytest.mark.parametrize(("robot", "link"), PLACES, ids=[*CHAINS, "body", "branch of a body"])
+def test_one_payload_is_one_of_the_unknown_masses(robot: Tree, link: str) -> None:
+    """Folded into the coefficients without payload, it bends the robot as before: all joints that carry it."""
+    q, sag = draw(6, robot.n), laden(robot, torch.tensor(3.0, dtype=torch.float64), link)
+    w = draw(sag.size, seed=2)
+    expected = GravitySag(robot).twists(q, sag.folded(w))
+    torch.testing.assert_close(sag.twists(q, w), expected, rtol=1e-12, atol=1e-13)
+    bent = sag.twists(q, torch.where(sag.loaded, w, 0.0)).abs().amax((0, 2)) > 0
+    carrying = robot.ancestors[robot.moving + list(robot.ends).index(link)]
+    assert not bool((bent & ~carrying).any())
+    if robot is BODY:
+        assert bool(bent[carrying].all())
+
+
+def test_masses_are_counted_in_units() -> None:
+    """Coefficients are sags under one unit, whatever the unit of mass is."""
+    robot, q = SimulatedArm().nominal, draw(len(MASSES), 6)
+    w = draw(laden(robot).size, seed=2)
+    in_grams = GravitySag(robot, Payload(robot.tips[0], 1e3 * MASSES, 1e3 * UNIT))
+    torch.testing.assert_close(in_grams.twists(q, w), laden(robot).twists(q, w))
+    assert Payload(robot.tips[0], MASSES, UNIT).amounts(q)[:, 0].tolist() == [0.0, 0.4, 1.0, 1.0, 0.3]
+    with pytest.raises(InputError, match="payloads of 5 rows: expected one for each, got 3 configurations"):
+        laden(robot).features(q[:3])
+    with pytest.raises(InputError, match="a payload of every row"):
+        laden(robot).folded(w)
+
+
+def test_a_payload_beside_the_flange_sits_where_it_is_said() -> None:
+    """Masses of every row differ; one set of coefficients explains all of their torques."""
+    arm = SimulatedArm(seed=3)
+    robot = with_load(arm.nominal, "box", simulated_arm.PAYLOAD_CENTRE)
+    assert (robot.tips, robot.loads) == (("flange",), ("box",))
+    q, masses = arm.sample(100), torch.linspace(0.0, 9.0, 100, dtype=torch.float64)
+    assert robot(q).equal(arm.nominal(q))
+    torques = arm.gravity_torques(q, masses) - arm.gravity_torques(q, 0.0)
+    assert float(torques.abs().amax(0)[1:5].min()) > 1.0
+    for link, least, most in (("box", 0.0, 1e-11), ("flange", 0.1, 10.0)):
+        sag, away = laden(robot, masses, link), []
+        for joint in range(6):
+            used, own = sag.features(q)[:, sag.loaded & sag.own & (sag.joints == joint)], torques[:, [joint]]
+            away.append(float((used @ torch.linalg.lstsq(used, own, driver="gelsd").solution - own).abs().max()))
+        assert least <= max(away) < most
+    for name, on, words in (("flange", None, "a new name"), ("box", "wrist", r"`on`.*flange.*got wrist")):
+        with pytest.raises(RobotError, match=words):
+            with_load(arm.nominal, name, (0.0, 0.0, 0.1), on)
+
+
+def test_a_slide_on_another_branch_does_not_carry_the_payload() -> None:
+    rows = [DHRow(0.1, 0.3, 0.2), DHRow(0.2, -0.7, 0.1, kind="prismatic"), DHRow(0.3, 1.1, 0.2, parent=0)]
+    robot = from_dh(rows)
+    for link, joints in (("tip_1", {0, 1}), ("tip_2", {0, 2})):
+        sag = laden(robot, torch.tensor(3.0, dtype=torch.float64), link)
+        assert set(sag.joints[sag.loaded].tolist()) == joints
+
+
+def test_a_map_of_payloads_at_rows_and_elsewhere() -> None:
+    chain = SimulatedArm(0).nominal
+    payload = Payload(chain.tips[0], MASSES, UNIT)
+    whole = GeometryMap(Geometry.nominal(chain), elastic=True, payload=payload)
+    assert whole.load.by_row
+    assert not whole.typical.load.by_row
+    q, theta = draw(len(MASSES), chain.n), 1e-3 * torch.ones(whole.parameters, dtype=torch.float64)
+    every = whole(q, theta)
+    some = torch.tensor([1, 3])
+    torch.testing.assert_close(whole.rows(some)(q[some], theta), every[some])
+    usual = GeometryMap(Geometry.nominal(chain), elastic=True, payload=payload.weighing(MASSES.median()))
+    torch.testing.assert_close(whole.typical(q, theta), usual(q, theta))
+    assert list(GravitySag(chain, payload).parts)[-1] == "payload"
+
+
+@pytest.mark.parametrize(
+    ("masses", "at", "message"),
+    [(0.0 * MASSES, None, "all payloads are 0"), (MASSES, "nowhere", "the link of the payload")],
+)
+def test_payloads_of_rows_that_cannot_be(masses: Tensor, at: str | None, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Payload.of_rows(SimulatedArm(0).nominal, masses, at)
+    assert not Payload.of_rows(SimulatedArm(0).nominal, None, None)

@@ -42,7 +42,7 @@ from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.cholesky import lower_root
-from diffeo_calib.regression.conditional import BeforeData, Conditional, Opened, diagonal_blocks, without_rigid_motions
+from diffeo_calib.regression.conditional import BeforeData, Conditional, Opened, diagonal_blocks
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
@@ -87,16 +87,6 @@ class Scene(NamedTuple):
     seen: int  # the first coordinates, of points that a device of positions sees
     free: bool  # whether nothing says where the robot stands in the frame of a measuring device
     unplaced: bool  # whether a device of positions stands anywhere
-    with_second_order: Callable[[Tensor], Tensor] = lambda covariance: covariance  # see :class:`FittedMap`
-
-    @property
-    def motions(self) -> list[int]:
-        """Numbers of the columns by motions of the base."""
-        return list(self.at.spec.nominal.places[:6])
-
-    def without_motions(self, known: Conditional, targets: Tensor) -> Conditional:
-        """Without the rigid motion that fits the errors at the targets best, where such motions are no errors."""
-        return without_rigid_motions(known, self.at.rows(targets), self.motions) if self.free else known
 
     def along(self, blocks: Tensor) -> Tensor:
         """Covariances of the markers, or of the origins of poses, from those of the points: (M, m, m) -> (M, r, r)."""
@@ -124,7 +114,7 @@ class Scene(NamedTuple):
         at, seen = known.features(self.at.rows(targets)), known.features(told)
         P = torch.eye(at.known.shape[1], dtype=at.known.dtype, device=at.known.device)
         if self.free:
-            B = at.at.sensitivity[..., self.motions].flatten(0, 1)
+            B = at.at.sensitivity[..., list(self.at.spec.nominal.places[:6])].flatten(0, 1)  # by motions of the base
             P = P - B @ torch.linalg.pinv(B)
         own = diagonal_blocks(P @ at.between() @ P, len(targets))
 
@@ -272,8 +262,7 @@ def of_model(model: CalibratedKinematics, free: str | None, groups: Sequence[Ten
     known = Opened(fit.with_motions, fit.columns, moved), Linearisation.joined(parts), fit.columns + len(moved)
     noise = fitted.new_noise.expand(len(q), -1, -1)
     where = torch.cat(points), noise, model.geometry.base.to(moved), model.bodies.averaging(noise), seen
-    scene = Scene(*known, *where, fitted.stands_free, without_positions(model), fitted.with_second_order)
-    return scene, numbers
+    return Scene(*known, *where, fitted.stands_free, without_positions(model)), numbers
 
 
 def without_positions(model: CalibratedKinematics) -> bool:

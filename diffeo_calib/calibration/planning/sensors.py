@@ -229,16 +229,15 @@ class DeviceReadings(Sensor):
             yield Told(name, rows, A, effects @ one.root, columns, self._noise(usual))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class BoardImages(Sensor):
     """Images of the board by one camera of a fit, where it stood last."""
 
-    model: CalibratedKinematics = None  # pyright: ignore[reportAssignmentType]  # always given
-    name: str = ""  # of the camera
-    # lens, board and what its images showed
-    seen: BoardCamera = None  # pyright: ignore[reportAssignmentType]  # always given
-    set_up: SetUp = None  # pyright: ignore[reportAssignmentType]  # of its last session
-    rows: Tensor = None  # pyright: ignore[reportAssignmentType]  # (M,) of the fit in that session
+    model: CalibratedKinematics
+    name: str  # of the camera
+    seen: BoardCamera  # lens, board and what its images showed
+    set_up: SetUp  # of its last session
+    rows: Tensor  # (M,) of the fit in that session
 
     @classmethod
     def last(cls, model: CalibratedKinematics, name: str, seen: BoardCamera, rows: Tensor) -> BoardImages:
@@ -309,11 +308,8 @@ class BoardImages(Sensor):
     def told(self, scene: Scene, among: Tensor) -> Iterator[Told]:
         """Where the camera sees the board."""
         rows, (root, columns, rest) = among[sees(self.seen.camera, self.boards(scene.points[among]))], self.lens
-        points, noise, parts = (
-            scene.points[rows],
-            scene.noise[rows],
-            [(columns, scene.noise.new_zeros(len(rows), 9, 0))],
-        )
+        points, noise = scene.points[rows], scene.noise[rows]
+        parts = [(columns, noise.new_zeros(len(rows), 9, 0))]
         if self.seen.camera.view is not None:
             noise, by_lens = self.tells(points)
             noise, parts = noise + rest, [(columns, by_lens @ root)]

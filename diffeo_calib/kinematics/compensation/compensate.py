@@ -31,13 +31,14 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.problem import (
     CODE,
     MEMBERS,
+    SLIDE_BOUND,
+    TURN_BOUND,
     CompensationProblem,
     Solution,
     Status,
     by_joint,
     joint_limits,
     mobilities,
-    usual_motion,
 )
 from diffeo_calib.kinematics.compensation.search import Box, box_search, reached
 from diffeo_calib.kinematics.compensation.targets import Array, Targets, checked_targets, finite_rows, tool_functions
@@ -183,7 +184,8 @@ def compensate(
     if not any(robot.periodic):
         v = functions.rough(np.zeros((1, robot.n)))[0, :, :3]
         goals = replace(goals, along=v @ np.linalg.pinv(v, rcond=LEAST_DIRECTION))
-    usual = usual_motion(robot, BOUND_FACTOR_BETWEEN_ROWS if following and bound is None else 1.0)
+    factor = BOUND_FACTOR_BETWEEN_ROWS if following and bound is None else 1.0
+    usual = factor * np.where(robot.periodic, TURN_BOUND, SLIDE_BOUND)
     motion = by_joint(robot, bound, "bound", usual)
     aimed = np.ones((len(begin), 1), dtype=bool) if goals.free is None else ~goals.free
     mobility = mobilities(robot, weights, tuple(tools), aimed)

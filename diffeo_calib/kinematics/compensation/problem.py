@@ -85,11 +85,6 @@ def joint_limits(chain: Tree, given: object) -> Limits:
     return Limits(low, high, coupling[shared], least, most)
 
 
-def usual_motion(chain: Tree, scale: float) -> Array:
-    """(n,) how far a correction may move each joint by default, rad or m."""
-    return scale * np.where(np.array(chain.periodic), TURN_BOUND, SLIDE_BOUND)
-
-
 def by_joint(chain: Tree, value: object, name: str, usual: Array) -> Array:
     """A positive number for all turning joints, ``usual`` (n,) for the others and for None, or one for each: (n,)."""
     if value is None:
@@ -156,8 +151,7 @@ class CompensationProblem:
         possible = np.flatnonzero(np.all(box.low <= box.high, axis=1))
         for first in range(0, len(possible), ROWS_AT_ONCE):
             rows = possible[first : first + ROWS_AT_ONCE]
-            own, box = self.started(rows, self.start[rows]), self.box(rows)
-            q, seen, done = box_search(self.tool, own.targets, np.clip(box.start, box.low, box.high), box)
+            own, (q, seen, done) = self.started(rows, self.start[rows]), self._search(rows)
             solved = own.keep_mimics(Solution(q, seen, own._codes(q, seen, done)))
             for whole, part in zip(found, solved, strict=True):
                 whole[rows] = part
@@ -179,34 +173,30 @@ class CompensationProblem:
     def _codes(self, q: Array, poses: Array, done: Array) -> Array:
         """(N,) codes of the statuses of rows at ``q`` (N, n) whose ``done`` says that they are reached."""
         codes = np.where(done, CODE[Status.reached], CODE[Status.unreachable])
-        rows = np.flatnonzero(~done)
-        if not len(rows):
+        if done.all():
             return codes
+        rows = np.flatnonzero(~done)
         at_limit = ((q[rows] <= self.limits.low) | (q[rows] >= self.limits.high)).any(1)
         freed = rows[at_limit]
-        freed = freed[self._reach(freed, limited=False)]
+        freed = freed[self._search(freed, limited=False)[2]]
         codes[freed] = CODE[Status.limit]
         rest = np.setdiff1d(rows, freed)
         codes[rest[self._singular(rest, q[rest], poses[rest])]] = CODE[Status.singular]
         return codes
 
-    def _reach(self, rows: Array, *, limited: bool, scale: float = 1.0) -> Array:
-        """(R,) whether rows reach their targets without the limits of their joints, or with a multiple of the bound."""
-        if not len(rows):
-            return np.zeros(0, dtype=bool)
+    def _search(self, rows: Array, *, limited: bool = True, scale: float = 1.0) -> tuple[Array, Array, Array]:
+        """:func:`box_search` of some rows, with or without the limits of the joints, with a multiple of the bound."""
         box = self.box(rows, limited=limited, scale=scale)
-        return box_search(self.tool, self.targets.take(rows), np.clip(box.start, box.low, box.high), box)[2]
+        return box_search(self.tool, self.targets.take(rows), np.clip(box.start, box.low, box.high), box)
 
     def _singular(self, rows: Array, q: Array, poses: Array) -> Array:
         """(R,) whether a singularity is to blame, at the start or at the nearest command ``q``."""
-        if not len(rows):
-            return np.zeros(0, dtype=bool)
         start, targets = self.start[rows], self.targets.take(rows)
         near, open_ = self._blames(targets, start, self.tool.poses(start), start)
         near_here, open_here = self._blames(targets, q, poses, start)
         found = (near & open_) | (near_here & open_here)
         doubtful = np.flatnonzero((near | near_here) & ~found)
-        found[doubtful] = self._reach(rows[doubtful], limited=True, scale=SECOND_SEARCH_BOUND_FACTOR)
+        found[doubtful] = self._search(rows[doubtful], scale=SECOND_SEARCH_BOUND_FACTOR)[2]
         return found
 
     def _blames(self, targets: Targets, q: Array, poses: Array, start: Array) -> tuple[Array, Array]:
