@@ -197,6 +197,7 @@ def test_lengths_from_another_zero_are_refused_or_warned_about() -> None:
 
 def test_what_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(placed_readings, "BALLS_TRIED", 2)
+    monkeypatch.setattr(placed_readings, "STARTS_STEPS", 20)
     arm, data = SimulatedArm(2), readings(SimulatedArm(2), "distance", 60)
     with pytest.warns(dc.DiffeoCalibWarning, match="no place of ball and devices explains"):
         registered(arm.nominal, dc.Readings.distances(data.q[:24], data.values[:24]))  # three devices as one
