@@ -14,10 +14,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.campaign.model import limit_of
 from diffeo_calib.campaign.verdicts import Verdict
-from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.robots import SimulatedArm
 
@@ -199,26 +197,7 @@ def test_bad_input_is_refused_and_nothing_is_lost(running: dc.Campaign) -> None:
     assert campaign.accepted == list(range(ROWS))
 
 
-BESIDE = ("positions", "poses", "several tips", "markers mounted anew", "mixture", "images of a board", "several kinds")
-
-
-@pytest.mark.parametrize("name", marked(*BESIDE))
-def test_rows_beside_known_devices_are_those_of_the_calibration(name: str) -> None:
-    """Taken for other rows, the rows of a calibration are what they were in it."""
-    kind = kind_named(name)
-    placed = place(kind.robot, kind.data, silent)
-    like = placed.tangent_data()
-    _, found = placed.beside(kind.data, like)
-    for part in ("y", "points", "sensitivities", "shared"):
-        own, other = getattr(like, part), getattr(found, part)
-        assert (own is None) == (other is None)
-        if own is not None:
-            assert_close(other, own, msg=lambda text, part=part: f"{part}: {text}")
-    assert_close(found.noise(kind.scales), like.noise(kind.scales))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["sessions", "mixture", "several kinds", "inclinations", "laser beams"])
+@pytest.mark.parametrize("name", marked("poses", "mixture", "sessions", "several kinds", "inclinations", "laser beams"))
 def test_other_kinds_of_rows(name: str) -> None:
     """The rows of the bank in random order, enough to place every device and for two models."""
     kind = kind_named(name)
