@@ -191,7 +191,7 @@ def _(bench: Bench) -> None:
 
 @verb("fit")
 def _(bench: Bench) -> None:
-    """Of some kinds with a fifth of the rows held out; most are calibrated once, in Python, with the rows that are read."""
+    """With a fifth of the rows held out for some kinds; most are calibrated once, in Python, with the rows read."""
     kind, path = bench.kind, bench.folder / "fit.safetensors"
     page = bench.folder / "report.html"
 
