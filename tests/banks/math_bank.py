@@ -278,17 +278,6 @@ def rows_jacobian(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
     return torch.stack(grads, 1)
 
 
-def inverse_of(flow: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
-    """The points x with flow(x) = y, by Newton's method with autograd Jacobians: (M, n) -> (M, n)."""
-    x = 2 * y - flow(y)
-    for _ in range(8):
-        step = torch.linalg.solve(rows_jacobian(flow, x), y - flow(x))
-        x = x + step
-        if float(step.abs().max()) < 1e-14:
-            break
-    return x
-
-
 def slopes(errors: list[float]) -> list[float]:
     """Orders of convergence when each entry halves the step of the one before."""
     return [log2(a / b) for a, b in pairwise(errors)]
