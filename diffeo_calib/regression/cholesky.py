@@ -57,8 +57,8 @@ class Factor:
             cross: (M, m) L^-1 times their covariance with these, without H. L: (m, m) of what these leave of theirs.
             W: (m, K) their rows.
         """
-        M, whole = len(self.L), L.new_empty(len(self.L) + len(L), len(self.L) + len(L))
-        whole[:M, :M], whole[:M, M:], whole[M:, :M], whole[M:, M:] = self.L, 0.0, cross.T, L
+        M, whole = len(self.L), L.new_zeros(len(self.L) + len(L), len(self.L) + len(L))
+        whole[:M, :M], whole[M:, :M], whole[M:, M:] = self.L, cross.T, L
         return Factor(whole, torch.cat([self.W, W]), self._gram + W.T @ W)
 
     def beside(self, H: Tensor) -> Factor:
