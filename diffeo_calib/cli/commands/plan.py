@@ -16,7 +16,7 @@ from diffeo_calib.calibration.planning.plan import Plan, drawn, plan
 from diffeo_calib.calibration.planning.sensors import Sensor, sensors_for
 from diffeo_calib.cli.console import out, progress_bar, say, text_table
 from diffeo_calib.cli.declarations import PlanOptions
-from diffeo_calib.cli.models import as_fitted, load_kinematics, load_robot, provenance_lines
+from diffeo_calib.cli.models import as_fitted, load_kinematics, load_robot, planned
 from diffeo_calib.cli.options import DRAWN, Candidates
 from diffeo_calib.cli.printed import expectation_lines
 from diffeo_calib.cli.record import record
@@ -71,12 +71,7 @@ def run(given: PlanOptions) -> None:
         markers = markers / table.per_metre if numbers else markers
         source = model or load_robot(begin, given)
         if model is not None:
-            say(*provenance_lines(model))
-            if given.payload is not None:
-                source = model.with_payload(given.payload)
-            elif model.payload is not None:
-                say(f"planned with a payload of {model.payload:g}, the median of the fit; --payload for another one")
-            markers = model.geometry.tool
+            source, markers = planned(model, given.payload)
         robot = source.robot if isinstance(source, CalibratedKinematics) else source
         table = of_robot(table, robot)
 
