@@ -76,7 +76,7 @@ def test_unusable_models_are_refused() -> None:
 LINES = ((2, 200.3, 1e-4), (0, 121.0, 8e-5))
 
 
-def drawn(lines: object = LINES, *, q: Tensor | None = None, seed: int = 0) -> tuple[TangentData, Hyperparameters]:
+def drawn(lines: Any = LINES, *, q: Tensor | None = None, seed: int = 0) -> tuple[TangentData, Hyperparameters]:
     """Measurements of the model itself, drawn from its prior, with gear lines in addition; 150 poses by default."""
     arm = SimulatedArm(1)
     q = arm.sample(150, seed=3) if q is None else q
@@ -223,6 +223,7 @@ def configurations(rows: int, seed: int) -> Tensor:
     return torch.from_numpy(rng.uniform((-2, -2, 0, -2, -2, -2), (2, 2, 0.6, 2, 2, 2), (rows, 6)))
 
 
+@pytest.mark.slow
 def test_a_bent_slide_is_part_of_the_model(tmp_path: Path) -> None:
     """True errors and regions at other poses; beyond the measured range regions widen; files hold all."""
     robot, q, new = sliding_robot(), configurations(60, 1), configurations(200, 2)
