@@ -331,8 +331,22 @@ def _unclear(found: Sequence[Source], *, excluded: bool) -> InputError:
         fix = "no signs, zeros, coupling or units of the joints do either: "
     fix += "check the table's joints against the robot's, or write the file yourself; of a robot with several tips "
     fix += "the columns of each are to be named after it, such as left_x"
+    if alone := _parts_alone(found[0]):
+        got, fix = f"{got}; {alone}", "if the device moved between rows, name its set-ups in a column, `session`"
     what = "units with which the robot explains what the rows vary"
     return InputError.of(what, expected="one clear reading", got=f"left unexplained {got}", fix=fix)
+
+
+def _parts_alone(source: Source) -> str:
+    """Which third of the rows, in their order, the robot explains by itself, in words."""
+    for one, own in source.positions():
+        third = len(own) // 3
+        for name, rows in (("first", range(third)), ("last", range(len(own) - third, len(own)))):
+            part = own.rows(list(rows))
+            left = likely_mistakes.residual_of(source.robot, part) / max(spread(part.points), SMALLEST_SPREAD_M)
+            if left < DOUBTFUL:
+                return f"the {name} {third} rows alone, {one.table.length} and {one.table.angle}: {percent(left)}"
+    return ""
 
 
 def _with_meanings(best: Source) -> Source:

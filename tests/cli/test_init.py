@@ -355,3 +355,12 @@ def test_a_robot_that_explains_nothing_is_refused(count: int, message: str, tmp_
     assert message in text
     assert not entries
     assert not (tmp_path / "c.toml").exists()
+
+
+def test_a_device_that_moved_is_said(proposed: Proposed) -> None:
+    q, points = rows()
+    half = len(q) // 2
+    points[half:] = points[half:] @ points.new_tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) + 900.0
+    entries, text = proposed((NAMES, q), (XYZ, points))
+    assert not entries
+    assert re.search(r"the (first|last) \d+ rows alone, mm and deg: \S+ %; if the device moved", text)
