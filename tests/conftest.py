@@ -100,7 +100,7 @@ LONGEST = (
     *("test_hidden_markers.py", "test_planned_sensors.py", "test_json_results.py"),
     *("test_distributed.py", "test_analysis.py", "test_evaluators.py", "test_readings.py", "test_tree_calibrations.py"),
     *("test_registration.py", "test_calibrate.py", "test_hardware.py", "test_unusual_data.py"),
-    *("test_refused.py", "test_second_device.py", "test_fit.py", "test_default_device.py"),
+    *("test_refused.py", "test_second_device.py", "test_fit.py"),
     *("test_examples.py", "test_calibrated.py", "test_correct_command.py", "test_mixtures.py", "test_sessions.py"),
 )
 """File names, those of a quarter of a minute and more; all others follow in the usual order."""

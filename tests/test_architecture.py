@@ -346,3 +346,45 @@ def test_one_table_of_the_priors_of_places() -> None:
     assert pattern.search("PLACE_DEVIATION_M = 0.1")
     found = [path.name for path in SOURCES.values() if pattern.search(path.read_text(encoding="utf-8"))]
     assert not found, found
+
+
+# --- every tensor states its device and its kind of numbers ----------------------------------------------------------
+#
+# The package is the same under any default device and type of torch.
+
+NUMBERED = {"arange", "randint", "randperm", "tril_indices", "triu_indices", "Generator"}
+"""Their kind of numbers does not follow the default type; that of `arange` follows its arguments."""
+FACTORIES = NUMBERED | {
+    *("as_tensor", "asarray", "empty", "empty_strided", "eye", "full", "hamming_window", "hann_window", "linspace"),
+    *("logspace", "normal", "ones", "rand", "randn", "scalar_tensor", "sparse_coo_tensor", "tensor", "zeros"),
+}
+"""Functions of torch whose result lies on the default device, unless it is stated."""
+OLD = {"Tensor", "FloatTensor", "DoubleTensor", "LongTensor", "BoolTensor", "set_default_device", "set_default_dtype"}
+"""Constructors that cannot state it, and global switches."""
+
+
+def undecided(tree: ast.Module) -> Iterator[str]:
+    """Calls in a program that leave the device or the kind of numbers to a default."""
+    for node in ast.walk(tree):
+        if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)):
+            continue
+        owner, name = node.func.value, node.func.attr
+        if not (isinstance(owner, ast.Name) and owner.id == "torch" and name in FACTORIES | OLD):
+            continue
+        stated = {keyword.arg for keyword in node.keywords}
+        if name == "Generator" and node.args:
+            stated.add("device")
+        for option in ("device",) if name in NUMBERED else ("device", "dtype"):
+            if name in OLD or option not in stated:
+                yield f"line {node.lineno}: torch.{name} without {option}"
+
+
+def test_a_silent_line_is_found() -> None:
+    lines = "torch.zeros(3)", "torch.eye(2, dtype=float, device=cpu)", "torch.Tensor(3)", "torch.Generator(cpu)"
+    found = [text.partition(":")[0] for text in undecided(ast.parse("\n".join([*lines, "torch.Generator()"])))]
+    assert found == ["line 1", "line 1", "line 3", "line 3", "line 5"]
+
+
+def test_every_tensor_states_its_device_and_its_kind() -> None:
+    found = [f"{module}, {text}" for module, tree in trees().items() for text in undecided(tree)]
+    assert not found, "\n".join(found)

@@ -30,7 +30,6 @@ import torch
 from hidden_markers import at_random
 from kind_bank import table_options
 from mistakes import PLACES, noise, resting
-from mixture_bank import DISTANCES
 from simulated_camera import camera_arm, fixed_camera_arm
 from simulated_sockets import rest_in_sockets
 from torch import Tensor
@@ -344,7 +343,7 @@ def _of_devices(of: Design, rng: np.random.Generator) -> Campaign:
     if of.kind == "ball in sockets":
         arm = SimulatedArm(of.number)
         found = rest_in_sockets(arm, of.number, places=PLACES, rows=of.rows // 12, repeatability=deviation)
-        known: Any = {"distances": DISTANCES, "distance_std": 3e-5, "doubt": False}
+        known: Any = {"distances": reading_bank.DISTANCES, "distance_std": 3e-5, "doubt": False}
         return campaign(arm, dc.Measurements.from_sockets(found.q, found.names, names, **known))
     if of.kind.startswith("board"):
         return campaign(*_of_board(of), (0, 1, 2))

@@ -103,8 +103,6 @@ def choose_scales(
         registration: base and markers. identification: the geometric calibration.
         given: scales that are used as they are. models: of robots of the same type, whose scales are used, inflated
             where leave-one-out errors contradict them.
-        seed: draws the poses on which scales are selected.
-        progress: called as ``progress(task, done, total)``.
 
     Warns:
         DiffeoCalibWarning: too few poses to select scales; leave-one-out errors contradict the scales.
@@ -255,11 +253,7 @@ POSES, COORDINATES = 300, 1500
 
 
 def with_payload_factor(data: TangentData, scales: Hyperparameters, seed: int = 0) -> Hyperparameters:
-    """Set the likeliest payload factor; scales without payload stay.
-
-    Args:
-        data: the measurements. scales: all other scales. seed: draws the poses if there are many.
-    """
+    """Set the likeliest payload factor; scales without payload stay."""
     sag = data.nominal.elasticity
     if sag is None or not bool(sag.loaded.any()):  # no coefficient depends on it
         return scales

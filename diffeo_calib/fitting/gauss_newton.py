@@ -140,7 +140,7 @@ class _Run:
         trial = self._trial(momenta)
         if trial is not None and self._residual(trial[0]) < self.residual:
             return trial
-        self.mixing.forget()
+        self.mixing = Mixing()  # starts again after a point that was rejected
         return None
 
     def _trial(self, momenta: Momenta) -> tuple[GeodesicDeformation, float] | None:
@@ -210,10 +210,6 @@ class Mixing:
     def __init__(self) -> None:
         self._targets: list[Tensor] = []
         self._steps: list[Tensor] = []
-
-    def forget(self) -> None:
-        """Start again, after a mixed point that was rejected."""
-        self._targets, self._steps = [], []
 
     def mixed(self, current: Momenta, target: Momenta) -> Momenta | None:
         """The mixed point.

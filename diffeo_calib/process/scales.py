@@ -119,17 +119,6 @@ class Hyperparameters:
         """K_W on R^3."""
         return RadialKernel(TASK_PROFILE, lengthscale=self.task_lengthscale, variance=self.task_amplitude**2)
 
-    def joint_kernel_values(self, squared_distances: Tensor) -> KernelValues:
-        """K_V, diagonal (n, M, N) in rad^2 or m^2, for squared distances (n, M, N) of every joint."""
-        own = Term(TRANSMISSION_PROFILE, self.transmission_amplitude, self.transmission_lengthscale)
-        coupled = Term(COUPLED_PROFILE, self.coupled_amplitude, self.coupled_lengthscale, joined=True)
-        return KernelValues(squared_distances, own, coupled)
-
-    def task_kernel_values(self, squared_distances: Tensor) -> KernelValues:
-        """kappa of K_W = kappa I for squared distances (M, N) in m^2, with values (1, M, N), m^2."""
-        term = Term(TASK_PROFILE, self.task_amplitude.reshape(1), self.task_lengthscale.reshape(1))
-        return KernelValues(squared_distances[None], term)
-
     def prior_variance(self, nominal: GeometryMap, place_deviation: float = PLACES.found_m_rad) -> Tensor:
         """Prior variances of theta: errors of the geometry, coefficients of gravity sag, gear lines and axes in turn.
 
@@ -276,8 +265,11 @@ class Pairs:
         self._points = torch.cdist(z, z, compute_mode="donot_use_mm_for_euclid_dist").square_()
 
     def values(self, scales: Hyperparameters) -> tuple[KernelValues, KernelValues]:
-        """K_V at all pairs of configurations, and kappa of K_W = kappa I at those of points."""
-        return scales.joint_kernel_values(self._joints), scales.task_kernel_values(self._points)
+        """K_V, diagonal (n, N, N), at all pairs of configurations, and kappa (1, N P, N P) of K_W = kappa I."""
+        own = Term(TRANSMISSION_PROFILE, scales.transmission_amplitude, scales.transmission_lengthscale)
+        coupled = Term(COUPLED_PROFILE, scales.coupled_amplitude, scales.coupled_lengthscale, joined=True)
+        task = Term(TASK_PROFILE, scales.task_amplitude.reshape(1), scales.task_lengthscale.reshape(1))
+        return KernelValues(self._joints, own, coupled), KernelValues(self._points[None], task)
 
     def matrix(self, values: tuple[KernelValues, KernelValues]) -> Tensor:
         """(N R, N R), without a graph."""

@@ -38,19 +38,18 @@ ACCEPTABLE_RESIDUAL = 1e-6  # relative residual that is accepted where rounding 
 
 
 def partial_cholesky(
-    linearisation: Linearisation, max_rest: float, most: int, *, block: int = BLOCK_CONFIGURATIONS, seed: int = 0
+    linearisation: Linearisation, max_rest: float, most: int, block: int = BLOCK_CONFIGURATIONS
 ) -> tuple[Tensor, Tensor, Tensor]:
     """A factor of the prior covariance G of a linearisation by some of its configurations.
 
     Args:
-        max_rest: the trace of G - P P^T at which to stop. most: number of configurations.
-        block: how many are drawn together. seed: of the draws.
+        max_rest: the trace of G - P P^T at which to stop. most: number of configurations, ``block`` drawn together.
 
     Returns:
         P (N m, r) with P P^T ~ G, the diagonal (N m,) of G - P P^T, and the numbers of the configurations.
     """
     n, m, _ = linearisation.sensitivity.shape
-    every, generator = torch.arange(n, device=linearisation.sensitivity.device), seeded(seed)
+    every, generator = torch.arange(n, device=linearisation.sensitivity.device), seeded(0)
     rest = torch.cat([linearisation.rows(some).gram().diagonal() for some in every.split(BLOCK_CONFIGURATIONS)])
     factor, chosen = rest.new_zeros(len(rest), 0), every[:0]
     while len(chosen) < most and float(rest.sum()) > max_rest:
@@ -71,7 +70,7 @@ def partial_cholesky(
 
 def pivots(linearisation: Linearisation, count: int) -> Tensor:
     """Row numbers of ``count`` configurations that together explain most of G: (count,)."""
-    chosen = partial_cholesky(linearisation, 0.0, count, block=BLOCK_CONFIGURATIONS // 4)[2]
+    chosen = partial_cholesky(linearisation, 0.0, count, BLOCK_CONFIGURATIONS // 4)[2]
     unused = torch.ones(len(linearisation.sensitivity), dtype=torch.bool, device=chosen.device)
     unused[chosen] = False
     return torch.cat([chosen, unused.nonzero()[:, 0][: count - len(chosen)]])
@@ -81,13 +80,10 @@ class ConjugateGradientRegression(Conditional):
     """Preconditioned conjugate gradients on (G + R) mu = target.
 
     Args:
-        linearisation: first-order response of k1 at the data. noise: R.
-        rank: bound on that of P. tolerance: of the relative residual.
+        linearisation: first-order response of k1 at the data. noise: R. tolerance: of the relative residual.
     """
 
-    def __init__(
-        self, linearisation: Linearisation, noise: Noise, *, rank: int = MAX_RANK, tolerance: float = CG_TOLERANCE
-    ) -> None:
+    def __init__(self, linearisation: Linearisation, noise: Noise, tolerance: float = CG_TOLERANCE) -> None:
         self.linearisation, self.size = linearisation, linearisation.sensitivity.shape[:2].numel()
         self.noise, self.tolerance = noise, tolerance
         deviations, shared = linearisation.spec.prior_variance.sqrt(), noise.shared
@@ -95,7 +91,7 @@ class ConjugateGradientRegression(Conditional):
         self.slopes = torch.cat([linearisation.sensitivity * deviations, shared], 2).flatten(0, 1)
         max_rest = NEGLIGIBLE_VARIANCE_RATIO * float(noise.covariance.diagonal(dim1=1, dim2=2)[noise.visible].sum())
         n, m, _ = noise.covariance.shape
-        self.P, rest, _ = partial_cholesky(linearisation.fields, max_rest, max(1, rank // m))
+        self.P, rest, _ = partial_cholesky(linearisation.fields, max_rest, max(1, MAX_RANK // m))
         blocks = noise.covariance + torch.diag_embed(rest.view(n, m))
         self.preconditioner = Noise(blocks, torch.cat([self.P, self.slopes], 1).view(n, m, -1))
 
@@ -200,7 +196,7 @@ def condition(
     check_memory(4 * BYTES_PER_FLOAT * size * columns, f"{size} measured coordinates with linear={method!r}")
     if method == "cholesky":
         return Process.of_rows(linearisation, noise)
-    return ConjugateGradientRegression(linearisation, noise, tolerance=tolerance)
+    return ConjugateGradientRegression(linearisation, noise, tolerance)
 
 
 def choose(linear: LinearSolver, size: int) -> LinearSolver:

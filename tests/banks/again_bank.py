@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import reading_bank
 import torch
-from mixture_bank import DISTANCES
+from reading_bank import DISTANCES
 from shared_bank import shared
 from simulated_sockets import rest_in_sockets
 from torch import Tensor

@@ -1,31 +1,24 @@
 """One small table and one fitted model of every kind of measurement, and of several kinds in one table.
 
-The robots and most rows are those of the golden numbers; here a part of the rows is kept for the verbs that judge.
+A part of the rows is kept for the verbs that judge. The models' numbers are held by tests/golden.
 """
 
 from __future__ import annotations
 
-import copy
 import csv
+import re
 import tempfile
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
-import golden_bank
-import inclinometer
-import laser_line
 import pytest
-import reading_bank
 import torch
 import two_arms_bank
-from golden_bank import Golden
-from product_bank import simulated_poses
 from shared_bank import shared
-from simulated_camera import camera_arm, fixed_camera_arm, images_of_both
+from source_bank import KINDS, SOURCES, Source
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -34,9 +27,8 @@ from diffeo_calib.calibration.recalibration.new_rows import NewSetUp
 from diffeo_calib.calibration.recalibration.new_set_up import place_again
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.csv.sensors import ImageColumns
-from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.measurements.rows import with_attributes
-from diffeo_calib.measurements.table_format import LEVER, TableFormat
+from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
 
@@ -44,154 +36,6 @@ ELSEWHERE = torch.tensor([0.4, -0.2, 0.3, 0.2, 0.5, -0.3], dtype=torch.float64)
 """Where the device stands later: shift in m, turn in rad."""
 UNITS = ("--length", "mm", "--angle", "deg")
 FOLDER = tempfile.TemporaryDirectory(prefix="diffeo_calib_kinds_")  # of all kinds, until this process ends
-Truth = Callable[[Tensor], Tensor]
-"""Joint values (N, n) -> true markers (N, P, 3) in the order of the model's, m, in any frame that does not move."""
-
-
-@dataclass(frozen=True)
-class Source:
-    """Rows of a simulated robot; the largest RMS error, mm, of a model of them, after a rigid fit."""
-
-    golden: Golden
-    truth: Truth
-    worst_mm: float
-
-
-def _of_arm(golden: Golden, worst_mm: float, arm: SimulatedArm, order: tuple[int, ...] = (0,), **load: float) -> Source:
-    return Source(golden, lambda q: arm.true_points(q, **load)[:, list(order)], worst_mm)
-
-
-def _poses() -> Source:
-    return _of_arm(golden_bank.poses(40), 0.25, simulated_poses(1)[0], (0, 1, 2))
-
-
-def _sessions() -> Source:
-    """Without a wrong row."""
-    scales = golden_bank.sessions(15).scales
-    golden = replace(golden_bank.sessions(60, searched=True), scales=scales)
-    return _of_arm(golden, 0.25, SimulatedArm(seed=5, markers=2), (0, 1))
-
-
-def _tips() -> Source:
-    """Poses of both hands; each stands for three points."""
-    golden = golden_bank.two_tips()
-    arms = two_arms_bank.TwoArms(golden.robot)
-    return Source(golden, lambda q: mark_points(arms.poses(q).flatten(0, 1), LEVER).view(len(q), -1, 3), 0.2)
-
-
-def _readings(kind: str, worst_mm: float) -> Source:
-    arm = SimulatedArm(0)
-    rows = reading_bank.readings(arm, kind, 96, noise=2e-5)
-    golden = Golden(arm.nominal, rows, reading_bank.scales(), arm.sample(5, seed=77))
-    return _of_arm(golden, worst_mm, arm)
-
-
-def _images() -> Source:
-    """A camera on the tool and a printed board."""
-    seen = camera_arm(60)
-    golden = Golden(seen.arm.nominal, seen.images(0.1), golden_bank.camera_on_tool().scales, seen.q[:5])
-    return _of_arm(golden, 0.3, seen.arm, (0, 1, 2))
-
-
-def _two_cameras() -> Source:
-    """Two fixed cameras, and a printed board on the tool."""
-    arms = [fixed_camera_arm(70, second=second) for second in (False, True)]
-    rows = images_of_both(arms, (33, 27), 0.1)
-    golden = Golden(arms[0].arm.nominal, rows, golden_bank.camera_on_tool().scales, rows.q[:5])
-    return _of_arm(golden, 0.3, arms[0].arm, (0, 1, 2))
-
-
-def _two_on_the_tool() -> Source:
-    """Two cameras on the tool, and a printed board."""
-    arms = [camera_arm(70, second=second) for second in (False, True)]
-    rows = images_of_both(arms, (33, 27), 0.1, on_tool=True)
-    golden = Golden(arms[0].arm.nominal, rows, golden_bank.camera_on_tool().scales, rows.q[:5])
-    return _of_arm(golden, 0.3, arms[0].arm, (0, 1, 2))
-
-
-def _images_and_tracker() -> Source:
-    """Images of a board, and in other rows a tracker's marker on the same tool."""
-    seen, tracker = camera_arm(60), SimulatedArm(seed=1)
-    arm, names = copy.copy(seen.arm), seen.arm.nominal.joint_names
-    arm.truth = replace(arm.truth, base=tracker.truth.base, tool=tracker.truth.tool, on=tracker.truth.on)
-    q = arm.sample(40, seed=3)
-    noise = 2e-5 * torch.randn(40, 1, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-    tracked = dc.Measurements(q, arm.true_points(q) + noise, names)
-    rows: Any = dc.Observations.joined([seen.images(0.1), tracked])  # pyright: ignore
-    golden = Golden(arm.nominal, rows, golden_bank.camera_on_tool().scales, seen.q[:5])
-    return _of_arm(golden, 0.3, seen.arm, (0, 1, 2))
-
-
-def _several() -> Source:
-    """A tracker sees marker 1; the ball, marker 0, is seen by three kinds of devices."""
-    arm = SimulatedArm(0, markers=2)
-    q, points = arm.measure(40, seed=5)
-    tracked = dc.Measurements(q, points[:, 1:], arm.nominal.joint_names)
-    counts = {"distance": 96, "height": 96, "image": 96}  # a distance's closed form needs 17 rows of a device
-    each = [reading_bank.readings(arm, kind, rows, noise=2e-5) for kind, rows in counts.items()]
-    golden = Golden(arm.nominal, dc.Observations.joined([tracked, *each]), reading_bank.scales(), q[:5])  # pyright: ignore
-    return _of_arm(golden, 0.15, arm, (1, 0))
-
-
-def _beams() -> Source:
-    """A kind of device from outside the package: distances of the ball from lines, beside positions of a marker."""
-    arm = SimulatedArm(0, markers=2)
-    q, points = arm.measure(40, seed=5)
-    tracked = dc.Measurements(q, points[:, 1:], arm.nominal.joint_names)
-    rows: Any = dc.Observations.joined([tracked, laser_line.readings(arm, arm.sample(160, seed=6))])
-    return _of_arm(Golden(arm.nominal, rows, reading_bank.scales(), q[:5]), 0.25, arm, (1, 0))
-
-
-def _inclinations() -> Source:
-    """One that sees a frame: two angles of the tool against gravity, beside its poses."""
-    known = golden_bank.poses(40)
-    arm = simulated_poses(1)[0]
-    rows: Any = dc.Observations.joined([known.rows, inclinometer.readings(arm, arm.sample(90, seed=6))])  # pyright: ignore
-    return _of_arm(replace(known, rows=rows), 0.25, arm, (0, 1, 2))
-
-
-MOUNTED = torch.tensor([[0.0, 0.0, 0.0], [3e-3, -4e-3, 0.0], [-2e-3, 1e-3, 4.5e-3]], dtype=torch.float64)
-"""Places of the marker in three sessions, from that of the first, in the frame of the tip, m."""
-
-
-def remounted(arm: SimulatedArm, rows: dc.Measurements, shifts: Tensor = MOUNTED) -> dc.Measurements:
-    """Rows of one marker as those of sessions in turn, for each of which it was mounted anew; "a" has most rows."""
-    turn = torch.arange(len(rows)) % 5
-    whose = torch.where(turn < len(shifts), turn, 0)
-    turns = arm.truth.marker_poses(rows.q)[..., :3, :3]
-    moved = rows.shifted((turns @ shifts[whose][:, None, :, None])[..., 0])
-    return moved.with_sessions(["abcdefg"[number] for number in whose.tolist()], remounted=True)
-
-
-def _remounted() -> Source:
-    known, arm = golden_bank.positions(96), SimulatedArm(seed=1)
-    rows: Any = known.rows
-    return _of_arm(replace(known, rows=remounted(arm, rows)), 0.2, arm)
-
-
-SOURCES: dict[str, Callable[[], Source]] = {
-    "positions": lambda: _of_arm(golden_bank.positions(56), 0.2, SimulatedArm(seed=1)),
-    "poses": _poses,
-    "hidden markers": lambda: _of_arm(golden_bank.hidden(), 0.25, SimulatedArm(seed=1, markers=3), (0, 1, 2)),
-    "several tips": _tips,
-    "sessions": _sessions,
-    "markers mounted anew": _remounted,
-    "payloads": lambda: _of_arm(golden_bank.payloads(56), 0.25, SimulatedArm(seed=1), payload=4.0),
-    "ball in sockets": lambda: _of_arm(golden_bank.sockets(), 2.0, SimulatedArm(seed=0)),
-    "mixture": lambda: _of_arm(golden_bank.mixture(), 0.5, SimulatedArm(seed=3, markers=2), (1, 0)),
-    "distances": lambda: _readings("distance", 0.3),
-    "heights": lambda: _readings("height", 0.3),
-    "images": lambda: _readings("image", 2.0),
-    "camera on the tool": lambda: _of_arm(golden_bank.camera_on_tool(), 1.0, camera_arm(30).arm, (0, 1, 2)),
-    "images of a board": _images,
-    "two cameras": _two_cameras,
-    "two cameras on the tool": _two_on_the_tool,
-    "images and a tracker": _images_and_tracker,
-    "several kinds": _several,
-    "laser beams": _beams,
-    "inclinations": _inclinations,
-}
-KINDS = tuple(SOURCES)
 QUICK = ("positions", "poses", "mixture", "heights")
 """Kinds that every run tests; those of the others are slow tests."""
 POSITIONED = ("positions", "hidden markers")
@@ -204,8 +48,8 @@ CAMERAS = (*ON_TOOL, "two cameras")
 
 
 def marked(*names: str) -> list[Any]:
-    """Kinds as parameters of a test."""
-    return [pytest.param(name, marks=[pytest.mark.slow] * (name not in QUICK)) for name in names]
+    """Kinds as parameters of a test, all by default."""
+    return [pytest.param(name, marks=[pytest.mark.slow] * (name not in QUICK)) for name in names or KINDS]
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,16 +66,16 @@ class Kind:
 
     @property
     def robot(self) -> dc.Tree:
-        return self.source.golden.robot
+        return self.source.robot
 
     @property
     def scales(self) -> Any:
-        return self.source.golden.scales
+        return self.source.scales
 
     @cached_property
     def tables(self) -> tuple[Any, Any]:
         """Rows of the fit, and new rows of the same devices: a quarter, every place of a block as a whole."""
-        rows: Any = self.source.golden.rows
+        rows: Any = self.source.rows
         new = torch.arange(len(rows)) // 3 % 4 == 3
         if rows.places is not None:
             new = torch.where(rows.places < 0, new, rows.places == rows.places.max())
@@ -286,7 +130,7 @@ class Kind:
     def q(self, count: int = 40) -> Tensor:
         """Configurations within the joint ranges of the fit; for the camera those in which it sees its board."""
         if self.name in CAMERAS:
-            return self.source.golden.rows.q[:count]
+            return self.source.rows.q[:count]
         draw = torch.rand(count, self.robot.n, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
         low, high = self.data.q.min(0).values, self.data.q.max(0).values
         return low + (high - low) * (0.1 + 0.8 * draw)
@@ -329,7 +173,7 @@ class Kind:
 @cache
 def kind_named(name: str) -> Kind:
     """The kind, made once."""
-    folder = Path(FOLDER.name) / name.replace(" ", "_")
+    folder = Path(FOLDER.name) / re.sub(r"\W", "_", name)
     folder.mkdir()
     kind = Kind(name, SOURCES[name](), folder)
     if name == "several tips":

@@ -6,11 +6,12 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from typing import Any
 
 import torch
-from product_bank import simulated_poses, sliding_measurements, sliding_robot
-from reading_bank import readings, scales
-from simulated_sockets import rest_in_sockets
+from product_bank import sliding_measurements, sliding_robot
+from reading_bank import scales
+from source_bank import SOURCES
 from tangent_bank import normal, shaken
 from torch import Tensor
 
@@ -22,7 +23,6 @@ from diffeo_calib.fitting.result import silent
 from diffeo_calib.maps.linearisation import Numbers
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.conditional import Process
-from diffeo_calib.robots import SimulatedArm
 
 NARROW_M_RAD = 1e-3
 """Prior deviation of the places: formulas with the whole covariance keep their digits."""
@@ -68,41 +68,20 @@ class Case:
         return Case(self.data.rows(rows), self.scales)
 
 
-def markers(count: int, rows: int) -> dc.Measurements:
-    arm = SimulatedArm(seed=3, markers=count)
-    return dc.Measurements(*arm.measure(rows, seed=4), arm.nominal.joint_names)
-
-
-def hidden() -> dc.Measurements:
-    """Three markers, of which a third are not seen, in any pattern."""
-    data = markers(3, 12)
-    gone = normal(12, 3, seed=7) < -0.4
-    gone[:, 0] &= ~gone.all(1)
-    return dc.Measurements(data.q, data.points.masked_fill(gone[..., None], torch.nan), data.joint_names)
-
-
-def mixture() -> dc.Measurements:
-    """A tracker sees marker 1, and the ball rests in sockets."""
-    arm = SimulatedArm(seed=3, markers=2)
-    q, points = arm.measure(8, seed=5)
-    rows, names = rest_in_sockets(arm, seed=3, places=4, rows=4), arm.nominal.joint_names
-    ball = dc.Measurements.from_sockets(rows.q, rows.names, names, distances={("0", "1"): 0.05}, distance_std=1e-5)
-    return dc.Measurements.joined([dc.Measurements(q, points[:, 1:], names), ball])
-
-
-def robot(count: int = 1) -> dc.Tree:
-    return SimulatedArm(seed=3, markers=count).nominal
-
-
-ROWS: dict[str, Callable[[], tuple[dc.Tree, dc.Measurements | dc.Readings]]] = {
-    "one marker": lambda: (robot(), markers(1, 14)),
-    "three markers": lambda: (robot(3), markers(3, 10)),
-    "hidden markers": lambda: (robot(3), hidden()),
-    "poses": lambda: (simulated_poses(10)[0].nominal, simulated_poses(10)[1]),
+ROWS: dict[str, Callable[[], tuple[dc.Tree, Any]]] = {
+    "one marker": lambda: first("positions", 14),
+    "hidden markers": lambda: first("hidden markers", 12),
+    "poses": lambda: first("poses", 10),
     "sliding": lambda: (sliding_robot(), sliding_measurements(sliding_robot(), 14)),
-    "distances": lambda: (robot(), readings(SimulatedArm(seed=3), "distance", 45, noise=2e-5)),
-    "mixture": lambda: (robot(2), mixture()),
+    "distances": lambda: first("distances", 45),
+    "mixture": lambda: first("mixture", 40),
 }
+
+
+def first(name: str, rows: int) -> tuple[dc.Tree, Any]:
+    """The robot and some rows of a kind."""
+    source = SOURCES[name]()
+    return source.robot, source.rows.rows(slice(0, rows))
 
 
 @cache

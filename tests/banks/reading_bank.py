@@ -16,6 +16,8 @@ from diffeo_calib.robots.se3 import transforms
 POINTS = torch.tensor([[1.2, 0.0, 0.2], [-0.6, 1.0, 0.3], [-0.5, -1.1, 0.8]], dtype=torch.float64)
 AXES = torch.tensor([[0.0, 0.0, 1.0], [0.8, 0.0, 0.6], [0.0, 0.8, 0.6]], dtype=torch.float64)
 EYES = torch.tensor([[2.8, 0.5, 1.0], [-1.5, 2.5, 1.2], [-0.5, -2.9, 0.2]], dtype=torch.float64)
+DISTANCES = {("0", "1"): 0.05}
+"""Between the sockets of a block, m."""
 FOCAL, CENTRE = (3500.0, 3400.0), (1200.0, 1000.0)
 
 

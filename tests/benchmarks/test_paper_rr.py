@@ -1,13 +1,19 @@
-"""The benchmark of the paper's section 5: records of quick mode, its cases, failures as records."""
+"""Benchmarks on the paper's arm: records of quick mode, failures as records, tangent and flow."""
 
 from __future__ import annotations
 
+import math
+
 import pytest
+import torch
 from harness import Value
+from kernel_choices import MODELS
 from paper_rr import Case, attempt, measure
+from rr_calibrations import calibrate
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import NumericalError
+from diffeo_calib.robots import elastic_rr
 
 
 def number(value: Value) -> float:
@@ -38,3 +44,14 @@ def test_a_failure_is_a_record(monkeypatch: pytest.MonkeyPatch) -> None:
     record = attempt(Case("exact", "Gauss-Newton", dc.GaussNewton(), dc.RK4(1), 0.01), quick=True)
     assert record["converged"] is False
     assert record["status"] == "failed: the flow overflows"
+
+
+def test_tangent_and_flow_agree_where_deformations_are_small() -> None:
+    draws = torch.rand(80, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    x, test = (2 * math.pi * draws - math.pi).split([30, 50])
+    model = calibrate(MODELS["geometry, phi, psi"], x, elastic_rr.real(x, 1e-3), 0)
+    flow, note = model.flow()
+    assert note is None
+    torch.testing.assert_close(flow(test), model.tangent()(test), rtol=0, atol=2e-6)
+    error = (flow(test) - elastic_rr.real(test, 1e-3)).square().sum(1).mean().sqrt()
+    assert float(error) < 5e-6  # of 1e-4 that the nominal arm leaves

@@ -14,14 +14,6 @@ from reading_bank import scales
 import diffeo_calib as dc
 
 
-@pytest.mark.slow
-def test_one_record() -> None:
-    (record,) = regions.measure(regions.arguments(["--quick"]))
-    for name in ("new", "robot"):
-        assert 0.3 < float(record[name] or 0) <= 1.0, name
-    assert 0.3 < float(record["sharpness"] or 0) < 3.0
-
-
 def test_right_regions_hold_nineteen_of_twenty_in_the_mean() -> None:
     own = regions.case("usual", 15, 0, None)
     model = dc.calibrate(own.robot, own.train, hyperparameters=scales()).model
@@ -38,11 +30,3 @@ def test_squared_distances_are_chi_squared() -> None:
     errors = torch.from_numpy(np.random.default_rng(0).standard_normal((20_000, 3))) @ root.T
     inside = coverage.squares(errors, (root @ root.T).expand(20_000, 3, 3)) < coverage.INSIDE_95
     assert float(inside.double().mean()) == pytest.approx(0.95, abs=0.005)
-
-
-@pytest.mark.slow
-def test_one_record_of_coverage() -> None:
-    record = coverage.simulated("outliers", 20, 0)
-    for name in ("measured", "true", "outside"):
-        assert 0.5 < float(record[name] or 0) <= 1.0, name
-    assert 0.005 < float(record["perfect_std"] or 0) < 0.08

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import pytest
 import torch
@@ -12,9 +11,7 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning
-from diffeo_calib.kernels.base import SumKernel
-from diffeo_calib.kernels.radial import RadialKernel
-from diffeo_calib.process.scales import SCALES
+from diffeo_calib.fitting.result import silent
 
 CERTIFICATE = 1e-4
 
@@ -66,14 +63,6 @@ def test_the_summary_holds_the_numbers_of_the_stages(arm: Case) -> None:
 
 
 @pytest.mark.slow
-def test_leave_one_out_errors_foretell_the_held_out_ones(arm: Case, pair: Case, slider: Case) -> None:
-    for case in (arm, pair, slider):
-        left_out = case.model.summary.leave_one_out_rms
-        assert left_out / math.sqrt(case.train.markers) == pytest.approx(case.held_out()[2], rel=0.4)
-        assert dc.evaluate(case.model, case.train).rms < left_out
-
-
-@pytest.mark.slow
 def test_a_perfect_robot_is_not_made_worse() -> None:
     noise = 2e-6
     case = calibrated(40, geometry=0, transmission=0, gravity=0, noise=noise)
@@ -92,37 +81,22 @@ def test_noise_free_data_can_be_calibrated() -> None:
     assert case.result.fit.converged
 
 
-@pytest.mark.slow
-def test_a_prismatic_joint(slider: Case) -> None:
-    registration, geometry, diffeomorphic = slider.held_out()
-    assert geometry < 0.5 * registration
-    assert diffeomorphic < 0.2 * geometry
-    sound(slider)
-    kernel = slider.model.map.deformation.spec.joint_kernel
-    assert isinstance(kernel, SumKernel)
-    for term in kernel.terms:  # the slide is a line in every one of them, not a circle of 2 pi metres
-        assert isinstance(term, RadialKernel)
-        assert term.periodic == (True, True, False, True, True, True)
-
-
-def watched() -> tuple[Any, list[tuple[str, int, int]]]:
-    """A calibration with twelve poses, and the progress that it reported."""
+def test_twelve_poses_are_selected_on() -> None:
+    """Without a warning: their leave-one-out errors are too few to judge the scales. The same model every time."""
     steps: list[tuple[str, int, int]] = []
-    arm, train, _ = simulated(12)
-    return dc.calibrate(arm.nominal, train, seed=3, progress=lambda *step: steps.append(step)), steps
-
-
-@pytest.fixture(scope="module")
-def twelve() -> tuple[Any, list[tuple[str, int, int]]]:
-    return watched()
-
-
-@pytest.mark.slow
-def test_two_runs_are_equal(twelve: Any, arm: Case) -> None:
-    first, second = twelve[0], watched()[0]
-    assert torch.equal(first.model(arm.test.q), second.model(arm.test.q))
-    assert torch.equal(first.selection.scales.logarithms(), second.selection.scales.logarithms())
-    assert first.model.summary == second.model.summary
+    arm, train, test = simulated(12)
+    result, again = (
+        dc.calibrate(arm.nominal, train, seed=3, progress=progress)
+        for progress in (lambda *step: steps.append(step), silent)
+    )
+    assert "12 poses" in result.status
+    assert "likelihood" in result.status
+    assert dc.evaluate(result.model, test).rms < dc.evaluate(result.registration.geometry.points, test).rms
+    assert torch.equal(result.model(test.q), again.model(test.q))
+    assert result.model.summary == again.model.summary
+    tasks = list(dict.fromkeys(task for task, _, _ in steps))
+    assert tasks == ["registration", "geometry", "hyper-parameters", "axes", "cross-validation", "Gauss-Newton"]
+    assert all(0 <= done <= total for _, done, total in steps)
 
 
 @pytest.mark.slow
@@ -133,9 +107,6 @@ def test_given_scales_are_used(arm: Case) -> None:
     assert again.selection.status == "given"
     # The same scales from the start give the weights of outliers another path: a few micrometres at most.
     assert_close(again.model(arm.test.q), arm.model(arm.test.q), rtol=0, atol=1e-5)
-    louder = dc.Hyperparameters(**{name: getattr(scales, name) * 3.0 for name in SCALES})
-    other = dc.calibrate(arm.robot, arm.train, hyperparameters=louder)
-    assert float((other.model(arm.test.q) - arm.model(arm.test.q)).abs().max()) > 1e-6
 
 
 @pytest.mark.parametrize("rows", [3, 11])
@@ -150,20 +121,6 @@ def test_few_poses_take_the_defaults_and_say_so(rows: int) -> None:
     assert result.outliers == []
     assert dc.evaluate(result.model, test).rms < 1.1 * dc.evaluate(result.registration.geometry.points, test).rms
     assert bool(torch.isfinite(result.model.predict(test.q[:5])[1]).all())
-
-
-def test_twelve_poses_are_selected_on(twelve: Any, arm: Case) -> None:
-    """Without a warning: their leave-one-out errors are too few to judge the scales."""
-    result = twelve[0]
-    assert "12 poses" in result.status
-    assert "likelihood" in result.status
-    assert dc.evaluate(result.model, arm.test).rms < dc.evaluate(result.registration.geometry.points, arm.test).rms
-
-
-def test_progress_is_reported(twelve: Any) -> None:
-    tasks = list(dict.fromkeys(task for task, _, _ in twelve[1]))
-    assert tasks == ["registration", "geometry", "hyper-parameters", "axes", "cross-validation", "Gauss-Newton"]
-    assert all(0 <= done <= total for _, done, total in twelve[1])
 
 
 # --- calibrations that end early --------------------------------------------------------------------------------------
@@ -183,14 +140,18 @@ def interrupting(task: str, at: int):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:leave-one-out errors contradict the selected scales")  # they are not selected yet
-@pytest.mark.parametrize(("task", "at"), [("hyper-parameters", 1), ("cross-validation", 2), ("Gauss-Newton", 1)])
+@pytest.mark.parametrize(("task", "at"), [("hyper-parameters", 1), ("cross-validation", 2), ("Gauss-Newton", 0)])
 def test_ctrl_c_keeps_a_usable_model(task: str, at: int, arm: Case) -> None:
     scales = arm.result.selection.scales if task == "Gauss-Newton" else None
     result = dc.calibrate(arm.robot, arm.train, hyperparameters=scales, progress=interrupting(task, at))
     assert result.interrupted
     assert "interrupted" in result.status
-    geometry = dc.evaluate(result.identification.geometry.points, arm.test).rms
-    assert dc.evaluate(result.model, arm.test).rms < geometry
+    assert result.status.count("interrupted") == 1
+    geometry = result.identification.geometry.points
+    if task == "Gauss-Newton":  # before its first step
+        assert_close(result.model(arm.test.q), geometry(arm.test.q), rtol=0, atol=1e-13)
+    else:
+        assert dc.evaluate(result.model, arm.test).rms < dc.evaluate(geometry, arm.test).rms
     assert bool(torch.isfinite(result.model.predict(arm.test.q[:3])[1]).all())
 
 
@@ -205,18 +166,3 @@ def test_ctrl_c_ends_the_search_beside_what_may_drift(arm: Case) -> None:
     data = arm.train.with_covariates(time=torch.arange(len(arm.train)))
     assert dc.calibrate(arm.robot, data, progress=progress).interrupted
     assert tasks.count("hyper-parameters") <= 2, "no second search"
-
-
-def test_ctrl_c_before_the_first_step_leaves_geometry(arm: Case) -> None:
-    given = arm.result.selection.scales
-    result = dc.calibrate(arm.robot, arm.train, hyperparameters=given, progress=interrupting("Gauss-Newton", 0))
-    assert result.interrupted
-    assert "after 0 iterations" in result.status
-    assert result.status.count("interrupted") == 1
-    assert_close(result.model(arm.test.q), result.identification.geometry.points(arm.test.q), rtol=0, atol=1e-13)
-
-
-def test_ctrl_c_before_there_is_anything_to_keep(arm: Case) -> None:
-    for task in ("registration", "geometry"):
-        with pytest.raises(KeyboardInterrupt):
-            dc.calibrate(arm.robot, arm.train, progress=interrupting(task, 0))

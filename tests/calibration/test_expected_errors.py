@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any
 
-import golden_bank
 import pytest
 import torch
 from campaigns import CAMPAIGNS
 from degenerate import arm_of, measured
-from kind_bank import KINDS, kind_named, marked
+from kind_bank import kind_named, marked
 from product_bank import with_usual_scales
 from torch import Tensor
 
@@ -22,15 +20,9 @@ from diffeo_calib.robots.se3 import twist_transform
 FAR = twist_transform(torch.tensor([0.03, -0.02, 0.01, 0.02, 0.01, -0.03], dtype=torch.float64))
 
 
-def calibrated(case: Any) -> Any:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # few rows
-        return dc.calibrate(case.robot, case.rows, hyperparameters=case.scales)
-
-
-@pytest.mark.parametrize(("case", "free"), [(golden_bank.positions, False), (golden_bank.sockets, True)])
-def test_rigid_motions_are_errors_of_a_model_in_the_frame_of_a_device_alone(case: Any, free: bool) -> None:
-    model = calibrated(case()).model
+@pytest.mark.parametrize(("name", "free"), [("positions", False), ("ball in sockets", True)])
+def test_rigid_motions_are_errors_of_a_model_in_the_frame_of_a_device_alone(name: str, free: bool) -> None:
+    model = kind_named(name).model
 
     def away(q: Tensor) -> Tensor:
         return model(q) @ FAR[:3, :3].mT + FAR[:3, 3]
@@ -72,7 +64,7 @@ def test_a_marker_that_the_rows_leave_open_is_no_error_of_the_robot(name: str) -
     assert again.open_places
 
 
-@pytest.mark.parametrize("name", marked(*KINDS))
+@pytest.mark.parametrize("name", marked())
 def test_usual_rows_leave_no_place_open(name: str) -> None:
     found = ExpectedError.of(kind_named(name).model)
     assert found.open_places == ()

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from math import nan
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from command_bank import leave_undrawn
 from process_bank import case
 from torch import Tensor
 from torch.testing import assert_close
@@ -21,7 +18,6 @@ from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.gauss_newton import GaussNewton
-from diffeo_calib.reports.analysis.predictions import FitRows, Predictions
 from diffeo_calib.robots import SimulatedArm
 
 
@@ -119,13 +115,10 @@ def squares(model: dc.CalibratedKinematics, test: dc.Measurements) -> Tensor:
 
 
 @pytest.mark.slow
-def test_calibration_with_gaps_is_nearly_as_good_as_without(some: dc.Measurements, result: Any) -> None:
+def test_calibration_with_gaps_is_nearly_as_good_as_without(result: Any) -> None:
     test = rows(100, 9)
-    errors = {"hidden": dc.evaluate(result.model, test).rms}
-    scales = result.selection.scales
-    for name, given in (("all", rows(COUNT, 1)), ("whole rows", some.rows(some.visible.all(1)))):
-        errors[name] = dc.evaluate(dc.calibrate(three_markers().nominal, given, hyperparameters=scales).model, test).rms
-    assert errors["hidden"] < 1.3 * errors["all"] < 0.5 * errors["whole rows"]
+    every = dc.calibrate(three_markers().nominal, rows(COUNT, 1), hyperparameters=result.selection.scales).model
+    assert dc.evaluate(result.model, test).rms < 1.3 * dc.evaluate(every, test).rms
     assert float((squares(result.model, test) < INSIDE_95).double().mean()) > 0.93
 
 
@@ -137,21 +130,3 @@ def test_only_the_wrong_marker_loses_its_weight(result: Any) -> None:
     weights = result.tails.weights[WRONG_ROW]
     assert float(weights[2]) < 0.1 < float(weights[1])
     assert float(weights[0]) == 1.0
-
-
-@pytest.mark.slow
-def test_model_file_knows_what_was_hidden(
-    some: dc.Measurements, result: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    dc.save(result.model, tmp_path / "model.safetensors")
-    loaded = dc.load(tmp_path / "model.safetensors")
-    assert isinstance(loaded, dc.CalibratedKinematics)
-    fit_rows = FitRows(loaded)
-    assert_close(fit_rows.points, some.points, rtol=0, atol=1e-8, equal_nan=True)
-    predictions = Predictions.of_fit(fit_rows)
-    assert bool((predictions.squares.isnan() == ~some.visible).all())
-    assert 0.9 < predictions.coverage() <= 1.0
-    leave_undrawn(monkeypatch)
-    for name, rows_of in (("report.html", (with_gaps(rows(20, 5), 2),)), ("fit.html", ())):
-        dc.write_report(loaded, tmp_path / name, *rows_of)
-        assert not re.search("NaN|>nan", (tmp_path / name).read_text(encoding="utf-8"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import inf
 from typing import Any
 
@@ -17,7 +16,6 @@ from diffeo_calib.calibration.identification.identification import Prior, identi
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots import Geometry, SimulatedArm
-from diffeo_calib.robots.se3 import rotation
 
 ARM = SimulatedArm()
 
@@ -58,34 +56,24 @@ def test_identification_estimates_the_noise_and_its_own_error() -> None:
     assert 0.5 < float(found.tails.weights.min()) <= float(found.tails.weights.max()) < 1.2
 
 
-def test_noise_of_few_poses_is_not_underestimated() -> None:
-    # 105 coordinates, some 36 of them used up by parameters: the plain residual would say 0.04 mm.
-    levels = []
-    for seed in range(8):
-        arm = SimulatedArm(seed=seed, transmission=0, gravity=0, noise=5e-5)
-        q, points = arm.measure(35, seed)
-        levels.append(identify(register(arm.nominal, q, points).geometry, q, points).noise)
-    assert sum(levels) / len(levels) == pytest.approx(5e-5, rel=0.07)
-
-
-@pytest.mark.parametrize("size", [1e-3, 5e-2])
-def test_outliers_lose_their_influence(size: float) -> None:
+def test_outliers_lose_their_influence() -> None:
     arm = SimulatedArm(seed=2, markers=2, transmission=0, gravity=0, noise=2e-5)
     q, points = arm.measure(80)
     spoilt, bad = points.clone(), [3, 4, 40, 77]
-    spoilt[bad, 1] += draw(4, 3, seed=1) * size
+    spoilt[bad, 1] += draw(4, 3, seed=1, size=1e-3)
     start, test = register(arm.nominal, q, points).geometry, arm.sample(300, seed=9)
     clean, found = identify(start, q, points), identify(start, q, spoilt)
-    wrong = identify(start, q, spoilt, noise=2e-5)
+    given = identify(start, q, spoilt, noise=2e-5)
     assert float(found.tails.weights[bad, 1].max()) < 0.05
     others = torch.ones(80, 2, dtype=torch.bool)
     others[bad, 1] = False
     assert float(found.tails.weights[others].min()) > 0.15
-    assert found.tails.freedom < 10
     assert found.noise == pytest.approx(clean.noise, rel=0.3)
     truth = arm.true_points(test)
     assert rms(found.geometry, test, truth) < 1.3 * rms(clean.geometry, test, truth)
-    assert rms(wrong.geometry, test, truth) > 3 * rms(clean.geometry, test, truth)
+    assert rms(given.geometry, test, truth) > 3 * rms(clean.geometry, test, truth)
+    assert (given.noise, given.prior, given.tails.freedom) == (2e-5, Prior(), inf)
+    assert bool((given.tails.weights == 1.0).all())
 
 
 def test_left_out_points_are_predicted_by_the_others() -> None:
@@ -100,23 +88,6 @@ def test_left_out_points_are_predicted_by_the_others() -> None:
         squares.append(float((alone.points(q[row : row + 1]) - points[row]).square().sum()))
     assert found.left_out == pytest.approx((sum(squares) / 25) ** 0.5, rel=0.1)
     assert found.left_out > 1.5 * found.rms
-
-
-def test_scales_of_the_joint_errors_are_found() -> None:
-    """Translations and rotations apart: one arm of each kind."""
-    arm = SimulatedArm(seed=3, transmission=0, gravity=0, noise=1e-5)
-    q = arm.sample(200)
-    start = replace(Geometry.nominal(arm.nominal, 2), tool=draw(2, 3, seed=1, size=0.1))
-    for translation, rotation_size in ((1e-3, 1e-4), (1e-4, 1e-3)):
-        theta = torch.zeros(start.size, dtype=torch.float64)
-        twists = draw(6, 6, seed=2) * torch.tensor([translation] * 3 + [rotation_size] * 3, dtype=torch.float64)
-        theta[start.slices["joints"]] = twists.flatten()
-        points = start.points(q, theta) + draw(200, 2, 3, seed=3, size=1e-5)
-        prior = identify(start, q, points).prior
-        larger, smaller = sorted((prior.translation, prior.rotation), reverse=True)
-        assert larger == pytest.approx(1e-3, rel=0.5)
-        assert smaller < 4e-4  # the smaller one is still falling when the noise has settled
-        assert (prior.translation > prior.rotation) == (translation > rotation_size)
 
 
 class Ahead:
@@ -141,44 +112,6 @@ def test_a_step_to_where_nothing_can_be_measured_is_shortened() -> None:
     assert float(found.shifts[0]) == pytest.approx(0.5, abs=1e-4)
     with pytest.raises(InputError, match="behind"):
         solve(rows, one[0], none, start=(one[0], one[0]))
-
-
-def test_what_is_given_stays() -> None:
-    q, points = ARM.measure(40)
-    start, given = register(ARM.nominal, q, points).geometry, Prior(translation=2e-3, rotation=3e-4)
-    assert identify(start, q, points, prior=given).prior == given
-    found = identify(start, q, points, noise=3e-4)
-    assert found.prior == Prior()
-    assert found.noise == pytest.approx(3e-4)
-    assert torch.equal(found.tails.weights, torch.ones(40, 1, dtype=torch.float64))
-    assert found.tails.freedom == inf
-
-
-def test_identification_is_the_maximum_a_posteriori() -> None:
-    q, points = ARM.measure(50)
-    start, noise = register(ARM.nominal, q, points).geometry, 3e-4
-    found = identify(start, q, points, noise=noise)
-    scale = Prior().deviations(start)
-    # theta by least squares from the absorbed geometry back to the start is not unique: test the objective instead
-    best = objective(start, found.geometry, q, points, noise)
-    for seed in range(20):
-        theta = scale * draw(start.size, seed=seed, size=1e-3)
-        assert objective(start, found.geometry.absorb(theta), q, points, noise) > best
-
-
-def objective(start: Geometry, geometry: Geometry, q: Tensor, points: Tensor, noise: float) -> float:
-    errors = torch.linalg.solve(start.joint_errors, geometry.joint_errors)
-    twists = torch.cat([errors[:, :3, 3], rotation_vectors(errors[:, :3, :3])], dim=1)
-    return float(
-        (geometry.points(q) - points).square().sum() / noise**2 + twists.square().sum() / Prior().rotation ** 2
-    )
-
-
-def rotation_vectors(matrices: Tensor) -> Tensor:
-    half = (matrices - matrices.mT) / 2  # the angles are milliradians
-    w = torch.stack([half[:, 2, 1], half[:, 0, 2], half[:, 1, 0]], dim=1)
-    torch.testing.assert_close(rotation(w), matrices, rtol=0, atol=1e-6)
-    return w
 
 
 @pytest.mark.parametrize("axes", [3, 6])

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 import torch
-from kind_bank import remounted
 from product_bank import usual_scales
+from source_bank import remounted
 from table_bank import refused
 
 import diffeo_calib as dc

@@ -6,12 +6,11 @@ import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from golden_bank import sockets
+from kind_bank import kind_named
 from math_bank import normal
 from product_bank import simulated, simulated_poses, ur10_measurements, ur10_scales
 from reading_bank import readings, scales
@@ -75,11 +74,10 @@ def test_the_result_tells_which_scales_pass_without_a_warning(share: float, noti
 
 def test_sockets_without_a_known_distance_show_no_size() -> None:
     """Neither another one nor a change: what the ball differs within a socket is no motion."""
-    golden = sockets()
-    table: Any = golden.rows
-    table = table.rows(slice(0, 48))
+    kind = kind_named("ball in sockets")
+    table = kind.data
     table = with_attributes(table, sockets=replace(table.sockets, distances=(), distance_std=None))
-    result, (text,) = warned(dc.calibrate, golden.robot, table, hyperparameters=golden.scales)
+    result, (text,) = warned(dc.calibrate, kind.robot, table, hyperparameters=kind.scales)
     assert "no distance between sockets is known" in text
     size = result.lengths[0]
     assert abs(size.value) < size.deviation

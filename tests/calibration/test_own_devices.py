@@ -12,7 +12,7 @@ import two_arms_bank
 from inclinometer import Inclinometers
 from kind_bank import kind_named, rigid_rms
 from laser_line import Beams, readings
-from product_bank import simulated_poses, usual_scales
+from product_bank import simulated_poses, with_usual_scales
 from tangent_bank import normal
 from torch import Tensor
 from torch.testing import assert_close
@@ -117,15 +117,12 @@ def urdf() -> str:
     """Two arms of six joints on one base."""
     text = '<link name="base"/>'
     for hand, side in zip(two_arms_bank.HANDS, (0.35, -0.35), strict=True):
-        parent = "base"
-        for k, (axis, origin) in enumerate(zip(AXES, ORIGINS, strict=True)):
-            child = f"{hand}_{k}"
-            text += f'<link name="{child}"/><joint name="{hand}_j{k}" type="revolute"><parent link="{parent}"/>'
-            text += f'<child link="{child}"/><origin xyz="{origin.format(side=side)}"/><axis xyz="{axis}"/>'
-            text += '<limit lower="-3" upper="3"/></joint>'
-            parent = child
-        text += f'<link name="{hand}"/><joint name="{hand}_end" type="fixed"><parent link="{parent}"/>'
-        text += f'<child link="{hand}"/><origin xyz="0.1 0 0.05"/></joint>'
+        links = ["base", *(f"{hand}_{k}" for k in range(6)), hand]
+        for k, (axis, origin) in enumerate(zip((*AXES, ""), (*ORIGINS, "0.1 0 0.05"), strict=True)):
+            kind = "revolute" if axis else "fixed"
+            text += f'<link name="{links[k + 1]}"/><joint name="{hand}_j{k}" type="{kind}"><parent link="{links[k]}"/>'
+            text += f'<child link="{links[k + 1]}"/><origin xyz="{origin.format(side=side)}"/>'
+            text += f'<axis xyz="{axis}"/><limit lower="-3" upper="3"/></joint>' if axis else "</joint>"
     return f'<robot name="two_arms">{text}</robot>'
 
 
@@ -149,29 +146,6 @@ def holding(arms: two_arms_bank.TwoArms, X: Tensor, home: Tensor, rows: int, see
     return q[(away(arms, q, X).abs().amax(1) < 1e-9) & (q.abs().amax(1) < 2.5)]
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    path = tmp_path_factory.mktemp("arms") / "arms.urdf"
-    path.write_text(urdf())
-    robot = dc.load_urdf(path, "base", list(two_arms_bank.HANDS))
-    arms = two_arms_bank.TwoArms(robot)
-    home = torch.tensor(
-        [[0.3, 0.6, 0.9, 0.2, -0.6, 0.1], [-0.3, 0.6, 0.9, -0.2, -0.6, -0.1]], dtype=torch.float64
-    ).flatten()
-    left, right = arms.poses(home[None])[0]
-    X = torch.linalg.inv(left) @ right
-    q = holding(arms, X, home, 110, 3)
-    q, kept = q[:32], q[32:]
-    seen = q + 2e-5 * normal(*q.shape, seed=5)  # a tool is rigid to some hundredths of a millimetre
-    held = dc.Readings.of("held tool", seen, torch.zeros(len(q), 6), None, robot.joint_names, numbers=6, doubt=False)
-    free = home + 0.8 * (2 * torch.rand(16, 12, dtype=torch.float64, generator=torch.Generator().manual_seed(8)) - 1)
-    turned = arms.poses(free)
-    turned[..., :3, :3] = rotation(2e-4 * normal(16, 2, 3, seed=6)) @ turned[..., :3, :3]
-    turned[..., :3, 3] += 2e-5 * normal(16, 2, 3, seed=7)
-    tracked = dc.Measurements.from_poses(free, turned, robot.joint_names, on=two_arms_bank.HANDS)
-    return robot, arms, X, tracked, held, kept
-
-
 def relative_errors(model: Any, arms: Any, q: Tensor) -> float:
     """RMS distance of the second hand from where the first has it, against the truth, m."""
     found, true = (torch.linalg.inv(poses[:, 0]) @ poses[:, 1] for poses in (model.poses(q), arms.poses(q)))
@@ -179,27 +153,34 @@ def relative_errors(model: Any, arms: Any, q: Tensor) -> float:
 
 
 @pytest.mark.slow
-def test_it_makes_the_model_better_and_goes_through_verbs(made: Any, tmp_path: Path) -> None:
-    robot, arms, X, tracked, held, kept = made
-    scales = usual_scales(robot)
+def test_a_held_tool_makes_the_model_better_and_goes_through_verbs(tmp_path: Path) -> None:
+    (tmp_path / "arms.urdf").write_text(urdf())
+    robot = dc.load_urdf(tmp_path / "arms.urdf", "base", list(two_arms_bank.HANDS))
+    arms, names = two_arms_bank.TwoArms(robot), robot.joint_names
+    bent = torch.tensor([0.3, 0.6, 0.9, 0.2, -0.6, 0.1], dtype=torch.float64)
+    home = torch.cat([bent, bent * torch.tensor([-1, 1, 1, -1, 1, -1])])
+    left, right = arms.poses(home[None])[0]
+    X = torch.linalg.inv(left) @ right
+    q, kept = holding(arms, X, home, 110, 3).tensor_split([32])
+    seen = q + 2e-5 * normal(*q.shape, seed=5)  # a tool is rigid to some hundredths of a millimetre
+    held, new = (
+        dc.Readings.of("held tool", rows, torch.zeros(len(rows), 6), None, names, numbers=6, doubt=False)
+        for rows in (seen, kept)
+    )
+    free = home + 0.8 * (2 * torch.rand(16, 12, dtype=torch.float64, generator=torch.Generator().manual_seed(8)) - 1)
+    turned = arms.poses(free)
+    turned[..., :3, :3] = rotation(2e-4 * normal(16, 2, 3, seed=6)) @ turned[..., :3, :3]
+    turned[..., :3, 3] += 2e-5 * normal(16, 2, 3, seed=7)
+    tracked = dc.Measurements.from_poses(free, turned, names, on=two_arms_bank.HANDS)
     rows: Any = dc.Observations.joined([tracked, held])
-    alone = dc.calibrate(robot, tracked, hyperparameters=scales).model
-    found = dc.calibrate(robot, rows, hyperparameters=scales)
-    better, before = (relative_errors(model, arms, kept) for model in (found.model, alone))
-    assert better < 0.5 * before
+    alone = with_usual_scales(robot, tracked).model
+    found = with_usual_scales(robot, rows)
+    assert relative_errors(found.model, arms, kept) < 0.5 * relative_errors(alone, arms, kept)
     assert_close(found.readings[0].devices.constants.view(3, 4)[:, 3], X[:3, 3], rtol=0, atol=2e-3)
     dc.save(found.model, tmp_path / "m.safetensors")
     model: Any = dc.load(tmp_path / "m.safetensors")
-    new: Any = dc.Readings.of(
-        "held tool", kept, torch.zeros(len(kept), 6), None, robot.joint_names, numbers=6, doubt=False
-    )
     assert dc.evaluate(model, new).rms < 1e-3  # pyright: ignore
     assert model.predict(kept[:3])[0].shape == (3, 6, 3)
-
-
-@pytest.mark.slow
-def test_both_hands_must_be_measured(made: Any) -> None:
-    robot, arms, _, tracked, held, _ = made
-    single = dc.Measurements.from_poses(tracked.q, arms.poses(tracked.q)[:, 0], robot.joint_names, on=["left"])
+    single = dc.Measurements.from_poses(free, arms.poses(free)[:, 0], names, on=["left"])
     with pytest.raises(MeasurementError, match=r"held tools: expected poses of 2 frames beside them, got 1"):
         dc.calibrate(robot, dc.Observations.joined([single, held]))  # pyright: ignore

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -121,6 +122,10 @@ def test_a_plan_can_be_made_in_parts() -> None:
     assert whole.assumed
     assert sorted(whole.rank.tolist()) == list(range(1, 9))
     assert torch.equal(whole.q, q[whole.rows])
+    moves = torch.cdist(whole.q, whole.q, p=torch.inf)  # the slowest joint decides
+    for first, last in combinations(range(9), 2):  # no reversal of a part is a shorter path
+        order = [*range(first), *reversed(range(first, last)), *range(last, 8)]
+        assert float(moves[order[:-1], order[1:]].sum()) > float(moves.diagonal(1).sum()) - 1e-9
     assert bool((whole.expected_rms.diff() < 0).all())
     assert whole.needed(float(whole.expected_rms[6])) == 6
     assert whole.needed(0.0) is None

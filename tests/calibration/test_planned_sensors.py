@@ -182,28 +182,25 @@ def test_poses_of_a_ball_in_sockets() -> None:
 
 
 def test_two_tips_are_planned_together(tmp_path: Path) -> None:
-    robot = two_arms_bank.robot(tmp_path)
-    q = dc.candidates(
-        robot, 60, tracker=dc.Tracker((0.0, 0.0, 8.0), direction=(0.0, 0.0, 1.0), half_angle=2.0), floor=0.1
-    )
-    both = dc.plan(robot, q, 8)
-    left = dc.plan(robot, q, 8, marker={"left": (0.1, 0.0, 0.1)})
-    assert float(both.expected_rms[8]) != float(left.expected_rms[8])
+    robot, up = two_arms_bank.robot(tmp_path), dc.Tracker((0.0, 0.0, 8.0), half_angle=2.0)
+    q = dc.candidates(robot, 60, tracker=up, floor=0.1)
     still = q.clone()
     still[:, 3:] = 0.3  # the right arm
-    moved, held = (float(dc.plan(robot, rows, 8, target=q).expected_rms[8]) for rows in (q, still))
-    assert moved < 0.7 * held
-    posed = dc.plan(robot, q, 8, sensor=dc.Sensor.poses())
-    assert float(posed.expected_rms[8]) < float(posed.expected_rms[4])
+
+    def rms(rows: Tensor, count: int = 8, **how: Any) -> float:
+        return float(dc.plan(robot, rows, 8, target=q, **how).expected_rms[count])
+
+    assert rms(q) != rms(q, marker={"left": (0.1, 0.0, 0.1)})
+    assert rms(q) < 0.7 * rms(still)
+    assert rms(q, sensor=dc.Sensor.poses()) < rms(q, 4, sensor=dc.Sensor.poses())
 
 
 @pytest.mark.slow
 def test_payload_of_the_plan() -> None:
-    model = kind_named("payloads").model
-    q = kind_named("payloads").q(30)
-    plans = [dc.plan(model.with_payload(mass), q, 4) for mass in (0.0, 4.0)]
-    assert [plan.payload for plan in plans] == [0.0, 4.0]
-    assert float(plans[0].expected_rms[0]) != float(plans[1].expected_rms[0])
+    kind = kind_named("payloads")
+    none, heavy = (dc.plan(kind.model.with_payload(mass), kind.q(30), 4) for mass in (0.0, 4.0))
+    assert (none.payload, heavy.payload) == (0.0, 4.0)
+    assert float(none.expected_rms[0]) != float(heavy.expected_rms[0])
 
 
 def test_mistakes_about_sensors_are_one_sentence(arm: Any) -> None:
@@ -292,30 +289,26 @@ def test_an_image_tells_what_its_pose_shows() -> None:
 @pytest.mark.slow
 def test_views() -> None:
     """Too near, too far, too flat, from behind, behind the camera, outside of the image, and folded back into it."""
-    camera, arm = true_camera(), camera_arm(60)
-    points, pixels = arm.shown(0.1)[1].split([3, 2], 2)
+    points, pixels = camera_arm(60).shown(0.1)[1].split([3, 2], 2)
     images = Images(points, pixels, WIDTH, HEIGHT)
     view = sighted(images, None, BOARD_PRIOR).camera.view
     assert (len(view.points), view.fewest) == (35, int(images.seen.sum(1).min()))
-    camera = replace(camera, view=replace(view, near=0.3, far=0.6, facing=-0.4))
+    camera = replace(true_camera(), view=replace(view, near=0.3, far=0.6, facing=-0.4))
     ahead = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
     ahead[2, 3] = 0.4
-    assert sees(camera, ahead[None]).tolist() == [True]
-
-    def seen(shift: tuple[float, float, float] = (0.0, 0.0, 0.0), turn: float = 0.0) -> bool:
-        pose = ahead.clone()
-        pose[:3, :3] = rotation(pose.new_tensor([[turn, 0.0, 0.0]]))[0] @ pose[:3, :3]
-        pose[:3, 3] += pose.new_tensor(shift)
-        return bool(sees(camera, pose[None]))
-
-    away = [seen((0.0, 0.0, z)) for z in (-0.12, 0.25, -0.8)] + [seen((0.3, 0.0, 0.0)), seen(turn=1.3), seen(turn=3.1)]
-    assert not any(away)
-    assert seen(turn=1.0)
+    places = [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)]  # shift, and turn about x
+    places += [(0.0, 0.0, z, 0.0) for z in (-0.12, 0.25, -0.8)] + [(0.3, 0.0, 0.0, 0.0)]
+    shift, turn = torch.tensor([*places, (0.0, 0.0, 0.0, 1.3), (0.0, 0.0, 0.0, 3.1)], dtype=torch.float64).split(
+        [3, 1], 1
+    )
+    poses = ahead.repeat(len(shift), 1, 1)
+    poses[:, :3, :3] = rotation(torch.nn.functional.pad(turn, (0, 2))) @ ahead[:3, :3]
+    poses[:, :3, 3] += shift
+    assert sees(camera, poses).tolist() == [True] * 2 + [False] * 6
     folding = replace(camera, unknowns=camera.unknowns.clone(), view=replace(camera.view, far=9.0, facing=-0.1))  # pyright: ignore
     folding.unknowns[4:9] = torch.tensor([-0.3, 0.0, 0.0, 0.0, 0.0])
-    aside = ahead.clone()
-    aside[0, 3] = 0.4 * 1.8  # tangent 1.8 comes back to 0.05
-    assert not bool(shown(folding, aside[None]).any())
+    ahead[0, 3] = 0.4 * 1.8  # tangent 1.8 comes back to 0.05
+    assert not bool(shown(folding, ahead[None]).any())
 
 
 @pytest.mark.slow

@@ -8,20 +8,25 @@ from typing import Any
 
 import pytest
 import torch
+from kind_bank import kind_named
 from product_bank import with_usual_scales
 from reading_bank import scales
 from simulated_sockets import SocketRows, rest_in_sockets
 from table_bank import refused
+from tangent_bank import covariance
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration, check_sockets
+from diffeo_calib.calibration.choose_scales import ChosenScales
+from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.placing.sockets import SocketDevices
-from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places, leave_one_out
+from diffeo_calib.calibration.scales.selection import Selection, defaults
+from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
-from diffeo_calib.regression.conditional import Estimated
+from diffeo_calib.regression.regions import region_factor
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
 
@@ -56,12 +61,6 @@ def aligned(points: Tensor, truth: Tensor) -> Tensor:
     return points @ T[:3, :3].mT + T[:3, 3] - truth
 
 
-def gauge(model: dc.CalibratedKinematics) -> Estimated:
-    found = model.map.conditional
-    assert isinstance(found, Estimated)
-    return found
-
-
 def test_far_more_accurate_than_geometry_and_as_accurate_as_predicted(arm: SimulatedArm, result: Any) -> None:
     q = arm.sample(500, seed=9)
     truth = arm.true_points(q)[:, 0]
@@ -87,7 +86,7 @@ def test_the_sockets_are_where_they_are(result: Any, rows: SocketRows) -> None:
 
 def test_covariances_by_the_projection_written_out(arm: SimulatedArm, result: Any) -> None:
     model, q = result.model, arm.sample(4, seed=3)
-    found, at = gauge(model), model.map.geodesic.linearise(q)
+    found, at = model.map.conditional, model.map.geodesic.linearise(q)
     both = model.map.geodesic.linearise(torch.cat([q, found.reference.at.joint[0].points]))
     C = found.before.covariance_between(both)
     B = both.sensitivity.flatten(0, 1)[:, :6]
@@ -106,10 +105,6 @@ def placed(arm: SimulatedArm, data: dc.Measurements) -> Placed:
 
 def test_places_left_out_by_leaving_them_out(data: dc.Measurements, placed: Placed) -> None:
     """Closed form against a regression without the rows of the place."""
-    from diffeo_calib.calibration.choose_scales import ChosenScales
-    from diffeo_calib.calibration.scales.leave_one_out import leave_one_out
-    from diffeo_calib.calibration.scales.selection import Selection, defaults
-
     tangent, devices = placed.tangent_data(), placed.placement.one(SocketDevices)
     scales = defaults(tangent, placed.identification.noise, placed.identification.prior)
     chosen = ChosenScales(Selection(scales, "defaults"), tangent, leave_one_out(tangent, scales))
@@ -128,12 +123,6 @@ def test_places_left_out_by_leaving_them_out(data: dc.Measurements, placed: Plac
 
 def test_deviations_grow_where_places_contradict_each_other(data: dc.Measurements, placed: Placed) -> None:
     """The ratio of squared errors of left-out places, by conditioning on the rows of the others."""
-    from tangent_bank import covariance
-
-    from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places
-    from diffeo_calib.calibration.scales.selection import defaults
-    from diffeo_calib.regression.regions import region_factor
-
     tangent, found = placed.tangent_data(), placed.identification
     scales = defaults(tangent, 0.3 * found.noise, found.prior)
     K, r, total = covariance(tangent, scales), tangent.target.flatten(), 0.0
@@ -179,18 +168,6 @@ def test_a_size_that_is_not_the_robots_is_warned_about(arm: SimulatedArm, rows: 
     assert result.expected.workspace > 3e-3
 
 
-def test_evaluation_of_rows_in_sockets(result: Any, data: dc.Measurements) -> None:
-    some = data.rows(data.socket < 3)  # type: ignore[operator]
-    found = dc.evaluate(result.model, some)
-    points = result.model(some.q)[:, 0]
-    middles = [points[some.socket == s].mean(0) for s in range(3)]
-    squares = [(points[some.socket == s] - m).square().sum(1) for s, m in enumerate(middles)]
-    assert found.rms == pytest.approx(float(torch.cat(squares).mean().sqrt()), rel=1e-9)
-    (distance,) = found.distances
-    assert (distance.first, distance.second, distance.known) == ("0/0", "0/1", 0.05)
-    assert distance.error == pytest.approx(float((middles[0] - middles[1]).norm()) - 0.05, abs=1e-12)
-
-
 # --- rows that cannot be right ----------------------------------------------------------------------------------------
 
 PAIR = ("0", "1")
@@ -222,6 +199,12 @@ def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows
         ("sockets: expected at least 9, got 6", staged(table(some, **bare).rows([0, 1, 6, 7, 12, 13]))),
         (r"expected about (49|50)\..* mm, by the robot, got 5e\+04 mm", staged(table(some, distances={PAIR: 50.0}))),
         ("check the unit of `distances`", staged(table(some, distances={PAIR: 5e-5}))),
+        ("rows with sockets: expected no sessions", staged(table(some).with_sessions(["a"] * 18 + ["b"] * 18))),
+        ("rows with sockets: expected no payloads", staged(table(some).with_payload(2.0))),
+        *(
+            ("calibrated with measured positions", lambda verb=verb: verb(kind_named("positions").model, table(some)))
+            for verb in (dc.evaluate, dc.CalibratedKinematics.registered)
+        ),
     )
     for options, words in (
         (bare, "the size of the robot rests on its description"),
@@ -262,27 +245,24 @@ def test_a_tool_that_never_turns_or_tilts(plain: SimulatedArm, some: SocketRows)
 
 def test_tables_that_cannot_be_made(some: SocketRows) -> None:
     wrong: Any = table
+    named, pair = "expected 36 names, one per row, got", "expected names of two sockets"
     refused(
-        ("`sockets`: expected 36 names, one per row, got 1", lambda: wrong(some, ("0/0",))),
+        (f"{named} 1", lambda: wrong(some, ("0/0",))),
         (r"18 row\(s\) have no name, the first is row 1", lambda: wrong(some, ("0/0", " ") * 18)),
         (r"1 row\(s\) have no name", lambda: wrong(some, [None, *some.names[1:]])),
-        ("expected 36 names, one per row, got 'abcd'", lambda: wrong(some, "abcd")),
-        ("expected 36 names, one per row, got 5", lambda: wrong(some, 5)),
+        (f"{named} 'abcd'", lambda: wrong(some, "abcd")),
+        (f"{named} 5", lambda: wrong(some, 5)),
         ("`distances`: expected a dictionary, got .*0.05", lambda: wrong(some, distances=[("0", "1", 0.05)])),
         ("`distance_std` without `distances`", lambda: wrong(some, distances=None)),
         ("`distance_std`: expected a positive number in m, got None", lambda: wrong(some, distance_std=None)),
         ("`distance_std`: expected a positive number", lambda: wrong(some, distance_std=-1.0)),
-        ("the distance of .* expected metres above 0", lambda: wrong(some, distances={("0", "1"): 0.0})),
-        ("expected names of two sockets, got .*'0/0', '0/1'", lambda: wrong(some, distances={("0", "7"): 0.1})),
-        ("a known distance: expected names of two sockets", lambda: wrong(some, distances={("0", "0"): 0.1})),
-        ("expected one value", lambda: wrong(some, distances={("0", "1"): 0.05, ("0/0", "0/1"): 0.06})),
+        ("the distance of .* expected metres above 0", lambda: wrong(some, distances={PAIR: 0.0})),
+        (f"{pair}, got .*'0/0', '0/1'", lambda: wrong(some, distances={("0", "7"): 0.1})),
+        (f"a known distance: {pair}", lambda: wrong(some, distances={("0", "0"): 0.1})),
+        ("expected one value", lambda: wrong(some, distances={PAIR: 0.05, ("0/0", "0/1"): 0.06})),
     )
-
-
-def test_distances_by_name(some: SocketRows) -> None:
-    known: Any = table(some, distances={("0", "1"): 0.05, ("0/0", "2/1"): 0.7}).sockets
+    known = wrong(some, distances={PAIR: 0.05, ("0/0", "2/1"): 0.7}).sockets
     assert known.distances == ((0, 1, 0.05), (2, 3, 0.05), (4, 5, 0.05), (0, 5, 0.7))
-    assert known.place_names == ("0", "1", "2")
 
 
 def test_splits_hold_out_whole_places(some: SocketRows) -> None:
@@ -294,20 +274,3 @@ def test_splits_hold_out_whole_places(some: SocketRows) -> None:
     assert sorted(len(held) for _, held in data.folds(3)) == [12, 12, 12]
     with pytest.raises(MeasurementError, match="expected at least 4 places with sockets, got 3"):
         data.folds(4)
-
-
-def test_no_position_is_made_up(plain: SimulatedArm, some: SocketRows, tmp_path: object) -> None:
-    data = table(some)
-    assert bool(data.points.isnan().all())
-    assert "6 sockets" in repr(data)
-    assert data.sha256 != table(some, distance_std=1e-5).sha256
-    names = tuple(reversed(some.names))
-    assert data.sha256 != table(some, names).sha256
-    tracked = with_usual_scales(plain.nominal, dc.Measurements(*plain.measure(15, seed=2))).model
-    for verb in (dc.evaluate, dc.CalibratedKinematics.registered):
-        with pytest.raises(InputError, match="calibrated with measured positions"):
-            verb(tracked, data)
-    with pytest.raises(MeasurementError, match="rows with sockets: expected no sessions"):
-        dc.calibrate(plain.nominal, data.with_sessions(["a"] * 18 + ["b"] * 18))
-    with pytest.raises(MeasurementError, match="rows with sockets: expected no payloads"):
-        check_sockets(plain.nominal, data.with_payload(2.0))

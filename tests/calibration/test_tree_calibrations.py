@@ -1,7 +1,6 @@
 """Calibrations of robots with branches: several tips, loads, and everything that follows from a fitted model."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -102,12 +101,6 @@ def test_commands_of_one_arm_leave_the_other_alone(model: dc.CalibratedKinematic
     missed = dc.compensate(left, beyond, start)
     assert not bool(missed.reached.any())
     assert float((missed.q - start)[:, right].abs().max()) < 1e-6
-
-
-@pytest.mark.parametrize("export", [dc.interop.write_c, dc.interop.write_dh])
-def test_serial_formats_need_a_tip(export: object, model: dc.CalibratedKinematics, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="has several tips; name its `tip`"):
-        export(model, tmp_path / "body.c")  # pyright: ignore[reportCallIssue]
 
 
 def test_markers_say_on_which_tip_they_are(body: SimulatedUpperBody, data: Any, model: Any) -> None:

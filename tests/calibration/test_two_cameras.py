@@ -12,10 +12,9 @@ from typing import Any
 import pytest
 import torch
 from command_bank import Command
-from golden_bank import camera_on_tool
 from kind_bank import Kind, kind_named
+from product_bank import usual_scales
 from simulated_camera import (
-    BOARD_ON_FLANGE,
     BOARD_PRIOR,
     CAMERA,
     CAMERA_BESIDE,
@@ -28,18 +27,21 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.cameras.files import camera_text, read_camera
 from diffeo_calib.cameras.images import UNKNOWNS
+from diffeo_calib.fitting.result import silent
 from diffeo_calib.interop.camera_files import camera_files
 from diffeo_calib.kinematics.hand_eye import HandEye
-from diffeo_calib.robots.se3 import rotation
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.se3 import twist_transform
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning"),  # few rows
     pytest.mark.slow,
 ]
 
-SCALES = camera_on_tool().scales
+SCALES = usual_scales(SimulatedArm().nominal)
 FIXED: Any = {"camera_on_tool": False, "board": BOARD_PRIOR}
 
 
@@ -64,16 +66,44 @@ def of_corners(corners: Tensor | None = None, **known: Any) -> Any:
     return dc.Measurements.from_images(data().q, data().corners if corners is None else corners, **own)
 
 
-def test_lenses_and_the_one_board_are_found() -> None:
+def places(on_tool: bool) -> list[Tensor]:
+    """Of the left and the right camera, in the robot's base or on the tool, m."""
+    if on_tool:
+        return [twist_transform(torch.tensor(own, dtype=torch.float64)) for own in (CAMERA, CAMERA_BESIDE)]
+    return [torch.linalg.inv(arm.arm.truth.base) for arm in arms()]
+
+
+def check_hand_eyes(model: Any, largest_std: float, *, on_tool: bool = True) -> None:
+    """Every camera is where it is, by the deviations that are told of it."""
+    found = HandEye.of_each(model, camera_on_tool=on_tool)
+    assert sorted(found) == ["left", "right"]
+    for name, truth in zip(("left", "right"), places(on_tool), strict=True):
+        known = found[name].camera
+        away = known.pose[:3, :3] @ truth[:3, :3].mT
+        turn = 0.5 * (away - away.mT)[[2, 0, 1], [1, 2, 0]]
+        errors = torch.cat([known.pose[:3, 3] - truth[:3, 3], turn])
+        assert bool((errors.abs() < 4 * known.deviations).all()), (name, errors, known.deviations)
+        assert float(known.deviations[:2].max()) < largest_std
+
+
+def test_every_camera_is_where_it_is_and_has_its_lens() -> None:
+    check_hand_eyes(kind().model, 2e-3, on_tool=False)
+    check_hand_eyes(kind_named("two cameras on the tool").model, 1e-4)
     placed = next(own for own in kind().model.placement if own.cameras)
-    assert placed.names == ("left", "right")
-    for name, arm in zip(placed.names, arms(), strict=True):
-        camera = placed.cameras[name].camera
-        assert float(((camera.unknowns - arm.camera.unknowns) / camera.deviations).abs().max()) < 4.5
-        assert not placed.cameras[name].on_tool
-    one, other = (own.camera for own in placed.cameras.values())
-    assert_close(one.board, other.board, rtol=0, atol=0)
-    assert_close(one.deviations[9:], other.deviations[9:])
+    lenses = [placed.cameras[name].camera for name in ("left", "right")]
+    assert_close(lenses[0].board, lenses[1].board, rtol=0, atol=0)
+    for lens, arm in zip(lenses, arms(), strict=True):
+        assert float(((lens.unknowns - arm.camera.unknowns) / lens.deviations).abs().max()) < 4.5
+
+
+def test_every_camera_of_a_recalibrated_model_is_where_it_is(tmp_path: Path) -> None:
+    own = kind_named("two cameras on the tool")
+    again: Any = dc.recalibrate(own.model, own.moved).model
+    check_hand_eyes(again, 1.5e-4)
+    dc.save(again, tmp_path / "again.safetensors")
+    assert len(camera_files(dc.load(tmp_path / "again.safetensors"))) == 12  # pyright: ignore
+    alone = own.moved.rows([name == "right" for name in own.moved.camera_names])
+    check_hand_eyes(dc.recalibrate(own.model, alone).model, 1e-4)
 
 
 def test_the_size_of_the_board_is_known_once() -> None:
@@ -83,25 +113,6 @@ def test_the_size_of_the_board_is_known_once() -> None:
     again = of_corners(camera=data().cameras)
     known = [float(camera.deviations[scale]) for camera in again.cameras.values()]
     assert known == pytest.approx([BOARD_PRIOR.scale] * 2, rel=0.03)
-
-
-def test_both_cameras_are_where_they_are_whoever_holds_the_frame() -> None:
-    known = {}
-    for counts in ((33, 30), (30, 33)):
-        rows = images_of_both(arms(), counts, 0.1)
-        found = HandEye.of_each(dc.calibrate(kind().robot, rows, hyperparameters=SCALES).model, camera_on_tool=False)
-        for name, arm in zip(("left", "right"), arms(), strict=True):
-            own = found[name].camera
-            away = own.pose[:3, 3] - torch.linalg.inv(arm.arm.truth.base)[:3, 3]
-            assert bool((away.abs() < 4 * own.deviations[:3]).all())
-            known.setdefault(name, []).append(own.deviations)
-        board = found["left"].board
-        assert bool(
-            ((board.pose[:3, 3] - board.pose.new_tensor(BOARD_ON_FLANGE)).abs() < 4 * board.deviations[:3]).all()
-        )
-    for one, other in known.values():
-        assert float((one / other - 1).abs().max()) < 0.15
-        assert float(one[:3].max()) < 2e-3
 
 
 def test_the_files_of_each_camera_begin_with_its_name(tmp_path: Path) -> None:
@@ -125,42 +136,8 @@ def test_sessions_of_a_camera_are_set_ups_of_their_own() -> None:
     ]
 
 
-PLACES_ON_TOOL = dict(zip(("left", "right"), (CAMERA, CAMERA_BESIDE), strict=True))
-
-
-def on_tool() -> Kind:
-    return kind_named("two cameras on the tool")
-
-
-def check_hand_eyes(model: Any, largest_std: float) -> None:
-    """Every camera is where it is, by the deviations that are told of it."""
-    found = HandEye.of_each(model, camera_on_tool=True)
-    assert set(found) == set(PLACES_ON_TOOL)
-    for name, given in PLACES_ON_TOOL.items():
-        truth, known = torch.tensor(given, dtype=torch.float64), found[name].camera
-        away = known.pose[:3, :3] @ rotation(truth[None, 3:])[0].mT
-        turn = 0.5 * (away - away.mT)[[2, 0, 1], [1, 2, 0]]
-        errors = torch.cat([known.pose[:3, 3] - truth[:3], turn])
-        assert bool((errors.abs() < 4 * known.deviations).all()), (name, errors, known.deviations)
-        assert float(known.deviations[:2].max()) < largest_std
-
-
-def test_every_camera_is_where_it_is_on_the_tool() -> None:
-    check_hand_eyes(on_tool().model, 1e-4)  # along the axis of the flange, an offset of its joint would do the same
-
-
-def test_every_camera_of_a_recalibrated_model_is_where_it_is(tmp_path: Path) -> None:
-    rows = on_tool().moved
-    again: Any = dc.recalibrate(on_tool().model, rows).model
-    check_hand_eyes(again, 1.5e-4)
-    dc.save(again, tmp_path / "again.safetensors")
-    assert len(camera_files(dc.load(tmp_path / "again.safetensors"))) == 12  # pyright: ignore
-    alone = rows.rows([name == "right" for name in rows.camera_names])
-    check_hand_eyes(dc.recalibrate(on_tool().model, alone).model, 1e-4)
-
-
 def test_tables_of_several_cameras_that_cannot_be() -> None:
-    known, tool, days = data().cameras, on_tool().data, ["day 1"] * 20 + ["day 2"] * 100
+    known, tool, days = data().cameras, kind_named("two cameras on the tool").data, ["day 1"] * 20 + ["day 2"] * 100
     lens = replace(known["right"], half_size=0.0)
     few = data().rows([name == "left" or k < 7 for k, name in enumerate(data().camera_names)])
     refused(
@@ -181,7 +158,7 @@ def test_every_camera_and_session_warns_of_a_board_of_another_size() -> None:
     seen = dc.Measurements.from_images(q, corners * larger, (1280, 960), **FIXED)
     for rows in (of_corners(data().corners * larger), seen.with_sessions(["day 1"] * 40 + ["day 2"] * (len(q) - 40))):
         with pytest.warns(dc.DiffeoCalibWarning, match=r"size of the board.*[34].\d % larger"):
-            dc.calibrate(kind().robot, rows, hyperparameters=SCALES)
+            place(kind().robot, rows, silent)
 
 
 def test_each_camera_has_a_file_of_its_own(command: Command, tmp_path: Path) -> None:

@@ -193,7 +193,7 @@ def test_a_kind_from_outside_alone(tmp_path: Path, init: Proposed) -> None:
     for name in ("laser beams", "inclinations"):
         kind = kind_named(name)
         table = tmp_path / f"{name[:3]}.csv"
-        rows = kind.source.golden.rows.parts[1].with_joint_names(kind.robot.joint_names)
+        rows = kind.source.rows.parts[1].with_joint_names(kind.robot.joint_names)
         write_measurements(table, rows, TableFormat("mm", "deg"))
         said[name] = init(table, kind.urdf)
     assert "line distance=line distance" in said["laser beams"][0]["reading"]

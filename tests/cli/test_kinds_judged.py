@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 from command_bank import Command
-from kind_bank import FREE, KINDS, UNITS, kind_named, marked
+from kind_bank import FREE, UNITS, kind_named, marked
 
 import diffeo_calib as dc
 from diffeo_calib.kinematics.evaluation import place, residuals
@@ -18,11 +18,11 @@ DRAWN = ("positions", "poses", "several tips", "sessions", "ball in sockets", "i
 """Kinds whose pictures differ."""
 
 
-@pytest.mark.parametrize("name", marked(*KINDS))
+@pytest.mark.parametrize("name", marked())
 def test_residuals_are_measured_minus_predicted(name: str) -> None:
     """Their sizes are the errors, and every row has as many as its table says."""
     kind = kind_named(name)
-    data: Any = kind.source.golden.rows
+    data: Any = kind.source.rows
     found = residuals(kind.model, place(kind.model, data), data)
     assert sum(map(len, found.index.values())) == len(data)
     for one in found.values():

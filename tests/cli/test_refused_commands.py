@@ -20,14 +20,11 @@ from diffeo_calib.measurements.table_format import TableFormat
     "words",
     [
         "fit",
-        "fit t.csv --robot r.urdf",
         "nonsense",
         "evaluate m t.csv --position x,y,z --length km --angle rad",
         "evaluate m t.csv --position x,y,z --length m --angle rad --surprise",
         "fit t.csv --holdout 1.5",
-        "fit t.csv --holdout nan",
         "evaluate m t.csv --position x,y,z --length m --angle rad --rotation-angle turn",
-        "demo --seed -1",
         "demo --count 3",
     ],
 )
@@ -89,13 +86,11 @@ REFUSED = {
     r"for 'elbow_joint', did you mean elbow_jiont": given(edit=set_cell(0, 2, "elbow_jiont")),
     r"line 32 repeats 4; real repeats differ by noise": given(edit=lambda cells: [*cells, cells[3]]),
     r"in 1 row.*|at least 2|2 distinct": given(edit=rows_of(0, 1)),
-    r"at least 3 poses, got 1": given(edit=rows_of(0, 1, 2)),
     r"at least 3 poses, got 2.*measure more poses": given("--holdout", "0", edit=rows_of(0, 1, 2)),
 }
 """What is said -> options, and an edit of the table."""
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("message", REFUSED)
 def test_what_fit_refuses(message: str, small_site: Site, command: Command, tmp_path: Path) -> None:
     options, edit = REFUSED[message]
@@ -106,24 +101,8 @@ def test_what_fit_refuses(message: str, small_site: Site, command: Command, tmp_
     done = command(*words, *options)
     assert done.code == 1
     assert re.search(message, done.error), done.error
-    assert "tip" in message or not (tmp_path / "model").exists()
     assert done.out == "" or "tip" in message
-
-
-@pytest.mark.slow
-def test_shuffled_rows(small_site: Site, command: Command, tmp_path: Path) -> None:
-    """Points paired with other rows' joints: what a sorted spreadsheet column does."""
-
-    def shuffle(cells: list[list[str]]) -> list[list[str]]:
-        order = np.random.default_rng(0).permutation(len(cells) - 1) + 1
-        return [cells[0], *(cells[i + 1][:6] + cells[j][6:] for i, j in enumerate(order))]
-
-    done = command(*small_site.fit(edited(small_site, tmp_path / "bad.csv", shuffle), tmp_path / "model"))
-    assert done.code == 1
-    doubts = [text for text in done.warnings if "the measurements do not fit this robot" in text]
-    assert "rows pair joints with their own points" in doubts[0]
-    assert "of the judged positions are more than" in done.error
-    assert (tmp_path / "model").exists()
+    assert "tip" in message or not (tmp_path / "model").exists()
 
 
 @pytest.mark.slow
@@ -161,19 +140,14 @@ def test_models_that_do_not_belong_to_a_table(small_site: Site, sound: bytes, co
         assert not (tmp_path / "p.csv").exists()
 
 
-PLACES = [("none/file.png", "No such file or directory"), ("here.png", "Is a directory")]
-
-
-@pytest.mark.parametrize("case", [(option, *place) for option in ("-o", "--report") for place in PLACES])
-def test_outputs_are_checked_before_the_fit(
-    case: tuple[str, str, str], small_site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    option, place, message = case
-    monkeypatch.setattr("diffeo_calib.cli.commands.fit.robot_of", lambda *_, **__: pytest.fail("the work has begun"))
+def test_outputs_are_checked_before_the_fit(small_site: Site, command: Command, tmp_path: Path) -> None:
+    command.monkeypatch.setattr("diffeo_calib.cli.commands.fit.robot_of", lambda *_: pytest.fail("the work has begun"))
     (tmp_path / "here.png").mkdir()
-    done = command(*small_site.fit(small_site.csv, tmp_path / "model"), option, tmp_path / place)
-    assert done.code == 1
-    assert f"file '{tmp_path / place}' cannot be written ({message})" in done.error
+    for option in ("-o", "--report"):
+        for place, message in (("none/file.png", "No such file or directory"), ("here.png", "Is a directory")):
+            done = command(*small_site.fit(small_site.csv, tmp_path / "model"), option, tmp_path / place)
+            assert done.code == 1
+            assert f"file '{tmp_path / place}' cannot be written ({message})" in done.error
 
 
 def test_files_that_are_none(small_site: Site, command: Command, tmp_path: Path) -> None:

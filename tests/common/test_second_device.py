@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from math_bank import CASES, Case, normal, rr_problem, two_marker_problem
+from math_bank import CASES, Case, normal, rr_problem
 from product_bank import Case as ArmCase
 from second_device_bank import PLACES, Place, SecondDevice, at
 from sum_bank import apart, every_formula, mapped, points, torch_backends
@@ -32,12 +32,10 @@ ONCE, TWICE = (dc.GaussNewton(max_iterations=count) for count in (1, 2))
 FITS: dict[str, Callable[[dc.Problem], dc.Fit]] = {
     "Gauss-Newton": lambda problem: dc.fit(problem, TWICE, dc.RK4(2)),
     "chosen steps": lambda problem: dc.fit(problem, ONCE),
-    "many stages": lambda problem: dc.fit(problem, ONCE, dc.RK8(1)),
     "adaptive": lambda problem: dc.fit(problem, ONCE, dc.TorchDiffEq("dopri5", rtol=1e-2, atol=1e-3)),
     "L-BFGS": lambda problem: dc.fit(problem, dc.LBFGS(max_iterations=2), dc.RK4(2)),
     "descent": lambda problem: dc.fit(problem, dc.GradientDescent(1e-6, max_iterations=2), dc.RK4(1)),
     "conjugate gradients": lambda problem: dc.fit(problem, dc.GaussNewton(linear="cg", max_iterations=1), dc.RK4(1)),
-    "controls": lambda problem: dc.fit(problem, ONCE, controls=6, integrator=dc.RK4(1)),
     "eulerian": lambda problem: dc.fit(problem, dc.LBFGS(max_iterations=2), dc.RK4(1), formulation="eulerian"),
 }
 QUICK = ("Gauss-Newton",)
@@ -119,16 +117,6 @@ def test_fits(place: Place, name: str) -> None:
             for one, other in zip(model.predict(there), expected.model.predict(x), strict=True):
                 place.compare(one, other)
         torch.testing.assert_close(model.to("cpu")(x), expected.model(x))
-
-
-@every_place
-def test_several_markers(place: Place) -> None:
-    problem = two_marker_problem(elastic_rr.grid(3))
-    expected = dc.fit(problem)
-    with at(place) as name:
-        fit = dc.fit(problem.to(name))
-        assert fit.energy == pytest.approx(expected.energy, rel=0 if place.exact else 1e-6)
-        place.compare(fit.model.predict(problem.x.to(name))[1], expected.model.predict(problem.x)[1])
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
 """Solvers of the exact model: Gauss-Newton and L-BFGS find the same optimum, and report how they stopped."""
 
-from collections.abc import Callable
 from contextlib import suppress
 from itertools import pairwise
 
@@ -27,7 +26,6 @@ from diffeo_calib.fitting.gauss_newton import Mixing
 from diffeo_calib.fitting.problem import Problem, tangent
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.maps.deformation import Momenta
-from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.robots import elastic_rr
 
 
@@ -163,8 +161,6 @@ def test_a_start_with_too_large_flows_is_reported(solver: dc.GaussNewton | dc.LB
 
 # --- L-BFGS --------------------------------------------------------------------------------------------------------
 
-Run = Callable[[Momenta, dc.RK4], GeodesicDeformation]
-
 
 @pytest.mark.slow
 def test_lbfgs_descends_from_the_tangent_model_to_the_same_optimum() -> None:
@@ -177,28 +173,6 @@ def test_lbfgs_descends_from_the_tangent_model_to_the_same_optimum() -> None:
     other = dc.fit(problem, dc.GaussNewton(), dc.RK4(1))
     assert fit.energy == pytest.approx(other.energy, rel=1e-9)
     torch.testing.assert_close(fit.momenta.flatten(), other.momenta.flatten(), rtol=0, atol=1e-5)
-
-
-def test_lbfgs_keeps_its_best_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Interrupted during a line search: further evaluations never make the result worse."""
-    energies = []
-    for calls in range(2, 12):  # the first evaluation is the start; the third overshoots
-        problem, left = rr_problem(3), [calls]
-        deform = problem.deform
-
-        def interrupted(
-            momenta: Momenta, integrator: dc.RK4, left: list[int] = left, run: Run = deform
-        ) -> GeodesicDeformation:
-            left[0] -= 1
-            if left[0] == 0:
-                raise KeyboardInterrupt
-            return run(momenta, integrator)
-
-        start = random_start(problem)
-        monkeypatch.setattr(problem, "deform", interrupted)
-        energies.append(dc.fit(problem, dc.LBFGS(), dc.RK4(1), start=start).energy)
-    assert all(after <= before for before, after in pairwise(energies))
-    assert energies[-1] < energies[0]
 
 
 # --- Mixed steps ---------------------------------------------------------------------------------------------------

@@ -14,20 +14,34 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import warnings
+from collections.abc import Mapping
 from math import ceil, floor, inf, log10
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
-REPOSITORY = Path(__file__).parents[2]
+if __name__ == "__main__":
+    FOLDERS = "", "tests/banks", "benchmarks/real_robots", "benchmarks/robustness", "scripts/examples"
+    sys.path[:0] = [str(Path(__file__).parents[2] / name) for name in FOLDERS]
+
+import again_bank
+from kind_bank import kind_named
+from source_bank import SOURCES
+
+import diffeo_calib as dc
+from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.robots import SimulatedArm
+
 NOTE = (
     "Written by tests/golden/write.py. Tolerances are relative to the norm of each quantity. Those of cases whose "
     "scales are searched are wider: the search amplifies rounding. Long tensors: four entries, four projections on "
     "random directions of length one."
 )
-SHAKES, MARGIN = (1, 2, 3), 10.0
+SHAKES, MARGIN, ROUNDING = (1, 2), 10.0, 2.0**-52
 FILE = Path(__file__).with_name("numbers.json")
 SMALLEST_TOLERANCE = 1e-9
 SOLVED = ("theta, ", "evaluation", "frames of sessions")
@@ -109,20 +123,81 @@ def upwards(value: float) -> float:
     return float(f"{ceil(value / unit - 1e-9) * unit:.0e}")
 
 
+# --- numbers of a calibration -----------------------------------------------------------------------------------------
+
+
+def computed(name: str, shake: int | None = None) -> dict[str, Entry]:
+    """All numbers of a case; ``shake``: seed of changes of the measured numbers by their last digit."""
+    kind = kind_named(name)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # few rows
+        result: Any = kind.result
+        if shake is not None:
+            result = dc.calibrate(kind.robot, shaken(kind.data, shake), hyperparameters=kind.scales)
+        found = {**numbers(result, kind.data, kind.q(5)), **(used(result) if name == "positions" else {})}
+    return {key: entry(values) for key, values in found.items()}
+
+
+def shaken(rows: Any, seed: int) -> Any:
+    """The same measurements, each number in its last digit another one."""
+    rng = np.random.default_rng(seed)
+
+    def near(values: Tensor) -> Tensor:
+        return values * (1 + ROUNDING * torch.from_numpy(rng.integers(-1, 2, tuple(values.shape))))
+
+    return with_attributes(rows, q=near(rows.q))
+
+
+def numbers(result: Any, rows: Any, q: Tensor) -> dict[str, Tensor]:
+    """What users see of a result, as tensors."""
+    mean, covariance = result.model.predict(q, noise=False)
+    left_out, scales, geometry = result.leave_one_out, result.selection.scales, result.model.nominal.geometry
+    theta = result.fit.solution.momenta.theta
+    judged = dc.evaluate(result.model, rows)
+    found = {f"theta, {name}": theta[part] for name, part in geometry.slices.items()}
+    found |= {"theta, gravity": theta[geometry.size :], "scales": scales.logarithms()}
+    for own in result.placement:
+        devices = own.devices
+        found |= {f"{devices.kind}s": devices.constants, f"{devices.kind}s, deviations": devices.deviations}
+    return found | {
+        "k1": mean,
+        "slope": result.model.jacobian(q),
+        "covariance": covariance,
+        "noise of new rows": result.model.predict(q, noise=True)[1] - covariance,
+        "left out, errors": left_out.errors,
+        "left out, squares": left_out.squares,
+        "outliers": one(*(number for each in result.outliers for number in (each.row, each.marker or 0))),
+        "evaluation": one(*(each.rms for each in (judged.values() if isinstance(judged, Mapping) else [judged]))),
+        "expected error": one(result.expected.workspace),
+    }
+
+
+def one(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def used(result: Any) -> dict[str, Tensor]:
+    """A model is registered by ten rows and recalibrated by twenty of a device elsewhere; each with its tool."""
+    arm, tool = SimulatedArm(seed=1), torch.eye(4, dtype=torch.float64)
+    q, tool[2, 3] = arm.sample(5, seed=78), 0.1
+    ten, twenty, others = (again_bank.positions(arm, rows, seed) for rows, seed in ((10, 11), (20, 12), (15, 13)))
+    model = result.model.with_tool(tool)
+    again = dc.recalibrate(model, twenty)
+    found = {"recalibrated, transform": again.moved.transform}
+    for name, own in (("registered", model.registered(ten)), ("recalibrated", again.model)):
+        mean, covariance = own.predict(q, noise=False)
+        found |= {f"{name}, k1": mean, f"{name}, covariance": covariance, f"{name}, tool": own.tool_poses(q)}
+        found[f"{name}, evaluation"] = one(dc.evaluate(own, others).rms)
+    return found
+
+
 def main() -> None:
-    folders = "", "tests/banks", "benchmarks/real_robots", "benchmarks/robustness"
-    sys.path[:0] = [str(REPOSITORY / name) for name in folders]
-    from golden_bank import CASES, golden
-
-    def computed(name: str, shake: int | None = None) -> dict[str, Entry]:
-        return {key: entry(values) for key, values in golden(name, shake).items()}
-
     parser = argparse.ArgumentParser(description="Write the golden numbers anew.")
     parser.add_argument("names", nargs="*", metavar="CASE", help="some cases; all by default")
     parser.add_argument("--keep", action="store_true", help="keep the tolerances of the file")
     given = parser.parse_args()
     known = read()
-    for name in given.names or CASES:
+    for name in given.names or SOURCES:
         found, old = computed(name), known.get(name, {})
         others = [] if given.keep else [computed(name, seed) for seed in SHAKES]
         for key, own in found.items():
@@ -132,7 +207,7 @@ def main() -> None:
             elif SMALLEST_TOLERANCE < MARGIN * largest < inf:
                 own["tolerance"] = upwards(MARGIN * largest)
         known[name] = found
-    write({name: known[name] for name in CASES})
+    write({name: known[name] for name in SOURCES})
 
 
 if __name__ == "__main__":

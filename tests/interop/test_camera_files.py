@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 import torch
 from command_bank import Command
-from golden_bank import camera_on_tool
 from kind_bank import kind_named
+from product_bank import usual_scales
 from scipy.spatial.transform import Rotation
 from simulated_camera import BOARD_ON_FLANGE, CAMERA, FIXED_CAMERA, fixed_camera_arm
 from torch import Tensor
@@ -39,7 +39,7 @@ def on_tool() -> dc.CalibratedKinematics:
 def fixed() -> dc.CalibratedKinematics:
     seen = fixed_camera_arm(25)
     data = seen.images(0.1, on_tool=False)
-    return dc.calibrate(seen.arm.nominal, data, hyperparameters=camera_on_tool().scales).model
+    return dc.calibrate(seen.arm.nominal, data, hyperparameters=usual_scales(seen.arm.nominal)).model
 
 
 def camera_of(model: dc.CalibratedKinematics) -> BoardCamera:

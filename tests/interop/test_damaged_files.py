@@ -221,6 +221,9 @@ WRONG_TENSORS: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
     "x flat": ("x", lambda t: t.flatten()),
     "noise flat": ("noise", lambda t: t.flatten()),
     "single precision": ("x", lambda t: t.float()),
+    "rigid errors of other joints": ("rigid_errors", lambda t: t[:2]),
+    "rigid errors not rigid": ("rigid_errors", lambda t: 2 * t),
+    "rigid errors not finite": ("rigid_errors", lambda t: t * float("nan")),
     "integers": ("noise", lambda t: t.long()),
 }
 

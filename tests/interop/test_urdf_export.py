@@ -16,7 +16,7 @@ from robots_bank import draw
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, RobotError
-from diffeo_calib.interop.urdf import origin_numbers, write_urdf
+from diffeo_calib.interop.urdf import origin_numbers, urdf_of, write_urdf
 from diffeo_calib.robots import Geometry
 from diffeo_calib.robots.se3 import roll_pitch_yaw, transforms
 
@@ -102,11 +102,13 @@ def test_angles_of_an_origin_are_exact_also_where_they_are_ambiguous(lever: floa
 
 
 def test_a_model_brings_its_own_urdf(tmp_path: Path) -> None:
-    """Of its rigid kinematics: tests/cli/test_export_command.py."""
-    chain = write_ugly(tmp_path / "robot.urdf")
+    """Byte for byte, whatever they are. Of its rigid kinematics: tests/cli/test_export_command.py."""
+    chain = write_ugly(
+        tmp_path / "robot.urdf", UGLY.replace('utf-8"', 'iso-8859-1"').replace("-->", "\xff -->"), "latin-1"
+    )
     dc.save(model_of(chain), tmp_path / "model.safetensors")
     model: Any = dc.load(tmp_path / "model.safetensors")
-    (tmp_path / "robot.urdf").unlink()
+    assert urdf_of(model.robot) == (tmp_path / "robot.urdf").read_bytes()
     write_urdf(wrong(model.robot), tmp_path / "new.urdf")
     q = configurations(chain)
     torch.testing.assert_close(

@@ -6,19 +6,19 @@ import os
 import signal
 import sys
 import time
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import torch
-from math_bank import normal, rr_problem
-from sum_bank import points
+from math_bank import rr_problem
+from sum_bank import FORMULAS, points
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.flows.geodesic import Flow, energy
 from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile
 from diffeo_calib.kernels.reductions import backends, distributed
-from diffeo_calib.kernels.reductions.formulas import FIELD, FIELD_AND_JACOBIAN, GRADIENT, HESSIAN_PRODUCT
+from diffeo_calib.kernels.reductions.formulas import FIELD
 from diffeo_calib.regression import control_points
 
 COUNT, ROWS = 300, 200
@@ -33,37 +33,29 @@ def everything_shared() -> None:
 def sums(backend: backends.Backend) -> list[Tensor]:
     """All formulas, of points with themselves and with others."""
     found: list[Tensor] = []
-    for profile in (GaussianProfile(), MaternProfile(2.5)):
-        for formula in (FIELD, FIELD_AND_JACOBIAN, GRADIENT, HESSIAN_PRODUCT):
-            for rows in (None, points(ROWS, 2)):
-                found += backends.evaluate(formula, profile, rows, points(COUNT, 1), backend)
+    for formula, rows in product(FORMULAS.values(), (None, points(ROWS, 2))):
+        found += backends.evaluate(formula, MaternProfile(2.5), rows, points(COUNT, 1), backend)
     return found
 
 
-def flow(backend: backends.Backend) -> list[Tensor]:
-    """A flow of landmarks, and the gradient of a loss through it."""
-    kernel = (dc.Gaussian(0.5) + dc.Matern(0.7, nu=2.5)).using(backend)
-    q, a = normal(COUNT, 3, seed=1), normal(COUNT, 3, seed=2) / COUNT
-    q, a = q.requires_grad_(), a.requires_grad_()
-    run = Flow(kernel, q, a, dc.RK4(2))
-    loss = run.end[0].square().sum() + run(normal(ROWS, 3, seed=3)).square().sum() + energy(kernel, q, a)
-    return [run.end.detach(), *torch.autograd.grad(loss, (q, a))]
-
-
 def fits(backend: backends.Backend) -> list[Tensor]:
-    """Steps of Gauss-Newton by conjugate gradients, and with control points."""
-    problem, steps = rr_problem(5), dc.RK4(2)
-    full = dc.fit(problem, dc.GaussNewton(linear="cg", max_iterations=2), steps, backend=backend)
-    coarse = dc.fit(problem, dc.GaussNewton(max_iterations=2), steps, controls=12, backend=backend)
-    found = [torch.tensor([fit.energy, float(fit.iterations)], dtype=torch.float64) for fit in (full, coarse)]
-    return [*found, *full.momenta.tensors[:2], full.model(problem.x), coarse.model(problem.x)]
+    """Steps of L-BFGS, through flows and their gradients, of Gauss-Newton by conjugate gradients, of control points."""
+    found = []
+    for solver, options in (
+        (dc.LBFGS(max_iterations=3), {}),
+        (dc.GaussNewton(linear="cg", max_iterations=2), {}),
+        (dc.GaussNewton(max_iterations=2), {"controls": 12}),
+    ):
+        fit = dc.fit(rr_problem(5), solver, dc.RK4(2), backend=backend, **options)
+        found += [torch.tensor([fit.energy], dtype=torch.float64), fit.model(fit.problem.x)]
+    return found
 
 
 def agree(folder: Path) -> None:
     """Write the results of all work, and those of one process."""
     everything_shared()
-    found: dict[str, Any] = {make.__name__: make("distributed") for make in (sums, flow, fits)}
-    found["alone"] = {make.__name__: make("dense") for make in (sums, flow, fits)}
+    found: dict[str, Any] = {make.__name__: make("distributed") for make in (sums, fits)}
+    found["alone"] = {make.__name__: make("dense") for make in (sums, fits)}
     torch.save(found, folder / f"found_{distributed.ranks().own}.pt")
 
 

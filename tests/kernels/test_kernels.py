@@ -86,25 +86,14 @@ def test_field_and_its_jacobian(case: Case) -> None:
 
 
 @every_case
-def test_gradient_of_the_hamiltonian(case: Case) -> None:
-    _, q, a = data(case)
-    live_q, live_a = q.clone().requires_grad_(), a.clone().requires_grad_()
-    expected_q, expected_a = torch.autograd.grad(
-        case.hamiltonian(live_q, live_a), (live_q, live_a), materialize_grads=True
-    )
-    velocity, slope = case.kernel.hamiltonian_gradient(q, a)
-    torch.testing.assert_close(velocity, expected_a, rtol=1e-13, atol=1e-13)
-    torch.testing.assert_close(slope, expected_q, rtol=1e-12, atol=1e-12)
-
-
-@every_case
-def test_gradient_between_two_sets_of_points(case: Case) -> None:
-    """Gradient of sum_ij c_i^T K(x_i, q_j) a_j in c and x."""
+def test_gradients_with_themselves_and_between_two_sets_of_points(case: Case) -> None:
+    """Of H(q, a), and of sum_ij c_i^T K(x_i, q_j) a_j in c and x."""
     x, q, a = data(case)
-    c = normal(M, case.dim, seed=8).requires_grad_()
-    live = x.clone().requires_grad_()
-    energy = (c * case.velocity(live, q, a)).sum()
-    expected = torch.autograd.grad(energy, (c, live))
+    live_q, live_a = q.clone().requires_grad_(), a.clone().requires_grad_()
+    slope, velocity = torch.autograd.grad(case.hamiltonian(live_q, live_a), (live_q, live_a), materialize_grads=True)
+    torch.testing.assert_close(case.kernel.hamiltonian_gradient(q, a), (velocity, slope), rtol=1e-12, atol=1e-12)
+    c, live = normal(M, case.dim, seed=8).requires_grad_(), x.clone().requires_grad_()
+    expected = torch.autograd.grad((c * case.velocity(live, q, a)).sum(), (c, live))
     torch.testing.assert_close(case.kernel.gradient(x, c.detach(), q, a), expected, rtol=1e-12, atol=1e-12)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 from deformation_bank import made
@@ -13,7 +12,6 @@ from torch.testing import assert_close
 from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.poses import angle_between, mark_jacobian, mark_points
-from diffeo_calib.runtime.chain import perpendicular
 
 CHI2_95 = 7.8147  # 95 % quantile, three degrees of freedom
 
@@ -111,20 +109,6 @@ def test_wrong_input(arm: Case) -> None:
     for device in ("foo", "cuda:99", torch.float32, "meta"):
         with pytest.raises(InputError, match="the device"):
             model.to(device)  # pyright: ignore[reportArgumentType]
-
-
-@pytest.mark.parametrize(
-    ("axis", "rows"),
-    [
-        ((0.0, 0.0, 1.0), ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0))),
-        ((0.0, 1.0, 0.0), ((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))),
-        ((1.0, 0.0, 0.0), ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0))),
-        ((0.0, 0.0, -1.0), ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0))),
-    ],
-)
-def test_lateral_directions_of_gravity_sag(axis: tuple[float, ...], rows: tuple[tuple[float, ...], ...]) -> None:
-    """Coefficients in model files refer to these directions: they must never change."""
-    np.testing.assert_allclose(perpendicular(np.array(axis)), np.array(rows), rtol=0, atol=1e-15)
 
 
 def test_large_batches_equal_small_ones_and_full_turns_change_nothing(arm: Case) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -12,7 +11,6 @@ from robots_bank import tool_frame
 from torch import Tensor
 from torch.testing import assert_close
 
-import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.tool import REFERENCE_ROWS, covariance_without_placement, tool_points, tool_transform
@@ -45,13 +43,6 @@ def test_a_tool_that_was_never_measured(pair: Case) -> None:
     found = pair.model.tool_poses(pair.test.q, tool_frame(), "measuring")
     truth = true_poses(40, 2, pair.test.q, tool_frame())
     assert float(angle_between(found[:, :3, :3], truth[:, :3, :3]).square().mean().sqrt().rad2deg()) < 0.05
-
-
-def test_points_of_the_markers_are_those_of_the_model(pair: Case) -> None:
-    """The origin of a tool at a marker is that marker, moved by the same flows."""
-    for k, marker in enumerate(pair.model.geometry.tool):
-        found = pair.model.tool_poses(pair.test.q, marker, "measuring")[:, :3, 3]
-        torch.testing.assert_close(found, pair.model(pair.test.q)[:, k], rtol=0, atol=2e-6)
 
 
 def test_a_model_of_poses_agrees_with_itself(posed: Case) -> None:
@@ -95,16 +86,6 @@ def test_covariance_in_the_base_frame_is_turned_into_its_axes(arm: Case) -> None
     turn = torch.block_diag(R.mT, R.mT)
     found = model.predict_tool_poses(q, tool, "base")[1]
     torch.testing.assert_close(found, turn @ measured @ turn.mT, rtol=1e-9, atol=1e-16)
-
-
-def test_a_tool_travels_with_the_model(arm: Case, tmp_path: Path) -> None:
-    model, q = arm.model.with_tool(tool_frame()), arm.test.q[:3]
-    torch.testing.assert_close(model.tool_poses(q), arm.model.tool_poses(q, tool_frame()), rtol=0, atol=0)
-    dc.save(model, tmp_path / "tool.safetensors")
-    again = dc.load(tmp_path / "tool.safetensors")
-    assert isinstance(again, dc.CalibratedKinematics)
-    torch.testing.assert_close(again.tool_poses(q), model.tool_poses(q), rtol=0, atol=1e-13)
-    torch.testing.assert_close(again(q), arm.model(q), rtol=0, atol=0)
 
 
 def test_wrong_tools_and_frames(arm: Case) -> None:

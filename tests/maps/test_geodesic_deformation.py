@@ -114,15 +114,6 @@ every_arm = pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS.keys())
 
 
 @every_arm
-def test_without_momenta_it_is_the_nominal_map(arm: Arm) -> None:
-    deformation, x = arm.deform(size=0.0), arm.points(9, 1)
-    theta = deformation.momenta.theta
-    torch.testing.assert_close(deformation(x), arm.spec.nominal(x, theta), rtol=0, atol=0)
-    torch.testing.assert_close(deformation.z1, arm.spec.nominal(deformation.x, theta), rtol=0, atol=0)
-    torch.testing.assert_close(deformation.jacobian(x), arm.spec.nominal.jacobian(x, theta), rtol=0, atol=1e-15)
-
-
-@every_arm
 def test_composition_of_naive_flows(arm: Arm) -> None:
     """psi(k0(phi^-1(x))) written out with the fields of two naive geodesics; controls have their own images."""
     deformation, x = arm.deform(), arm.points(9, 1)

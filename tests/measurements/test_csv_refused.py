@@ -49,47 +49,27 @@ FILES: list[Case] = [
     (TABLE.replace("q1", "q1 [°]"), {"joints": ["q1 [°]", "q2"]}, "column 'q1 [°]': expected rad, as stated, got deg"),
 ]
 OPTIONS: list[Case] = [
-    ("", {"length": "km"}, "`length`: expected 'm' or 'mm' or 'cm' or 'inch', got 'km'"),
-    ("", {"angle": "degrees"}, "`angle`: expected 'rad' or 'deg', got 'degrees'"),
-    ("", {"joint_length": "km"}, "`joint_length`: expected 'm' or 'mm' or 'cm' or 'inch', got 'km'"),
-    ("", {"decimal": ";"}, "`decimal` ... ';'"),
-    ("", {"decimal": ","}, "`sep` and `decimal`: expected different ... sep=';'"),
-    ("", {"sep": "::"}, "`sep`: expected one character, got '::'"),
-    ("", {"duplicates": "ignore"}, "`duplicates`: expected 'error' or 'keep' or 'drop'"),
-    ("", {"joints": "q1"}, "`joints` ... 'q1'"),
-    ("", {"joints": ["q1", "x"]}, "distinct columns, got ['x'] twice"),
-    ("", {"position": [["x", "y", "z"]] * 2}, "`joints` and `position`: expected distinct columns, got ['x'"),
-    ("", {"position": "xyz"}, "`position`: expected three names"),
-    ("", {"position": [["x", "y", "z"], ["x", "y"]]}, "`position`"),
+    (TABLE, {"length": "km"}, "`length`: expected 'm' or 'mm' or 'cm' or 'inch', got 'km'"),
+    (TABLE, {"angle": "degrees"}, "`angle`: expected 'rad' or 'deg', got 'degrees'"),
+    (TABLE, {"joint_length": "km"}, "`joint_length`: expected 'm' or 'mm' or 'cm' or 'inch', got 'km'"),
+    (TABLE, {"decimal": ";"}, "`decimal` ... ';'"),
+    (TABLE, {"decimal": ","}, "`sep` and `decimal`: expected different ... sep=';'"),
+    (TABLE, {"sep": "::"}, "`sep`: expected one character, got '::'"),
+    (TABLE, {"duplicates": "ignore"}, "`duplicates`: expected 'error' or 'keep' or 'drop'"),
+    (TABLE, {"joints": "q1"}, "`joints` ... 'q1'"),
+    (TABLE, {"joints": ["q1", "x"]}, "distinct columns, got ['x'] twice"),
+    (TABLE, {"position": [["x", "y", "z"]] * 2}, "`joints` and `position`: expected distinct columns, got ['x'"),
+    (TABLE, {"position": "xyz"}, "`position`: expected three names"),
+    (TABLE, {"position": [["x", "y", "z"], ["x", "y"]]}, "`position`"),
     (
-        "",
+        TABLE,
         {"kinds": ["revolute"]},
         "`joints`: expected 1 columns of joints, one for each of `kinds`, got 2 (['q1', 'q2'])",
     ),
-    ("", {"kinds": ["revolute", "planar"]}, "`kinds` ... 'prismatic' ... got 'planar'"),
-    ("", {"joint_length": "m"}, "`joint_length` without the kinds of the joints ... pass the robot, or `kinds`"),
-    ("", {"camera_on_tool": True}, "`camera_on_tool` without `rotation`; name the columns"),
+    (TABLE, {"kinds": ["revolute", "planar"]}, "`kinds` ... 'prismatic' ... got 'planar'"),
+    (TABLE, {"joint_length": "m"}, "`joint_length` without the kinds of the joints ... pass the robot, or `kinds`"),
+    (TABLE, {"camera_on_tool": True}, "`camera_on_tool` without `rotation`; name the columns"),
 ]
-
-
-@pytest.mark.parametrize(("text", "how", "message"), [*FILES, *((TABLE, *own[1:]) for own in OPTIONS)])
-def test_files_and_options(text: str | bytes, how: dict[str, Any], message: str, read: Reader) -> None:
-    with pytest.raises(MeasurementError, match=in_order(message)) as caught:
-        read(text, **how)
-    assert str(caught.value).endswith(".")
-    assert "\n" not in str(caught.value)
-    assert "table.csv'" in str(caught.value) or message.startswith(("`", "distinct")), "the file is named"
-
-
-def test_files_that_cannot_be_opened_and_units_that_are_not_named(tmp_path: Path) -> None:
-    units: dict[str, Any] = {"length": "m", "angle": "rad"}
-    for path, message in ((tmp_path / "nowhere.csv", "nowhere.csv' does not exist.*folder"), (tmp_path, "is a folder")):
-        with pytest.raises(MeasurementError, match=message):
-            read_measurements(path, JOINTS, POSITION, **units)
-    for name in units:
-        with pytest.raises(TypeError, match=name):
-            read_measurements(tmp_path, JOINTS, POSITION, **{other: units[other] for other in units if other != name})
-
 
 # --- poses and deviations -------------------------------------------------------------------------------------------
 
@@ -161,55 +141,72 @@ SEVERAL: list[Case] = [
     (ONE_FRAME, {}, "columns x, y, z, a, b and 1 more ... shows this frame; leave them out"),
 ]
 
-
-@pytest.mark.parametrize(
-    ("text", "how", "message"),
-    [
-        *((text, POSED | how, said) for text, how, said in POSES),
-        *((own[0], FRAMES | own[1], own[2]) for own in SEVERAL),
-    ],
-)
-def test_poses(text: str, how: dict[str, Any], message: str, read: Reader) -> None:
-    with pytest.raises(MeasurementError, match=in_order(message)):
-        read(text, **how)
-
-
 # --- hidden markers -------------------------------------------------------------------------------------------------
 
 PAIR: dict[str, Any] = {"position": [("ax", "ay", "az"), ("bx", "by", "bz")]}
 MARKERS = "q1,q2,ax,ay,az,bx,by,bz\n0.1,0.2,1,2,3,4,5,6\n0.3,0.4,1.5,2.5,3.5,,,\n0.5,0.6,,,,4.5,5.5,6.5\n"
+COMMAS: dict[str, Any] = {"sep": ";", "decimal": ","}
 DEVIATIONS = "q1;q2;ax;ay;az;bx;by;bz;sa;sb\n0,1;0,2;1;2;3;;;;;\n"
+HALVES = {
+    "0.7,0.8,1,,3,4,5,6": "'ay' ... an empty cell ... marker or frame are empty",
+    "0.7,0.8,1,2,3,,,6": "'bx' ... an empty cell ... marker or frame are empty",
+    "0.7,,1,2,3,4,5,6": "'q2' ... an empty cell",
+    "0.7,,,,,,,": "'q2': expected a finite number",
+    "0.7,0.8,1,2,3,,inf,": "'by' ... 'inf'",  # and not the empty one beside it
+    "0.7,0.8,1,2,3,,,1e400": "'bz' ... '1e400'",
+    "0.7,0.8,1,2,3,,nan,5": "'by' ... 'nan'",
+    "0.7,far,1,2,3,4,5,6": "'q2' ... 'far'",
+    "0.7,1e13,1,2,3,4,5,6": "'q2' ... '1e13'",
+    "0.7,MISSING,1,2,3,4,5,6": "'q2' ... 'MISSING'",
+}
+HIDDEN: list[Case] = [
+    *((MARKERS + row + "\n", PAIR, f"line 5, column {message}") for row, message in HALVES.items()),
+    (DEVIATIONS, COMMAS | PAIR | {"std": ["sa", "sb"]}, "line 2, column 'sa' ... an empty cell"),
+    (DEVIATIONS, COMMAS | PAIR | {"std": ["sa"]}, "line 2, column 'sa' ... an empty cell"),  # one for all
+    (MARKERS.partition("0.5,0.6")[0].replace("4,5,6", ",,"), PAIR, "bx, by, bz: empty in all 2 lines"),
+]
+BALLS = "q1,q2,ball,x,y,z\n0.1,0.2,top,1,2,3\n0.3,0.4,low,1,1,2\n"
+BALL: dict[str, Any] = {"marker": "ball"}
+OF_MARKERS: list[Case] = [
+    (BALLS, {"marker": "ball=top,left"}, "column 'ball': expected markers of the model: top, left, got low"),
+    (BALLS, {"marker": "smr"}, "no column ['smr']"),
+    (BALLS.replace("top", ""), BALL, "line 2, column 'ball': expected the name of a marker, got an empty cell"),
+    (BALLS, BALL | {"position": [["x", "y", "z"], ["u", "v", "w"]]}, "`marker` (ball): expected one position"),
+    (BALLS, BALL | POSED, "`marker` (ball)"),
+    (BALLS, BALL | {"socket": "place"}, "`marker` (ball)"),
+]
 
 
 @pytest.mark.parametrize(
-    ("row", "message"),
+    ("text", "how", "message"),
     [
-        ("0.7,0.8,1,,3,4,5,6", "'ay' ... an empty cell ... marker or frame are empty"),
-        ("0.7,0.8,1,2,3,,,6", "'bx' ... an empty cell ... marker or frame are empty"),
-        ("0.7,,1,2,3,4,5,6", "'q2' ... an empty cell"),
-        ("0.7,,,,,,,", "'q2': expected a finite number"),
-        ("0.7,0.8,1,2,3,,inf,", "'by' ... 'inf'"),  # and not the empty one beside it
-        ("0.7,0.8,1,2,3,,,1e400", "'bz' ... '1e400'"),
-        ("0.7,0.8,1,2,3,,nan,5", "'by' ... 'nan'"),
-        ("0.7,far,1,2,3,4,5,6", "'q2' ... 'far'"),
-        ("0.7,1e13,1,2,3,4,5,6", "'q2' ... '1e13'"),
-        ("0.7,MISSING,1,2,3,4,5,6", "'q2' ... 'MISSING'"),
+        *FILES,
+        *OPTIONS,
+        *((text, POSED | how, message) for text, how, message in POSES),
+        *((text, FRAMES | how, message) for text, how, message in SEVERAL),
+        *HIDDEN,
+        *OF_MARKERS,
     ],
 )
-def test_half_a_marker(read: Reader, row: str, message: str) -> None:
-    with pytest.raises(MeasurementError, match=in_order(f"line 5, column {message}")):
-        read(MARKERS + row + "\n", **PAIR)
+def test_one_clear_error(text: str | bytes, how: dict[str, Any], message: str, read: Reader) -> None:
+    with pytest.raises(MeasurementError, match=in_order(message)) as caught:
+        read(text, **how)
+    assert str(caught.value).endswith(".")
+    assert "\n" not in str(caught.value)
+    assert "table.csv'" in str(caught.value) or message.startswith(("`", "distinct")), "the file is named"
 
 
-def test_markers_without_deviations_or_places(read: Reader) -> None:
-    for std in (["sa", "sb"], ["sa"]):  # one for each, or one for all
-        with pytest.raises(MeasurementError, match=r"line 2, column 'sa'.*an empty cell"):
-            read(DEVIATIONS, sep=";", decimal=",", std=std, **PAIR)
-    with pytest.raises(MeasurementError, match="bx, by, bz: empty in all 2 lines"):
-        read("\n".join([*MARKERS.splitlines()[:1], "0.1,0.2,1,2,3,,,", "0.3,0.4,1,2,3,,,"]), **PAIR)
+def test_files_that_cannot_be_opened_and_units_that_are_not_named(tmp_path: Path) -> None:
+    units: dict[str, Any] = {"length": "m", "angle": "rad"}
+    for path, message in ((tmp_path / "nowhere.csv", "nowhere.csv' does not exist.*folder"), (tmp_path, "is a folder")):
+        with pytest.raises(MeasurementError, match=message):
+            read_measurements(path, JOINTS, POSITION, **units)
+    for name in units:
+        with pytest.raises(TypeError, match=name):
+            read_measurements(tmp_path, JOINTS, POSITION, **{other: units[other] for other in units if other != name})
 
 
-# --- several kinds, and a marker in each line -----------------------------------------------------------------------
+# --- several kinds --------------------------------------------------------------------------------------------------
 
 SI = TableFormat("m", "rad", joints=("a", "b"))
 LINES = """a,b,x,y,z,d,u,v,spot,who,sd
@@ -265,22 +262,3 @@ def test_several_kinds(edit: Any, how: dict[str, Any], message: str, tmp_path: P
 def test_columns_of_readings(kind: str, names: Any, how: dict[str, Any], message: str) -> None:
     with pytest.raises(MeasurementError, match=message):
         dc.ReadingColumns(kind, names, **how)
-
-
-BALLS = "q1,q2,ball,x,y,z\n0.1,0.2,top,1,2,3\n0.3,0.4,low,1,1,2\n"
-
-
-@pytest.mark.parametrize(
-    ("text", "how", "message"),
-    [
-        (BALLS, {"marker": "ball=top,left"}, "column 'ball': expected markers of the model: top, left, got low"),
-        (BALLS, {"marker": "smr"}, "no column ['smr']"),
-        (BALLS.replace("top", ""), {}, "line 2, column 'ball': expected the name of a marker, got an empty cell"),
-        (BALLS, {"position": [["x", "y", "z"], ["u", "v", "w"]]}, "`marker` (ball): expected one position"),
-        (BALLS, {"rotation": ["u", "v", "w"], "convention": "xyz", "rotation_angle": "deg"}, "`marker` (ball)"),
-        (BALLS, {"socket": "place"}, "`marker` (ball)"),
-    ],
-)
-def test_a_marker_in_each_line(text: str, how: dict[str, Any], message: str, read: Reader) -> None:
-    with pytest.raises(MeasurementError, match=in_order(message)):
-        read(text, **({"marker": "ball"} | how))

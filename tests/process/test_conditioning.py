@@ -169,7 +169,7 @@ def test_opened_unknowns_are_those_of_another_factor(case: Case, size: float | N
 
 
 def test_rows_without_noise_that_are_there_twice_are_refused() -> None:
-    one = case("three markers")
+    one = case("poses")
     twice = one.part(torch.tensor([0, 0]))
     with pytest.raises(NumericalError, match="the covariance of the rows is not positive definite"):
         twice.data.prior(one.scales).given(twice.numbers, 0.0 * twice.noise)

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import re
-import warnings
 from pathlib import Path
 
 import pytest
 import torch
 from command_bank import Command
-from kind_bank import kind_named
+from kind_bank import ELSEWHERE, kind_named
 from lxml import html
 from product_bank import Case, usual_scales
+from table_bank import refused
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import DiffeoCalibWarning, InputError
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.poses import rotation_matrices
 from diffeo_calib.measurements.rows import with_attributes
@@ -23,6 +22,7 @@ from diffeo_calib.reports.analysis.findings import Findings, find
 from diffeo_calib.reports.html.sections import record
 from diffeo_calib.reports.html.sentences import verdict
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.sensors.tables import divided
 
 SECTIONS = ["errors", "where", "why", "trust", "repeatability", "record"]
@@ -93,16 +93,11 @@ def test_without_measurements_the_rows_of_the_fit_are_left_out_one_by_one(arm: C
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.slow
 def test_a_registered_and_a_recalibrated_model(arm: Case, tmp_path: Path) -> None:
-    turn = torch.eye(4, dtype=torch.float64)
-    turn[:3, :3] = torch.linalg.matrix_exp(torch.tensor([[0, -0.3, 0.1], [0.3, 0, 0.2], [-0.1, -0.2, 0.0]])).double()
-    turn[:3, 3] = torch.tensor([0.5, -0.2, 0.1])
-    moved = dc.Measurements(arm.test.q, arm.test.points @ turn[:3, :3].T + turn[:3, 3])
-    registered = arm.model.registered(moved[:15])
-    new = moved[15 : 15 + SHOWN]
+    moved = arm.test.in_frames(twist_transform(ELSEWHERE).expand(len(arm.test), 4, 4))
+    registered, new = arm.model.registered(moved[:15]), moved[15 : 15 + SHOWN]
     found = made(tmp_path / "registered.html", registered, new)
     assert found.errors["calibrated"].rms == pytest.approx(dc.evaluate(registered, new).rms)
-    again = dc.recalibrate(arm.model, moved[:20]).model
-    found = made(tmp_path / "again.html", again)
+    found = made(tmp_path / "again.html", dc.recalibrate(arm.model, moved[:20]).model)
     assert found.errors["calibrated"].rms < 3e-4
     torch.testing.assert_close(found.rows.points[-20:], moved[:20].points, atol=1e-7, rtol=0)
 
@@ -176,27 +171,24 @@ def test_what_is_refused(files: tuple[Path, Path], tmp_path: Path, command: Comm
         done = command("evaluate", model, "--report", out, *words)
         assert done.code == 1
         assert text in done.err
-    eye = torch.eye(4, dtype=torch.float64).expand(60, 4, 4)
-    with pytest.raises(InputError, match="calibrated with points: expected measured points, got poses"):
-        dc.write_report(arm.model, out, dc.Measurements.from_poses(arm.train.q, eye))
-    with pytest.raises(InputError, match="the markers of `data`: expected 1, got 2"):
-        dc.write_report(arm.model, out, dc.Measurements(arm.train.q, arm.train.points.repeat(1, 2, 1)))
-    with pytest.raises(InputError, match="report"):
-        dc.write_report(arm.model, tmp_path / "none" / "report.html")
+    q, eye, two = arm.train.q, torch.eye(4, dtype=torch.float64).expand(60, 4, 4), arm.train.points.repeat(1, 2, 1)
+    poses, markers = dc.Measurements.from_poses(q, eye), dc.Measurements(q, two)
+    refused(
+        ("with points: expected measured points, got poses", lambda: dc.write_report(arm.model, out, poses)),
+        ("the markers of `data`: expected 1, got 2", lambda: dc.write_report(arm.model, out, markers)),
+        ("report", lambda: dc.write_report(arm.model, tmp_path / "none" / "report.html")),
+    )
     assert not out.exists()
 
 
+@pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 def test_names_of_any_length_and_with_markup_fit_into_their_panels(tmp_path: Path) -> None:
     evil = "<img src=x onerror=alert(1)>&\"'</script>$x^2$"
     links = [(0.0, 1.57, 0.3), (0.4, 0.0, 0.0), (0.1, 1.57, 0.1)]
     robot = dc.from_dh(links, names=[f"{evil}{joint}{'y' * 200}" for joint in range(3)], name=evil)
-    rng = torch.Generator().manual_seed(0)
-    q = 3 * torch.rand(30, 3, dtype=torch.float64, generator=rng) - 1.5
-    noise = 1e-5 * torch.randn(30, 1, 3, dtype=torch.float64, generator=rng)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DiffeoCalibWarning)
-        data = dc.Measurements(q, Geometry.nominal(robot).points(q) + noise)
-        model = dc.calibrate(robot, data, hyperparameters=usual_scales(robot), note=evil).model
+    q, noise = torch.randn(30, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).split(3, 1)
+    data = dc.Measurements(q, Geometry.nominal(robot).points(q) + 1e-5 * noise[:, None])
+    model = dc.calibrate(robot, data, hyperparameters=usual_scales(robot), note=evil).model
     dc.write_report(model, tmp_path / "r.html", title=f"{evil}\x1b[31m")
     text = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert "<img" not in text

@@ -225,15 +225,6 @@ REPORTED = 0.2
 """Smallest offset that is reported, as a part of the largest."""
 
 
-def register_robustly(robot: Tree, data: Measurements) -> Identification:
-    """Base and markers from the rows that are no gross outliers; joint offsets too if they explain far more.
-
-    Warns:
-        DiffeoCalibWarning: joint offsets are far from the robot's description.
-    """
-    return with_large_offsets(data, *register_inliers(robot, data))
-
-
 def register_inliers(robot: Tree, data: Measurements) -> tuple[Identification, Tensor]:
     """Base and markers from the rows that are no gross outliers, and a first guess (N,) of these rows."""
     on = marker_tips(robot, data)

@@ -6,7 +6,7 @@ twist of the first joint are held, the devices are unknown.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import inf
@@ -40,7 +40,7 @@ from diffeo_calib.sensors.tables import OtherReadings
 
 ROUGH_M = 2e-3
 """Errors of a robot before its calibration, to compare starts."""
-STARTS_STEPS = 200
+STARTS_STEPS, COMPARED = 200, 1e-3  # most steps; change of the cost by which those end that are only compared
 BALLS_TRIED, BALL_SPREAD_M = 24, 0.15
 """Places of the ball on the tool that are tried where no start leads anywhere, and their standard deviation."""
 UNEXPLAINED = "no place of ball and devices explains the readings"
@@ -144,7 +144,7 @@ def register_readings(bare: Geometry, tables: Sequence[Readings]) -> Identificat
 
 def rough_error(bare: Geometry, tables: Sequence[Readings]) -> float:
     """RMS error of the readings from the start of :func:`register_readings`, m; infinite where none leads on."""
-    found = _rough_fits(bare, tables, bare.tool[:1])
+    found = _rough_fits(bare, tables, bare.tool[:1], ftol=COMPARED)
     return float(torch.cat([own.flatten() for own in found[0].errors]).square().mean().sqrt()) if found else inf
 
 
@@ -165,27 +165,27 @@ class RoughFit(NamedTuple):
         return {"expected": expected, "got": f"a median of {1e3 * median:.3g} mm at {as_written(device)}"}
 
 
-def _rough_fits(bare: Geometry, tables: Sequence[Readings], balls: Tensor) -> list[RoughFit]:
-    """From each ball (B, 3) in the tip's frame, m, that leads anywhere, the best first."""
+def _rough_fits(bare: Geometry, tables: Sequence[Readings], balls: Tensor, **how: float) -> list[RoughFit]:
+    """From each ball (B, 3) in the tip's frame, m, that leads anywhere, the best first; ``how``: options of scipy."""
     found = list[RoughFit]()
     for ball in balls:
         with suppress(InputError):  # the start has the ball at a fixed point or behind a camera
-            found.append(_rough_fit(bare, tables, ball))
+            found.append(_rough_fit(bare, tables, ball, how))
     found.sort(key=itemgetter(0))
     for best in found[:1]:  # a device may be lost where the ball was far away: all anew around the ball that was found
         with suppress(InputError):
-            found.append(_rough_fit(bare, tables, best.rows.geometry.tool[0]))
+            found.append(_rough_fit(bare, tables, best.rows.geometry.tool[0], how))
     return sorted(found, key=itemgetter(0))
 
 
-def _rough_fit(bare: Geometry, tables: Sequence[Readings], ball: Tensor) -> RoughFit:
+def _rough_fit(bare: Geometry, tables: Sequence[Readings], ball: Tensor, how: Mapping[str, float]) -> RoughFit:
     """Ball and devices, from these in closed form around a ball (3,), errors of joints zero."""
     geometry = bare.with_tool(ball[None])
     devices = [kind_of(data).at(data, geometry.points(data.q)[:, 0]) for data in tables]
     rows = Rows(geometry, tuple(map(ReadRows, tables, devices)))
     sigma = torch.full((sum(map(len, tables)),), ROUGH_M, dtype=torch.float64, device=HOST)
     root = Prior().root(geometry, range(geometry.slices["tool"].start))
-    fit = solve(rows, sigma, root, max_nfev=STARTS_STEPS, loss="soft_l1")
+    fit = solve(rows, sigma, root, max_nfev=STARTS_STEPS, loss="soft_l1", **how)
     worst = max(
         (float(errors[data.device == number].norm(dim=2).median()), name)
         for data, errors in zip(tables, fit.errors, strict=True)

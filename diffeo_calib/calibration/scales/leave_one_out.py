@@ -74,9 +74,6 @@ def weighed(data: TangentData, scales: Hyperparameters, seed: int = 0) -> Tangen
     """The measurements with the weights that outliers get with these scales, by expectation maximisation.
 
     Memory does not grow with the number of blocks. An outlier anywhere counts: no sample could stand for all rows.
-
-    Args:
-        data: the measurements, with the weights to begin with. scales: held fixed. seed: draws the blocks.
     """
     tails = data.tails
     for _ in range(ROUNDS):
@@ -102,7 +99,7 @@ def _among_gross(data: TangentData, scales: Hyperparameters, tails: Tails, seed:
 
 
 def leave_one_out(data: TangentData, scales: Hyperparameters, seed: int = 0) -> LeaveOneOut:
-    """Leave-one-out errors in closed form; arguments as of :func:`weighed`."""
+    """Leave-one-out errors in closed form."""
     errors, squares = torch.empty_like(data.y), torch.empty_like(data.tails.weights)
     effective, count = [], 0
     for rows, part in _parts(data, seed):
@@ -189,7 +186,6 @@ def cross_validated_inflation(
         scales: the selected ones. data: the measurements.
         groups: (N,) a number for each configuration, the same for its repeats.
         seed: draws the folds, as it drew the sample on which the scales were selected.
-        progress: called as ``progress(task, done, total)``.
 
     Returns:
         None if Ctrl-C ended the search.

@@ -86,9 +86,7 @@ def select(
         data: the measurements.
         start: where the search starts; by default it makes shorter searches from the defaults with each of several
             transmission length scales, and of commanded poses or places from short waves and little noise.
-        seed: draws the subset of poses.
         iterations: of the optimiser from every start; by default as many as the number of coordinates allows.
-        progress: called as ``progress(task, done, total)``.
 
     Returns:
         the best scales that were evaluated; Ctrl-C ends the search early.

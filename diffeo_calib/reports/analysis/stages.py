@@ -19,7 +19,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import identify
-from diffeo_calib.calibration.identification.registration import register_robustly
+from diffeo_calib.calibration.identification.registration import register_inliers, with_large_offsets
 from diffeo_calib.calibration.planning.plan import Plan, drawn, plan
 from diffeo_calib.calibration.planning.sensors import sensor_of
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC, NOMINAL
@@ -51,8 +51,9 @@ def stages_of(model: CalibratedKinematics, rows: FitRows | None = None) -> dict[
         geometric = rigid_kinematics(model) if errors is None else with_errors(model, errors)
         geometries = with_errors(model, None).geometry, geometric.geometry
     else:
+        data = rows.measurements
         with quiet():  # they were shown when the model was fitted
-            registered = register_robustly(model.robot, rows.measurements).geometry
+            registered = with_large_offsets(data, *register_inliers(model.robot, data)).geometry
             geometries = registered, identify(registered, rows.q, rows.points).geometry
     return {NOMINAL: geometries[0].points, GEOMETRIC: geometries[1].points, CALIBRATED: model}
 

@@ -1,0 +1,55 @@
+"""What is known of a camera and its board is what small changes of the fit's parameters do to their poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from kind_bank import kind_named, marked
+from torch import Tensor
+
+from diffeo_calib.kinematics.hand_eye import HandEye, SetUp
+from diffeo_calib.measurements.poses import poses_from_marks
+from diffeo_calib.robots.se3 import twist_transform
+
+STEP = 1e-6
+
+
+def changes(pose: Callable[[Tensor], Tensor], count: int) -> Tensor:
+    """(6, count) shift and turn of a pose, along the axes of its frame, by unit steps."""
+    columns = []
+    for step in STEP * torch.eye(count, dtype=torch.float64):
+        ahead, behind = pose(step), pose(-step)
+        turn = ahead[:3, :3] @ behind[:3, :3].mT
+        small = 0.5 * torch.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+        columns.append(torch.cat([(ahead - behind)[:3, 3], small]) / (2 * STEP))
+    return torch.stack(columns, 1)
+
+
+@pytest.mark.parametrize("name", marked("two cameras", "two cameras on the tool"))
+def test_covariances_are_those_of_small_changes(name: str) -> None:
+    """Also of the camera whose frame or place on the tool is not the model's: shifts of the fit move it."""
+    model, on_tool = kind_named(name).model, "on the tool" in name
+    g, fitted, lever = model.geometry, model.map, model.bodies.pose_lever()
+    for camera in HandEye.of_each(model, camera_on_tool=on_tool):
+        own, found = SetUp.of(model, camera), HandEye.of(model, camera_on_tool=on_tool, camera=camera)
+        carried, standing = (found.camera, found.board) if on_tool else (found.board, found.camera)
+        twists = torch.zeros(6, 0, dtype=torch.float64) if own.twists is None else own.twists
+        shifts = torch.zeros(0, dtype=torch.int64) if own.columns is None else own.columns.nonzero()[:, 0]
+
+        def poses(step: Tensor, own: SetUp = own, twists: Tensor = twists) -> tuple[Tensor, Tensor]:
+            theta, moved = step.split([g.size, twists.shape[1]])
+            after, turned = g.absorb(theta), twist_transform(twists @ moved)
+            frame, device = (own.transform @ turned, own.mount) if own.framed else (own.transform, turned @ own.mount)
+            return poses_from_marks(after.tool[None], lever)[0] @ device, torch.linalg.inv(frame @ after.base)
+
+        for number, (known, part) in enumerate(((carried, "tool"), (standing, "base"))):
+            numbers = torch.arange(g.size)[g.slices[part]]
+            J = changes(lambda step, number=number: poses(step)[number], g.size + len(shifts))
+            which = torch.cat([numbers, len(fitted.geodesic.spec.prior_variance) + shifts])
+            J = J[:, torch.cat([numbers, g.size + torch.arange(len(shifts))])]
+            left = J[:, : len(numbers)] @ fitted.open_directions[numbers]
+            expected = J @ fitted.parameter_covariance(which) @ J.mT + left @ left.mT
+            size = known.deviations[:, None] * known.deviations
+            torch.testing.assert_close(known.covariance / size, expected / size, rtol=0, atol=0.02)
