@@ -90,13 +90,20 @@ def given_scales(monkeypatch: pytest.MonkeyPatch) -> None:
 
 BY_KIND = (
     *("test_matrix.py", "test_kinds_judged.py", "test_init.py", "test_live_campaign.py", "test_expected_errors.py"),
-    *("test_registered_kinds.py", "test_predicted_readings.py", "test_laws_of_kinds.py"),
+    *("test_registered_kinds.py", "test_predicted_readings.py", "test_laws_of_kinds.py", "test_golden.py"),
 )
 """Files whose tests end in a kind of measurement. Those of one kind run in one process, which calibrates it once."""
 LONGEST = (
     *BY_KIND,
-    *("test_keops.py", "test_torch_program.py", "test_report.py", "test_registered.py", "test_recalibrate.py"),
-    *("test_outliers.py", "test_sockets.py", "test_transforms.py", "test_rigid.py"),
+    *(
+        "test_documentation.py",
+        "test_keops.py",
+        "test_torch_program.py",
+        "test_report.py",
+        "test_registered.py",
+        "test_recalibrate.py",
+    ),
+    *("test_documentation.py", "test_outliers.py", "test_sockets.py", "test_transforms.py", "test_rigid.py"),
     *("test_hidden_markers.py", "test_planned_sensors.py", "test_json_results.py"),
     *("test_distributed.py", "test_analysis.py", "test_evaluators.py", "test_readings.py", "test_tree_calibrations.py"),
     *("test_registration.py", "test_calibrate.py", "test_hardware.py", "test_unusual_data.py"),

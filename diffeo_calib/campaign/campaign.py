@@ -241,9 +241,8 @@ class Campaign:
         else:
             self._judge(self._model, self.table)
         self._renew()
-        self.verdicts[row] = replace(self.verdicts[row], expected_error=self.expected_error)
-        if self._model is None:
-            self.verdicts[row] = replace(self.verdicts[row], cause=self._obstacle)
+        why = {"cause": self._obstacle} if self._model is None else {}
+        self.verdicts[row] = replace(self.verdicts[row], expected_error=self.expected_error, **why)
         for one in self.verdicts[:row]:
             if one.again and float((self.table.q[one.row] - self.table.q[row]).abs().max()) < SAME_POSE:
                 self.verdicts[one.row] = replace(one, again=False)
@@ -285,25 +284,21 @@ class Campaign:
     def _next_scales(self, model: CampaignModel) -> float:
         """Accepted rows at which scales are selected again."""
         near = self.goal is not None and model.expected_error < NEAR * self.goal
-        return max((NEAR_GROWTH if near else SCALES_GROWTH) * model.selected, FIRST_SCALES)
+        return max((NEAR_GROWTH if near else SCALES_GROWTH) * model.around.selected, FIRST_SCALES)
 
     @small_work()
     def _make(self, table: Any, verdicts: Sequence[Verdict]) -> None:
         """A new model from accepted rows; without one if they do not allow it yet."""
         numbers, old = [one.row for one in verdicts if one.accepted], self._model
-        count, first = len(numbers), len(numbers) < FIRST_SCALES
-        same = old is not None and count < self._next_scales(old)
+        first = len(numbers) < FIRST_SCALES
+        same = None if old is None or len(numbers) >= self._next_scales(old) else old
         asked = self.candidates, self.target[:: -(-len(self.target) // TARGETS)]
         try:
-            scales = old.around.scales if same else None
-            around = Around.of(self.robot, table.rows(numbers), asked, scales, first=first, seed=self.seed)
+            kept = same and same.around
+            around = Around.of(self.robot, table.rows(numbers), asked, kept, first=first, seed=self.seed)
             around = around.with_open_candidates(CANDIDATES, self.seed) if self._draws else around
-            known: Any = {"selected": 0 if first else count}
-            if same:
-                known = {name: getattr(old, name) for name in ("selected", "deviation", "ratios")}
-            elif self.goal is not None and not first:
-                known["deviation"] = around.deviation()
-            made = CampaignModel(around, table, verdicts, count=count, **known)
+            around = around if same or first or self.goal is None else around.with_deviation()
+            made = CampaignModel(around, table, verdicts, same.ratios if same else ())
             if old is None:
                 made.check_placed()
         except DiffeoCalibError as error:

@@ -58,6 +58,8 @@ class Around:
     Args:
         placed: geometry and devices. data: the rows they were found with. scales: of the model.
         candidates: (M, n), poses to measure, and target (T, n), where the robot shall be accurate, rad or m.
+        selected: rows that the scales were selected with. deviation: of the log expected error by uncertain scales;
+            infinite where they are not selected.
     """
 
     placed: Placed
@@ -65,6 +67,8 @@ class Around:
     scales: Hyperparameters
     candidates: Tensor
     target: Tensor
+    selected: int
+    deviation: float = inf
 
     @classmethod
     def of(
@@ -72,7 +76,7 @@ class Around:
         robot: Tree,
         rows: Any,
         asked: tuple[Tensor, Tensor],
-        known: Hyperparameters | None,
+        same: Around | None,
         *,
         first: bool,
         seed: int,
@@ -80,8 +84,8 @@ class Around:
         """Around accepted rows.
 
         Args:
-            asked: candidates and target. known: scales to keep; None to select them, unless these are the ``first``
-                rows, which are too few for that.
+            asked: candidates and target. same: that with the scales to keep; None to select them, unless these are the
+                ``first`` rows, which are too few for that.
 
         Raises:
             DiffeoCalibError: rows that do not allow a model yet.
@@ -90,6 +94,7 @@ class Around:
             warnings.simplefilter("ignore", DiffeoCalibWarning)  # few rows leave much open
             placed = place(robot, rows, silent)
             data, stages = placed.tangent_data(), (placed.registration, placed.identification)
+            known = None if same is None else same.scales
             if known is None and first:
                 known = defaults(data, noise_of_few(data, len(rows), *stages), placed.identification.prior)
             scales = None if known is None else replace(known, lines=())
@@ -99,7 +104,8 @@ class Around:
             expected, got = "squared errors of single rows as the others predict them", f"{ratio:.2g} times that"
             fix = "measure more rows, then the model is made"
             raise MeasurementError.of("the first rows do not fit together yet", expected=expected, got=got, fix=fix)
-        return cls(placed, chosen.data, chosen.selection.scales, *asked)
+        how = (0 if first else len(rows), inf) if same is None else (same.selected, same.deviation)
+        return cls(placed, chosen.data, chosen.selection.scales, *asked, *how)
 
     def rows(self, others: Any) -> tuple[TangentData, Callable[[], list[Hypothesis]]]:
         """Rows of the campaign around the places, and what may change of robot, tool and devices.
@@ -201,8 +207,8 @@ class Around:
         compared = self.errors[1]
         return compared @ target.between() @ compared
 
-    def deviation(self) -> float:
-        """Standard deviation of the log RMS error over the target by uncertain scales.
+    def with_deviation(self) -> Around:
+        """With the standard deviation of the log RMS error over the target by uncertain scales.
 
         It is s with s^2 = g^T F^-1 g, g the gradient of the logarithm by the log scales, with the Fisher information of
         the rows, whose covariance K has the derivatives K_i by log scales, and the prior,
@@ -226,17 +232,14 @@ class Around:
             slopes.append((value - value_before) / (2 * LOG_SCALE_STEP))
         W, g = torch.stack(white), torch.tensor(slopes, dtype=point.dtype, device=point.device)
         F = 0.5 * W @ W.T + torch.eye(len(g), dtype=W.dtype, device=W.device) / GROWTH**2
-        return float(g @ torch.linalg.solve(F, g)) ** 0.5
+        return replace(self, deviation=float(g @ torch.linalg.solve(F, g)) ** 0.5)
 
 
 class CampaignModel:
     """What the accepted rows say.
 
     Args:
-        around: places and scales. table: all rows. verdicts: on them.
-        count: accepted rows that the places were found with. selected: those that the scales were selected with.
-        deviation: of the log expected error by uncertain scales; infinite where they are not selected.
-        ratios: of accepted rows, see :attr:`typical`.
+        around: places and scales. table: all rows. verdicts: on them. ratios: of accepted rows, see :attr:`typical`.
 
     Attributes:
         seen: rows of the campaign when this was made. window: numbers of the last rows, ``last`` linearised.
@@ -244,19 +247,8 @@ class CampaignModel:
         covariance: (T r, T r) of the errors over the target, m^2.
     """
 
-    def __init__(
-        self,
-        around: Around,
-        table: Any,
-        verdicts: Sequence[Verdict],
-        *,
-        count: int,
-        selected: int,
-        deviation: float = inf,
-        ratios: Sequence[float] = (),
-    ) -> None:
-        self.around, self.seen = around, len(table)
-        self.count, self.selected, self.deviation, self.ratios = count, selected, deviation, list(ratios)
+    def __init__(self, around: Around, table: Any, verdicts: Sequence[Verdict], ratios: Sequence[float]) -> None:
+        self.around, self.seen, self.ratios = around, len(table), list(ratios)
         placed, names = set(around.placed.data.device_names), table.device_names
         judged = [one for one in verdicts if names[one.row] in placed]
         accepted = [one.row for one in judged if one.accepted]
@@ -269,8 +261,7 @@ class CampaignModel:
 
     def rebuilt(self, table: Any, verdicts: Sequence[Verdict]) -> CampaignModel:
         """Around the same places, what the rows say that are accepted now, of devices that have a place."""
-        same: Any = {name: getattr(self, name) for name in ("count", "selected", "deviation", "ratios")}
-        return CampaignModel(self.around, table, verdicts, **same)
+        return CampaignModel(self.around, table, verdicts, self.ratios)
 
     def check_placed(self) -> None:
         """MeasurementError while rows do not say where the robot stands: around a wrong place nothing can be judged."""
@@ -282,6 +273,11 @@ class CampaignModel:
             )
 
     @property
+    def count(self) -> int:
+        """Accepted rows that the places were found with."""
+        return len(self.around.placed.data)
+
+    @property
     def expected_error(self) -> float:
         """RMS error over the target, m, of the markers, or of the origins of poses."""
         return float((3 * self.covariance.diagonal().mean()).clamp(min=0).sqrt())
@@ -289,7 +285,7 @@ class CampaignModel:
     @property
     def error_limit(self) -> float:
         """95 % quantile of the error over the target, m; infinite where it is not known."""
-        return limit_of(self.expected_error, self.covariance, self.deviation)
+        return limit_of(self.expected_error, self.covariance, self.around.deviation)
 
     @property
     def typical(self) -> float:

@@ -12,7 +12,6 @@ positive definite.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -68,22 +67,13 @@ class FeatureMap:
             )
 
     @cached_property
-    def _places(self) -> list[list[int]]:
-        """Where lines and circles stand among the columns."""
-        return [[k for k, p in enumerate(self.periodic) if p == wanted] for wanted in (False, True)]
-
-    @cached_property
-    def _selections(self) -> list[tuple[slice | list[int], slice | list[int]]]:
-        """Indices of lines and of circles in the coordinates of x, and in the length scales."""
-        return [(as_index([self.columns[k] for k in places]), as_index(places)) for places in self._places]
-
-    def _parts(self, *points: Sequence[Tensor]) -> list[list[Tensor] | None]:
-        """The lines of some points and the circles of others, with their inverse scales; None where there are none."""
-        scales = (self._scales() if self.lengthscale.requires_grad else self._fixed_scales).to(points[1][0])
-        return [
-            [*(t[..., own] for t in some), scales[scaled]] if places else None
-            for some, places, (own, scaled) in zip(points, self._places, self._selections, strict=True)
-        ]
+    def _sides(self) -> list[tuple[slice | list[int], slice | list[int], int]]:
+        """Indices of lines and of circles in the coordinates of x, and in the length scales, and their number."""
+        found = []
+        for wanted in (False, True):
+            places = [k for k, circle in enumerate(self.periodic) if circle == wanted]
+            found.append((as_index([self.columns[k] for k in places]), as_index(places), len(places)))
+        return found
 
     def _scales(self) -> Tensor:
         return (1.0 / self.lengthscale).expand(len(self.columns))
@@ -93,63 +83,58 @@ class FeatureMap:
         with torch.inference_mode(False):  # kept, and used in derivatives later
             return self._scales()
 
+    def _derivatives(self, x: Tensor, order: int) -> Tensor:
+        """The derivative of this order of every feature by its own coordinate: (..., n) -> (..., D)."""
+        scales = (self._scales() if self.lengthscale.requires_grad else self._fixed_scales).to(x)
+        (lines, of_lines, L), (circles, of_circles, C) = self._sides
+        found: list[Tensor] = []
+        if L:
+            at, scale = x[..., lines], scales[of_lines]
+            found.append(at * scale if order == 0 else (scale if order == 1 else 0.0 * scale).expand_as(at))
+        if C:
+            angle, scale = x[..., circles], scales[of_circles]
+            cosine, sine = angle.cos() * scale, angle.sin() * scale
+            found += ([cosine, sine], [-sine, cosine], [-cosine, -sine])[order]
+        return _joined(found)
+
     def lift(self, x: Tensor) -> Tensor:
         """F(x): (..., n) -> (..., D)."""
-        lines, circles, found = *self._parts([x], [x]), []
-        if lines is not None:
-            found.append(lines[0] * lines[1])
-        if circles is not None:
-            angle, scale = circles
-            found += [angle.cos() * scale, angle.sin() * scale]
-        return _joined(found)
+        return self._derivatives(x, 0)
 
     def push(self, x: Tensor, dx: Tensor) -> Tensor:
         """DF(x) dx: (..., n), (..., n) -> (..., D)."""
-        lines, circles, found = *self._parts([dx], [x, dx]), []
-        if lines is not None:
-            found.append(lines[0] * lines[1])
-        if circles is not None:
-            angle, turn, scale = circles
-            found += [-angle.sin() * turn * scale, angle.cos() * turn * scale]
-        return _joined(found)
+        return self._derivatives(x, 1) * self._of_features(dx)
 
     def pull(self, x: Tensor, g: Tensor) -> Tensor:
         """DF(x)^T g: (..., n), (..., D) -> (..., n)."""
-        lines, circles, found = *self._parts([], [x]), []
-        g_line, g_cos, g_sin = self._split(g)
-        if lines is not None:
-            found.append(g_line * lines[0])
-        if circles is not None:
-            angle, scale = circles
-            found.append((angle.cos() * g_sin - angle.sin() * g_cos) * scale)
-        return self._scatter(x, found)
+        return self._gathered(x, self._derivatives(x, 1) * g)
 
     def pull_derivative(self, x: Tensor, dx: Tensor, g: Tensor) -> Tensor:
         """(D^2F(x)[dx])^T g: the derivative of ``pull(x, g)`` along dx at fixed g; (..., n)."""
-        g_line, g_cos, g_sin = self._split(g)
-        found = [torch.zeros_like(g_line)]
-        _, circles = self._parts([], [x, dx])
-        if circles is not None:
-            angle, turn, scale = circles
-            found.append(-(angle.cos() * g_cos + angle.sin() * g_sin) * scale * turn)
-        return self._scatter(x, found)
+        return self._gathered(x, self._derivatives(x, 2) * self._of_features(dx) * g)
 
-    @cached_property
-    def _ordered(self) -> list[int]:
-        return [self.columns[k] for places in self._places for k in places]
+    def _of_features(self, dx: Tensor) -> Tensor:
+        """The change of every feature's own coordinate: (..., n) -> (..., D)."""
+        (lines, _, L), (circles, _, C) = self._sides
+        turned = [dx[..., circles]] * 2 if C else []
+        return _joined([dx[..., lines], *turned] if L else turned)
 
-    def _split(self, g: Tensor) -> Sequence[Tensor]:
-        lines, circles = map(len, self._places)
-        return torch.split(g, [lines, circles, circles], dim=-1)
-
-    def _scatter(self, x: Tensor, parts: list[Tensor]) -> Tensor:
-        """Values on lines and circles as a vector of all n coordinates, zero elsewhere."""
-        values, columns = _joined(parts), self._ordered
-        if isinstance(where := as_index(columns), slice):  # without a copy of the indices to the device
+    def _gathered(self, x: Tensor, values: Tensor) -> Tensor:
+        """Sums of the features of every coordinate, as a vector of all n coordinates, zero elsewhere."""
+        L, C = self._sides[0][2], self._sides[1][2]
+        if C:
+            lines, cosines, sines = values.split([L, C, C], dim=-1)
+            values = torch.cat([lines, cosines + sines], -1) if L else cosines + sines
+        if isinstance(where := self._ordered, slice):  # without a copy of the indices to the device
             before, after = where.start, x.shape[-1] - where.stop
             return torch.nn.functional.pad(values, (before, after)) if before or after else values
         out = torch.zeros((*values.shape[:-1], x.shape[-1]), dtype=values.dtype, device=values.device)
-        return out.index_copy(-1, torch.tensor(columns, dtype=torch.int64, device=out.device), values)
+        return out.index_copy(-1, torch.tensor(where, dtype=torch.int64, device=out.device), values)
+
+    @cached_property
+    def _ordered(self) -> slice | list[int]:
+        """Coordinates of lines, then of circles, as an index."""
+        return as_index(sorted(self.columns, key=lambda c: self.periodic[self.columns.index(c)]))
 
 
 def _joined(parts: list[Tensor]) -> Tensor:

@@ -92,7 +92,7 @@ def residuals(kinematics: Callable[[Tensor], Tensor], places: Places, data: Any)
         (sensor_of(table).errors(table, _predicted(kinematics, table), places), rows)
         for table, rows in rows_of_one_kind(data)
     ]
-    return Evaluations.of(found, len(data), places.found, places.numbers)
+    return Evaluations.of(found, places.found, places.numbers)
 
 
 def check_rows(kinematics: Callable[[Tensor], Tensor], data: Any) -> None:

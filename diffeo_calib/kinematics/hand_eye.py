@@ -88,27 +88,23 @@ class HandEye:
         Raises:
             InputError: a model of points, or one that was registered again.
         """
-        fitted, lever = model.map, model.bodies.pose_lever()
         if model.registration is not None:
             raise InputError.of("the hand-eye transform", expected="a model in the place of its fit")
-        geometry = geometry or model.geometry
+        geometry, lever = geometry or model.geometry, model.bodies.pose_lever()
         set_up, tool = SetUp.of(model, camera), poses_from_marks(geometry.tool[None], lever)
-        carried = tool @ set_up.mount
-        to_pose = pose_directions(tool, lever)[0]  # (6, 9)
-        there = torch.eye(6, dtype=to_pose.dtype, device=to_pose.device)  # from the model's tool
-        there[:3, 3:] = -skew((carried - tool)[0, :3, 3])
-        to_pose = there @ to_pose
-        known = to_pose @ _covariance(fitted, geometry.slices["tool"], set_up.on_tool(geometry.tool)) @ to_pose.mT
-        if set_up.mount_std is not None:
-            own = there @ torch.block_diag(*[tool[0, :3, :3]] * 2) * set_up.mount_std
-            known = known + own @ own.mT
-        standing = inverse_poses((set_up.transform @ geometry.base)[None])[0]
+        carried = (tool @ set_up.mount)[0]
+        from_tool = _at(carried[:3, 3] - tool[0, :3, 3])
+        own = from_tool @ torch.block_diag(*[tool[0, :3, :3]] * 2)  # by a shift and a turn along the axes of the tool
+        by_tool = from_tool @ pose_directions(tool, lever)[0]
+        known = _covariance(model.map, geometry.slices["tool"], by_tool, set_up.columns, own @ set_up.of_mount)
+        known = known + own @ torch.diag(set_up.mount_std.square()) @ own.mT
         # base T(e) for an error twist e: what stands moves by -e, at its place, seen from the base
-        moved = -torch.eye(6, dtype=standing.dtype, device=standing.device)
-        moved[:3, 3:] = skew(standing[:3, 3])
-        found = moved @ _covariance(fitted, geometry.slices["base"], set_up.seen_from(geometry.base)) @ moved.mT
+        standing = inverse_poses((set_up.transform @ geometry.base)[None])[0]
+        by_base, back = -_at(standing[:3, 3]), geometry.base[:3, :3].mT
+        of_base = torch.block_diag(back, back) @ _at(geometry.base[:3, 3]) @ set_up.of_frame
+        found = _covariance(model.map, geometry.slices["base"], by_base, set_up.columns, by_base @ of_base)
         tip, base = geometry.on[0], model.robot.base
-        carried_there = KnownPose(carried[0], known, tip, f"in the frame of '{tip}'", "in_tip")
+        carried_there = KnownPose(carried, known, tip, f"in the frame of '{tip}'", "in_tip")
         standing_there = KnownPose(standing, found, base, "in the robot's base", "in_base")
         return cls(*((carried_there, standing_there) if camera_on_tool else (standing_there, carried_there)))
 
@@ -159,19 +155,20 @@ class SetUp(NamedTuple):
 
     transform: Tensor  # (4, 4) from the model's measuring frame to its own, m
     mount: Tensor  # (4, 4) from what it had on the tool to that of the model, m
-    framed: bool = False  # whether the measuring frame was moved, not what is on the tool
-    # (c,) boolean, the shifts of the fit that move its rows, not those of the others; None for the model's
-    columns: Tensor | None = None
-    # (6, k) shift and turn by each of them, m and rad: of the measuring frame about the model's origin, or of what is
+    columns: Tensor  # (c,) boolean, the shifts of the fit that move its rows, not those of the others
+    # (6, k) shift and turn by each of them, m and rad: of the measuring frame about the model's origin, and of what is
     # on the tool along the axes of the model's tool
-    twists: Tensor | None = None
-    mount_std: Tensor | None = None  # (6,) deviations of what is on the tool where no row of the fit tells of them
+    of_frame: Tensor
+    of_mount: Tensor
+    mount_std: Tensor  # (6,) deviations of what is on the tool where no row of the fit tells of them, else zero
 
     @classmethod
     def of(cls, model: CalibratedKinematics, name: str | None) -> SetUp:
         """By the rows of the set-up in the fit."""
-        eye = torch.eye(4, dtype=model.geometry.base.dtype, device=model.geometry.base.device)
-        here = cls(eye, eye)
+        shared, points = model.map.noise.shared, model.map.fitted_points.unflatten(1, (-1, 3))
+        eye, none = torch.eye(4, dtype=points.dtype, device=points.device), points.new_zeros(6, 0)
+        columns = torch.zeros(shared.shape[2], dtype=torch.bool, device=shared.device)
+        here = cls(eye, eye, columns, none, none, points.new_zeros(6))
         own = next((own for own in model.placement if own.kind in TRANSFORMS and name in own.names), None)
         if name is None or own is None:
             return here
@@ -179,30 +176,19 @@ class SetUp(NamedTuple):
         transform, rows = own.constants[number].view(4, 4), own.rows[own.device == number]
         if bool((transform == eye).all()):
             return here
-        framed = own.kind == SESSION
-        found = here._replace(framed=framed, **{"transform" if framed else "mount": transform})
-        columns, twists = found._shifts(model, rows)
-        if not framed and not bool(columns.any()):
-            return found._replace(mount_std=own.deviations[number])
-        return found._replace(columns=columns, twists=twists)
-
-    def _slopes(self, points: Tensor) -> Tensor:
-        """(M, 9, 6) of points (M, 3, 3), m, by the twists."""
-        return frame_slopes(points, points.new_zeros(3)) if self.framed else own_slopes(points)
-
-    def _shifts(self, model: CalibratedKinematics, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Which shifts (c,) of the fit these rows share alone and are rigid motions, and the twists (6, k) of these."""
-        fitted = model.map
-        shared, points = fitted.noise.shared, fitted.fitted_points.unflatten(1, (-1, 3))
-        others = torch.ones(len(shared), dtype=torch.bool, device=shared.device)
+        framed, others = own.kind == SESSION, torch.ones(len(shared), dtype=torch.bool, device=shared.device)
         others[rows] = False
-        own = shared[rows] * ~(shared[others] != 0).any(1).any(0)
-        columns, twists = own_shifts(own, self._slopes(points[rows]))
-        rigid = int(columns.sum())
-        if rigid != NUMBERS_OF_A_FRAME and bool((own != 0).any()) and (self.framed or rigid):
+        alone = shared[rows] * ~(shared[others] != 0).any(1).any(0)
+        slopes = frame_slopes(points[rows], points.new_zeros(3)) if framed else own_slopes(points[rows])
+        columns, twists = own_shifts(alone, slopes)
+        rigid, still = int(columns.sum()), torch.zeros_like(twists)
+        if rigid != NUMBERS_OF_A_FRAME and bool((alone != 0).any()) and (framed or rigid):
             what = "the hand-eye transform of one of several cameras"
             raise InputError.of(what, expected="a model in the place of its fit", fix="calibrate with all rows")
-        return columns, twists
+        if framed:
+            return here._replace(transform=transform, columns=columns, of_frame=twists, of_mount=still)
+        std = here.mount_std if rigid else own.deviations[number]
+        return here._replace(mount=transform, columns=columns, of_frame=still, of_mount=twists, mount_std=std)
 
     def view(self, poses: Tensor) -> Tensor:
         """What is measured of poses (M, 4, 4) of the model's tool, m."""
@@ -210,41 +196,26 @@ class SetUp(NamedTuple):
 
     def shifted(self, points: Tensor) -> Tensor:
         """(M, 9, k) what its shifts do to points (M, 9) of the model's tool, m."""
-        none = points.new_zeros(*points.shape, 0)
-        return none if self.twists is None else self._slopes(points.unflatten(1, (-1, 3))) @ self.twists
-
-    def seen_from(self, base: Tensor) -> Shifts:
-        """The twists of a base (4, 4) about its origin and along its axes by the shifts; none for the model's frame."""
-        if self.columns is None or self.twists is None or not self.framed:
-            return None
-        shift, turn = self.twists.split(3)
-        there = shift + torch.linalg.cross(turn, base[:3, 3:].expand_as(turn), dim=0)
-        return self.columns, torch.cat([base[:3, :3].mT @ there, base[:3, :3].mT @ turn])
-
-    def on_tool(self, tool: Tensor) -> Shifts:
-        """What the shifts do to points (3, 3) of a frame on the tool, m; none for the model's tool."""
-        if self.columns is None or self.twists is None or self.framed:
-            return None
-        return self.columns, self._slopes(tool[None])[0] @ self.twists
+        own = points.unflatten(1, (-1, 3))
+        return frame_slopes(own, points.new_zeros(3)) @ self.of_frame + own_slopes(own) @ self.of_mount
 
 
-Shifts = tuple[Tensor, Tensor] | None
-"""Numbers (c,) boolean of shifts of a fit, and their effects (k', k)."""
+def _at(place: Tensor) -> Tensor:
+    """(6, 6) from the shift of a body at the origin, and its turn, to those at a place (3,), m."""
+    there = torch.eye(6, dtype=place.dtype, device=place.device)
+    there[:3, 3:] = -skew(place)
+    return there
 
 
-def _covariance(fitted: FittedMap, part: slice, shifts: Shifts = None) -> Tensor:
-    """Posterior covariance of some parameters, m^2 and rad^2, what the rows leave open included.
+def _covariance(fitted: FittedMap, part: slice, slopes: Tensor, columns: Tensor, effects: Tensor) -> Tensor:
+    """(6, 6) of a pose, by some parameters (6, p) and by shifts that rows of the fit shared, columns (c,) (6, k).
 
-    With ``shifts``, columns (c,) and effects (k', k), that of their sum with shifts that rows of the fit shared.
+    What the rows leave open is included.
     """
     numbers = torch.arange(part.start, part.stop, dtype=torch.int64, device=fitted.x.device)
-    still_open = fitted.open_directions[numbers]
-    if shifts is None:
-        known = fitted.parameter_covariance(numbers)
-    else:
-        columns, effects = shifts
-        known = fitted.with_shifts(fitted.parameters_as_points(numbers), effects[None], columns)[0]
-    return known + still_open @ still_open.mT
+    left = slopes @ fitted.open_directions[numbers]
+    at = fitted.parameters_as_points(numbers).projected(slopes[None])
+    return fitted.with_shifts(at, effects[None], columns)[0] + left @ left.mT
 
 
 def _numbers(values: Tensor) -> str:

@@ -23,6 +23,7 @@ from diffeo_calib.runtime.build import ROTARY
 KINDS = (*ROTARY, "prismatic", "fixed")
 LARGEST_OFFSET = 1e6
 """No joint is farther from the one before it [m], and none is geared by more."""
+UNIT_ROUNDING = 1e-15  # of the length of a vector that was divided by it
 SQUARABLE = 1e-100
 """Smaller numbers have squares that may be 0."""
 
@@ -73,7 +74,8 @@ class Joint:
             fix = "give the joint an axis, or make it fixed"
             raise RobotError.of(f"the axis of {what}", expected="a non-zero vector", got="(0, 0, 0)", fix=fix)
         axis = axis / axis.abs().max() if float(axis.abs().max()) < SQUARABLE else axis
-        object.__setattr__(self, "axis", axis / axis.norm())
+        # a unit vector stays as it is, so that models come back from files bit for bit
+        object.__setattr__(self, "axis", axis if abs(float(axis.norm()) - 1.0) < UNIT_ROUNDING else axis / axis.norm())
         if isnan(self.lower) or isnan(self.upper) or self.lower > self.upper:
             got = f"lower {self.lower}, upper {self.upper}"
             raise RobotError.of(f"the limits of {what}", expected="lower <= upper", got=got, fix="correct them")

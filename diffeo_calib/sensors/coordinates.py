@@ -294,7 +294,7 @@ def errors_of_kinds(errors: Tensor, own: Coordinates | None, readings: Sequence[
     for one in readings:
         numbers = errors[one.rows[:, None], one.numbers]
         found.append((OtherDevices.in_unit(one.data, one.devices, numbers), one.rows))
-    return Evaluations.of(found, len(errors))
+    return Evaluations.of(found)
 
 
 def alone(socket: Tensor) -> Tensor:

@@ -209,7 +209,7 @@ class Evaluations(Mapping[str, Evaluation]):
     """Errors of a table of several kinds, each in its own unit: kind of the rows -> its :class:`Evaluation`.
 
     Args:
-        kinds: the evaluations. index: row numbers (M,) of each kind in the table of ``count`` rows.
+        kinds: the evaluations. index: row numbers (M,) of each kind in the table.
         placed: what was found from the judged rows, in sentences, because the model does not know it.
         numbers: how many numbers that took.
     """
@@ -218,16 +218,15 @@ class Evaluations(Mapping[str, Evaluation]):
         self,
         kinds: Mapping[str, Evaluation],
         index: Mapping[str, Tensor],
-        count: int,
         placed: Sequence[str] = (),
         numbers: int = 0,
     ) -> None:
-        self._kinds, self.index, self.total = dict(kinds), dict(index), count
+        self._kinds, self.index = dict(kinds), dict(index)
         self.placed, self.numbers = tuple(placed), numbers
 
     @classmethod
     def of(
-        cls, found: Iterable[tuple[Evaluation, Tensor]], count: int, placed: Sequence[str] = (), numbers: int = 0
+        cls, found: Iterable[tuple[Evaluation, Tensor]], placed: Sequence[str] = (), numbers: int = 0
     ) -> Evaluations:
         """Errors of rows of one kind each, with their row numbers (M,); of several of one kind: distance, distance 2.
 
@@ -238,7 +237,7 @@ class Evaluations(Mapping[str, Evaluation]):
             taken = sum(other.kind == one.kind for other in kinds.values())
             name = f"{one.kind} {taken + 1}" if taken else one.kind
             kinds[name], index[name] = one, rows
-        return cls(kinds, index, count, placed, numbers)
+        return cls(kinds, index, placed, numbers)
 
     def __getitem__(self, kind: str) -> Evaluation:
         return self._kinds[kind]
@@ -262,7 +261,7 @@ class Evaluations(Mapping[str, Evaluation]):
         some = {kind: found for kind, found in some.items() if found.count}
         place = mask.cumsum(0) - 1
         index = {kind: place[self.index[kind][mask[self.index[kind]]]] for kind in some}
-        return Evaluations(some, index, int(mask.sum()), self.placed, self.numbers)
+        return Evaluations(some, index, self.placed, self.numbers)
 
     @property
     def positions(self) -> Evaluation | None:

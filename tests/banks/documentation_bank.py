@@ -12,8 +12,8 @@ from pathlib import Path
 import get_ur10_data
 import torch
 from commanded_bank import bent, drawn, flange, seen, write_columns
+from init_bank import write_socket_table, write_wire_table
 from product_bank import simulated, simulated_poses
-from trackerless_bank import write_socket_table, write_wire_table
 
 import diffeo_calib as dc
 from diffeo_calib.measurements.csv.files import write_measurements

@@ -172,17 +172,17 @@ _PER_JOINT_TERMS = tuple(
     for j, (s, v) in enumerate(((0.7, 0.5), (0.9, 1.5), (1.2, 0.8)))
 )
 
+CIRCULAR = circle(1) * line(1) * circle(1)
 CASES = (
-    Case("gaussian", dc.Gaussian(0.8, 1.3), line(2), (_ard(gaussian, (0.8, 0.8), (1.3, 1.3)),)),
     Case(
-        "gaussian-ard",
+        "gaussian",
         dc.Gaussian([0.8, 1.1, 0.6], [1.3, 0.0, 2.0]),
         line(3),
         (_ard(gaussian, (0.8, 1.1, 0.6), (1.3, 0.0, 2.0)),),
     ),
     *(
         Case(f"matern-{nu}", dc.Matern(0.9, nu, 0.7), line(2), (_ard(matern(nu), (0.9, 0.9), (0.7, 0.7)),))
-        for nu in (1.5, 2.5, 3.5)
+        for nu in (1.5, 3.5)
     ),
     Case(
         "matern-mixed",
@@ -190,17 +190,15 @@ CASES = (
         MIXED,
         (_ard(matern(2.5), (0.9, 1.1, 0.7), (1.4, 1.4, 1.4)),),
     ),
-    Case("cauchy", dc.Cauchy([0.9, 1.4], 0.6), line(2), (_ard(cauchy, (0.9, 1.4), (0.6, 0.6)),)),
     Case(
         "cauchy-mixed",
-        dc.Cauchy(0.9, [0.6, 1.0, 1.2], space=circle(1) * line(1) * circle(1)),
-        circle(1) * line(1) * circle(1),
+        dc.Cauchy(0.9, [0.6, 1.0, 1.2], space=CIRCULAR),
+        CIRCULAR,
         (_ard(cauchy, (0.9, 0.9, 0.9), (0.6, 1.0, 1.2)),),
     ),
     Case("constant", constant_kernel([0.4, 0.9]), line(2), (_ard(constant, (1.0, 1.0), (0.4, 0.9)),)),
-    Case("von-mises", dc.VonMises(1.3, 2.0), circle(2), (_von_mises((1.3, 1.3), (2.0, 2.0)),)),
     Case(
-        "von-mises-ard",
+        "von-mises",
         dc.VonMises((0.7, 1.9, 0.3), (2.0, 1.0, 0.5)),
         circle(3),
         (_von_mises((0.7, 1.9, 0.3), (2.0, 1.0, 0.5)),),
@@ -276,17 +274,6 @@ def rows_jacobian(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
     y = function(x)
     grads = [torch.autograd.grad(y[:, k].sum(), x, retain_graph=True)[0] for k in range(y.shape[1])]
     return torch.stack(grads, 1)
-
-
-def inverse_of(flow: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
-    """The points x with flow(x) = y, by Newton's method with autograd Jacobians: (M, n) -> (M, n)."""
-    x = 2 * y - flow(y)
-    for _ in range(8):
-        step = torch.linalg.solve(rows_jacobian(flow, x), y - flow(x))
-        x = x + step
-        if float(step.abs().max()) < 1e-14:
-            break
-    return x
 
 
 def slopes(errors: list[float]) -> list[float]:

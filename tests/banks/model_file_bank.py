@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
@@ -34,11 +33,6 @@ def planar(kernel_x: Kernel | None = None, kernel_y: Kernel | None = None, rows:
         noise=0.02,
     )
     return dc.fit(problem, integrator=dc.RK4(2))
-
-
-def header_of(path: Path) -> dict[str, Any]:
-    with safe_open(path, framework="pt") as file:
-        return json.loads(file.metadata()[model_file.ENTRY])
 
 
 def refused(path: Path) -> str:

@@ -57,54 +57,57 @@ def covered(model: dc.CalibratedKinematics, data: dc.Measurements) -> float:
     return float(((away.mT @ torch.linalg.solve(covariance, away)) < 7.815).double().mean())
 
 
+USUAL: dict[str, float | tuple[float, ...]] = {
+    "transmission_lengthscale": 0.7,
+    "transmission_amplitude": 3e-4,
+    "coupled_lengthscale": 1.5,
+    "coupled_amplitude": 3e-5,
+    "joint_noise": 1e-5,
+    "task_lengthscale": 1.0,
+    "task_amplitude": 1e-5,
+    "sensor_noise": 1.5e-5,
+    "rotation_noise": 5e-5,
+    "translation_errors": 5e-4,
+    "rotation_errors": 3e-4,
+    "compliance": 5e-4,
+    "lateral_compliance": 1e-4,
+    "gravity": (0.1, 0.1, 1.8),
+}
+ONE = ("task_lengthscale", "task_amplitude", "sensor_noise", "rotation_noise", "translation_errors", "rotation_errors")
+"""Scales of which a robot has one."""
+
+
+def scales_of(joints: int, moving: int, **changed: float | tuple[float, ...]) -> dc.Hyperparameters:
+    """Usual scales of a robot, some of them changed."""
+
+    def sized(name: str, value: float | tuple[float, ...]) -> Tensor:
+        found = torch.tensor(value, dtype=torch.float64)
+        count = moving if name.endswith("compliance") else joints
+        return found if name in ONE or found.ndim else found.repeat(count)
+
+    return dc.Hyperparameters(**{name: sized(name, value) for name, value in {**USUAL, **changed}.items()})
+
+
 def usual_scales(robot: dc.Tree) -> dc.Hyperparameters:
     """Scales such as the search finds for the simulated robots; with these a calibration takes a third of the time."""
-
-    def full(count: int, value: float) -> Tensor:
-        return torch.full((count,), value, dtype=torch.float64)
-
-    def one(value: float) -> Tensor:
-        return torch.tensor(value, dtype=torch.float64)
-
-    return dc.Hyperparameters(
-        transmission_lengthscale=full(robot.n, 0.7),
-        transmission_amplitude=full(robot.n, 3e-4),
-        coupled_lengthscale=full(robot.n, 1.5),
-        coupled_amplitude=full(robot.n, 3e-5),
-        joint_noise=full(robot.n, 1e-5),
-        task_lengthscale=one(1.0),
-        task_amplitude=one(1e-5),
-        sensor_noise=one(1.5e-5),
-        rotation_noise=one(5e-5),
-        translation_errors=one(5e-4),
-        rotation_errors=one(3e-4),
-        compliance=full(robot.moving, 5e-4),
-        lateral_compliance=full(robot.moving, 1e-4),
-        gravity=torch.tensor([0.1, 0.1, 1.8], dtype=torch.float64),
-    )
+    return scales_of(robot.n, robot.moving)
 
 
 def ur10_scales() -> dc.Hyperparameters:
     """Scales such as the search finds for the measured UR10; tests/calibration/test_hardware.py searches them."""
-
-    def each(*values: float) -> Tensor:
-        return torch.tensor(values, dtype=torch.float64)
-
-    return dc.Hyperparameters(
-        transmission_lengthscale=each(0.08, 0.07, 0.06, 0.1, 0.05, 0.2),
-        transmission_amplitude=each(4e-4, 4e-4, 3e-4, 5e-4, 5e-4, 6e-4),
-        coupled_lengthscale=each(2.0, 1.2, 1.5, 1.0, 2.0, 1.3),
-        coupled_amplitude=each(3e-5, 7e-5, 2e-4, 2e-4, 1e-4, 6e-4),
-        joint_noise=each(2e-5, 6e-5, 5e-5, 1e-4, 3e-5, 3e-4),
-        task_lengthscale=each(0.8)[0],
-        task_amplitude=each(1.5e-5)[0],
-        sensor_noise=each(2e-5)[0],
-        rotation_noise=each(7e-5)[0],
-        translation_errors=each(4e-4)[0],
-        rotation_errors=each(6e-4)[0],
-        compliance=each(7e-5, 1.5e-4, 1.7e-4, 7e-4, 1.3e-3, 1.3e-3),
-        lateral_compliance=each(2e-5, 3e-5, 3e-5, 1e-4, 3e-4, 4e-4),
-        gravity=each(0.2, 0.2, 2.9),
+    return scales_of(
+        6,
+        6,
+        transmission_lengthscale=(0.08, 0.07, 0.06, 0.1, 0.05, 0.2),
+        transmission_amplitude=(4e-4, 4e-4, 3e-4, 5e-4, 5e-4, 6e-4),
+        coupled_lengthscale=(2.0, 1.2, 1.5, 1.0, 2.0, 1.3),
+        coupled_amplitude=(3e-5, 7e-5, 2e-4, 2e-4, 1e-4, 6e-4),
+        joint_noise=(2e-5, 6e-5, 5e-5, 1e-4, 3e-5, 3e-4),
+        **{"task_lengthscale": 0.8, "task_amplitude": 1.5e-5, "sensor_noise": 2e-5, "rotation_noise": 7e-5},
+        **{"translation_errors": 4e-4, "rotation_errors": 6e-4},
+        compliance=(7e-5, 1.5e-4, 1.7e-4, 7e-4, 1.3e-3, 1.3e-3),
+        lateral_compliance=(2e-5, 3e-5, 3e-5, 1e-4, 3e-4, 4e-4),
+        gravity=(0.2, 0.2, 2.9),
     )
 
 

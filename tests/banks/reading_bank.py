@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
+from product_bank import scales_of
 from tangent_bank import normal
 from torch import Tensor
 
@@ -64,18 +65,9 @@ def readings(
 
 def scales() -> dc.Hyperparameters:
     """Roughly those of the simulated arm."""
-
-    def each(value: float, *shape: int) -> Tensor:
-        return torch.full(shape, value, dtype=torch.float64)
-
-    return dc.Hyperparameters(
-        each(0.6, 6),
-        each(3e-4, 6),
-        each(1.5, 6),
-        each(3e-5, 6),
-        *(each(1e-6, 6), each(1.0), each(2e-5), each(2e-5), each(1e-4), each(5e-4), each(5e-4)),
-        *(each(2e-4, 6), each(1e-5, 6), each(1.0, 3)),
-    )
+    noise = {"joint_noise": 1e-6, "task_amplitude": 2e-5, "sensor_noise": 2e-5, "rotation_noise": 1e-4}
+    loads = {"compliance": 2e-4, "lateral_compliance": 1e-5, "gravity": (1.0, 1.0, 1.0)}
+    return scales_of(6, 6, transmission_lengthscale=0.6, rotation_errors=5e-4, **noise, **loads)
 
 
 def reading_errors(result: CalibrationResult, data: dc.Readings, stage: str = STAGES[-1]) -> Tensor:

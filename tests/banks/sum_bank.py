@@ -24,7 +24,6 @@ ROWS, COLUMNS, FEATURES, OUTPUTS = 7, 5, 3, 2
 FAR = float(1 << 20)
 PROFILES = (GaussianProfile(), CauchyProfile(), ConstantProfile(), *(MaternProfile(nu) for nu in (1.5, 2.5, 3.5)))
 
-every_profile = pytest.mark.parametrize("profile", PROFILES, ids=lambda p: f"{type(p).__name__}{getattr(p, 'nu', '')}")
 needs_llvmlite = pytest.mark.skipif(find_spec("llvmlite") is None, reason="llvmlite is not installed")
 torch_backends = pytest.mark.parametrize("backend", ["dense", "tiled", pytest.param("fused", marks=needs_llvmlite)])
 

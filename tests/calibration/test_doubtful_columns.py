@@ -3,30 +3,29 @@
 from __future__ import annotations
 
 import math
-import warnings
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from kind_bank import kind_named, marked
-from product_bank import Case, simulated
-from table_bank import warned
+from product_bank import Case, simulated, with_usual_scales
+from table_bank import refused, warned
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.outliers import stuck_columns
+from diffeo_calib.calibration.diagnostics.outliers import stuck_columns, warn_of_stuck
 from diffeo_calib.calibration.diagnostics.plausibility import (
     check_identification,
     check_markers,
     marker_column,
     quantum,
     unmeasured_markers,
-    warn_of_rounding,
 )
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.placing.place import place
-from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.csv.lines import write_rows
 from diffeo_calib.measurements.rows import with_attributes
@@ -37,10 +36,7 @@ from diffeo_calib.robots import Geometry, Joint, SimulatedArm, from_dh
 
 HELD = {
     "positions": ("position", "z"),
-    "hidden markers": ("position", "marker3_z"),
     "poses": ("pose", "z"),
-    "heights": ("height", "height"),
-    "images": ("image", "v"),
     "images and a tracker": ("marker", "marker 2"),
     "inclinations": ("inclination", "inclination 2"),
 }
@@ -67,19 +63,14 @@ def stuck(data: Any, kind: str) -> Any:
     return with_attributes(data, points=points)
 
 
-def named(robot: dc.Tree, data: Any, scales: dc.Hyperparameters) -> str:
-    """The warning about columns of one value."""
-    with pytest.warns(DiffeoCalibWarning) as caught:
-        dc.calibrate(robot, data, hyperparameters=scales)
-    return next(str(one.message) for one in caught if "one value" in str(one.message))
-
-
 @pytest.mark.parametrize("name", marked(*HELD))
 def test_a_stuck_column_is_named(name: str) -> None:
-    kind = kind_named(name)
-    rows, column = HELD[name]
+    """Before a calibration chooses scales and fits."""
+    kind, (rows, column) = kind_named(name), HELD[name]
     data = stuck(kind.data, rows)
-    assert f"'{column}' of the {rows}s" in named(kind.robot, data, kind.scales)
+    placed, _ = warned(place, kind.robot, data, silent)
+    (text,) = warned(warn_of_stuck, placed.tangent_data(), stuck_columns(data))[1]
+    assert f"'{column}' of the {rows}s" in text
 
 
 def planar_rows(wrong: int = 0) -> tuple[Any, dc.Measurements]:
@@ -99,27 +90,27 @@ def planar_rows(wrong: int = 0) -> tuple[Any, dc.Measurements]:
 def test_the_height_of_a_planar_robot_may_be_one_value(wrong: int) -> None:
     robot, data = planar_rows(wrong)
     assert [one.words for one in stuck_columns(data)] == ["'z' of the positions"]
-    found, texts = warned(dc.calibrate, robot, data)
+    found, texts = warned(with_usual_scales, robot, data)
     assert len(found.outliers) >= 0.8 * wrong
-    assert wrong or not any("one value" in one for one in texts)
+    assert any("one value" in one for one in texts) == bool(wrong)
 
 
-def test_deviations_and_a_few_rows_are_no_stuck_columns() -> None:
+def test_deviations_and_a_few_rows_are_no_stuck_columns_and_others_are() -> None:
     data = kind_named("positions").data
     assert stuck_columns(with_attributes(data, std=torch.full_like(data.points, 2e-5))) == []
     assert stuck_columns(stuck(data.rows(slice(5)), "position")) == []
+    for name, rows, column in (("heights", "height", "height"), ("images", "image", "v")):
+        (found,) = stuck_columns(stuck(kind_named(name).data, rows))
+        assert f"'{column}' of the {rows}s" in found.words
+    hidden = kind_named("hidden markers")
+    _, texts = warned(dc.calibrate, hidden.robot, stuck(hidden.data, "position"), hyperparameters=hidden.scales)
+    assert any("'marker3_z' of the positions holds one value" in one for one in texts)
 
 
 # --- joint values with few digits -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("step", "words"),
-    [
-        (5e-4, "0.0005 rad"),
-        (math.radians(0.01), "0.01 degrees"),
-    ],
-)
+@pytest.mark.parametrize(("step", "words"), [(5e-4, "0.0005 rad"), (math.radians(0.01), "0.01 degrees")])
 def test_the_step_of_a_column(step: float, words: str, arm: Case) -> None:
     values = (arm.train.q[:, 1] / step).round() * step
     assert quantum(values, turning=True) == (pytest.approx(step), words)
@@ -130,25 +121,15 @@ def test_the_step_of_a_column(step: float, words: str, arm: Case) -> None:
     assert quantum(values, turning=False) == (pytest.approx(1e-3), "1 mm")
 
 
-def test_values_commanded_with_few_digits_are_right(arm: Case) -> None:
-    """Their rounding would cause far larger errors than remain."""
-    tangent = place(arm.robot, arm.train, silent).tangent_data()
-    for step in (1e-2, 1e-6):  # or far smaller ones
-        data = dc.Measurements((arm.train.q / step).round() * step, arm.train.points)
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            warn_of_rounding(arm.robot, data, tangent, arm.result.leave_one_out)
-
-
-@pytest.mark.slow
-def test_readings_rounded_to_a_milliradian() -> None:
+@pytest.mark.parametrize("step", [1e-2, 1e-3, 1e-6])
+def test_rounded_joint_values_are_warned_about_where_they_cause_the_error(step: float) -> None:
+    """Those of 1e-2 were commanded, and reached: their rounding would cause far larger errors than remain."""
     arm, train, _ = simulated(40)
-    data = dc.Measurements((1e3 * train.q).round() / 1e3, train.points)
-    words = (
-        r"waist_joint, .*, wrist_roll_joint are rounded to 0.001 rad: .* got 0\.\d+ mm RMS of position error from this"
-    )
-    with pytest.warns(DiffeoCalibWarning, match=words):
-        dc.calibrate(arm.nominal, data)
+    q = (train.q / step).round() * step
+    points = arm.true_points(q) + 2e-5 * torch.randn(40, 1, 3, dtype=q.dtype) if step > 1e-3 else train.points
+    words = r"waist_joint, .*, wrist_roll_joint are rounded to 0.001 rad: .* got 0\.\d+ mm RMS of position error"
+    _, texts = warned(with_usual_scales, arm.nominal, dc.Measurements(q, points))
+    assert [bool(re.search(words, one)) for one in texts if "rounded" in one] == [True] * (step == 1e-3)
 
 
 # --- a column that nobody read names the marker of each row -----------------------------------------------------------
@@ -166,20 +147,20 @@ def labelled(path: Path, points: Tensor, labels: Tensor, q: Tensor = Q) -> dc.Me
     return dc.read_measurements(path, ARM.nominal, ["x", "y", "z"], length="m", angle="rad", duplicates="keep")
 
 
-def marker_of(data: dc.Measurements) -> tuple[str, str] | None:
-    return marker_column(register(ARM.nominal, data.q, data.points).geometry, data)
-
-
 def test_several_markers_are_told_by_their_column(tmp_path: Path) -> None:
     data = labelled(tmp_path / "t.csv", POINTS[torch.arange(ROWS), LABELS], LABELS)
-    found: Any = marker_of(data)
-    assert found[0] == "target"
-    tool = ARM.truth.tool
-    jump = 1e3 * float(torch.cdist(tool, tool).max())
-    assert found[1].startswith("3 values between which the points jump by")
-    assert abs(float(found[1].split("jump by ")[1].split(" mm")[0]) / jump - 1.0) < 0.1
-    with pytest.raises(MeasurementError, match=r"column 'target' takes 3 values.* name the column: --marker target"):
-        check_identification(data, register(ARM.nominal, data.q, data.points))
+    start = register(ARM.nominal, data.q, data.points)
+    column, words = marker_column(start.geometry, data) or ("", "")
+    found = re.match(r"3 values between which the points jump by ([\d.]+) mm", words)
+    assert column == "target"
+    assert found is not None
+    assert float(found[1]) == pytest.approx(1e3 * float(torch.cdist(ARM.truth.tool, ARM.truth.tool).max()), rel=0.1)
+    refused(
+        (
+            r"column 'target' takes 3 values.* name the column: --marker target",
+            lambda: check_identification(data, start),
+        )
+    )
 
 
 @pytest.mark.parametrize("case", ["no jump", "other labels", "device", "mass", "repeated poses"])
@@ -196,78 +177,65 @@ def test_other_columns_name_no_marker(case: str, tmp_path: Path) -> None:
     elif case == "repeated poses":
         q, labels = Q[:9].repeat(5, 1), torch.arange(9).repeat(5)
         points = ARM.true_points(q)[:, 0]
-    assert marker_of(labelled(tmp_path / "t.csv", points, labels, q)) is None
+    data = labelled(tmp_path / "t.csv", points, labels, q)
+    assert marker_column(register(ARM.nominal, data.q, data.points).geometry, data) is None
 
 
 # --- markers that nobody measured -------------------------------------------------------------------------------------
 
 PAIR = SimulatedArm(seed=5, markers=2)
-UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+PAIR_ROWS = dc.Measurements(*PAIR.measure(40, seed=1), PAIR.nominal.joint_names)
+FIRST = PAIR_ROWS.points[:, 0]
 
 
-def pair_rows(count: int = 40) -> dc.Measurements:
-    q, points = PAIR.measure(count, seed=1)
-    return dc.Measurements(q, points, PAIR.nominal.joint_names)
+def pair(first: Tensor, second: Tensor) -> dc.Measurements:
+    return dc.Measurements(PAIR_ROWS.q, torch.stack([first, second], 1), PAIR_ROWS.joint_names)
 
 
-def with_second(points: torch.Tensor) -> dc.Measurements:
-    data = pair_rows(len(points))
-    return dc.Measurements(data.q, torch.stack([data.points[:, 0], points], 1), data.joint_names)
-
-
-def wished(digits: int, reached: float = 0.0) -> torch.Tensor:
+def wished(digits: int, reached: float = 0.0) -> Tensor:
     """Places of the nominal robot in another frame, to so many digits of a mm, at joint values reached so well, rad."""
-    q = pair_rows().q
-    q = q + reached * torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype)
-    poses = PAIR.nominal(q)
+    q = PAIR_ROWS.q
+    poses = PAIR.nominal(q + reached * torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype))
     at = poses[:, :3, :3] @ poses.new_tensor([0.02, 0.03, 0.1]) + poses[:, :3, 3]
     turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.3, 0.1], [0.3, 0.0, 0.2], [-0.1, -0.2, 0.0]], dtype=q.dtype))
     return ((at @ turn.mT + 0.4) * 10.0 ** (3 + digits)).round() / 10.0 ** (3 + digits)
 
 
-def test_measured_markers_are_silent() -> None:
-    assert not list(unmeasured_markers(PAIR.nominal, pair_rows()))
-    assert not list(unmeasured_markers(PAIR.nominal, pair_rows(8)))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_markers(PAIR.nominal, pair_rows())
-
-
-@pytest.mark.parametrize("digits", [2, 9])
-def test_places_of_the_nominal_robot_are_refused(digits: int) -> None:
-    data = with_second(wished(digits))
-    with pytest.raises(MeasurementError, match=r"marker 1 follows the nominal robot to 0\.00.* mm, another one to"):
-        dc.calibrate(PAIR.nominal, data)
+def test_markers_that_are_no_measurements_are_refused() -> None:
+    """Wished places, and copies, also shifted ones; measured markers are silent."""
+    follows, copy = (
+        r"marker 1 follows the nominal robot to 0\.00.* mm, another one to",
+        "marker 1 is a copy of marker 0",
+    )
+    shifted = FIRST + torch.tensor([0.1, 0.0, 0.2], dtype=FIRST.dtype)
+    refused(
+        (follows, lambda: dc.calibrate(PAIR.nominal, pair(FIRST, wished(2)))),
+        (follows, lambda: check_markers(PAIR.nominal, pair(FIRST, wished(9)))),
+        (copy, lambda: dc.calibrate(PAIR.nominal, pair(FIRST, FIRST.clone()))),
+        (f"{copy}, shifted by the same", lambda: check_markers(PAIR.nominal, pair(FIRST, shifted))),
+    )
+    hidden = FIRST.clone()
+    hidden[::2] = torch.nan
+    assert [one.proved for one in unmeasured_markers(PAIR.nominal, pair(FIRST, hidden))] == [True]
+    for rows in (PAIR_ROWS, PAIR_ROWS.rows(slice(8))):
+        assert not list(unmeasured_markers(PAIR.nominal, rows))
 
 
 def test_a_marker_that_is_near_the_nominal_robot_is_measured_where_the_other_one_does_not_belong() -> None:
     """A robot with errors of micrometres, and a marker that is not on its tip: no proof against the first."""
-    data = with_second(wished(4, reached=3e-5))
+    near = wished(4, reached=3e-5)
     with pytest.warns(DiffeoCalibWarning, match="marker 1 follows the nominal robot"):
-        check_markers(PAIR.nominal, data)
-    elsewhere = PAIR.nominal(data.q.roll(1, 0))[:, :3, 3]
-    points = torch.stack([elsewhere, data.points[:, 1]], 1)
-    assert not list(unmeasured_markers(PAIR.nominal, dc.Measurements(data.q, points, data.joint_names)))
+        check_markers(PAIR.nominal, pair(FIRST, near))
+    elsewhere = PAIR.nominal(PAIR_ROWS.q.roll(1, 0))[:, :3, 3]
+    assert not list(unmeasured_markers(PAIR.nominal, pair(elsewhere, near)))
 
 
 def test_markers_above_each_other_on_a_robot_that_turns_about_one_axis_are_two() -> None:
-    joints = [
-        Joint(f"j{k}", "revolute", torch.eye(4, dtype=torch.float64), UP, lower=-2.0, upper=2.0) for k in range(2)
-    ]
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    joints = [Joint(f"j{k}", "revolute", torch.eye(4, dtype=torch.float64), up, lower=-2.0, upper=2.0) for k in (0, 1)]
     joints[1].origin[0, 3] = 0.4
-    robot, shift = dc.Chain("planar", "base", "tip", joints), torch.tensor([0.0, 0.0, 0.1], dtype=torch.float64)
+    robot = dc.Chain("planar", "base", "tip", joints)
     q = 4.0 * torch.rand(40, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 2.0
     poses = robot(q)
     first = poses[:, :3, 3] + 0.3 * poses[:, :3, 0] + 1e-3 * torch.sin(q[:, :1])
-    assert not list(unmeasured_markers(robot, dc.Measurements(q, torch.stack([first, first + shift], 1))))
-
-
-def test_copies_are_refused_also_shifted_ones() -> None:
-    first = pair_rows().points[:, 0]
-    with pytest.raises(MeasurementError, match="marker 1 is a copy of marker 0"):
-        dc.calibrate(PAIR.nominal, with_second(first.clone()))
-    with pytest.raises(MeasurementError, match="copy of marker 0, shifted by the same"):
-        check_markers(PAIR.nominal, with_second(first + torch.tensor([0.1, 0.0, 0.2], dtype=first.dtype)))
-    hidden = first.clone()
-    hidden[::2] = torch.nan
-    assert [one.proved for one in unmeasured_markers(PAIR.nominal, with_second(hidden))] == [True]
+    assert not list(unmeasured_markers(robot, dc.Measurements(q, torch.stack([first, first + 0.1 * up], 1))))

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from kind_bank import kind_named
 from product_bank import simulated, sliding_robot
 from table_bank import refused
 from tangent_bank import Setting, covariance
@@ -27,7 +28,6 @@ from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.interop.numpy_model import load_numpy
-from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.process.scales import DEVIATIONS, SCALES, Hyperparameters, axis_deviations
 from diffeo_calib.process.tails import Tails
@@ -38,61 +38,38 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.runtime.build import axis_waves
 from diffeo_calib.runtime.chain import Waves, wave_angles
 
-ROWS = 16
+# --- scales of other robots of the same type --------------------------------------------------------------------------
 
 
-def measured(seed: int) -> tuple[SimulatedArm, dc.Measurements]:
-    arm = SimulatedArm(seed=seed)
-    return arm, dc.Measurements(*arm.measure(ROWS))
+def test_scales_are_those_of_the_other_model_but_for_one_factor() -> None:
+    kind, arm = kind_named("positions"), SimulatedArm(seed=0)
+    found = dc.calibrate(arm.nominal, dc.Measurements(*arm.measure(16)), scales_of=[kind.model]).selection
+    factor = float(found.scales.sensor_noise / kind.scales.sensor_noise)
+    assert_close(found.scales.vector, kind.scales.inflated(factor).vector, rtol=1e-9, atol=0)
+    assert "1 other model" in found.status
 
 
-@pytest.fixture(scope="module")
-def first() -> dc.CalibrationResult:
-    arm, data = measured(0)
-    return dc.calibrate(arm.nominal, data)
-
-
-@pytest.fixture(scope="module")
-def second(first: dc.CalibrationResult) -> dc.CalibrationResult:
-    arm, data = measured(1)
-    return dc.calibrate(arm.nominal, data, scales_of=[first.model])
-
-
-def with_scales(model: CalibratedKinematics, scales: torch.Tensor | None) -> CalibratedKinematics:
-    return model.changed(scales=scales)
-
-
-def test_scales_are_those_of_the_other_model_but_for_one_factor(
-    first: dc.CalibrationResult, second: dc.CalibrationResult
-) -> None:
-    ours, theirs = second.selection.scales, first.selection.scales
-    factor = float(ours.sensor_noise / theirs.sensor_noise)
-    torch.testing.assert_close(ours.vector, theirs.inflated(factor).vector)
-    assert "1 other model" in second.selection.status
-
-
-def test_means_are_quadratic_of_deviations_and_geometric_of_others(first: dc.CalibrationResult) -> None:
-    scales, model = first.selection.scales, first.model
-    larger = with_scales(model, scales.vector * 7.0)
-    mean = scales_of_models([model, larger], scales)
+def test_means_are_quadratic_of_deviations_and_geometric_of_others() -> None:
+    scales, model = kind_named("positions").scales, kind_named("positions").model
+    mean = scales_of_models([model, model.changed(scales=scales.vector * 7.0)], scales)
     for name in SCALES:
-        expected = 5.0 if name in DEVIATIONS else 7.0**0.5
-        torch.testing.assert_close(getattr(mean, name), expected * getattr(scales, name))
+        assert_close(
+            getattr(mean, name), (5.0 if name in DEVIATIONS else 7.0**0.5) * getattr(scales, name), rtol=1e-9, atol=0
+        )
 
 
-def test_unusable_models_are_refused(first: dc.CalibrationResult) -> None:
-    arm, data = measured(1)
-    planar, model, wrong = from_dh([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), first.model, "model"
+def test_unusable_models_are_refused() -> None:
+    kind, planar = kind_named("positions"), from_dh([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
 
-    def calibrated(scales_of: Any, robot: dc.Chain = arm.nominal, **more: Any) -> Callable[[], object]:
-        return lambda: dc.calibrate(robot, data, scales_of=scales_of, **more)
+    def calibrated(scales_of: Any, robot: dc.Tree = kind.robot, **more: Any) -> Callable[[], object]:
+        return lambda: dc.calibrate(robot, kind.data, scales_of=scales_of, **more)
 
     refused(
-        (r"scales_of.*2 joints.*6 joints", calibrated([model], planar)),
-        (r"model 2.*calibrated robot.*str", calibrated([model, wrong])),
-        (r"scales_of.*list", calibrated(model)),
-        (r"model 1 has no scales", calibrated([with_scales(model, None)])),
-        (r"hyperparameters.*scales_of", calibrated([model], hyperparameters=first.selection.scales)),
+        (r"scales_of.*2 joints.*6 joints", calibrated([kind.model], planar)),
+        (r"model 2.*calibrated robot.*str", calibrated([kind.model, "model"])),
+        (r"scales_of.*list", calibrated(kind.model)),
+        (r"model 1 has no scales", calibrated([kind.model.changed(scales=None)])),
+        (r"hyperparameters.*scales_of", calibrated([kind.model], hyperparameters=kind.scales)),
     )
 
 
@@ -101,7 +78,7 @@ def test_unusable_models_are_refused(first: dc.CalibrationResult) -> None:
 LINES = ((2, 200.3, 1e-4), (0, 121.0, 8e-5))
 
 
-def drawn(lines: object = LINES, *, q: Tensor | None = None, seed: int = 0) -> tuple[TangentData, Hyperparameters]:
+def drawn(lines: Any = LINES, *, q: Tensor | None = None, seed: int = 0) -> tuple[TangentData, Hyperparameters]:
     """Measurements of the model itself, drawn from its prior, with gear lines in addition; 150 poses by default."""
     arm = SimulatedArm(1)
     q = arm.sample(150, seed=3) if q is None else q
@@ -218,8 +195,8 @@ def test_the_prior_of_an_axis_is_that_of_functions_with_its_size() -> None:
     own = {"axes": ((2, -3.0, 3.0, 10),), "axis_errors": errors, "axis_lengthscale": length}
     scales, data = replace(setting.scales, **own), setting.tangent_data
     with_axis = data.with_position_errors(scales)
-    assert_close(scales.from_logarithms(scales.logarithms()).axis_errors, errors)
-    assert_close(scales.inflated(2.0).axis_errors, 2.0 * errors)
+    assert_close(scales.from_logarithms(scales.logarithms()).axis_errors, errors, rtol=1e-12, atol=0)
+    assert_close(scales.inflated(2.0).axis_errors, 2.0 * errors, rtol=1e-12, atol=0)
     assert_close(scales.with_vector(setting.scales.vector).axis_lengthscale, length)
     waves = Waves(*map(torch.from_numpy, axis_waves(scales.axes, 6)))
     deviations = axis_deviations(errors[0], length[0], 10).view(10, 6)
@@ -248,6 +225,7 @@ def configurations(rows: int, seed: int) -> Tensor:
     return torch.from_numpy(rng.uniform((-2, -2, 0, -2, -2, -2), (2, 2, 0.6, 2, 2, 2), (rows, 6)))
 
 
+@pytest.mark.slow
 def test_a_bent_slide_is_part_of_the_model(tmp_path: Path) -> None:
     """True errors and regions at other poses; beyond the measured range regions widen; files hold all."""
     robot, q, new = sliding_robot(), configurations(60, 1), configurations(200, 2)

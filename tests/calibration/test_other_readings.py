@@ -125,11 +125,9 @@ def test_a_wrong_column(tmp_path: Path) -> None:
         one for one in other_columns(arm.nominal, read) if "'shoulder_joint' fits as shoulder_joint in pl" in one.words
     ]
     torch.testing.assert_close(right[0].q, data.q, rtol=1e-12, atol=1e-12)
-    assert read.origin.numeric_columns(read.line_numbers)["load"].tolist() == [row[1] for row in noise]
-    path.write_text("another file\n")
-    assert read.origin.numeric_columns(read.line_numbers) == {}
-    path.unlink()
-    assert read.origin.numeric_columns(read.line_numbers) == {}
+    for changed in (lambda: path.write_text("another file\n"), path.unlink):
+        changed()
+        assert read.origin.numeric_columns(read.line_numbers) == {}
 
 
 @pytest.mark.slow
@@ -156,15 +154,11 @@ def with_joint(q: Tensor, joint: int, factor: float, offset: float = 0.0) -> Ten
 
 
 MISTAKES: dict[str, Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]] = {
-    "100 times too small": lambda q, y: (q, 0.01 * y),
-    "10 times too large": lambda q, y: (q, 10 * y),
     "1000 times too large": lambda q, y: (q, 1e3 * y),
     "radians that were converted": lambda q, y: (q.deg2rad(), y),
     "seems to be left-handed": lambda q, y: (q, y[..., [1, 0, 2]]),
     "joints='waist_joint,shoulder_joint,wrist_bend_joint,": lambda q, y: (q[:, [0, 1, 4, 3, 2, 5]], y),
     "pi/180*{elbow_joint},": lambda q, y: (with_joint(q, 2, 180 / math.pi), y),
-    "-{shoulder_joint}": lambda q, y: (with_joint(q, 1, -1.0), y),
-    "-{wrist_roll_joint}": lambda q, y: (with_joint(q, 5, -1.0), y),
     ",{elbow_joint}-90,": lambda q, y: (with_joint(q, 2, 1.0, math.pi / 2), y),
     "-{elbow_joint}": lambda q, y: (with_joint(with_joint(q, 2, -1.0), 4, -1.0), y),
 }
@@ -185,6 +179,7 @@ def test_joints_of_a_slide() -> None:
     assert "1000 times too small: check their unit (`joint_length`)" in advice(robot, read)
 
 
+@pytest.mark.slow
 def test_hidden_markers_do_not_spoil_a_diagnosis(tmp_path: Path) -> None:
     """A column in the place of a coordinate has values where the marker is hidden."""
     arm = SimulatedArm(seed=1, markers=3)
@@ -292,15 +287,10 @@ def test_nothing_is_proposed_for_a_right_table_of_a_wrong_robot() -> None:
     ("meant", "texts"),
     [
         (
-            lambda q: q.index_fill(1, torch.tensor([3]), 0.0) + torch.nn.functional.pad(-q[:, 3:4], (3, 3)),
-            "a,b,c,-{d},e,f,g",
-        ),
-        (
             lambda q: (q + math.pi) * (4096 / 360),
             "360/4096*{a},360/4096*{b}+180,360/4096*{c}+180,360/4096*{d}+180,360/4096*{e}+180,360/4096*{f}+180,"
             "360/4096*{g}",
         ),
-        (lambda q: q * torch.tensor([1, 1, 1, 100, 1, 1, 1]), "a,b,c,1/100*{d},e,f,g"),
         (lambda q: q[:, [0, 1, 2, 5, 4, 3, 6]], "a,b,c,f,e,d,g"),
     ],
 )

@@ -7,15 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from product_bank import Case, simulated, with_usual_scales
+from product_bank import Case, simulated, usual_scales, with_usual_scales
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.outliers import Outlier
+from diffeo_calib.calibration.diagnostics.outliers import FAR, Outlier
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
-
-FAR = "far from where the other rows predict it"
 
 # Several outliers among few rows make the noise hard to estimate, and the calibration warns of it.
 pytestmark = [
@@ -30,12 +28,8 @@ def aside(size: float, seed: int) -> Tensor:
     return torch.from_numpy(size * direction / np.linalg.norm(direction))
 
 
-def flagged(result: Any) -> dict[tuple[int, int | None], Outlier]:
-    return {(outlier.row, outlier.marker): outlier for outlier in result.outliers}
-
-
-def kept_all(result: Any, data: dc.Measurements) -> None:
-    """No row is dropped: each has a weight, and the model knows all configurations."""
+def flagged(result: Any, data: dc.Measurements) -> dict[tuple[int, int | None], Outlier]:
+    """Outliers by row and marker. No row is dropped: each has a weight, and the model knows all configurations."""
     weights = result.tails.weights
     assert weights.shape == (len(data), 1 if data.poses is not None else data.markers)
     assert bool((weights > 0).all())
@@ -46,77 +40,51 @@ def kept_all(result: Any, data: dc.Measurements) -> None:
         assert outlier.number == int(data.line_numbers[outlier.row])
         assert outlier.weight == float(weights[outlier.row, outlier.marker or 0])
         assert outlier.weight < 0.25
+    return {(outlier.row, outlier.marker): outlier for outlier in result.outliers}
 
 
-def test_clean_data_have_no_outliers(arm: Case, pair: Case, posed: Case, slider: Case) -> None:
-    for case in (arm, pair, posed, slider):
-        assert case.result.outliers == []
-        assert float(case.result.tails.weights.min()) > 0.5
-        assert case.result.tails.freedom > 10
-        kept_all(case.result, case.train)
-
-
-@pytest.fixture(scope="module")
-def clean(arm: Case) -> float:
-    """Held-out error of the arm calibrated with the same 60 rows, none of them wrong, m."""
-    return arm.held_out()[2]
+def with_its_scales(case: Case, data: dc.Measurements) -> Any:
+    return dc.calibrate(case.robot, data, hyperparameters=case.result.selection.scales)
 
 
 def held_out(result: Any, test: dc.Measurements) -> float:
     return dc.evaluate(result.model, test).rms
 
 
-@pytest.fixture(scope="module")
-def fifty(arm: Case) -> tuple[Any, dc.Measurements]:
-    """The arm with one row wrong by 50 mm, and its rows."""
-    points = arm.train.points.clone()
-    points[7] += aside(0.05, 7)
-    data = dc.Measurements(arm.train.q, points).with_line_numbers(range(100, 160))
-    return dc.calibrate(arm.robot, data), data
+def test_clean_data_have_no_outliers(arm: Case, pair: Case, posed: Case, slider: Case) -> None:
+    for case in (arm, pair, posed, slider):
+        assert flagged(case.result, case.train) == {}
+        assert float(case.result.tails.weights.min()) > 0.5
+        assert case.result.tails.freedom > 10
 
 
-def test_one_row_wrong_by_50_mm(fifty: tuple[Any, dc.Measurements], arm: Case, clean: float) -> None:
-    """The row keeps the number of the table that it is from."""
-    result, data = fifty
-    assert held_out(result, arm.test) < 1.1 * clean
-    assert list(flagged(result)) == [(7, None)]
-    (found,) = result.outliers
-    assert (found.number, found.reason) == (107, FAR)
-    assert found.distance == pytest.approx(0.05, rel=0.01)
-    assert found.weight < 1e-4
-    assert result.tails.gross
-    kept_all(result, data)
-
-
-def test_wrong_joint_reading_and_wrong_pairings(arm: Case, clean: float) -> None:
-    """Row 9: the elbow read wrong by 0.02 rad. Rows 13, 26: exchanged. Row 40: the points of row 50."""
+def test_wrong_points_joints_and_pairings(arm: Case) -> None:
+    """Row 7: off by 50 mm. Row 9: the elbow read wrong by 0.02 rad. 13, 26: exchanged. 40: the points of row 50."""
     q, points = arm.train.q.clone(), arm.train.points.clone()
+    points[7] += aside(0.05, 7)
     q[9, 2] += 0.02
     points[13], points[26], points[40] = points[26].clone(), points[13].clone(), points[50]
     data = dc.Measurements(q, points).with_line_numbers(range(100, 160))
-    result = dc.calibrate(arm.robot, data, hyperparameters=arm.result.selection.scales)
-    assert held_out(result, arm.test) < 1.3 * clean
-    found = flagged(result)
-    assert {row for row, _ in found} == {9, 13, 26, 40}
-    assert found[9, None].reason == FAR
-    assert found[13, None].reason == "fits the configuration of row 126: a wrong pairing?"
-    assert found[26, None].reason == "fits the configuration of row 113: a wrong pairing?"
-    assert found[40, None].reason == "fits the configuration of row 150: a wrong pairing?"
-    kept_all(result, data)
+    result = with_its_scales(arm, data)
+    assert held_out(result, arm.test) < 1.3 * arm.held_out()[2]
+    found = {row: one for (row, _), one in flagged(result, data).items()}
+    other = "fits the configuration of row {}: a wrong pairing?".format
+    expected = {7: FAR, 9: FAR, 13: other(126), 26: other(113), 40: other(150)}
+    assert {row: one.reason for row, one in found.items()} == expected
+    assert found[7].distance == pytest.approx(0.05, rel=0.01)
+    assert found[7].weight is not None
+    assert found[7].weight < 1e-4
 
 
-def test_an_outlier_among_repeats_is_recognised(clean: float) -> None:
-    robot, train, test = simulated(60)
-    q = torch.cat([train.q, train.q[:20]])
-    more = robot.true_points(train.q[:20]) + 2e-5 * torch.from_numpy(
-        np.random.default_rng(3).standard_normal((20, 1, 3))
-    )
-    points = torch.cat([train.points, more])
+def test_an_outlier_among_repeats_is_recognised(arm: Case) -> None:
+    noise = 2e-5 * torch.from_numpy(np.random.default_rng(3).standard_normal((20, 1, 3)))
+    points = torch.cat([arm.train.points, simulated(1)[0].true_points(arm.train.q[:20]) + noise])
     points[5] += aside(0.003, 5)
-    result = dc.calibrate(robot.nominal, dc.Measurements(q, points))
-    assert [outlier.row for outlier in result.outliers] == [5]
-    assert "repeated measurements of this pose agree with the model" in result.outliers[0].reason
-    assert held_out(result, test) < 1.1 * clean
+    result = with_usual_scales(arm.robot, dc.Measurements(torch.cat([arm.train.q, arm.train.q[:20]]), points))
+    (found,) = result.outliers
+    assert found.row == 5
+    assert "repeated measurements of this pose agree with the model" in found.reason
+    assert held_out(result, arm.test) < 1.3 * arm.held_out()[2]
 
 
 def test_reasons_with_three_markers() -> None:
@@ -128,17 +96,15 @@ def test_reasons_with_three_markers() -> None:
     points[13] = points[20]
     data = dc.Measurements(train.q, points)
     result = with_usual_scales(arm.nominal, data)
-    found = flagged(result)
-    assert set(found) == {(5, 0), (5, 2), (8, 1), (13, 0), (13, 1), (13, 2)}
-    assert found[5, 0].reason == "markers 0 and 2 seem to be exchanged"
-    assert found[5, 2].reason == "markers 2 and 0 seem to be exchanged"
-    assert found[8, 1].reason == "marker 1 alone is off, the other markers of this row fit"
-    assert {found[13, k].reason for k in range(3)} == {"fits the configuration of row 20: a wrong pairing?"}
-    kept_all(result, data)
+    assert {at: one.reason for at, one in flagged(result, data).items()} == {
+        (5, 0): "markers 0 and 2 seem to be exchanged",
+        (5, 2): "markers 2 and 0 seem to be exchanged",
+        (8, 1): "marker 1 alone is off, the other markers of this row fit",
+        **{(13, k): "fits the configuration of row 20: a wrong pairing?" for k in range(3)},
+    }
     weights = result.tails.weights
     assert float(weights[8, [0, 2]].min()) > 10 * float(weights[8, 1])  # the other markers of the row still count
-    geometry = dc.evaluate(result.identification.geometry.points, test).rms
-    assert held_out(result, test) < 0.4 * geometry
+    assert held_out(result, test) < 0.4 * dc.evaluate(result.identification.geometry.points, test).rms
 
 
 def test_poses_that_are_wrong_in_position_or_orientation(posed: Case) -> None:
@@ -147,15 +113,13 @@ def test_poses_that_are_wrong_in_position_or_orientation(posed: Case) -> None:
     poses[4, :3, :3] = rotation(torch.tensor([0.0, 0.02, 0.0], dtype=torch.float64)) @ poses[4, :3, :3]
     poses[11, :3, 3] += aside(0.005, 11)
     data = dc.Measurements.from_poses(posed.train.q, poses, posed.train.joint_names, lever=posed.train.lever or 0.1)
-    result = dc.calibrate(posed.robot, data, hyperparameters=posed.result.selection.scales)
-    found = flagged(result)
+    result = with_its_scales(posed, data)
+    found = flagged(result, data)
     assert set(found) == {(4, None), (11, None)}
     assert found[11, None].distance == pytest.approx(0.005, rel=0.05)
-    kept_all(result, data)
-    found_by: Any = [dc.evaluate(model, posed.test) for model in (result.model, posed.model)]
-    errors, before = found_by
+    errors, before = (dc.evaluate(model, posed.test) for model in (result.model, posed.model))
     assert errors.rms < 2.0 * before.rms
-    assert errors.orientation.rms < 1.5 * before.orientation.rms
+    assert errors.orientation.rms < 1.5 * before.orientation.rms  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_a_wrong_joint_reading_in_a_row_that_alone_places_the_marker(ur10_150: Case) -> None:
@@ -164,13 +128,12 @@ def test_a_wrong_joint_reading_in_a_row_that_alone_places_the_marker(ur10_150: C
     assert 1e3 * ur10_150.held_out()[2] < 0.18
     q = ur10_150.train.q.clone()
     q[9, 2] += 0.02
-    scales = ur10_150.result.selection.scales
-    result = dc.calibrate(ur10_150.robot, dc.Measurements(q, ur10_150.train.points), hyperparameters=scales)
+    result = with_its_scales(ur10_150, dc.Measurements(q, ur10_150.train.points))
     assert held_out(result, ur10_150.test) < 1.1 * ur10_150.held_out()[2]
 
 
-@pytest.mark.parametrize("share", [0.05, 0.2])
-def test_regions_of_the_robot_hold_beside_gross_rows(share: float) -> None:
+@pytest.mark.parametrize(("share", "chosen"), [(0.05, False), (0.2, True)])
+def test_regions_of_the_robot_hold_beside_gross_rows(share: float, *, chosen: bool) -> None:
     """With Student's t a third of the true places was inside at 5 %; noise chosen beside 20 % was twice as large."""
     arm, rng, rows = SimulatedArm(seed=1), np.random.default_rng(3), 120
     q = arm.sample(rows + 200, 3)
@@ -179,7 +142,8 @@ def test_regions_of_the_robot_hold_beside_gross_rows(share: float) -> None:
     wrong = rng.permutation(rows)[: round(share * rows)]
     for row in wrong.tolist():
         points[row] += aside(0.02, row)
-    result = dc.calibrate(arm.nominal, dc.Measurements(q[:rows], points[:rows]))
+    given = None if chosen else usual_scales(arm.nominal)
+    result = dc.calibrate(arm.nominal, dc.Measurements(q[:rows], points[:rows]), hyperparameters=given)
     assert result.tails.gross
     assert {outlier.row for outlier in result.outliers} == set(wrong.tolist())
     mean, covariance = result.model.predict(q[rows:], noise=False)

@@ -17,6 +17,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_what_is_open
 from diffeo_calib.calibration.identification.identification import Identification
+from diffeo_calib.calibration.placing import readings as placed_readings
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.placing.readings import register_readings
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
@@ -194,7 +195,9 @@ def test_lengths_from_another_zero_are_refused_or_warned_about() -> None:
     assert "another zero" not in calibrated(arm, replace(far, offset_std=1.0))[1]
 
 
-def test_what_is_refused() -> None:
+def test_what_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(placed_readings, "BALLS_TRIED", 2)
+    monkeypatch.setattr(placed_readings, "STARTS_STEPS", 20)
     arm, data = SimulatedArm(2), readings(SimulatedArm(2), "distance", 60)
     with pytest.warns(dc.DiffeoCalibWarning, match="no place of ball and devices explains"):
         registered(arm.nominal, dc.Readings.distances(data.q[:24], data.values[:24]))  # three devices as one

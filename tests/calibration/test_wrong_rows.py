@@ -45,13 +45,10 @@ def changed(case: Case, rows: slice, change: Tensor, count: int = 60) -> dc.Meas
     return dc.Measurements(case.test.q[:count], points).with_line_numbers(range(2, count + 2))
 
 
-def test_new_rows_that_are_right_are_not_named(arm: Case, pair: Case) -> None:
+def test_a_new_row_that_is_wrong_is_named(arm: Case, pair: Case) -> None:
     for case in (arm, pair):
         assert contradicted(case.model, case.test) == []
         assert steps_of(case.model, case.test) == []
-
-
-def test_a_new_row_that_is_wrong_is_named(arm: Case) -> None:
     (found,) = contradicted(arm.model, changed(arm, slice(7, 8), 0.01 * ASIDE))
     assert (found.row, found.number, found.weight) == (7, 9, None)
     assert found.distance == pytest.approx(0.002, rel=0.1)
@@ -97,34 +94,23 @@ def test_the_block_is_where_the_wrong_rows_are() -> None:
 ARM, ROWS = SimulatedArm(seed=0), 60
 
 
-def said(data: dc.Measurements) -> list[str]:
-    _, texts = warned(dc.calibrate, ARM.nominal, data, hyperparameters=scales())
-    return [one for one in texts if "look wrong and fit" in one]
-
-
-def measured(payload: Tensor | None = None) -> dc.Measurements:
-    return dc.Measurements(*ARM.measure(ROWS, seed=1, payload=payload))
-
-
-@pytest.mark.slow
-def test_a_session_that_begins_earlier_than_said() -> None:
-    """Of right sessions nothing is said: tests/calibration/test_sessions.py, where a warning is an error."""
-    whole, late = measured(), 3
-    points = whole.points.clone()
+def test_a_session_that_begins_earlier_than_said_and_a_payload_that_rows_did_not_carry() -> None:
+    """Of right labels nothing is said."""
+    whole = dc.Measurements(*ARM.measure(ROWS, seed=1))
+    points, names = whole.points.clone(), ["before"] * 33 + ["after"] * 27
     points[30:] += torch.tensor([2e-3, -1e-3, 5e-4], dtype=torch.float64)
-    names = ["before"] * (30 + late) + ["after"] * (30 - late)
-    (text,) = said(dc.Measurements(whole.q, points).with_sessions(names))
-    assert "3 rows look wrong and fit session 'after': lines 30, 31, 32" in text
-
-
-@pytest.mark.parametrize("wrong", [0, 3])
-def test_rows_that_carried_another_payload_than_said(wrong: int) -> None:
     masses = torch.tensor([0.0, 5.0, 10.0], dtype=torch.float64)[torch.arange(ROWS) % 3]
-    labels = masses.clone()
-    labels[2 : 3 * wrong : 3] = 0.0
-    texts = said(measured(masses).with_payload(labels))
-    assert len(texts) == bool(wrong)
-    assert all("fit a payload of 10: lines 2," in text for text in texts)
+    laden, labels = dc.Measurements(*ARM.measure(ROWS, seed=1, payload=masses)), masses.clone()
+    labels[2:9:3] = 0.0
+    for data, words in (
+        (dc.Measurements(whole.q, points).with_sessions(names), "3 rows .* fit session 'after': lines 30, 31, 32"),
+        (laden.with_payload(labels), "fit a payload of 10: lines 2,"),
+        (laden.with_payload(masses), ""),
+    ):
+        _, texts = warned(dc.calibrate, ARM.nominal, data, hyperparameters=scales())
+        found = [one for one in texts if "look wrong and fit" in one]
+        assert len(found) == bool(words)
+        assert all(re.search(words, one) for one in found), found
 
 
 # --- names that few rows carry ----------------------------------------------------------------------------------------
@@ -153,14 +139,14 @@ def test_a_lone_name_is_told_by_its_row(name: str) -> None:
 
 
 def test_a_lone_socket_of_new_rows_is_told_by_its_row() -> None:
-    model = kind_named("ball in sockets").model
-    new, words = with_a_lone_name("ball in sockets", kind_named("ball in sockets").new)
-    found = " ".join(dc.evaluate(model, new).placed)
+    kind = kind_named("ball in sockets")
+    new, words = with_a_lone_name("ball in sockets", kind.new)
+    found = " ".join(dc.evaluate(kind.model, new).placed)
     assert "1 of 12 rows show no error" in found
     assert re.search(words, found)
     for verb in (dc.recalibrate, dc.compare):
         with pytest.warns(DiffeoCalibWarning, match=words):
-            verb(model, new)
+            verb(kind.model, new)
 
 
 # --- single rows in sockets -------------------------------------------------------------------------------------------
@@ -193,20 +179,14 @@ def moved(data: dc.Measurements, rows: list[int]) -> dc.Measurements:
     return with_attributes(data, q=q)
 
 
-def test_rows_of_the_fit_are_named(result: Any) -> None:
-    assert sorted(one.row for one in result.outliers) == WRONG
-    for one in result.outliers:
-        assert one.distance == pytest.approx(SHIFT_M, rel=0.4)
-        assert one.weight < 0.3
-
-
-def test_rows_that_took_no_part_are_named(result: Any) -> None:
+def test_wrong_rows_are_named_also_where_they_took_no_part(result: Any) -> None:
     new = in_their_sockets(7, 1)
     assert contradicted_in_sockets(result.model, new) == []
-    wrong = contradicted_in_sockets(result.model, moved(new, [7]))
-    assert [one.row for one in wrong] == [7]
-    assert wrong[0].weight is None
-    assert wrong[0].distance == pytest.approx(SHIFT_M, rel=0.4)
+    found = contradicted_in_sockets(result.model, moved(new, [7]))
+    assert sorted(one.row for one in result.outliers) == WRONG
+    assert all(one.weight < 0.3 for one in result.outliers)
+    assert [(one.row, one.weight) for one in found] == [(7, None)]
+    assert all(one.distance == pytest.approx(SHIFT_M, rel=0.4) for one in (*result.outliers, *found))
     two = moved(new, [7]).rows([0, 7])
     assert contradicted_in_sockets(result.model, two) == [], "two rows cannot tell which of them is wrong"
 
@@ -230,19 +210,16 @@ def test_a_plane_is_named_where_it_matters(result: Any) -> None:
     found, expected = result.sockets, workspace_deviation(result.model.map)
     flat = found.positions.clone()
     flat[:, 2] = 0.2
+    tall = flat.clone()
+    tall[[0, 3], 2] = 0.9
 
-    def named(positions: torch.Tensor, expected_error: float) -> list[str]:
+    def named(positions: Tensor, expected_error: float) -> list[str]:
         rows = found.device, found.sockets.place, expected_error
         return warned(warn_of_flat_places, result.model.map, positions, *rows)[1]
 
-    assert named(flat, expected) == []
-    large = named(flat, 10 * expected)
-    assert len(large) == 1
-    assert "the sockets lie near a plane" in large[0]
-    assert "raise or tilt the block at one place" in large[0]
-    tall = flat.clone()
-    tall[[0, 3], 2] = 0.9
-    assert named(tall, 10 * expected) == []
+    assert named(flat, expected) == named(tall, 10 * expected) == []
+    (large,) = named(flat, 10 * expected)
+    assert re.search("the sockets lie near a plane.*raise or tilt the block at one place", large)
 
 
 # --- rows out of step with their joints -------------------------------------------------------------------------------
@@ -288,20 +265,15 @@ def test_from_a_line_on(first: int, lag: int) -> None:
     assert there - 2 <= step.rows <= there
 
 
-def test_a_block_in_the_middle() -> None:
+def test_a_block_in_the_middle_and_rows_in_any_order_with_gaps() -> None:
+    """As after a split: 70 % of the rows, and thus half of the pairs."""
     (step,) = out_of_step(*out_of_step_table(40, 10, 22, -1), typical=TYPICAL)
     assert (step.first, step.last, step.lag, step.to_the_end) == (12, 23, -1, False)
     assert step.sentence().startswith("in lines 12 to 23 the measured values belong to the joints 1 line above")
-
-
-def test_rows_in_any_order_and_with_gaps() -> None:
-    """As after a split: 70 % of the rows, and thus half of the pairs."""
-    tables = out_of_step_table(100, 50, 100, -1)
     rows = torch.randperm(100, generator=torch.Generator().manual_seed(3))[:70]
-    (step,) = out_of_step(*(part[rows] for part in tables), typical=TYPICAL)
-    assert step.lag == -1
+    (step,) = out_of_step(*(part[rows] for part in out_of_step_table(100, 50, 100, -1)), typical=TYPICAL)
+    assert (step.lag, step.to_the_end) == (-1, True)
     assert abs(step.first - 52) <= 2
-    assert step.to_the_end
 
 
 @pytest.mark.parametrize("rows", [4, 60])
@@ -327,10 +299,10 @@ def test_nothing_on_a_slow_path() -> None:
 
 # --- the rule that says which rows look wrong, on clean errors and beside gross ones ----------------------------------
 
-TABLES = 1500
+TABLES = 600
 
 
-@pytest.mark.parametrize("freedom", [1, 3, 6])
+@pytest.mark.parametrize("freedom", [1, 6])
 @pytest.mark.parametrize("rows", [5, 40])
 @pytest.mark.parametrize("expected", [0.05, 20.0])
 def test_one_of_a_hundred_clean_tables_is_suspected_however_few_its_rows(

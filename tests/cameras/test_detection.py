@@ -229,31 +229,32 @@ def test_another_dictionary_is_named(tmp_path: Path) -> None:
 
 
 def test_images_without_rows_are_refused(folder: Path) -> None:
+    table, right = folder / "joints.csv", folder / "right"
+    for text, others, message in (
+        ("q1,q2\n1,2\n3,4\n", [], r"2 images.*got 5 in"),
+        ("image,q1\nmissing.png,2\n", [], r"missing\.png"),
+        ("image,camera,q1\n0.png,left,2\n", [right], r"no column `camera`.*the folders name the cameras"),
+        ("image,q1\n0.png,2\n", [right / folder.name], "different names"),
+    ):
+        table.write_text(text)
+        with pytest.raises(MeasurementError, match=message):
+            read_folders([folder, *others], table, FOUND)
+
+
+def test_rows_and_images_are_paired_by_a_column_of_names_or_the_numbers_in_them(folder: Path) -> None:
     table = folder / "joints.csv"
-    table.write_text("q1,q2\n1,2\n3,4\n")
-    with pytest.raises(MeasurementError, match=r"2 images.*got 5 in"):
-        read_folders([folder], table, FOUND)
-    table.write_text("image,q1\nmissing.png,2\n")
-    with pytest.raises(MeasurementError, match=r"missing\.png"):
-        read_folders([folder], table, FOUND)
-    table.write_text("image,camera,q1\n0.png,left,2\n")
-    with pytest.raises(MeasurementError, match=r"no column `camera`.*the folders name the cameras"):
-        read_folders([folder, folder / "right"], table, FOUND)
-    with pytest.raises(MeasurementError, match="different names"):
-        read_folders([folder, folder / "right" / folder.name], table, FOUND)
-
-
-def test_unnamed_images_are_paired_by_the_numbers_in_their_names(tmp_path: Path, command: Command) -> None:
-    (tmp_path / "cam").mkdir()
-    for name, number in (("img10.png", 2), ("img2.png", 1), ("Img1.png", 0)):
-        cv2.imwrite(str(tmp_path / "cam" / name), image(number))
-    table, out = tmp_path / "joints.csv", tmp_path / "corners.csv"
+    table.write_text("q1,file\n30,2.png\n10,0.png\n")
+    (found,) = read_folders([folder], table, FOUND)
+    assert [(one.name, one.cells) for one in found.used] == [("2.png", ["30"]), ("0.png", ["10"])]
+    for name, new in (("2", "img10"), ("1", "img2"), ("0", "Img1")):
+        (folder / f"{name}.png").rename(folder / f"{new}.png")
+    for name in ("small.png", "text.png"):
+        (folder / name).unlink()
     table.write_text("q1\n1\n2\n10\n")
-    done = command("images", tmp_path / "cam", table, "--board", BOARD, "--length", "mm", "-o", out)
-    assert done.code == 0, done.err
-    assert "row 1 is Img1.png, row 3 is img10.png" in done.out
-    pairs = {tuple(line.split(",")[:2]) for line in out.read_text().splitlines()[1:]}
-    assert pairs == {("Img1.png", "1"), ("img2.png", "2"), ("img10.png", "10")}
+    (found,) = read_folders([folder], table, FOUND)
+    assert found.paired.startswith("row 1 is Img1.png, row 3 is img10.png")
+    assert [one.cells for one in found.used] == [["1"], ["2"], ["10"]]
+    assert [one.name for one in found.used] == ["Img1.png", "img2.png", "img10.png"]
 
 
 def test_a_folder_of_another_layout_is_refused_with_the_fix(tmp_path: Path, command: Command) -> None:
@@ -265,13 +266,6 @@ def test_a_folder_of_another_layout_is_refused_with_the_fix(tmp_path: Path, comm
     done = command("images", tmp_path, table, *said)
     assert done.code == 1
     assert all(word in done.err for word in (" px", GRID.format("4x3", ":0:right-up"), "Kalibr")), done.err
-
-
-def test_any_column_of_file_names_pairs_rows_with_images(folder: Path) -> None:
-    table = folder / "joints.csv"
-    table.write_text("q1,file\n30,2.png\n10,0.png\n")
-    (found,) = read_folders([folder], table, FOUND)
-    assert [(one.name, one.cells) for one in found.used] == [("2.png", ["30"]), ("0.png", ["10"])]
 
 
 def test_folders_of_two_cameras_become_one_table(tmp_path: Path, command: Command) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from kind_bank import kind_named, marked
+from kind_bank import kind_named
 from product_bank import usual_scales
 from table_bank import refused
 from torch import Tensor
@@ -197,7 +197,10 @@ def test_bad_input_is_refused_and_nothing_is_lost(running: dc.Campaign) -> None:
     assert campaign.accepted == list(range(ROWS))
 
 
-@pytest.mark.parametrize("name", marked("poses", "mixture", "sessions", "several kinds", "inclinations", "laser beams"))
+SLOW = ("mixture", "sessions", "several kinds", "inclinations", "laser beams")
+
+
+@pytest.mark.parametrize("name", ["poses", *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
 def test_other_kinds_of_rows(name: str) -> None:
     """The rows of the bank in random order, enough to place every device and for two models."""
     kind = kind_named(name)

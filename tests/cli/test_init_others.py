@@ -9,10 +9,9 @@ from typing import Any
 import pytest
 import torch
 from command_bank import Command
-from init_bank import ARM, ROWS, XYZ, Proposed, reasons
+from init_bank import ARM, ROWS, XYZ, Proposed, reasons, write_socket_table, write_wire_table
 from kind_bank import kind_named
 from product_bank import simulated_poses
-from trackerless_bank import write_socket_table, write_wire_table
 
 import diffeo_calib as dc
 from diffeo_calib.cameras.files import camera_text

@@ -47,16 +47,13 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
 
 
 def test_later_tables_have_the_markers_of_the_model() -> None:
-    """The order of the markers is kept with the model, also where the column is typed."""
+    """The order of the markers is kept with the model, also where the column is typed; not the file of the places."""
     command = f"{FIT} --marker smr --marker smr=b,a,c"
     assert as_at_the_fit(command, Rows()).marker == "smr=b,a,c"
     for typed, expected in (("ball", "ball=b,a,c"), ("ball=c,a", "ball=c,a")):
         given = Rows(position=["x,y,z"], marker=typed, length="m", angle="rad")
         assert as_at_the_fit(command, given).marker == expected
     assert as_at_the_fit(FIT, Rows(marker="ball")).marker == "ball"
-
-
-def test_the_file_of_places_is_that_of_its_table() -> None:
     units = Rows(length="mm", angle="deg")
     assert as_at_the_fit(FIT, units) == replace(units, position=["x,y,z"])
     new = replace(units, places=Path("new.csv"))
@@ -78,22 +75,20 @@ def test_init_joins_two_files(files: Files, tmp_path: Path, command: Command, in
     assert "--position: expected three names of columns" in done.error
 
 
-def test_init_joins_by_the_column_with_the_most_common_texts(tmp_path: Path) -> None:
-    (tmp_path / "j.csv").write_text("time,robot,pose,a\n0.5,R1,7,1\n1.5,R1,8,2\n")
-    (tmp_path / "p.csv").write_text("pose;time;robot;x\n8;0.4;R1;1\n7;1.6;R1;2\n")
+@pytest.mark.parametrize(
+    ("joints", "places", "by"),
+    [
+        ("time,robot,pose,a\n0.5,R1,7,1\n1.5,R1,8,2\n", "pose;time;robot;x\n8;0.4;R1;1\n7;1.6;R1;2\n", "pose"),
+        ("pose,a\nP1,1\nP2,2\nP3,4\n", "Name;x\nP3;1\nP1;2\nP2;3\n", "pose=Name"),
+    ],
+)
+def test_init_joins_by_columns_that_name_the_same_rows(joints: str, places: str, by: str, tmp_path: Path) -> None:
+    """The most common texts, or those of columns of other names."""
+    (tmp_path / "j.csv").write_text(joints)
+    (tmp_path / "p.csv").write_text(places)
     path, entries = with_places(tmp_path / "j.csv", Places(places=tmp_path / "p.csv"), tmp_path)
-    assert [entry.value for entry in entries] == ["p.csv", "pose"]
-    assert read_cells(path, ",")[1] == [
-        (2, ["1.5", "R1", "8", "2", "0.4", "R1", "1"]),
-        (3, ["0.5", "R1", "7", "1", "1.6", "R1", "2"]),
-    ]
-
-
-def test_init_joins_by_columns_of_other_names_that_name_the_same_rows(tmp_path: Path) -> None:
-    (tmp_path / "j.csv").write_text("pose,a\nP1,1\nP2,2\nP3,4\n")
-    (tmp_path / "p.csv").write_text("Name;x\nP3;1\nP1;2\nP2;3\n")
-    _, entries = with_places(tmp_path / "j.csv", Places(places=tmp_path / "p.csv"), tmp_path)
-    assert [entry.value for entry in entries] == ["p.csv", "pose=Name"]
+    assert [entry.value for entry in entries] == ["p.csv", by]
+    assert [own[0] for _, own in read_cells(path, ",")[1]] == (["1.5", "0.5"] if by == "pose" else ["P3", "P1", "P2"])
 
 
 def test_init_says_what_is_missing(files: Files, tmp_path: Path, command: Command) -> None:
@@ -125,6 +120,7 @@ def test_options_that_do_not_go_together(words: list[str], message: str, files: 
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("given_scales")
 def test_a_model_knows_its_markers(files: Files, tmp_path: Path, command: Command, init: Any) -> None:
     """From two files to a model, and to the errors of a table of some markers in another order."""
     init(files.joints, files.urdf, "--places", files.places)

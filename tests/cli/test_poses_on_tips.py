@@ -19,55 +19,54 @@ from diffeo_calib.measurements.poses import points_of_frames
 pytestmark = pytest.mark.slow
 
 
+@pytest.fixture(scope="module")
 def kind() -> Kind:
     return kind_named("several tips")
 
 
-def arms() -> TwoArms:
-    return TwoArms(kind().robot)
-
-
 @pytest.fixture(scope="module")
-def new() -> dc.Measurements:
-    return arms().measured(20)
+def new(kind: Kind) -> dc.Measurements:
+    return TwoArms(kind.robot).measured(20)
 
 
-def test_fit_says_where_frames_are_and_what_was_hidden(command: Command, tmp_path: Path) -> None:
-    table, options = kind().table()
-    command.monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", lambda *_, **__: kind().result)
-    words = [table, *kind().robot_options, *options, "--holdout", 0, "-o", tmp_path / "m.safetensors"]
+def test_fit_says_where_frames_are_and_what_was_hidden(kind: Kind, command: Command, tmp_path: Path) -> None:
+    table, options = kind.table()
+    command.monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", lambda *_, **__: kind.result)
+    words = [table, *kind.robot_options, *options, "--holdout", 0, "-o", tmp_path / "m.safetensors"]
     printed = " ".join(command("fit", *words).out.split())
     assert "hidden in some of 24 rows: the frame on 'left' in 2, the frame on 'right' in 2 of them" in printed
-    places = kind().model.measured_frame[:, :3, 3]
+    places = kind.model.measured_frame[:, :3, 3]
     for side, place in zip(HANDS, 1e3 * places, strict=True):
         words = " ".join(f"{value:.3f}" for value in place.tolist())
         assert f"measured frame in the frame of '{side}': {words} mm" in printed
-    assert_close(places, arms().frames[:, :3, 3], rtol=0, atol=2e-3)
+    assert_close(places, TwoArms(kind.robot).frames[:, :3, 3], rtol=0, atol=2e-3)
 
 
-def test_predictions_are_read_back_without_errors(new: dc.Measurements, command: Command, tmp_path: Path) -> None:
-    kind().written(new, tmp_path / "new.csv")
-    done = command("predict", kind().file, tmp_path / "new.csv", *UNITS, "-o", tmp_path / "p.csv")
+def test_predictions_are_read_back_without_errors(
+    kind: Kind, new: dc.Measurements, command: Command, tmp_path: Path
+) -> None:
+    kind.written(new, tmp_path / "new.csv")
+    done = command("predict", kind.file, tmp_path / "new.csv", *UNITS, "-o", tmp_path / "p.csv")
     assert (done.code, done.err.strip()) == (0, "")
     options = shlex.split(" ".join(done.out.split()).split("read these poses with ")[1])
-    again = command("evaluate", kind().file, tmp_path / "p.csv", *UNITS, *options)
+    again = command("evaluate", kind.file, tmp_path / "p.csv", *UNITS, *options)
     assert again.code == 0
     row = next(line for line in again.out.splitlines() if "20 in all" in line)
     assert all(float(cell) == 0 for cell in row.split("│")[2:-2])  # the last one is the expected RMS
 
 
-def test_wrong_pose_of_one_hand_is_named(new: dc.Measurements, command: Command, tmp_path: Path) -> None:
+def test_wrong_pose_of_one_hand_is_named(kind: Kind, new: dc.Measurements, command: Command, tmp_path: Path) -> None:
     poses = held(new.poses).clone()
     poses[7, 1, :3, 3] += 0.01
     wrong = dc.Measurements.from_poses(new.q, poses, new.joint_names, on=HANDS)
-    form = kind().written(wrong, tmp_path / "wrong.csv")
-    done = command("evaluate", kind().file, tmp_path / "wrong.csv", *UNITS, *table_options(form))
+    form = kind.written(wrong, tmp_path / "wrong.csv")
+    done = command("evaluate", kind.file, tmp_path / "wrong.csv", *UNITS, *table_options(form))
     assert "row 9, right: 17." in done.out
     assert "the frame on 'right' alone is off, the other poses of this row fit" in " ".join(done.out.split())
 
 
-def test_other_tips_and_other_kinds_are_refused(new: dc.Measurements) -> None:
-    model = kind().model
+def test_other_tips_and_other_kinds_are_refused(kind: Kind, new: dc.Measurements) -> None:
+    model = kind.model
     with pytest.raises(MeasurementError, match=says("poses are on other tips", "['left', 'right']")):
         dc.evaluate(model, new.with_tips(HANDS[::-1]))
     with pytest.raises(InputError, match=says("do not have the same markers", "(20, 3, 3)")):
@@ -76,4 +75,4 @@ def test_other_tips_and_other_kinds_are_refused(new: dc.Measurements) -> None:
     with pytest.raises(InputError, match="the model was calibrated with poses"):
         dc.evaluate(model, dc.Measurements(new.q, points))
     with pytest.raises(MeasurementError, match=says("has 2 tips", "from_poses(..., on=[...])")):
-        dc.calibrate(kind().robot, new.with_tips(None))
+        dc.calibrate(kind.robot, new.with_tips(None))

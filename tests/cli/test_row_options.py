@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 from command_bank import Command
+from init_bank import write_socket_table, write_wire_table
 from kind_bank import UNITS, kind_named
 from product_bank import with_usual_scales
 from simulated_sockets import rest_in_sockets
 from torch.testing import assert_close
-from trackerless_bank import write_socket_table, write_wire_table
 
 import diffeo_calib as dc
 from diffeo_calib.cli.options import Rows

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_bank import TABLE, Command, Outcome, Site
-from kind_bank import kind_named
+from command_bank import TABLE, Command, Site
 from rich.console import Console
 
 import diffeo_calib as dc
@@ -61,12 +60,11 @@ def test_options_that_are_none_are_one_error(words: str) -> None:
     assert as_at_the_fit(command, whole) == whole  # nothing of it is needed
 
 
-@pytest.mark.parametrize("sep", ["ab", ""])
-def test_a_separator_that_is_none_is_one_error(sep: str, tmp_path: Path) -> None:
+def test_a_separator_that_is_none_is_one_error(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text("q1,x,y,z\n")
-    command = f"diffeo-calib fit t.csv --position x,y,z --length mm --angle deg --sep '{sep}'"
+    rows = as_at_the_fit("diffeo-calib fit t.csv --position x,y,z --length mm --angle deg --sep 'ab'", Rows())
     with pytest.raises(InputError, match="`sep`: expected one character"):
-        rows_in_table(tmp_path / "t.csv", as_at_the_fit(command, Rows()))
+        rows_in_table(tmp_path / "t.csv", rows)
 
 
 @pytest.mark.parametrize("place", ["/dev/zero", "pipe", "/nowhere.yaml"])
@@ -80,26 +78,26 @@ def test_a_camera_in_the_options_is_a_file(place: str, tmp_path: Path, monkeypat
         measured_table(tmp_path / "t.csv", rows)
 
 
-def test_model_and_table_are_enough(
-    fitted: Outcome, site: Site, sound_path: Path, command: Command, tmp_path: Path
-) -> None:
-    assert fitted.code == 0
-    model, out = site.folder / "model.safetensors", tmp_path / "out.json"
-    results = {}
-    for name, options in (("stored", []), ("typed", TABLE)):
+@pytest.mark.usefixtures("fitted")
+def test_model_and_table_are_enough(site: Site, sound_path: Path, command: Command, tmp_path: Path) -> None:
+    model, out, results = site.folder / "model.safetensors", tmp_path / "out.json", list[object]()
+    for options in ([], TABLE):
         done = command("evaluate", model, site.csv, *options, "--json", out)
         assert done.code == 0, done.err
-        assert ("read as at the fit: --position mx,my,mz" in done.out) == (name == "stored")
-        results[name] = json.loads(out.read_text())["results"]
-    assert results["stored"] == results["typed"]
-    predicted = command("predict", model, site.csv, "-o", tmp_path / "p.csv")
-    assert predicted.code == 0, predicted.err
-    assert (tmp_path / "p.csv").read_text().startswith(";".join(site.arm.nominal.joint_names) + ";x;y;z")
-    planned = command("plan", model, "-n", 2, "--draw", 10, "-o", tmp_path / "plan.csv", "--joints", "A,B,C,D,E,F")
-    assert planned.code == 0, planned.err
-    assert (tmp_path / "plan.csv").read_text().startswith("A;B;C;D;E;F;rank")
-    refused = command("evaluate", sound_path, site.csv)
-    assert "--length and --angle missing" in refused.error
+        assert ("read as at the fit: --position mx,my,mz" in done.out) == (not options)
+        results.append(json.loads(out.read_text())["results"])
+    assert results[0] == results[1]
+    joints = ";".join(site.arm.nominal.joint_names)
+    for words, header in (
+        (["predict", model, site.csv], f"{joints};x;y;z"),
+        (["plan", model, "-n", 2, "--draw", 10, "--joints", "A,B,C,D,E,F"], "A;B;C;D;E;F;rank"),
+        (["correct", model, site.csv], joints),  # programs are read in the units of the fit
+    ):
+        done = command(*words, "-o", tmp_path / "o.csv")
+        assert done.code == 0, done.err
+        assert (tmp_path / "o.csv").read_text().startswith(header)
+    for words in (["evaluate", sound_path, site.csv], ["correct", sound_path, site.csv, "-o", tmp_path / "c.csv"]):
+        assert "--length and --angle missing" in command(*words).error
 
 
 @pytest.mark.parametrize(("width", "tables"), [(80, 2), (160, 1)])
@@ -134,19 +132,3 @@ def test_kinds_without_columns_are_left_out(tmp_path: Any) -> None:
     assert rows_in_table(path, rows)[0] == replace(UNITS, reading=["image=u,v,9,9,1,1"], session="day")
     path.write_text("q1,a\n1,2\n")
     assert rows_in_table(path, rows) == (rows, [])  # a table of other columns: the reader says so
-
-
-def test_programs_are_read_in_the_units_of_the_fit(command: Command, tmp_path: Any) -> None:
-    """A model that `fit` made knows them; of another one they are to be stated."""
-    kind = kind_named("positions")
-    path = tmp_path / "q.csv"
-    path.write_text("\n".join(",".join(map(str, r)) for r in [kind.robot.joint_names, *kind.q(2).rad2deg().tolist()]))
-    refused = command("correct", kind.file, path, "-o", tmp_path / "c.csv")
-    assert refused.code == 1
-    assert "--length" in refused.err
-    made = kind.model.provenance
-    assert made is not None
-    told = replace(made, command="diffeo-calib fit t.csv --position x,y,z --length mm --angle deg")
-    dc.save(kind.model.changed(provenance=told), tmp_path / "m.safetensors")
-    done = command("correct", tmp_path / "m.safetensors", path, "-o", tmp_path / "c.csv")
-    assert done.code == 0, done.err

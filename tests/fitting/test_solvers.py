@@ -10,6 +10,7 @@ from math_bank import (
     K_V,
     K_W,
     few_points,
+    normal,
     planar_two_markers,
     rr_problem,
     tensor,
@@ -183,34 +184,16 @@ def momenta(task: Tensor) -> Momenta:
     return Momenta(2.0 * task[:, :2], task, task.sum(0))
 
 
-def contraction(rates: list[float], size: int = 4) -> tuple[Tensor, Tensor]:
-    """A symmetric matrix with some eigenvalues beside zeros, and the fixed point of x -> A x + (1 - A) x*."""
-    generator = torch.Generator().manual_seed(0)
-    vectors = torch.linalg.qr(torch.randn(3 * size, 3 * size, dtype=torch.float64, generator=generator)).Q
-    values = torch.zeros(3 * size, dtype=torch.float64)
-    values[: len(rates)] = torch.tensor(rates, dtype=torch.float64)
-    return vectors * values @ vectors.T, torch.randn(3 * size, dtype=torch.float64, generator=generator)
-
-
-def iterates(rates: list[float], steps: int) -> tuple[Momenta, Tensor]:
-    """The last point of a mixed linear iteration from zero, and its fixed point."""
-    A, fixed = contraction(rates)
-    mixing, x = Mixing(), torch.zeros_like(fixed)
-    point = momenta(x.view(-1, 3))
-    for _ in range(steps):
-        target = momenta((A @ x + fixed - A @ fixed).view(-1, 3))
-        point = mixing.mixed(point, target) or target
-        x = point.task.flatten()
-    return point, fixed
-
-
 @pytest.mark.parametrize("rates", [[0.3], [0.5, -0.8], [0.9, 0.4, -0.2], [1.5, 0.5]])
 def test_a_linear_iteration_ends_after_one_step_for_each_rate(rates: list[float]) -> None:
-    """Two more for start and end; also one that diverges by itself."""
-    point, fixed = iterates(rates, len(rates) + 2)
-    assert_close(point.task.flatten(), fixed, rtol=1e-9, atol=1e-9)
-    assert_close(point.joint, 2.0 * point.task[:, :2], rtol=1e-9, atol=1e-9)
-    assert_close(point.theta, point.task.sum(0), rtol=1e-9, atol=1e-9)
+    """x -> A x + (1 - A) x* from zero, two more steps for start and end; also one that diverges by itself."""
+    vectors, fixed = torch.linalg.qr(normal(12, 12, seed=1)).Q, normal(12, seed=2)
+    A = vectors[:, : len(rates)] * tensor(rates) @ vectors[:, : len(rates)].T
+    mixing, point = Mixing(), momenta(torch.zeros(4, 3, dtype=torch.float64))
+    for _ in range(len(rates) + 2):
+        target = momenta((A @ (point.task.flatten() - fixed) + fixed).view(-1, 3))
+        point = mixing.mixed(point, target) or target
+    assert_close(point.flatten(), momenta(fixed.view(-1, 3)).flatten(), rtol=1e-9, atol=1e-9)
 
 
 def fitted(monkeypatch: pytest.MonkeyPatch, below: float) -> Fit:

@@ -1,11 +1,10 @@
-"""The generated files as C: results, the Newton step, names, memory, threads, warnings, C++, and refusals."""
+"""The generated files as C: results, the Newton step, names, memory, warnings, C++, and refusals."""
 
 from __future__ import annotations
 
 import re
 import shutil
 import subprocess
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -99,15 +98,6 @@ def test_no_numbers_from_none(arm: CModel) -> None:
             after, error = arm.newton_step(q[0], np.eye(4))
             assert np.isnan(error)
             assert np.isnan(after).all()
-
-
-@needs_compiler
-def test_calls_from_several_threads(arm: CModel) -> None:
-    each = np.random.default_rng(5).uniform(-1, 1, (2, 50, 6))
-    expected = [arm.poses_and_jacobian(rows) for rows in each]
-    with ThreadPoolExecutor(2) as threads:
-        for count, found in enumerate(threads.map(arm.poses_and_jacobian, [*each] * 5)):
-            np.testing.assert_equal(found, expected[count % 2])
 
 
 # --- The Newton step: trust region, joint limits, singularities ---------------------------------------------------
@@ -228,18 +218,6 @@ def test_no_step_is_longer_than_the_bound(arm: CModel, bound: float) -> None:
 
 
 @needs_compiler
-def test_near_singularities_steps_stay_small(arm: CModel) -> None:
-    """Wrist axes in one plane: a shift across them asks for infinite joint velocities."""
-    q = np.zeros(6)
-    direction = np.linalg.svd(arm.poses_and_jacobian(q[None])[1][0])[0][:, -1]
-    target = pose_at(arm, q)
-    target[:3, 3] += 5e-4 * direction[:3] / np.linalg.norm(direction[:3])
-    after, error = arm.newton_step(q, target, bound=0.02)
-    assert np.linalg.norm(after - q) <= 0.02 * (1 + 1e-12)
-    assert np.linalg.norm(linearised(arm, after, target, 0.1)[0]) <= error
-
-
-@needs_compiler
 @pytest.mark.parametrize("name", ["one joint", pytest.param("gantry", marks=pytest.mark.slow)])
 def test_robots_of_fewer_joints(name: str, tmp_path: Path) -> None:
     """They reach the poses that they can reach; another frame and prefix."""
@@ -260,7 +238,7 @@ def test_robots_of_fewer_joints(name: str, tmp_path: Path) -> None:
 @needs_compiler
 @pytest.mark.skipif(shutil.which("nm") is None, reason="no nm")
 def test_names_and_memory(files: CFiles) -> None:
-    """Only the documented names are global; mathematics alone is needed; no data can be written."""
+    """Only the documented names are global; mathematics alone is needed; no data can be written, by any thread."""
     target = files.source.with_suffix(".o")
     compiled([COMPILER, *C99, "-fno-stack-protector", "-c", files.source, "-o", target])
     listing = subprocess.run(["nm", target], capture_output=True, text=True, check=True, timeout=60).stdout

@@ -62,18 +62,6 @@ def test_nearly_parallel_axes(angle: float, convention: str) -> None:
     assert all(abs(row.beta) < 0.06 for row in table.rows)
 
 
-@both_conventions
-def test_a_table_is_found_again(convention: str) -> None:
-    """A robot made from a table, up to the freedom of the first and the last row and of each normal's direction."""
-    rows = [(0.3, 1.2, 0.4, 0.2), (-0.2, -1.5, 0.1, 0.3), (0.15, 0.9, -0.2, -0.4), (0.1, 1.1, 0.3, 0.1)]
-    table = dh_table(Geometry.nominal(dc.from_dh(rows, convention)), convention)
-    for row, (a, alpha, d, theta) in list(zip(table.rows, rows, strict=True))[1:-1]:
-        assert abs(row.a) == pytest.approx(abs(a), abs=1e-14)
-        assert abs(math.sin(row.alpha)) == pytest.approx(abs(math.sin(alpha)), abs=1e-14)
-        assert row.d == pytest.approx(d, abs=1e-14)
-        assert math.tan(row.theta) == pytest.approx(math.tan(theta), abs=1e-13)
-
-
 def test_a_ur10_has_its_maker_s_table(ur10_folder: Path) -> None:
     robot = dc.load_urdf(ur10_folder / "ur10_robot.urdf", "base_link", "ee_link")
     table = dh_table(Geometry.nominal(robot))

@@ -129,15 +129,6 @@ def test_sums_in_place_of_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert "interpolate" not in (tmp_path / "generated.c").read_text()
 
 
-def test_jacobian_is_the_derivative_of_the_program_itself() -> None:
-    """NumPy and torch share the formulas of gravity sag."""
-    program = made(deformation_of(CHAINS["arm"]))
-    q, step = draw(3, program.chain.n, seed=5).numpy(), 1e-6
-    jacobian = program.points_and_jacobian(q)[1]
-    for joint, e in enumerate(step * np.eye(q.shape[1])):
-        near(jacobian[..., joint], (program.points(q + e) - program.points(q - e)) / (2 * step), 1e-8)
-
-
 def test_maps_without_constant_stages_have_no_program() -> None:
     assert program_of(deformation_of(CHAINS["arm"], integrator=dc.TorchDiffEq())) is None
 

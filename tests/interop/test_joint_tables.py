@@ -65,6 +65,7 @@ def test_tables_cover_what_was_measured_and_say_how_good_interpolation_is(arm: C
         assert 0.5 * table.between < away < 1.5 * table.between + 1e-12
 
 
+@pytest.mark.slow
 def test_rigid_kinematics_made_for_the_tables_are_better_with_them(arm_200: Case) -> None:
     """On poses that were not fitted: nominal > rigid alone > rigid with tables > rigid made for tables."""
     model, test = arm_200.model, arm_200.test

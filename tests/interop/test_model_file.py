@@ -7,14 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 from math_bank import constant_kernel
-from model_file_bank import header_of, planar
+from model_file_bank import planar
 from product_bank import Case
-from safetensors import safe_open
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.interop import model_header
 from diffeo_calib.kernels.base import SumKernel
 from diffeo_calib.robots import elastic_rr
 
@@ -70,25 +68,6 @@ def test_every_kernel_comes_back(tmp_path: Path) -> None:
     again = dc.load(path, nominal=elastic_rr.nominal)
     assert torch.equal(again(x), fit.model(x))
     assert torch.equal(again.predict(x)[1], fit.model.predict(x)[1])
-
-
-def test_the_header_describes_the_model(arm: Case, tmp_path: Path) -> None:
-    path = tmp_path / "model.safetensors"
-    dc.save(arm.model, path)
-    header = header_of(path)
-    assert header["format"] == model_header.FORMAT
-    assert header["units"] == {"length": "m", "angle": "rad"}
-    robot = header["nominal"]
-    assert (robot["name"], robot["base"], robot["tip"]) == ("simulated_arm", "base_link", "flange")
-    report = header["report"]
-    assert report["coupling residual"] <= 1e-4
-    assert report["end residual"] <= 1e-4
-    assert report["diffeomorphic rms [m]"] < report["geometry rms [m]"] < report["registration rms [m]"]
-    assert report["status"] == arm.result.fit.status
-    with safe_open(path, framework="pt") as file:
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    assert all(t.dtype == torch.float64 for t in tensors.values())
-    assert tensors["x"].shape == (60, 6)
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,8 @@
-"""The best rigid kinematics of a model: exact where the model is rigid, cross-validated, saved and loaded."""
+"""The best rigid kinematics of a model: exact where the model is rigid, and cross-validated."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -14,11 +13,8 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.registration import with_joint_offsets
-from diffeo_calib.common.errors import InputError
 from diffeo_calib.interop.rigid import GEOMETRIC, PROJECTION, best_joint_offsets, rigid_kinematics, with_errors
 from diffeo_calib.robots import Geometry
-
-OLD = Path(__file__).parent / "data" / "robot_format_3.safetensors"
 
 
 def rms(points: Tensor, others: Tensor) -> float:
@@ -82,16 +78,6 @@ def test_joint_offsets_are_found_again(size: float, arm: Case) -> None:
     assert rms(found.rigid.geometry.points(q), model(q)) < 1e-6
     nominal = replace(found.rigid.geometry, joint_errors=Geometry.nominal(arm.robot).joint_errors)
     assert rms(nominal.points(q + found.offsets), model(q)) < 1e-6
-
-
-def test_files_without_it_are_projected(tmp_path: Path) -> None:
-    model = dc.load(OLD)
-    assert isinstance(model, dc.CalibratedKinematics)
-    assert model.rigid_errors is None
-    assert model.robot.source is None
-    assert rigid_kinematics(model).how == PROJECTION
-    with pytest.raises(InputError, match="does not hold the URDF that it was fitted with"):
-        dc.interop.write_urdf(model, tmp_path / "new.urdf")
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ import torch
 from product_bank import Case
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
-from sklearn.model_selection import GridSearchCV, KFold, cross_val_score
+from sklearn.model_selection import KFold, cross_val_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 from sklearn.utils.estimator_checks import check_estimator
@@ -101,16 +101,14 @@ def with_scales(arm: Case) -> dc.interop.DiffeoRegressor:
 
 
 @pytest.mark.slow
-def test_cross_validation_search_and_pipelines(arm: Case, table: tuple[np.ndarray, np.ndarray]) -> None:
-    folds, ours = KFold(3, shuffle=True, random_state=0), with_scales(arm)
+def test_cross_validation_and_pipelines(arm: Case, table: tuple[np.ndarray, np.ndarray]) -> None:
+    folds, ours = KFold(2, shuffle=True, random_state=0), with_scales(arm)
     scoring = "neg_root_mean_squared_error"
     scores = cross_val_score(ours, *table, cv=folds, scoring=scoring)
     assert scores.min() > -5e-3
     degrees = make_pipeline(FunctionTransformer(np.deg2rad), ours)
     degrees.fit(np.rad2deg(table[0]), table[1])
     assert degrees.score(np.rad2deg(arm.test.q.numpy()), arm.test.points.flatten(1).numpy()) > 0.9999999
-    search = GridSearchCV(ours, {"controls": [10, "all"]}, cv=2, scoring=scoring)
-    assert search.fit(*table).score(arm.test.q.numpy(), arm.test.points.flatten(1).numpy()) > -5e-3
 
 
 def test_bad_arguments(arm: Case, table: tuple[np.ndarray, np.ndarray]) -> None:

@@ -72,12 +72,6 @@ def test_other_readers_get_the_geometry_s_poses_and_only_origins_change(content:
         assert all(re.search(layout % (TRIPLE, TRIPLE), new) for layout in LAYOUT)
 
 
-def test_a_new_origin_takes_the_joint_s_indentation(tmp_path: Path) -> None:
-    text = UGLY.replace('"continuous"><parent link="a"/>', '"continuous">\n      <parent link="a"/>')
-    write_urdf(wrong(write_ugly(tmp_path / "robot.urdf", text)), tmp_path / "new.urdf")
-    assert re.search(rb'"continuous">\n      <origin [^>]*/>\n      <parent', (tmp_path / "new.urdf").read_bytes())
-
-
 def test_without_errors_the_file_is_copied(tmp_path: Path) -> None:
     chain = write_ugly(tmp_path / "robot.urdf", encoding="utf-8-sig")
     write_urdf(Geometry.nominal(chain), tmp_path / "new.urdf")

@@ -16,9 +16,8 @@ from sum_bank import FORMULAS, points
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile
+from diffeo_calib.kernels.profiles import MaternProfile
 from diffeo_calib.kernels.reductions import backends, distributed
-from diffeo_calib.kernels.reductions.formulas import FIELD
 from diffeo_calib.regression import control_points
 
 COUNT, ROWS = 300, 200
@@ -82,17 +81,6 @@ def lost(folder: Path) -> None:
         sys.exit(7)
 
 
-def differ(folder: Path) -> None:
-    """Every rank has points of its own."""
-    everything_shared()
-    own = distributed.ranks()
-    try:
-        backends.evaluate(FIELD, GaussianProfile(), None, points(COUNT, own.own), "distributed")
-    except dc.DiffeoCalibError as error:
-        print(error)
-        sys.exit(7)
-
-
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    {"agree": agree, "lost": lost, "differ": differ}[sys.argv[1]](Path(sys.argv[2]))
+    {"agree": agree, "lost": lost}[sys.argv[1]](Path(sys.argv[2]))

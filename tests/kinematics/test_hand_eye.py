@@ -35,14 +35,14 @@ def test_covariances_are_those_of_small_changes(name: str) -> None:
     for camera in HandEye.of_each(model, camera_on_tool=on_tool):
         own, found = SetUp.of(model, camera), HandEye.of(model, camera_on_tool=on_tool, camera=camera)
         carried, standing = (found.camera, found.board) if on_tool else (found.board, found.camera)
-        twists = torch.zeros(6, 0, dtype=torch.float64) if own.twists is None else own.twists
-        shifts = torch.zeros(0, dtype=torch.int64) if own.columns is None else own.columns.nonzero()[:, 0]
+        shifts = own.columns.nonzero()[:, 0]
 
-        def poses(step: Tensor, own: SetUp = own, twists: Tensor = twists) -> tuple[Tensor, Tensor]:
-            theta, moved = step.split([g.size, twists.shape[1]])
-            after, turned = g.absorb(theta), twist_transform(twists @ moved)
-            frame, device = (own.transform @ turned, own.mount) if own.framed else (own.transform, turned @ own.mount)
-            return poses_from_marks(after.tool[None], lever)[0] @ device, torch.linalg.inv(frame @ after.base)
+        def poses(step: Tensor, own: SetUp = own) -> tuple[Tensor, Tensor]:
+            theta, moved = step.split([g.size, own.of_mount.shape[1]])
+            after = g.absorb(theta)
+            mount, frame = twist_transform(own.of_mount @ moved) @ own.mount, twist_transform(own.of_frame @ moved)
+            standing = torch.linalg.inv(own.transform @ frame @ after.base)
+            return poses_from_marks(after.tool[None], lever)[0] @ mount, standing
 
         for number, (known, part) in enumerate(((carried, "tool"), (standing, "base"))):
             numbers = torch.arange(g.size)[g.slices[part]]

@@ -20,10 +20,10 @@ def same(found: Tensor, expected: Tensor, atol: float = 1e-10) -> None:
     torch.testing.assert_close(found, expected, rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("name", ["slides", "mimic joints", "mimic slides", "arm"])
-def test_jacobians_of_a_robot(name: str) -> None:
+@pytest.mark.parametrize("name", ["slides", "mimic joints", "mimic slides", "arm", "a plain map"])
+def test_jacobians(name: str) -> None:
     """In both modes, one row and all rows, at control points too."""
-    model = made(name)
+    model = fitted_plain("matern32") if name == "a plain map" else made(name)
     q = queries(model)
     expected = model.jacobian(q)
 
@@ -35,15 +35,6 @@ def test_jacobians_of_a_robot(name: str) -> None:
     same(vmap(jacfwd(f))(q), expected)
     same(jacrev(f)(q[0]), expected[0])
     same(jacfwd(f)(q[0]), expected[0])
-    same(vmap(lambda row: model.jacobian(row[None])[0])(q), expected)
-
-
-def test_jacobians_of_a_plain_map() -> None:
-    model = fitted_plain("matern32")
-    q = queries(model)
-    expected = model.jacobian(q)
-    same(vmap(jacrev(lambda row: model(row[None])[0]))(q), expected)
-    same(vmap(jacfwd(lambda row: model(row[None])[0]))(q), expected)
     same(vmap(lambda row: model.jacobian(row[None])[0])(q), expected)
 
 

@@ -62,7 +62,6 @@ READ: dict[str, tuple[str | bytes, dict[str, str], str]] = {
         {},
         "line 1, 2, 4 before the header skipped",
     ),
-    "a preamble of a spreadsheet": ("Trial,17,,,\nSite,hall,,,\n,,,,\n" + PLAIN, {}, "line 1, 2, 3 before the header"),
     "units": (PLAIN.replace("z\n", "z\nrad,(rad),[mm],mm,mm\n"), {}, "line 2 holds units"),
     "comments between rows": (
         PLAIN.replace("0.200,", "# moved the tripod\n0.200,") + "#9,9,9,9,9\n",
@@ -98,7 +97,6 @@ READ: dict[str, tuple[str | bytes, dict[str, str], str]] = {
     "another name twice": (separated(",", [[*NAMES, "t", "t"], *([*row, "1", "2"] for row in CELLS)]), {}, ""),
     "columns that are counted": ("0,1,2,3,4\n" + BARE, {"names": "01234"}, ""),
     "no names": (BARE, {"names": "12345"}, "no header line: columns are named by their places, 1 to 5"),
-    "a comment and no names": ("# by hand\n" + BARE, {"names": "12345"}, "no header line: columns are named by their"),
     "no names, trailing separators": (
         BARE.replace("\n", ",\n"),
         {"names": "12345"},

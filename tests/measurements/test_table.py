@@ -70,7 +70,10 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"q": [[0.0, 1.0]], "points": [[1, 2, 3]], "joint_names": ["a", "a"]}, "`joint_names` ... distinct"),
     ({"q": [[0.0]], "points": [[1, 2, 3]], "marker_names": ["a", "b"]}, "`marker_names`: expected 1 ... got 2"),
     ({"points": [[1, 2, 3], [4, 5, 6], [nan] * 3]}, "`points` has 3 value(s) that are not finite"),
-    ({"points": [[[1, 2, 3], [nan, nan, 6]]] * 3}, "`points`, row 0, marker 1 ... NaN for x, y only"),
+    (
+        {"points": [[[1, 2, 3], [nan, nan, 6]]] * 2 + [[[1, 2, 3]] * 2]},
+        "row 0, marker 1 (and 1 more) ... NaN for x, y only",
+    ),
     ({"points": [[[1, 2, 3]] * 2, [[nan] * 3] * 2, [[nan] * 3] * 2]}, "`points`, row 1, 2: no marker was seen"),
     ({"points": [[[1, 2, 3], [nan] * 3]] * 3, "marker_names": ["a", "tool"]}, "marker tool is hidden in all 3 rows"),
     ({"points": [[[1, 2, 3], [np.inf, 1, 1]]] * 3}, "`points` ... finite"),
@@ -125,6 +128,25 @@ def test_repeats_and_values_like_degrees_are_doubted_and_kept() -> None:
     assert data.groups().tolist() == [0, 1, 0]
     poses[2, :3, :3] = poses[1, :3, :3]  # the same place, turned
     assert Measurements.from_poses(data.q, poses).copies() == []
+
+
+def test_set_ups_and_loads_of_rows() -> None:
+    data, names = some(5), ["a", "b", "b", "a", "b"]
+    named = data.with_sessions(names)
+    assert named.largest_session().points.tolist() == data.points[[1, 2, 4]].tolist()
+    assert named.rows([0, 3]).largest_session().present_sessions == ("a",)
+    posed = Measurements.from_poses(data.q, random_poses(5))
+    for call, message in (
+        (lambda: data.with_sessions(["a", None, "b", nan, " "]), "3 row(s) have no name, the first is row 1"),  # pyright: ignore
+        (lambda: data.with_sessions(names[:2]), "expected 5 names, one per row, got 2"),
+        (lambda: posed.with_sessions(names, remounted=True), "mounted anew: expected positions, got poses"),
+        (lambda: data.with_payload([1, 2, -3, 4, 5]), "`payload`, row 2: expected a mass of 0 or more, got -3"),
+        (lambda: data.with_payload(-1.0), "`payload`: expected a mass of 0 or more, got -1"),
+        (lambda: Readings.distances(data.q, 1.0, offset_std=-1.0), "`offset_std`: expected 0 or more, got -1.0"),
+        (lambda: Readings.distances(data.q, [1, 1, 0, 1, 1]), "`lengths`: expected above 0, got 0 m in row 2"),
+    ):
+        with pytest.raises(MeasurementError, match=in_order(message)):
+            call()
 
 
 def test_rows() -> None:

@@ -15,8 +15,9 @@ from torch.testing import assert_close
 
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.maps.linearisation import Numbers
+from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.regression.cholesky import Factor
-from diffeo_calib.regression.conditional import BeforeData, Opened, Process
+from diffeo_calib.regression.conditional import BeforeData, Estimated, Opened, Process, diagonal_blocks
 
 
 def close(found: Tensor, expected: Tensor, relative: float) -> None:
@@ -113,6 +114,7 @@ def test_rows_may_come_in_parts_and_in_any_order(case: Case) -> None:
         close(found.mean(later), found.mean(plain), 1e-9)
         close(later.between(), plain.between(), 1e-9)
         close(later.between(plain), plain.between(), 1e-9)
+        close(found.covariance(new.numbers.at), diagonal_blocks(plain.between(), len(new.data.x)), 1e-9)
         K, target = b.numbers.with_noise(at.between(), b.noise), b.numbers.there(before.mean(at))
         normal = torch.distributions.MultivariateNormal(target, (K + K.T) / 2)
         more = float(normal.log_prob(b.numbers.target))
@@ -142,6 +144,17 @@ def test_unknowns_that_later_rows_open_are_as_if_they_had_been_there(case: Case)
     assert found.evidence == pytest.approx(whole.evidence - known.evidence, rel=1e-6)
 
 
+def test_errors_beside_unknowns_that_were_estimated_from_them(case: Case) -> None:
+    """Covariance of e(x) - B(x) A e(X), written out."""
+    first, _, new = cut(case)
+    known, at, reference = case.posterior, new.numbers.at, first.numbers.at
+    A = 1e-3 * normal(2, len(reference.sensitivity.flatten(0, 1)), seed=3)
+    C, cross = known.covariance_between(at), known.covariance_between(reference, at)
+    BA = at.sensitivity[..., [1, 4]].flatten(0, 1) @ A
+    expected = C - BA @ cross - (BA @ cross).T + BA @ known.covariance_between(reference) @ BA.T
+    close(Estimated(known, reference, A, [1, 4]).covariance_between(at), expected, 1e-9)
+
+
 def test_left_out_is_conditioning_without(case: Case) -> None:
     """Rows, and groups of rows."""
     rows = torch.arange(len(case.data.x))
@@ -166,6 +179,27 @@ def test_opened_unknowns_are_those_of_another_factor(case: Case, size: float | N
     close(again.matrix, case.posterior.factor.matrix + more @ more.T, 1e-9)
     close(found.inverse, again.inverse, 1e-7)
     close(found.mu, again.solve(found.numbers.target[:, None])[:, 0], 1e-7)
+
+
+def test_evidence_of_unknowns_is_that_of_their_covariance(case: Case) -> None:
+    """By a process and by the factor of its covariance; what unknowns explain is the fall of least squares."""
+    E, y = 1e-4 * normal(len(case.posterior.mu), 2, seed=9), case.numbers.target
+    K, found = case.posterior.factor.matrix, Evidence.of(E, case.posterior)
+    root, variances = torch.linalg.cholesky(K), torch.tensor([0.5, 30.0], dtype=torch.float64)
+    for one, other in zip(found, Evidence.by(E, y, root), strict=True):
+        assert_close(torch.as_tensor(one), torch.as_tensor(other), rtol=1e-6, atol=1e-6)
+    odds = Evidence(torch.stack([found.g, 2.0 * found.g]), found.H).log_odds(variances)
+    for row, variance in enumerate(variances):
+        for column, target in enumerate((y, 2.0 * y)):
+            before, after = (
+                torch.distributions.MultivariateNormal(torch.zeros_like(y), scale_tril=torch.linalg.cholesky(each))
+                for each in (K, K + variance * E @ E.T)
+            )
+            expected = float(after.log_prob(target) - before.log_prob(target))
+            assert float(odds[row, column]) == pytest.approx(expected, rel=1e-6, abs=1e-6)
+    white = torch.linalg.solve_triangular(root, torch.stack([y, y - E @ found.size], 1), upper=False).square().sum(0)
+    assert float(found.gain) == pytest.approx(float(white[0] - white[1]), rel=1e-6)
+    assert float(found.excess) == pytest.approx(max(float(white[1]) / len(y), 1.0), rel=1e-6)
 
 
 def test_rows_without_noise_that_are_there_twice_are_refused() -> None:

@@ -122,7 +122,7 @@ def test_accuracy_and_repeatability_by_the_formulas_of_the_standard(arm: Case) -
         assert repeats_of(none, {"calibrated": arm.model}, 2e-5) is None
 
 
-@of("arm", "slider")
+@of("arm", "posed")
 def test_stages_from_a_model_are_those_of_its_calibration(
     name: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:

@@ -274,8 +274,7 @@ class BoardImages(Sensor):
         if not bool(by_lens.isfinite().all()):  # it was seen from other places since
             return new
         of_fit = fitted.noise.shared[rows][:, :9].clone()
-        if self.set_up.columns is not None:
-            of_fit[..., self.set_up.columns] = 0.0
+        of_fit[..., self.set_up.columns] = 0.0
         effects = torch.linalg.lstsq(by_lens.flatten(0, 1), of_fit.flatten(0, 1), driver="gelsd").solution
         beyond = (fitted.noise.covariance[rows][:, :9, :9] - known).median(0).values
         values, axes = torch.linalg.eigh(0.5 * (beyond + beyond.mT))
@@ -313,9 +312,8 @@ class BoardImages(Sensor):
         if self.seen.camera.view is not None:
             noise, by_lens = self.tells(points)
             noise, parts = noise + rest, [(columns, by_lens @ root)]
-        if self.set_up.columns is not None:
-            first = len(scene.at.spec.prior_variance)
-            parts.append((first + self.set_up.columns.nonzero()[:, 0], self.set_up.shifted(points)))
+        first = len(scene.at.spec.prior_variance)
+        parts.append((first + self.set_up.columns.nonzero()[:, 0], self.set_up.shifted(points)))
         columns, effects = torch.cat([own for own, _ in parts]), torch.cat([own for _, own in parts], 2)
         every = torch.eye(9, dtype=points.dtype, device=points.device).expand(len(rows), 9, 9)
         yield Told(self.name, rows, every, effects, columns, self._noise(noise))

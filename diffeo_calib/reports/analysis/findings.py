@@ -274,7 +274,7 @@ def _left_out(model: CalibratedKinematics, rows: FitRows, stages: Mapping[str, K
     LOG.info("judged by the %d rows of the fit, each predicted by all others", len(found))
     data, (*before, own) = found.data, stages
     errors = {name: residuals(stages[name], place(stages[name], data), data) for name in before}
-    errors[own] = Evaluations.of([(found.errors, torch.arange(len(found), device=HOST))], len(found))
+    errors[own] = Evaluations.of([(found.errors, torch.arange(len(found), device=HOST))])
     outliers = found.outliers(model)
     cause = common_cause(model, data, outliers) if model.registration is None else None  # else they are elsewhere
     kinds, moved = _by_kind(errors, data.q, data.line_numbers), [cause] if cause else []
