@@ -139,7 +139,12 @@ class Source:
             return left / max(spread(own.points), SMALLEST_SPREAD_M)
         own, readings = divided(self.data)
         if own is not None:
-            return _in_sockets(self.robot, own.table)
+            if own.table.socket is None:
+                return inf
+            rests = register_sockets(self.robot, own.table.q, own.table.socket)
+            ball = rests.positions[own.table.socket]
+            around = float((ball - ball.mean(0)).norm(dim=1).median())
+            return float(rests.distances.median()) / around if around > 0.0 else inf
         tables = [one.table for one in readings]
         lengths = [one for one in tables if one.kind != "image"]
         if not lengths:
@@ -196,16 +201,6 @@ def is_clear(found: Sequence[Source], ratio: float = CLEAR_RATIO) -> bool:
 def percent(share: float, digits: int = 3) -> str:
     """A share in words."""
     return f"{100 * share:.{digits}g} %"
-
-
-def _in_sockets(robot: Tree, data: Measurements) -> float:
-    """Median distance of the ball from the middle of its socket, as a share of its spread over all rows."""
-    if data.socket is None:
-        return inf
-    found = register_sockets(robot, data.q, data.socket)
-    seen = found.positions[data.socket]
-    spread = float((seen - seen.mean(0)).norm(dim=1).median())
-    return float(found.distances.median()) / spread if spread > 0.0 else inf
 
 
 def _in_images(robot: Tree, data: Readings) -> float:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from diffeo_calib.cli.column_names import column
-from diffeo_calib.cli.guesses import Body, bodies_in, guess_joints, guess_matrix, joints_without_column
+from diffeo_calib.cli.guesses import Body, bodies_in, guess_joints, joints_without_column
 
 SIX = [f"joint_{k}" for k in range(1, 7)]
 SO_100 = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"]
@@ -114,14 +114,6 @@ def test_which_columns_are_the_joints() -> None:
     assert not guess_joints(names, ARM)
     assert joints_without_column(names, ARM) == ["forearm"]
     assert guess_joints([*names, "E1"], ARM)[0].names[3] == "E1"
-
-
-def test_poses_as_matrices() -> None:
-    """Twelve numbers are a pose too, where they are named by row and column."""
-    named = [f"T_{row}_{k}" for row in "1234" for k in "1234"]
-    assert guess_matrix([f"O_T_EE_d[{k}]" for k in range(16)]) is None
-    assert guess_matrix(series("O_T_EE[{}]", 0, 15)) is None
-    assert (guess_matrix(named), guess_matrix(named[:-1])) == ((named, True), (named[:12], True))
 
 
 @pytest.mark.parametrize(
