@@ -78,11 +78,11 @@ class Factor:
 
     def further(self, values: Tensor, sooner: Tensor) -> Tensor:
         """The rows of L^-1 values after the first n, ``sooner`` (n, k), from the values after n."""
-        n, M = len(sooner), len(self.first)
-        parts = [sooner]
-        for n, rows in ((n, self.first[n:]), (max(n, M), self.added[max(n - M, 0) :])):
+        start, M, parts = len(sooner), len(self.first), [sooner]
+        for n, rows in ((start, self.first[start:]), (max(start, M), self.added[max(start - M, 0) :])):
             if len(rows):
-                right = values[: len(rows)] - rows[:, :n] @ (torch.cat(parts) if len(parts) > 1 else sooner)
+                known = torch.cat(parts) if len(parts) > 1 else sooner
+                right = values[: len(rows)] - rows[:, :n] @ known
                 parts.append(torch.linalg.solve_triangular(rows[:, n:], right, upper=False))
                 values = values[len(rows) :]
         return torch.cat(parts[1:])
