@@ -241,9 +241,8 @@ class Campaign:
         else:
             self._judge(self._model, self.table)
         self._renew()
-        self.verdicts[row] = replace(self.verdicts[row], expected_error=self.expected_error)
-        if self._model is None:
-            self.verdicts[row] = replace(self.verdicts[row], cause=self._obstacle)
+        why = {"cause": self._obstacle} if self._model is None else {}
+        self.verdicts[row] = replace(self.verdicts[row], expected_error=self.expected_error, **why)
         for one in self.verdicts[:row]:
             if one.again and float((self.table.q[one.row] - self.table.q[row]).abs().max()) < SAME_POSE:
                 self.verdicts[one.row] = replace(one, again=False)

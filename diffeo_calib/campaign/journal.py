@@ -46,13 +46,7 @@ STILL_SECONDS = 5.0
 
 
 class Journal:
-    """The journal beside a table, open for one process: a context.
-
-    Args:
-        path: the file.
-
-    Attributes:
-        entries: what it holds.
+    """The journal beside a table, open for one process: a context, whose ``entries`` are those it had.
 
     Raises:
         InputError: it cannot be opened, another process writes it, or it is no journal.

@@ -258,15 +258,6 @@ def _rotations(columns: Sequence[str], labels: Sequence[str]) -> Iterator[Group]
             yield group
 
 
-def guess_matrix(columns: Sequence[str]) -> tuple[list[str], bool] | None:
-    """The 16 or 12 columns of a pose as a matrix, and whether they are named by row and column; None without any."""
-    for labels in ENTRIES:
-        for group in whole(columns, labels):
-            if not group.wished and not _goes_on(columns, group):
-                return list(group.names.values()), len(labels[0]) == 2
-    return None
-
-
 def guess_readings(columns: Sequence[str]) -> dict[str, list[str]]:
     """Texts of `fit --reading` of all kinds of devices, by the names of their columns; these columns."""
     found, described = dict[str, list[str]](), [column(name) for name in reversed(columns)]
@@ -422,16 +413,19 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
 
 
 def matrices_in(sheet: Sheet, columns: Sequence[str]) -> list[Body]:
-    """Poses that are written as 16 numbers by rows or columns."""
+    """Poses that are written as 16 or 12 numbers by rows or columns."""
     found = list[Body]()
-    while (guessed := guess_matrix(columns)) is not None:
-        names, named = guessed
-        below = [cell for k in BELOW if not named for cell in sheet.cells[names[k]]]
-        by_rows = all(number(cell, sheet.decimal) == 0 for cell in below)
-        entries = [names[4 * row : 4 * row + 4] if by_rows else names[row::4] for row in range(3)]
-        turn = [name for row in entries for name in row[:3]]
-        found.append(Body([row[3] for row in entries], turn, "a matrix"))
-        columns = [name for name in columns if name not in names]
+    for labels in ENTRIES:
+        used = {name for own in found for name in (*own.place, *own.turn)}
+        for group in whole([name for name in columns if name not in used], labels):
+            if group.wished or _goes_on(columns, group):
+                continue
+            names, counted = list(group.names.values()), len(labels[0]) < 2
+            below = [cell for k in BELOW if counted for cell in sheet.cells[names[k]]]
+            by_rows = all(number(cell, sheet.decimal) == 0 for cell in below)
+            entries = [names[4 * row : 4 * row + 4] if by_rows else names[row::4] for row in range(3)]
+            turn = [name for row in entries for name in row[:3]]
+            found.append(Body([row[3] for row in entries], turn, "a matrix"))
     return found
 
 
@@ -451,14 +445,6 @@ def _corners_in(sheet: Sheet) -> list[str]:
     width, height = (max(number(cell, sheet.decimal) or 0.0 for cell in sheet.cells[name]) for name in PIXEL)
     size = next((size for size in USUAL_SIZES if width < size[0] and height < size[1]), USUAL_SIZES[-1])
     return [f"{CORNERS}{','.join(map(str, size))}"]
-
-
-def tips_of(markers: Sequence[Sequence[str]], leaves: Sequence[str]) -> list[str]:
-    """The leaf after which the columns of each marker are named, such as left_x after left; none unless several are."""
-    known = {column(leaf).plain: leaf for leaf in leaves}
-    found = [known.get(column(triple[0]).plain.removesuffix("x")) for triple in markers]
-    tips = [tip for tip in found if tip is not None]
-    return tips if len(tips) == len(markers) and len(set(tips)) > 1 else []
 
 
 def with_places(csv: Path, given: Places, folder: Path) -> tuple[Path, list[Choice]]:

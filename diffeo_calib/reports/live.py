@@ -35,12 +35,7 @@ LAST_SECONDS = 0.6
 
 
 class Page(ThreadingHTTPServer):
-    """A running server.
-
-    Attributes:
-        url: where the page is, with its token if it has one.
-        decisions: what the buttons decided, as programs send it.
-    """
+    """A running server: ``url`` is the page, with its token; ``decisions`` take what the buttons decide."""
 
     def __init__(self, place: tuple[str, int], decisions: Inbox) -> None:
         super().__init__(place, _Handler)
@@ -63,14 +58,7 @@ class Page(ThreadingHTTPServer):
 
 @contextmanager
 def served(address: str, decisions: Inbox) -> Iterator[Page]:
-    """Serve a page at ``PORT`` or ``HOST:PORT``, 0 for any free port.
-
-    Args:
-        decisions: takes what the buttons decide.
-
-    Raises:
-        InputError: no such address, or one that is taken.
-    """
+    """Serve a page at ``PORT`` or ``HOST:PORT``, 0 for any free port; InputError if there is none, or it is taken."""
     host, _, port = address.rpartition(":")
     try:
         page = Page((host or LOCAL[0], int(port)), decisions)

@@ -16,12 +16,7 @@ from table_bank import refused
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.identification.identification import (
-    Prior,
-)
 from diffeo_calib.calibration.placing.place import place
-from diffeo_calib.calibration.scales.selection import defaults, log_posterior
-from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.rows import with_attributes
@@ -75,12 +70,6 @@ def result(arm: SimulatedArm, mixture: dc.Measurements, scales: dc.Hyperparamete
     return dc.calibrate(arm.nominal, mixture, hyperparameters=scales)
 
 
-@pytest.fixture(scope="module")
-def tangent(arm: SimulatedArm, mixture: dc.Measurements) -> TangentData:
-    """The mixture around its geometric calibration."""
-    return place(arm.nominal, mixture, silent).tangent_data()
-
-
 def rms(errors: Tensor) -> float:
     return float(errors.square().sum(-1).mean().sqrt())
 
@@ -114,21 +103,6 @@ def test_the_sockets_are_in_the_frame_of_the_device(arm: SimulatedArm, result: A
     assert squares < 2.5 * len(errors), "as far away as the covariance says"
     assert "mm in the measuring frame, deviations 0." in found.sentences()[0]
     assert not any("smaller than the true error" in line for line in found.sentences())
-
-
-def test_the_noise_of_sockets_is_searched(tangent: TangentData) -> None:
-    """One more scale, whose slope is that of the log posterior."""
-    centre = defaults(tangent, 3e-4, Prior())
-    point, step = centre.logarithms() + 0.1, 1e-4
-    found = log_posterior(point, centre, tangent)
-    values = []
-    for sign in (-1.0, 1.0):
-        moved = point.clone()
-        moved[-1] += sign * step
-        there = log_posterior(moved, centre, tangent)
-        values.append(there.likelihood + there.prior)
-    assert abs(float(found.gradient[-1])) > 1.0
-    assert float(found.gradient[-1]) == pytest.approx((values[1] - values[0]) / (2 * step), rel=1e-5)
 
 
 def test_several_set_ups_of_the_device(

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from process_bank import case
 from product_bank import Case, noise_blocks
 from tangent_bank import (
     Setting,
@@ -57,12 +58,12 @@ def test_the_unit_of_length_does_not_matter() -> None:
     geometry = setting.nominal.geometry
     large = replace(data, nominal=Grown(geometry), theta=data.theta[: geometry.size], x=data.x * big)
     grown = defaults(large, 10 * noise, prior)
-    assert_close(grown.coupled_lengthscale, setting.scales.coupled_lengthscale * big)
-    assert_close(grown.transmission_lengthscale, setting.scales.transmission_lengthscale * big)
-    assert_close(grown.task_lengthscale, 10 * setting.scales.task_lengthscale)
-    assert_close(grown.sensor_noise, 10 * setting.scales.sensor_noise)
-    assert_close(grown.rotation_noise, setting.scales.rotation_noise)
-    assert_close(grown.task_amplitude, 10 * setting.scales.task_amplitude)
+    assert_close(grown.coupled_lengthscale, setting.scales.coupled_lengthscale * big, rtol=1e-6, atol=0)
+    assert_close(grown.transmission_lengthscale, setting.scales.transmission_lengthscale * big, rtol=1e-6, atol=0)
+    assert_close(grown.task_lengthscale, 10 * setting.scales.task_lengthscale, rtol=1e-6, atol=0)
+    assert_close(grown.sensor_noise, 10 * setting.scales.sensor_noise, rtol=1e-6, atol=0)
+    assert_close(grown.rotation_noise, setting.scales.rotation_noise, rtol=1e-6, atol=0)
+    assert_close(grown.task_amplitude, 10 * setting.scales.task_amplitude, rtol=1e-6, atol=0)
     assert bool((grown.joint_noise > 0).all())
 
 
@@ -143,9 +144,15 @@ def of_poses() -> tuple[dc.Hyperparameters, TangentData]:
     return setting.scales, weighted(setting)
 
 
-@pytest.mark.parametrize("case", [of_places, of_poses])
-def test_gradient_against_central_differences(case: Callable[[], tuple[dc.Hyperparameters, TangentData]]) -> None:
-    centre, data = case()
+def of_a_mixture() -> tuple[dc.Hyperparameters, TangentData]:
+    """Sockets have a noise of their own."""
+    one = case("mixture")
+    return one.scales, one.data
+
+
+@pytest.mark.parametrize("rows", [of_places, of_poses, of_a_mixture])
+def test_gradient_against_central_differences(rows: Callable[[], tuple[dc.Hyperparameters, TangentData]]) -> None:
+    centre, data = rows()
     point, h = shaken(centre, 2).logarithms(), 0.02  # long steps: the prior of the base is wide
 
     def change(step: Tensor) -> float:
@@ -154,7 +161,7 @@ def test_gradient_against_central_differences(case: Callable[[], tuple[dc.Hyperp
 
     found = log_posterior(point, centre, data)
     start = 0
-    for name in SCALES:  # along one direction for every kind of scale
+    for name in centre.searched:  # along one direction for every kind of scale
         size = getattr(centre, name).numel()
         step = torch.zeros_like(point)
         step[start : start + size] = h * normal(size, seed=start)

@@ -361,25 +361,25 @@ def test_pages_of_nothing_and_of_a_row(tmp_path: Path, run: Callable[..., tuple[
             assert answer.status == 200
             return answer.read()
 
-    def shown(text: str) -> int:
-        """Number of poses on the page when it says something."""
+    def shown(text: str) -> tuple[int, int]:
+        """Numbers of poses that are done, and to be measured next, on the page when it says something."""
         for _ in range(600):
             state = json.loads(asked("GET", "/state"))
             if state.get("state", "").startswith(text):
-                return len(state["done"])
+                return len(state["done"]), len(state["next"])
             time.sleep(0.1)
-        return -1
+        return -1, -1
 
     def lines() -> Iterator[bytes]:
         yield from (b"{}\n", b'{"do": "reject", "line": 2}\n', b'{"joint_1": 1}\n')
         asked("GET", "/")
         for what in ("accept", "reject", "repeat"):
             asked("POST", f"/{what}?line=2")
-        assert shown("0 of 0 rows accepted; no model yet") == 0
+        assert shown("0 of 0 rows accepted; no model yet") == (0, 0)
         yield row(0)
-        assert shown("1 of 1") == 1
+        assert shown("1 of 1") == (1, 0)
         asked("POST", "/reject?line=2")
-        assert shown("0 of 1") == 1
+        assert shown("0 of 1") == (1, 0)
         decided = json.loads((tmp_path / "run.csv.journal").read_text().splitlines()[-1])
         assert (decided["row"], decided["accepted"], decided["decided"]) == (0, False, True)
         yield b'{"do": "repeat", "line": 2}\n'

@@ -134,6 +134,10 @@ def test_implausible_errors_have_a_sentence(arm: Case) -> None:
     text = implausible(arm.model, moved, errors) or ""
     assert text.startswith("these errors are not those of a calibrated robot: expected a median of about ")
     assert f"got {1e3 * errors.median:.3g} mm; check `length` and `angle`, the order of the columns, and that" in text
+    unsure = arm.model.changed(map=arm.model.map.inflated(1e5))
+    for shift, told in ((0.05, False), (0.15, True)):  # a tenth of the reach is too much whatever a model expects
+        moved = dc.Measurements(arm.test.q, arm.test.points + shift)
+        assert (implausible(unsure, moved, dc.evaluate(arm.model.__call__, moved)) is not None) == told
     far = dc.Measurements(arm.test.q, arm.test.points + 0.5)
     with pytest.raises(MeasurementError, match=r"moving the measuring device by 866 mm .*--free both"):
         dc.evaluate(arm.model, far)

@@ -17,7 +17,7 @@ from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.maps.linearisation import Numbers
 from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.regression.cholesky import Factor
-from diffeo_calib.regression.conditional import BeforeData, Opened, Process
+from diffeo_calib.regression.conditional import BeforeData, Estimated, Opened, Process, diagonal_blocks
 
 
 def close(found: Tensor, expected: Tensor, relative: float) -> None:
@@ -114,6 +114,7 @@ def test_rows_may_come_in_parts_and_in_any_order(case: Case) -> None:
         close(found.mean(later), found.mean(plain), 1e-9)
         close(later.between(), plain.between(), 1e-9)
         close(later.between(plain), plain.between(), 1e-9)
+        close(found.covariance(new.numbers.at), diagonal_blocks(plain.between(), len(new.data.x)), 1e-9)
         K, target = b.numbers.with_noise(at.between(), b.noise), b.numbers.there(before.mean(at))
         normal = torch.distributions.MultivariateNormal(target, (K + K.T) / 2)
         more = float(normal.log_prob(b.numbers.target))
@@ -141,6 +142,17 @@ def test_unknowns_that_later_rows_open_are_as_if_they_had_been_there(case: Case)
     close(known.mean(known.features(at)) + found.mean(one), whole.mean(other), 1e-6)
     close(one.between(), other.between(), 1e-6)
     assert found.evidence == pytest.approx(whole.evidence - known.evidence, rel=1e-6)
+
+
+def test_errors_beside_unknowns_that_were_estimated_from_them(case: Case) -> None:
+    """Covariance of e(x) - B(x) A e(X), written out."""
+    first, _, new = cut(case)
+    known, at, reference = case.posterior, new.numbers.at, first.numbers.at
+    A = 1e-3 * normal(2, len(reference.sensitivity.flatten(0, 1)), seed=3)
+    C, cross = known.covariance_between(at), known.covariance_between(reference, at)
+    BA = at.sensitivity[..., [1, 4]].flatten(0, 1) @ A
+    expected = C - BA @ cross - (BA @ cross).T + BA @ known.covariance_between(reference) @ BA.T
+    close(Estimated(known, reference, A, [1, 4]).covariance_between(at), expected, 1e-9)
 
 
 def test_left_out_is_conditioning_without(case: Case) -> None:

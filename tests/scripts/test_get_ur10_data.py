@@ -53,6 +53,10 @@ def test_writes_what_the_benchmark_reads(small: Path, tmp_path: Path, capsys: py
     data = read(own, find(folder)["ipa_ur10"])
     assert data.measurements.points[1, 0].tolist() == pytest.approx([0.1015, 2e-3, 3e-3])
     assert data.measurements.q[1, [0, 5]].tolist() == pytest.approx([0.1, 0.2])
+    rows = zip(get_ur10_data.LENGTHS, get_ur10_data.TWISTS, get_ur10_data.OFFSETS, strict=True)
+    q = torch.linspace(-3.0, 3.0, 60, dtype=torch.float64).reshape(10, 6)
+    torch.testing.assert_close(data.robot(q), dc.from_dh([*rows], "standard")(q), rtol=0, atol=1e-14)
+    torch.testing.assert_close(data.robot.limits[:, 1], torch.full((6,), 2 * math.pi, dtype=torch.float64))
     before = (own / "dataset.json").stat().st_mtime_ns
     get_ur10_data.main([str(folder), "--from", str(small.parent)])  # again: nothing to do
     assert (own / "dataset.json").stat().st_mtime_ns == before
@@ -60,17 +64,6 @@ def test_writes_what_the_benchmark_reads(small: Path, tmp_path: Path, capsys: py
     (own / "dataset.json").write_text("{}")
     assert "exists with other contents" in failure(capsys, folder, "--from", small)
     assert (own / "dataset.json").read_text() == "{}"
-
-
-def test_the_urdf_is_the_dh_table(small: Path, tmp_path: Path) -> None:
-    get_ur10_data.main([str(tmp_path), "--from", str(small)])
-    robot = dc.load_urdf(tmp_path / "ipa_ur10" / "ur10.urdf", base="base_link", tip="tool0")
-    rows = list(zip(get_ur10_data.LENGTHS, get_ur10_data.TWISTS, get_ur10_data.OFFSETS, strict=True))
-    expected = dc.from_dh(rows, "standard")
-    q = torch.linspace(-3.0, 3.0, 60, dtype=torch.float64).reshape(10, 6)
-    torch.testing.assert_close(robot(q), expected(q), rtol=0, atol=1e-14)
-    assert robot.joint_names == tuple(f"{name}_joint" for name in get_ur10_data.JOINTS)
-    torch.testing.assert_close(robot.limits[:, 1], torch.full((6,), 2 * math.pi, dtype=torch.float64))
 
 
 def test_failures_leave_nothing(

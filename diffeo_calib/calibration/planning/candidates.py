@@ -85,15 +85,7 @@ def all_of(criteria: Sequence[Criterion]) -> Criterion | None:
 
 
 def outside_column(robot: Tree, column: object, points: Tensor) -> Criterion:
-    """Whether all moving points are outside an upright cylinder.
-
-    Args:
-        robot: the chain. column: x, y and radius, and the height of its top if it ends, in the robot's base frame, m.
-        points: (P, 3) on the tool, in the tip's frame, m.
-
-    Raises:
-        InputError: other numbers.
-    """
+    """Whether all moving points are outside a column, see :func:`candidates`; points (P, 3) on the tool, m."""
     numbers = as_tensor(column, "column", (3,), also=((4,),), fix="pass x, y, radius and perhaps the top, in m")
     if not float(numbers[2]) > 0:
         raise InputError.of("the radius of `column`", expected="a positive number of m", got=float(numbers[2]))
@@ -108,11 +100,7 @@ def outside_column(robot: Tree, column: object, points: Tensor) -> Criterion:
 
 
 def _links(robot: Tree, q: Tensor, points: Tensor) -> Tensor:
-    """Points on everything that moves: from the first joint's origin, which stays, along all links to the tool.
-
-    Returns:
-        (N, K, 3) in the robot's base frame, m, the first joint's origin left out.
-    """
+    """Points (N, K, 3) on all that moves in the base frame, m: from the first joint's origin, left out, to the tool."""
     tips, count = robot.tip_poses(q), robot.tip_places.stop
     corners = robot.places(q)[:, :count, :3, 3]  # (N, n_all + T, 3)
     after = [(before, place) for place, before in enumerate(robot.before[:count]) if before >= 0]
@@ -215,11 +203,7 @@ def candidates(
 
 
 def brought_to(robot: Tree, q: Tensor, ball: Tensor, places: Tensor) -> Tensor:
-    """Configurations near others (N, n) that bring the ball to places (N, 3), m; NaN where none was found.
-
-    Args:
-        robot: the chain. ball: (3,) in the frame of its last tip, m.
-    """
+    """Configurations near others (N, n) that bring the ball (3,) to places (N, 3), m; NaN where none was found."""
     geometry = Geometry.nominal(robot, 1, robot.tips[-1:]).with_tool(ball[None])
     for _ in range(REACHING_STEPS):
         away = (places - geometry.points(q)[:, 0])[:, :, None]

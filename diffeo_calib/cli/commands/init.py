@@ -11,6 +11,7 @@ from statistics import median
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.cli import commanded_poses
+from diffeo_calib.cli.column_names import column
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.declarations import InitOptions
 from diffeo_calib.cli.guesses import (
@@ -23,7 +24,6 @@ from diffeo_calib.cli.guesses import (
     guess_sheet,
     joints_without_column,
     rows_in,
-    tips_of,
     with_places,
 )
 from diffeo_calib.cli.models import is_urdf, load_robot
@@ -146,8 +146,8 @@ def _of_robot(robot: Path, folder: Path, sheet: Sheet) -> Source:
     if others := best.other_units():
         remark = f"{few(others)}: the names say another unit than the robot finds in the numbers: check it"
         best = best.saying(Choice("", "", remark))
-    for column in best.rows.sockets[-1:]:
-        best = with_distances(best, column)
+    for socket in best.rows.sockets[-1:]:
+        best = with_distances(best, socket)
     if best.rows.markers and best.table.rotation is None:
         best = with_deviations(with_rotation(best))
     about = "a URDF" if is_urdf(robot) else f"a DH table, {DHFile.read(robot).units}"
@@ -158,7 +158,10 @@ def _read(robot: Path, sheet: Sheet, arm: Arm) -> Source:
     """The table as values of these joints; InputError if the robot does not explain the rows."""
     leaves = [path[-1].child for path in chains_in(robot)] if is_urdf(robot) else []
     rows = rows_in(sheet, arm.columns.names)
-    tips = tips_of(rows.markers, leaves)
+    known = {column(leaf).plain: leaf for leaf in leaves}
+    named = [known.get(column(triple[0]).plain.removesuffix("x")) for triple in rows.markers]
+    tips = [tip for tip in named if tip is not None]
+    tips = tips if len(tips) == len(named) and len(set(tips)) > 1 else []  # after which the columns of each are named
     chain = load_robot(robot, replace(arm.links, tip=tips or arm.links.tip))
     source = Source(sheet, chain, arm.columns.names, rows, TableFormat("mm", "deg", sheet.sep, sheet.decimal), tips)
     guessed = guess_joints(sheet.numbers, chain.joint_names) or [arm.columns]
