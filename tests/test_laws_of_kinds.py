@@ -14,12 +14,9 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.kinematics.hand_eye import HandEye, SetUp
-from diffeo_calib.kinematics.hand_eye import _covariance as covariance_of
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
-from diffeo_calib.sensors.set_ups import TRANSFORMS
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning"),  # few rows
@@ -306,32 +303,3 @@ def test_a_lens_that_is_known_poorly_hardly_moves_the_frame() -> None:
     )
     assert_close(after(kind.q(20)), before(kind.q(20)), rtol=0, atol=5e-5)
     assert after.registration.outliers == ()
-
-
-# --- where cameras are ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["camera on the tool", "two cameras on the tool", "two cameras"])
-def test_covariances_of_cameras_and_boards_are_those_of_their_poses_by_differences(name: str) -> None:
-    """Of every camera, whose mount may be away from the tool of the model."""
-    model, on_tool = kind_named(name).model, name != "two cameras"
-    own, poses = model.geometry, {"camera_on_tool": on_tool}
-    cameras: Any = [None, *(name for own in model.placement if own.kind in TRANSFORMS for name in own.names)]
-    for camera in cameras:
-        set_up, found = SetUp.of(model, camera), HandEye.of(model, camera=camera, **poses)
-        carried, standing = ("camera", "board") if on_tool else ("board", "camera")
-        parts = {carried: ("tool", set_up.on_tool(own.tool)), standing: ("base", set_up.seen_from(own.base))}
-        for what, (part, shifts) in parts.items():
-            known, numbers = getattr(found, what), range(own.size)[own.slices[part]]
-            columns = []
-            for number in numbers:
-                ends = []
-                for step in (1e-6, -1e-6):
-                    there = own.absorb(step * torch.eye(own.size, dtype=torch.float64)[number])
-                    moved = getattr(HandEye.of(model, camera=camera, geometry=there, **poses), what).pose
-                    turn = moved[:3, :3] @ known.pose[:3, :3].mT
-                    ends.append(torch.cat([moved[:3, 3], 0.5 * (turn - turn.mT)[[2, 0, 1], [1, 2, 0]]]))
-                columns.append((ends[0] - ends[1]) / 2e-6)
-            J = torch.stack(columns, 1)
-            expected = J @ covariance_of(model.map, own.slices[part], shifts) @ J.mT
-            assert_close(known.covariance, expected, rtol=1e-4, atol=1e-4 * float(expected.abs().max()), msg=what)

@@ -161,7 +161,6 @@ class Sights:
     poses: Tensor  # (N, 4, 4) of the board in the camera's frame, m
     covariance: Tensor  # (N, 6, 6) of the own errors of shift (m) and turn (rad), in the camera's axes
     shared: Tensor  # (N, 6, c) effects of the c errors, of unit variance, that all images share
-    rms: Tensor  # (N,) of the corners' errors, pixels
 
 
 def sighted(images: Images, camera: Camera | None = None, board: BoardPrior | None = None) -> Sights:
@@ -405,12 +404,10 @@ def _result(states: Sequence[State], weights: Sequence[Tensor]) -> list[Sights]:
     every = torch.cat([state.images.points[state.images.seen] for state in states])
     points, found = every.round(decimals=BOARD_DIGITS).unique(dim=0), []
     for state, own, part in zip(states, weights, parts, strict=True):
-        squares, seen = state.errors().square().sum(-1).nan_to_num(0.0), state.images.seen
-        noise = float((2 * seen.sum() / own.square().sum() / 2).sqrt())
+        noise = float((state.images.seen.sum() / own.square().sum()).sqrt())
         view = View.of(state.images.seen, state.poses, points)
         camera = replace(state.camera, root=state.known.root @ root, noise=noise, view=view)
-        rms = (squares.sum(1) / (2 * seen.sum(1))).sqrt()
-        found.append(Sights(camera, state.poses, part.inverse, part.effect @ root, rms))
+        found.append(Sights(camera, state.poses, part.inverse, part.effect @ root))
     return found
 
 

@@ -152,12 +152,17 @@ class Source:
         size = float(torch.cat([one.reported.flatten() for one in lengths]).square().mean().sqrt())
         return rough_error(Geometry.nominal(self.robot), lengths) / max(size, SMALLEST_SPREAD_M)
 
+    @property
+    def largest_set_up(self) -> Measurements | None:
+        """Its positions; None where there are none, or the table cannot be read so."""
+        with quiet(), suppress(DiffeoCalibError):
+            found = measured_positions(self.data) if self.rows.markers else None
+            return None if found is None else found.largest_session()
+        return None
+
     def positions(self) -> Iterator[tuple[Source, Measurements]]:
         """Ways in all units that can be read, with the positions of the largest set-up; none where there are none."""
-        for one in self.in_units() if self.rows.markers else ():
-            with quiet(), suppress(DiffeoCalibError):
-                if (found := measured_positions(one.data)) is not None:
-                    yield one, found.largest_session()
+        return ((one, own) for one in self.in_units() if (own := one.largest_set_up) is not None)
 
     def in_units(self, *, slides: bool = False) -> Iterator[Source]:
         """Ways in units of length and angle, and with a camera on the tool; ``slides`` in another unit than lengths."""
@@ -326,8 +331,29 @@ def _unclear(found: Sequence[Source], *, excluded: bool) -> InputError:
         fix = "no signs, zeros, coupling or units of the joints do either: "
     fix += "check the table's joints against the robot's, or write the file yourself; of a robot with several tips "
     fix += "the columns of each are to be named after it, such as left_x"
+    for one, own in _of_one_size(found[0]):
+        fix = likely_mistakes.likely_mistake(one.robot, own, one.left * spread(own.points)) or fix
+        third = len(own) // 3
+        for name, rows in (("first", range(third)), ("last", range(len(own) - third, len(own)))):
+            part = own.rows(list(rows))
+            left = likely_mistakes.residual_of(one.robot, part) / max(spread(part.points), SMALLEST_SPREAD_M)
+            if left < DOUBTFUL:
+                got += f"; the {name} {third} rows alone, {one.table.length} and {one.table.angle}: {percent(left)}"
+                fix = "if the device moved between rows, name its set-ups in a column, `session`"
     what = "units with which the robot explains what the rows vary"
     return InputError.of(what, expected="one clear reading", got=f"left unexplained {got}", fix=fix)
+
+
+def _of_one_size(source: Source) -> list[tuple[Source, Measurements]]:
+    """Ways in units in which robot and positions are of one size, the likeliest first."""
+    turning = torch.tensor(source.robot.periodic, dtype=torch.bool, device=HOST)
+    likely = dict[str, tuple[float, Source, Measurements]]()
+    for one, own in source.positions():
+        small = float(own.q[:, turning].abs().max()) < LARGEST_JOINT_ANGLE_RAD
+        moved = spread(source.robot.tip_poses(own.q)[:, :1, :3, 3]), spread(own.points)
+        if (one.table.angle == "deg" or small) and min(moved) > 0.0:
+            likely.setdefault(one.table.length, (abs(log(moved[0] / moved[1])), one, own))
+    return [(one, own) for _, one, own in sorted(likely.values(), key=lambda entry: entry[0])[:MOST_LENGTHS]]
 
 
 def _with_meanings(best: Source) -> Source:
@@ -338,14 +364,7 @@ def _with_meanings(best: Source) -> Source:
     """
     if best.rows.sockets or best.rows.readings:
         return best
-    turning = torch.tensor(best.robot.periodic, dtype=torch.bool, device=HOST)
-    likely = dict[str, tuple[float, Source, Measurements]]()
-    for one, own in best.positions():
-        small = float(own.q[:, turning].abs().max()) < LARGEST_JOINT_ANGLE_RAD
-        moved = spread(best.robot.tip_poses(own.q)[:, :1, :3, 3]), spread(own.points)
-        if (one.table.angle == "deg" or small) and min(moved) > 0.0:
-            likely.setdefault(one.table.length, (abs(log(moved[0] / moved[1])), one, own))
-    for _, one, data in sorted(likely.values(), key=lambda entry: entry[0])[:MOST_LENGTHS]:
+    for one, data in _of_one_size(best):
         units = one.table.angle, UNITS_PER_METRE[one.table.length]
         found, joints = likely_mistakes.conventions_of(best.robot, data, units[0]), JointExpressions.of(best.joints)
         if not found:

@@ -13,6 +13,8 @@ from diffeo_calib.common.threads import large_work
 
 NOISE_ADVICE = "raise `noise` or lower the kernels' variances"
 """How to repair a matrix that float64 cannot factorise."""
+MOST_ADDED = 128
+"""Rows of a factor that are kept apart from the first ones."""
 
 
 def lower_root(F: Tensor) -> Tensor:
@@ -28,11 +30,13 @@ class Factor:
     """K = L L^T + H H^T of numbers with features H (M, K), L, W = L^-1 H and B: priors of metres cost no digits.
 
     Args:
-        L: (M, M) lower Cholesky factor. W: (M, K). gram: (K, K) W^T W.
+        first: lower Cholesky factor of the first numbers. W: (M, K). gram: (K, K) W^T W.
+        added: the rows of L below it (m, M), apart because copying it takes longer than a new row.
     """
 
-    def __init__(self, L: Tensor, W: Tensor, gram: Tensor) -> None:
-        self.L, self.W, self._gram = L, W, gram
+    def __init__(self, first: Tensor, W: Tensor, gram: Tensor, added: Tensor | None = None) -> None:
+        self.first, self.W, self._gram = first, W, gram
+        self.added = first[:0] if added is None else added
         eye = torch.eye(W.shape[1], dtype=W.dtype, device=W.device)
         self.B, info = torch.linalg.cholesky_ex(eye + gram)
         if int(info):
@@ -57,14 +61,36 @@ class Factor:
             cross: (M, m) L^-1 times their covariance with these, without H. L: (m, m) of what these leave of theirs.
             W: (m, K) their rows.
         """
-        M, whole = len(self.L), L.new_zeros(len(self.L) + len(L), len(self.L) + len(L))
-        whole[:M, :M], whole[M:, :M], whole[M:, M:] = self.L, cross.T, L
-        return Factor(whole, torch.cat([self.W, W]), self._gram + W.T @ W)
+        old, M = self.added, len(self.W)
+        added = L.new_zeros(len(old) + len(L), M + len(L))
+        added[: len(old), :M], added[len(old) :, :M], added[len(old) :, M:] = old, cross.T, L
+        found = Factor(self.first, torch.cat([self.W, W]), self._gram + W.T @ W, added)
+        return found if len(added) <= MOST_ADDED else Factor(found.L, found.W, found._gram)
+
+    @cached_property
+    def L(self) -> Tensor:
+        """(M, M) lower Cholesky factor of K - H H^T."""
+        if not len(self.added):
+            return self.first
+        whole = self.first.new_zeros(len(self.W), len(self.W))
+        whole[: len(self.first), : len(self.first)], whole[len(self.first) :] = self.first, self.added
+        return whole
+
+    def further(self, values: Tensor, sooner: Tensor) -> Tensor:
+        """The rows of L^-1 values after the first n, ``sooner`` (n, k), from the values after n."""
+        start, M, parts = len(sooner), len(self.first), [sooner]
+        for n, rows in ((start, self.first[start:]), (max(start, M), self.added[max(start - M, 0) :])):
+            if len(rows):
+                known = torch.cat(parts) if len(parts) > 1 else sooner
+                right = values[: len(rows)] - rows[:, :n] @ known
+                parts.append(torch.linalg.solve_triangular(rows[:, n:], right, upper=False))
+                values = values[len(rows) :]
+        return torch.cat(parts[1:])
 
     def beside(self, H: Tensor) -> Factor:
         """The factor of K + H H^T for more features (M, k), with its inverse by that of K (M. Woodbury, 1950)."""
         W, V = torch.cat([self.W, self.white(H)], 1), self.inverse @ H
-        other = Factor(self.L, W, W.T @ W)
+        other = Factor(self.first, W, W.T @ W, self.added)
         root = torch.linalg.cholesky(torch.eye(H.shape[1], dtype=H.dtype, device=H.device) + H.T @ V)
         Y = torch.linalg.solve_triangular(root, V.T, upper=False)
         vars(other)["inverse"] = self.inverse.addmm(Y.T, Y, alpha=-1.0)
@@ -78,7 +104,7 @@ class Factor:
 
     def white(self, values: Tensor) -> Tensor:
         """L^-1 values (M, k)."""
-        return torch.linalg.solve_triangular(self.L, values, upper=False)
+        return self.further(values, values[:0])
 
     def solve(self, values: Tensor) -> Tensor:
         """K^-1 values (M, k)."""

@@ -210,15 +210,14 @@ class Process(Conditional):
     def features(self, at: Linearisation, sooner: Features | None = None) -> Features:
         """Features of a linearisation; ``sooner``: the same by the first of these rows alone."""
         found = self.before.features(at) if sooner is None else sooner
-        L, k, mixed = self.factor.L, self.known.shape[1], found.unknown
+        k, mixed = self.known.shape[1], found.unknown
         if sooner is not None:
             mixed = vars(sooner)["mixed"]
-        if (n := len(found.known) - k) == len(L):
+        if (n := len(found.known) - k) == len(self.alpha):
             return found
         cross = self.numbers.gram(at, n).addmm_(self.known[n:], found.known[:k], alpha=-1.0)
-        cross.addmm_(L[n:, :n], found.known[k:], alpha=-1.0)
         with large_work(cross.numel()):
-            more = torch.linalg.solve_triangular(L[n:, n:], cross, upper=False)
+            more = self.factor.further(cross, found.known[k:])
         mixed = mixed - self.factor.W[n:].T @ more
         unknown = torch.linalg.solve_triangular(self.factor.B, mixed, upper=False)
         new = Features(at, torch.cat([found.known, more]), unknown)

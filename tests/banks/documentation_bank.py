@@ -46,7 +46,7 @@ def write_tables(place: Path, rows: int = 100) -> None:
         ("check", changed[20:40]),
     ):
         write_measurements(place / f"{name}.csv", data.with_joint_names(names), table)
-    write_socket_table(place / "block.csv", arm, "01", 0, places=6, rows=rows // 5)
+    write_socket_table(place / "block.csv", arm, "01", 0, places=6, rows=20)
     write_wire_table(place / "wire.csv", arm, 0)
     posed = simulated_poses(30)[1]
     rotation = replace(table, rotation=["rx", "ry", "rz"], convention="XYZ", rotation_angle="deg")

@@ -14,9 +14,9 @@ from board_bank import CAMERA, images
 from torch.autograd.functional import jacobian
 from torch.testing import assert_close
 
-from diffeo_calib.cameras.board import LENS, BoardPrior, project, project_slopes
+from diffeo_calib.cameras.board import LENS, BoardPrior, project, project_slopes, real_board
 from diffeo_calib.cameras.files import camera_text, read_camera
-from diffeo_calib.cameras.images import UNKNOWNS, Images, first_guess, sighted, sighted_by_several
+from diffeo_calib.cameras.images import UNKNOWNS, Images, first_guess, sees, sighted, sighted_by_several
 from diffeo_calib.common.device import seeded
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError
 from diffeo_calib.robots.se3 import rotation, transforms
@@ -52,6 +52,29 @@ def test_opencv_projects_alike() -> None:
     matrix, zero = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.zeros(3)
     pixels, _ = cv2.projectPoints(points.numpy(), zero, zero, matrix, np.array(distortion))
     assert_close(project(points, CAMERA.lens), torch.from_numpy(pixels[:, 0]), rtol=0, atol=1e-9)
+
+
+def test_a_board_is_printed_as_its_formula_says() -> None:
+    """Scales along x and y, and deflections per half of its larger side."""
+    point, board = FOUND.poses.new_tensor([0.03, 0.02, 0.0]), FOUND.poses.new_tensor([1e-3, 2e-3, 0.01, 0.02, 0.03])
+    bent = 0.1 * (0.01 * 0.3**2 + 0.02 * 0.3 * 0.2 + 0.03 * 0.2**2)
+    expected = torch.tensor([1.003 * 0.03, 0.999 * 0.02, bent], dtype=torch.float64)
+    assert_close(real_board(point, board, 0.1), expected, rtol=1e-12, atol=1e-15)
+
+
+def test_a_camera_sees_boards_as_those_of_its_images_were() -> None:
+    """Not from farther away, from behind, nor outside of the image; how flat they were is the smallest cosine."""
+    camera, poses = FOUND.camera, FOUND.poses
+    assert camera.view is not None
+    assert bool(sees(camera, poses).all())
+    middle = poses[:, :3, :3] @ camera.corners.mean(0) + poses[:, :3, 3]
+    away = middle.norm(dim=1)
+    cosines = (poses[:, :3, 2] * middle).sum(1) / away
+    found = camera.view.near, camera.view.far, camera.view.facing
+    assert found == pytest.approx([float(each) for each in (away.min(), away.max(), cosines.min())])
+    behind = rotation(torch.tensor([[torch.pi, 0.0, 0.0]], dtype=torch.float64)) @ poses[:, :3, :3]
+    for R, place in ((poses[:, :3, :3], 2.0 * middle), (behind, middle), (poses[:, :3, :3], middle + away.max())):
+        assert not bool(sees(camera, transforms(R, place - R @ camera.corners.mean(0))).any())
 
 
 # --- the estimate ---------------------------------------------------------------------------------------------------

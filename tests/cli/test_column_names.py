@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from diffeo_calib.cli.column_names import column
-from diffeo_calib.cli.guesses import Body, bodies_in, guess_joints, joints_without_column
+from diffeo_calib.cli.guesses import Body, bodies_in, guess_deviations, guess_joints, joints_without_column
 
 SIX = [f"joint_{k}" for k in range(1, 7)]
 SO_100 = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"]
@@ -121,7 +121,9 @@ def test_which_columns_are_the_joints() -> None:
     [
         ("Wrist 1 [deg]", ("wrist", "1"), "deg"),
         ("POSX_mm", ("pos", "x"), "mm"),
-        ("tvec[2]", ("tvec", "z"), ""),
+        ("joint_deg_1", ("joint", "1"), "deg"),
+        ("b_m_x", ("b", "m", "x"), ""),
+        ("cam tvec[2]", ("cam", "tvec", "z"), ""),
         ("current_joint_1", ("actual", "joint", "1"), ""),
         ("joint_current_1 [A]", ("joint", "current", "1", "a"), ""),
         ("关节1(度)", ("关节", "1"), "deg"),
@@ -130,6 +132,12 @@ def test_which_columns_are_the_joints() -> None:
 )
 def test_words_and_units(name: str, words: tuple[str, ...], unit: str) -> None:
     assert (column(name).words, column(name).unit) == (words, unit)
+
+
+def test_deviations_are_named_as_what_they_are_of() -> None:
+    names = triple("Std {} [mm]")
+    assert guess_deviations(names[::-1], [triple("{} actual [mm]")]) == names
+    assert guess_deviations(names[:2], [triple("{} actual [mm]")]) is None
 
 
 def test_rotations_belong_to_the_places_that_are_named_alike() -> None:

@@ -355,3 +355,23 @@ def test_a_robot_that_explains_nothing_is_refused(count: int, message: str, tmp_
     assert message in text
     assert not entries
     assert not (tmp_path / "c.toml").exists()
+
+
+SHOWN_WRONG = {
+    "moved": (
+        lambda points: points @ points.new_tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) + 900.0,
+        r"the (first|last) \d+ rows alone, mm and deg: \S+ %; if the device moved",
+        2,
+    ),
+    "late": (lambda points: points.roll(1, 0), "the points seem to be one row too late: pair", 1),
+}
+
+
+@pytest.mark.parametrize("case", SHOWN_WRONG)
+def test_what_explains_the_rows_is_said(case: str, proposed: Proposed) -> None:
+    q, points = rows()
+    changed, message, parts = SHOWN_WRONG[case]
+    kept = len(q) - len(q) // parts
+    entries, text = proposed((NAMES, q), (XYZ, torch.cat([points[:kept], changed(points[kept:])])))
+    assert not entries
+    assert re.search(message, text)

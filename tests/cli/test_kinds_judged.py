@@ -14,7 +14,7 @@ from kind_bank import FREE, UNITS, kind_named, marked
 import diffeo_calib as dc
 from diffeo_calib.kinematics.evaluation import place, residuals
 
-DRAWN = ("positions", "several tips", "ball in sockets", "several kinds")
+DRAWN = ("positions", "several tips", "ball in sockets", "images")
 """Kinds whose pictures differ."""
 
 
@@ -39,14 +39,14 @@ def test_residuals_are_measured_minus_predicted(name: str) -> None:
 def test_a_drawn_report(name: str, tmp_path: Path) -> None:
     """Errors of each kind by stage, in its unit; tests/test_matrix.py leaves those of all kinds undrawn."""
     kind, path = kind_named(name), tmp_path / "page.html"
-    dc.write_report(kind.model, path, kind.data if name in (*FREE, "several kinds") else kind.new)
+    dc.write_report(kind.model, path, kind.data if name in FREE else kind.new)
     text = path.read_text()
     for heading in ("How good", "Where", "Why", "Can I trust it", "Repeatability", "Record"):
         assert f">{heading}</h2>" in text
     for caption in ("Expected error of positions by stage", "Where to measure next", "Geometry corrections"):
         assert caption in text
     assert ("No position was measured" in text) == (name in FREE)
-    assert ("RMS [px]" in text) == (name == "several kinds")
+    assert ("RMS [px]" in text) == (name == "images")
 
 
 @pytest.mark.parametrize("name", marked("hidden markers", "mixture"))

@@ -282,6 +282,12 @@ def test_a_pipe_is_read_once(content: bytes, tmp_path: Path) -> None:
         read_joints("/dev/zero", table)
 
 
+def test_records_are_no_table(tmp_path: Path) -> None:
+    (tmp_path / "t.json").write_text('[{"joints": [0.1, 0.2]}]')
+    with pytest.raises(MeasurementError, match=r"t.json' is no table: expected CSV, .*, got .json; write one"):
+        read_joints(tmp_path / "t.json", TableFormat(joints=["q1", "q2"]))
+
+
 # --- markers that were not seen -------------------------------------------------------------------------------------
 
 TWO = [("ax", "ay", "az"), ("bx", "by", "bz")]

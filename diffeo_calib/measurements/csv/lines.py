@@ -33,6 +33,7 @@ HEAD = 200
 """Lines among which the header is."""
 MOST_COLUMNS = 50_000
 """Of a table of configurations."""
+NO_TABLES = {".json", ".yaml", ".yml", ".xml"}
 AT_ONCE = 1 << 13
 """Bytes by which a file is judged."""
 WIDE = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
@@ -185,6 +186,9 @@ def _text(path: Path, sep: str) -> tuple[str, list[str]]:
     except OSError as error:
         what = f"file '{path}' cannot be read ({error.strerror})"
         raise MeasurementError.of(what, fix="pass the name of a readable file") from error
+    if path.suffix.lower() in NO_TABLES:
+        what, fix = f"'{path}' is no table", "write one: a line with the names of the columns, then a line for each row"
+        raise MeasurementError.of(what, expected="CSV, a spreadsheet or arrays", got=path.suffix, fix=fix)
     if data.startswith(WIDE):
         return data.decode("utf-16", "replace"), ["text in utf-16, not UTF-8"]
     if (sheet := as_text(path, data, sep)) is not None:
