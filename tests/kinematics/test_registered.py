@@ -130,7 +130,7 @@ def test_a_moved_tracker(arm: Case, free: str) -> None:
     rest = seen(arm, slice(10, None), T)
     assert rms(found, rest) < 1.25 * rms(arm.model, arm.test.rows(slice(10, None)))
     assert covered(found, rest) > 0.9
-    assert (record.free, record.rows, record.outliers) == (free, 10, ())
+    assert (record.free, record.rows, record.outliers, len(record.frame_deviations)) == (free, 10, (), 6)
 
 
 def test_another_marker(arm: Case) -> None:

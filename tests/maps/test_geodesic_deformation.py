@@ -190,7 +190,10 @@ def disturbance(points: Tensor) -> Tensor:
     return torch.stack([(1.3 * points.sum(-1) + k).sin() for k in range(points.shape[-1])], -1)
 
 
-@every_arm
+SLOW = {"mixed joints": [pytest.mark.slow]}
+
+
+@pytest.mark.parametrize("arm", [pytest.param(arm, id=name, marks=SLOW.get(name, ())) for name, arm in ARMS.items()])
 @pytest.mark.parametrize("where", ["x", "y", "theta"])
 def test_linearisation_in_path_space(arm: Arm, where: str) -> None:
     """The derivative of k1 when a field changes along the whole path: sum_s c_s Theta_s u(chi_s), order 4."""

@@ -20,7 +20,7 @@ from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.reports.analysis.findings import Findings, find
 from diffeo_calib.reports.html.sections import record
-from diffeo_calib.reports.html.sentences import verdict
+from diffeo_calib.reports.html.sentences import figures, verdict
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.sensors.tables import divided
@@ -74,9 +74,13 @@ def test_new_rows(arm: Case, tmp_path: Path) -> None:
     assert f"{1e3 * found.errors['calibrated'].rms:.3f}\u00a0mm calibrated" in text
     assert f"{SHOWN} rows that the model has not seen" in text
     assert len(text) < 3e6
-    figures = dc.plots.pictures(arm.model, new)
-    assert {"distributions-0", "before-after-0", "expected-0", "parts", "transmission-5", "coverage"} <= set(figures)
-    (axes,) = figures["distributions-0"].axes
+    errors, top = found.errors["calibrated"], dict(figures(found))
+    assert top["calibrated, RMS"] == f"{1e3 * errors.rms:.3f} mm"
+    assert top["95 % of errors below"] == f"{1e3 * errors.p95:.3f} mm"
+    assert top["inside claimed 95 % regions"].startswith(f"{found.predictions.inside()[0]} of {SHOWN} ")
+    panels = dc.plots.pictures(arm.model, new)
+    assert {"distributions-0", "before-after-0", "expected-0", "parts", "transmission-5", "coverage"} <= set(panels)
+    (axes,) = panels["distributions-0"].axes
     assert (axes.get_xlabel(), len(axes.lines)) == ("position error [mm]", 3)
 
 
