@@ -85,7 +85,7 @@ def test_registration_follows_the_frame(arm: Case, *, learn: bool) -> None:
     there, second = registered(arm, seen(arm, rows, T), free="base", learn=learn)
     assert_close(there(q), by(T, here(q)), rtol=0, atol=1e-9)
     assert_close(second.transform, T @ first.transform, rtol=0, atol=1e-9)
-    assert_close(second.frame_deviations.norm(), first.frame_deviations.norm())
+    assert_close(second.frame_deviations.norm(), first.frame_deviations.norm(), rtol=1e-4, atol=0)
     if learn:
         return  # the same rows would count twice
     again = there.registered(seen(arm, rows, S @ T), free="base", learn=False)
