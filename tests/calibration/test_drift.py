@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,7 +13,7 @@ import torch
 from again_bank import true_error
 from command_bank import Command
 from reading_bank import readings, scales
-from table_bank import refused
+from table_bank import refused, warned
 from tangent_bank import normal
 from torch import Tensor
 from torch.testing import assert_close
@@ -51,9 +50,7 @@ def drifting_rows(offset: float = OFFSET_RAD) -> dc.Measurements:
 
 
 def calibrated(data: object) -> Any:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return dc.calibrate(ARM.nominal, data, hyperparameters=scales())  # pyright: ignore[reportArgumentType]
+    return warned(dc.calibrate, ARM.nominal, data, hyperparameters=scales())[0]
 
 
 def drifts(result: Any) -> list[Drift]:
@@ -80,15 +77,14 @@ def test_a_joint_offset_that_drifts_is_part_of_the_model(drifted: Any) -> None:
 
 
 def test_a_column_with_which_nothing_drifts_changes_nothing() -> None:
-    train = drifting_rows(0.0)[:ROWS]
+    train = drifting_rows(0.0)[:40]
     plain, result = calibrated(train.with_covariates()), calibrated(train)
     assert drifts(result) == []
     assert torch.equal(plain.model(train.q), result.model(train.q))
 
 
 def test_readings_show_a_drift_too() -> None:
-    time = hours(150)
-    still = readings(ARM, "height", 150)
+    time, still = hours(150), readings(ARM, "height", 150)
     moved = readings(ARM, "height", 150, noise=2e-5, turned=lambda q: turned(q, time, 2 * OFFSET_RAD))
     data = dc.Readings.heights(still.q, moved.values[:, 0], moved.device_names, ARM.nominal.joint_names)
     plain, result = calibrated(data), calibrated(data.with_covariates(time=time))

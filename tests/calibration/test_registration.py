@@ -56,6 +56,19 @@ def test_too_few_poses_are_explained(markers: int, poses: int, need: int) -> Non
 SLIDE, DOWN = (0, pi / 2, 0, pi / 2, "prismatic"), (0, 0, 0, 0, "prismatic")
 
 
+@pytest.mark.parametrize(
+    ("rows", "tool"),
+    [([(0.5, 0, 0), (0.4, 0, 0), (0.2, 0, 0)], [0.03, -0.02, 0.0]), ([SLIDE, SLIDE, DOWN], [0.0, 0.0, 0.0])],
+    ids=["in a plane", "never turns"],
+)
+def test_directions_that_no_row_can_show_belong_to_the_base(rows: Any, tool: list[float]) -> None:
+    chain = from_dh(rows, name="machine")
+    truth = replace(Geometry.nominal(chain), base=somewhere(9).base, tool=torch.tensor([tool], dtype=torch.float64))
+    q = draw(40, 3)
+    found = register(chain, q, truth.points(q)).geometry
+    assert_close((found.base, found.tool), (truth.base, truth.tool), rtol=0, atol=1e-9)
+
+
 # --- joint offsets far from the description ---------------------------------------------------------------------------
 
 OTHER = SimulatedArm(seed=3)

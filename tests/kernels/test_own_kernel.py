@@ -77,6 +77,7 @@ def test_defaults_agree_with_closed_forms(dim: int) -> None:
         ("hamiltonian_gradient", (q, a)),
         ("hessian_product", (q, a, dq, da)),
         ("gram", gram),
+        ("own_blocks", (x, normal(2, 3, 2 * dim, seed=9))),
     ):
         same(getattr(PLAIN, method)(*arguments), getattr(CLOSED, method)(*arguments))
     terms = PLAIN, CLOSED, dc.Matern(0.7)
