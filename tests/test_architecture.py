@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import re
+from collections import Counter
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -186,6 +187,12 @@ def test_says_what_it_is_and_neither_prints_nor_asserts() -> None:
     assert len(trees()) > 100
     found = [text for module, tree in trees().items() for text in habits(module, tree)]
     assert not found, "\n".join(found)
+
+
+def test_files_of_tests_have_names_of_their_own() -> None:
+    """Pytest imports them by these."""
+    names = Counter(path.name for path in (PACKAGE.parent / "tests").rglob("test_*.py"))
+    assert [name for name, count in names.items() if count > 1] == []
 
 
 def test_few_public_names() -> None:

@@ -77,6 +77,15 @@ def test_a_model_is_saved_whole(kind: str) -> None:
     assert_close(torch.from_numpy(dc.interop.load_numpy(own.file)(q.numpy())), again(q), rtol=0, atol=1e-11)
 
 
+def test_a_fit_in_another_frame_is_the_fit_moved() -> None:
+    """Of positions beside rows in sockets, whose places move along."""
+    kind, T = kind_named("mixture"), twist_transform(ELSEWHERE)
+    rows, q = with_attributes(kind.data, points=kind.data.points @ T[:3, :3].mT + T[:3, 3]), kind.q(20)
+    moved, here = dc.calibrate(kind.robot, rows, hyperparameters=kind.scales), kind.result
+    for there, own in ((moved.model(q), here.model(q)), (moved.sockets.positions, here.sockets.positions)):
+        assert_close(there, own @ T[:3, :3].mT + T[:3, 3], rtol=0, atol=2e-6)
+
+
 # --- several devices of one kind ------------------------------------------------------------------------------------
 
 

@@ -45,7 +45,12 @@ def test_the_refined_geometry_is_part_of_the_model(arm: Case) -> None:
     # Without the flows the model consists of the refined geometry and the gravity sag.
     nominal, q = arm.model.nominal, arm.train.q
     errors, coefficients = nominal.split(theta)
-    assert_close(refined.points(q).flatten(1), nominal(q, torch.cat([errors, torch.zeros_like(coefficients)])))
+    assert_close(
+        refined.points(q).flatten(1),
+        nominal(q, torch.cat([errors, torch.zeros_like(coefficients)])),
+        rtol=0,
+        atol=1e-12,
+    )
     assert float((refined.points(q).flatten(1) - nominal(q, theta)).abs().max()) > 1e-4
 
 

@@ -9,15 +9,16 @@ from math import inf
 import numpy as np
 import pytest
 import torch
-from product_bank import usual_scales
+from product_bank import covered, usual_scales
 from scipy.stats import chi2
-from tangent_bank import Setting, built, covariance, prior_covariance
+from tangent_bank import Setting, built, covariance, normal, prior_covariance
 from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.scales import leave_one_out as one_out
 from diffeo_calib.calibration.scales.leave_one_out import (
     LeaveOneOut,
+    cross_validated_inflation,
     leave_one_out,
     motions,
     random_folds,
@@ -141,3 +142,27 @@ def test_rows_along_motions_and_repeats_belong_together() -> None:
         assert not set(found[outside].tolist()) & set(found[inside].tolist())
         assert 7 <= len(found[inside].unique()) <= 8
     assert folds[0][1].tolist() != random_folds(found, 5, 1)[0][1].tolist()
+
+
+def test_right_scales_are_hardly_widened(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the uncertainty of the factor, and by what a search changes that sees fewer rows."""
+    data, scales, found = built("sliding").tangent_data, built("sliding").scales, []
+    monkeypatch.setattr(one_out, "ITERATIONS", 1)
+    factor = torch.linalg.cholesky(covariance(data, scales))
+    for seed in range(5):  # measurements of a robot that the scales describe exactly
+        target = (factor @ normal(data.y.numel(), seed=seed)).view_as(data.y)
+        drawn, rows = replace(data, y=data.y + target - data.target), torch.arange(len(data.x))
+        found.append(cross_validated_inflation(scales, scales, drawn, rows, seed=seed) or 0.0)
+    assert min(found) > 0.5
+    assert 0.9 < np.median(found) < 1.7, found
+
+
+@pytest.mark.slow
+def test_coverage_with_few_poses() -> None:
+    """The 95 % regions of new measurements, two arms with 30 poses."""
+    found = []
+    for seed in range(2):
+        simulated = SimulatedArm(seed=seed)
+        data = dc.Measurements(*simulated.measure(330, seed))
+        found.append(covered(dc.calibrate(simulated.nominal, data[:30]).model, data[30:]))
+    assert 0.9 < np.mean(found) < 0.995, found

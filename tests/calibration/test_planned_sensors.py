@@ -157,7 +157,7 @@ def test_recalibrated_and_registered_models_plan_for_their_devices(name: str) ->
     for model in (dc.recalibrate(kind.model, kind.new).model, kind.model.registered(kind.new)):
         found = dc.plan(model, kind.q(30), 3)
         if model.registration is not None:
-            assert_close(model.map.new_noise, model.registration.noise)
+            assert_close(model.map.new_noise, model.registration.noise, rtol=1e-9, atol=0)
         assert set(found.devices) <= names
         assert float(found.expected_rms[3]) <= float(found.expected_rms[0]) < 2.5 * before
 

@@ -83,6 +83,18 @@ def test_transmission_alone() -> None:
     assert case.held_out()[2] < 0.03 * 1e-3
 
 
+def test_gravity_alone() -> None:
+    case, source = calibrated(40, geometry=0, transmission=0), simulated(1, geometry=0, transmission=0)[0]
+    found, q = sizes(case), case.train.q
+    deflected = rms(pushed(source, q, source.components(q).gravity))
+    assert deflected > 0.5
+    assert found.pop("gravity on joints") == pytest.approx(deflected, rel=0.05)
+    del found["geometry"]  # part of the registration was compensated
+    assert max(found.values()) < 0.015, found
+    assert rms(case.model.geometry.points(q) - source.truth.points(q)) < 0.04
+    assert case.held_out()[2] < 0.06 * 1e-3
+
+
 def test_transmission_is_what_moves_the_markers(arm: Case) -> None:
     """To first order: the flow's momenta along the joint's own kernel, whatever the other joints are."""
     values = torch.linspace(-3, 3, 7, dtype=torch.float64)

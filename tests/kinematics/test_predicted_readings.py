@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from command_bank import Command
-from kind_bank import UNITS, Kind, kind_named
+from kind_bank import UNITS, Kind, kind_named, marked
 from torch.testing import assert_close
 
 import diffeo_calib as dc
@@ -44,7 +44,7 @@ def squares(kind: Kind, model: dc.CalibratedKinematics) -> list[float]:
     return found
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", marked(*KINDS))
 def test_regions_hold_new_readings(name: str) -> None:
     """Of 24 new rows of each kind: all but a few, and the squares have the size of a chi-squared number's."""
     found = squares(kind_named(name), kind_named(name).model)
@@ -52,7 +52,7 @@ def test_regions_hold_new_readings(name: str) -> None:
     assert 0.1 < float(np.mean(found)) < 0.6  # 0.26 of one number, 0.33 of two
 
 
-@pytest.mark.parametrize("name", ["distances", "images"])
+@pytest.mark.parametrize("name", marked("heights", "images"))
 def test_devices_placed_on_new_rows(name: str) -> None:
     """Their errors are added to the model's: regions hold the rows, and are no smaller than those of the fit."""
     kind = kind_named(name)

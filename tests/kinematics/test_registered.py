@@ -85,7 +85,7 @@ def test_registration_follows_the_frame(arm: Case, *, learn: bool) -> None:
     there, second = registered(arm, seen(arm, rows, T), free="base", learn=learn)
     assert_close(there(q), by(T, here(q)), rtol=0, atol=1e-9)
     assert_close(second.transform, T @ first.transform, rtol=0, atol=1e-9)
-    assert_close(second.frame_deviations.norm(), first.frame_deviations.norm())
+    assert_close(second.frame_deviations.norm(), first.frame_deviations.norm(), rtol=1e-4, atol=0)
     if learn:
         return  # the same rows would count twice
     again = there.registered(seen(arm, rows, S @ T), free="base", learn=False)
@@ -180,10 +180,10 @@ def test_rows_teach_the_robot_where_nothing_else_has_changed(arm: Case) -> None:
     assert len(kept.configurations) == count
 
 
-WRONG = {3: (0.0, 0.02, 0.0)}, *({2: shift, 5: shift} for shift in ((0.0, 0.002, -0.002), (0.01, 0.01, -0.01)))
+WRONG = {3: (0.0, 0.02, 0.0)}, *({2: shift, 5: shift} for shift in ((0.0, 0.002, -0.002), (0.0, 0.02, 0.0)))
 
 
-@pytest.mark.parametrize("wrong", WRONG, ids=["one", "two by 3 mm", "two by 17 mm"])
+@pytest.mark.parametrize("wrong", WRONG, ids=["one", "two by 3 mm", "two by 20 mm"])
 def test_wrong_rows_take_no_part(wrong: dict[int, tuple[float, ...]], arm: Case) -> None:
     """Of eight; two that are wrong alike hide each other, and are found as a pair only."""
     T = transform(9)

@@ -9,7 +9,7 @@ import again_bank
 import pytest
 import torch
 from again_bank import positions
-from kind_bank import ELSEWHERE, Kind, kind_named
+from kind_bank import ELSEWHERE, Kind, kind_named, marked
 from torch.testing import assert_close
 
 import diffeo_calib as dc
@@ -60,7 +60,7 @@ def test_another_ball_is_no_registration(kind: Kind) -> None:
         kind.model.registered(with_attributes(kind.new, q=q))
 
 
-@pytest.mark.parametrize("name", ["mixture", "several kinds"])
+@pytest.mark.parametrize("name", marked("mixture", "several kinds"))
 @pytest.mark.parametrize("learn", [True, False])
 def test_positions_beside_a_ball_are_registered_with_their_devices(name: str, *, learn: bool) -> None:
     """The frame follows from the positions, the ball stays on the tool, and all devices are placed anew."""
@@ -96,7 +96,7 @@ def test_sockets_follow_every_registration(*, learn: bool) -> None:
         assert_close(after[name][:3], before[name][:3] + 2 * shift, rtol=0, atol=2e-3)
 
 
-@pytest.mark.parametrize("name", ["images of a board", "hidden markers"])
+@pytest.mark.parametrize("name", marked("images of a board", "hidden markers"))
 def test_rows_teach_a_registered_model_what_they_teach_a_recalibrated_one(name: str) -> None:
     """Of a robot that has not changed both are conditioned on old and new rows."""
     kind = kind_named(name)

@@ -239,23 +239,28 @@ def likelihood_ratios(rows: NewRows, roots: dict[str, Tensor], seed: int) -> tup
     R = torch.block_diag(*rows.weighted_noise)
     seen = rows.visible.flatten()  # what was not measured has no noise whose level may change
     R, base, residual = R[seen][:, seen], base[seen][:, seen], rows.residual.flatten()[seen, None]
-    factors = [torch.linalg.cholesky(base + f * R) for f in NOISE_FACTORS.to(base)]
+    # In the basis in which R is 1 and the rest diagonal all levels of noise are.
+    root_of_noise = torch.linalg.cholesky(R)
+    half = torch.linalg.solve_triangular(root_of_noise, base, upper=False)
+    rest, Q = torch.linalg.eigh(torch.linalg.solve_triangular(root_of_noise, half.T, upper=False))
+    levels = rest.clamp(min=0.0) + NOISE_FACTORS.to(base)[:, None]
 
-    def white(values: Tensor) -> list[Tensor]:
-        return [torch.linalg.solve_triangular(factor, values, upper=False) for factor in factors]
+    def aligned(values: Tensor) -> Tensor:
+        return Q.T @ torch.linalg.solve_triangular(root_of_noise, values, upper=False)
 
-    def densities(whitened: list[Tensor]) -> Tensor:
+    def densities(values: Tensor) -> Tensor:
         """(noise, k) log densities without a change, but for a constant."""
-        each = zip(whitened, factors, strict=True)
-        return torch.stack([-0.5 * r.square().sum(0) - factor.diagonal().log().sum() for r, factor in each])
+        return -0.5 * (levels.reciprocal() @ values.square() + levels.log().sum(1)[:, None])
 
-    likeliest = int(densities(white(residual)).argmax())
+    measured = aligned(residual)
+    likeliest = int(densities(measured).argmax())
     draws = torch.randn(len(R), SIMULATED_DRAWS, generator=seeded(seed), dtype=base.dtype, device=HOST).to(base.device)
-    samples = white(torch.cat([residual, factors[likeliest] @ draws], 1))
+    samples = torch.cat([measured, levels[likeliest].sqrt()[:, None] * draws], 1)
     plain, sizes, ratios, variances = densities(samples), SIZES.to(base), dict[str, Tensor](), dict[str, float]()
     for name, root in roots.items():
-        each = zip(white(root.flatten(0, 1)[seen]), samples, plain, strict=True)
-        changed = torch.cat([own + Evidence((E.T @ r).mT, E.T @ E).log_odds(sizes) for E, r, own in each])
+        E = aligned(root.flatten(0, 1)[seen])
+        each = zip(E.T / levels[:, None], plain, strict=True)
+        changed = torch.cat([own + Evidence((F @ samples).mT, F @ E).log_odds(sizes) for F, own in each])
         ratios[name] = 2.0 * (changed.amax(0) - plain.amax(0))
         variances[name] = float(SIZES[int(changed[:, 0].argmax()) % len(SIZES)])
     largest = torch.stack(list(ratios.values())).amax(0)[1:]
