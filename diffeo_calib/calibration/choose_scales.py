@@ -163,7 +163,7 @@ def _inflated(
         if centre is None or (poses >= FEWEST_POSES and not found.interrupted):
             inflation = cross_validated_inflation(centre, found.scales, data, groups, seed=seed, progress=progress)
             found = replace(found, interrupted=inflation is None)
-        least = 1.0 if data.tails.gross else float(measurements.without_device)
+        least = float(data.tails.gross or measurements.without_device)  # no reading shows every direction
         factor = max(inflation or few, least)
         row_scales = found.scales if factor < 1.0 else None  # narrow regions make no outliers
     if bool(resting.any()):

@@ -12,6 +12,7 @@ import torch
 from kind_bank import kind_named, marked
 from product_bank import Case, simulated, with_usual_scales
 from table_bank import refused, warned
+from tangent_bank import normal
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -126,7 +127,7 @@ def test_rounded_joint_values_are_warned_about_where_they_cause_the_error(step: 
     """Those of 1e-2 were commanded, and reached: their rounding would cause far larger errors than remain."""
     arm, train, _ = simulated(40)
     q = (train.q / step).round() * step
-    points = arm.true_points(q) + 2e-5 * torch.randn(40, 1, 3, dtype=q.dtype) if step > 1e-3 else train.points
+    points = arm.true_points(q) + 2e-5 * normal(40, 1, 3, seed=2) if step > 1e-3 else train.points
     words = r"waist_joint, .*, wrist_roll_joint are rounded to 0.001 rad: .* got 0\.\d+ mm RMS of position error"
     _, texts = warned(with_usual_scales, arm.nominal, dc.Measurements(q, points))
     assert [bool(re.search(words, one)) for one in texts if "rounded" in one] == [True] * (step == 1e-3)

@@ -76,6 +76,15 @@ def test_outliers_lose_their_influence() -> None:
     assert bool((given.tails.weights == 1.0).all())
 
 
+def test_deviations_of_translations_and_of_rotations_are_found_apart() -> None:
+    q, start = ARM.sample(200), Geometry.nominal(ARM.nominal).with_tool(draw(2, 3, seed=1, size=0.1))
+    theta = torch.zeros(start.size, dtype=torch.float64)
+    theta[start.slices["joints"]] = (draw(6, 6, seed=2) * torch.tensor([1e-4] * 3 + [1e-3] * 3)).flatten()
+    prior = identify(start, q, start.points(q, theta) + draw(200, 2, 3, seed=3, size=1e-5)).prior
+    assert prior.rotation == pytest.approx(1e-3, rel=0.5)
+    assert prior.translation < 4e-4  # it is still falling when the noise has settled
+
+
 def test_left_out_points_are_predicted_by_the_others() -> None:
     """In closed form as by leaving every row out."""
     arm = SimulatedArm(seed=2, transmission=0, gravity=0, noise=5e-5)

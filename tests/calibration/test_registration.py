@@ -19,10 +19,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_open_directions
 from diffeo_calib.calibration.identification.identification import identify
-from diffeo_calib.calibration.identification.registration import (
-    find_joint_offsets,
-    register,
-)
+from diffeo_calib.calibration.identification.registration import find_joint_offsets, register, with_joint_offsets
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.robots import Chain, DHRow, Geometry, SimulatedArm, from_dh
 
@@ -88,6 +85,16 @@ def test_one_joint_is_found_among_geometric_errors(joint: int, degrees: float) -
     expected = torch.zeros(6, dtype=torch.float64)
     expected[joint] = math.radians(degrees)
     assert_close(offsets[1:5], expected[1:5], rtol=0, atol=0.01)  # base and marker may carry the first and the last
+
+
+def test_absorbed_offsets_are_exactly_other_joint_values() -> None:
+    """Turning, sliding and mimic joints."""
+    rows = [DHRow(0.1, 0.3, 0.2), DHRow(0.0, 0.5, 0.1, kind="prismatic"), DHRow(0.2, -0.4, 0.0)]
+    rows.append(DHRow(0.3, 0.2, 0.1, mimic={"joint_1": -0.5, "joint_3": 1.0}))
+    geometry = Geometry.nominal(from_dh(rows), 2)
+    geometry, q = geometry.absorb(draw(geometry.size, seed=1, size=0.1)), draw(7, 3, seed=2)
+    offsets = torch.tensor([0.2, -0.05, 0.4], dtype=torch.float64)
+    assert_close(with_joint_offsets(geometry, offsets).points(q), geometry.points(q + offsets), rtol=0, atol=1e-14)
 
 
 # --- long chains ------------------------------------------------------------------------------------------------------

@@ -108,9 +108,6 @@ def test_the_fit_of_six_numbers_is_that_of_nine() -> None:
     assert maps[0].noise.covariance.shape == (12, 9, 9)
 
 
-# --- noise of markers and of poses, and of new rows whose noise differs ---------------------------------------------
-
-
 # --- new measurements where the noise differs from row to row ---------------------------------------------------------
 
 INSIDE_95 = float(chi2.ppf(0.95, 3))
@@ -145,6 +142,9 @@ def test_regions_hold_95_percent_of_a_mixture() -> None:
         factor = differing_factor(each, mean, everywhere(each))
         assert share(errors, mean) < 0.93
         assert share(errors, factor * mean) == pytest.approx(0.95, abs=0.01)
+    each = torch.eye(3, dtype=torch.float64).repeat(100, 1, 1)
+    each[0] *= 1e6
+    assert differing_factor(each, each.mean(0), everywhere(each)) == pytest.approx(1.0, abs=1e-12), "never narrower"
 
 
 def test_hidden_markers_do_not_count() -> None:

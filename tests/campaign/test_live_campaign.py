@@ -261,6 +261,10 @@ def test_a_goal_is_reached_once_the_limit_is_below_it(running: dc.Campaign, meas
         assert campaign.reached == (needed == 0)
         assert campaign._next_scales(campaign._model) == pytest.approx(factor * 20)
         assert needed is None or campaign.next(1).needed == needed
+    campaign._make(campaign.table, campaign.verdicts)  # around all rows, with the same scales
+    campaign.poll()
+    assert (campaign._model.count, campaign._next_scales(campaign._model)) == (ROWS, pytest.approx(2.0 * 20))
+    assert 1.1 < campaign.error_limit / campaign.expected_error < 2
     few = begun(dc.Measurements(*(part[:14] for part in measured)), ARM.nominal, candidates=measured[0][:5], goal=1.0)
     assert few.expected_error is not None
     assert (few.error_limit, few.reached) == (None, False), "before the scales are selected"

@@ -205,7 +205,8 @@ def test_poses_as_numbers_of_matrices(by_rows: bool, proposed: Proposed) -> None
     poses = ARM.nominal(q.deg2rad())
     poses[:, :3, 3] = 1e3 * poses[:, :3, 3] + noise(ROWS, 3, size=0.5)
     names = [f"O_T_EE[{k}]" for k in range(16)]
-    written, _ = proposed((SERIES, q), (names, (poses if by_rows else poses.mT).flatten(1)))
+    wished = [f"{name}_d" for name in names], poses.flatten(1)
+    written, _ = proposed((SERIES, q), wished, (names, (poses if by_rows else poses.mT).flatten(1)))
     order = torch.arange(16).view(4, 4) if by_rows else torch.arange(16).view(4, 4).mT
     assert written["position"] == [",".join(names[int(k)] for k in order[:3, 3])]
     assert written["rotation"] == ",".join(names[int(k)] for k in order[:3, :3].flatten())

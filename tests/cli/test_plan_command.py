@@ -83,6 +83,7 @@ def test_next_poses_and_poses_to_measure_again(
         (["ROBOT", "--range", "joint_1"], "--range joint_1: expected JOINT=A:B"),
         (["ROBOT", "--candidates", "CSV", "--draw", "9"], "--draw beside --candidates"),
         (["ROBOT", "--candidates", "CSV", "--collisions"], "--collisions beside --candidates"),
+        (["ROBOT", "--candidates", "CSV", "-n", "99"], "at most 30, got 99"),
         (["ROBOT", "--floor", "9000"], "`floor` refuses nearly everything"),
     ],
 )

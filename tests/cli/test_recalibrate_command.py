@@ -36,6 +36,10 @@ def test_a_new_model_and_what_has_changed(files: dict[str, str], command: Comman
     assert "the markers are taken to be where they were (these rows show that to 0.0" in done.out
     assert "no change was found but the places of device and markers" in done.out
     assert len(dc.load(files["new.safetensors"]).configurations) == 75
+    for free, named, other in (("base", True, False), ("remounted", False, False), ("both", False, True)):
+        table = files["new.csv"], *TABLE, "--free", free, "-o", files["new.safetensors"]
+        done = command("recalibrate", files["old.safetensors"], *table)
+        assert ("are taken to be where they were" in done.out, "or are other ones" in done.out) == (named, other)
     compared = command("recalibrate", files["old.safetensors"], files["new.safetensors"])
     assert compared.code == 0
     assert "RMS from the model, device and markers found anew: position 0.0" in compared.out

@@ -2,6 +2,7 @@
 
 from contextlib import suppress
 from itertools import pairwise
+from typing import Any
 
 import pytest
 import torch
@@ -161,6 +162,24 @@ def test_a_start_with_too_large_flows_is_reported(solver: dc.GaussNewton | dc.LB
 
 
 # --- L-BFGS --------------------------------------------------------------------------------------------------------
+
+
+def test_lbfgs_keeps_its_best_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interrupted during a line search, which overshoots at times: further evaluations never make it worse."""
+    energies = []
+    for calls in range(2, 8):  # the first evaluation is the start
+        problem = rr_problem(3)
+        run, stops = problem.deform, iter([False] * (calls - 1) + [True])
+
+        def deform(*given: Any, run: Any = run, stops: Any = stops) -> Any:
+            if next(stops, False):
+                raise KeyboardInterrupt
+            return run(*given)
+
+        monkeypatch.setattr(problem, "deform", deform)
+        energies.append(dc.fit(problem, dc.LBFGS(), dc.RK4(1), start=random_start(problem)).energy)
+    assert energies == sorted(energies, reverse=True)
+    assert energies[-1] < energies[0]
 
 
 @pytest.mark.slow

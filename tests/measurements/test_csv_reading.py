@@ -49,7 +49,8 @@ SEMICOLONS, COMMAS = {"sep": ";"}, {"sep": ";", "decimal": ","}
 READ: dict[str, tuple[str | bytes, dict[str, str], str]] = {
     "byte order mark": ("\ufeff" + PLAIN.replace("\n", "\r\n"), {}, ""),
     "UTF-16": (PLAIN.encode("utf-16"), {}, "text in utf-16"),
-    "Windows": (("Kraft (°), größe\n" + PLAIN).encode("cp1252"), {}, "text in cp1252, not UTF-8"),
+    "Windows": (("Kraft, größe\n" + PLAIN).encode("cp1252"), {}, "text in cp1252, not UTF-8"),
+    "Windows' quotation marks": (("# Tom’s arm\n" + PLAIN).encode("cp1252"), {}, "text in cp1252, not UTF-8"),
     "Chinese": (("# 关节(度), 坐标(毫米)\n" + PLAIN).encode("gb18030"), {}, "text in gb18030, not UTF-8"),
     "Japanese": (("# 関節, X座標, 測定\n" + PLAIN).encode("cp932"), {}, "text in cp932, not UTF-8"),
     "a number sign before the names": ("# " + PLAIN, {}, ""),
@@ -285,7 +286,7 @@ def test_a_pipe_is_read_once(content: bytes, tmp_path: Path) -> None:
 def test_records_are_no_table(tmp_path: Path) -> None:
     (tmp_path / "t.json").write_text('[{"joints": [0.1, 0.2]}]')
     with pytest.raises(MeasurementError, match=r"t.json' is no table: expected CSV, .*, got .json; write one"):
-        read_joints(tmp_path / "t.json", TableFormat(joints=["q1", "q2"]))
+        read_joints(tmp_path / "t.json", TableFormat("m", "rad", joints=JOINTS))
 
 
 # --- markers that were not seen -------------------------------------------------------------------------------------

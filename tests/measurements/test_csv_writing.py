@@ -119,6 +119,7 @@ def assert_same(found: Any, wanted: Any) -> None:
     assert type(found) is type(wanted)
     assert found.joint_names == wanted.joint_names
     assert found.device_names == wanted.device_names
+    assert_close(found.q, wanted.q)
     assert [part.kind for part in found.parts] == [part.kind for part in wanted.parts]
     for own, other in zip(found.parts, wanted.parts, strict=True):
         assert own.device_names == other.device_names
@@ -130,7 +131,8 @@ def assert_same(found: Any, wanted: Any) -> None:
             assert getattr(own, name, None) == getattr(other, name, None), name
         if getattr(other, "sockets", None) is not None:
             assert own.row_sockets == other.row_sockets
-            assert len(own.sockets.distances) == len(other.sockets.distances)
+            known = [[one.distance_std, *(d for *_, d in one.distances)] for one in (own.sockets, other.sockets)]
+            assert known[0] == pytest.approx(known[1])
 
 
 @pytest.mark.parametrize(

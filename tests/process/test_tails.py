@@ -63,6 +63,7 @@ def test_freedom_and_scale_are_those_that_scipy_finds(freedom: float, scale: flo
     found, own = expectation_maximisation(errors)
     assert found == pytest.approx(expected, rel=0.03)
     assert own / scale == pytest.approx(expected_scale, rel=0.01)
+    assert expectation_maximisation(simulated(4000, 3, inf, scale, seed=3))[0] == inf, "clean data have no tails"
 
 
 def test_errors_of_no_size_or_of_any_size_do_no_harm() -> None:

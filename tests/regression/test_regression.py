@@ -243,8 +243,11 @@ def test_covariance_of_a_large_problem(name: str, wide: float, monkeypatch: pyte
     torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
     monkeypatch.setattr(iterative, "NEGLIGIBLE_VARIANCE_RATIO", 0.03)
     noise = float(problem.noise.covariance.diagonal(dim1=1, dim2=2).mean())
-    rough = ConjugateGradientRegression(data, problem.noise).covariance(queries)
-    assert 0.0 < float((rough - expected).diagonal(dim1=1, dim2=2).abs().max()) < noise
+    rough = ConjugateGradientRegression(data, problem.noise)
+    assert 0.0 < float((rough.covariance(queries) - expected).diagonal(dim1=1, dim2=2).abs().max()) < noise
+    rest = (rough.preconditioner.covariance - problem.noise.covariance).diagonal(dim1=1, dim2=2).flatten()
+    left = (data.fields.gram() - rough.P @ rough.P.T).diagonal()
+    torch.testing.assert_close(rest, left, rtol=0, atol=1e-8 * float(data.fields.gram().diagonal().max()))
 
 
 @every_way

@@ -34,6 +34,8 @@ HEAD = 200
 MOST_COLUMNS = 50_000
 """Of a table of configurations."""
 NO_TABLES = {".json", ".yaml", ".yml", ".xml"}
+QUOTES = b"\x85\x91\x92\x93\x94\x95\x96\x97\x99"
+"""Quotation marks, dashes and the like in cp1252."""
 AT_ONCE = 1 << 13
 """Bytes by which a file is judged."""
 WIDE = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
@@ -204,9 +206,12 @@ def _text(path: Path, sep: str) -> tuple[str, list[str]]:
 
 
 def _code_page(data: bytes) -> str:
-    """The code page of a text that is not UTF-8: Chinese has pairs of high bytes, Japanese begins them with others."""
-    words = re.findall(rb"[\x80-\xff]+", data)
-    if all(len(word) % 2 == 0 and min(word) > 0xA0 for word in words):
+    """The code page of a text that is not UTF-8: Chinese has pairs of high bytes, Japanese begins them with others.
+
+    Bytes of quotation marks tell nothing. The pair in "Größe" would be a rare character; usual ones begin below 0xD8.
+    """
+    words = [word for word in re.findall(rb"[\x80-\xff]+", data) if word.strip(QUOTES)]
+    if words and all(len(word) % 2 == 0 and min(word) > 0xA0 for word in words) and min(words)[0] < 0xD8:
         return "gb18030"
     return "cp932" if 2 * sum(0x80 < word[0] < 0xA0 for word in words) > len(words) else "cp1252"
 
