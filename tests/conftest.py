@@ -95,14 +95,7 @@ BY_KIND = (
 """Files whose tests end in a kind of measurement. Those of one kind run in one process, which calibrates it once."""
 LONGEST = (
     *BY_KIND,
-    *(
-        "test_documentation.py",
-        "test_keops.py",
-        "test_torch_program.py",
-        "test_report.py",
-        "test_registered.py",
-        "test_recalibrate.py",
-    ),
+    *("test_keops.py", "test_torch_program.py", "test_report.py", "test_registered.py", "test_recalibrate.py"),
     *("test_documentation.py", "test_outliers.py", "test_sockets.py", "test_transforms.py", "test_rigid.py"),
     *("test_hidden_markers.py", "test_planned_sensors.py", "test_json_results.py"),
     *("test_distributed.py", "test_analysis.py", "test_evaluators.py", "test_readings.py", "test_tree_calibrations.py"),

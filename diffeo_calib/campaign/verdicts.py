@@ -162,22 +162,24 @@ def find_change(
     if not hypotheses:
         return None
     known, doubted = flags
-    owner, found = seen.numbers.owner, []
+    owner, found, effects = seen.numbers.owner, [], [seen.numbers.of_table(one.effects) for one in hypotheses]
     for first in range(len(numbers) - gates.ROWS_AFTER_CHANGE + 1):
         after, before = (owner >= first) & doubted[owner], (owner < first) & known[owner]
         used, count = seen.some(before | after), int(before.sum())
         factor = torch.linalg.cholesky(used.covariance)
-        white, factor = torch.linalg.solve_triangular(factor, used.error[:, None], upper=False), factor[count:, count:]
-        error = factor @ white[count:, 0]  # given those before
-        for one in hypotheses:
-            E = seen.numbers.of_table(one.effects)[after]
-            spare = len(E) - E.shape[1]
+        white = torch.linalg.solve_triangular(factor, used.error[:, None], upper=False)[count:, 0]  # given those before
+        many = torch.cat([E[after] for E in effects], 1)
+        many = torch.linalg.solve_triangular(factor[count:, count:], many, upper=False)
+        total, rows = float(white.square().sum()), len(white)
+        for one, E, W in zip(hypotheses, effects, many.split([E.shape[1] for E in effects], 1), strict=True):
+            spare = rows - E.shape[1]
             if spare < gates.SPARE_NUMBERS:
                 continue
-            evidence = Evidence.by(E, error, factor)
-            u, gain = evidence.size, float(evidence.gain) / typical
-            if evidence.total / typical - gain <= chi2_above(gates.LEFT_CHANCE, spare):
-                found.append((gain - E.shape[1] * log(len(E)), gain, first, one, E @ u, u, len(E)))
+            g = W.T @ white
+            u = Evidence(g, W.T @ W).size
+            gain = float(g @ u) / typical
+            if total / typical - gain <= chi2_above(gates.LEFT_CHANCE, spare):
+                found.append((gain - E.shape[1] * log(rows), gain, first, one, E[after] @ u, u, rows))
     best = max(found, key=lambda one: one[0], default=None)
     if best is None or chi2_probability(best[1], len(best[5])) > gates.JUMP_CHANCE:
         return None

@@ -37,13 +37,6 @@ class Evidence(NamedTuple):
         target = process.numbers.target
         return cls(E.T @ process.mu, E.T @ (process.inverse @ E), float(target @ process.mu), len(target))
 
-    @classmethod
-    def by(cls, E: Tensor, r: Tensor, factor: Tensor) -> Evidence:
-        """By errors (M,), with effects (M, U) on them and the Cholesky factor (M, M) of K."""
-        white = torch.linalg.solve_triangular(factor, torch.cat([r[:, None], E], 1), upper=False)
-        r, E = white[:, 0], white[:, 1:]
-        return cls(E.T @ r, E.T @ E, float(r @ r), len(r))
-
     @property
     def size(self) -> Tensor:
         """(..., U) the most probable unknowns."""

@@ -37,7 +37,8 @@ UGLY = """<?xml version='1.0' encoding="utf-8"?>
                 0.3" />
       <axis xyz="0 0 1"/><limit lower="-3" upper='3' effort="1" velocity="1"/>
   </joint>
-  <joint name="lift" type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 2 0"/></joint>
+  <joint name="lift" type="continuous">
+     <parent link="a"/><child link="b"/><axis xyz="0 2 0"/></joint>
   <joint name="pla>te" type="fixed">
     <origin rpy="0 0 0.5" xyz="0.1 0 0"></origin><parent link="b"/><child link="c"/></joint>
   <joint name="slide" type="prismatic">

@@ -118,14 +118,16 @@ def test_levers_in_another_unit_are_refused(lever: float) -> None:
 def test_evidence_for_unknowns_is_that_of_weighted_least_squares() -> None:
     root, E, r = normal(12, 12, seed=1), normal(12, 2, seed=2), 5.0 * normal(12, seed=3)
     L = torch.linalg.cholesky(root @ root.mT + torch.eye(12, dtype=torch.float64))
-    found, white = Evidence.by(E, r, L), torch.linalg.solve(L, torch.cat([E, r[:, None]], 1))
+    white = torch.linalg.solve(L, torch.cat([E, r[:, None]], 1))
+    W, r = white[:, :2], white[:, 2]
+    found = Evidence(W.T @ r, W.T @ W, float(r @ r), len(r))
     expected = torch.linalg.lstsq(white[:, :2], white[:, 2:]).solution[:, 0]
     left = white[:, 2] - white[:, :2] @ expected
     assert_close(found.size, expected, rtol=1e-6, atol=0)
     assert float(found.gain) == pytest.approx(float(white[:, 2].square().sum() - left.square().sum()))
     assert float(found.excess) == pytest.approx(float(left.square().mean()))
     assert float(found.excess) > 1.0
-    assert float(Evidence.by(E, 1e-3 * r, L).excess) == 1.0, "smaller errors are no excess"
+    assert float(found._replace(g=1e-3 * found.g, total=1e-6 * found.total).excess) == 1.0, "smaller ones are no excess"
 
 
 # --- changes ----------------------------------------------------------------------------------------------------------

@@ -151,7 +151,7 @@ def test_predict(site: Site, path: Path, model: dc.CalibratedKinematics, command
     command.monkeypatch.setattr("diffeo_calib.cli.commands.evaluate.ROWS_AT_ONCE", 7)
     done = command("predict", path, site.csv, *TABLE[2:], "-o", tmp_path / "p.csv")
     assert (done.code, done.err.strip()) == (0, "")
-    assert "40 predictions written" in done.out
+    assert [words in done.out for words in ("40 predictions written", f"; note: {NOTE}")] == [True, True]
     header, values = numbers_in(tmp_path / "p.csv")
     assert header == [*site.arm.nominal.joint_names, "x", "y", "z", "std_x", "std_y", "std_z"]
     mean, covariance = model.predict(site.data.q)

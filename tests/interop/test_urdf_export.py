@@ -37,7 +37,7 @@ ORIGIN = re.compile(rb"\s*<origin\b[^>]*>")
 TRIPLE = rb" ".join([rb"-?[\d.e+-]+"] * 3)
 LAYOUT = (
     rb"<origin\n         rpy = '%b'\n         xyz = \"%b\" />",
-    rb'<joint name="lift" type="continuous"><origin xyz="%b" rpy="%b"/><parent',
+    rb'<joint name="lift" type="continuous">\n     <origin xyz="%b" rpy="%b"/>\n     <parent',
     rb'<child link="d"/><origin xyz="%b" rpy="%b"/><axis',
     rb'    <origin xyz="%b" rpy="%b"/><parent link="d"/>',
 )

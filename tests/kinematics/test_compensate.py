@@ -192,10 +192,10 @@ def test_a_stretched_arm_ends_where_the_workspace_does(arm: Case) -> None:
 
 
 def test_limits_stop_a_row_and_are_named(arm: Case) -> None:
-    q = commands(arm, 40, seed=8)
+    q, joint = commands(arm, 40, seed=8), 1
+    q[:, joint] *= 0.02  # so that some rows begin within the limit and need to go beyond it
     targets = intended(arm, q)
     free = dc.compensate(arm.model, targets, q, tool=tool_frame())
-    joint = 1
     ways = free.correction[:, joint]
     narrow = arm.robot.limits.clone()
     narrow[joint] = torch.tensor([-10.0, float(q[free.reached, joint].median())])

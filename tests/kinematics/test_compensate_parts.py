@@ -15,8 +15,11 @@ from two_arms_bank import HANDS, robot
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.compensation.problem import joint_limits
+from diffeo_calib.kinematics.compensation.targets import Targets
 from diffeo_calib.measurements.poses import angle_between
 from diffeo_calib.robots.joint import Joint
+from diffeo_calib.robots.se3 import twist_transform
+from diffeo_calib.runtime.build import calibrated_chain
 
 ROWS = 12
 TOOLS = torch.tensor([[0.0, 0.0, 0.1], [0.02, 0.05, 0.0]], dtype=torch.float64)
@@ -123,6 +126,34 @@ def test_wrong_targets_of_both_hands(model: dc.CalibratedKinematics) -> None:
     for change, message in wrong:
         with pytest.raises(InputError, match=message):
             dc.compensate(model, **{"targets": targets, "start": start, **change})  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("axes", [3, 1, 0])
+def test_gradient_and_hessian_of_the_cost(model: dc.CalibratedKinematics, axes: int) -> None:
+    """By central differences, of rigid kinematics far from the targets, a free hand in two rows."""
+    rng, h, free = np.random.default_rng(1), 1e-5, np.zeros((6, 2), dtype=bool)
+    free[1, 0] = free[4, 1] = True
+    poses, q = (
+        twist_transform(torch.from_numpy(rng.standard_normal((6, 2, 6)))).numpy(),
+        rng.uniform(-2, 2, (6, model.robot.n)),
+    )
+    goal = Targets(poses[..., :3, 3], poses[..., :3, :axes], np.eye(3)[:, 3 - axes :], 0.3, free)
+    chain = calibrated_chain(
+        model.robot.arrays, np.eye(4), model.geometry.joint_errors.numpy(), np.zeros(6 + 6 * model.robot.moving)
+    )
+
+    def slope(at: np.ndarray) -> np.ndarray:
+        there, jacobian = chain.poses_and_jacobian(at)
+        return -np.einsum("nkj,nk->nj", goal.slopes(jacobian), goal.errors(there))
+
+    here, jacobian = chain.poses_and_jacobian(q)
+    S = goal.slopes(jacobian)
+    hessian = S.swapaxes(1, 2) @ S + goal.curvature(jacobian, here)
+    for joint, step in enumerate(h * np.eye(q.shape[1])):
+        rise = goal.cost(chain.poses_and_jacobian(q + step)[0]) - goal.cost(chain.poses_and_jacobian(q - step)[0])
+        np.testing.assert_allclose(slope(q)[:, joint], rise / (2 * h), rtol=0, atol=1e-8)
+        change = (slope(q + step) - slope(q - step)) / (2 * h)
+        np.testing.assert_allclose(hessian[:, :, joint], change, rtol=0, atol=1e-8)
 
 
 # --- limits of mimic joints -----------------------------------------------------------------------------------------

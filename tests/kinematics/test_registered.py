@@ -105,6 +105,8 @@ def test_what_a_registration_adds_is_that_written_out(arm: Case) -> None:
     assert_close(fitted.joint_covariance(q), expected, rtol=1e-6, atol=1e-14)
     blocks = torch.stack([expected[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(4)])
     assert_close(blocks, fitted.predict(q, noise=False)[1], rtol=1e-6, atol=1e-14)
+    known, wider = (one.predict(q) for one in (arm.model.map, arm.model.map.inflated(50.0)))
+    assert_close(wider, (known[0], 50 * known[1]), rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize("new", [False, True], ids=["its own marker", "another marker"])

@@ -11,9 +11,7 @@ import torch
 from eulerian_bank import CORRECTED, P0, deformed, momenta, small_problem
 from math_bank import rr_problem, uniform
 from matplotlib.image import imread
-from paper_figures import (
-    main,
-)
+from paper_figures import main
 from torch import Tensor
 
 import diffeo_calib as dc

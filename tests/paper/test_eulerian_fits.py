@@ -110,9 +110,6 @@ def test_algorithm_2_is_the_fitted_model(equations: Eulerian) -> None:
 # --- gradient descent with a fixed step -------------------------------------------------------------------------------
 
 
-STEP = 0.05
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("formulation", "step", "tolerance"), [("exact", 0.15, 1e-3), ("eulerian", 0.05, 3e-3)])
 def test_finds_the_optimum_of_an_easy_problem(formulation: str, step: float, tolerance: float) -> None:
