@@ -313,7 +313,7 @@ def _(bench: Bench) -> None:
         assert any(kind.data.device_names[-1] in name for name in rows[0])  # what the device will read
 
 
-@verb("report", *QUICK, *FREE[:2], "images", "camera on the tool", "several kinds")
+@verb("report", *QUICK, *FREE[:2], "hidden markers", "images", "camera on the tool", "several kinds")
 def _(bench: Bench) -> None:
     """Of the rows of the fit, each predicted by all others; tests/cli/test_kinds_judged.py draws those of new rows."""
     kind, path = bench.kind, bench.folder / "report.html"
@@ -322,7 +322,9 @@ def _(bench: Bench) -> None:
     found = bench.json("evaluate", kind.file, table, "--report", path, *options)
     assert found["left_out"]
     assert tuple(found["errors"]) in ((), STAGES)
-    assert "<svg" in path.read_text(encoding="utf-8")
+    page = path.read_text(encoding="utf-8")
+    assert "<svg" in page
+    assert not re.search(r"\b[Nn]a[Nn]\b", page)
 
 
 @verb("plan")
