@@ -257,7 +257,8 @@ class CampaignModel:
         self.process = around.process(table, [row for row in accepted if row not in self.window])
         self.last = around.rows(table.rows(self.window))[0]
         self._target, self._options = (self.process.features(each[0]) for each in (around.errors, around.options))
-        self._learn(verdicts, self.process.features(self.last.numbers(around.scales).at))
+        self._at = self.process.features(self.last.numbers(around.scales).at)
+        self._learn(verdicts)
 
     def rebuilt(self, table: Any, verdicts: Sequence[Verdict]) -> CampaignModel:
         """Around the same places, what the rows say that are accepted now, of devices that have a place."""
@@ -320,10 +321,12 @@ class CampaignModel:
         row, full = len(table) - 1, int(len(self.window) > gates.WINDOW)
         window = [*self.window[full:], row]
         last, changes = self.around.rows(table.rows(window))
+        own = last.rows(_number(len(window) - 1))
+        at = self.process.features(own.numbers(self.around.scales).at)
+        single, typical = self._seen(own, at), self.typical
         if full and verdicts[self.window[0]].accepted:
             self.process = self.around.given(self.process, self.last.rows(_number(0)))
-        self.window, self.last, own = window, last, last.rows(_number(len(window) - 1))
-        single, typical = self._seen(own), self.typical
+        self.window, self.last = window, last
         found = single.measure(_freedom(own))
         fits = found.fits(typical)
         if fits:
@@ -332,12 +335,14 @@ class CampaignModel:
         shown = self.around.placed.shown(table.rows([row]).parts[0])
         verdicts.append(Verdict(row, fits, fits, found.error, found.expected, cause, shown=shown, line=lines[row]))
         numbers, some = last.numbers(self.around.scales), [verdicts[number] for number in window]
-        at = self.process.features(numbers.at)
+        kept = self._at.rows(torch.arange(full, len(window) - 1 + full, device=HOST))
+        kept, new = (self.process.features(one.at, one) for one in (kept, at))
+        self._at = kept.followed_by(new, numbers.at)
         flags = _flags([one.accepted for one in some]), _flags([not one.cause for one in some])
         how: Any = {"single": found, "typical": typical, "coordinates": last.y.shape[1]}
         change = None
         if not cause:
-            seen = Seen.of(self.process, numbers, self.around.noise(last), at)
+            seen = Seen.of(self.process, numbers, self.around.noise(last), self._at)
             change = find_change(seen, window, changes(), flags, **how)
         if change is not None:
             known = verdicts[window[0]].change
@@ -349,19 +354,20 @@ class CampaignModel:
                 if one.change is not None or not (before or one.cause or one.decided):
                     accepted = before and bool(one.fits)
                     verdicts[number] = replace(one, accepted=accepted, change=None if before else change)
-        self._learn(verdicts, at)
+        self._learn(verdicts)
 
-    def _learn(self, verdicts: Sequence[Verdict], at: Features) -> None:
-        """What is known now; ``at``: the last rows as the process predicts them. Those not accepted tell nothing."""
+    def _learn(self, verdicts: Sequence[Verdict]) -> None:
+        """What is known now. Of the last rows those not accepted tell nothing."""
         accepted, noise = _flags([verdicts[row].accepted for row in self.window]), self.around.noise(self.last)
         noise = without_hidden(noise, accepted[:, None].expand(noise.shape[:2]))
-        self.now = self.process.given(self.last.numbers(self.around.scales), noise, at)
+        self.now = self.process.given(self.last.numbers(self.around.scales), noise, self._at)
         self._target = self.process.features(self._target.at, self._target)
         self.covariance = self.around.covariance(self.now.features(self._target.at, self._target))
 
-    def _seen(self, data: TangentData) -> Seen:
-        """Rows as the accepted ones before them predict them."""
-        return Seen.of(self.now, data.numbers(self.around.scales), self.around.noise(data))
+    def _seen(self, data: TangentData, sooner: Features | None = None) -> Seen:
+        """Rows as the accepted ones before them predict them; ``sooner``: their features by the process."""
+        numbers = data.numbers(self.around.scales)
+        return Seen.of(self.now, numbers, self.around.noise(data), self.now.features(numbers.at, sooner))
 
     def _cause(self, table: Any, own: TangentData, seen: Seen) -> str:
         """Why the last row is wrong, in words; empty if nothing that is undone makes it fit."""

@@ -125,9 +125,8 @@ class Seen(NamedTuple):
     covariance: Tensor
 
     @classmethod
-    def of(cls, process: Process, numbers: Numbers, noise: Tensor, at: Features | None = None) -> Seen:
-        """All numbers, with noise (N, R, R) of the rows, m^2; ``at``: their features, if known already."""
-        at = process.features(numbers.at) if at is None else at
+    def of(cls, process: Process, numbers: Numbers, noise: Tensor, at: Features) -> Seen:
+        """All numbers, with noise (N, R, R) of the rows, m^2; ``at``: their features."""
         error = numbers.target - numbers.there(process.mean(at))
         return cls(numbers, error, numbers.with_noise(at.between(), noise))
 

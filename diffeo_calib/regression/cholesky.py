@@ -61,11 +61,11 @@ class Factor:
             cross: (M, m) L^-1 times their covariance with these, without H. L: (m, m) of what these leave of theirs.
             W: (m, K) their rows.
         """
-        old, M = self.added, len(self.W)
+        first, old = (self.first, self.added) if len(self.added) <= MOST_ADDED else (self.L, self.first[:0])
+        M = len(self.W)
         added = L.new_zeros(len(old) + len(L), M + len(L))
-        added[: len(old), :M], added[len(old) :, :M], added[len(old) :, M:] = old, cross.T, L
-        found = Factor(self.first, torch.cat([self.W, W]), self._gram + W.T @ W, added)
-        return found if len(added) <= MOST_ADDED else Factor(found.L, found.W, found._gram)
+        added[: len(old), : old.shape[1]], added[len(old) :, :M], added[len(old) :, M:] = old, cross.T, L
+        return Factor(first, torch.cat([self.W, W]), self._gram + W.T @ W, added)
 
     @cached_property
     def L(self) -> Tensor:

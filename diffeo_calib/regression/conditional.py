@@ -59,9 +59,19 @@ class Features:
 
     def rows(self, index: Tensor) -> Features:
         """Features of some configurations (B,)."""
-        M = len(self.at.sensitivity)
-        known, unknown = (part.unflatten(1, (M, -1))[:, index].flatten(1) for part in (self.known, self.unknown))
-        return Features(self.at.rows(index), known, unknown)
+        M, parts = len(self.at.sensitivity), (self.known, self.unknown, vars(self).get("mixed", self.unknown))
+        known, unknown, mixed = (part.unflatten(1, (M, -1))[:, index].flatten(1) for part in parts)
+        found = Features(self.at.rows(index), known, unknown)
+        vars(found)["mixed"] = mixed
+        return found
+
+    def followed_by(self, other: Features, at: Linearisation) -> Features:
+        """Features of these configurations and others by the same process; ``at``: all of them."""
+        parts = [(one.known, one.unknown, vars(one)["mixed"]) for one in (self, other)]
+        known, unknown, mixed = (torch.cat(both, 1) for both in zip(*parts, strict=True))
+        found = Features(at, known, unknown)
+        vars(found)["mixed"] = mixed
+        return found
 
     def blocks(self) -> Tensor:
         """Covariance of every configuration of a projected linearisation with itself: (M, r, r)."""

@@ -16,6 +16,7 @@ from torch.testing import assert_close
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.maps.linearisation import Numbers
 from diffeo_calib.process.evidence import Evidence
+from diffeo_calib.regression import cholesky
 from diffeo_calib.regression.cholesky import Factor
 from diffeo_calib.regression.conditional import BeforeData, Estimated, Opened, Process, diagonal_blocks
 
@@ -89,11 +90,13 @@ def test_predictions_are_those_of_the_whole_covariance(case: Case) -> None:
 # --- one block after the other ------------------------------------------------------------------------------------
 
 
-def test_rows_may_come_in_parts_and_in_any_order(case: Case) -> None:
+@pytest.mark.parametrize("most", [0, 1000])
+def test_rows_may_come_in_parts_and_in_any_order(case: Case, most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """What was expected before goes on with later rows, whose evidence is a difference."""
+    monkeypatch.setattr(cholesky, "MOST_ADDED", most)
     first, second, new = cut(case)
     prior, rows = case.data.prior(case.scales), torch.arange(len(case.data.x))
-    both = case.part(rows[rows % 3 != 2])
+    both, all_of = case.part(rows[rows % 3 != 2]), case.part(rows)
     whole = prior.given(both.numbers, both.noise)
     estimate, covariance = unknowns(whole)
     deviation = covariance.diagonal().sqrt()
@@ -109,6 +112,8 @@ def test_rows_may_come_in_parts_and_in_any_order(case: Case) -> None:
         for actual, wanted in zip(noiseless(found, new), expected, strict=True):
             close(actual, wanted, 1e-9)
         assert_close(found.inverse @ found.numbers.target, found.mu, rtol=0, atol=1e-8 * float(found.mu.abs().max()))
+        again = found.given(new.numbers, new.noise)  # a factor of three parts, or of two
+        close(noiseless(again, new)[0], noiseless(prior.given(all_of.numbers, all_of.noise), new)[0], 1e-9)
         plain, known = found.features(new.numbers.at), before.features(new.numbers.at)
         later = found.features(new.numbers.at, known)
         close(found.mean(later), found.mean(plain), 1e-9)
