@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 import torch
 from deformation_bank import model_of
+from product_bank import Case
 from robots_bank import parallelogram
 from table_bank import held
 from torch import Tensor
@@ -126,6 +130,15 @@ def test_wrong_targets_of_both_hands(model: dc.CalibratedKinematics) -> None:
     for change, message in wrong:
         with pytest.raises(InputError, match=message):
             dc.compensate(model, **{"targets": targets, "start": start, **change})  # pyright: ignore[reportArgumentType]
+
+
+def test_a_model_is_forgotten_with_its_last_use(arm: Case) -> None:
+    model = arm.model.with_tool([0.0, 0.0, 0.1])
+    dc.compensate(model, torch.zeros(1, 3), torch.zeros(1, 6))
+    seen = weakref.ref(model)
+    del model
+    gc.collect()
+    assert seen() is None
 
 
 @pytest.mark.parametrize("axes", [3, 1, 0])

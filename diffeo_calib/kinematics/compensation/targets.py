@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from math import isfinite
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -231,6 +232,8 @@ def _unit(given: Tensor, count: int, place: Any) -> Array:
 
 SOME_LENGTH = 0.5
 """m that a radian counts as where directions of a robot without a finite reach are compared."""
+MOST_TOOLS = 16
+"""Tools of one model that are kept ready."""
 
 
 @dataclass(frozen=True)
@@ -245,8 +248,18 @@ class ToolFunctions:
     length: float  # m that a turn of one radian counts as where directions are compared: a quarter of the robot's reach
 
 
+# the functions know the model's map but not the model, which would otherwise never be forgotten
+_ready: WeakKeyDictionary[CalibratedKinematics, dict[object, ToolFunctions]] = WeakKeyDictionary()
+
+
 def tool_functions(model: CalibratedKinematics, tools: Mapping[str, Tensor], frame: str) -> ToolFunctions:
-    """Kinematics of tools (4, 4) on these tips in a frame, "base" or "measuring"."""
+    """Kinematics of tools (4, 4) on these tips in a frame, "base" or "measuring"; kept for later calls."""
+    known = _ready.setdefault(model, {})
+    key = frame, *((tip, tool.numpy().tobytes()) for tip, tool in tools.items())
+    if key in known:
+        return known[key]
+    if len(known) >= MOST_TOOLS:
+        known.clear()
     robot, geometry, device = model.robot, model.geometry, model.configurations.device
     each = [ToolKinematics(model.map, model.nominal, tool, frame, tip) for tip, tool in tools.items()]
 
@@ -261,4 +274,6 @@ def tool_functions(model: CalibratedKinematics, tools: Mapping[str, Tensor], fra
     chain = replace(chain, tips=ends)
     poses, jacobian = (partial(by_tool, of) for of in (ToolKinematics.poses, ToolKinematics.jacobian))
     serial, length = robot.moving == robot.n, 0.25 * robot.reach if isfinite(robot.reach) else SOME_LENGTH
-    return ToolFunctions(poses, jacobian, lambda q: chain.poses_and_jacobian(q)[1][:, numbers], serial, length)
+    return known.setdefault(
+        key, ToolFunctions(poses, jacobian, lambda q: chain.poses_and_jacobian(q)[1][:, numbers], serial, length)
+    )
