@@ -349,7 +349,7 @@ def _of_one_size(source: Source) -> list[tuple[Source, Measurements]]:
     turning = torch.tensor(source.robot.periodic, dtype=torch.bool, device=HOST)
     likely = dict[str, tuple[float, Source, Measurements]]()
     for one, own in source.positions():
-        small = float(own.q[:, turning].abs().max()) < LARGEST_JOINT_ANGLE_RAD
+        small = bool((own.q[:, turning].abs() < LARGEST_JOINT_ANGLE_RAD).all())
         moved = spread(source.robot.tip_poses(own.q)[:, :1, :3, 3]), spread(own.points)
         if (one.table.angle == "deg" or small) and min(moved) > 0.0:
             likely.setdefault(one.table.length, (abs(log(moved[0] / moved[1])), one, own))

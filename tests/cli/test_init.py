@@ -376,3 +376,19 @@ def test_what_explains_the_rows_is_said(case: str, proposed: Proposed) -> None:
     entries, text = proposed((NAMES, q), (XYZ, torch.cat([points[:kept], changed(points[kept:])])))
     assert not entries
     assert re.search(message, text)
+
+
+def test_slides_that_explain_nothing_are_refused(tmp_path: Path, init: Proposed) -> None:
+    links = [f"link_{k}" for k in range(4)]
+    slides = "".join(
+        f'<joint name="s{k}" type="prismatic"><parent link="{links[k]}"/><child link="{links[k + 1]}"/>'
+        f'<axis xyz="{axis}"/><limit lower="0" upper="2"/></joint><link name="{links[k + 1]}"/>'
+        for k, axis in enumerate(("1 0 0", "0 1 0", "0 0 1"))
+    )
+    (tmp_path / "slides.urdf").write_text(f'<robot name="r"><link name="link_0"/>{slides}</robot>')
+    cells = 900.0 * torch.randn(40, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    lines = [",".join(f"{value:.3f}" for value in row) for row in cells.tolist()]
+    (tmp_path / "t.csv").write_text("\n".join(["s0,s1,s2,x,y,z", *lines]))
+    entries, text = init(tmp_path / "t.csv", tmp_path / "slides.urdf")
+    assert not entries
+    assert "one clear reading" in text
