@@ -125,16 +125,6 @@ def test_rows_of_the_model_itself_change_nothing(arm: Case, *, new: bool) -> Non
     assert float(least) > 0.1 * float(alone)
 
 
-@pytest.mark.parametrize("free", ["both", "base"])
-def test_a_moved_tracker(arm: Case, free: str) -> None:
-    T = transform(5)
-    found, record = registered(arm, seen(arm, slice(0, 10), T), free=free)
-    rest = seen(arm, slice(10, None), T)
-    assert rms(found, rest) < 1.25 * rms(arm.model, arm.test.rows(slice(10, None)))
-    assert covered(found, rest) > 0.9
-    assert (record.free, record.rows, record.outliers, len(record.frame_deviations)) == (free, 10, (), 6)
-
-
 def test_another_marker(arm: Case) -> None:
     """0.2 m from the fitted one and never seen: as good as a tool centre point of the model can be."""
     T, q = transform(6), arm.test.q
