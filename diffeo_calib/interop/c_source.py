@@ -21,9 +21,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from diffeo_calib.common.errors import PACKAGE, InputError, as_written
 from diffeo_calib.common.files import write_together
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.kinematics.provenance import package_version
-from diffeo_calib.kinematics.tool import checked_tip, tool_transform
+from diffeo_calib.kinematics.tool import checked_tip, program_of, tool_transform
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.arrays import Array
 from diffeo_calib.runtime.chain import NominalChain, Sag, Waves

@@ -27,10 +27,8 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, NumericalError, as_written
 from diffeo_calib.common.files import check_writable, write_whole
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kernels.profiles import PROFILES
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.program import program_of
-from diffeo_calib.kinematics.tool import ToolKinematics, tool_points, tool_transform
+from diffeo_calib.kinematics.tool import ToolKinematics, program_of, tool_points, tool_transform
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.measurements.poses import POINTS, of_frames, poses_of_triangles
 from diffeo_calib.robots.se3 import twist_transform
@@ -94,6 +92,9 @@ def _combined(x: Tensor, coefficients: Tensor, slopes: Sequence[Tensor]) -> Tens
 TORCH = SimpleNamespace(
     sin=torch.sin,
     cos=torch.cos,
+    exp=torch.exp,
+    sqrt=torch.sqrt,
+    relu=torch.relu,
     clip=torch.clamp,
     within_turn=lambda x: x - TURN * torch.floor(x * (1.0 / TURN)),
     stack=torch.stack,
@@ -101,7 +102,6 @@ TORCH = SimpleNamespace(
     ones_like=torch.ones_like,
     broadcast_to=torch.broadcast_to,
     at_least=lambda values, floor: values.clamp(min=floor),
-    profile=lambda name, r2: PROFILES[name].derivative(r2, 0),
     cells_around=_cells_around,
     combined=_combined,
     transforms=twist_transform,

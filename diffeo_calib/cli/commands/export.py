@@ -19,8 +19,7 @@ from diffeo_calib.cli.record import make_folder, record
 from diffeo_calib.common.files import write_together
 from diffeo_calib.interop.c_source import CFiles, c_files
 from diffeo_calib.interop.camera_files import camera_files
-from diffeo_calib.interop.dh import DHTable, dh_table, dh_text
-from diffeo_calib.interop.mjcf import mjcf_text
+from diffeo_calib.interop.dh import DHTable, dh_table, dh_text, ur_text, ur_transforms
 from diffeo_calib.interop.rigid import (
     Compared,
     RigidKinematics,
@@ -38,8 +37,7 @@ from diffeo_calib.interop.tables import (
     tables_text,
 )
 from diffeo_calib.interop.torch_program import export_onnx, export_torch
-from diffeo_calib.interop.ur_kinematics import ur_text, ur_transforms
-from diffeo_calib.interop.urdf import corrected_urdf, urdf_of
+from diffeo_calib.interop.urdf import corrected_urdf, mjcf_text, urdf_of
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.bodies import placement_lines
 from diffeo_calib.measurements.table_format import TableFormat
