@@ -186,21 +186,14 @@ def records(case: str, sizes: Sequence[int], seeds: int, arguments: argparse.Nam
                 yield from (held_out(poses, urad, seed) for seed in range(seeds))
 
 
-def main() -> None:
-    """Parse the arguments and measure."""
-    parser = harness.parser(__doc__)
-    parser.add_argument("--cases", nargs="+", choices=CASES, default=["lines", "none"], metavar="CASE")
-    parser.add_argument("--seeds", type=harness.count, default=20, metavar="N", help="arms, or draws")
-    parser.add_argument("--poses", type=harness.count, nargs="+", default=list(SIZES), metavar="N")
-    parser.add_argument("--amplitudes", type=float, nargs="+", default=list(AMPLITUDES_URAD), metavar="URAD")
-    parser.add_argument("--data", type=Path, default=None, metavar="FOLDER", help="measured robots")
-    arguments = parser.parse_args()
-    harness.guarded(lambda: _report(arguments))
-
-
-def _report(arguments: argparse.Namespace) -> None:
-    harness.report(measure(arguments), arguments.out, COLUMNS)
-
-
 if __name__ == "__main__":
-    main()
+    harness.run(
+        __doc__,
+        measure,
+        COLUMNS,
+        cases=harness.names(CASES, ["lines", "none"]),
+        seeds=harness.number(20, "arms, or draws"),
+        poses=harness.numbers(SIZES),
+        amplitudes={"type": float, "nargs": "+", "default": list(AMPLITUDES_URAD), "metavar": "URAD"},
+        data={**harness.DATA, "help": "measured robots"},
+    )

@@ -30,7 +30,7 @@ from diffeo_calib.common.checks import check_memory
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import large_work
 from diffeo_calib.kernels.base import Kernel
-from diffeo_calib.kernels.reductions.distributed import ranks_of
+from diffeo_calib.kernels.reductions.distributed import Ranks, ranks
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
@@ -81,7 +81,8 @@ class ControlPointRegression(Conditional):
         kernels = self.spec.joint_kernel, self.spec.task_kernel
         self._roots = [_root(kernel, nodes) for kernel, nodes in zip(kernels, self.controls, strict=True)]
         large = len(x) * size * noise.covariance.shape[1] >= SHARED_ENTRIES
-        self._ranks = ranks_of(deformation.backends if large else [])
+        distributed = large and any("distributed" in name for name in deformation.backends)
+        self._ranks = ranks() if distributed else Ranks()
         if self._ranks.count > 1:
             # Each process has blocks of its own, and shares no sum in them.
             self.deformation = deformation.using("auto")

@@ -17,7 +17,7 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.interop.model_header import describe, rebuild_registration
+from diffeo_calib.interop.model_file import describe, rebuild_registration
 from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.kinematics.registered_map import Registration, check_isotropic, moved
 from diffeo_calib.measurements.poses import mark_points, poses_from_marks
