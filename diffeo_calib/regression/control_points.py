@@ -91,7 +91,8 @@ class ControlPointRegression(Conditional):
         with large_work(size * noise.covariance.shape[:2].numel()):
             for rows in self._blocks(size):
                 value, white = self._white_rows(rows)
-                _add_square(hessian, white)
+                for first, last in pairwise(k * size // STRIPS for k in range(STRIPS + 1)):  # the lower triangle alone
+                    hessian[first:last, :last].addmm_(white[first:last], white[:last].T)
                 if residual is not None:
                     pull += white @ self.noise.whiten(residual(rows, value)[:, :, None], rows).reshape(-1, 1)
             hessian, pull = self._ranks.total([hessian, pull])
@@ -189,12 +190,6 @@ class ControlPointRegression(Conditional):
             for root, part in zip(self._roots, (b, p), strict=True)
         ]
         return torch.cat([*solved, theta * self.spec.prior_variance.sqrt()[:, None], shifts])
-
-
-def _add_square(matrix: Tensor, values: Tensor) -> None:
-    """Add values values^T, (n, k) (k, n), to the lower triangle of a matrix (n, n)."""
-    for first, last in pairwise(k * len(matrix) // STRIPS for k in range(STRIPS + 1)):
-        matrix[first:last, :last].addmm_(values[first:last], values[:last].T)
 
 
 def _root(kernel: Kernel, nodes: list[NodeSensitivity]) -> Tensor:
