@@ -82,6 +82,16 @@ def load_laden(path: Path, mass: float | None) -> CalibratedKinematics:
     return model if mass is None else model.with_payload(mass)
 
 
+def planned(model: CalibratedKinematics, mass: float | None) -> tuple[CalibratedKinematics, Tensor]:
+    """A model to plan with, of a robot that carries a mass, by default the median of the fit; its markers (P, 3), m."""
+    say(*provenance_lines(model))
+    if mass is not None:
+        model = model.with_payload(mass)
+    elif model.payload is not None:
+        say(f"planned with a payload of {model.payload:g}, the median of the fit; --payload for another one")
+    return model, model.geometry.tool
+
+
 def check_payload_column(model: CalibratedKinematics, column: str | None) -> None:
     """Raise InputError if only one of a model and a table has payloads."""
     if model.payload is None and column is not None:

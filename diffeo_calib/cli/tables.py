@@ -21,7 +21,7 @@ from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.main import add_to_command_line
 from diffeo_calib.cli.options import CORNERS, Rows, Targets, Units, has
-from diffeo_calib.common.errors import InputError, MeasurementError, few
+from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.files import PROGRAM
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.files import read_observations
@@ -210,6 +210,13 @@ class MeasuredTable:
             add_to_command_line(["--marker", named])
         data = data.with_joint_names(robot.joint_names)
         return data.with_tips(tips) if several else data
+
+    def warn_of_other_frames(self, count: int) -> None:
+        """Warn of rows of the fit that are judged in a frame in which they were not measured."""
+        if count and self.table.session is None:
+            what = f"{count} rows of the fit were measured in another set-up than that of the model, and are judged in "
+            fix = "name the column of the set-ups (--session), or leave these rows out"
+            warn_user(sentence(f"{what}its frame", fix=fix))
 
 
 def targets_of(path: Path, table: TableFormat, given: Targets, tools: int) -> Tensor | None:

@@ -21,7 +21,7 @@ from diffeo_calib.cli.options import Rows, Units
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.tables import MeasuredTable, as_written, of_robot, table_format, with_rows
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
+from diffeo_calib.common.errors import InputError, MeasurementError, warn_user
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -86,9 +86,7 @@ def run(options: EvaluateOptions) -> None:
     say(*(line for errors in found.values() for line in printed.socket_lines(errors, "all rows")))
     say(*printed.expectation_lines(model, data))
     warn_outside_range(model, data.q)
-    if source.table.session is None and (count := rows_of_other_frames(model, data.q)):
-        what = f"{count} rows of the fit were measured in another set-up than that of the model, and are judged in its "
-        warn_user(sentence(f"{what}frame", fix="name the column of the set-ups (--session), or leave these rows out"))
+    source.warn_of_other_frames(rows_of_other_frames(model, data.q))
     if judged.refusal is not None:
         raise MeasurementError(judged.refusal)
     positions = 0 if found.positions is None else len(found.positions.errors)

@@ -16,7 +16,7 @@ from diffeo_calib.calibration.planning.plan import Plan, drawn, plan
 from diffeo_calib.calibration.planning.sensors import Sensor, sensors_for
 from diffeo_calib.cli.console import out, progress_bar, say, text_table
 from diffeo_calib.cli.declarations import PlanOptions
-from diffeo_calib.cli.models import as_fitted, load_kinematics, load_robot, provenance_lines
+from diffeo_calib.cli.models import as_fitted, load_kinematics, load_robot, planned
 from diffeo_calib.cli.options import DRAWN, Candidates
 from diffeo_calib.cli.printed import expectation_lines
 from diffeo_calib.cli.record import record
@@ -69,14 +69,10 @@ def run(given: PlanOptions) -> None:
         numbers = [stated_numbers("--marker", text, (3,)) for text in given.marker or ()]
         markers = torch.tensor(numbers or [MARKER], dtype=torch.float64, device=HOST)
         markers = markers / table.per_metre if numbers else markers
-        if model is None:
-            source = robot = load_robot(begin, given)
-        else:
-            say(*provenance_lines(model))
-            if given.payload is None and model.payload is not None:
-                say(f"planned with a payload of {model.payload:g}, the median of the fit; --payload for another one")
-            source, robot = model if given.payload is None else model.with_payload(given.payload), model.robot
-            markers = source.geometry.tool
+        source = model or load_robot(begin, given)
+        if model is not None:
+            source, markers = planned(model, given.payload)
+        robot = source.robot if isinstance(source, CalibratedKinematics) else source
         table = of_robot(table, robot)
 
         def configurations(table_of: Path | None) -> Tensor | None:
