@@ -182,7 +182,8 @@ class Around:
     @cached_property
     def options(self) -> tuple[Linearisation, Tensor]:
         """What the candidates would tell, and its noise (M, r, r), m^2."""
-        copies = with_joints(self.placed.data.rows([self.like] * len(self.candidates)), self.candidates)
+        copies = self.placed.data.rows([self.like] * len(self.candidates)).parts[0]
+        copies = with_attributes(copies, q=self.candidates)
         for own in self._elsewhere:
             copies = own.changed(copies)
         data = self.rows(copies)[0]
@@ -323,11 +324,11 @@ class CampaignModel:
         row, full = len(table) - 1, int(len(self.window) > gates.WINDOW)
         window = [*self.window[full:], row]
         last, changes = self.around.rows(table.rows(window))
-        own = last.rows(_number(len(window) - 1))
+        own = last.rows(torch.tensor([len(window) - 1], device=HOST))
         at = self.process.features(own.numbers(self.around.scales).at)
         single, typical = self._seen(own, at), self.typical
         if full and verdicts[self.window[0]].accepted:
-            self.process = self.around.given(self.process, self.last.rows(_number(0)))
+            self.process = self.around.given(self.process, self.last.rows(torch.tensor([0], device=HOST)))
         self.window, self.last = window, last
         found = single.measure(_freedom(own))
         fits = found.fits(typical)
@@ -403,22 +404,13 @@ class CampaignModel:
             "it seems to have been measured at the joint values of the row before": table.q[-2],
         }
         copies = table.rows([len(table) - 1] * len(joints))
-        others = self.around.rows(with_joints(copies, torch.stack([*joints.values()])))[0]
+        others = self.around.rows(with_attributes(copies.parts[0], q=torch.stack([*joints.values()])))[0]
         for number, words in enumerate(joints):
-            yield words, self._seen(others.rows(_number(number)))
-
-
-def with_joints(table: Any, q: Tensor) -> Any:
-    """Rows of one kind at other joint values (N, n)."""
-    return with_attributes(table.parts[0], q=q)
+            yield words, self._seen(others.rows(torch.tensor([number], device=HOST)))
 
 
 def _flags(values: Sequence[bool]) -> Tensor:
     return torch.tensor(values, dtype=torch.bool, device=HOST)
-
-
-def _number(row: int) -> Tensor:
-    return torch.tensor([row], dtype=torch.int64, device=HOST)
 
 
 def _freedom(data: TangentData) -> int:

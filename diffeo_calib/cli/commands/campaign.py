@@ -101,8 +101,7 @@ class Live:
                 verdicts[entry["row"]] |= {name: entry[name] for name in KEPT if name in entry}
         readable = [line if "rows" in entry else b"\n" for line, entry in zip(lines, known, strict=False)]
         if verdicts:
-            table = self._read(readable)
-            if len(table) != len(verdicts):
+            if len(table := self._read(readable)) != len(verdicts):
                 raise self.journal.damaged(f"{len(verdicts)} verdicts of {len(table)} rows")
             self.campaign.resume(table, [Verdict(row, **one) for row, one in enumerate(verdicts)])
             self.say(f"going on after {len(known)} lines{expected(self.campaign)}", self.state())
