@@ -5,7 +5,7 @@ A row is judged by d^2 = e^T S^-1 e, chi-squared if it is right. Two kinds of ca
 * of one row: its unit, its joints are those of another row, two markers are exchanged, one marker is wrong. A cause is
   named if the row fits when it is undone.
 * from a row k on: a device has moved, a marker has slipped, a joint has another offset. By chance such a hypothesis
-  gains chi-squared (process/evidence.py) from the errors of the last rows. Rows that were taken in one by one
+  gains chi-squared (regression/conditional.py) from the errors of the last rows. Rows that were taken in one by one
   count again here: small changes show in several rows only. A single wrong row, which six unknowns of a device explain
   as well, is no change.
 """

@@ -21,9 +21,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from diffeo_calib.common.errors import PACKAGE, InputError, as_written
 from diffeo_calib.common.files import write_together
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.kinematics.provenance import package_version
-from diffeo_calib.kinematics.tool import checked_tip, tool_transform
+from diffeo_calib.kinematics.tool import checked_tip, program_of, tool_transform
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.arrays import Array
 from diffeo_calib.runtime.chain import NominalChain, Sag, Waves
@@ -67,6 +66,7 @@ def write_c(
     *,
     prefix: str | None = None,
     tip: str | None = None,
+    write: bool = True,
 ) -> CFiles:
     """Write a model as a C99 source file, and a header of the same name beside it.
 
@@ -82,26 +82,12 @@ def write_c(
         prefix: beginning of all names; by default the name of the file, with ``_`` for what C does not allow in names.
         tip: that carries the tool, for a robot with several; the model's own by default. The other branches bend the
             robot by their weight: the functions take the values of all joints.
+        write: False makes the contents alone, to be written together with other files.
 
     Raises InputError: a model with adaptive time steps or a user's kernel, whose flows are no constants, or on another
     device than the CPU; another frame; several tips of which none is named; a path without ``.c``, or to a file of
     other origin; a prefix that is no name in C.
     """
-    files = c_files(model, path, tool, frame, prefix=prefix, tip=tip)
-    write_together(files.contents)
-    return files
-
-
-def c_files(
-    model: CalibratedKinematics,
-    path: str | PathLike[str],
-    tool: object,
-    frame: str,
-    *,
-    prefix: str | None = None,
-    tip: str | None = None,
-) -> CFiles:
-    """The files that :func:`write_c` writes."""
     robot, source = model.robot, Path(path)
     carrier = checked_tip(robot, model.tool_tip if tip is None else tip)
     if source.suffix != ".c":
@@ -133,7 +119,10 @@ def c_files(
         frame_name=FRAME_NAMES[frame],
         remarks=[_comment(line) for line in _remarks(model, chosen, carrier)],
     )
-    return CFiles(source, header, name, texts)
+    files = CFiles(source, header, name, texts)
+    if write:
+        write_together(files.contents)
+    return files
 
 
 def _joints(robot: Tree) -> Iterator[str]:

@@ -16,7 +16,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.cli.commands.export import HASH
 from diffeo_calib.common.errors import InputError, RobotError
-from diffeo_calib.interop.ur_kinematics import ur_text, write_ur_kinematics
+from diffeo_calib.interop.dh import ur_text, write_ur_kinematics
 from diffeo_calib.robots import Chain, Geometry, SimulatedArm
 
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import printable
 from diffeo_calib.reports.plots import style
-from diffeo_calib.reports.plots.joints import joint_label, joint_values
+from diffeo_calib.reports.plots.panels import joint_label, joint_values
 from diffeo_calib.robots.tree import Tree
 
 if TYPE_CHECKING:
