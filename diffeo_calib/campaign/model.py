@@ -324,11 +324,11 @@ class CampaignModel:
         row, full = len(table) - 1, int(len(self.window) > gates.WINDOW)
         window = [*self.window[full:], row]
         last, changes = self.around.rows(table.rows(window))
-        own = last.rows(torch.tensor([len(window) - 1], device=HOST))
+        own = last.rows(torch.arange(len(window), device=HOST)[-1:])
         at = self.process.features(own.numbers(self.around.scales).at)
         single, typical = self._seen(own, at), self.typical
         if full and verdicts[self.window[0]].accepted:
-            self.process = self.around.given(self.process, self.last.rows(torch.tensor([0], device=HOST)))
+            self.process = self.around.given(self.process, self.last.rows(torch.arange(1, device=HOST)))
         self.window, self.last = window, last
         found = single.measure(_freedom(own))
         fits = found.fits(typical)
@@ -405,8 +405,8 @@ class CampaignModel:
         }
         copies = table.rows([len(table) - 1] * len(joints))
         others = self.around.rows(with_attributes(copies.parts[0], q=torch.stack([*joints.values()])))[0]
-        for number, words in enumerate(joints):
-            yield words, self._seen(others.rows(torch.tensor([number], device=HOST)))
+        for words, row in zip(joints, torch.arange(len(joints), device=HOST).split(1), strict=True):
+            yield words, self._seen(others.rows(row))
 
 
 def _flags(values: Sequence[bool]) -> Tensor:
