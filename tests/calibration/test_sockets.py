@@ -70,20 +70,6 @@ def test_the_sockets_are_where_they_are(result: Any, rows: SocketRows) -> None:
     assert abs(float((first - second).norm()) - 0.05) < 2e-5  # known to 1e-5
 
 
-def test_covariances_by_the_projection_written_out(arm: SimulatedArm, result: Any) -> None:
-    model, q = result.model, arm.sample(4, seed=3)
-    found, at = model.map.conditional, model.map.geodesic.linearise(q)
-    both = model.map.geodesic.linearise(torch.cat([q, found.reference.at.joint[0].points]))
-    C = found.before.covariance_between(both)
-    B = both.sensitivity.flatten(0, 1)[:, :6]
-    motion = torch.cat([torch.zeros(6, 12, dtype=C.dtype), torch.linalg.pinv(B[12:])], 1)
-    P = (torch.eye(len(C), dtype=C.dtype) - B @ motion)[:12]
-    expected = P @ C @ P.mT
-    torch.testing.assert_close(found.covariance_between(at), expected, rtol=1e-6, atol=1e-14)
-    blocks = torch.stack([expected[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(4)])
-    torch.testing.assert_close(model.predict(q, noise=False)[1][:, 0], blocks, rtol=1e-3, atol=1e-12)
-
-
 @pytest.fixture(scope="module")
 def placed(arm: SimulatedArm, data: dc.Measurements) -> Placed:
     return place(arm.nominal, data, silent)

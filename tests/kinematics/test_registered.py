@@ -217,14 +217,6 @@ def test_a_marker_that_may_have_moved_is_weighed(arm: Case) -> None:
     assert kept.excess > 2 * found.excess
 
 
-def test_known_deviations_count(arm: Case) -> None:
-    """Rows of a coarse device leave larger deviations than those of a tracker."""
-    data = seen(arm, slice(0, 8), transform(14))
-    (_, fine), (_, coarse) = (registered(arm, dc.Measurements(data.q, data.points, std=std)) for std in (None, 1e-3))
-    assert float(coarse.frame_deviations[:3].norm()) > 3.0 * float(fine.frame_deviations[:3].norm())
-    assert float(coarse.noise.diagonal().min()) > 0.999e-6
-
-
 def test_tools_of_a_registered_model(arm: Case) -> None:
     """Inside the base nothing changes; in the measuring frame poses move."""
     q, tool = arm.test.q[:6], [0.05, 0.0, 0.2]
