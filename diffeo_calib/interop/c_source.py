@@ -107,6 +107,13 @@ def write_c(
     program = program.at(carrier)
     check_frame(frame)
     chosen = (model.tool if tool is None else tool_transform(tool)).numpy()
+    of_tip = f" {carrier}" * (len(robot.tips) > 1)
+    matrix = "; ".join(" ".join(f"{value:.9g}" for value in row) for row in chosen[:3])
+    remarks, rows = [f"The tool in the frame of the tip{of_tip}, [R t]: {matrix}."], len(model.configurations)
+    if model.markers == 1:
+        remarks.append("One marker was measured: the tool's roll about the last axis is known from the prior alone.")
+    made = model.provenance
+    remarks.append(f"The model was {made.sentence(robot.name, rows) if made else f'fitted to {rows} configurations'}.")
     texts = c_source(
         program,
         source.stem,
@@ -117,7 +124,7 @@ def write_c(
         robot=_comment(robot.name),
         joints=[_comment(line) for line in _joints(robot)],
         frame_name=FRAME_NAMES[frame],
-        remarks=[_comment(line) for line in _remarks(model, chosen, carrier)],
+        remarks=[_comment(line) for line in remarks],
     )
     files = CFiles(source, header, name, texts)
     if write:
@@ -129,17 +136,6 @@ def _joints(robot: Tree) -> Iterator[str]:
     for name, turns, (low, high) in zip(robot.joint_names, robot.periodic, robot.limits.tolist(), strict=True):
         limits = "no limits" if isinf(low) and isinf(high) else f"{low:.6g} to {high:.6g}"
         yield f"{name} [{'rad' if turns else 'm'}]: {limits}"
-
-
-def _remarks(model: CalibratedKinematics, tool: Array, tip: str) -> list[str]:
-    of_tip = f" {tip}" * (len(model.robot.tips) > 1)
-    matrix = "; ".join(" ".join(f"{value:.9g}" for value in row) for row in tool[:3])
-    remarks = [f"The tool in the frame of the tip{of_tip}, [R t]: {matrix}."]
-    if model.markers == 1:
-        remarks.append("One marker was measured: the tool's roll about the last axis is known from the prior alone.")
-    rows, provenance = len(model.configurations), model.provenance
-    fitted = f"fitted to {rows} configurations" if provenance is None else provenance.sentence(model.robot.name, rows)
-    return [*remarks, f"The model was {fitted}."]
 
 
 def _comment(text: str) -> str:
