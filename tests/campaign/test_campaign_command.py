@@ -238,7 +238,7 @@ def test_rows_that_are_there_before_are_judged_as_with_once(
     wrong = ",".join(["1000"] * len(lines[0].split(","))) + "\n"
     (tmp_path / "run.csv").write_text("".join([*lines[:14], wrong, lines[14], "x" + lines[18]]))
     accepted = []
-    goal = '"error_limit_mm": 0.001, "more_rows": null, "target_reached": false'
+    goal = '"error_limit_mm": null, "more_rows": '
     for how, known in (  # the last one answers in JSON
         (["--once"], "mm expected"),
         (["--stdin", "--tolerance", "1um"], goal),
