@@ -17,6 +17,7 @@ from torch import Tensor
 from diffeo_calib.calibration.choose_scales import VARIANCE_RATIO, choose_scales, noise_of_few
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import changes_of
+from diffeo_calib.calibration.diagnostics.plausibility import check_joints
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.placing.placement import Elsewhere
 from diffeo_calib.calibration.planning.candidates import candidates, ranges_around
@@ -92,6 +93,7 @@ class Around:
         """
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DiffeoCalibWarning)  # few rows leave much open
+            check_joints(robot, rows)
             placed = place(robot, rows, silent)
             data, stages = placed.tangent_data(), (placed.registration, placed.identification)
             known = None if same is None else same.scales
