@@ -171,7 +171,7 @@ def recalibrate(
     check_seed(seed)
     progress("registration", 0, 1)
     before = place_again(model, new, marker)
-    rows = weighed(before, marker)
+    rows = weighed(before, marker, opens=True)
     LOG.info("registration: RMS %s of %d new rows", rows.by_kind(rows.placed_residual).rms_text, len(new))
     progress("changes", 0, 1)
     changes, drifts = find_changes(rows, seed=seed) if drift == "tested" else (Changes(), [])
@@ -179,7 +179,7 @@ def recalibrate(
     if groups := dict.fromkeys(one.where for one in changes.found if one.where):  # no model holds for all of them
         what = f"the new rows do not belong to one robot: only {' and '.join(groups)} deviates from the old model"
         warn_user(sentence(what, fix="check what happened between them, and recalibrate with the rows since then"))
-    warn_about(before.registration, outliers=False, excess=not drifts, marker=marker)
+    warn_about(before.registration, outliers=False, excess=not drifts, marker=marker, among=rows.changed_among)
     if drift == "tested":
         drifts = with_usual_drift(rows, drifts)
     if drifts:
@@ -347,7 +347,7 @@ def compare(
     measured, payload = not isinstance(other, CalibratedKinematics), None
     if measured:
         check_arguments(model, other, marker)
-        rows = weighed(place_again(model, other, marker), marker)
+        rows = weighed(place_again(model, other, marker), marker, opens=True)
     else:
         payload = common_mass(model.payload, other.payload)
         model = under_mass(model, payload).to(HOST)
@@ -355,7 +355,9 @@ def compare(
     changes, _ = find_changes(rows, level=level, seed=seed)
     if measured:
         unchanged = not changes.found
-        warn_about(rows.set_up.registration, outliers=unchanged, excess=unchanged, marker=marker)
+        warn_about(
+            rows.set_up.registration, outliers=unchanged, excess=unchanged, marker=marker, among=rows.changed_among
+        )
     q = model.configurations  # what is usual is expected at the rows of its fit
     _, covariance = model.predict(q[:: -(-len(q) // MOST_USUAL)], noise=False)
     variance = float(covariance.diagonal(dim1=-2, dim2=-1).mean().clamp(min=0))
@@ -401,7 +403,7 @@ def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) ->
     found = find_place(fitted, other.lever, measured(other, there, model(q)))[1]
     placed = RegisteredMap(moved(fitted, found.transform), found)
     new = measured(model, q, placed(there).unflatten(1, (-1, 3)))
-    rows = weighed(place_again(model, new, "other"), "other")
+    rows = weighed(place_again(model, new, "other", opens=False), "other")
     errors, _ = roots(placed.conditional.covariance_between(placed.geodesic.linearise(there)))
     return rows.drifting([errors.unflatten(0, (len(q), -1))]).with_weights()
 
