@@ -21,9 +21,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from diffeo_calib.common.errors import PACKAGE, InputError, as_written
 from diffeo_calib.common.files import write_together
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.kinematics.provenance import package_version
-from diffeo_calib.kinematics.tool import checked_tip, tool_transform
+from diffeo_calib.kinematics.tool import checked_tip, program_of, tool_transform
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.arrays import Array
 from diffeo_calib.runtime.chain import NominalChain, Sag, Waves
@@ -67,6 +66,7 @@ def write_c(
     *,
     prefix: str | None = None,
     tip: str | None = None,
+    write: bool = True,
 ) -> CFiles:
     """Write a model as a C99 source file, and a header of the same name beside it.
 
@@ -82,26 +82,12 @@ def write_c(
         prefix: beginning of all names; by default the name of the file, with ``_`` for what C does not allow in names.
         tip: that carries the tool, for a robot with several; the model's own by default. The other branches bend the
             robot by their weight: the functions take the values of all joints.
+        write: False makes the contents alone, to be written together with other files.
 
     Raises InputError: a model with adaptive time steps or a user's kernel, whose flows are no constants, or on another
     device than the CPU; another frame; several tips of which none is named; a path without ``.c``, or to a file of
     other origin; a prefix that is no name in C.
     """
-    files = c_files(model, path, tool, frame, prefix=prefix, tip=tip)
-    write_together(files.contents)
-    return files
-
-
-def c_files(
-    model: CalibratedKinematics,
-    path: str | PathLike[str],
-    tool: object,
-    frame: str,
-    *,
-    prefix: str | None = None,
-    tip: str | None = None,
-) -> CFiles:
-    """The files that :func:`write_c` writes."""
     robot, source = model.robot, Path(path)
     carrier = checked_tip(robot, model.tool_tip if tip is None else tip)
     if source.suffix != ".c":
@@ -121,6 +107,13 @@ def c_files(
     program = program.at(carrier)
     check_frame(frame)
     chosen = (model.tool if tool is None else tool_transform(tool)).numpy()
+    of_tip = f" {carrier}" * (len(robot.tips) > 1)
+    matrix = "; ".join(" ".join(f"{value:.9g}" for value in row) for row in chosen[:3])
+    remarks, rows = [f"The tool in the frame of the tip{of_tip}, [R t]: {matrix}."], len(model.configurations)
+    if model.markers == 1:
+        remarks.append("One marker was measured: the tool's roll about the last axis is known from the prior alone.")
+    made = model.provenance
+    remarks.append(f"The model was {made.sentence(robot.name, rows) if made else f'fitted to {rows} configurations'}.")
     texts = c_source(
         program,
         source.stem,
@@ -131,26 +124,18 @@ def c_files(
         robot=_comment(robot.name),
         joints=[_comment(line) for line in _joints(robot)],
         frame_name=FRAME_NAMES[frame],
-        remarks=[_comment(line) for line in _remarks(model, chosen, carrier)],
+        remarks=[_comment(line) for line in remarks],
     )
-    return CFiles(source, header, name, texts)
+    files = CFiles(source, header, name, texts)
+    if write:
+        write_together(files.contents)
+    return files
 
 
 def _joints(robot: Tree) -> Iterator[str]:
     for name, turns, (low, high) in zip(robot.joint_names, robot.periodic, robot.limits.tolist(), strict=True):
         limits = "no limits" if isinf(low) and isinf(high) else f"{low:.6g} to {high:.6g}"
         yield f"{name} [{'rad' if turns else 'm'}]: {limits}"
-
-
-def _remarks(model: CalibratedKinematics, tool: Array, tip: str) -> list[str]:
-    of_tip = f" {tip}" * (len(model.robot.tips) > 1)
-    matrix = "; ".join(" ".join(f"{value:.9g}" for value in row) for row in tool[:3])
-    remarks = [f"The tool in the frame of the tip{of_tip}, [R t]: {matrix}."]
-    if model.markers == 1:
-        remarks.append("One marker was measured: the tool's roll about the last axis is known from the prior alone.")
-    rows, provenance = len(model.configurations), model.provenance
-    fitted = f"fitted to {rows} configurations" if provenance is None else provenance.sentence(model.robot.name, rows)
-    return [*remarks, f"The model was {fitted}."]
 
 
 def _comment(text: str) -> str:

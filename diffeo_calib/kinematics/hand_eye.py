@@ -136,12 +136,6 @@ class HandEye:
         return {f"{name}_{own.key}": own.entry() for name, own in vars(self).items()}
 
 
-def hand_eye_entry(found: Mapping[str, HandEye]) -> dict[str, object]:
-    """Camera and board for programs; of several cameras by their names; nothing of none."""
-    each = {name: own.entry() for name, own in found.items()}
-    return {"hand_eyes": each} if len(each) > 1 else dict(zip(("hand_eye",), each.values(), strict=False))
-
-
 def hand_eye_sentences(found: Mapping[str, HandEye]) -> Iterator[str]:
     """Every camera and the board with their deviations."""
     for name, own in found.items():

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from product_bank import Case, calibrated, simulated
+from product_bank import Case, simulated
 from table_bank import refused
 from torch import Tensor
 from torch.testing import assert_close
@@ -18,9 +18,6 @@ from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.robots import SimulatedArm
 
 pytestmark = pytest.mark.slow
-
-FINE = 5e-6
-"""Noise of a coordinate with which transmission errors of single joints are compared, m."""
 
 
 def rms(displacements: Tensor) -> float:
@@ -36,16 +33,6 @@ def sizes(case: Case) -> dict[str, float]:
 def pushed(arm: SimulatedArm, q: Tensor, errors: Tensor) -> Tensor:
     """What joint errors (N, 6) move the markers by, (N, 3 P)."""
     return (arm.truth.jacobian(q).flatten(1, 2) @ errors[:, :, None])[..., 0]
-
-
-def missed(case: Case, arm: SimulatedArm, joint: int) -> float:
-    """Error of the transmission found of a joint over the size of the true one, RMS, without their mean values."""
-    low, high = arm.nominal.limits[joint].tolist()
-    q = torch.zeros(400, arm.nominal.n, dtype=torch.float64)
-    q[:, joint] = torch.linspace(low, high, 400, dtype=torch.float64)
-    true = arm.components(q).transmission[:, joint]
-    error = case.model.transmission(arm.nominal.joint_names[joint], q[:, joint]) - true
-    return float((error - error.mean()).norm() / (true - true.mean()).norm())
 
 
 def test_parts_with_every_source_of_error(arm: Case) -> None:
@@ -69,30 +56,6 @@ def test_parts_with_every_source_of_error(arm: Case) -> None:
     joints = true.transmission + true.gravity
     moved = arm.model(q).detach() - arm.model.geometry.points(q)
     assert rms(moved.flatten(1) - pushed(source, q, joints)) < 0.4 * rms(pushed(source, q, joints))
-
-
-def test_transmission_alone() -> None:
-    """Every curve within 15 % (wrist roll 30 %: 0.1 m of lever arm) from 60 poses with noise 0.005 mm."""
-    case, source = calibrated(60, geometry=0, gravity=0, noise=FINE), simulated(1, geometry=0, gravity=0)[0]
-    for joint, bound in enumerate((0.1, 0.1, 0.1, 0.15, 0.13, 0.3)):
-        assert missed(case, source, joint) < bound, joint
-    for nothing in ("gravity on joints", "gravity on links", "coupled joint errors", "task space"):
-        assert sizes(case)[nothing] < 0.005, nothing
-    q = case.train.q
-    assert rms(case.model.geometry.points(q) - source.truth.points(q)) < 0.02
-    assert case.held_out()[2] < 0.03 * 1e-3
-
-
-def test_gravity_alone() -> None:
-    case, source = calibrated(40, geometry=0, transmission=0), simulated(1, geometry=0, transmission=0)[0]
-    found, q = sizes(case), case.train.q
-    deflected = rms(pushed(source, q, source.components(q).gravity))
-    assert deflected > 0.5
-    assert found.pop("gravity on joints") == pytest.approx(deflected, rel=0.05)
-    del found["geometry"]  # part of the registration was compensated
-    assert max(found.values()) < 0.015, found
-    assert rms(case.model.geometry.points(q) - source.truth.points(q)) < 0.04
-    assert case.held_out()[2] < 0.06 * 1e-3
 
 
 def test_transmission_is_what_moves_the_markers(arm: Case) -> None:

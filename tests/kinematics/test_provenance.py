@@ -63,7 +63,7 @@ def test_the_hash_is_that_of_the_file_or_of_the_arrays(arm: Case, tmp_path: Path
 def test_entries_of_a_summary_are_named_with_their_units() -> None:
     """Unknown numbers are left out, as the first files of version 3 did; JSON knows no infinity."""
     old: Any = dc.load(OLD)
-    entries = old.summary.to_dict()  # all of them: tests/interop/test_numpy_model.py
+    entries = old.summary.to_dict()  # all of them: tests/interop/test_model_file.py
     assert old.provenance is None
     assert {"registration rms [m]", "geometry rms [m]", "task space [m]", "rows", "noise degrees of freedom"} < {
         *entries

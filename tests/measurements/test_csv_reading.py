@@ -422,16 +422,3 @@ def test_ur10_poses_are_read(ur10_folder: Path) -> None:
     assert_close(held(data.std)[0, 0] * 1e3, torch.tensor([0.00095905, 0.0022901, 0.0019936]).double())
     assert_close(held(data.rotation_std)[0].rad2deg(), torch.tensor([0.00094925, 0.0014176, 0.0011736]).double())
     assert torch.linalg.matrix_rank(held(data.covariance), rtol=1e-12).unique().tolist() == [6]
-
-
-def test_fr3_poses_are_read(ur10_folder: Path) -> None:
-    """Matrices of a camera, against those that the controller reports."""
-    path = ur10_folder.parent / "franka_fr3" / "franka_fr3_camera.csv"
-    joints = [f"q{i}_rad" for i in range(1, 8)]
-    matrix = [f"cam_T{i}{j}" for i in range(3) for j in range(3)]
-    options: dict[str, Any] = {"length": "m", "angle": "rad", "convention": "matrix"}
-    data = read_measurements(path, joints, ["cam_T03", "cam_T13", "cam_T23"], rotation=matrix, **options)
-    assert len(data) == 114
-    reported = [f"tcp_{4 * i + j}" for i in range(3) for j in range(3)]
-    tcp = read_measurements(path, joints, ["tcp_3", "tcp_7", "tcp_11"], rotation=reported, **options)
-    assert float(relative_spread(held(data.poses), held(tcp.poses)).median()) < math.radians(1.0)

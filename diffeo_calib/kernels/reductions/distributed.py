@@ -79,8 +79,6 @@ class Ranks:
         Raises:
             LostRankError: they differ, or another rank has ended or hangs.
         """
-        if self.count == 1:
-            return
         found = [torch.empty_like(numbers) for _ in range(self.count)]
         self._exchange(messages.all_gather, found, numbers)
         every = torch.stack(found)
@@ -94,9 +92,8 @@ class Ranks:
         try:
             message(*tensors)
         except RuntimeError as error:
-            what = (
-                f"rank {self.own} of {self.count} waited for another process that has ended, hangs or does other work"
-            )
+            what = f"rank {self.own} of {self.count} waited for another process"
+            what += " that has ended, hangs or does other work"
             fix = "look at the first error of the others, and start all again"
             raise LostRankError.of(f"{what} ({_first_line(error)})", fix=fix) from error
 
@@ -118,11 +115,6 @@ def ranks() -> Ranks:
     if not messages.is_initialized():
         _connect()
     return Ranks(messages.get_rank(), messages.get_world_size())
-
-
-def ranks_of(backends: Sequence[str]) -> Ranks:
-    """The processes that share the work of kernels with these backends: this one alone, unless one is distributed."""
-    return ranks() if any("distributed" in name for name in backends) else Ranks()
 
 
 def _connect() -> None:

@@ -99,17 +99,12 @@ def sums(
         waves = Lattice.of(profile, extent, accuracy)
         if waves is None or (m + n) * (POINT_COST + WAVE_COST * waves.size) > pairs:
             return None
-        if waves.error(profile, _displacements(at.features, columns.features, extent)) > accuracy:
-            return None
-        return RESULTS[formula](waves, at, columns)
-
-
-def _displacements(rows: Tensor, columns: Tensor, extent: Tensor) -> Tensor:
-    """Some differences of points, and the largest possible one, where the copies of the kernel are nearest."""
-    count = min(CHECKED_ROWS, len(rows), len(columns))
-    every = [torch.arange(count, device=t.device, dtype=torch.int64) * (len(t) - 1) // count for t in (rows, columns)]
-    apart = rows[every[0], None] - columns[every[1]][None]
-    return torch.cat([apart.flatten(0, 1), extent[None], -extent[None], 0 * extent[None]])
+        count = min(CHECKED_ROWS, m, n)
+        steps = torch.arange(count, device=low.device, dtype=torch.int64)
+        apart = at.features[steps * (m - 1) // count, None] - columns.features[steps * (n - 1) // count]
+        # the kernel's copies are nearest at the largest possible difference
+        apart = torch.cat([apart.flatten(0, 1), extent[None], -extent[None], 0 * extent[None]])
+        return None if waves.error(profile, apart) > accuracy else RESULTS[formula](waves, at, columns)
 
 
 class Lattice:
@@ -197,12 +192,8 @@ class Lattice:
         return [slice(k, min(k + size, count)) for k in range(0, count, size)] or [slice(0, 0)]
 
 
-def _field_and_jacobian(waves: Lattice, i: Points, j: Points) -> tuple[Tensor, ...]:
-    return _with_slopes(waves, i.features, waves.coefficients(j.features, j.momenta))
-
-
 def _gradient(waves: Lattice, i: Points, j: Points) -> tuple[Tensor, ...]:
-    v, slopes = _field_and_jacobian(waves, i, j)
+    v, slopes = RESULTS[FIELD_AND_JACOBIAN](waves, i, j)
     return v, torch.einsum("mr,mrd->md", i.momenta, slopes)
 
 
@@ -228,7 +219,7 @@ def _with_slopes(waves: Lattice, at: Tensor, grid: Tensor) -> tuple[Tensor, Tens
 
 RESULTS: dict[Formula, Callable[[Lattice, Points, Points], tuple[Tensor, ...]]] = {
     FIELD: lambda waves, i, j: (waves.values(i.features, waves.coefficients(j.features, j.momenta)),),
-    FIELD_AND_JACOBIAN: _field_and_jacobian,
+    FIELD_AND_JACOBIAN: lambda waves, i, j: _with_slopes(waves, i.features, waves.coefficients(j.features, j.momenta)),
     GRADIENT: _gradient,
     HESSIAN_PRODUCT: _hessian_product,
 }
