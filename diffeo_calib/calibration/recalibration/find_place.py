@@ -6,7 +6,7 @@ moved a little (1 mm), or is another one (0.3 m): the marginal likelihood of the
 
 Leaving rows J out lowers their quadratic form by mu_J^T (K^-1)_JJ^-1 mu_J. Compared with what remains, this is an F
 test (externally studentised residuals), so that an outlier does not hide itself. Rows whose weights say that they are
-gross go first, together: they may hide each other. Then single ones are tried, and pairs.
+gross go first, together: they may hide each other.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def find_place(
     while True:
         odds = _odds(found)
         best = found[max(odds, key=odds.__getitem__)]
-        worst = gross_rows(best) or worst_rows(best)
+        worst = worst_rows(best)
         if not worst or len(outliers) + len(worst) > LARGEST_OUTLIER_PART * len(some):
             break
         outliers += kept[worst].tolist()
@@ -271,7 +271,6 @@ def _odds(found: dict[str, NewRows]) -> dict[str, float]:
 
 PRIOR_FREEDOM = 10.0
 """The model's own covariance counts as an estimate of the scale with so many degrees of freedom."""
-MOST_PAIRS = 800
 FALSE_ALARM_PROBABILITY = 0.001
 """Probability that clean rows have an outlier."""
 
@@ -288,37 +287,25 @@ def scale_of(rows: NewRows, falls: Tensor | float = 0.0, coordinates: Tensor | i
     return ((given.target @ given.solved.flatten() - falls).clamp(min=0.0) + PRIOR_FREEDOM) / freedom, freedom
 
 
-def gross_rows(rows: NewRows) -> list[int]:
-    """Rows that are more likely gross than good, which hide each other; none unless left-out errors show any."""
-    tails = rows.with_weights().tails
-    return (tails.weights < OUTLIER_WEIGHT).any(1).nonzero()[:, 0].tolist() if tails.gross else []
-
-
 def worst_rows(rows: NewRows) -> list[int]:
-    """The one or two rows that contradict all others, or none."""
+    """The row that contradicts all others, or rows that are more likely gross than good; or none."""
     from scipy.special import fdtrc  # noqa: PLC0415  # slow to import, not needed to use a model
 
+    if (tails := rows.with_weights().tails).gross:
+        return (tails.weights < OUTLIER_WEIGHT).any(1).nonzero()[:, 0].tolist()
     given = rows.given
-    M, m = given.residual.shape
-    for size in (1, 2):
-        sets = torch.combinations(torch.arange(M, device=given.residual.device), size)
-        if M - size < LEAST_POINTS or len(sets) > MOST_PAIRS:
-            continue
-        at = (sets[..., None] * m + torch.arange(m, device=sets.device)).flatten(1)  # (K, size m)
-        blocks, chosen = given.factor.inverse[at[:, :, None], at[:, None, :]], given.solved.flatten()[at]
-        falls = (chosen * torch.linalg.solve(blocks, chosen[..., None])[..., 0]).sum(1)
-        coordinates = given.visible.sum(1)[sets].sum(1).to(falls)
-        variances, freedom = scale_of(rows, falls, coordinates)
-        ratios = falls / coordinates / variances
-        chances = torch.from_numpy(fdtrc(*(each.numpy(force=True) for each in (coordinates, freedom, ratios))))
-        best = int(ratios.masked_fill((chances > chances.min()).to(ratios.device), 0.0).argmax())  # of equal chances
-        if float(chances[best]) * len(sets) < FALSE_ALARM_PROBABILITY:
-            return sets[best].tolist()
-    return []
+    if len(rows) <= LEAST_POINTS:
+        return []
+    falls, coordinates = given.left_out_squares, given.visible.sum(1).to(given.residual)
+    variances, freedom = scale_of(rows, falls, coordinates)
+    ratios = falls / coordinates / variances
+    chances = torch.from_numpy(fdtrc(*(each.numpy(force=True) for each in (coordinates, freedom, ratios))))
+    best = int(ratios.masked_fill((chances > chances.min()).to(ratios.device), 0.0).argmax())  # of equal chances
+    return [best] if float(chances[best]) * len(rows) < FALSE_ALARM_PROBABILITY else []
 
 
 def opened(rows: NewRows, data: Any) -> NewRows:
-    """The rows beside what has changed among them; as they are if nothing has.
+    """The rows beside what has changed of device and tool among them; as they are if nothing has.
 
     Args:
         rows: new rows. data: the same as they were measured.
@@ -327,7 +314,8 @@ def opened(rows: NewRows, data: Any) -> NewRows:
         return rows
     shown, chain, mine = rows.visible[..., None], rows.nominal.geometry.chain, rows.placement
     frame, markers = (rows.by_places * shown).tensor_split([6], 2)
-    if rows.observe is None and rows.noise_model.rigid_basis is not None:  # nothing bends a frame
+    own = rows.set_up.coordinates
+    if own is not None and own.table.lever is not None:  # nothing bends a frame
         markers = markers @ torch.block_diag(*rigid_motions(rows.marks.points.flatten()))
     found = [Hypothesis(BASE, own, fix=NEW_SET_UP) for own in (frame, frame[..., :3])]
     found.append(Hypothesis(MARKERS, markers, fix=NEW_SET_UP))
@@ -337,7 +325,8 @@ def opened(rows: NewRows, data: Any) -> NewRows:
     found = [own for own in (*found, *mine.hypotheses(rows, CHANGE)) if bool((own.effects != 0).any())]
     named = [own._replace(name=mine.bodies.get(own.name, own.name)) for own in found]
     told = SampledRows(torch.arange(len(rows), device=shown.device), rows.process, None)
-    causes = [*changed(told, named, data.line_numbers, data.row_names)]
+    found = changed(told, named, data.line_numbers, data.row_names)
+    causes = [one for one in found if TWO_ROBOTS not in one.fix]  # of the robot, see find_changes.py
     if len(rows) >= gates.MIXED_ROWS:
         causes += two_tools(told, markers, data.line_numbers)
     best = best_of(causes, told)
