@@ -197,7 +197,9 @@ def test_what_moved_among_the_rows_is_opened(arm: Case) -> None:
     slipped = at + torch.tensor([3e-4, -4e-4, 0.0], dtype=torch.float64)
     parts = other_marker(at, q[:20], T), other_marker(slipped, q[20:40], T)
     rest, rows = other_marker(at, q[40:], T, seed=6), dc.Measurements.joined(parts).with_line_numbers(range(40))
-    with pytest.warns(dc.DiffeoCalibWarning, match="a marker or the tool seems to have moved by about 0.5 mm near row 20"):
+    with pytest.warns(
+        dc.DiffeoCalibWarning, match="a marker or the tool seems to have moved by about 0.5 mm near row 20"
+    ):
         found = [registered(arm, rows)[0], dc.recalibrate(arm.model, rows).model]
     for model in found:
         said = model.predict(rest.q)[1].diagonal(dim1=-2, dim2=-1).sum(-1).mean().sqrt()

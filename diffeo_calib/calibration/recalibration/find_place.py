@@ -114,7 +114,13 @@ def find_place(
         found[name] = max(settled, key=lambda each: each.given.log_evidence())
     kept, outliers = torch.arange(len(some), device=some.q.device), list[int]()
     while True:
-        odds = _odds(found)
+        scale = max(1.0, float(scale_of([*found.values()][-1])[0]))  # large errors under the widest prior are none
+        logs = {
+            name: own.given.log_evidence(scale) + UNMOVED_LOG_ODDS * (name == "same") for name, own in found.items()
+        }
+        odds = {name: exp(own - max(logs.values())) for name, own in logs.items()}
+        likely = {name: own for name, own in odds.items() if own > NEGLIGIBLE_PROBABILITY * sum(odds.values())}
+        odds = {name: own / sum(likely.values()) for name, own in likely.items()}
         best = found[max(odds, key=odds.__getitem__)]
         worst = worst_rows(best)
         if not worst or len(outliers) + len(worst) > LARGEST_OUTLIER_PART * len(some):
@@ -258,15 +264,6 @@ def _check_enough(data: Measurements, *, framed: bool, known: bool) -> None:
     if len(data) < least:
         what, fix = "these rows do not determine where everything is", "measure 6 to 10 poses"
         raise MeasurementError.of(what, expected=f"at least {least} rows", got=len(data), fix=fix)
-
-
-def _odds(found: dict[str, NewRows]) -> dict[str, float]:
-    """Probabilities of the priors that count. Errors as large as those under the widest prior are no evidence."""
-    scale = max(1.0, float(scale_of([*found.values()][-1])[0]))
-    logs = {name: each.given.log_evidence(scale) + UNMOVED_LOG_ODDS * (name == "same") for name, each in found.items()}
-    odds = {name: exp(each - max(logs.values())) for name, each in logs.items()}
-    likely = {name: each for name, each in odds.items() if each > NEGLIGIBLE_PROBABILITY * sum(odds.values())}
-    return {name: each / sum(likely.values()) for name, each in likely.items()}
 
 
 PRIOR_FREEDOM = 10.0

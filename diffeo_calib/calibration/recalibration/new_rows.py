@@ -28,7 +28,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
 from diffeo_calib.kinematics.registered_map import Registration, place_slopes, robot_map, turned
 from diffeo_calib.maps.linearisation import Linearisation, Numbers
-from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
+from diffeo_calib.maps.noise import mean_block, without_hidden
 from diffeo_calib.maps.observation import Stacked
 from diffeo_calib.measurements.poses import block_diagonal, own_blocks
 from diffeo_calib.measurements.table import Measurements
@@ -358,18 +358,6 @@ class NewRows:
     def placed_residual(self) -> Tensor:
         """(M, R) residuals with devices and markers where the rows put them, m; NaN where hidden."""
         return self.given.shown(self.given.after_placing @ self.given.target)
-
-    @property
-    def expected_residual(self) -> Tensor:
-        """(M, R) standard deviations of these that model and noise lead to expect, m; NaN where hidden."""
-        placed = self.given.after_placing
-        variances = ((placed @ Noise(self.noise).add_to(self.given.C)) * placed).sum(1).clamp(min=0.0)
-        return self.given.shown(variances.sqrt())
-
-    @property
-    def excess(self) -> float:
-        """Root mean square of the left-out errors of the better half of the rows in units of the expected ones."""
-        return float((self.given.left_out_squares / self.visible.sum(1)).median().sqrt())
 
     @property
     def process(self) -> Process:

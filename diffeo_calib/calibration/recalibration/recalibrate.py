@@ -54,6 +54,7 @@ from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.provenance import Provenance, check_note
 from diffeo_calib.kinematics.registered_map import RegisteredMap, Registration, fitted_markers, moved
+from diffeo_calib.maps.noise import Noise
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.conditional import roots
@@ -184,7 +185,8 @@ def recalibrate(
         drifts = with_usual_drift(rows, drifts)
     if drifts:
         rows = rows.drifting([each.root(rows.at) for each in drifts]).with_weights()
-    warn_of_contradictions(rows, rows.excess if before.registration is None else before.registration.excess)
+    excess = float((rows.given.left_out_squares / rows.visible.sum(1)).median().sqrt())  # of the better half
+    warn_of_contradictions(rows, excess if before.registration is None else before.registration.excess)
     problem, start = both_dates(rows, rows.inflation, [each.root for each in drifts])
     solver, integrator = GaussNewton(tolerance=RESIDUAL_TOLERANCE), rows.fitted.geodesic.integrator
     fitted = fit(problem, solver, integrator, start=start, progress=progress)
@@ -362,12 +364,13 @@ def compare(
     _, covariance = model.predict(q[:: -(-len(q) // MOST_USUAL)], noise=False)
     variance = float(covariance.diagonal(dim1=-2, dim2=-1).mean().clamp(min=0))
     usual = (variance + rows.noise.diagonal(dim1=1, dim2=2)).sqrt()
-    usual = usual.masked_fill(~rows.visible, nan)
+    usual, placed = usual.masked_fill(~rows.visible, nan), rows.given.after_placing
+    expected = ((placed @ Noise(rows.noise).add_to(rows.given.C)) * placed).sum(1).clamp(min=0.0).sqrt()
     return Comparison(
         moved=rows.set_up.registration if measured else None,
         changes=changes,
         errors=rows.by_kind(rows.placed_residual),
-        expectations=rows.by_kind(rows.expected_residual),
+        expectations=rows.by_kind(rows.given.shown(expected)),
         usual=rows.by_kind(usual),
         hidden=hidden_offsets(model.robot, rows.set_up, changes) if measured else (),
         payload=payload,
