@@ -27,7 +27,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few, sentence, warn_user
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kinematics.nominal import FlangePoints, rigid_motions
+from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.registered_map import (
     HARDLY,
     Registration,
@@ -311,9 +311,6 @@ def opened(rows: NewRows, data: Any) -> NewRows:
         return rows
     shown, chain, mine = rows.visible[..., None], rows.nominal.geometry.chain, rows.placement
     frame, markers = (rows.by_places * shown).tensor_split([6], 2)
-    own = rows.set_up.coordinates
-    if own is not None and own.table.lever is not None:  # nothing bends a frame
-        markers = markers @ torch.block_diag(*rigid_motions(rows.marks.points.flatten()))
     found = [Hypothesis(BASE, own, fix=NEW_SET_UP) for own in (frame, frame[..., :3])]
     found.append(Hypothesis(MARKERS, markers, fix=NEW_SET_UP))
     for joint, (name, turns) in enumerate(zip(chain.joint_names, chain.periodic, strict=True)):
