@@ -252,7 +252,7 @@ def check_other_table(model: CalibratedKinematics, new: Any) -> None:
 
 
 def check_unit(predicted: Tensor, measured: Tensor) -> None:
-    """Raise MeasurementError for points (M, P, 3), m, that fit in the other unit of length to those by the old model."""
+    """Raise MeasurementError where measured points (M, P, 3), m, are those of the old model in another unit."""
     ratio = size_ratio(predicted, measured)
     if not 1 / LARGEST_RATIO < ratio < LARGEST_RATIO and in_other_unit(ratio, OTHER_UNIT):
         what, expected = (
