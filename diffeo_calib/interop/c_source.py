@@ -156,17 +156,14 @@ def c_source(
         limits: (n, 2) of the active joints [rad or m].
         texts: ``robot``, its name; ``joints``, a line for each; ``frame_name`` of the results; ``remarks``, sentences.
     """
-    chain, nominal, joints = program.chain, program.chain.nominal, len(program.chain.nominal.axes)
+    chain, nominal = program.chain, program.chain.nominal
     named = (
         ("joint", "phi^-1: corrections of the joints", program.joint_flow),
         ("task", "psi: corrections of positions", program.task_flow),
     )
     flows = [_flow_constants(*flow) for flow in named if not flow[2].vanishes]
     terms = [term for flow in flows for term in flow["terms"]]
-    runs, first = [], 0  # markers of one tip that follow one another: tip, first and number
-    for tip, run in groupby(program.on):
-        runs.append((tip, first, len(list(run))))
-        first += runs[-1][2]
+    runs = (list(own) for _, own in groupby(range(len(program.on)), program.on.__getitem__))
     contents = texts | {
         "stem": stem,
         "prefix": prefix,
@@ -175,9 +172,10 @@ def c_source(
         "markers": len(program.markers),
         "generated": f"{GENERATED} {package_version()}",
         "lanes": LANES,
-        "on_path": nominal.ancestors[joints:][: len(chain.tips)] * 1,
-        "groups": runs,
-        "program_tip": program.tip,
+        "on_path": nominal.ancestors[len(nominal.axes) :][: len(chain.tips)] * 1,
+        # markers of one tip that follow one another: tip, first and number
+        "groups": [(program.on[own[0]], own[0], len(own)) for own in runs],
+        "program": program,
         "flows": flows,
         "flow_names": [flow["name"] for flow in flows],
         "profiles": sorted({term["term"].profile for term in terms}),
@@ -185,11 +183,7 @@ def c_source(
         "tabulated": any(flow["tables"] for flow in flows),
         "chain": chain,
         "nominal": nominal,
-        "waves": chain.waves,
-        "axis_waves": chain.axes,
-        "moving": joints,
         "sag": None if chain.sag is None else _sag_constants(nominal, chain.sag),
-        "markers_in_flange": program.markers,
         "tool_points": tool_points(tool),
         "frame": frame,
         "limits": limits,
@@ -204,8 +198,7 @@ def _flow_constants(name: str, title: str, flow: RecordedFlow) -> dict[str, Any]
     Of its tables, one after the other by stages, then joints: knots (rows,) rad; f, f', f'' (rows, 3) there; the first
     row of every table, and the number of rows.
     """
-    found: dict[str, Any] = {"name": name, "title": title, "size": flow.size, "steps": flow.steps, "tables": None}
-    found |= {"stages": len(flow.weights), "coefficients": flow.coefficients, "weights": flow.weights}
+    found: dict[str, Any] = vars(flow) | {"name": name, "title": title, "stages": len(flow.weights)}
     found["terms"] = [_term_constants(f"{name}_term{k}", term) for k, term in enumerate(flow.terms, 1)]
     if flow.tables is not None:
         every = [table for stage in flow.tables.stages for table in stage]

@@ -239,14 +239,20 @@ def test_rows_that_are_there_before_are_judged_as_with_once(
     wrong = ",".join(["1000"] * len(lines[0].split(","))) + "\n"
     (tmp_path / "run.csv").write_text("".join([*lines[:14], wrong, lines[14], "x" + lines[18]]))
     accepted = []
-    for how, known in (("--once", "mm expected"), ("--stdin", '"expected_error_mm": 0.')):  # the latter answers in JSON
-        done = command("campaign", tmp_path / "campaign.toml", how, "--accepted", tmp_path / "accepted.csv")
-        assert done.code == 0
+    goal = '"error_limit_mm": null, "more_rows": '
+    for how, known in (  # the last one answers in JSON
+        (["--once"], "mm expected"),
+        (["--stdin", "--tolerance", "1um"], goal),
+        (["--stdin"], '"expected_error_mm": 0.'),
+    ):
+        done = command("campaign", tmp_path / "campaign.toml", *how, "--accepted", tmp_path / "accepted.csv")
+        assert done.code == (4 if known == goal else 0)
         for words in ("row 15 looks wrong", known, "run.csv', line 17"):
             assert words in done.out
+        assert (goal in done.out) == (known == goal)
         accepted.append((tmp_path / "accepted.csv").read_text())
         (tmp_path / "run.csv.journal").unlink()
-    assert accepted[0] == accepted[1] == "".join([*lines[:14], lines[14]])
+    assert accepted[0] == accepted[1] == accepted[2] == "".join([*lines[:14], lines[14]])
 
 
 @pytest.mark.slow

@@ -5,20 +5,23 @@ new_rows.py, after a start in closed form (robots/placement.py). A marker either
 moved a little (1 mm), or is another one (0.3 m): the marginal likelihood of the rows chooses. The base may be anywhere.
 
 Leaving rows J out lowers their quadratic form by mu_J^T (K^-1)_JJ^-1 mu_J. Compared with what remains, this is an F
-test (externally studentised residuals), so that an outlier does not hide itself. Single rows are tried first, then
-pairs, which may hide each other.
+test (externally studentised residuals), so that an outlier does not hide itself. Rows whose weights say that they are
+gross go first, together: they may hide each other.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from math import exp, log
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.recalibration.new_rows import NewRows, NewSetUp, UsualNoise
+from diffeo_calib.calibration.diagnostics.hypotheses import BASE, MARKERS, NEW_SET_UP, TWO_ROBOTS, SampledRows
+from diffeo_calib.calibration.diagnostics.judge import best_of, changed, two_tools
+from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows, NewSetUp, UsualNoise
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few, sentence, warn_user
@@ -38,9 +41,11 @@ from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_points, tool_transform
 from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.poses import kind_of_points, own_blocks, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.placement import PLACES, place, rigid_fit
 from diffeo_calib.robots.se3 import skew
 from diffeo_calib.sensors.coordinates import check_joint_order
+from diffeo_calib.sensors.devices import CHANGE, Hypothesis
 from diffeo_calib.sensors.tables import Coordinates
 
 FREE = ("both", "base", "marker")
@@ -73,6 +78,7 @@ def find_place(
     free: str = "both",
     marker_std: float | None = None,
     ball: bool = False,
+    opens: bool = False,
 ) -> tuple[NewRows, Registration]:
     """Find where the device stands and where the markers sit.
 
@@ -80,6 +86,7 @@ def find_place(
         model: the map, placed anew before or not. lever: of its frames, m; None for markers.
         data: the rows. free, marker_std: see :meth:`CalibratedKinematics.registered`.
         ball: whether the last marker is a ball that no row shows, and that stays where it was on the tool.
+        opens: whether something may have changed among the rows.
 
     Returns:
         the rows around the most probable places, with their prior, and the record.
@@ -111,7 +118,13 @@ def find_place(
         found[name] = max(settled, key=lambda each: each.given.log_evidence())
     kept, outliers = torch.arange(len(some), device=some.q.device), list[int]()
     while True:
-        odds = _odds(found)
+        scale = max(1.0, float(scale_of([*found.values()][-1])[0]))  # large errors under the widest prior are none
+        logs = {
+            name: own.given.log_evidence(scale) + UNMOVED_LOG_ODDS * (name == "same") for name, own in found.items()
+        }
+        odds = {name: exp(own - max(logs.values())) for name, own in logs.items()}
+        likely = {name: own for name, own in odds.items() if own > NEGLIGIBLE_PROBABILITY * sum(odds.values())}
+        odds = {name: own / sum(likely.values()) for name, own in likely.items()}
         best = found[max(odds, key=odds.__getitem__)]
         worst = worst_rows(best)
         if not worst or len(outliers) + len(worst) > LARGEST_OUTLIER_PART * len(some):
@@ -121,6 +134,8 @@ def find_place(
         kept, found = kept[stay], {name: rows.kept(stay).settled() for name, rows in found.items()}
     most = max(LARGEST_ERROR_PER_REACH * chain.reach, gates.REGISTERED_RESIDUAL * spread)
     _refuse_others(best.given.shown(best.given.residual).unflatten(1, (-1, 3)), most)
+    if opens and (beside := opened(best, some.rows(kept))) is not best:
+        best = beside.settled()
     said = {
         "lever": search.data.lever,
         "free": free,
@@ -267,18 +282,8 @@ def _refuse_others(away: Tensor, most: float) -> float:
     return typical
 
 
-def _odds(found: dict[str, NewRows]) -> dict[str, float]:
-    """Probabilities of the priors that count. Errors as large as those under the widest prior are no evidence."""
-    scale = max(1.0, float(scale_of([*found.values()][-1])[0]))
-    logs = {name: each.given.log_evidence(scale) + UNMOVED_LOG_ODDS * (name == "same") for name, each in found.items()}
-    odds = {name: exp(each - max(logs.values())) for name, each in logs.items()}
-    likely = {name: each for name, each in odds.items() if each > NEGLIGIBLE_PROBABILITY * sum(odds.values())}
-    return {name: each / sum(likely.values()) for name, each in likely.items()}
-
-
 PRIOR_FREEDOM = 10.0
 """The model's own covariance counts as an estimate of the scale with so many degrees of freedom."""
-MOST_PAIRS = 800
 FALSE_ALARM_PROBABILITY = 0.001
 """Probability that clean rows have an outlier."""
 
@@ -296,26 +301,52 @@ def scale_of(rows: NewRows, falls: Tensor | float = 0.0, coordinates: Tensor | i
 
 
 def worst_rows(rows: NewRows) -> list[int]:
-    """The one or two rows that contradict all others, or none."""
+    """The row that contradicts all others, or rows that are more likely gross than good; or none."""
     from scipy.special import fdtrc  # noqa: PLC0415  # slow to import, not needed to use a model
 
+    if (tails := rows.with_weights().tails).gross:
+        return (tails.weights < OUTLIER_WEIGHT).any(1).nonzero()[:, 0].tolist()
     given = rows.given
-    M, m = given.residual.shape
-    for size in (1, 2):
-        sets = torch.combinations(torch.arange(M, device=given.residual.device), size)
-        if M - size < LEAST_POINTS or len(sets) > MOST_PAIRS:
-            continue
-        at = (sets[..., None] * m + torch.arange(m, device=sets.device)).flatten(1)  # (K, size m)
-        blocks, chosen = given.factor.inverse[at[:, :, None], at[:, None, :]], given.solved.flatten()[at]
-        falls = (chosen * torch.linalg.solve(blocks, chosen[..., None])[..., 0]).sum(1)
-        coordinates = given.visible.sum(1)[sets].sum(1).to(falls)
-        variances, freedom = scale_of(rows, falls, coordinates)
-        ratios = falls / coordinates / variances
-        chances = torch.from_numpy(fdtrc(*(each.numpy(force=True) for each in (coordinates, freedom, ratios))))
-        best = int(ratios.masked_fill((chances > chances.min()).to(ratios.device), 0.0).argmax())  # of equal chances
-        if float(chances[best]) * len(sets) < FALSE_ALARM_PROBABILITY:
-            return sets[best].tolist()
-    return []
+    if len(rows) <= LEAST_POINTS:
+        return []
+    falls, coordinates = given.left_out_squares, given.visible.sum(1).to(given.residual)
+    variances, freedom = scale_of(rows, falls, coordinates)
+    ratios = falls / coordinates / variances
+    chances = torch.from_numpy(fdtrc(*(each.numpy(force=True) for each in (coordinates, freedom, ratios))))
+    best = int(ratios.masked_fill((chances > chances.min()).to(ratios.device), 0.0).argmax())  # of equal chances
+    return [best] if float(chances[best]) * len(rows) < FALSE_ALARM_PROBABILITY else []
+
+
+def opened(rows: NewRows, data: Any) -> NewRows:
+    """The rows beside what has changed of device and tool among them; as they are if nothing has.
+
+    Args:
+        rows: new rows. data: the same as they were measured.
+    """
+    if len(rows) < 4 * gates.CHANGE_ROWS:
+        return rows
+    shown, chain, mine = rows.visible[..., None], rows.nominal.geometry.chain, rows.placement
+    frame, markers = (rows.by_places * shown).tensor_split([6], 2)
+    found = [Hypothesis(BASE, own, fix=NEW_SET_UP) for own in (frame, frame[..., :3])]
+    found.append(Hypothesis(MARKERS, markers, fix=NEW_SET_UP))
+    for joint, (name, turns) in enumerate(zip(chain.joint_names, chain.periodic, strict=True)):
+        effects = rows.at.joint_to_start[:, :, joint, None] * shown
+        found.append(Hypothesis(name, effects, ("mrad" if turns else "mm", 1e-3), TWO_ROBOTS))
+    found = [own for own in (*found, *mine.hypotheses(rows, CHANGE)) if bool((own.effects != 0).any())]
+    named = [own._replace(name=mine.bodies.get(own.name, own.name)) for own in found]
+    told = SampledRows(torch.arange(len(rows), device=shown.device), rows.process, None)
+    found = changed(told, named, data.line_numbers, data.row_names)
+    causes = [one for one in found if TWO_ROBOTS not in one.fix]  # of the robot, see find_changes.py
+    if len(rows) >= gates.MIXED_ROWS:
+        causes += two_tools(told, markers, data.line_numbers)
+    best = best_of(causes, told)
+    if best is None:
+        return rows
+    columns, none = (
+        rows.shared[..., :0] if best.columns is None else best.columns,
+        Tails.none(*rows.tails.weights.shape),
+    )
+    return rows.changed(shared=torch.cat([columns, rows.shared], 2), tails=none, changed_among=best.text)
 
 
 def _record(best: NewRows, said: dict[str, object], *, known: bool) -> Registration:
@@ -359,13 +390,18 @@ UNLIKELY = 0.01
 """Probability of what is said of the markers, below which it is warned of."""
 
 
-def warn_about(found: Registration | None, *, outliers: bool = True, excess: bool = True, marker: str = "") -> None:
+def warn_about(
+    found: Registration | None, *, outliers: bool = True, excess: bool = True, marker: str = "", among: str = ""
+) -> None:
     """Warn of outliers, of exchanged markers, of directions that rows do not determine, and of errors that remain.
 
     Args:
         found: the registration, if a device measured coordinates. marker: what is said of the markers.
         outliers: whether to name the rows that took no part. excess: whether to warn of errors that remain.
+        among: what has changed among the rows, in a sentence.
     """
+    if among:
+        warn_user(among)
     if found is None:
         return
     if found.outliers and outliers:
