@@ -8,11 +8,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
+from itertools import accumulate, product
+from math import pi
 from os.path import relpath
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.column_names import LENGTHS, WORDS, Column, Group, column, groups, whole
 from diffeo_calib.cli.options import CORNERS, Places
@@ -22,7 +24,7 @@ from diffeo_calib.measurements.csv.joined import joined_file
 from diffeo_calib.measurements.csv.lines import HEAD, CsvLines, read_cells
 from diffeo_calib.measurements.csv.sensors import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.readings import MILLIMETRES
-from diffeo_calib.measurements.table_format import ZERO
+from diffeo_calib.measurements.table_format import SPHERICAL, SPHERICAL_UNITS, ZERO
 from diffeo_calib.sensors.kinds import known_kinds
 
 SEPARATORS = (",", ";", "\t", "|", " ")
@@ -85,6 +87,11 @@ class Sheet:
         """Column -> texts of all rows."""
         header, rows = read_cells(self.path, self.sep)
         return {name: [cells[k].strip() for _, cells in rows] for k, name in enumerate(header)}
+
+    def joint_columns(self, joints: Sequence[str]) -> list[JointColumns]:
+        """As :func:`guess_joints`; without constant columns if need be: of axes that a controller alone knows."""
+        varying = [name for name in self.numbers if len({*self.cells[name]}) > 1]
+        return guess_joints(self.numbers, joints) or guess_joints(varying, joints)
 
 
 def guess_sheet(path: Path) -> Sheet:
@@ -210,6 +217,7 @@ class Body(NamedTuple):
     turn: list[str]
     usual: str = ""  # what such names of a rotation usually mean
     left: str = ""  # what the place is, if no device measured it
+    spherical: tuple[str, ...] = ()  # how the place may be written, if it is a distance and two angles
 
     @property
     def words(self) -> set[str]:
@@ -245,6 +253,32 @@ def bodies_in(columns: Sequence[str]) -> list[Body]:
         names, left = list(own.names.values()), "wished places" if own.wished else left
         bodies.append(Body(names, *found.get(names[0], ([], "")), left=left))
     return bodies
+
+
+def _numbered(columns: Sequence[str]) -> list[Body]:
+    """Series of three numbers that may be places."""
+    found = [own for labels in ("123", "012") for own in whole(columns, labels) if not _goes_on(columns, own)]
+    return [
+        Body([*own.names.values()], []) for own in found if not (own.wished or own.says("rate", "deviation", "turn"))
+    ]
+
+
+def spherical_in(sheet: Sheet, columns: Sequence[str]) -> list[Body]:
+    """A place as a distance and two angles, of which the second is above the horizon or from the zenith."""
+    found = list[Column]()
+    for role, units in (("distance", {*LENGTHS}), ("around", {*SPHERICAL_UNITS}), ("vertical", {*SPHERICAL_UNITS})):
+        own = (one for one in map(column, columns) if WORDS[role] & {*one.words} and one.unit in {*units, ""})
+        found += [one for one in own if one not in found][:1]
+    if len(found) < 3:
+        return []
+    names, words, known = [one.name for one in found], {*found[2].words}, {one.unit for one in found[1:]} - {""}
+    turned = numbers_in(sheet.cells[names[1]], sheet.decimal)
+    large = any(abs(value) > 2 * pi for value in turned if value is not None)
+    known = known or {*SPHERICAL_UNITS} - ({"rad"} if large else set())
+    ways = [way for way in SPHERICAL if way.rpartition("_")[2] in known]
+    for role in ("elevation", "zenith"):
+        ways = [way for way in ways if way.startswith(role) or not WORDS[role] & words]
+    return [Body(names, [], spherical=tuple(ways))]
 
 
 def _rotations(columns: Sequence[str], labels: Sequence[str]) -> Iterator[Group]:
@@ -385,7 +419,7 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
     others = [name for name in sheet.numbers if name not in joints]
     nameless = all(name.isdecimal() for name in sheet.header) and len(others) > 2
     bodies = [Body(others[:3], [])] if nameless else [own for own in found if not own.left]
-    bodies = bodies or matrices_in(sheet, others)[:1]
+    bodies = bodies or matrices_in(sheet, others)[:1] or spherical_in(sheet, others) or _numbered(others)
     if not bodies and len(joints) == 2:  # a machine in a plane, and what was measured in it
         flat = [own for own in whole(others, "xy") if not (own.wished or own.says("rate", "deviation"))]
         bodies = [Body([*own.names.values(), ZERO], []) for own in flat]
@@ -410,6 +444,17 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
     }
     named = {option: names[0] for option, names in guessed.items() if names}
     return RowColumns(bodies, sockets, readings, named, left)
+
+
+def marker_of_lines(sheet: Sheet, joints: Sequence[str]) -> str | None:
+    """The column whose texts tell apart the lines of each pose, if the first of them alone holds joint values."""
+    values = zip(*(sheet.cells.get(name, ()) for name in joints), strict=False)
+    poses = list(accumulate(any(cells) for cells in values))
+    for name, texts in sheet.cells.items():
+        named = 1 < len({*texts}) <= gates.MOST_MARKERS and "" not in texts
+        if named and poses and poses[0] > 0 and poses[-1] < len(poses) == len({*zip(poses, texts, strict=True)}):
+            return name
+    return None
 
 
 def matrices_in(sheet: Sheet, columns: Sequence[str]) -> list[Body]:

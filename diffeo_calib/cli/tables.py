@@ -62,7 +62,17 @@ def table_format(units: Units) -> TableFormat:
 def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
     """Add the columns that options name, but for readings; lever in the unit of length."""
     Rows.check_together(vars(rows))
-    as_typed = "convention", "rotation_angle", "remounted", "payload", "time", "temperature", "session", "marker"
+    as_typed = (
+        "spherical",
+        "convention",
+        "rotation_angle",
+        "remounted",
+        "payload",
+        "time",
+        "temperature",
+        "session",
+        "marker",
+    )
     return replace(
         table,
         **{name: getattr(rows, name) for name in as_typed},
@@ -148,7 +158,7 @@ def rows_in_table(csv: Path, rows: Rows) -> tuple[Rows, list[str]]:
     missing = [kind for kind, has in there.items() if not has]
     changes: dict[str, Any] = {} if rows.session in header else {"session": None, "remounted": False}
     if "--position" in missing:
-        changes |= {"position": None, "std": None, "rotation": None, "rotation_std": None}
+        changes |= {"position": None, "spherical": None, "std": None, "rotation": None, "rotation_std": None}
     if "--socket" in missing:
         changes |= {"socket": None, "distance": None, "distance_std": None}
     kept = [text for text in rows.reading or () if f"--reading {text}" not in missing]

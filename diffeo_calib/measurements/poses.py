@@ -9,6 +9,7 @@ the pose back. One frame is measured or one on each of several tips: (N, T, 4, 4
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from math import pi
 
 import torch
 from torch import Tensor
@@ -279,6 +280,22 @@ def transforms_of_frames(rotations: Tensor, places: Tensor) -> Tensor:
     """Poses (N, T, 4, 4) of rotations (N, T, 3, 3) and places (N, T, 3), m; NaN as a whole where either is."""
     frames = transforms(rotations, places)
     return frames.masked_fill(frames.isnan().any(3, keepdim=True).any(2, keepdim=True), torch.nan)
+
+
+def from_spherical(places: Tensor, how: str) -> Tensor:
+    """Places (..., 3), m, of distances, m, and angles, rad, see SPHERICAL of table_format."""
+    distance, around, up = places.unbind(-1)
+    around, up = (-around if "clockwise" in how else around), (0.5 * pi - up if "zenith" in how else up)
+    flat = distance * up.cos()
+    return torch.stack([flat * around.cos(), flat * around.sin(), distance * up.sin()], -1)
+
+
+def to_spherical(places: Tensor, how: str) -> Tensor:
+    """The inverse of :func:`from_spherical`."""
+    x, y, z = places.unbind(-1)
+    around, up = torch.atan2(y, x), torch.atan2(z, x.hypot(y))
+    around, up = (-around if "clockwise" in how else around), (0.5 * pi - up if "zenith" in how else up)
+    return torch.stack([places.norm(dim=-1), around, up], -1)
 
 
 def directions_of_frames(frames: Tensor, lever: float) -> Tensor:

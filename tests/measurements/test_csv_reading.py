@@ -17,7 +17,7 @@ from torch.testing import assert_close
 
 from diffeo_calib.cli.guesses import guess_sheet
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
-from diffeo_calib.measurements.csv.files import read_joints, read_measurements, read_observations
+from diffeo_calib.measurements.csv.files import read_joints, read_measurements, read_observations, write_measurements
 from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.poses import angle_between, rotation_matrices, transforms
 from diffeo_calib.measurements.table_format import TableFormat
@@ -45,8 +45,16 @@ SPACED = [
     for own, row in zip(GERMAN, GROUPED, strict=True)
 ]
 ALIGNED = "".join("".join(f"{cell:>12}" for cell in row) + "\n" for row in [NAMES, *CELLS])
+
+
+def _lists(each: str, mark: str) -> str:
+    rows = ([str(k), each.format(mark.join(row[:2])), each.format(mark.join(row[2:]))] for k, row in enumerate(CELLS))
+    return "n,q,seen_pos\n" + "".join(f'{number},"{q}","{place}"\n' for number, q, place in rows)
+
+
+LISTED = ["q_1", "q_2", "seen_pos_x", "seen_pos_y", "seen_pos_z"]
 SEMICOLONS, COMMAS = {"sep": ";"}, {"sep": ";", "decimal": ","}
-READ: dict[str, tuple[str | bytes, dict[str, str], str]] = {
+READ: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
     "byte order mark": ("\ufeff" + PLAIN.replace("\n", "\r\n"), {}, ""),
     "UTF-16": (PLAIN.encode("utf-16"), {}, "text in utf-16"),
     "Windows": (("Kraft, größe\n" + PLAIN).encode("cp1252"), {}, "text in cp1252, not UTF-8"),
@@ -67,9 +75,19 @@ READ: dict[str, tuple[str | bytes, dict[str, str], str]] = {
     "comments between rows": (
         PLAIN.replace("0.200,", "# moved the tripod\n0.200,") + "#9,9,9,9,9\n",
         {},
-        "2 line(s) with comments, names or nothing skipped (line 4, 11)",
+        "2 line(s) with comments, names, statistics or nothing skipped (line 4, 11)",
     ),
-    "lines of separators": (PLAIN + ",,,,\n" * 3, {}, "3 line(s) with comments, names or nothing skipped"),
+    "lines of separators": (PLAIN + ",,,,\n" * 3, {}, "3 line(s) with comments, names, statistics or nothing skipped"),
+    "statistics below": (
+        separated(",", [["pose", *NAMES], *([f"p{k}", *row] for k, row in enumerate(CELLS)), ["Mean:", *CELLS[0]]])
+        + "Std. dev.,0,0,0,0,0\n",
+        {},
+        "statistics or nothing skipped (line 10, 11)",
+    ),
+    "lists in cells": (_lists("[{}]", ", "), {"names": LISTED}, ""),
+    "arrays of ROS in cells": (_lists("array('d', [{}])", ", "), {"names": LISTED}, ""),
+    "lists of NumPy, with spaces": (_lists("[{} ]", "  "), {"names": LISTED}, ""),
+    "lists without quotes": (_lists("({})", ", ").replace('"', ""), {"names": LISTED}, ""),
     "trailing separators": (PLAIN.replace("\n", ",\n"), {}, ""),
     "trailing separators of rows alone": (
         PLAIN.replace("\n", ";\n").replace("z;", "z").replace(",", ";"),
@@ -307,6 +325,36 @@ def test_empty_cells_and_usual_marks_hide_a_marker(read: Reader, cell: str) -> N
     if cell in LOST:
         assert f"'{cell}' (3)" in str(said[0].message)  # pyright: ignore[reportIndexIssue]
         assert "line 3" in str(said[0].message)  # pyright: ignore[reportIndexIssue]
+
+
+def test_lines_without_joint_values(read: Reader) -> None:
+    """They are left out; of several markers they belong to the pose above."""
+    rows = [[*NAMES, "ball"], *([*row, "a"] for row in CELLS[:2]), ["", "", "5", "6", "7", "b"], [*CELLS[2], "a"]]
+    with pytest.warns(DiffeoCalibWarning, match="no joint values in line 4: 1 row"):
+        assert read(separated(",", rows), **FORMAT).line_numbers.tolist() == [2, 3, 5]
+    data = read(separated(",", rows), marker="ball", **FORMAT)
+    assert_close(1e3 * data.points[1, 1], torch.tensor([5.0, 6.0, 7.0], dtype=torch.float64))
+    assert (len(data), data.markers) == (3, 2)
+
+
+def test_angles_in_minutes_and_places_as_angles(read: Reader, tmp_path: Path) -> None:
+    """Also written and read again."""
+    text = "q1;q2;sd;hz;v\n0;0;2;270°;90°\n0;1;2;0°0'0\";0\n1;1;2;45° 30' 36,0\";120°\n"
+    how: dict[str, Any] = {
+        "length": "m",
+        "angle": "rad",
+        "sep": ";",
+        "decimal": ",",
+        "spherical": "zenith_clockwise_deg",
+    }
+    data = read(text, JOINTS, ["sd", "hz", "v"], **how)
+    turn, up = math.radians(-45.51), math.radians(-30.0)
+    last = [2 * math.cos(up) * math.cos(turn), 2 * math.cos(up) * math.sin(turn), 2 * math.sin(up)]
+    assert_close(data.points[:, 0].tolist(), [[0.0, 2.0, 0.0], [0.0, 0.0, 2.0], last], rtol=1e-14, atol=1e-14)
+    for way in ("elevation_rad", "zenith_gon", "elevation_clockwise_deg"):
+        table = TableFormat("m", "rad", joints=JOINTS, position=["r", "around", "up"], spherical=way)
+        write_measurements(tmp_path / "t.csv", data, table)
+        assert_close(read_observations(tmp_path / "t.csv", table).points, data.points, rtol=1e-14, atol=1e-14)
 
 
 def test_a_line_without_any_marker_is_left_out_and_named(read: Reader) -> None:

@@ -20,7 +20,6 @@ from diffeo_calib.cli.guesses import (
     JointColumns,
     Sheet,
     entries,
-    guess_joints,
     guess_sheet,
     joints_without_column,
     rows_in,
@@ -70,6 +69,8 @@ def run(given: InitOptions) -> None:
         source = _commanded(given.robot, sheet) or _of_robot(given.robot or Path(), output.parent, sheet)
     except InputError as error:
         raise type(error)(f"{error} {sheet.odd}".strip()) from error
+    with quiet():
+        copies = len(source.data.copies())
     choices = [
         Choice("csv", relpath(given.csv, output.parent), "; ".join(["the table", *sheet.notes])),
         *joined,
@@ -77,6 +78,7 @@ def run(given: InitOptions) -> None:
         *source.said,
         Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it"),
         Choice("decimal", sheet.decimal, "the same"),
+        *[Choice("duplicates", "drop", f"{copies} line(s) repeat others exactly; real repeats differ")] * bool(copies),
         Choice("output", csv.with_suffix(".safetensors").name, "the model"),
         Choice("report", csv.with_suffix(".html").name, "the report"),
     ]
@@ -164,7 +166,7 @@ def _read(robot: Path, sheet: Sheet, arm: Arm) -> Source:
     tips = tips if len(tips) == len(named) and len(set(tips)) > 1 else []  # after which the columns of each are named
     chain = load_robot(robot, replace(arm.links, tip=tips or arm.links.tip))
     source = Source(sheet, chain, arm.columns.names, rows, TableFormat("mm", "deg", sheet.sep, sheet.decimal), tips)
-    guessed = guess_joints(sheet.numbers, chain.joint_names) or [arm.columns]
+    guessed = sheet.joint_columns(chain.joint_names) or [arm.columns]
     source = with_units(with_measured(with_joint_columns(source, guessed)))
     about = [Choice("base", arm.links.base or "", "root of the URDF")] if is_urdf(robot) else []
     about += entries([arm.links], dh_convention="the convention with which it explains the rows")
@@ -231,7 +233,7 @@ def _arms(robot: Path, sheet: Sheet) -> list[Arm]:
     arms = list[Arm]()
     for options, joints, ends in whole:
         for count in range(len(joints), 0, -1):
-            guessed = guess_joints(sheet.numbers, joints[:count])
+            guessed = sheet.joint_columns(joints[:count])
             series = bool(guessed) and guessed[0].how.startswith("numbered")
             if guessed and (2 * count > len(joints) or not series):  # a short series may be of anything
                 lacking = joints_without_column(sheet.numbers, joints) if count < len(joints) else ()
@@ -242,7 +244,8 @@ def _arms(robot: Path, sheet: Sheet) -> list[Arm]:
         longest = sorted((joints for _, joints, _ in whole), key=len)[:-4:-1]
         expected = " or ".join(few(joints, 20) for joints in longest if joints) or "a robot with joints"
         missing = few(joints_without_column(sheet.numbers, longest[0]), 20) if longest else "a joint"
-        fix = f"no column is named after {missing}: name the columns as the joints, or q1, q2, ... in their order"
+        fix = f"no column is named after {missing}" if missing else "numbered columns are more than the joints"
+        fix += ": name the columns as the joints, or q1, q2, ... in their order"
         got = few(sheet.numbers, 20)
         raise InputError.of(f"columns of the joints of '{robot}'", expected=expected, got=got, fix=fix)
     arms = [arm for arm in arms if arm.columns.how == "named as in the URDF"] or arms
