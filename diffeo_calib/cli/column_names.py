@@ -30,6 +30,7 @@ ROLES = {
     "joint": "q j joint joints jnt axis axes ax a rax achse gelenk theta th qpos jpos pos position positions angle "
     "angles state states 关节 軸 轴 関節",
     "external": "e ext external extax eax rail track slide linear",
+    "pixel": "px pixel pixels",
     "distance": "r d sd dist distance range slope rho radius strecke schragstrecke schragdistanz",
     "around": "hz az azimuth azim azimut horizontal horiz hor ha",
     "elevation": "elevation elev el",

@@ -30,8 +30,6 @@ from diffeo_calib.sensors.kinds import known_kinds
 SEPARATORS = (",", ";", "\t", "|", " ")
 DECIMALS = (".", ",")
 ROWS_LOOKED_AT = 50
-PIXELS = ("u", "v"), ("pixelu", "pixelv"), ("upx", "vpx")
-"""Names of columns of images."""
 LENS, SOME_LENS = "FX,FY,CX,CY", "1000,1000,500,500"
 """Placeholder for the user to fill in, and the value that replaces it while the other rows are read."""
 
@@ -121,7 +119,7 @@ def guess_sheet(path: Path) -> Sheet:
                     odd += wrong  # most are numbers, or they look like numbers
             why = str(bad_cells(path, odd, "a number", number_hint(odd[0][2], decimal))) if odd else ""
             found.append(Sheet(path, sep, decimal, tuple(columns), tuple(numbers), tuple(file.notes), why))
-    best = max(found, key=lambda sheet: len(sheet.numbers), default=None)
+    best = max(found, key=lambda sheet: (len(sheet.numbers), _marked(sheet)), default=None)
     width, reason = max(reasons, key=lambda one: one[0], default=(0, None))
     if reason is not None and (best is None or not best.numbers or width > 2 * len(best.numbers)):
         raise reason
@@ -129,6 +127,11 @@ def guess_sheet(path: Path) -> Sheet:
         fix = "check that one line names the columns, and that the lines below hold numbers"
         raise MeasurementError.of(f"'{path}' is no table of numbers with any usual separator", fix=fix)
     return best
+
+
+def _marked(sheet: Sheet) -> int:
+    """How many columns of numbers have the decimal mark: others may have the other one."""
+    return sum(any(sheet.decimal in text for text in sheet.cells[name]) for name in sheet.numbers)
 
 
 def _counts(texts: Sequence[str]) -> bool:
@@ -304,10 +307,8 @@ def guess_readings(columns: Sequence[str]) -> dict[str, list[str]]:
             own = next(([there[name] for name in names] for names in each if set(names) <= set(there)), None)
             if own is not None and own not in found.values():
                 found[f"{word}={','.join(own)}"] = own
-    names = {one.plain: one.name for one in described}
-    pixels = next(([names[name] for name in pair] for pair in PIXELS if set(pair) <= set(names)), None)
-    if pixels is not None:
-        found[f"image={','.join(pixels)},{LENS}"] = pixels
+    pixels = [*whole(columns, "uv"), *(own for own in whole(columns, "xy") if own.says("pixel"))]
+    found |= {f"image={','.join(own.names.values())},{LENS}": [*own.names.values()] for own in pixels[:1]}
     return found
 
 
@@ -420,6 +421,8 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
     nameless = all(name.isdecimal() for name in sheet.header) and len(others) > 2
     bodies = [Body(others[:3], [])] if nameless else [own for own in found if not own.left]
     bodies = bodies or matrices_in(sheet, others)[:1] or spherical_in(sheet, others) or _numbered(others)
+    counted = [name for name in others if name.isdecimal()]  # of another file, which has no names
+    bodies = bodies or [Body(counted[:3], [])] * (len(counted) > 2)
     if not bodies and len(joints) == 2:  # a machine in a plane, and what was measured in it
         flat = [own for own in whole(others, "xy") if not (own.wished or own.says("rate", "deviation"))]
         bodies = [Body([*own.names.values(), ZERO], []) for own in flat]

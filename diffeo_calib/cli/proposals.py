@@ -274,6 +274,13 @@ def with_measured(source: Source) -> Source:
     for _, data in source.positions() if len(rows.bodies) > 1 else ():
         every = unmeasured_markers(source.robot, data)
         found = found or {marker: words for marker, words, proved in every if proved}
+    if not found and len(rows.bodies) > 1 and not source.tips:  # perhaps in units of their own
+        each = (replace(source, rows=replace(rows, bodies=[own])) for own in rows.bodies)
+        alone = [min(one.left for one in own.in_units()) for own in each]
+        far = max(alone)
+        for k, left in enumerate(alone) if gates.DIGITS_SHARE < far < LARGEST_RESIDUAL else ():
+            if left < min(gates.FOLLOWED * far, gates.NOMINAL_SHARE):
+                found[k] = f"the nominal robot leaves {percent(left)} of them, and {percent(far)} of others: computed"
     kept = [k for k in range(len(rows.bodies)) if k not in found]
     left = [f"{few(rows.markers[k])}: {words} (counted from 0)" for k, words in found.items()]
     rows = replace(rows, bodies=[rows.bodies[k] for k in kept], left=[*rows.left, *left])

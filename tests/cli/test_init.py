@@ -95,9 +95,15 @@ def test_two_arms_that_explain_the_rows_alike_are_not_guessed(tmp_path: Path, pr
     q, points = rows()
     _, text = proposed(([f"q{k}" for k in range(6)], q), (XYZ, points), robot="two.urdf")
     assert "expected some that explain the rows far better, got left_waist_joint" in text
-    assert (
-        proposed(([f"right_{name}" for name in NAMES], q), (XYZ, points), robot="two.urdf")[0]["tip"] == "right_flange"
+    right = [f"right_{name}" for name in NAMES], q
+    assert proposed(right, (XYZ, points), robot="two.urdf")[0]["tip"] == "right_flange"
+    places = [[f"{side} ball {axis}" for axis in XYZ] for side in ("left", "right")]
+    both = (
+        ([f"left_{name}" for name in NAMES], q.roll(1, 0)),
+        (places[0], points.roll(1, 0)),
+        (places[1], points),
     )
+    assert proposed(right, *both, robot="two.urdf")[0]["tip"] == ["left_flange", "right_flange"]
 
 
 GON = 200.0 / pi

@@ -99,6 +99,11 @@ READ: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
     "thousands in quotes": (PLAIN.replace("1000.50", '"1,000.50"'), {}, ""),
     "Swiss thousands": (separated("\t", [NAMES, *SWISS]), {"sep": "\t"}, ""),
     "thousands and decimal commas": (separated(";", [NAMES, *SPACED]), COMMAS, ""),
+    "decimal commas in one column": (
+        separated(";", [NAMES, *([*own[:2], row[2], *own[3:]] for own, row in zip(CELLS, GERMAN, strict=True))]),
+        SEMICOLONS,
+        "",
+    ),
     "minus signs": (PLAIN.replace("-", "\u2212"), {}, ""),
     "spaces that do not break": (PLAIN.replace(",", "\u00a0,\u00a0"), {}, ""),
     "columns that spaces align": (separated("   ", [NAMES, *CELLS]), {"sep": " "}, ""),

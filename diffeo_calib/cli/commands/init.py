@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from os.path import relpath
@@ -11,7 +13,7 @@ from statistics import median
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.cli import commanded_poses
-from diffeo_calib.cli.column_names import column
+from diffeo_calib.cli.column_names import Column, column
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.declarations import InitOptions
 from diffeo_calib.cli.guesses import (
@@ -158,12 +160,8 @@ def _of_robot(robot: Path, folder: Path, sheet: Sheet) -> Source:
 
 def _read(robot: Path, sheet: Sheet, arm: Arm) -> Source:
     """The table as values of these joints; InputError if the robot does not explain the rows."""
-    leaves = [path[-1].child for path in chains_in(robot)] if is_urdf(robot) else []
     rows = rows_in(sheet, arm.columns.names)
-    known = {column(leaf).plain: leaf for leaf in leaves}
-    named = [known.get(column(triple[0]).plain.removesuffix("x")) for triple in rows.markers]
-    tips = [tip for tip in named if tip is not None]
-    tips = tips if len(tips) == len(named) and len(set(tips)) > 1 else []  # after which the columns of each are named
+    tips = _tips_named(chains_in(robot) if is_urdf(robot) else [], [column(triple[0]) for triple in rows.markers])
     chain = load_robot(robot, replace(arm.links, tip=tips or arm.links.tip))
     source = Source(sheet, chain, arm.columns.names, rows, TableFormat("mm", "deg", sheet.sep, sheet.decimal), tips)
     guessed = sheet.joint_columns(chain.joint_names) or [arm.columns]
@@ -174,6 +172,24 @@ def _read(robot: Path, sheet: Sheet, arm: Arm) -> Source:
     if source.tips:
         return source.saying(Choice("tip", list(source.tips), "leaves after which the columns are named"))
     return _with_tip(robot, source, arm)
+
+
+def _tips_named(paths: Sequence[list[JointElement]], markers: Sequence[Column]) -> list[str]:
+    """The leaf that the columns of each marker are named after, or by a word that no other arm has; none if one lacks.
+
+    Fingers of a gripper are no arms: each has a joint or none of its own.
+    """
+    words = {path[-1].child: {*column(path[-1].child).words} for path in paths}
+    moving = {path[-1].child: {joint.name for joint in path if joint.kind != "fixed"} for path in paths}
+    counts = Counter(word for own in words.values() for word in own)
+    others = {leaf: set[str]().union(*(own for one, own in moving.items() if one != leaf)) for leaf in moving}
+    arms = [leaf for leaf, own in moving.items() if len(own - others[leaf]) > 1]
+    tips = list[str]()
+    for marker in markers:
+        alike = [leaf for leaf in arms if any(counts[word] == 1 for word in words[leaf] & {*marker.words})]
+        exact = [leaf for leaf in words if column(leaf).plain == marker.plain.removesuffix("x")]
+        tips += (exact or alike)[:1]
+    return tips if len(tips) == len(markers) and len(set(tips)) > 1 else []
 
 
 def _with_tip(robot: Path, source: Source, arm: Arm) -> Source:

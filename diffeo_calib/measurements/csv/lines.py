@@ -272,7 +272,7 @@ def _named(lines: Lines, comments: Sequence[bool], start: int, sizes: Sequence[i
     words = [
         (k, cells)
         for k, cells in before
-        if len(cells) in sizes and not _is_units(cells) and not any(map(_value, cells))
+        if len(cells) in sizes and not _is_units(cells) and (_counted(cells) or not any(map(_value, cells)))
     ]
     for k, cells in words:
         if all(cells[: sizes[0]]) and not repeated(cells[: sizes[0]]):
@@ -289,9 +289,9 @@ def _named(lines: Lines, comments: Sequence[bool], start: int, sizes: Sequence[i
 
 
 def _joined(names: list[list[str]]) -> list[str]:
-    """The names of the last of some lines; those that repeat with the names above them, such as "marker_X"."""
+    """The names of the last of some lines; those that repeat, or count, with the names above, such as "marker_X"."""
     *above, header = names
-    twice = {name for name in repeated(header) if name}
+    twice = {name for name in repeated(header) if name} | {*filter(str.isdecimal, header)}
     for line in above:
         for k in range(1, len(line)):
             line[k] = line[k] or line[k - 1]  # a name stands above the first of its columns alone
@@ -369,8 +369,13 @@ def _numbers(cells: Sequence[str]) -> int:
     """How many cells are numbers; 0 where they are less than half of those that are filled, or count the columns."""
     filled = [cell for cell in cells if number(cell, ".") is None or _value(cell)]
     found = sum(map(_value, filled))
-    counted = found > 3 and filled in ([str(k + first) for k in range(len(filled))] for first in (0, 1))
-    return 0 if counted or 2 * found < len(filled) else found
+    return 0 if _counted(cells) or 2 * found < len(filled) else found
+
+
+def _counted(cells: Sequence[str]) -> bool:
+    """Whether the numbers among some cells count joints or columns."""
+    found = [cell for cell in cells if _value(cell)]
+    return len(found) > 3 and found in ([str(k + first) for k in range(len(found))] for first in (0, 1))
 
 
 def write_rows(path: str | PathLike[str], names: Sequence[str], blocks: Iterable[Cells], table: TableFormat) -> None:
