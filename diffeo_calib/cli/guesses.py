@@ -119,7 +119,8 @@ def guess_sheet(path: Path) -> Sheet:
                     odd += wrong  # most are numbers, or they look like numbers
             why = str(bad_cells(path, odd, "a number", number_hint(odd[0][2], decimal))) if odd else ""
             found.append(Sheet(path, sep, decimal, tuple(columns), tuple(numbers), tuple(file.notes), why))
-    best = max(found, key=lambda sheet: (len(sheet.numbers), _marked(sheet)), default=None)
+    most = max((len(sheet.numbers) for sheet in found), default=0)
+    best = max((sheet for sheet in found if len(sheet.numbers) == most), key=_marked, default=None)
     width, reason = max(reasons, key=lambda one: one[0], default=(0, None))
     if reason is not None and (best is None or not best.numbers or width > 2 * len(best.numbers)):
         raise reason
@@ -259,11 +260,11 @@ def bodies_in(columns: Sequence[str]) -> list[Body]:
 
 
 def _numbered(columns: Sequence[str]) -> list[Body]:
-    """Series of three numbers that may be places."""
-    found = [own for labels in ("123", "012") for own in whole(columns, labels) if not _goes_on(columns, own)]
-    return [
-        Body([*own.names.values()], []) for own in found if not (own.wished or own.says("rate", "deviation", "turn"))
-    ]
+    """Series of three numbers that may be places; else the first columns of another file, which has no names."""
+    each = (own for labels in ("123", "012") for own in whole(columns, labels) if not _goes_on(columns, own))
+    found = [own.names.values() for own in each if not (own.wished or own.says("rate", "deviation", "turn"))]
+    counted = [name for name in columns if name.isdecimal()]
+    return [Body([*names], []) for names in found or [counted[:3]] * (len(counted) > 2)]
 
 
 def spherical_in(sheet: Sheet, columns: Sequence[str]) -> list[Body]:
@@ -420,9 +421,7 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
     others = [name for name in sheet.numbers if name not in joints]
     nameless = all(name.isdecimal() for name in sheet.header) and len(others) > 2
     bodies = [Body(others[:3], [])] if nameless else [own for own in found if not own.left]
-    bodies = bodies or matrices_in(sheet, others)[:1] or spherical_in(sheet, others) or _numbered(others)
-    counted = [name for name in others if name.isdecimal()]  # of another file, which has no names
-    bodies = bodies or [Body(counted[:3], [])] * (len(counted) > 2)
+    bodies = bodies or matrices_in(sheet, others)[:1] or spherical_in(sheet, others)
     if not bodies and len(joints) == 2:  # a machine in a plane, and what was measured in it
         flat = [own for own in whole(others, "xy") if not (own.wished or own.says("rate", "deviation"))]
         bodies = [Body([*own.names.values(), ZERO], []) for own in flat]
@@ -432,6 +431,7 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
     if bodies or sockets or len(readings) > 1:  # beside other kinds of rows, or one another, some cells are empty
         there = (text for text, own in devices.items() if all("" in sheet.cells[name] for name in own))
         readings = [*corners, *there]
+    bodies = bodies or ([] if sockets or readings else _numbered(others))
     if not bodies and not sockets and not readings:
         expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
         common = next((name for name in sheet.header if name not in joints), "COLUMN")

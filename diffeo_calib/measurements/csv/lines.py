@@ -11,7 +11,7 @@ import csv
 import io
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import combinations, islice, zip_longest
+from itertools import combinations, islice, takewhile, zip_longest
 from math import isfinite, isnan, prod
 from os import PathLike
 from pathlib import Path
@@ -112,8 +112,10 @@ class CsvLines:
             and not (named and cells[:expected] == self.header)
             and not (self._commented and _is_comment(cells))
         ]
-        while kept and any(STATISTICS.fullmatch(cell) for cell in kept[-1][1]) and len(kept) > 1:
-            kept.pop()
+        words = [next(filter(None, cells)) for _, cells in kept]
+        last = list(takewhile(STATISTICS.fullmatch, reversed(words)))
+        if len({*last}) == len(last) < len(kept):  # not a word in all rows
+            kept = kept[: len(kept) - len(last)]
         sizes = expected, expected + self._extra
         bad = [(line, len(cells)) for line, cells in kept if len(cells) not in sizes or any(cells[expected:])]
         if bad:

@@ -30,14 +30,7 @@ from diffeo_calib.measurements.poses import (
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 from diffeo_calib.measurements.sockets import SEPARATOR, Distances
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_format import (
-    SPHERICAL_UNITS,
-    ZERO,
-    TableFormat,
-    column_names,
-    flat_names,
-    numbers_of,
-)
+from diffeo_calib.measurements.table_format import ZERO, TableFormat, column_names, flat_names, numbers_of
 
 ONE_READING = "every line is one reading of one device: fill the cell in, or remove the line"
 LENGTH = Check(
@@ -132,8 +125,8 @@ class PositionColumns(SensorColumns):
             for own in self.each
         ]
         if form.spherical:
-            per_rad = SPHERICAL_UNITS[form.spherical.rpartition("_")[2]]
-            each = [[own[0], *(Column(one.name, per_rad) for one in own[1:3]), *own[3:]] for own in each]
+            unit = form.spherical.rpartition("_")[2]
+            each = [[own[0], *(Column(one.name, unit) for one in own[1:3]), *own[3:]] for own in each]
         some = dict.fromkeys(one for own in each for one in own if one.check == DEVIATION or one.name == ZERO)
         shared = [one for one in some if sum(one in own for own in each) > 1]
         found = [Body([one for one in own if one not in shared], f"shows this {word}") for own in each]

@@ -185,11 +185,11 @@ def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
 
 def _with_joints(path: Path, rows: Lines, places: Sequence[int], *, fill: bool) -> Lines:
     """Lines with joint values: those without any are left out, or, where lines ``fill`` a pose, have those above."""
-    empty = [line for line, cells in rows if not any(cells[place] for place in places)]
+    empty = {line for line, cells in rows if not any(cells[place] for place in places)}
     if not empty or len(empty) == len(rows):
         return rows
     if not fill:
-        warn_user(f"file '{path}': no joint values in line {few(empty)}: {len(empty)} row(s) left out")
+        warn_user(f"file '{path}': no joint values in line {few(sorted(empty))}: {len(empty)} row(s) left out")
         return [(line, cells) for line, cells in rows if line not in empty]
     above: dict[int, str] = {}
     filled = list[tuple[int, list[str]]]()
