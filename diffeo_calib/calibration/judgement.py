@@ -23,8 +23,8 @@ from diffeo_calib.kinematics.evaluation import (
     some_rows,
 )
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.sensors.coordinates import Places
 from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
-from diffeo_calib.sensors.places import Places
 
 
 def check_errors(model: CalibratedKinematics, found: Evaluation, usual: float) -> None:

@@ -17,6 +17,7 @@ from torch import Tensor
 from diffeo_calib.calibration.choose_scales import VARIANCE_RATIO, choose_scales, noise_of_few
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import changes_of
+from diffeo_calib.calibration.diagnostics.plausibility import check_joints
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.placing.placement import Elsewhere
 from diffeo_calib.calibration.planning.candidates import candidates, ranges_around
@@ -92,6 +93,7 @@ class Around:
         """
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DiffeoCalibWarning)  # few rows leave much open
+            check_joints(robot, rows)
             placed = place(robot, rows, silent)
             data, stages = placed.tangent_data(), (placed.registration, placed.identification)
             known = None if same is None else same.scales
@@ -242,7 +244,8 @@ class CampaignModel:
         around: places and scales. table: all rows. verdicts: on them. ratios: of accepted rows, see :attr:`typical`.
 
     Attributes:
-        seen: rows of the campaign when this was made. window: numbers of the last rows, ``last`` linearised.
+        seen: rows of the campaign when this was made. window: numbers of the last rows; ``numbers`` and
+            ``noise`` are what these tell.
         process: what is known by the accepted rows but the last ones. now: by all of them.
         covariance: (T r, T r) of the errors over the target, m^2.
     """
@@ -255,9 +258,12 @@ class CampaignModel:
         first = accepted[(len(accepted) + 1) // 2]  # the others hold what is known
         self.window = [one.row for one in judged[-gates.WINDOW :] if one.row >= first]
         self.process = around.process(table, [row for row in accepted if row not in self.window])
-        self.last = around.rows(table.rows(self.window))[0]
-        self._target, self._options = (self.process.features(each[0]) for each in (around.errors, around.options))
-        self._at = self.process.features(self.last.numbers(around.scales).at)
+        last = around.rows(table.rows(self.window))[0]
+        self.numbers, self.noise = last.numbers(around.scales), around.noise(last)
+        ats = self.numbers.at, around.errors[0], around.options[0]
+        self._at, self._target, self._options = map(self.process.features, ats)
+        self._cross = self._at.by_fields_with(self._target)
+        _ = self._target.by_fields  # what later ones are lowered from
         self._learn(verdicts)
 
     def rebuilt(self, table: Any, verdicts: Sequence[Verdict]) -> CampaignModel:
@@ -318,31 +324,34 @@ class CampaignModel:
         Raises:
             MeasurementError: a device that is not known.
         """
-        row, full = len(table) - 1, int(len(self.window) > gates.WINDOW)
-        window = [*self.window[full:], row]
-        last, changes = self.around.rows(table.rows(window))
-        own = last.rows(_number(len(window) - 1))
-        at = self.process.features(own.numbers(self.around.scales).at)
-        single, typical = self._seen(own, at), self.typical
-        if full and verdicts[self.window[0]].accepted:
-            self.process = self.around.given(self.process, self.last.rows(_number(0)))
-        self.window, self.last = window, last
-        found = single.measure(_freedom(own))
+        row = len(table) - 1
+        window = [*self.window[int(len(self.window) > gates.WINDOW) :], row]
+        data, changes = self.around.rows(table.rows(window))
+        own, numbers, noise = (
+            data.rows(_number(len(window) - 1)),
+            data.numbers(self.around.scales),
+            self.around.noise(data),
+        )
+        last = numbers.rows(_number(len(window) - 1))
+        at = self.process.features(last.at)
+        near, far = (one.by_fields_with(at) for one in (self._at, self._target))
+        single = Seen.of(self.now, last, noise[-1:], self.now.features(last.at, at, self.numbers.there(near)))
+        if len(self.window) > gates.WINDOW:
+            at, near, far = self._without_oldest(verdicts[self.window[0]].accepted, at, near, far)
+        self.window, self.numbers, self.noise = window, numbers, noise
+        self._at, self._cross = self._at.followed_by(at, near), torch.cat([self._cross, far.T])
+        found, typical = single.measure(_freedom(own)), self.typical
         fits = found.fits(typical)
         if fits:
             self.ratios.append(found.square / chi2_above(1.0 - gates.TYPICAL_SHARE, found.freedom))
         cause = "" if fits else self._cause(table, own, single)
         shown = self.around.placed.shown(table.rows([row]).parts[0])
         verdicts.append(Verdict(row, fits, fits, found.error, found.expected, cause, shown=shown, line=lines[row]))
-        numbers, some = last.numbers(self.around.scales), [verdicts[number] for number in window]
-        kept = self._at.rows(torch.arange(full, len(window) - 1 + full, device=HOST))
-        kept, new = (self.process.features(one.at, one) for one in (kept, at))
-        self._at = kept.followed_by(new, numbers.at)
+        some, change = [verdicts[number] for number in window], None
         flags = _flags([one.accepted for one in some]), _flags([not one.cause for one in some])
-        how: Any = {"single": found, "typical": typical, "coordinates": last.y.shape[1]}
-        change = None
+        how: Any = {"single": found, "typical": typical, "coordinates": data.y.shape[1]}
         if not cause:
-            seen = Seen.of(self.process, numbers, self.around.noise(last), self._at)
+            seen = Seen.of(self.process, numbers, noise, self._at)
             change = find_change(seen, window, changes(), flags, **how)
         if change is not None:
             known = verdicts[window[0]].change
@@ -356,18 +365,44 @@ class CampaignModel:
                     verdicts[number] = replace(one, accepted=accepted, change=None if before else change)
         self._learn(verdicts)
 
+    def _without_oldest(
+        self, accepted: bool, at: Features, near: Tensor, far: Tensor
+    ) -> tuple[Features, Tensor, Tensor]:
+        """Take the oldest of the last rows from these, and into what is known by all others if it was accepted.
+
+        Args:
+            at: features of a new row. near, far: its covariance by the fields with the last rows, and with the target.
+
+        Returns:
+            The same, given that row; of ``near`` without it.
+        """
+        size = self.numbers.shape[1]
+        if accepted:
+            oldest, before = self.numbers.rows(_number(0)), (self._at, self._target, at)
+            process = self.process.given(oldest, self.noise[:1], self._at.rows(_number(0)))
+            blocks = self._at.by_fields[:size], self._cross[:size], near[:size]
+            self._at, self._target, at = (
+                process.features(one.at, one, oldest.there(block)) for one, block in zip(before, blocks, strict=True)
+            )
+            last, target, new = (one.known[self.process.size :] for one in (self._at, self._target, at))
+            near, far, self._cross = near - last.T @ new, far - target.T @ new, self._cross - last.T @ target
+            self.process = process
+        self._at = self._at.rows(torch.arange(1, self.numbers.shape[0], device=HOST))
+        self._cross = self._cross[size:]
+        return at, near[size:], far
+
     def _learn(self, verdicts: Sequence[Verdict]) -> None:
         """What is known now. Of the last rows those not accepted tell nothing."""
-        accepted, noise = _flags([verdicts[row].accepted for row in self.window]), self.around.noise(self.last)
-        noise = without_hidden(noise, accepted[:, None].expand(noise.shape[:2]))
-        self.now = self.process.given(self.last.numbers(self.around.scales), noise, self._at)
-        self._target = self.process.features(self._target.at, self._target)
-        self.covariance = self.around.covariance(self.now.features(self._target.at, self._target))
+        accepted = _flags([verdicts[row].accepted for row in self.window])
+        noise = without_hidden(self.noise, accepted[:, None].expand(self.noise.shape[:2]))
+        self.now = self.process.given(self.numbers, noise, self._at)
+        target = self.now.features(self._target.at, self._target, self.numbers.there(self._cross))
+        self.covariance = self.around.covariance(target)
 
-    def _seen(self, data: TangentData, sooner: Features | None = None) -> Seen:
-        """Rows as the accepted ones before them predict them; ``sooner``: their features by the process."""
+    def _seen(self, data: TangentData) -> Seen:
+        """Rows as the accepted ones before them predict them."""
         numbers = data.numbers(self.around.scales)
-        return Seen.of(self.now, numbers, self.around.noise(data), self.now.features(numbers.at, sooner))
+        return Seen.of(self.now, numbers, self.around.noise(data), self.now.features(numbers.at))
 
     def _cause(self, table: Any, own: TangentData, seen: Seen) -> str:
         """Why the last row is wrong, in words; empty if nothing that is undone makes it fit."""

@@ -67,7 +67,11 @@ def region_scale(
     counts = {int(k): float(shares[dims == k].sum() / shares.sum()) for k in np.unique(dims)}
     high = smallest(lambda at: _held(exp(at), counts, density) >= CONFIDENCE, *map(log, FACTORS))
     number = float(shares.sum())
-    own = _log_quantile(values / np.array([chi2_above(1.0 - CONFIDENCE, k) for k in dims]), shares)
+    ratios = values / np.array([chi2_above(1.0 - CONFIDENCE, k) for k in dims])
+    order = np.argsort(ratios)
+    count = shares.sum() ** 2 / np.square(shares).sum()
+    below = shares[order].cumsum() / shares.sum() * count / (count + 1.0)  # a new one lies below with the confidence
+    own = float(np.interp(CONFIDENCE, below, np.log(ratios[order].clip(min=np.finfo(float).tiny))))
     return float(np.exp((number * own + ROWS * high) / (number + ROWS)))
 
 
@@ -88,15 +92,6 @@ def region_factor(freedom: float, dim: int) -> float:
     if freedom == inf:
         return 1.0
     return dim * f_below(CONFIDENCE, dim, freedom) / chi2_above(1.0 - CONFIDENCE, dim)
-
-
-def _log_quantile(ratios: np.ndarray, shares: np.ndarray) -> float:
-    """Logarithm of the value below which a new one of n lies with the confidence: the quantile at (n + 1) / n of it."""
-    order = np.argsort(ratios)
-    own = shares[order]
-    number = own.sum() ** 2 / np.square(own).sum()
-    below = own.cumsum() / own.sum() * number / (number + 1.0)
-    return float(np.interp(CONFIDENCE, below, np.log(ratios[order].clip(min=np.finfo(float).tiny))))
 
 
 def student_likelihood(squares: Tensor, dim: Tensor, freedoms: Tensor, shares: Tensor | None = None) -> Tensor:

@@ -219,6 +219,7 @@ REFUSED = {
     "columns": (ECHO.format("plumb_bob", FIVE).replace(NINE, "500, 0, 0, 0, 510, 0, 310, 235, 1"), "row by row"),
     "no size": (STORAGE.replace("image_size", "size") + f"D: [{FIVE}]\n", "image_width"),
     "nothing": ("", r"camera\.yaml.*camera_matrix"),
+    "a tag without an end": ("<" + 900_000 * "a", "camera_matrix"),  # which quadratic time would not read
     "words": ("camera_matrix:\n  data: [1, x]\n", r"camera\.yaml.*camera_matrix"),
     "no lens": ("a: [1, 2]\nimage_width: 3\nimage_height: 3\nd: [0, 0, 0, 0]", r"`camera_matrix`.*`k`.*Kalibr.*fx"),
 }
@@ -255,7 +256,7 @@ REFUSED |= {
     damage: (re.sub(pattern, other, FILE, flags=re.S), rf"camera\.yaml.*{message}")
     for damage, (pattern, other, message) in DAMAGED.items()
 }
-for piece in ("camera_matrix:\n", "camera_matrix:\n data: [", " "):  # which quadratic time would not read
+for piece in ("camera_matrix:\n", "camera_matrix:\n data: [", " "):  # nor these
     REFUSED[f"long {piece}"] = "camera_matrix:" + piece * (900_000 // len(piece)), "camera_matrix"
     REFUSED[f"too long {piece}"] = piece * (1_100_000 // len(piece)), "too large for a camera file: .* at most 1 MB"
 

@@ -85,14 +85,15 @@ def test_rows_that_came_before_the_first_model_are_judged_by_it(measured: tuple[
 def test_rows_that_give_no_model_are_tried_once(
     measured: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tries = []
+    (q, y), tries = measured, []
+    still = dc.Campaign(ARM.nominal).add(q[:1].repeat(12, 1), y[:1].repeat(12, 1, 1))
+    assert "all 12 rows hold the same configuration" in still[-1].cause
 
     def refused(_: Any, table: Any, *__: Any, **___: Any) -> None:
         tries.append(len(table))
         raise dc.DiffeoCalibError("these rows do not say where the device is")
 
     monkeypatch.setattr("diffeo_calib.campaign.campaign.Around.of", refused)
-    q, y = measured
     campaign = dc.Campaign(ARM.nominal, candidates=q, target=q)
     campaign.add(q[:12], y[:12])
     campaign.reject(0)

@@ -20,7 +20,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, ModelFileError
-from diffeo_calib.interop import model_file, model_header
+from diffeo_calib.interop import model_file
 
 
 def test_cut_short(sound: bytes, tmp_path: Path) -> None:
@@ -66,7 +66,7 @@ def test_files_of_other_kinds(tmp_path: Path) -> None:
     ):
         path.write_bytes(content)
         assert "cannot be read as a model file" in refused(path)
-    header = json.dumps({"format": model_header.FORMAT})
+    header = json.dumps({"format": model_file.FORMAT})
     for metadata, message in (
         (None, "is not a diffeo_calib model"),
         ({"format": "pt"}, "is not a diffeo_calib model"),
@@ -182,7 +182,7 @@ MISSING: dict[str, Callable[[Any, Any], object]] = {
     **{k: lambda header, _, k=k: header.pop(k) for k in NOT_UNDERSTOOD},
     **{k: lambda header, _, k=k: header["nominal"]["joints"][0].pop(k) for k in ("lower", "mimic", "mimic_offset")},
     "elastic": lambda header, _: header["nominal"].pop("elastic"),
-    **{k: lambda _, tensors, k=k: tensors.pop(k) for k in (*model_header.MOMENTA, *model_header.GEOMETRY)},
+    **{k: lambda _, tensors, k=k: tensors.pop(k) for k in (*model_file.MOMENTA, *model_file.GEOMETRY)},
 }
 """Entries of the header, of a joint and of elasticity, and tensors."""
 

@@ -108,17 +108,6 @@ def test_the_command_writes_lengths_in_the_unit_of_the_table(command: Command, t
         assert {"px": "in px", "mm": "in mm"}[own.unit] in done.out
 
 
-def test_a_payload_of_all_rows_is_a_number(command: Command, tmp_path: Any) -> None:
-    kind = kind_named("payloads")
-    path = tmp_path / "q.csv"
-    path.write_text("\n".join(",".join(map(str, r)) for r in [kind.robot.joint_names, *kind.q(2).rad2deg().tolist()]))
-    done = command("predict", kind.file, path, *UNITS, "--payload", "4", "-o", tmp_path / "p.csv")
-    assert done.code == 0, done.err
-    table = np.genfromtxt(tmp_path / "p.csv", delimiter=",", names=True)
-    expected = 1e3 * kind.model.with_payload(4.0)(kind.q(2)).detach()[:, 0]
-    np.testing.assert_allclose(np.stack([table[axis] for axis in "xyz"], 1), expected, atol=1e-3)
-
-
 def test_devices_of_a_kind_that_is_not_registered_are_warned_of(tmp_path: Any, monkeypatch: Any) -> None:
     kind = kind_named("heights")
     dc.save(kind.model, tmp_path / "m.safetensors")

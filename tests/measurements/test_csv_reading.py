@@ -19,7 +19,7 @@ from diffeo_calib.cli.guesses import guess_sheet
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.csv.files import read_joints, read_measurements, read_observations
 from diffeo_calib.measurements.csv.lines import read_cells
-from diffeo_calib.measurements.poses import angle_between, rotation_matrices, transforms
+from diffeo_calib.measurements.poses import rotation_matrices, transforms
 from diffeo_calib.measurements.table_format import TableFormat
 
 quietly = pytest.mark.filterwarnings("ignore::diffeo_calib.common.errors.DiffeoCalibWarning")

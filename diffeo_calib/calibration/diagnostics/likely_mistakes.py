@@ -319,7 +319,7 @@ def conventions_of(robot: Tree, data: Measurements, angle: str, judge: Judge = r
 
     def left(q: Tensor) -> float:
         residual, size = judge(replace(own, q=q))
-        return residual / size
+        return residual / max(size, 1e-12)
 
     return conventions(robot, data, left, degrees(1.0) if angle == "deg" else 1.0)
 

@@ -59,10 +59,9 @@ from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.coordinates import errors_of_kinds
+from diffeo_calib.sensors.coordinates import Places, errors_of_kinds, fitting_devices
 from diffeo_calib.sensors.devices import ROW
 from diffeo_calib.sensors.errors import Evaluations, shown_unit
-from diffeo_calib.sensors.places import Places, fitting_devices
 from diffeo_calib.sensors.tables import (
     Coordinates,
     OtherReadings,

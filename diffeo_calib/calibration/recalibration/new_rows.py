@@ -36,9 +36,8 @@ from diffeo_calib.process.tails import Tails, gross_weights, reweight
 from diffeo_calib.regression.linear_rows import LinearRows
 from diffeo_calib.regression.regions import OTHER_DATE, region_factor, region_scale
 from diffeo_calib.robots.se3 import rotation, transforms
-from diffeo_calib.sensors.coordinates import errors_of_kinds
+from diffeo_calib.sensors.coordinates import errors_of_kinds, fitting_devices
 from diffeo_calib.sensors.errors import Evaluations
-from diffeo_calib.sensors.places import fitting_devices
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings
 
 MAX_STEPS = 100

@@ -34,14 +34,12 @@ from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
 from diffeo_calib.kinematics.registered_map import Registration, fitted_markers, robot_map
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
-from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.measurements.checks import in_other_unit
 from diffeo_calib.measurements.poses import own_blocks
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.sensors.coordinates import check_shown, sensor_of
-from diffeo_calib.sensors.places import mounted_of
+from diffeo_calib.sensors.coordinates import check_shown, mounted_of, sensor_of
 from diffeo_calib.sensors.tables import (
     ball_tip,
     check_markers,
@@ -205,21 +203,19 @@ def with_ball(fitted: FittedMap, ball: Tensor, tip: str, deviation: float) -> Fi
     theta = torch.cat([theta[:end], theta.new_zeros(3), theta[end:]])
     p = old.momenta.task.view(len(old.x), -1, 3)
     p = torch.cat([p, p.new_zeros(len(p), 1, 3)], 1).flatten(0, 1)
-    spec = replace(old.spec, nominal=after, prior_variance=prior, at_controls=_of_rows(old.spec.at_controls, after))
+    by_row = old.spec.at_controls
+    if isinstance(by_row, SessionMarkers):  # the ball is at one place in all sessions
+        tools = torch.cat([by_row.tools, ball.expand(len(by_row.tools), 1, 3)], 1)
+        by_row = SessionMarkers(after.with_payload(by_row.load), by_row.session, tools)
+    elif isinstance(by_row, GeometryMap):
+        by_row = after.with_payload(by_row.load)
+    spec = replace(old.spec, nominal=after, prior_variance=prior, at_controls=by_row)
     deformation = GeodesicDeformation(spec, old.x, Momenta(old.momenta.joint, p, theta), old.integrator)
     markers = nominal.geometry.markers
     slopes = torch.nn.functional.pad(fitted.functionals, (0, 3))
     new_noise = torch.block_diag(fitted.new_noise, own_blocks(fitted.new_noise[None], markers)[0].mean(0))
     parts = fitted.noise, fitted.data, new_noise, fitted.workspace
     return FittedMap(deformation, *parts, slopes=slopes, y=fitted.measured())
-
-
-def _of_rows(by_row: NominalMap | None, after: GeometryMap) -> NominalMap | None:
-    """k0 of the controls with the ball at one place in all of them."""
-    if isinstance(by_row, SessionMarkers):
-        tools = torch.cat([by_row.tools, after.geometry.tool[-1:].expand(len(by_row.tools), 1, 3)], 1)
-        return SessionMarkers(after.with_payload(by_row.load), by_row.session, tools)
-    return after.with_payload(by_row.load) if isinstance(by_row, GeometryMap) else by_row
 
 
 Marker = Literal["evidence", "same", "moved", "other"]

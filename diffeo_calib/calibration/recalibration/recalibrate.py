@@ -60,8 +60,8 @@ from diffeo_calib.regression.conditional import roots
 from diffeo_calib.robots.cartesian import is_cartesian, pose_inputs, turns_nowhere
 from diffeo_calib.robots.payload import common_mass, under_mass, words_of_mass
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.coordinates import mounted_of
 from diffeo_calib.sensors.errors import Evaluations
-from diffeo_calib.sensors.places import mounted_of
 
 LOG = logging.getLogger(__name__)
 CERTIFICATES = "coupling_residual", "end_residual", "energy", "status"

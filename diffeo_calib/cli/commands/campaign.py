@@ -101,7 +101,9 @@ class Live:
                 verdicts[entry["row"]] |= {name: entry[name] for name in KEPT if name in entry}
         readable = [line if "rows" in entry else b"\n" for line, entry in zip(lines, known, strict=False)]
         if verdicts:
-            self.campaign.resume(self._read(readable), [Verdict(row, **one) for row, one in enumerate(verdicts)])
+            if len(table := self._read(readable)) != len(verdicts):
+                raise self.journal.damaged(f"{len(verdicts)} verdicts of {len(table)} rows")
+            self.campaign.resume(table, [Verdict(row, **one) for row, one in enumerate(verdicts)])
             self.say(f"going on after {len(known)} lines{expected(self.campaign)}", self.state())
         self.said = [(one.accepted, one.again) for one in self.campaign.verdicts]
         self.waiting = lines[len(known) :]
