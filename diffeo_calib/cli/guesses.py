@@ -17,10 +17,9 @@ from typing import Any, NamedTuple
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.column_names import LENGTHS, WORDS, Column, Group, column, groups, whole
-from diffeo_calib.cli.options import CORNERS, Places
+from diffeo_calib.cli.options import CORNERS
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, bad_cells, number, number_hint, numbers_in
-from diffeo_calib.measurements.csv.joined import joined_file
 from diffeo_calib.measurements.csv.lines import HEAD, CsvLines, read_cells
 from diffeo_calib.measurements.csv.sensors import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.readings import MILLIMETRES
@@ -493,23 +492,3 @@ def _corners_in(sheet: Sheet) -> list[str]:
     width, height = (max(number(cell, sheet.decimal) or 0.0 for cell in sheet.cells[name]) for name in PIXEL)
     size = next((size for size in USUAL_SIZES if width < size[0] and height < size[1]), USUAL_SIZES[-1])
     return [f"{CORNERS}{','.join(map(str, size))}"]
-
-
-def with_places(csv: Path, given: Places, folder: Path) -> tuple[Path, list[Choice]]:
-    """The table, joined with that of the measured places if there is one, and the entries of a campaign in a folder."""
-    if given.places is None:
-        return csv, []
-    joints, places = guess_sheet(csv), guess_sheet(given.places)
-    common = {name: len({*own} & {*places.cells[name]}) for name, own in joints.cells.items() if name in places.cells}
-    if not common:  # columns that name the same rows
-        each = product(joints.cells.items(), places.cells.items())
-        pairs = [f"{own}={other}" for (own, names), (other, others) in each if sorted(names) == sorted({*others})]
-        common = dict.fromkeys(pairs if len(pairs) == 1 else [], 1)
-    if given.by is None and not common:
-        expected, got = "a column that both files have", " and ".join(few(own.header, 12) for own in (joints, places))
-        fix = "add one, such as the number of the pose, or name two: --by COLUMN=OTHER"
-        raise InputError.of("--places without --by", expected=expected, got=got, fix=fix)
-    by = given.by or max(common, key=lambda name: common[name])
-    found = joined_file(csv, given.places, by, joints.sep, joints.decimal, several=True)
-    entries = [Choice("places", relpath(given.places, folder), "the measured places"), Choice("by", by, found.sentence)]
-    return found, entries

@@ -352,11 +352,16 @@ def _unclear(found: Sequence[Source], *, excluded: bool) -> InputError:
         fix = "no signs, zeros, coupling or units of the joints do either: "
     fix += "check the table's joints against the robot's, or write the file yourself; of a robot with several tips "
     fix += "the columns of each are to be named after it, such as left_x"
-    if ticks := _without_unit(found):
-        got = f"up to {ticks[1]:.4g} in {few(ticks[0])}: no angles, but pulses or ticks of encoders"
-        fix = f'write joints = "360/COUNTS*{{{ticks[0][0]}}},..." with the counts per turn of each axis, as the '
-        fix += "controller states them, negative where it counts the other way"
-    for one, own in _of_one_size(found[0]) if not ticks else ():
+    for one in (own for own in found if own.table.angle == "deg" and own.left < inf):
+        largest = zip(one.joints, one.robot.periodic, one.q.abs().amax(0).rad2deg().tolist(), strict=True)
+        if far := {name: most for name, turns, most in largest if turns and most > LARGEST_TURN_DEG}:
+            got = f"up to {max(far.values()):.4g} in {few([*far])}: no angles, but pulses or ticks of encoders"
+            fix = (
+                f'write joints = "360/COUNTS*{{{next(iter(far))}}},..." with the counts per turn of each axis, as the '
+            )
+            fix += "controller states them, negative where it counts the other way"
+            return InputError.of("columns of the joints", expected="rad or deg", got=got, fix=fix)
+    for one, own in _of_one_size(found[0]):
         fix = likely_mistakes.likely_mistake(one.robot, own, one.left * spread(own.points)) or fix
         third = len(own) // 3
         for name, rows in (("first", range(third)), ("last", range(len(own) - third, len(own)))):
@@ -367,15 +372,6 @@ def _unclear(found: Sequence[Source], *, excluded: bool) -> InputError:
                 fix = "if the device moved between rows, name its set-ups in a column, `session`"
     what = "units with which the robot explains what the rows vary"
     return InputError.of(what, expected="one clear reading", got=f"left unexplained {got}", fix=fix)
-
-
-def _without_unit(found: Sequence[Source]) -> tuple[list[str], float] | None:
-    """The columns of joints that turn farther than any axis, even in degrees, and their largest number."""
-    for one in (own for own in found if own.table.angle == "deg" and own.left < inf):
-        largest = zip(one.joints, one.robot.periodic, one.q.abs().amax(0).rad2deg().tolist(), strict=True)
-        far = {name: most for name, turns, most in largest if turns and most > LARGEST_TURN_DEG}
-        return ([*far], max(far.values())) if far else None
-    return None
 
 
 def _of_one_size(source: Source) -> list[tuple[Source, Measurements]]:

@@ -99,21 +99,19 @@ def _spreadsheet(path: Path, file: BinaryIO) -> tuple[Rows, list[str]]:
 
 def _joined_sheets(sheets: Mapping[str, Rows]) -> tuple[Rows, list[str]] | None:
     """Two sheets whose first lines have one common name, with the same different texts below it, side by side."""
-    if len(sheets) != 2:
-        return None
-    (one, own), (other, others) = (
-        (name, [[*map(_cell, row)] for row in rows if any(row)]) for name, rows in sheets.items()
-    )
-    common = {*own[0]} & {*others[0]} - {""}
+    each = [[[*map(_cell, row)] for row in rows if any(row)] for rows in sheets.values()]
+    common = {*each[0][0]} & {*each[-1][0]} - {""} if len(each) == 2 else set[str]()
     if len(common) != 1:
         return None
-    by = common.pop()
-    here, there = (own[0].index(by), others[0].index(by))
-    below = {row[there]: row for row in others}
-    if {row[here] for row in own} != {*below} or not len(own) == len(others) == len(below):
+    (by,), (one, other) = common, each
+    first, second = ({row[rows[0].index(by)]: row for row in rows} for rows in each)
+    if {*first} != {*second} or len({len(own) for own in (one, other, first)}) > 1:
         return None
-    cells = [[*row, *(cell for k, cell in enumerate(below[row[here]]) if k != there)] for row in own]
-    return cells, [f"sheets '{one}' and '{other}' joined by '{by}'"]
+    cells = [
+        [*row, *(cell for name, cell in zip(other[0], second[key], strict=True) if name != by)]
+        for key, row in first.items()
+    ]
+    return cells, [f"sheets {' and '.join(map(repr, sheets))} joined by '{by}'"]
 
 
 def _cell(value: Any) -> str:

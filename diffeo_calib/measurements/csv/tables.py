@@ -191,8 +191,7 @@ def _with_joints(path: Path, rows: Lines, places: Sequence[int], *, fill: bool) 
     if not fill:
         warn_user(f"file '{path}': no joint values in line {few(sorted(empty))}: {len(empty)} row(s) left out")
         return [(line, cells) for line, cells in rows if line not in empty]
-    above: dict[int, str] = {}
-    filled = list[tuple[int, list[str]]]()
+    above, filled = dict[int, str](), list[tuple[int, list[str]]]()
     for line, cells in rows:
         above = above if line in empty else {place: cells[place] for place in places}
         filled.append((line, [above.get(place, cell) for place, cell in enumerate(cells)]))
