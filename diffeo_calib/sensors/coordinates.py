@@ -22,11 +22,11 @@ from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices, Extrinsics, check_devices
-from diffeo_calib.sensors.errors import ERRORS, READINGS, SPREAD, Evaluation, Evaluations
+from diffeo_calib.sensors.errors import ERRORS, READINGS, SPREAD, Evaluation, Evaluations, socket_errors
 from diffeo_calib.sensors.kinds import kind_of
 from diffeo_calib.sensors.set_ups import ROWS, SetUps, Turns, check_same_markers, mounted_kind, set_up_kind
-from diffeo_calib.sensors.sockets import SocketPlaces, socket_errors, sockets_of
 from diffeo_calib.sensors.tables import Coordinates
+from diffeo_calib.sensors.tool_frames import SocketPlaces
 
 KNOWN_DEVIATION = 1e-8
 """Prior deviations of increments below this, m or rad, are those of numbers that are known."""
@@ -250,7 +250,8 @@ class Contacts(Sensor):
         def share(q: Tensor) -> float:
             tips = model.robot.tip_poses(q)[..., 0, :3, 3]
             motion = float((tips - tips.mean(0)).square().sum(1).mean().sqrt())
-            away = socket_errors(model(q).detach()[:, -1], *sockets_of(data))[0].norm(dim=1)
+            resting = data.socket_numbers.to(q.device), data.known_sockets
+            away = socket_errors(model(q).detach()[:, -1], *resting)[0].norm(dim=1)
             return float(away.nanmedian()) / max(motion, SMALLEST_MOTION_M)
 
         own = share(data.q)
@@ -271,7 +272,8 @@ class Contacts(Sensor):
 
     def errors(self, data: Measurements, points: Tensor, places: Places) -> Evaluation:
         """Spread within sockets, and errors of known distances."""
-        away, distances = socket_errors(points[:, -1], *sockets_of(data))
+        resting = data.socket_numbers.to(points.device), data.known_sockets
+        away, distances = socket_errors(points[:, -1], *resting)
         size, lines, names = away.norm(dim=1, keepdim=True), data.line_numbers, data.row_sockets
         return Evaluation(size, None, away[:, None], lines, distances, what=SPREAD, kind="socket", devices=names)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -179,6 +180,9 @@ def test_files_keep_a_camera(tmp_path: Path) -> None:
     assert same.noise == FOUND.camera.noise
     path.write_text(camera_text(FOUND.camera, ros=True))
     assert (read_camera(path).half_size, read_camera(path).root.shape) == (0.0, (len(UNKNOWNS), 0))
+    K, _, R, P = (torch.tensor(json.loads(data)) for data in re.findall(r"data: (\[[^]]*\])", path.read_text()))
+    assert_close(P.view(3, 4), torch.nn.functional.pad(K.view(3, 3), (0, 1)), rtol=0, atol=0)
+    assert_close(R.view(3, 3), torch.eye(3), rtol=0, atol=0)
 
 
 NINE, FIVE = "500.0, 0.0, 310.0, 0.0, 510.0, 235.0, 0.0, 0.0, 1.0", "-0.1, 0.02, 0.001, -0.0002, 0.0"

@@ -29,8 +29,7 @@ from diffeo_calib.sensors.height import Planes
 from diffeo_calib.sensors.image import Cameras
 from diffeo_calib.sensors.kinds import stored_devices
 from diffeo_calib.sensors.range import FixedPoints
-from diffeo_calib.sensors.sockets import SocketPlaces
-from diffeo_calib.sensors.tool_frames import Contacts, HeldTools, Trackers
+from diffeo_calib.sensors.tool_frames import Contacts, HeldTools, SocketPlaces, Trackers
 
 ROWS, STEP = 60, 1e-6
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import isfinite
 from typing import Any
 
@@ -70,6 +71,9 @@ def test_the_place_of_the_whole_scene_moves_no_reading() -> None:
     assert all(0.0 < one < other for one, other in zip(bare, whole, strict=True))
     (placed,) = kind.model.placement
     assert float(1e3 * placed.deviations[:, :3].median()) > 2 * float(np.median(bare))
+    old = kind.model.changed(placement=(replace(placed, shown=None),))  # of a file that does not say the unit: metres
+    for one, own in zip(of_rows(old, part), of_rows(kind.model, part), strict=True):
+        assert_close(1e3 * one.mean, own.mean)
 
 
 def test_means_are_the_observations_of_the_model(tmp_path: Any) -> None:

@@ -70,7 +70,7 @@ def registered(
     rows = with_points(mounted_of(model).in_any_frame(rows).largest_session(), model)
     here = model.to(HOST)._carrying(model.nominal.load.under(rows.payload).typical)
     ball = model.ball and bool(rows.points[:, -1].isnan().all())
-    placed, found = _placed(here, rows, free=free, marker_std=marker_std, ball=ball, learn=learn)
+    placed, found = _placed(here, rows, free=free, marker_std=marker_std, ball=ball, learn=learn, opens=True)
     learns, before = placed.registration is None, getattr(model.registration, "table_sha256", "")
     found = replace(found, table_sha256=" ".join([before, new.sha256][: 1 + learns]).strip())
     vars(placed).update({} if learns else {"registration": found})
@@ -94,7 +94,7 @@ def _placed(
     """The map in its new place, by rows that say where the robot stands, and the record."""
     model = here.map
     (new, registration), fit = find_place(model, here.lever, data, **asked), model.unregistered
-    warn_about(registration)
+    warn_about(registration, among=new.changed_among)
     LOG.info("registered anew: RMS %.4f mm on %d rows", 1e3 * registration.rms_after, registration.rows)
     open_by = max(float(registration.frame_deviations.max()), registration.known_m)
     learn = learn and new.marks.same and open_by < LARGEST_M_RAD and not registration.doubtful
