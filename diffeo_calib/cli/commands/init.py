@@ -109,7 +109,7 @@ def run(given: InitOptions) -> None:
 
 def with_places(csv: Path, given: Places, folder: Path) -> tuple[Path, list[Choice]]:
     """The table, joined with that of the measured places if there is one, and the entries of a campaign in a folder."""
-    if given.places is None:
+    if not given.places:
         return csv, []
     joints, places = guess_sheet(csv), guess_sheet(given.places)
     common = {name: len({*own} & {*places.cells[name]}) for name, own in joints.cells.items() if name in places.cells}
