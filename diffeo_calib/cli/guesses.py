@@ -17,9 +17,10 @@ from typing import Any, NamedTuple
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.column_names import LENGTHS, WORDS, Column, Group, column, groups, whole
-from diffeo_calib.cli.options import CORNERS
+from diffeo_calib.cli.options import CORNERS, Places
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, bad_cells, number, number_hint, numbers_in
+from diffeo_calib.measurements.csv.joined import joined_file
 from diffeo_calib.measurements.csv.lines import HEAD, CsvLines, read_cells
 from diffeo_calib.measurements.csv.sensors import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.readings import MILLIMETRES
@@ -119,7 +120,8 @@ def guess_sheet(path: Path) -> Sheet:
             why = str(bad_cells(path, odd, "a number", number_hint(odd[0][2], decimal))) if odd else ""
             found.append(Sheet(path, sep, decimal, tuple(columns), tuple(numbers), tuple(file.notes), why))
     most = max((len(sheet.numbers) for sheet in found), default=0)
-    best = max((sheet for sheet in found if len(sheet.numbers) == most), key=_marked, default=None)
+    likely = [sheet for sheet in found if len(sheet.numbers) == most]  # columns may have different decimal marks
+    best = max(likely, key=lambda own: sum(own.decimal in "".join(own.cells[k]) for k in own.numbers), default=None)
     width, reason = max(reasons, key=lambda one: one[0], default=(0, None))
     if reason is not None and (best is None or not best.numbers or width > 2 * len(best.numbers)):
         raise reason
@@ -127,11 +129,6 @@ def guess_sheet(path: Path) -> Sheet:
         fix = "check that one line names the columns, and that the lines below hold numbers"
         raise MeasurementError.of(f"'{path}' is no table of numbers with any usual separator", fix=fix)
     return best
-
-
-def _marked(sheet: Sheet) -> int:
-    """How many columns of numbers have the decimal mark: others may have the other one."""
-    return sum(any(sheet.decimal in text for text in sheet.cells[name]) for name in sheet.numbers)
 
 
 def _counts(texts: Sequence[str]) -> bool:
@@ -312,20 +309,6 @@ def guess_readings(columns: Sequence[str]) -> dict[str, list[str]]:
     return found
 
 
-def guess_deviations(columns: Sequence[str], triples: Sequence[Sequence[str]]) -> list[str] | None:
-    """Columns whose names are those of the positions but for a word such as std, in their order; None if one lacks."""
-    deviations = [one for one in map(column, columns) if {*one.words} & WORDS["deviation"]]
-    known = {_without(one, WORDS["deviation"]): one.name for one in deviations}
-    known |= {_without(one, WORDS["deviation"] | WORDS["measured"]): one.name for one in deviations}
-    wanted = [column(name) for triple in triples for name in triple]
-    found = [known.get(one.plain) or known.get(_without(one, WORDS["measured"])) for one in wanted]
-    return None if None in found else [name for name in found if name is not None]
-
-
-def _without(one: Column, words: frozenset[str]) -> str:
-    return "".join(word for word in one.words if word not in words)
-
-
 # --- what was measured ---
 
 
@@ -492,3 +475,23 @@ def _corners_in(sheet: Sheet) -> list[str]:
     width, height = (max(number(cell, sheet.decimal) or 0.0 for cell in sheet.cells[name]) for name in PIXEL)
     size = next((size for size in USUAL_SIZES if width < size[0] and height < size[1]), USUAL_SIZES[-1])
     return [f"{CORNERS}{','.join(map(str, size))}"]
+
+
+def with_places(csv: Path, given: Places, folder: Path) -> tuple[Path, list[Choice]]:
+    """The table, joined with that of the measured places if there is one, and the entries of a campaign in a folder."""
+    if given.places is None:
+        return csv, []
+    joints, places = guess_sheet(csv), guess_sheet(given.places)
+    common = {name: len({*own} & {*places.cells[name]}) for name, own in joints.cells.items() if name in places.cells}
+    if not common:  # columns that name the same rows
+        each = product(joints.cells.items(), places.cells.items())
+        pairs = [f"{own}={other}" for (own, names), (other, others) in each if sorted(names) == sorted({*others})]
+        common = dict.fromkeys(pairs if len(pairs) == 1 else [], 1)
+    if given.by is None and not common:
+        expected, got = "a column that both files have", " and ".join(few(own.header, 12) for own in (joints, places))
+        fix = "add one, such as the number of the pose, or name two: --by COLUMN=OTHER"
+        raise InputError.of("--places without --by", expected=expected, got=got, fix=fix)
+    by = given.by or max(common, key=lambda name: common[name])
+    found = joined_file(csv, given.places, by, joints.sep, joints.decimal, several=True)
+    entries = [Choice("places", relpath(given.places, folder), "the measured places"), Choice("by", by, found.sentence)]
+    return found, entries

@@ -21,7 +21,7 @@ from diffeo_calib.calibration.diagnostics import gates, likely_mistakes
 from diffeo_calib.calibration.diagnostics.plausibility import marker_column, unmeasured_markers
 from diffeo_calib.calibration.identification.registration import register, register_sockets, spread
 from diffeo_calib.calibration.placing.readings import rough_error
-from diffeo_calib.cli.column_names import column
+from diffeo_calib.cli.column_names import WORDS, Column, column
 from diffeo_calib.cli.guesses import (
     LENS,
     SOME_LENS,
@@ -30,7 +30,6 @@ from diffeo_calib.cli.guesses import (
     RowColumns,
     Sheet,
     entries,
-    guess_deviations,
     marker_of_lines,
 )
 from diffeo_calib.cli.options import Rows
@@ -444,6 +443,20 @@ def with_rotation(source: Source, *, camera: bool = False) -> Source:
     turned = Choice("rotation", written[0] if len(written) == 1 else written, alone)
     turn = entries([best.table], convention=why, rotation_angle="the same")
     return best.saying(*entries([best.table], **units), turned, *turn)
+
+
+def guess_deviations(columns: Sequence[str], triples: Sequence[Sequence[str]]) -> list[str] | None:
+    """Columns whose names are those of the positions but for a word such as std, in their order; None if one lacks."""
+    deviations = [one for one in map(column, columns) if {*one.words} & WORDS["deviation"]]
+    known = {_without(one, WORDS["deviation"]): one.name for one in deviations}
+    known |= {_without(one, WORDS["deviation"] | WORDS["measured"]): one.name for one in deviations}
+    wanted = [column(name) for triple in triples for name in triple]
+    found = [known.get(one.plain) or known.get(_without(one, WORDS["measured"])) for one in wanted]
+    return None if None in found else [name for name in found if name is not None]
+
+
+def _without(one: Column, words: frozenset[str]) -> str:
+    return "".join(word for word in one.words if word not in words)
 
 
 def with_deviations(source: Source) -> Source:

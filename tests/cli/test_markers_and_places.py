@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import pytest
 from command_bank import Command
 
-from diffeo_calib.cli.commands.init import with_places
+from diffeo_calib.cli.guesses import with_places
 from diffeo_calib.cli.options import Places, Rows
 from diffeo_calib.cli.tables import as_at_the_fit
 from diffeo_calib.measurements.csv.lines import read_cells, write_rows

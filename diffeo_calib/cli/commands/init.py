@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product, takewhile
+from itertools import takewhile
 from os.path import relpath
 from pathlib import Path
 from statistics import median
@@ -25,9 +25,10 @@ from diffeo_calib.cli.guesses import (
     guess_sheet,
     joints_without_column,
     rows_in,
+    with_places,
 )
 from diffeo_calib.cli.models import is_urdf, load_robot
-from diffeo_calib.cli.options import CORNERS, Links, Places
+from diffeo_calib.cli.options import CORNERS, Links
 from diffeo_calib.cli.proposals import (
     CLEAR_RATIO,
     LARGEST_RESIDUAL,
@@ -45,7 +46,6 @@ from diffeo_calib.cli.proposals import (
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.checks import quiet
-from diffeo_calib.measurements.csv.joined import joined_file
 from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.measurements.csv.sensors import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.table_format import TableFormat
@@ -105,26 +105,6 @@ def run(given: InitOptions) -> None:
     say(*lines)
     fill_in = ", fill in the lines that say `uncomment`" * any("uncomment" in line for line in lines)
     say(f"campaign: {output}; check it{fill_in}, then run: diffeo-calib fit {output}")
-
-
-def with_places(csv: Path, given: Places, folder: Path) -> tuple[Path, list[Choice]]:
-    """The table, joined with that of the measured places if there is one, and the entries of a campaign in a folder."""
-    if not given.places:
-        return csv, []
-    joints, places = guess_sheet(csv), guess_sheet(given.places)
-    common = {name: len({*own} & {*places.cells[name]}) for name, own in joints.cells.items() if name in places.cells}
-    if not common:  # columns that name the same rows
-        each = product(joints.cells.items(), places.cells.items())
-        pairs = [f"{own}={other}" for (own, names), (other, others) in each if sorted(names) == sorted({*others})]
-        common = dict.fromkeys(pairs if len(pairs) == 1 else [], 1)
-    if given.by is None and not common:
-        expected, got = "a column that both files have", " and ".join(few(own.header, 12) for own in (joints, places))
-        fix = "add one, such as the number of the pose, or name two: --by COLUMN=OTHER"
-        raise InputError.of("--places without --by", expected=expected, got=got, fix=fix)
-    by = given.by or max(common, key=lambda name: common[name])
-    found = joined_file(csv, given.places, by, joints.sep, joints.decimal, several=True)
-    entries = [Choice("places", relpath(given.places, folder), "the measured places"), Choice("by", by, found.sentence)]
-    return found, entries
 
 
 def _commanded(robot: Path | None, sheet: Sheet) -> Source | None:
