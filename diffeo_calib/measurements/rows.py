@@ -161,9 +161,7 @@ class RowGroups:
         """Warn about exact copies of rows, which predict each other."""
         if pairs := self.copies():
             earlier, later = (self.row_names[row] for row in pairs[0])
-            text = (
-                f"{len(pairs)} of {len(self)} rows repeat an earlier row exactly: first {later}, of {earlier}"
-            )
+            text = f"{len(pairs)} of {len(self)} rows repeat an earlier row exactly: first {later}, of {earlier}"
             warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
 
     @classmethod

@@ -197,7 +197,6 @@ WRONG_TENSORS: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
     "one row less in the noise": ("noise", lambda t: t[:-1]),
     "prior negative": ("prior_variance", lambda t: -t),
     "parameters of a million metres": ("theta", lambda t: t + 2e6),
-    "x flat": ("x", lambda t: t.flatten()),
     "rigid errors of other joints": ("rigid_errors", lambda t: t[:2]),
     "rigid errors not rigid": ("rigid_errors", lambda t: 2 * t),
     "integers": ("noise", lambda t: t.long()),
