@@ -25,6 +25,7 @@ from contextlib import ExitStack, suppress
 from io import FileIO
 from itertools import chain, starmap
 from pathlib import Path
+from stat import S_ISREG
 from typing import IO, TYPE_CHECKING, Any
 
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few, warn_user
@@ -177,6 +178,8 @@ class GrowingTable:
         """Complete lines that were appended since the last call; InputError if what was there has changed."""
         try:
             status = self.path.stat()
+            if not S_ISREG(status.st_mode):  # a pipe would be waited for, a device may never end
+                raise InputError.of(f"{self.path} is no file to which lines are appended", fix="name another one")
             state = status.st_size, status.st_mtime_ns, status.st_ino
             if state == self._state:
                 return []

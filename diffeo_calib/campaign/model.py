@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from itertools import combinations
 from math import inf, isinf, pi
 from typing import Any
@@ -25,7 +25,7 @@ from diffeo_calib.calibration.planning.knowledge import greedy
 from diffeo_calib.calibration.scales.leave_one_out import variance_ratio
 from diffeo_calib.calibration.scales.selection import GROWTH, defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.campaign.verdicts import Seen, Verdict, find_change
+from diffeo_calib.campaign.verdicts import Change, InOrder, Seen, Verdict, find_change
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError, few
 from diffeo_calib.common.quantiles import chi2_above
@@ -109,8 +109,8 @@ class Around:
         how = (0 if first else len(rows), inf) if same is None else (same.selected, same.deviation)
         return cls(placed, chosen.data, chosen.selection.scales, *asked, *how)
 
-    def rows(self, others: Any) -> tuple[TangentData, Callable[[], list[Hypothesis]]]:
-        """Rows of the campaign around the places, and what may change of robot, tool and devices.
+    def rows(self, others: Any) -> tuple[TangentData, Callable[[slice], list[Hypothesis]]]:
+        """Rows of the campaign around the places, and what may change among some of robot, tool and devices.
 
         MeasurementError for devices that have no place.
         """
@@ -124,8 +124,8 @@ class Around:
         whole = joined_tables([anchors, others])
         placed, data = self.placed.beside(whole, self.data)
         index = torch.arange(len(anchors), len(whole), device=HOST)
-        rows = data.rows(index)
-        return rows, lambda: changes_of(rows, placed.placement.hypotheses(data, CHANGE), index)
+        rows, devices = data.rows(index), cache(lambda: placed.placement.hypotheses(data, CHANGE))
+        return rows, lambda some: changes_of(rows.rows(_numbers(some.start, some.stop)), devices(), index[some])
 
     def noise(self, data: TangentData) -> Tensor:
         """(N, R, R) of what rows tell, m^2."""
@@ -316,7 +316,10 @@ class CampaignModel:
         return order, (3 * lowered).clamp(min=0).sqrt().tolist()
 
     def judge(self, table: Any, verdicts: list[Verdict], lines: Sequence[int]) -> None:
-        """Judge the last row of a table, add its verdict, and learn from it if it is accepted.
+        """Judge the rows of a table after those with a verdict, add theirs, and learn from those that are accepted.
+
+        It ends before another row than the first that does not fit or shows a change: one by one they would all have
+        the same verdicts.
 
         Args:
             lines: of all rows, see :attr:`Verdict.line`.
@@ -324,72 +327,76 @@ class CampaignModel:
         Raises:
             MeasurementError: a device that is not known.
         """
-        row = len(table) - 1
-        window = [*self.window[int(len(self.window) > gates.WINDOW) :], row]
+        first, before = len(verdicts), len(self.window)
+        window = [*self.window, *range(first, len(table))]
         data, changes = self.around.rows(table.rows(window))
-        own, numbers, noise = (
-            data.rows(_number(len(window) - 1)),
-            data.numbers(self.around.scales),
-            self.around.noise(data),
+        numbers, noise = data.numbers(self.around.scales), self.around.noise(data)
+        new = self.process.features(numbers.rows(_numbers(before, len(window))).at)
+        near, far = (one.by_fields_with(new) for one in (self._at, self._target))
+        at, cross = self._at.followed_by(new, near), torch.cat([self._cross, far.T])
+        accepted = [verdicts[row].accepted for row in self.window] + [True] * (len(window) - before)
+        seen = InOrder.of(Seen.of(self.process, numbers, noise, at), _flags(accepted))
+        expected = self._expected_errors(seen, cross + at.unknown.T @ self._target.unknown)
+        for number in range(before, len(window)):
+            row, single, typical = window[number], seen.rows(number, number + 1), self.typical
+            found = single.measure(_freedom(data.rows(_numbers(number, number + 1))))
+            fits = found.fits(typical)
+            if number > before and not fits:
+                break
+            cause = (
+                ""
+                if fits
+                else self._cause(table.rows(slice(0, row + 1)), data.rows(_numbers(number, number + 1)), single)
+            )
+            verdict = Verdict(row, fits, fits, found.error, found.expected, cause, line=lines[row])
+            last = slice(max(0, number - gates.WINDOW), number + 1)
+            some, change = [*(verdicts[row] for row in window[last][:-1]), verdict], None
+            if not cause:
+                flags = _flags([one.accepted for one in some]), _flags([not one.cause for one in some])
+                how: Any = {"single": found, "typical": typical, "coordinates": data.y.shape[1]}
+                change = find_change(seen.rows(last.start, last.stop), window[last], changes(last), flags, **how)
+            if number > before and change is not None:
+                break
+            if fits:
+                self.ratios.append(found.square / chi2_above(1.0 - gates.TYPICAL_SHARE, found.freedom))
+            shown = self.around.placed.shown(table.rows([row]).parts[0])
+            verdicts.append(replace(verdict, shown=shown, expected_error=expected[number]))
+            if change is not None:
+                _change(verdicts, window[last], change, lines)
+            if change is not None or not fits:
+                break
+        self.window, self.numbers, self.noise, self._at, self._cross = (
+            window[: before + len(verdicts) - first],
+            numbers,
+            noise,
+            at,
+            cross,
         )
-        last = numbers.rows(_number(len(window) - 1))
-        at = self.process.features(last.at)
-        near, far = (one.by_fields_with(at) for one in (self._at, self._target))
-        single = Seen.of(self.now, last, noise[-1:], self.now.features(last.at, at, self.numbers.there(near)))
-        if len(self.window) > gates.WINDOW:
-            at, near, far = self._without_oldest(verdicts[self.window[0]].accepted, at, near, far)
-        self.window, self.numbers, self.noise = window, numbers, noise
-        self._at, self._cross = self._at.followed_by(at, near), torch.cat([self._cross, far.T])
-        found, typical = single.measure(_freedom(own)), self.typical
-        fits = found.fits(typical)
-        if fits:
-            self.ratios.append(found.square / chi2_above(1.0 - gates.TYPICAL_SHARE, found.freedom))
-        cause = "" if fits else self._cause(table, own, single)
-        shown = self.around.placed.shown(table.rows([row]).parts[0])
-        verdicts.append(Verdict(row, fits, fits, found.error, found.expected, cause, shown=shown, line=lines[row]))
-        some, change = [verdicts[number] for number in window], None
-        flags = _flags([one.accepted for one in some]), _flags([not one.cause for one in some])
-        how: Any = {"single": found, "typical": typical, "coordinates": data.y.shape[1]}
-        if not cause:
-            seen = Seen.of(self.process, numbers, noise, self._at)
-            change = find_change(seen, window, changes(), flags, **how)
-        if change is not None:
-            known = verdicts[window[0]].change
-            if known is not None and change.row == window[0]:  # it is older than these rows
-                change = replace(change, row=known.row)
-            change = replace(change, line=lines[change.row])
-            for number in window:
-                one, before = verdicts[number], number < change.row
-                if one.change is not None or not (before or one.cause or one.decided):
-                    accepted = before and bool(one.fits)
-                    verdicts[number] = replace(one, accepted=accepted, change=None if before else change)
+        self._let_go(verdicts)
         self._learn(verdicts)
 
-    def _without_oldest(
-        self, accepted: bool, at: Features, near: Tensor, far: Tensor
-    ) -> tuple[Features, Tensor, Tensor]:
-        """Take the oldest of the last rows from these, and into what is known by all others if it was accepted.
+    def _expected_errors(self, seen: InOrder, cross: Tensor) -> list[float]:
+        """RMS error over the target after each of some rows, m, whose numbers have a covariance (N R, T r) with it."""
+        compared = self.around.errors[1]
+        white = torch.linalg.solve_triangular(seen.root, seen.seen.numbers.there(cross) @ compared, upper=False)
+        lowered = white.square().sum(1).cumsum(0)[seen.ends(seen.seen.numbers.shape[0]) - 1] / len(compared)
+        variance = self.around.covariance(self._target).diagonal().mean() - lowered
+        return (3 * variance).clamp(min=0).sqrt().tolist()
 
-        Args:
-            at: features of a new row. near, far: its covariance by the fields with the last rows, and with the target.
-
-        Returns:
-            The same, given that row; of ``near`` without it.
-        """
-        size = self.numbers.shape[1]
-        if accepted:
-            oldest, before = self.numbers.rows(_number(0)), (self._at, self._target, at)
-            process = self.process.given(oldest, self.noise[:1], self._at.rows(_number(0)))
-            blocks = self._at.by_fields[:size], self._cross[:size], near[:size]
-            self._at, self._target, at = (
-                process.features(one.at, one, oldest.there(block)) for one, block in zip(before, blocks, strict=True)
-            )
-            last, target, new = (one.known[self.process.size :] for one in (self._at, self._target, at))
-            near, far, self._cross = near - last.T @ new, far - target.T @ new, self._cross - last.T @ target
-            self.process = process
-        self._at = self._at.rows(torch.arange(1, self.numbers.shape[0], device=HOST))
-        self._cross = self._cross[size:]
-        return at, near[size:], far
+    def _let_go(self, verdicts: Sequence[Verdict]) -> None:
+        """Keep as many of the last rows as are looked at together; those of the others that are accepted are known."""
+        size, count = self.numbers.shape[1], max(0, len(self.window) - gates.WINDOW - 1)
+        gone, kept = (self.window[:count], _numbers(count, len(self.window)))
+        rows = _flags([verdicts[row].accepted for row in gone]).nonzero()[:, 0]
+        if len(rows):
+            at = (rows[:, None] * size + torch.arange(size, device=HOST)).flatten()
+            oldest, before = self.numbers.rows(rows), self.process.size
+            self.process = self.process.given(oldest, self.noise[rows], self._at.rows(rows))
+            blocks = (self._at, self._at.by_fields[at]), (self._target, self._cross[at])
+            self._at, self._target = (self.process.features(one.at, one, oldest.there(own)) for one, own in blocks)
+            self._cross = self._cross - self._at.known[before:].T @ self._target.known[before:]
+        self.window, self.numbers, self.noise = self.window[count:], self.numbers.rows(kept), self.noise[kept]
+        self._at, self._cross = self._at.rows(kept), self._cross[count * size : (count + len(kept)) * size]
 
     def _learn(self, verdicts: Sequence[Verdict]) -> None:
         """What is known now. Of the last rows those not accepted tell nothing."""
@@ -438,7 +445,7 @@ class CampaignModel:
         copies = table.rows([len(table) - 1] * len(joints))
         others = self.around.rows(with_joints(copies, torch.stack([*joints.values()])))[0]
         for number, words in enumerate(joints):
-            yield words, self._seen(others.rows(_number(number)))
+            yield words, self._seen(others.rows(_numbers(number, number + 1)))
 
 
 def with_joints(table: Any, q: Tensor) -> Any:
@@ -450,8 +457,21 @@ def _flags(values: Sequence[bool]) -> Tensor:
     return torch.tensor(values, dtype=torch.bool, device=HOST)
 
 
-def _number(row: int) -> Tensor:
-    return torch.tensor([row], dtype=torch.int64, device=HOST)
+def _numbers(first: int, last: int) -> Tensor:
+    return torch.arange(first, last, device=HOST)
+
+
+def _change(verdicts: list[Verdict], window: Sequence[int], change: Change, lines: Sequence[int]) -> None:
+    """Take rows out that came after a change, and those before it in again that an earlier one had taken out."""
+    known = verdicts[window[0]].change
+    if known is not None and change.row == window[0]:  # it is older than these rows
+        change = replace(change, row=known.row)
+    change = replace(change, line=lines[change.row])
+    for number in window:
+        one, before = verdicts[number], number < change.row
+        if one.change is not None or not (before or one.cause or one.decided):
+            accepted = before and bool(one.fits)
+            verdicts[number] = replace(one, accepted=accepted, change=None if before else change)
 
 
 def _freedom(data: TangentData) -> int:

@@ -24,6 +24,7 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.quantiles import chi2_above, chi2_probability
 from diffeo_calib.maps.linearisation import Numbers
+from diffeo_calib.maps.noise import HIDDEN_VARIANCE
 from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.regression.conditional import Features, Process
 from diffeo_calib.sensors.devices import Hypothesis
@@ -140,6 +141,39 @@ class Seen(NamedTuple):
         square = float(self.error @ torch.linalg.solve(self.covariance, self.error))
         expected = float(self.covariance.diagonal().mean().clamp(min=0).sqrt())
         return Measure(square, freedom, float(self.error.square().mean().sqrt()), expected)
+
+
+class InOrder(NamedTuple):
+    """Rows one after the other, each as those before it predict it that are accepted.
+
+    Args:
+        seen: all of them, as those before all of them predict them. root: lower Cholesky factor of their covariance, in
+            which those that are not accepted tell nothing. white: root^-1 error.
+    """
+
+    seen: Seen
+    root: Tensor
+    white: Tensor
+
+    @classmethod
+    def of(cls, seen: Seen, accepted: Tensor) -> InOrder:
+        """By which of the rows are accepted, (N,) boolean."""
+        hidden = HIDDEN_VARIANCE * (~accepted[seen.numbers.owner]).to(seen.error)
+        root = torch.linalg.cholesky(seen.covariance + torch.diag(hidden))
+        return cls(seen, root, torch.linalg.solve_triangular(root, seen.error[:, None], upper=False)[:, 0])
+
+    def ends(self, count: int) -> Tensor:
+        """(count,) how many numbers the first rows have, one of them, two, ..."""
+        owner = self.seen.numbers.owner
+        return torch.searchsorted(owner, torch.arange(1, count + 1, device=owner.device))
+
+    def rows(self, first: int, last: int) -> Seen:
+        """Rows from the first to before the last, as accepted ones before the first predict them."""
+        index = torch.arange(first, last, device=self.root.device)
+        start, end = (int(self.ends(count)[-1]) if count else 0 for count in (first, last))
+        own, before = slice(start, end), self.root[start:end, :start]
+        error = self.seen.error[own] - before @ self.white[:start]
+        return Seen(self.seen.numbers.rows(index), error, self.seen.covariance[own, own] - before @ before.T)
 
 
 def find_change(

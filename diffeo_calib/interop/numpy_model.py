@@ -127,9 +127,9 @@ class NumpyKinematics:
 
     def _at(self, tip: str | None, frame: str) -> Program:
         check_frame(frame)
-        if tip not in (*self.program.tips, None) or (tip is None and len(self.program.tips) > 1):
-            fix = f"pass one of {', '.join(self.program.tips)}"
-            raise InputError.of("`tip`", expected="the name of a tip", got=tip, fix=fix)
+        tips = self.program.chain.nominal.tips
+        if tip not in (*tips, None) or (tip is None and len(tips) > 1):
+            raise InputError.of("`tip`", expected="the name of a tip", got=tip, fix=f"pass one of {', '.join(tips)}")
         return self.program if tip is None else self.program.at(tip)
 
     def _tool(self, tool: object) -> Array:
@@ -215,4 +215,4 @@ def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
     flows = [recorded_flow(k, stages, *tableau) for k, stages in zip(kernels, (joint, task), strict=True)]
     seen = arrays.get("registration_markers", tool + shifts)
     at = on if len(seen) == len(tool) else [on[0]] * len(seen)
-    return Program(flows[0], k0, flows[1], seen, tuple(at), chain.tips)
+    return Program(flows[0], k0, flows[1], seen, tuple(at))

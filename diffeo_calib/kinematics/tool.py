@@ -230,8 +230,8 @@ def _program(deformation: Deformation) -> Program | None:
     chain = calibrated_chain(geometry.chain.arrays, *parts, geometry.markers, elastic=elastic, **nominal.own._asdict())
     joint, task = (_recorded(flow, deformation.integrator) for flow in flows)
     points = geometry.absorb(nominal.split(theta)[0].detach().cpu()).tool if other is None else other.points
-    tips, on = geometry.chain.tips, geometry.on if other is None else other.map.geometry.on
-    return Program(joint, chain, task, _array(points), tuple(map(tips.index, on)), tips)
+    on = geometry.on if other is None else other.map.geometry.on
+    return Program(joint, chain, task, _array(points), tuple(map(geometry.chain.tips.index, on)))
 
 
 def _recorded(flow: Flow, integrator: RungeKutta) -> RecordedFlow:

@@ -143,6 +143,23 @@ def test_a_moved_device_and_a_joint_are_named_and_their_rows_taken_out(
     assert change.unit == "mrad"
 
 
+def test_rows_together_have_the_verdicts_of_single_ones(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
+    """With a wrong row among them. Of a large table few models are made."""
+    q, y = (part[ROWS : ROWS + 5].clone() for part in measured)
+    y[2] += 5 * MM
+    campaign, verdicts = after(running, q, y)
+    other: Any = copy.deepcopy(running)
+    for row, one in enumerate(verdicts):
+        (single,) = other.add(q[row], y[row])
+        assert (one.fits, one.accepted, one.cause) == (row != 2, row != 2, single.cause)
+        found, expected = ((each.error, each.expected, each.expected_error) for each in (one, single))
+        assert found == pytest.approx(expected, rel=1e-8)
+    assert campaign.expected_error == pytest.approx(other.expected_error, rel=1e-8)
+    assert other._due == 30
+    other._waiting = 1000 - len(other.accepted)
+    assert other._due == 62.5
+
+
 def test_the_next_poses_help_more_than_any_others(running: dc.Campaign) -> None:
     found: Any = running.next(3, goal=1e-9)
     assert (len(found.q), found.needed) == (3, None)

@@ -284,7 +284,10 @@ def test_bad_input(arm: Case) -> None:
     data = seen(arm, slice(0, 8), transform(17))
     model, names, directions = arm.model, arm.robot.joint_names, "is not the same in all directions"
     two = dc.Measurements(data.q, data.points.repeat(1, 2, 1))
+    still, large = (dc.Measurements(data.q, factor * data.points, doubt=False) for factor in (1e-9, 1e7))
     refused(
+        (r"no place of .* explains these rows: expected at most 0\..* check that", lambda: model.registered(still)),
+        (r"no place of .* explains these rows: expected at most 1\d", lambda: model.registered(large)),
         (r"`measurements`: expected dc.Measurements, got Tensor", lambda: model.registered(data.q)),  # pyright: ignore[reportArgumentType]
         (r"`free`: expected 'both' or 'base' or 'marker', got 'tool'", lambda: model.registered(data, free="tool")),
         ("`marker_std`, in m: expected a number above 0", lambda: model.registered(data, marker_std=0.0)),

@@ -27,6 +27,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few, sentence, warn_user
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.evaluation import LARGEST_ERROR_PER_REACH
 from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.registered_map import (
     HARDLY,
@@ -59,6 +60,8 @@ UNMOVED_LOG_ODDS = log(10.0)
 """Before the rows are seen: markers that nobody names as moved have not been touched."""
 MOST_ROWS = 200
 """Of more rows, so many evenly spaced ones take part."""
+BEYOND_REACH = 10.0
+"""Distance of rows from their middle, in reaches of the robot or m, from which their unit is wrong."""
 LARGEST_OUTLIER_PART = 0.34
 """Largest part of the rows that are taken for outliers."""
 NEGLIGIBLE_PROBABILITY = 0.01
@@ -102,6 +105,7 @@ def find_place(
         check_number(marker_std, "`marker_std`, in m", above=0.0)
     evenly = [round(k * (len(data) - 1) / (MOST_ROWS - 1)) for k in range(MOST_ROWS)]
     some = data if len(data) <= MOST_ROWS else data.rows(evenly)
+    spread = _refuse_others(some.points - some.points.nanmean((0, 1)), BEYOND_REACH * max(chain.reach, 1.0))
     search = Search.of(model, lever, some, free, ball=ball)
     priors = {name: first for name, (first, _) in MARKER_DEVIATIONS.items() if search.known or name == "other"}
     priors = priors if marker_std is None else {"stated": marker_std}
@@ -128,6 +132,8 @@ def find_place(
         outliers += kept[worst].tolist()
         stay = kept.new_tensor([row for row in range(len(kept)) if row not in worst])
         kept, found = kept[stay], {name: rows.kept(stay).settled() for name, rows in found.items()}
+    most = max(LARGEST_ERROR_PER_REACH * chain.reach, gates.REGISTERED_RESIDUAL * spread)
+    _refuse_others(best.given.shown(best.given.residual).unflatten(1, (-1, 3)), most)
     if opens and (beside := opened(best, some.rows(kept))) is not best:
         best = beside.settled()
     said = {
@@ -264,6 +270,16 @@ def _check_enough(data: Measurements, *, framed: bool, known: bool) -> None:
     if len(data) < least:
         what, fix = "these rows do not determine where everything is", "measure 6 to 10 poses"
         raise MeasurementError.of(what, expected=f"at least {least} rows", got=len(data), fix=fix)
+
+
+def _refuse_others(away: Tensor, most: float) -> float:
+    """Typical length of vectors (N, P, 3), m; MeasurementError if those of no calibrated robot are as long."""
+    typical = float(away.norm(dim=-1).nanmedian())
+    if typical > most:
+        what, fix = "no place of device and markers explains these rows", "check that they are of this robot, `length`"
+        fix += " and `angle`, and the order of the columns"
+        raise MeasurementError.of(what, expected=f"at most {most:.3g} m", got=f"a median of {typical:.3g} m", fix=fix)
+    return typical
 
 
 PRIOR_FREEDOM = 10.0

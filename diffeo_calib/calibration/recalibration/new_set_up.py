@@ -191,7 +191,7 @@ def _place_of_device(
         return old.geodesic.with_nominal(robot_map(old).under(rows.payload))(rows.q).detach().unflatten(1, (-1, 3))
 
     largest = device.largest_session()
-    check_size(predicted(largest), largest.points)
+    check_unit(predicted(largest), largest.points)
     rows, found = find_place(old, lever, largest, marker_std=marker_std, opens=opens)
     ratio = size_ratio(*(each.unflatten(1, (-1, 3)) for each in (rows.points, rows.given.shown(rows.y))))
     if abs(ratio - 1.0) > USUAL_RATIO:
@@ -273,21 +273,16 @@ def check_other_table(model: CalibratedKinematics, new: Any) -> None:
             raise InputError.of(what, fix="pass rows that were measured later")
 
 
-def check_size(predicted: Tensor, measured: Tensor) -> None:
-    """Doubt the length unit of rows: points (M, P, 3) by the old model, m, and measured ones.
-
-    Raises:
-        MeasurementError: lengths that fit in the other unit.
-    """
+def check_unit(predicted: Tensor, measured: Tensor) -> None:
+    """Raise MeasurementError where measured points (M, P, 3), m, are those of the old model in another unit."""
     ratio = size_ratio(predicted, measured)
-    if 1 / LARGEST_RATIO < ratio < LARGEST_RATIO:
-        return
-    what, expected = "the new rows do not have the robot's size", "distances between rows as the model predicts them"
-    fix = "check `length` and `angle`, and the order of the columns"
-    text = sentence(what, expected=expected, got=f"{ratio:.3g} times these", fix=fix)
-    if in_other_unit(ratio, OTHER_UNIT):
-        raise MeasurementError(text)
-    warn_user(text)
+    if not 1 / LARGEST_RATIO < ratio < LARGEST_RATIO and in_other_unit(ratio, OTHER_UNIT):
+        what, expected = (
+            "the new rows do not have the robot's size",
+            "distances between rows as the model predicts them",
+        )
+        fix = "check `length` and `angle`, and the order of the columns"
+        raise MeasurementError.of(what, expected=expected, got=f"{ratio:.3g} times these", fix=fix)
 
 
 def size_ratio(predicted: Tensor, measured: Tensor) -> float:

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.outliers import Outlier
 from diffeo_calib.calibration.diagnostics.row_order import common_cause
-from diffeo_calib.calibration.expected_errors import expected_errors
-from diffeo_calib.calibration.judgement import Accuracy, accuracy, judge
+from diffeo_calib.calibration.expected_errors import Accuracy, accuracy, expected_errors, judge
 from diffeo_calib.calibration.result import Part, parts
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
