@@ -209,13 +209,8 @@ class TangentData:
         rows = order[:count].sort().values.to(self.x.device)
         return rows, self.rows(rows)
 
-    @property
-    def good(self) -> TangentData:
-        """Leave out what is more likely gross: by its weights it would hold the noise where it was."""
-        return self.trusted(0.5) if self.tails.gross else self
-
     def trusted(self, least: float) -> TangentData:
-        """Leave out what has smaller weights."""
+        """Leave out what has smaller weights: by these it would hold the noise where it was."""
         small = (self.tails.weights < least).repeat_interleave(self.noise_model.size, 1)
         return self._variant(noise_model=replace(self.noise_model, visible=self.visible & ~small))
 
