@@ -24,8 +24,6 @@ from diffeo_calib.calibration.identification.identification import (
     ReadRows,
     Rows,
     described,
-    estimated,
-    held_parameters,
     solve,
 )
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
@@ -218,20 +216,3 @@ def reading_sets(
     """Sets of devices and the rows that they measured; ``frame``: that of the devices, in words."""
     each = zip(readings, devices, strict=True)
     return tuple(ReadingDevices(own, table, frame).measuring(rows, own.numbers(table)) for (table, rows), own in each)
-
-
-def check_known(tables: Sequence[Readings], registration: Identification, found: Identification) -> None:
-    """Test what was said to be known of devices by a geometric calibration that leaves it open.
-
-    Args:
-        tables: readings. registration: theirs. found: their geometric calibration.
-    """
-    freed = [devices.freed() for devices in registration.devices]
-    if all(devices is None for devices in freed):
-        return
-    each = zip(tables, registration.devices, freed, strict=True)
-    parts = tuple(ReadRows(data, own if free is None else free) for data, own, free in each)
-    held = held_parameters(registration.geometry, adrift=True)
-    again = estimated(Rows(registration.geometry, parts), held, Prior())
-    for devices in again.devices:
-        devices.check_freed(found.noise, again.noise)
