@@ -119,7 +119,7 @@ ROUNDING = 1e-6
 """Of limits in files, rad or m."""
 MOST = 10_000_000
 CONFIGURATIONS_AT_ONCE = 4096
-"""Configurations that are drawn together, at most: to sockets four times as many as are asked for are brought."""
+"""Configurations that are drawn together, at most: for sockets four times as many as are asked for at first."""
 FIRST_DRAWS = 100_000
 REACHING_STEPS, LARGEST_STEP, REACHING_DAMPING_M = 25, 0.5, 0.01
 """Damped Gauss-Newton steps that bring a ball to its place, the longest of a joint [rad or m], and their damping."""
@@ -185,12 +185,9 @@ def candidates(
     generator, found = seeded(check_seed(seed)), [lower.new_empty(0, robot.n)]
     seen = dict.fromkeys(criteria, 0)
     passed = dict.fromkeys(criteria, 0)
-    drawn, accepted, together = (
-        0,
-        0,
-        CONFIGURATIONS_AT_ONCE if places is None else min(CONFIGURATIONS_AT_ONCE, 4 * count),
-    )
+    drawn, accepted, together = 0, 0, CONFIGURATIONS_AT_ONCE if places is None else count
     while accepted < count:
+        together = min(CONFIGURATIONS_AT_ONCE, 4 * together)
         q = torch.rand(together, robot.n, dtype=torch.float64, device=HOST, generator=generator)
         q = lower + (upper - lower) * q
         if places is not None:
