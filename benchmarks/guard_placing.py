@@ -26,7 +26,6 @@ import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from functools import partial
 from math import pi
 from multiprocessing import get_context
 from typing import Any
@@ -181,16 +180,7 @@ def measure(plan: Any) -> Iterator[Record]:
             }
 
 
-def run() -> None:
-    """Parse the command line and measure."""
-    parser = harness.parser(__doc__)
-    parser.add_argument("--count", type=harness.count, default=1000, metavar="N", help="placements of every kind")
-    parser.add_argument("--jobs", type=harness.count, default=1, metavar="N", help="processes")
-    parser.add_argument("--cases", nargs="+", default=list(CASES), choices=CASES)
-    plan = parser.parse_args()
-    columns = ("case", "rows", "placements", "right", "refused", "wrong", "seconds")
-    harness.guarded(partial(harness.report, measure(plan), plan.out, columns))  # pyright: ignore[reportArgumentType]
-
-
 if __name__ == "__main__":
-    run()
+    count, jobs = harness.number(1000, "placements of every kind"), harness.number(1, "processes")
+    columns = ("case", "rows", "placements", "right", "refused", "wrong", "seconds")
+    harness.run(__doc__, measure, columns, count=count, jobs=jobs, cases=harness.names(CASES))

@@ -50,20 +50,52 @@ def count(text: str) -> int:
     return value
 
 
-def run(description: str | None, measure: Callable[[bool], Iterable[Record]], columns: Sequence[str] = ()) -> None:
-    """Run a benchmark that adds no options: parse the arguments, measure, report.
+Option = Mapping[str, object]
+"""Keyword arguments of :meth:`argparse.ArgumentParser.add_argument`."""
+DATA: Option = {"type": Path, "metavar": "FOLDER", "help": "folder of data sets; default: $DIFFEO_CALIB_DATA"}
+
+
+def number(default: int | None, text: str | None = None) -> Option:
+    """Describe an option with one number, of at least one."""
+    return {"type": count, "default": default, "metavar": "N", "help": text}
+
+
+def numbers(default: Sequence[int], text: str | None = None) -> Option:
+    """Describe an option with several numbers."""
+    return {**number(None, text), "nargs": "+", "default": list(default)}
+
+
+def names(choices: Iterable[str], default: Iterable[str] | None = None, text: str | None = None) -> Option:
+    """Describe an option with several of some names, by default all of them."""
+    every = list(choices)
+    chosen = every if default is None else list(default)
+    return {"nargs": "+", "choices": every, "default": chosen, "metavar": "NAME", "help": text or ", ".join(every)}
+
+
+def run(
+    description: str | None,
+    measure: Callable[[argparse.Namespace], Iterable[Record]],
+    columns: Sequence[str] = (),
+    *,
+    quick: Mapping[str, object] | None = None,
+    **options: Option,
+) -> None:
+    """Run a benchmark: parse the arguments, measure, report.
 
     Args:
         description: the program's docstring; its first line is the help text.
-        measure: called with `quick`; yields the records.
+        measure: called with the arguments; yields the records.
         columns: fields of the records to print; by default all of the first record.
+        quick: values of the options with `--quick`.
+        options: by their names, with underscores.
     """
-    arguments = parser(description).parse_args()
-
-    def program() -> None:
-        report(measure(arguments.quick), arguments.out, columns)
-
-    guarded(program)
+    arguments = parser(description)
+    for name, option in options.items():
+        arguments.add_argument(f"--{name.replace('_', '-')}", **option)  # pyright: ignore[reportArgumentType]
+    plan = arguments.parse_args()
+    if plan.quick:
+        vars(plan).update(quick or {})
+    guarded(lambda: report(measure(plan), plan.out, columns))
 
 
 def report(records: Iterable[Record], out: Path | None, columns: Sequence[str] = ()) -> list[Record]:
@@ -109,7 +141,7 @@ def earlier(paths: Sequence[Path], key: Sequence[str]) -> list[Record]:
     return list(records.values())
 
 
-def guarded(program: Callable[[], None]) -> None:
+def guarded(program: Callable[[], object]) -> None:
     """Run; an error that the user can correct prints one sentence and exits with code 1."""
     try:
         program()

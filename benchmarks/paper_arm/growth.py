@@ -82,4 +82,4 @@ def measure(quick: bool) -> Iterator[Record]:
 
 
 if __name__ == "__main__":
-    harness.run(__doc__, measure)
+    harness.run(__doc__, lambda plan: measure(plan.quick))

@@ -112,24 +112,8 @@ def compared(robot: RobotData, train: dc.Measurements, test: dc.Measurements, co
         yield record | {"stage": "full", "seconds": seconds} | judged(result.model, test)
 
 
-def arguments() -> Namespace:
-    """Parse the command line."""
-    parser = harness.parser(__doc__)
-    parser.add_argument("--data", type=Path, metavar="FOLDER", help="folder of data sets; default: $DIFFEO_CALIB_DATA")
-    parser.add_argument("--robot", default="ipa_ur10", metavar="NAME")
-    parser.add_argument("--seeds", type=harness.count, default=1, metavar="N")
-    parser.add_argument("--rows", nargs="+", type=harness.count, default=[150, 1000], metavar="N")
-    plan = parser.parse_args()
-    if plan.quick:
-        plan.seeds, plan.rows = 1, [60]
-    return plan
-
-
-def run(plan: Namespace) -> None:
-    """Measure."""
-    warnings.simplefilter("ignore")
-    harness.report(measure(plan), plan.out, COLUMNS)
-
-
 if __name__ == "__main__":
-    harness.guarded(lambda: run(arguments()))
+    warnings.simplefilter("ignore")
+    options = {"data": harness.DATA, "robot": {"default": "ipa_ur10", "metavar": "NAME"}}
+    options |= {"seeds": harness.number(1), "rows": harness.numbers([150, 1000])}
+    harness.run(__doc__, measure, COLUMNS, quick={"seeds": 1, "rows": [60]}, **options)

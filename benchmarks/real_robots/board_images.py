@@ -230,22 +230,8 @@ def rigid_rms(points: Tensor, truth: Tensor) -> float:
     return float((points.flatten(0, 1) @ R + t - truth.flatten(0, 1)).square().sum(1).mean().sqrt())
 
 
-def arguments() -> Namespace:
-    """Parse the command line."""
-    parser = harness.parser(__doc__)
-    parser.add_argument("--seeds", type=harness.count, default=3, metavar="N", help="simulated arms")
-    parser.add_argument("--rendered", action="store_true", help="render the images, and find the corners by OpenCV")
-    text = "two fixed cameras, and head and hand"
-    parser.add_argument("--several", action="store_true", help=text)
-    plan = parser.parse_args()
-    plan.seeds = 1 if plan.quick else plan.seeds
-    return plan
-
-
-def run(plan: Namespace) -> None:
-    """Measure."""
-    harness.report(measure(plan), plan.out, COLUMNS)
-
-
 if __name__ == "__main__":
-    harness.guarded(lambda: run(arguments()))
+    rendered = {"action": "store_true", "help": "render the images, and find the corners by OpenCV"}
+    several = {"action": "store_true", "help": "two fixed cameras, and head and hand"}
+    seeds = harness.number(3, "simulated arms")
+    harness.run(__doc__, measure, COLUMNS, quick={"seeds": 1}, seeds=seeds, rendered=rendered, several=several)

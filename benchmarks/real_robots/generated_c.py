@@ -39,7 +39,7 @@ import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.interop import CFiles, write_c
 from diffeo_calib.interop.c_source import array
-from diffeo_calib.kinematics.program import program_of
+from diffeo_calib.kinematics.tool import program_of
 
 ROWS, RUNS, QUICK_RUNS = 20, 500, 3
 FLAGS = ("-std=c99", "-O2")

@@ -92,20 +92,13 @@ def one(
     return judged(model, test) | {"changed": changed, "seconds": time.perf_counter() - begin}
 
 
-def main() -> None:
-    """Parse the arguments and measure."""
-    parser = harness.parser(__doc__)
-    parser.add_argument("--data", type=Path, metavar="FOLDER", help="the folder of measurements")
-    parser.add_argument("--old", nargs="+", default=list(OLD_ROWS), choices=list(OLD_ROWS), help="series of old models")
-    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS, help="which methods")
-    parser.add_argument("--seeds", type=harness.count, default=3, metavar="N", help="sets of rows")
-    arguments = parser.parse_args()
-
-    def program() -> None:
-        harness.report(measure(arguments), arguments.out, COLUMNS)
-
-    harness.guarded(program)
-
-
 if __name__ == "__main__":
-    main()
+    harness.run(
+        __doc__,
+        measure,
+        COLUMNS,
+        data=harness.DATA,
+        old=harness.names(OLD_ROWS, text="series of old models"),
+        methods=harness.names(METHODS),
+        seeds=harness.number(3, "sets of rows"),
+    )

@@ -102,21 +102,7 @@ def board_error(mean: torch.Tensor, test: dc.Measurements, middle: Sequence[floa
     return 1e3 * float((places[0] - places[1]).square().sum(1).mean().sqrt())
 
 
-def arguments() -> Namespace:
-    """Parse the command line."""
-    parser = harness.parser(__doc__)
-    parser.add_argument("--data", type=Path, metavar="FOLDER", help="folder of data sets; default: $DIFFEO_CALIB_DATA")
-    parser.add_argument("--seeds", type=harness.count, default=3, metavar="N", help="simulated arms")
-    plan = parser.parse_args()
-    plan.seeds = 1 if plan.quick else plan.seeds
-    return plan
-
-
-def run(plan: Namespace) -> None:
-    """Measure."""
-    warnings.simplefilter("ignore")
-    harness.report(measure(plan), plan.out, COLUMNS)
-
-
 if __name__ == "__main__":
-    harness.guarded(lambda: run(arguments()))
+    warnings.simplefilter("ignore")
+    seeds = harness.number(3, "simulated arms")
+    harness.run(__doc__, measure, COLUMNS, quick={"seeds": 1}, data=harness.DATA, seeds=seeds)

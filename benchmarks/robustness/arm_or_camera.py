@@ -95,16 +95,6 @@ def measure(plan: Namespace) -> Iterator[Record]:
             yield record | {"true_mm": 1e3 * true, "expected_mm": 1e3 * result.expected.measured}
 
 
-def arguments() -> Namespace:
-    """Parse the command line."""
-    parser = harness.parser(__doc__)
-    parser.add_argument("--seeds", type=harness.count, default=20, metavar="N")
-    parser.add_argument("--only", nargs="+", metavar="CASE")
-    plan = parser.parse_args()
-    plan.seeds = 1 if plan.quick else plan.seeds
-    return plan
-
-
 if __name__ == "__main__":
-    plan = arguments()
-    harness.guarded(lambda: harness.report(measure(plan), plan.out, COLUMNS))
+    only = {"nargs": "+", "metavar": "CASE"}
+    harness.run(__doc__, measure, COLUMNS, quick={"seeds": 1}, seeds=harness.number(20), only=only)

@@ -170,4 +170,4 @@ def _model(rows: int) -> tuple[dc.CalibratedKinematics, torch.Tensor]:
 
 
 if __name__ == "__main__":
-    harness.run(__doc__, measure)
+    harness.run(__doc__, lambda plan: measure(plan.quick))

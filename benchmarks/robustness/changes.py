@@ -74,19 +74,7 @@ def measure(arguments: argparse.Namespace) -> Iterator[Record]:
             yield {"case": case, "rows": rows} | measured(model, *known[case], rows, sets)
 
 
-def main() -> None:
-    """Parse the arguments and measure."""
-    parser = harness.parser(__doc__)
-    parser.add_argument("--seeds", type=harness.count, default=50, metavar="N", help="sets of rows of each case")
-    parser.add_argument("--rows", type=harness.count, nargs="+", default=list(SIZES), metavar="N")
-    parser.add_argument("--cases", nargs="+", default=None, metavar="CASE", help="which cases; all by default")
-    arguments = parser.parse_args()
-
-    def program() -> None:
-        harness.report(measure(arguments), arguments.out, COLUMNS)
-
-    harness.guarded(program)
-
-
 if __name__ == "__main__":
-    main()
+    which = {"nargs": "+", "metavar": "CASE", "help": "which cases; all by default"}
+    seeds, rows = harness.number(50, "sets of rows of each case"), harness.numbers(SIZES)
+    harness.run(__doc__, measure, COLUMNS, seeds=seeds, rows=rows, cases=which)

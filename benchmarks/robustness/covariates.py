@@ -241,19 +241,7 @@ def measure(arguments: argparse.Namespace) -> Iterator[Record]:
                 yield from real(series, seeds, arguments.data)
 
 
-def main() -> None:
-    """Parse the arguments and measure."""
-    parser = harness.parser(__doc__)
-    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), metavar="CASE")
-    parser.add_argument("--seeds", type=harness.count, default=3, metavar="N", help="random splits, or arms")
-    parser.add_argument("--data", type=Path, default=None, metavar="FOLDER", help="measured robots")
-    arguments = parser.parse_args()
-    harness.guarded(lambda: _report(arguments))
-
-
-def _report(arguments: argparse.Namespace) -> None:
-    harness.report(measure(arguments), arguments.out, COLUMNS)
-
-
 if __name__ == "__main__":
-    main()
+    data = {**harness.DATA, "help": "measured robots"}
+    seeds = harness.number(3, "random splits, or arms")
+    harness.run(__doc__, measure, COLUMNS, cases=harness.names(CASES), seeds=seeds, data=data)

@@ -234,26 +234,12 @@ def measure(plan: Namespace) -> Iterator[Record]:
                         yield from by_positions(name, 1e-3 * noise, seed, plan.rows)
 
 
-def arguments() -> Namespace:
-    """Parse the command line."""
-    parser = harness.parser(__doc__)
-    parser.add_argument("--seeds", type=harness.count, default=3, metavar="N")
-    parser.add_argument("--first", type=int, default=0, metavar="SEED")
-    parser.add_argument("--rows", type=harness.count, default=150, metavar="N")
-    parser.add_argument("--noise", nargs="+", type=float, default=[0.02, 0.1], metavar="MM")
-    parser.add_argument("--cases", nargs="+", default=list(CASES), choices=list(CASES))
-    methods = ["devices", "positions"]
-    parser.add_argument("--methods", nargs="+", default=methods, choices=methods)
-    plan = parser.parse_args()
-    if plan.quick:
-        plan.seeds, plan.noise, plan.cases, plan.methods = 1, [0.02], ["distances to 3 points"], ["devices"]
-    return plan
-
-
-def run(plan: Namespace) -> None:
-    """Measure."""
-    harness.report(measure(plan), plan.out, COLUMNS)
-
-
 if __name__ == "__main__":
-    harness.guarded(lambda: run(arguments()))
+    options = {"seeds": harness.number(3), "rows": harness.number(150), "cases": harness.names(CASES)}
+    options |= {
+        "first": {"type": int, "default": 0, "metavar": "SEED"},
+        "methods": harness.names(["devices", "positions"]),
+    }
+    options["noise"] = {"nargs": "+", "type": float, "default": [0.02, 0.1], "metavar": "MM"}
+    quick = {"seeds": 1, "noise": [0.02], "cases": ["distances to 3 points"], "methods": ["devices"]}
+    harness.run(__doc__, measure, COLUMNS, quick=quick, **options)

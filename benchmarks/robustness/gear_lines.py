@@ -38,9 +38,9 @@ import diffeo_calib as dc
 from diffeo_calib.calibration import choose_scales
 from diffeo_calib.calibration.diagnostics.plausibility import registered
 from diffeo_calib.calibration.identification.identification import identify
-from diffeo_calib.calibration.scales.gear_lines import find_gear_lines
 from diffeo_calib.calibration.scales.leave_one_out import weighed
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
+from diffeo_calib.calibration.scales.position_errors import find_gear_lines
 from diffeo_calib.calibration.scales.selection import defaults, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.kinematics.nominal import GeometryMap
@@ -111,7 +111,7 @@ def drawn(poses: int, draws: int) -> Record:
 @contextmanager
 def no_scan() -> Iterator[None]:
     """Calibrations without gear lines."""
-    scan = choose_scales.gear_lines
+    scan = choose_scales.position_errors
     before, scan.find_gear_lines = scan.find_gear_lines, lambda *_: ()
     try:
         yield
@@ -186,21 +186,14 @@ def records(case: str, sizes: Sequence[int], seeds: int, arguments: argparse.Nam
                 yield from (held_out(poses, urad, seed) for seed in range(seeds))
 
 
-def main() -> None:
-    """Parse the arguments and measure."""
-    parser = harness.parser(__doc__)
-    parser.add_argument("--cases", nargs="+", choices=CASES, default=["lines", "none"], metavar="CASE")
-    parser.add_argument("--seeds", type=harness.count, default=20, metavar="N", help="arms, or draws")
-    parser.add_argument("--poses", type=harness.count, nargs="+", default=list(SIZES), metavar="N")
-    parser.add_argument("--amplitudes", type=float, nargs="+", default=list(AMPLITUDES_URAD), metavar="URAD")
-    parser.add_argument("--data", type=Path, default=None, metavar="FOLDER", help="measured robots")
-    arguments = parser.parse_args()
-    harness.guarded(lambda: _report(arguments))
-
-
-def _report(arguments: argparse.Namespace) -> None:
-    harness.report(measure(arguments), arguments.out, COLUMNS)
-
-
 if __name__ == "__main__":
-    main()
+    harness.run(
+        __doc__,
+        measure,
+        COLUMNS,
+        cases=harness.names(CASES, ["lines", "none"]),
+        seeds=harness.number(20, "arms, or draws"),
+        poses=harness.numbers(SIZES),
+        amplitudes={"type": float, "nargs": "+", "default": list(AMPLITUDES_URAD), "metavar": "URAD"},
+        data={**harness.DATA, "help": "measured robots"},
+    )

@@ -104,23 +104,7 @@ def calibrated(simulated: SimulatedArm | SimulatedUpperBody, robot: Tree, data: 
     return record | {"geometry_mm": rms_mm(geometry), "seconds": seconds}
 
 
-def arguments() -> Namespace:
-    """Parse the command line."""
-    parser = harness.parser(__doc__)
-    parser.add_argument("--arm-rows", type=harness.count, default=100, metavar="N")
-    parser.add_argument("--body-rows", type=harness.count, default=150, metavar="N")
-    parser.add_argument("--seeds", type=harness.count, default=2, metavar="N")
-    plan = parser.parse_args()
-    if plan.quick:
-        plan.arm_rows, plan.body_rows, plan.seeds = 40, 0, 1
-    return plan
-
-
-def run(plan: Namespace) -> None:
-    """Measure."""
-    warnings.simplefilter("ignore")
-    harness.report(measure(plan), plan.out, COLUMNS)
-
-
 if __name__ == "__main__":
-    harness.guarded(lambda: run(arguments()))
+    warnings.simplefilter("ignore")
+    options = {"arm_rows": harness.number(100), "body_rows": harness.number(150), "seeds": harness.number(2)}
+    harness.run(__doc__, measure, COLUMNS, quick={"arm_rows": 40, "body_rows": 0, "seeds": 1}, **options)

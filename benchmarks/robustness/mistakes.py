@@ -454,20 +454,13 @@ def measure(arguments: argparse.Namespace) -> Iterator[Record]:
             yield {"mistake": name, "arm": seed} | judged(arm, MISTAKES[name](arm, rng))
 
 
-def main() -> None:
-    """Parse the arguments and measure."""
-    parser = harness.parser(__doc__)
-    parser.add_argument("--arms", type=harness.count, default=5, metavar="N")
-    parser.add_argument("--clean", type=harness.count, metavar="N", help="measure clean campaigns instead")
-    parser.add_argument("--first", type=int, default=0, metavar="N", help="number of the first arm or campaign")
-    parser.add_argument("--mistakes", nargs="+", metavar="NAME", choices=list(MISTAKES), help="which; all by default")
-    arguments = parser.parse_args()
-
-    def program() -> None:
-        harness.report(measure(arguments), arguments.out, COLUMNS)
-
-    harness.guarded(program)
-
-
 if __name__ == "__main__":
-    main()
+    harness.run(
+        __doc__,
+        measure,
+        COLUMNS,
+        arms=harness.number(5),
+        clean=harness.number(None, "measure clean campaigns instead"),
+        first={"type": int, "default": 0, "metavar": "N", "help": "number of the first arm or campaign"},
+        mistakes={"nargs": "+", "metavar": "NAME", "choices": list(MISTAKES), "help": "which; all by default"},
+    )

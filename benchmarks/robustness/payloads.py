@@ -71,18 +71,6 @@ def measure(arguments: argparse.Namespace) -> Iterator[Record]:
                 yield measured(rows, seed)
 
 
-def main() -> None:
-    """Parse the arguments and measure."""
-    parser = harness.parser(__doc__)
-    parser.add_argument("--rows", type=harness.count, nargs="+", default=[60, 150], metavar="N", help="of a campaign")
-    parser.add_argument("--seeds", type=harness.count, default=5, metavar="N", help="arms")
-    arguments = parser.parse_args()
-    harness.guarded(lambda: _report(arguments))
-
-
-def _report(arguments: argparse.Namespace) -> None:
-    harness.report(measure(arguments), arguments.out, COLUMNS)
-
-
 if __name__ == "__main__":
-    main()
+    rows, seeds = harness.numbers([60, 150], "of a campaign"), harness.number(5, "arms")
+    harness.run(__doc__, measure, COLUMNS, rows=rows, seeds=seeds)

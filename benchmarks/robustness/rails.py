@@ -94,20 +94,8 @@ def measure(arguments: argparse.Namespace) -> Iterator[Record]:
             }
 
 
-def main() -> None:
-    """Parse the arguments and measure."""
-    parser = harness.parser(__doc__)
-    parser.add_argument("--rows", type=harness.count, nargs="+", default=[60, 120, 240, 300], metavar="N")
-    parser.add_argument("--seeds", type=harness.count, default=3, metavar="N", help="arms")
-    parser.add_argument("--shift", type=float, default=3e-4, metavar="M", help="straightness")
-    parser.add_argument("--turn", type=float, default=1e-4, metavar="RAD", help="roll, pitch and yaw")
-    arguments = parser.parse_args()
-    harness.guarded(lambda: _report(arguments))
-
-
-def _report(arguments: argparse.Namespace) -> None:
-    harness.report(measure(arguments), arguments.out, COLUMNS)
-
-
 if __name__ == "__main__":
-    main()
+    shift = {"type": float, "default": 3e-4, "metavar": "M", "help": "straightness"}
+    turn = {"type": float, "default": 1e-4, "metavar": "RAD", "help": "roll, pitch and yaw"}
+    rows, seeds = harness.numbers([60, 120, 240, 300]), harness.number(3, "arms")
+    harness.run(__doc__, measure, COLUMNS, rows=rows, seeds=seeds, shift=shift, turn=turn)

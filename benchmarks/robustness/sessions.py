@@ -84,21 +84,6 @@ def judged(
     yield record | {"rms_mm": 1e3 * float(errors.square().mean().sqrt()), "moved": moved}
 
 
-def arguments() -> Namespace:
-    """Parse the command line."""
-    parser = harness.parser(__doc__)
-    parser.add_argument("--rows", nargs="+", type=harness.count, default=[105, 250], metavar="N")
-    parser.add_argument("--seeds", type=harness.count, default=3, metavar="N")
-    plan = parser.parse_args()
-    if plan.quick:
-        plan.rows, plan.seeds = [105], 1
-    return plan
-
-
-def run(plan: Namespace) -> None:
-    """Measure."""
-    harness.report(measure(plan), plan.out, COLUMNS)
-
-
 if __name__ == "__main__":
-    harness.guarded(lambda: run(arguments()))
+    rows, seeds = harness.numbers([105, 250]), harness.number(3)
+    harness.run(__doc__, measure, COLUMNS, quick={"rows": [105], "seeds": 1}, rows=rows, seeds=seeds)

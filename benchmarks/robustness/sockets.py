@@ -246,24 +246,9 @@ def measure(plan: Namespace) -> Iterator[Record]:
             yield from tried(seed, "places known")
 
 
-def arguments() -> Namespace:
-    """Parse the command line."""
-    parser = harness.parser(__doc__)
-    parser.add_argument("--seeds", type=harness.count, default=3, metavar="N")
-    parser.add_argument("--first", type=int, default=0, metavar="SEED")
-    parser.add_argument("--repeatability", nargs="+", type=float, default=[0.02, 0.05, 0.1], metavar="MM")
-    parts = ["real", "simulated", "advice", "mixtures"]
-    parser.add_argument("--parts", nargs="+", default=parts, choices=parts)
-    plan = parser.parse_args()
-    if plan.quick:
-        plan.seeds, plan.repeatability, plan.parts = 1, [0.05], ["simulated"]
-    return plan
-
-
-def run(plan: Namespace) -> None:
-    """Measure."""
-    harness.report(measure(plan), plan.out, COLUMNS)
-
-
 if __name__ == "__main__":
-    harness.guarded(lambda: run(arguments()))
+    options = {"seeds": harness.number(3), "parts": harness.names(["real", "simulated", "advice", "mixtures"])}
+    options["first"] = {"type": int, "default": 0, "metavar": "SEED"}
+    options["repeatability"] = {"nargs": "+", "type": float, "default": [0.02, 0.05, 0.1], "metavar": "MM"}
+    quick = {"seeds": 1, "repeatability": [0.05], "parts": ["simulated"]}
+    harness.run(__doc__, measure, COLUMNS, quick=quick, **options)

@@ -77,23 +77,7 @@ def positions(model: dc.CalibratedKinematics, q: Tensor) -> tuple[Tensor, Tensor
     return frames[..., :3, 3], covariance[..., :3, :3]
 
 
-def arguments() -> Namespace:
-    """Parse the command line."""
-    parser = harness.parser(__doc__)
-    parser.add_argument("--rows", nargs="+", type=harness.count, default=[150, 350], metavar="N")
-    parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=list(ROBOTS), metavar="NAME")
-    parser.add_argument("--seeds", type=harness.count, default=3, metavar="N")
-    plan = parser.parse_args()
-    if plan.quick:
-        plan.rows, plan.seeds = [60], 1
-    return plan
-
-
-def run(plan: Namespace) -> None:
-    """Measure."""
-    warnings.simplefilter("ignore")
-    harness.report(measure(plan), plan.out, COLUMNS)
-
-
 if __name__ == "__main__":
-    harness.guarded(lambda: run(arguments()))
+    warnings.simplefilter("ignore")
+    options = {"rows": harness.numbers([150, 350]), "robots": harness.names(ROBOTS), "seeds": harness.number(3)}
+    harness.run(__doc__, measure, COLUMNS, quick={"rows": [60], "seeds": 1}, **options)

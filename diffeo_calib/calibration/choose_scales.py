@@ -28,8 +28,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.calibration.scales import gear_lines
-from diffeo_calib.calibration.scales.axis_errors import with_axis_errors
+from diffeo_calib.calibration.scales import position_errors
 from diffeo_calib.calibration.scales.leave_one_out import (
     FEWEST_HALVED,
     LeaveOneOut,
@@ -40,6 +39,7 @@ from diffeo_calib.calibration.scales.leave_one_out import (
     variance_ratio,
     weighed,
 )
+from diffeo_calib.calibration.scales.position_errors import with_axis_errors
 from diffeo_calib.calibration.scales.selection import Selection, defaults, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import InputError, sentence, warn_user
@@ -57,6 +57,8 @@ FEWEST_POSES = 12
 """Different poses below which the data cannot determine the scales: defaults are used."""
 NOISE_SHARE = 0.3
 """Of the registration's residual, which counts as noise where the geometry has more parameters than there are data."""
+DOUBTED_WEIGHT = 0.25
+"""Of a row beside the geometric calibration, below which the first search for scales leaves it out."""
 FEWEST_JUDGED = 30
 """Rows below which leave-one-out errors are too few to judge the scales."""
 VARIANCE_RATIO = 2.5
@@ -138,7 +140,16 @@ def choose_scales(
         warn_user(sentence(f"{count} are too few to select scales: defaults are used", fix=fix))
         found = Selection(centre, f"defaults, since {count} are too few to select them")
     else:
-        found, data = _selected(centre, data, seed, progress)
+        # fields explain gross errors where these weigh as much as beside the geometry, whose errors are larger
+        found = select(centre, data.trusted(DOUBTED_WEIGHT), seed=seed, progress=progress)
+        data = weighed(data, found.scales, seed)
+        again = True
+        while again and not found.interrupted:  # from the start once more where gross errors show only now
+            gross = data.tails.gross
+            start = None if gross else found.scales  # which let the fields explain gross errors
+            found = select(centre, data, start=start, seed=seed, progress=progress)
+            found, data = _supported(found, data, seed)
+            again = data.tails.gross and not gross
         found = replace(found, scales=with_payload_factor(data, found.scales, seed))
         how = {"poses": poses, "lines": measurements.line_numbers, "seed": seed, "progress": progress}
         centre, found, data = _with_position_errors(centre, found, data, **how)
@@ -187,19 +198,6 @@ def noise_of_few(data: TangentData, poses: int, registration: Identification, id
     return max(identification.noise, NOISE_SHARE * registration.noise)
 
 
-def _selected(
-    centre: Hyperparameters, data: TangentData, seed: int, progress: Progress
-) -> tuple[Selection, TangentData]:
-    """Scales by marginal likelihood, and the measurements with the weights that follow."""
-    first = select(centre, data, seed=seed, progress=progress)
-    data = weighed(data, first.scales, seed)
-    if first.interrupted:
-        return first, data
-    start = None if data.tails.gross else first.scales  # which let the fields explain gross errors
-    second = select(centre, data, start=start, seed=seed, progress=progress)
-    return _supported(second, data, seed)
-
-
 def _supported(found: Selection, data: TangentData, seed: int) -> tuple[Selection, TangentData]:
     """Drop amplitudes that the data do not support, and with the weights that follow."""
     noise = data.noise_model.mean_covariance(found.scales, data.jacobian)
@@ -218,13 +216,13 @@ def _with_position_errors(
     progress: Progress,
 ) -> tuple[Hyperparameters, Selection, TangentData]:
     """Add the gear lines, then the axes, that the data show; choose the other scales again for what is left."""
-    for stage in ("gear lines",) * (poses >= gear_lines.FEWEST_POSES) + ("axes",):
+    for stage in ("gear lines",) * (poses >= position_errors.FEWEST_POSES) + ("axes",):
         if found.interrupted:
             break
         progress(stage, 0, 1)
         if stage == "axes":
             start = with_axis_errors(data, found.scales, lines)
-        elif gears := gear_lines.find_gear_lines(data, start := found.scales, seed):
+        elif gears := position_errors.find_gear_lines(data, start := found.scales, seed):
             start = replace(start, lines=gears)
         if start is not found.scales:
             data = data.with_position_errors(start)

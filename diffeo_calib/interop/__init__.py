@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from diffeo_calib.interop.dh import DHTable as DHTable
     from diffeo_calib.interop.dh import dh_table as dh_table
     from diffeo_calib.interop.dh import write_dh as write_dh
-    from diffeo_calib.interop.mjcf import write_mjcf as write_mjcf
+    from diffeo_calib.interop.dh import write_ur_kinematics as write_ur_kinematics
     from diffeo_calib.interop.numpy_model import NumpyKinematics as NumpyKinematics
     from diffeo_calib.interop.numpy_model import load_numpy as load_numpy
     from diffeo_calib.interop.rigid import JointOffsets as JointOffsets
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from diffeo_calib.interop.torch_program import TorchProgram as TorchProgram
     from diffeo_calib.interop.torch_program import export_onnx as export_onnx
     from diffeo_calib.interop.torch_program import export_torch as export_torch
-    from diffeo_calib.interop.ur_kinematics import write_ur_kinematics as write_ur_kinematics
+    from diffeo_calib.interop.urdf import write_mjcf as write_mjcf
     from diffeo_calib.interop.urdf import write_urdf as write_urdf
 
 if not TYPE_CHECKING:  # type checkers see the imports above, and report unknown names

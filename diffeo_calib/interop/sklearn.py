@@ -74,27 +74,25 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             fix = "pass robot=dc.load_urdf(...) to the constructor"
             raise InputError.of("`robot`", expected="a dc.Tree", got=type(robot).__name__, fix=fix)
         data: Any = y if isinstance(y, RowGroups) else self._measured(robot, X, y)
-        if data is y and not np.array_equal(self._joints(robot, X, reset=True), y.q.numpy()):
+        if data is y and not np.array_equal(self._joints(robot, validate_data(self, X, dtype=np.float64)), y.q.numpy()):
             raise MeasurementError.of("`X`", expected="the joint values of the rows in `y`", fix="pass y.q")
-        chosen = {"hyperparameters": self.hyperparameters, "controls": self.controls, "seed": self.seed}
-        self.result_ = calibrate(robot, data, **chosen)
+        how = {"hyperparameters": self.hyperparameters, "controls": self.controls, "seed": self.seed}
+        self.result_ = calibrate(robot, data, **how)
         self.model_ = self.result_.model
         return self
 
     def _measured(self, robot: Tree, X: Any, y: Any) -> Measurements:
         """The rows as measurements."""
-        values = np.asarray(y)
-        hidden = np.isnan(values) if values.dtype.kind == "f" else np.zeros(values.shape, dtype=bool)
-        known: Any = np.where(hidden, 0.0, values) if hidden.any() and not hidden.all() else y
-        checked: Any = validate_data(self, X, known, multi_output=True, y_numeric=True, dtype=np.float64)
-        points = np.where(hidden, np.nan, checked[1]).reshape(len(checked[1]), -1)
-        each = 1 if self.lever is None else POINTS
+        hidden = {"ensure_2d": False, "ensure_all_finite": "allow-nan", "dtype": np.float64}
+        each_as: Any = {"dtype": np.float64}, hidden
+        checked: Any = validate_data(self, X, y, validate_separately=each_as)
+        points, each = checked[1].reshape(len(checked[1]), -1), 1 if self.lever is None else POINTS
         if points.shape[1] % (3 * each):
             fix = "pass x, y and z of every marker, in m, or of three points for every pose; distances, heights and "
             fix += "images belong to devices whose places are found from all rows: dc.calibrate"
             raise MeasurementError.of("`y`", expected=f"{3 * each} P columns", got=points.shape[1], fix=fix)
         tips = None if self.on is None else [tip for tip in self.on for _ in range(each)]
-        q, places = (torch.from_numpy(part) for part in (self._in_order(robot, checked[0]), points))
+        q, places = (torch.from_numpy(part.copy()) for part in (self._joints(robot, checked[0]), points))
         rows = Measurements.of_points(q, places.unflatten(1, (-1, 3)), tips, self.lever)
         return rows.with_joint_names(robot.joint_names).doubted(True)
 
@@ -113,7 +111,7 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Returns (M, 3 P) m; with ``return_std`` also their standard deviations, (M, 3 P) m.
         """
         check_is_fitted(self, "model_")
-        q = self._joints(self.model_.robot, X, reset=False)
+        q = self._joints(self.model_.robot, validate_data(self, X, reset=False, dtype=np.float64))
         if not return_std:
             return self.model_(q).flatten(1).numpy()
         mean, covariance = self.model_.predict(q)
@@ -126,10 +124,7 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         tags.regressor_tags.poor_score = True  # on tables that are no robot's
         return tags
 
-    def _joints(self, robot: Tree, X: Any, *, reset: bool) -> np.ndarray:
-        return self._in_order(robot, validate_data(self, X, reset=reset, dtype=np.float64))
-
-    def _in_order(self, robot: Tree, q: Any) -> np.ndarray:
+    def _joints(self, robot: Tree, q: Any) -> np.ndarray:
         """Columns in the robot's order, where they have names; MeasurementError unless they are its joints."""
         names, wanted = getattr(self, "feature_names_in_", None), robot.joint_names
         if names is not None and sorted(names) != sorted(wanted):

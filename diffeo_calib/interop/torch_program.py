@@ -27,10 +27,8 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, NumericalError, as_written
 from diffeo_calib.common.files import check_writable, write_whole
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kernels.profiles import PROFILES
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.program import program_of
-from diffeo_calib.kinematics.tool import ToolKinematics, tool_points, tool_transform
+from diffeo_calib.kinematics.tool import ToolKinematics, program_of, tool_points, tool_transform
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.measurements.poses import POINTS, of_frames, poses_of_triangles
 from diffeo_calib.robots.se3 import twist_transform
@@ -94,6 +92,9 @@ def _combined(x: Tensor, coefficients: Tensor, slopes: Sequence[Tensor]) -> Tens
 TORCH = SimpleNamespace(
     sin=torch.sin,
     cos=torch.cos,
+    exp=torch.exp,
+    sqrt=torch.sqrt,
+    relu=torch.relu,
     clip=torch.clamp,
     within_turn=lambda x: x - TURN * torch.floor(x * (1.0 / TURN)),
     stack=torch.stack,
@@ -101,7 +102,6 @@ TORCH = SimpleNamespace(
     ones_like=torch.ones_like,
     broadcast_to=torch.broadcast_to,
     at_least=lambda values, floor: values.clamp(min=floor),
-    profile=lambda name, r2: PROFILES[name].derivative(r2, 0),
     cells_around=_cells_around,
     combined=_combined,
     transforms=twist_transform,
@@ -187,52 +187,43 @@ class TorchProgram(nn.Module):
 
 
 def export_torch(
-    model: CalibratedKinematics | FittedMap,
-    path: str | os.PathLike[str],
-    output: str = "points",
-    *,
-    tool: object = None,
-    frame: str = "base",
-    dtype: torch.dtype = torch.float64,
+    model: CalibratedKinematics | FittedMap, path: str | os.PathLike[str], output: str = "points", **how: Any
 ) -> None:
     """Write a calibrated model as a program of torch, which runs without this package.
 
     ``torch.export.load(path).module()`` is a function of q (N, n) for any number N of rows; AOTInductor compiles the
-    file for C++. It holds what :class:`TorchProgram`, with these arguments, computes, and no checks of its input other
-    than its type and number of columns. ``path`` is ``*.pt2``; an existing file is replaced atomically.
+    file for C++. It holds what :class:`TorchProgram` computes, and no checks of its input other than its type and
+    number of columns.
+
+    Args:
+        model, output: see there. path: ``*.pt2``; an existing file is replaced atomically.
+        how: ``tool``, ``frame`` and ``dtype``, as there.
 
     Raises InputError: as :class:`TorchProgram`, or a file that cannot be written. NumericalError: the program disagrees
     with the model.
     """
-    contents, q = io.BytesIO(), _example(model, dtype)
-    with _recorded(model, path, output, tool=tool, frame=frame, dtype=dtype) as program:
-        extra = {DESCRIPTION: json.dumps(_description(model, output, frame))}
-        torch.export.save(program, contents, extra_files=extra)
+    contents = io.BytesIO()
+    with _recorded(model, path, output, **how) as (program, q, description):
+        torch.export.save(program, contents, extra_files={DESCRIPTION: json.dumps(description)})
         found = program.module()(q)
+    precision, how = PRECISIONS[q.dtype], {name: value for name, value in how.items() if name != "dtype"}
     expected = model(q.double())
     if isinstance(model, CalibratedKinematics) and output != "points":
-        expected = model.poses(q.double()) if output == "poses" else model.tool_poses(q.double(), tool, frame)
+        expected = model.poses(q.double()) if output == "poses" else model.tool_poses(q.double(), **how)
     difference = float((found - expected).abs().max())
-    if not difference <= PRECISIONS[dtype]:
+    if not difference <= precision:
         what = f"the recorded program differs from the model by {difference:.2g} m"
-        raise NumericalError.of(what, expected=f"at most {PRECISIONS[dtype]:g}", fix="report it with the model file")
+        raise NumericalError.of(what, expected=f"at most {precision:g}", fix="report it with the model file")
     write_whole(path, contents.getvalue())
 
 
 def export_onnx(
-    model: CalibratedKinematics | FittedMap,
-    path: str | os.PathLike[str],
-    output: str = "points",
-    *,
-    tool: object = None,
-    frame: str = "base",
-    dtype: torch.dtype = torch.float64,
+    model: CalibratedKinematics | FittedMap, path: str | os.PathLike[str], output: str = "points", **how: Any
 ) -> None:
     """Write a calibrated model as an ONNX file ``*.onnx``, for onnxruntime and other programs.
 
-    Its input ``q`` is (N, n) with any number N of rows, its output has the name of ``output``. It holds what
-    :class:`TorchProgram`, with these arguments, computes. An existing file is replaced atomically. Needs the packages
-    onnx and onnxscript: ``pip install diffeo_calib[onnx]``.
+    Its input ``q`` is (N, n) with any number N of rows, its output has the name of ``output``. Arguments as of
+    :func:`export_torch`. Needs the packages onnx and onnxscript: ``pip install diffeo_calib[onnx]``.
 
     Raises InputError: as :class:`TorchProgram`, packages that are not installed, or a file that cannot be written.
     """
@@ -246,48 +237,41 @@ def export_onnx(
     level = registry.level
     registry.setLevel(logging.ERROR)  # it warns about packages that are not needed
     try:
-        with _recorded(model, path, output, tool=tool, frame=frame, dtype=dtype) as program:
+        with _recorded(model, path, output, **how) as (program, _, description):
             table: Any = {torch.ops.aten.scalar_tensor.default: _exact_scalar}
             names = {"input_names": ["q"], "output_names": [output], "custom_translation_table": table}
             found = torch.onnx.export(program, dynamo=True, verbose=False, **names)
     finally:
         registry.setLevel(level)
     proto = cast(torch.onnx.ONNXProgram, found).model_proto
-    for key, value in _description(model, output, frame).items():
+    for key, value in description.items():
         proto.metadata_props.add(key=key, value=value)
     write_whole(path, proto.SerializeToString())
 
 
 @contextmanager
 def _recorded(
-    model: CalibratedKinematics | FittedMap, path: str | os.PathLike[str], output: str, **options: Any
-) -> Iterator[torch.export.ExportedProgram]:
-    """The exported program for any number of rows; InputError for a path that cannot be written."""
+    model: CalibratedKinematics | FittedMap, path: str | os.PathLike[str], output: str, **how: Any
+) -> Iterator[tuple[torch.export.ExportedProgram, Tensor, dict[str, str]]]:
+    """The exported program for any number of rows, some configurations of the fit, and inputs and outputs as text.
+
+    InputError for a path that cannot be written.
+    """
     check_writable(path)  # recording takes too long to find out afterwards
-    module = TorchProgram(model, output, **options).eval()
-    example, rows = (_example(model, options["dtype"]),), ({0: torch.export.Dim("rows")},)
+    module, x = TorchProgram(model, output, **how).eval(), _map_of(model).x
+    q = x[torch.arange(EXAMPLE_ROWS, device=x.device) % len(x)].detach().to(how.get("dtype", torch.float64))
+    description = {"output": output, "units": "m, rad"}
+    if isinstance(model, CalibratedKinematics):
+        description |= {"robot": model.robot.name, "joints": ", ".join(model.robot.joint_names)}
+        description["frame"] = how.get("frame", "base") if output == "tool_poses" else "measuring"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch's own, about its inner workings
-        yield torch.export.export(module, example, dynamic_shapes=rows, strict=False)
-
-
-def _description(model: CalibratedKinematics | FittedMap, output: str, frame: str) -> dict[str, str]:
-    """A program's inputs and outputs, as text by subject."""
-    found = {"output": output, "units": "m, rad"}
-    if isinstance(model, CalibratedKinematics):
-        found |= {"robot": model.robot.name, "joints": ", ".join(model.robot.joint_names)}
-        found["frame"] = frame if output == "tool_poses" else "measuring"
-    return found
+        rows = ({0: torch.export.Dim("rows")},)
+        yield torch.export.export(module, (q,), dynamic_shapes=rows, strict=False), q, description
 
 
 def _map_of(model: CalibratedKinematics | FittedMap) -> FittedMap:
     return model.map if isinstance(model, CalibratedKinematics) else model
-
-
-def _example(model: CalibratedKinematics | FittedMap, dtype: torch.dtype) -> Tensor:
-    """Some configurations of the fit."""
-    x = _map_of(model).x
-    return x[torch.arange(EXAMPLE_ROWS, device=x.device) % len(x)].detach().to(dtype)
 
 
 def _check_arguments(model: CalibratedKinematics | FittedMap, output: str, tool: object, dtype: torch.dtype) -> None:

@@ -21,11 +21,11 @@ from torch import Tensor
 from diffeo_calib.common.checks import wrapped
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.runtime.profiles import FORMULAS
+from diffeo_calib.runtime.arrays import FORMULAS
 
 MAX_ORDER = 3  # highest derivative that every profile provides
 METHODS = SimpleNamespace(exp=lambda a: a.exp(), sqrt=lambda a: a.sqrt(), relu=lambda a: a.relu())
-"""Functions of the formulas in runtime/profiles.py for tensors, symbols and lazy matrices."""
+"""Functions of the formulas in runtime/arrays.py for tensors, symbols and lazy matrices."""
 
 
 class Profile(ABC):

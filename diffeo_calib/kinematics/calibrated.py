@@ -16,10 +16,9 @@ from diffeo_calib.common.errors import InputError, as_written, printable
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.device_readings import PredictedReadings, predicted_readings
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.kinematics.provenance import Provenance, Summary
 from diffeo_calib.kinematics.registered_map import Registration, robot_map
-from diffeo_calib.kinematics.tool import ToolKinematics, checked_tip, tool_transform
+from diffeo_calib.kinematics.tool import ToolKinematics, checked_tip, program_of, takes_program, tool_transform
 from diffeo_calib.kinematics.transmission import transmission
 from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.poses import (

@@ -11,7 +11,8 @@ only, orientations are off by 0.046 degrees RMS, those of its geometric calibrat
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -20,13 +21,19 @@ from diffeo_calib.common.checks import as_tensor, wrapped
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, as_written, listed
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
+from diffeo_calib.flows.geodesic import Flow
+from diffeo_calib.flows.integrators import RungeKutta
+from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
-from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.kinematics.registered_map import marker_slopes
+from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.measurements.poses import mark_points, marks, pose_directions, poses_from_marks, rigid_poses
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime import program
+from diffeo_calib.runtime.arrays import Array
+from diffeo_calib.runtime.build import calibrated_chain, recorded_flow
+from diffeo_calib.runtime.flow import RecordedFlow
 from diffeo_calib.runtime.program import TOOL_LEVER, Program, check_frame
 from diffeo_calib.sensors.set_ups import frame_slopes
 
@@ -181,3 +188,57 @@ def covariance_without_placement(model: Any, q: Tensor, tool: Tensor, tip: str |
     seen = poses_from_marks(points[len(every) :], TOOL_LEVER)
     rest = pose_directions(seen, TOOL_LEVER) @ rest.unflatten(0, (-1, 9))  # (M, 6, 9 (R + M))
     return rest @ covariance @ rest.mT
+
+
+_PROGRAMS: WeakKeyDictionary[Deformation, Program | None] = WeakKeyDictionary()
+"""Programs that have been made: copies of a model with another tool share its deformation."""
+
+
+def takes_program(q: Tensor) -> bool:
+    """Whether a query can be answered by NumPy: on the CPU, and no derivative or trace of it is wanted."""
+    plain = q.device.type == "cpu" and not (q.requires_grad and torch.is_grad_enabled())
+    return plain and not wrapped(q) and not torch.compiler.is_compiling()
+
+
+def program_of(deformation: Deformation, q: Tensor | None = None) -> Program | None:
+    """The program of a robot's calibrated map, made at its first use; None where torch must answer the query ``q``.
+
+    None for maps without constant stages: adaptive time steps, users' kernels, the Eulerian formulation, and maps on
+    another device than the CPU.
+    """
+    if q is not None and not takes_program(q):
+        return None
+    if deformation not in _PROGRAMS:
+        _PROGRAMS[deformation] = _program(deformation)
+    return _PROGRAMS[deformation]
+
+
+def _program(deformation: Deformation) -> Program | None:
+    if not isinstance(deformation, GeodesicDeformation):
+        return None
+    asked, theta = deformation.spec.nominal, deformation.momenta.theta
+    other = asked if isinstance(asked, FlangePoints) else None
+    nominal = asked if other is None else other.fitted
+    if not isinstance(nominal, GeometryMap) or nominal.load.by_row:
+        return None
+    flows = deformation.joint_flow, deformation.task_flow
+    radial = all(isinstance(term, RadialKernel) for flow in flows for term in flow.kernel.terms)
+    if not radial or not isinstance(deformation.integrator, RungeKutta) or deformation.x.device.type != "cpu":
+        return None
+    geometry, elastic = nominal.geometry, nominal.elasticity is not None
+    parts = (_array(part) for part in (geometry.base, geometry.joint_errors, nominal.folded(theta)))
+    chain = calibrated_chain(geometry.chain.arrays, *parts, geometry.markers, elastic=elastic, **nominal.own._asdict())
+    joint, task = (_recorded(flow, deformation.integrator) for flow in flows)
+    points = geometry.absorb(nominal.split(theta)[0].detach().cpu()).tool if other is None else other.points
+    on = geometry.on if other is None else other.map.geometry.on
+    return Program(joint, chain, task, _array(points), tuple(map(geometry.chain.tips.index, on)))
+
+
+def _recorded(flow: Flow, integrator: RungeKutta) -> RecordedFlow:
+    kernel = [cast(RadialKernel, term).to_config() for term in flow.kernel.terms]
+    coefficients, weights = integrator.tableau()
+    return recorded_flow(kernel, _array(torch.stack(flow.stages)), _array(coefficients), _array(weights))
+
+
+def _array(tensor: Tensor) -> Array:
+    return tensor.detach().cpu().numpy()

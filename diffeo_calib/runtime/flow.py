@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from diffeo_calib.runtime.arrays import NUMPY, Array, combined
-from diffeo_calib.runtime.profiles import FORMULAS
+from diffeo_calib.runtime.arrays import FORMULAS, NUMPY, Array, combined
 from diffeo_calib.runtime.tables import JointTables, tabulated
 
 BLOCK = 1 << 16
@@ -131,7 +130,7 @@ def advanced(flow: Any, x: Any, use: Any) -> Any:
         for row in flow.coefficients:
             at, stage = use.combined(x, row, slopes), step * len(flow.weights) + len(slopes)
             distances = ((term, squared_distances(term, stage, at, use)[1]) for term in flow.terms)
-            parts = [use.profile(term.profile, r2) @ term.weights[stage] for term, r2 in distances]
+            parts = [next(FORMULAS[term.profile](r2, (0,), use)) @ term.weights[stage] for term, r2 in distances]
             if flow.tables is not None:
                 parts.append(tabulated(flow.tables, stage, at, use)[0] @ flow.tables.selection)
             slopes.append(sum(parts[1:], parts[0]))

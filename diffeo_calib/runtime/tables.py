@@ -17,8 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from diffeo_calib.runtime.arrays import NUMPY, Array, as_index
-from diffeo_calib.runtime.profiles import FORMULAS
+from diffeo_calib.runtime.arrays import FORMULAS, NUMPY, Array, as_index
 
 TOLERANCE = 1e-13
 """Largest error of a table, rad; for fields above 1 rad relative to the largest."""

@@ -9,7 +9,7 @@ from math import inf
 import numpy as np
 import pytest
 import torch
-from product_bank import covered, scales_of, usual_scales
+from product_bank import scales_of, usual_scales
 from scipy.stats import chi2
 from tangent_bank import Setting, built, covariance, normal, prior_covariance
 from torch.testing import assert_close
@@ -182,14 +182,3 @@ def test_parts_of_the_space_show_errors_that_no_row_does() -> None:
     assert found[1] > 1.25 * np.median(by_rows), (by_parts, by_rows)
     assert halved(x.repeat(2, 1))[:192].equal(halved(x.repeat(2, 1))[192:])  # repeats are left out together
     assert halved(x).bincount().tolist() == [6] * 32
-
-
-@pytest.mark.slow
-def test_coverage_with_few_poses() -> None:
-    """The 95 % regions of new measurements, two arms with 30 poses."""
-    found = []
-    for seed in range(2):
-        simulated = SimulatedArm(seed=seed)
-        data = dc.Measurements(*simulated.measure(330, seed))
-        found.append(covered(dc.calibrate(simulated.nominal, data[:30]).model, data[30:]))
-    assert 0.9 < np.mean(found) < 0.995, found

@@ -14,43 +14,25 @@ import numpy as np
 import pytest
 import torch
 from model_file_bank import Editor, refused, set_entry, set_tensor
-from product_bank import simulated
 from safetensors.torch import save_file
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, ModelFileError
-from diffeo_calib.interop import model_file, model_header
+from diffeo_calib.interop import model_file
 
 
-def test_cut_short(sound: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "cut.safetensors"
+def test_cut_short_or_flipped(sound: bytes, tmp_path: Path) -> None:
+    path, start = tmp_path / "cut.safetensors", 8 + struct.unpack("<Q", sound[:8])[0]
     for length in [*range(64), *range(64, len(sound), 307), len(sound) - 8, len(sound) - 1]:
         path.write_bytes(sound[:length])
         assert "copy or save it again" in refused(path), length
-    path.write_bytes(sound + b"\0")
-    refused(path)
-
-
-@pytest.mark.parametrize(("part", "stride"), [("header", 41), ("tensors", 101)])
-def test_flipped_bits(part: str, stride: int, small: dc.CalibratedKinematics, sound: bytes, tmp_path: Path) -> None:
-    """Refused, or without effect: e-05 may become E-05, or a 17th digit may change without changing the number."""
-    path, q = tmp_path / "flipped.safetensors", simulated(1)[2].q[:3]
-    expected, start = small(q), 8 + struct.unpack("<Q", sound[:8])[0]
-    places = range(0, start, stride) if part == "header" else range(start, len(sound), stride)
-    harmless = 0
-    for count, place in enumerate(places):
-        flipped = bytearray(sound)
-        flipped[place] ^= (0x01, 0x20, 0x80, 0xFF)[count % 4]
-        path.write_bytes(flipped)
-        try:
-            model = dc.load(path)
-        except ModelFileError:
-            continue
-        harmless += 1
-        assert part == "header", place
-        assert torch.equal(model(q), expected), place
-    assert harmless <= 0.02 * len(places)
+    for other in (
+        sound + b"\0",
+        *(sound[:k] + bytes([sound[k] ^ 32]) + sound[k + 1 :] for k in range(start, len(sound), 101)),
+    ):
+        path.write_bytes(other)
+        refused(path)
 
 
 def test_files_of_other_kinds(tmp_path: Path) -> None:
@@ -66,7 +48,7 @@ def test_files_of_other_kinds(tmp_path: Path) -> None:
     ):
         path.write_bytes(content)
         assert "cannot be read as a model file" in refused(path)
-    header = json.dumps({"format": model_header.FORMAT})
+    header = json.dumps({"format": model_file.FORMAT})
     for metadata, message in (
         (None, "is not a diffeo_calib model"),
         ({"format": "pt"}, "is not a diffeo_calib model"),
@@ -141,7 +123,6 @@ WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
     "too many steps": (("integrator", "steps"), 2000, "at most 1024"),
     "unknown integrator": (("integrator", "kind"), "euler", "euler"),
     "dimension of a word": (("task_dim",), "three", "do not fit together"),
-    "dimension zero": (("task_dim",), 0, "task_dim"),
     "dimension of the plane": (("task_dim",), 2, "task_dim"),
     "integrator is true": (("integrator",), True, "do not fit together"),
     "lever of a model of points": (("lever",), 0.1, "a model of poses: expected three points for each, got 1"),
@@ -182,7 +163,7 @@ MISSING: dict[str, Callable[[Any, Any], object]] = {
     **{k: lambda header, _, k=k: header.pop(k) for k in NOT_UNDERSTOOD},
     **{k: lambda header, _, k=k: header["nominal"]["joints"][0].pop(k) for k in ("lower", "mimic", "mimic_offset")},
     "elastic": lambda header, _: header["nominal"].pop("elastic"),
-    **{k: lambda _, tensors, k=k: tensors.pop(k) for k in (*model_header.MOMENTA, *model_header.GEOMETRY)},
+    **{k: lambda _, tensors, k=k: tensors.pop(k) for k in (*model_file.MOMENTA, *model_file.GEOMETRY)},
 }
 """Entries of the header, of a joint and of elasticity, and tensors."""
 
@@ -212,18 +193,12 @@ WRONG_TENSORS: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
     "one elastic prior less": ("prior_variance", lambda t: t[:-1]),
     "one elastic prior nothing": ("prior_variance", lambda t: t * (torch.arange(len(t)) < len(t) - 1)),
     "one row less in x": ("x", lambda t: t[:-1]),
-    "one row less in b": ("momenta_x", lambda t: t[:-1]),
     "one row less in p": ("momenta_y", lambda t: t[:-1]),
     "one row less in the noise": ("noise", lambda t: t[:-1]),
     "prior negative": ("prior_variance", lambda t: -t),
     "parameters of a million metres": ("theta", lambda t: t + 2e6),
-    "momenta not finite": ("momenta_y", lambda t: t * float("nan")),
-    "x flat": ("x", lambda t: t.flatten()),
-    "noise flat": ("noise", lambda t: t.flatten()),
-    "single precision": ("x", lambda t: t.float()),
     "rigid errors of other joints": ("rigid_errors", lambda t: t[:2]),
     "rigid errors not rigid": ("rigid_errors", lambda t: 2 * t),
-    "rigid errors not finite": ("rigid_errors", lambda t: t * float("nan")),
     "integers": ("noise", lambda t: t.long()),
 }
 

@@ -18,7 +18,7 @@ from diffeo_calib.interop import write_c
 from diffeo_calib.interop.torch_program import _ConstantPoints
 from diffeo_calib.kernels.profiles import PROFILES
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.program import program_of
+from diffeo_calib.kinematics.tool import program_of
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.robots.dh import DHRow

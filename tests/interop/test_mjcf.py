@@ -14,7 +14,7 @@ from export_bank import UGLY, UGLY_ENDS, configurations, own_poses, wrong
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, RobotError
-from diffeo_calib.interop.mjcf import mjcf_text, write_mjcf
+from diffeo_calib.interop.urdf import mjcf_text, write_mjcf
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.tree import Chain

@@ -16,7 +16,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.interop import model_header
+from diffeo_calib.interop import model_file
 from diffeo_calib.kernels.base import Kernel, SumKernel
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.radial import RadialKernel
@@ -204,11 +204,11 @@ def test_a_model_with_kernel_and_profile_is_loaded(saved: tuple[Any, Path]) -> N
     (model, path), at = saved, tensor([[0.3, -0.2]])
     again: Any = dc.load(path, nominal, kernels=OWN)
     same(again(at), model(at), 0.0)
-    header, tensors = model_header.describe(model)
+    header, tensors = model_file.describe(model)
     header = json.loads(json.dumps(header))
     assert header["joint_kernel"][1].pop("profile_probe")[0] == 1.0
     with pytest.warns(dc.DiffeoCalibWarning, match="profile 'rq' is that of its fit is not checked"):
-        model_header.rebuild(header, tensors, nominal, OWN)
+        model_file.rebuild(header, tensors, nominal, OWN)
 
 
 @pytest.mark.parametrize(

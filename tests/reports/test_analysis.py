@@ -21,7 +21,7 @@ from diffeo_calib.reports.analysis.predictions import SHARES, FitRows, Predictio
 from diffeo_calib.reports.analysis.stages import Deviations, repeats_of, stages_of
 from diffeo_calib.reports.html.sections import trust
 from diffeo_calib.reports.html.sentences import advice
-from diffeo_calib.reports.plots.errors import draw_before_after, draw_distributions
+from diffeo_calib.reports.plots.panels import draw_before_after, draw_distributions
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.sensors.errors import Evaluation
 

@@ -17,10 +17,9 @@ from diffeo_calib.cli.declarations import ExportOptions
 from diffeo_calib.cli.models import load_laden, tool_in_tip
 from diffeo_calib.cli.record import make_folder, record
 from diffeo_calib.common.files import write_together
-from diffeo_calib.interop.c_source import CFiles, c_files
+from diffeo_calib.interop.c_source import CFiles, write_c
 from diffeo_calib.interop.camera_files import camera_files
-from diffeo_calib.interop.dh import DHTable, dh_table, dh_text
-from diffeo_calib.interop.mjcf import mjcf_text
+from diffeo_calib.interop.dh import DHTable, dh_table, dh_text, ur_text, ur_transforms
 from diffeo_calib.interop.rigid import (
     Compared,
     RigidKinematics,
@@ -38,8 +37,7 @@ from diffeo_calib.interop.tables import (
     tables_text,
 )
 from diffeo_calib.interop.torch_program import export_onnx, export_torch
-from diffeo_calib.interop.ur_kinematics import ur_text, ur_transforms
-from diffeo_calib.interop.urdf import corrected_urdf, urdf_of
+from diffeo_calib.interop.urdf import corrected_urdf, mjcf_text, urdf_of
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.bodies import placement_lines
 from diffeo_calib.measurements.table_format import TableFormat
@@ -148,7 +146,9 @@ def run(given: ExportOptions) -> None:
     model = load_laden(given.model, given.payload)
     own = tool_in_tip(model, given.tool, TableFormat(given.length, given.angle))
     tool = None if given.tool is None else own
-    source = None if given.c is None else c_files(model, given.c, tool, given.frame or "base", tip=given.tip)
+    source = (
+        None if given.c is None else write_c(model, given.c, tool, given.frame or "base", tip=given.tip, write=False)
+    )
     export, rigid = _Export(model, given), [option for option in wanted if option in RIGID]
     if rigid:
         export.rigid(rigid, tables="--correction-tables" in wanted)

@@ -79,8 +79,6 @@ class Ranks:
         Raises:
             LostRankError: they differ, or another rank has ended or hangs.
         """
-        if self.count == 1:
-            return
         found = [torch.empty_like(numbers) for _ in range(self.count)]
         self._exchange(messages.all_gather, found, numbers)
         every = torch.stack(found)
@@ -94,9 +92,8 @@ class Ranks:
         try:
             message(*tensors)
         except RuntimeError as error:
-            what = (
-                f"rank {self.own} of {self.count} waited for another process that has ended, hangs or does other work"
-            )
+            what = f"rank {self.own} of {self.count} waited for another process"
+            what += " that has ended, hangs or does other work"
             fix = "look at the first error of the others, and start all again"
             raise LostRankError.of(f"{what} ({_first_line(error)})", fix=fix) from error
 
@@ -115,17 +112,8 @@ def ranks() -> Ranks:
     if not messages.is_available():
         what = "the backend 'distributed' needs torch.distributed, which this build of torch lacks"
         raise InputError.of(what, fix="use the backend 'tiled'")
-    if not messages.is_initialized():
-        _connect()
-    return Ranks(messages.get_rank(), messages.get_world_size())
-
-
-def ranks_of(backends: Sequence[str]) -> Ranks:
-    """The processes that share the work of kernels with these backends: this one alone, unless one is distributed."""
-    return ranks() if any("distributed" in name for name in backends) else Ranks()
-
-
-def _connect() -> None:
+    if messages.is_initialized():
+        return Ranks(messages.get_rank(), messages.get_world_size())
     missing = [name for name in ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT") if name not in os.environ]
     if missing:
         what = "the backend 'distributed' needs a program that runs in several processes"
@@ -138,6 +126,7 @@ def _connect() -> None:
         what = f"the processes of this program do not find each other ({_first_line(error)})"
         raise LostRankError.of(what) from error
     atexit.register(lambda: messages.destroy_process_group() if messages.is_initialized() else None)
+    return Ranks(messages.get_rank(), messages.get_world_size())
 
 
 class Distributed(SumBackend):

@@ -42,7 +42,8 @@ POINT_COST = 150.0  # time of a point beside its waves, relative to that of a pa
 WAVES_TIMES_POINTS_AT_ONCE = 1 << 20  # waves times points in memory at once
 CHECKED_ROWS = 24  # rows and columns at which every lattice is checked
 DERIVATIVES = 2  # the highest derivative of the kernel in a formula
-STEPS, FARTHEST = 4096, 60.0  # distances and frequencies that are looked at
+STEPS, FARTHEST = 4096, 60.0
+GRID = torch.linspace(0.0, FARTHEST, STEPS + 1, dtype=torch.float64, device=HOST)[1:]  # distances, or frequencies
 
 
 @lru_cache(maxsize=256)
@@ -51,33 +52,27 @@ def negligible_beyond(profile: Profile, dim: int, accuracy: float) -> float | No
 
     A factor of 3^dim is left for the copies of a kernel on a lattice.
     """
-    r = _grid()
-    kappa = profile.derivatives(r.square(), DERIVATIVES)
-    second = 2 * kappa[1].abs() + 4 * r.square() * kappa[2].abs()
-    size = torch.stack([kappa[0].abs(), 2 * r * kappa[1].abs(), second]).amax(0)
+    kappa = profile.derivatives(GRID.square(), DERIVATIVES)
+    second = 2 * kappa[1].abs() + 4 * GRID.square() * kappa[2].abs()
+    size = torch.stack([kappa[0].abs(), 2 * GRID * kappa[1].abs(), second]).amax(0)
     return _first_below(3.0**dim * size.flip(0).cummax(0).values.flip(0), accuracy)
 
 
 @lru_cache(maxsize=256)
 def bandwidth(profile: Profile, dim: int, accuracy: float) -> float | None:
     """The frequency beyond which the spectral density, with its first two moments, adds up to less than an accuracy."""
-    w = _grid()
-    density = profile.spectral_density(w.square(), dim)
+    density = profile.spectral_density(GRID.square(), dim)
     if density is None:
         return None
-    shell = density * (2.0 * pi ** (dim / 2) / gamma(dim / 2)) * w ** (dim - 1) * (FARTHEST / STEPS)
-    beyond = torch.stack([shell * w**k for k in range(DERIVATIVES + 1)]).flip(1).cumsum(1).flip(1)
+    shell = density * (2.0 * pi ** (dim / 2) / gamma(dim / 2)) * GRID ** (dim - 1) * (FARTHEST / STEPS)
+    beyond = torch.stack([shell * GRID**k for k in range(DERIVATIVES + 1)]).flip(1).cumsum(1).flip(1)
     return _first_below(beyond.amax(0), accuracy)
-
-
-def _grid() -> Tensor:
-    return torch.linspace(0.0, FARTHEST, STEPS + 1, dtype=torch.float64, device=HOST)[1:]
 
 
 def _first_below(values: Tensor, level: float) -> float | None:
     """Where on the grid decreasing values fall below a level."""
     below = values < level
-    return float(_grid()[below][0]) if bool(below[-1]) else None
+    return float(GRID[below][0]) if bool(below[-1]) else None
 
 
 def sums(
@@ -99,17 +94,12 @@ def sums(
         waves = Lattice.of(profile, extent, accuracy)
         if waves is None or (m + n) * (POINT_COST + WAVE_COST * waves.size) > pairs:
             return None
-        if waves.error(profile, _displacements(at.features, columns.features, extent)) > accuracy:
-            return None
-        return RESULTS[formula](waves, at, columns)
-
-
-def _displacements(rows: Tensor, columns: Tensor, extent: Tensor) -> Tensor:
-    """Some differences of points, and the largest possible one, where the copies of the kernel are nearest."""
-    count = min(CHECKED_ROWS, len(rows), len(columns))
-    every = [torch.arange(count, device=t.device, dtype=torch.int64) * (len(t) - 1) // count for t in (rows, columns)]
-    apart = rows[every[0], None] - columns[every[1]][None]
-    return torch.cat([apart.flatten(0, 1), extent[None], -extent[None], 0 * extent[None]])
+        count = min(CHECKED_ROWS, m, n)
+        steps = torch.arange(count, device=low.device, dtype=torch.int64)
+        apart = at.features[steps * (m - 1) // count, None] - columns.features[steps * (n - 1) // count]
+        # the kernel's copies are nearest at the largest possible difference
+        apart = torch.cat([apart.flatten(0, 1), extent[None], -extent[None], 0 * extent[None]])
+        return None if waves.error(profile, apart) > accuracy else RESULTS[formula](waves, at, columns)
 
 
 class Lattice:
@@ -197,12 +187,8 @@ class Lattice:
         return [slice(k, min(k + size, count)) for k in range(0, count, size)] or [slice(0, 0)]
 
 
-def _field_and_jacobian(waves: Lattice, i: Points, j: Points) -> tuple[Tensor, ...]:
-    return _with_slopes(waves, i.features, waves.coefficients(j.features, j.momenta))
-
-
 def _gradient(waves: Lattice, i: Points, j: Points) -> tuple[Tensor, ...]:
-    v, slopes = _field_and_jacobian(waves, i, j)
+    v, slopes = RESULTS[FIELD_AND_JACOBIAN](waves, i, j)
     return v, torch.einsum("mr,mrd->md", i.momenta, slopes)
 
 
@@ -228,7 +214,7 @@ def _with_slopes(waves: Lattice, at: Tensor, grid: Tensor) -> tuple[Tensor, Tens
 
 RESULTS: dict[Formula, Callable[[Lattice, Points, Points], tuple[Tensor, ...]]] = {
     FIELD: lambda waves, i, j: (waves.values(i.features, waves.coefficients(j.features, j.momenta)),),
-    FIELD_AND_JACOBIAN: _field_and_jacobian,
+    FIELD_AND_JACOBIAN: lambda waves, i, j: _with_slopes(waves, i.features, waves.coefficients(j.features, j.momenta)),
     GRADIENT: _gradient,
     HESSIAN_PRODUCT: _hessian_product,
 }

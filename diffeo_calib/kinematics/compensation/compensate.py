@@ -177,7 +177,11 @@ def compensate(
         raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
     check_number(lever, "`lever`", above=0.0)
     wanted, robot = real_tensor(targets, "targets"), model.robot
-    begin, following = _starts(start, robot, wanted)
+    fix = "pass the joints of `robot.joint_names`, one row per target, or one start for the first row"
+    given = real_tensor(named_columns(start, robot.joint_names, "start"), "start")
+    following = given.ndim == 1 and wanted.ndim > 1  # every other row starts at the command of the row before
+    begin = finite_rows(given, "start", (robot.n,) if following else ("N", robot.n), fix)
+    begin = np.tile(begin, (len(wanted), 1)) if following else begin
     goals = checked_targets(wanted, robot, len(begin), axis=axis, tool_axis=tool_axis, lever=lever)
     tools = _tools(model, tool, goals)
     functions = tool_functions(model, tools, frame)
@@ -187,8 +191,7 @@ def compensate(
     factor = BOUND_FACTOR_BETWEEN_ROWS if following and bound is None else 1.0
     usual = factor * np.where(robot.periodic, TURN_BOUND, SLIDE_BOUND)
     motion = by_joint(robot, bound, "bound", usual)
-    aimed = np.ones((len(begin), 1), dtype=bool) if goals.free is None else ~goals.free
-    mobility = mobilities(robot, weights, tuple(tools), aimed)
+    mobility = mobilities(robot, weights, tuple(tools), ~goals.free)
     problem = CompensationProblem(functions, goals, begin, joint_limits(robot, limits), motion, mobility)
     pace = _pace(robot, problem, rate, time, path=path and not following)
     if following:
@@ -203,16 +206,6 @@ def compensate(
         fix = "look at their statuses: the path may pass a singularity or change its branch there"
         warn_user(sentence(rows, fix=fix))
     return _result(problem, found, jumps)
-
-
-def _starts(start: object, robot: Tree, targets: Tensor) -> tuple[Array, bool]:
-    """(N, n) starts, and whether only the first one counts."""
-    fix = "pass the joints of `robot.joint_names`, one row per target, or one start for the first row"
-    start = real_tensor(named_columns(start, robot.joint_names, "start"), "start")
-    if start.ndim == 1 and targets.ndim > 1:
-        first = finite_rows(start, "start", (robot.n,), fix)
-        return np.tile(first, (len(targets), 1)), True
-    return finite_rows(start, "start", ("N", robot.n), fix), False
 
 
 def _pace(robot: Tree, problem: CompensationProblem, rate: object, time: object, *, path: bool) -> Pace | None:
@@ -243,7 +236,7 @@ def _tools(model: CalibratedKinematics, tool: object, goals: Targets) -> dict[st
         InputError: not one tool for every tip.
     """
     tips = model.robot.tips
-    if goals.free is None:
+    if not goals.of_tips:
         return {checked_tip(model.robot, model.tool_tip): model.tool if tool is None else tool_transform(tool)}
     if tool is None:
         own = model.tool_tip or tips[0]
@@ -256,12 +249,11 @@ def _tools(model: CalibratedKinematics, tool: object, goals: Targets) -> dict[st
 
 
 def _result(problem: CompensationProblem, found: Solution, jumps: Sequence[int] | Array = ()) -> Compensation:
-    (miss, angle), poses, free = problem.targets.misses(found.poses), found.poses, problem.targets.free
-    if free is None:
+    goals, status = problem.targets, tuple(MEMBERS[code] for code in found.codes.tolist())
+    (miss, angle), poses = goals.misses(found.poses), found.poses
+    miss, angle = np.where(goals.free, np.nan, miss), None if angle is None else np.where(goals.free, np.nan, angle)
+    if not goals.of_tips:
         poses, miss, angle = poses[:, 0], miss[:, 0], None if angle is None else angle[:, 0]
-    else:
-        miss, angle = np.where(free, np.nan, miss), None if angle is None else np.where(free, np.nan, angle)
-    status = tuple(MEMBERS[code] for code in found.codes.tolist())
     q, start, seen, away = (torch.from_numpy(part) for part in (found.q, problem.start.copy(), poses, miss))
     turned = None if angle is None else torch.from_numpy(angle)
     return Compensation(q, start, status, seen, away, turned, tuple(int(row) for row in jumps))

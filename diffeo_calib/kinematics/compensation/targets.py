@@ -54,9 +54,9 @@ class Targets:
     position: Array  # (N, T, 3) m
     axes: Array  # (N, T, 3, A) orthonormal columns, the directions of these axes
     tool_axes: Array  # (3, A) the axes in the frame of the tool
-    lever: float = 0.1  # L in m
-    # (N, T) True where a tool may be anywhere; None for targets of the single tool of a model
-    free: Array | None = None
+    lever: float  # L in m
+    free: Array  # (N, T) True where a tool may be anywhere
+    of_tips: bool = True  # whether they are those of all tips of a robot, else of the tool of a model
     along: Array | None = None  # (T, 3, 3) projectors on the directions in which shifts count; None for all
 
     def __len__(self) -> int:
@@ -69,8 +69,7 @@ class Targets:
 
     def take(self, rows: Array) -> Targets:
         """The targets of some rows."""
-        free = None if self.free is None else self.free[rows]
-        return replace(self, position=self.position[rows], axes=self.axes[rows], free=free)
+        return replace(self, position=self.position[rows], axes=self.axes[rows], free=self.free[rows])
 
     @property
     def weight(self) -> float:
@@ -143,8 +142,7 @@ class Targets:
 
     def _counted(self, values: Array) -> Array:
         """Values (N, T, ...) of tools, zero where one is free."""
-        if self.free is not None:
-            values[self.free] = 0.0
+        values[self.free] = 0.0
         return values
 
     def _joined(self, shifts: Array, turns: Array) -> Array:
@@ -176,7 +174,8 @@ def checked_targets(targets: Tensor, robot: Tree, rows: int, *, axis: object, to
     fix = "pass one pose (4, 4) or one position (3,) for every row of `start`"
     if targets.ndim != 4 and not (targets.ndim == 3 and targets.shape[2] == 3):
         finite_rows(targets, "targets", (rows, 4, 4) if targets.ndim == 3 else (rows, 3), fix)
-        return Targets(**_parts(targets[:, None], axis, tool_axis, "row {}".format), lever=lever)
+        parts = _parts(targets[:, None], axis, tool_axis, "row {}".format)
+        return Targets(**parts, lever=lever, free=np.zeros((rows, 1), dtype=bool), of_tips=False)
     tips, one = targets.shape[1], targets.shape[2:]
     if tips != len(robot.tips):
         fix = "pass one for every tip, NaN where a tip may be anywhere; or (N, 4, 4) or (N, 3) for the tip of the tool"

@@ -21,12 +21,11 @@ from diffeo_calib.reports.analysis.findings import Findings, RowsOfKind
 from diffeo_calib.reports.analysis.predictions import FitRows, Predictions
 from diffeo_calib.reports.analysis.stages import STANDARD_REPEATS, Kinematics
 from diffeo_calib.reports.html import sentences
-from diffeo_calib.reports.html.document import Picture, Section, Table, joint_values_by_row, marker_name
+from diffeo_calib.reports.html.document import Picture, Section, Table, joint_values_by_row
 from diffeo_calib.reports.html.document import millimetres as mm
 from diffeo_calib.reports.html.document import rough_millimetres as rough
-from diffeo_calib.reports.plots import errors as plots
-from diffeo_calib.reports.plots import joints
-from diffeo_calib.reports.plots.joints import joint_label, joint_unit, joint_values
+from diffeo_calib.reports.plots import panels
+from diffeo_calib.reports.plots.panels import joint_label, joint_unit, joint_values
 from diffeo_calib.reports.plots.style import PANEL, Frame
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.payload import payload_sentence
@@ -53,13 +52,13 @@ def stage_pictures(stages: Mapping[str, Evaluation], suffix: str, repeatability:
     some = next(iter(stages.values()))
     label = f"Share of rows whose {some.label} is at most a value."
     how = {"repeatability": repeatability, "frame": UNDER_LEGEND}
-    yield Picture(f"distributions{suffix}", label, plots.draw_distributions, stages, **how)
+    yield Picture(f"distributions{suffix}", label, panels.draw_distributions, stages, **how)
     label = f"Every row: {some.label} of the calibrated model against that of the stage before it."
-    yield Picture(f"before-after{suffix}", label, plots.draw_before_after, stages, frame=UNDER_LEGEND)
+    yield Picture(f"before-after{suffix}", label, panels.draw_before_after, stages, frame=UNDER_LEGEND)
     turned = {name: one.orientation for name, one in stages.items() if one.orientation is not None}
     if turned:
         label = "Share of rows whose orientation error is at most a value."
-        yield Picture(f"angles{suffix}", label, plots.draw_distributions, turned, frame=UNDER_LEGEND)
+        yield Picture(f"angles{suffix}", label, panels.draw_distributions, turned, frame=UNDER_LEGEND)
 
 
 def stage_table(stages: Mapping[str, Evaluation]) -> Table:
@@ -112,7 +111,7 @@ def where(found: Findings) -> Section:
     pictures, solid = list[Picture](), "dashed anywhere in the measured ranges, solid where it was measured."
     for k, name in enumerate(robot.joint_names):
         label, what = f"Error that the model itself expects against {printable(name)}: {solid}", (robot, k)
-        pictures.append(Picture(f"expected-{k}", label, joints.draw_expected, *what, found.deviations, key=k == 0))
+        pictures.append(Picture(f"expected-{k}", label, panels.draw_expected, *what, found.deviations, key=k == 0))
     scene = None if found.predictions is None else _scene(found.stages, found.predictions)
     arrows = "Arrows point from the predicted to the measured place, with one scale in all views. Below: "
     see = arrows * (scene is not None) + (
@@ -153,13 +152,13 @@ def _scene(stages: Mapping[str, Kinematics], seen: Predictions) -> dict[str, Any
 def why(found: Findings) -> Section:
     """What each part of the model explains: sag, waves of its gears, and corrections of the geometry."""
     parts = found.parts
-    left = 0.3 + PER_LETTER * max(len(joints.short(part.name)) for part in parts)
-    frame = Frame((joints.PART_WIDTH, 0.9 + 0.24 * len(parts)), left=left)
+    left = 0.3 + PER_LETTER * max(len(panels.short(part.name)) for part in parts)
+    frame = Frame((panels.PART_WIDTH, 0.9 + 0.24 * len(parts)), left=left)
     label = "What each part of the model explains (parts may cancel)."
-    pictures = [Picture("parts", label, joints.draw_parts, parts, frame=frame)]
+    pictures = [Picture("parts", label, panels.draw_parts, parts, frame=frame)]
     label = "motion beyond its reading, with its 95 % band; below, where the joint was measured."
     for joint, name in enumerate(found.model.robot.joint_names):
-        what = joints.draw_transmission, found.model, found.rows, joint
+        what = panels.draw_transmission, found.model, found.rows, joint
         pictures.append(Picture(f"transmission-{joint}", f"{printable(name)}: {label}", *what))
     see, tables = "A wide band means that the joint was measured too little there.", list[Table]()
     notes = ["Coupled joint errors depend on several joints, task space on the place of the marker."]
@@ -216,11 +215,11 @@ def trust(found: Findings) -> Section:
     pictures = list[Picture]()
     if seen is not None:
         label = "Found against claimed shares of errors; on the diagonal the claims are true."
-        pictures.append(Picture("coverage", label, plots.draw_coverage, seen))
+        pictures.append(Picture("coverage", label, panels.draw_coverage, seen))
     if found.learning_curve:
         label = "Error of rows of the fit when a model knows fewer of them, each row left out in turn."
         what = found.learning_curve, found.forecast, found.limit if found.repeats else None
-        pictures.append(Picture("learning", label, plots.draw_learning_curve, *what))
+        pictures.append(Picture("learning", label, panels.draw_learning_curve, *what))
     pictures += _residuals(found)
     wrong = list(outlier_lines(found.outliers, 0 if seen is None else len(seen), "rows"))
     return Section("trust", "Can I trust it", sentences.judged(found), tables, None, pictures, notes, wrong)
@@ -238,11 +237,11 @@ def _residuals(found: Findings) -> Iterator[Picture]:
             missing = int((~values.isfinite()).sum())
             label += f" {missing} of {len(values)} rows have no value." * (missing > 0)
             given = values, errors, printable(name)
-            yield Picture(f"residuals-{place}-{number}", label, plots.draw_residuals, *given, key=number == 0)
+            yield Picture(f"residuals-{place}-{number}", label, panels.draw_residuals, *given, key=number == 0)
         for joint, name in enumerate(robot.joint_names):
             label = f"{what} against {printable(name)}, their RMS dashed."
             given = joint_values(robot, joint, q[:, joint]), errors, joint_label(robot, joint)
-            yield Picture(f"residuals-{place}-joint-{joint}", label, plots.draw_residuals, *given, key=False)
+            yield Picture(f"residuals-{place}-joint-{joint}", label, panels.draw_residuals, *given, key=False)
 
 
 def _largest(found: Findings, own: RowsOfKind) -> Table:
@@ -257,7 +256,8 @@ def _largest(found: Findings, own: RowsOfKind) -> Table:
         lines.append(["expected RMS [mm]", *(mm(float(seen.claimed[row, body[row]])) for row in order)])
     lines += joint_values_by_row(found.model.robot, own.q[order])
     if own.errors.errors.shape[1] > 1:
-        lines.insert(0, ["marker", *(marker_name(int(body[row]), found.model.on) for row in order)])
+        on = [f" on {printable(tip)}" * (len({*found.model.on}) > 1) for tip in found.model.on]
+        lines.insert(0, ["marker", *(f"{number}{on[number]}" for number in body[order].tolist())])
     return Table(what, ["row", *(str(int(own.lines[row])) for row in order)], lines)
 
 

@@ -8,7 +8,7 @@ from diffeo_calib.common.errors import printable
 from diffeo_calib.common.quantiles import binomial_band, largest_known
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.html.document import rough_millimetres
-from diffeo_calib.reports.plots.joints import in_bins, joint_unit, joint_values
+from diffeo_calib.reports.plots.panels import in_bins, joint_unit, joint_values
 from diffeo_calib.sensors.errors import ERRORS
 
 WORTHWHILE_ERROR_FACTOR = 1.1
