@@ -49,11 +49,11 @@ LIST = re.compile(r"(?:[\w.]+\((?:'\w', *)?)?([\[(].*[\])])(?:, *dtype=[\w.]+)?\
 """A list in one cell, as Python, NumPy and ROS write it: [0.1, 0.2], (0.1, 0.2), [0.1 0.2], array('d', [0.1, 0.2])."""
 UNQUOTED = r"(?m)(^|{0})[ \t]*([\[(][-+\d.][^\[\]()\n]*[\])])[ \t]*(?={0}|\r?$)"
 STATISTICS = re.compile(
-    r"(mean|average|avg|mittel|moyenne|media|median|std|st\.? ?dev|standard|sigma|σ|rms|min|max|range|spannweite|count"
-    r"|anzahl|sum|ecart|écart)\w*[.:]?( ?(abw|dev|value|wert|error)\w*\.?)?:?",
+    r"(?:(mean|average|avg|mittel|moyenne|media|std|st\.? ?dev|standard|rms)|median|sigma|σ|min|max|range|spannweite"
+    r"|count|anzahl|sum|ecart|écart)\w*[.:]?( ?(abw|dev|value|wert|error)\w*\.?)?:?",
     re.IGNORECASE,
 )
-"""Words before the statistics of columns, below the rows."""
+"""Words before the statistics of columns, below the rows; a mean or a deviation is among them."""
 OTHERS = re.compile(r"[mu]?s|sec|min|h|k?g|nm?|°?c|k|v|px|pixels?|%|-|none")
 
 
@@ -112,9 +112,9 @@ class CsvLines:
             and not (named and cells[:expected] == self.header)
             and not (self._commented and _is_comment(cells))
         ]
-        words = [next(filter(None, cells)) for _, cells in kept]
-        last = list(takewhile(STATISTICS.fullmatch, reversed(words)))
-        if len({*last}) == len(last) < len(kept):  # not a word in all rows
+        found = (STATISTICS.fullmatch(next(filter(None, cells))) for _, cells in reversed(kept))
+        last = [(own[0], own[1]) for own in takewhile(bool, found) if own]
+        if len({*last}) == len(last) < len(kept) and any(sure for _, sure in last):  # no word of all rows, or a name
             kept = kept[: len(kept) - len(last)]
         sizes = expected, expected + self._extra
         bad = [(line, len(cells)) for line, cells in kept if len(cells) not in sizes or any(cells[expected:])]
