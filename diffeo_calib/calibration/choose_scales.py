@@ -30,8 +30,10 @@ from torch import Tensor
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.scales import position_errors
 from diffeo_calib.calibration.scales.leave_one_out import (
+    FEWEST_HALVED,
     LeaveOneOut,
     cross_validated_inflation,
+    inflation_by_parts,
     inflation_by_places,
     leave_one_out,
     variance_ratio,
@@ -48,12 +50,15 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.observation import LinearFunctionals, Observation
 from diffeo_calib.process.scales import DEVIATIONS, FOUND, SCALES, GearLine, Hyperparameters
+from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.tree import Tree
 
 FEWEST_POSES = 12
 """Different poses below which the data cannot determine the scales: defaults are used."""
 NOISE_SHARE = 0.3
 """Of the registration's residual, which counts as noise where the geometry has more parameters than there are data."""
+DOUBTED_WEIGHT = 0.25
+"""Of a row beside the geometric calibration, below which the first search for scales leaves it out."""
 FEWEST_JUDGED = 30
 """Rows below which leave-one-out errors are too few to judge the scales."""
 VARIANCE_RATIO = 2.5
@@ -135,12 +140,16 @@ def choose_scales(
         warn_user(sentence(f"{count} are too few to select scales: defaults are used", fix=fix))
         found = Selection(centre, f"defaults, since {count} are too few to select them")
     else:
-        found = select(centre, data, seed=seed, progress=progress)
+        # fields explain gross errors where these weigh as much as beside the geometry, whose errors are larger
+        found = select(centre, data.trusted(DOUBTED_WEIGHT), seed=seed, progress=progress)
         data = weighed(data, found.scales, seed)
-        if not found.interrupted:
-            start = None if data.tails.gross else found.scales  # which let the fields explain gross errors
+        again = True
+        while again and not found.interrupted:  # from the start once more where gross errors show only now
+            gross = data.tails.gross
+            start = None if gross else found.scales  # which let the fields explain gross errors
             found = select(centre, data, start=start, seed=seed, progress=progress)
             found, data = _supported(found, data, seed)
+            again = data.tails.gross and not gross
         found = replace(found, scales=with_payload_factor(data, found.scales, seed))
         how = {"poses": poses, "lines": measurements.line_numbers, "seed": seed, "progress": progress}
         centre, found, data = _with_position_errors(centre, found, data, **how)
@@ -168,6 +177,8 @@ def _inflated(
         if centre is None or (poses >= FEWEST_POSES and not found.interrupted):
             inflation = cross_validated_inflation(centre, found.scales, data, groups, seed=seed, progress=progress)
             found = replace(found, interrupted=inflation is None)
+        if is_cartesian(data.nominal.geometry.chain) and poses >= FEWEST_HALVED:
+            inflation = max(inflation or few, inflation_by_parts(data, found.scales, seed))
         least = float(data.tails.gross or measurements.without_device)  # no reading shows every direction
         factor = max(inflation or few, least)
         row_scales = found.scales if factor < 1.0 else None  # narrow regions make no outliers
