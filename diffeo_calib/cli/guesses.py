@@ -366,10 +366,10 @@ class RowColumns:
         """Whether the rows are corners of a board in images."""
         return any(text.startswith(CORNERS) for text in self.readings)
 
-    def entries(self, folder: Path) -> Iterator[Choice]:
-        """Entries of a campaign in a folder that name them."""
+    def entries(self, folder: Path, spherical: str | None) -> Iterator[Choice]:
+        """Entries of a campaign in a folder that name them; places may be a distance and two angles."""
         if self.markers:
-            names = [",".join(triple) for triple in self.markers]
+            names = [f"{spherical}=" * (spherical is not None) + ",".join(triple) for triple in self.markers]
             yield Choice("position", names, f"{len(names)} marker(s), by their names")
         yield from (Choice("", "", f"{text}; not used") for text in self.left)
         if self.sockets:

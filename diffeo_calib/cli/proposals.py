@@ -325,7 +325,7 @@ def with_units(source: Source) -> Source:
     why = f"{what} {percent(best.left, 2)}, {than}{why}"
     no_length = source.rows.without_length and all(periodic)
     length, angle = ("of lengths that you add: the table holds none", why) if no_length else (why, "the same")
-    others = {"joint_length": "the same: the slides are in another unit", "spherical": "the same"}
+    others = {"joint_length": "the same: the slides are in another unit"}
     others["camera_on_tool"] = "the same; else the board is on the tool"
     return best.saying(*entries([best.table], length=length, angle=angle, **others))
 
@@ -396,7 +396,7 @@ def _with_meanings(best: Source) -> Source:
             why = f"the nominal robot then leaves {percent(meaning.left, 2)} of what the rows vary, with the columns "
             why += f"as they are {percent(best.left)}{more}"
             said.append(Choice("joints", ",".join(own.texts(joints.columns, *units)), why, sure=len(found) == 1))
-        said += entries([one.table], length="with these joints", angle="the same", spherical="the same")
+        said += entries([one.table], length="with these joints", angle="the same")
         names = str(said[0].value).split(",") if said[0].sure else best.joints
         return with_measured(replace(one, joints=names).saying(*said))  # the robot explains the rows only now
     return best

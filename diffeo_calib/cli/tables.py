@@ -30,7 +30,7 @@ from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
 from diffeo_calib.measurements.csv.sensors import ImageColumns, ReadingColumns, SocketColumns, columns_of
 from diffeo_calib.measurements.poses import by_frame
-from diffeo_calib.measurements.table_format import BESIDE, LEVER, TableFormat
+from diffeo_calib.measurements.table_format import BESIDE, LEVER, SPHERICAL, TableFormat
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.kinds import known_kinds
@@ -62,11 +62,13 @@ def table_format(units: Units) -> TableFormat:
 def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
     """Add the columns that options name, but for readings; lever in the unit of length."""
     Rows.check_together(vars(rows))
-    as_typed = "convention", "rotation_angle", "remounted", "session", "marker", "spherical", *BESIDE
+    as_typed = "convention", "rotation_angle", "remounted", "session", "marker", *BESIDE
+    spherical = next((one.partition("=")[0] for one in rows.position or () if _place(one) != one), None)
     return replace(
         table,
         **{name: getattr(rows, name) for name in as_typed},
-        position=[_split_names(text) for text in rows.position or ()] or None,
+        position=[_split_names(_place(text)) for text in rows.position or ()] or None,
+        spherical=spherical,
         rotation=_names_of_each(rows.rotation),
         lever=LEVER if rows.lever is None else rows.lever / table.per_metre,
         camera_on_tool=rows.camera_on_tool and not rows.images,
@@ -139,7 +141,7 @@ def rows_in_table(csv: Path, rows: Rows) -> tuple[Rows, list[str]]:
     """Options without the kinds of rows that a table has no column of, if it has those of others; and these kinds."""
     table = table_format(rows)
     header = set(read_cells(with_places(csv, rows, table), table.sep)[0])
-    kinds = {"--position": rows.position or [], "--socket": [rows.socket] * (rows.socket is not None)}
+    kinds = {"--position": [*map(_place, rows.position or ())], "--socket": [rows.socket] * (rows.socket is not None)}
     kinds |= {f"--reading {text}": [text.partition("=")[2]] for text in rows.reading or () if CORNERS not in text}
     named = {kind: {name.strip() for text in texts for name in text.split(",")} for kind, texts in kinds.items()}
     there = {kind: bool(names & header) for kind, names in named.items() if names}
@@ -148,7 +150,7 @@ def rows_in_table(csv: Path, rows: Rows) -> tuple[Rows, list[str]]:
     missing = [kind for kind, has in there.items() if not has]
     changes: dict[str, Any] = {} if rows.session in header else {"session": None, "remounted": False}
     if "--position" in missing:
-        changes |= {"position": None, "spherical": None, "std": None, "rotation": None, "rotation_std": None}
+        changes |= {"position": None, "std": None, "rotation": None, "rotation_std": None}
     if "--socket" in missing:
         changes |= {"socket": None, "distance": None, "distance_std": None}
     kept = [text for text in rows.reading or () if f"--reading {text}" not in missing]
@@ -274,6 +276,12 @@ def with_rotation(table: TableFormat, given: Targets) -> TableFormat:
     if convention is None and isinstance(joints, PoseColumns) and not joints.is_program:
         convention, angle = joints.convention or None, angle or table.angle
     return replace(table, convention=convention, rotation_angle=angle).for_writing(rotation_std=False)
+
+
+def _place(text: str) -> str:
+    """The columns of a place, without the way in which these are a distance and two angles."""
+    way, _, columns = text.partition("=")
+    return columns if way in SPHERICAL else text
 
 
 def _split_names(text: str) -> list[str]:

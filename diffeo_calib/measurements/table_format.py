@@ -78,7 +78,8 @@ class TableFormat:
             units of the table, such as -{J2}+90 or {J3}+{J2}. In Python also the robot.
         kinds: of each joint; by default those of the robot, or all revolute.
         position: the three position columns of a marker; several of them for more markers. Empty cells: hidden in that
-            row. A third name "0" that is no column: all are in the plane of x and y. None in Python without positions.
+            row. On the command line elevation_deg=R,AZ,EL or zenith_clockwise_gon=... for a distance and two angles. A
+            third name "0" that is no column: all are in the plane of x and y. None in Python without positions.
         spherical: positions are a distance, a horizontal angle and one above the horizon, or from the zenith, as
             trackers and total stations report them: elevation_deg, zenith_gon, elevation_clockwise_rad, ...
         sockets: columns of a ball in sockets. readings: of each kind of reading, and of images (csv/sensors.py).

@@ -215,7 +215,7 @@ def test_places_as_a_distance_and_angles(names: tuple[str, str], written: str, p
     found, _ = proposed(
         (SERIES, q), (["Slope dist", *names], to_spherical(points, written) * torch.tensor([1.0, GON, GON]))
     )
-    assert (found["position"], found["spherical"]) == ([f"Slope dist,{names[0]},{names[1]}"], written)
+    assert found["position"] == [f"{written}=Slope dist,{names[0]},{names[1]}"]
     assert (found["length"], found["angle"]) == ("mm", "deg")
 
 

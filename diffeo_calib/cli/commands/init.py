@@ -76,7 +76,7 @@ def run(given: InitOptions) -> None:
     choices = [
         Choice("csv", relpath(given.csv, output.parent), "; ".join(["the table", *sheet.notes])),
         *joined,
-        *source.rows.entries(output.parent),
+        *source.rows.entries(output.parent, source.table.spherical),
         *source.said,
         Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it"),
         Choice("decimal", sheet.decimal, "the same"),
