@@ -44,10 +44,6 @@ class SampledRows(NamedTuple):
         motion = self.data.in_coordinates(effects) @ u
         return motion.unflatten(1, (-1, 3 if motion.shape[1] % 3 == 0 else motion.shape[1])).norm(dim=2)
 
-    def left(self, E: Tensor) -> float:
-        """Part of the RMS left-out error that remains beside unknowns of any size with effects (M, U)."""
-        return left_out_rms(self.process.opened(E)) / left_out_rms(self.process)
-
 
 def left_out_rms(process: Process) -> float:
     """RMS of the errors of rows, m, as all other rows predict them."""
@@ -113,7 +109,7 @@ OF_MIMIC = "check the multiplier of this joint in the robot's description"
 
 
 def lengths_of(data: TangentData) -> Iterator[Hypothesis]:
-    """The whole robot, the axes of its measuring device, and single links."""
+    """The whole robot, the axes of its measuring device, slides, and what joints are to those that they follow."""
     geometry = data.nominal.geometry
     away = data.places.unflatten(1, (-1, 3)) - geometry.base[:3, 3].to(data.x.device)
 
@@ -139,6 +135,12 @@ def lengths_of(data: TangentData) -> Iterator[Hypothesis]:
             value = q @ chain.coupling[joint].to(q)
             along = (moved * value[:, None])[..., None]
             yield Hypothesis(f"the multiplier of {name}", along, fix=OF_MIMIC, **ratio)
+
+
+def links_of(data: TangentData) -> Iterator[Hypothesis]:
+    """Single links."""
+    chain = data.nominal.geometry.chain
+    for joint, name in enumerate(chain.moving_names):
         offset = chain.offsets[joint].to(data.x.device)
         length = float(offset[:3, 3].norm())
         if chain.before[joint] >= 0 and length > gates.LINK_M:  # the first joint's is where the base stands

@@ -431,7 +431,8 @@ def with_usual_drift(rows: NewRows, named: Sequence[ChangedPart]) -> list[Change
     (_, odds, size), kept = max(found, key=itemgetter(0))
     if odds < gates.DRIFT_ODDS and all(each.joint is not None for each in named):
         return [*named]
-    if not named and likeliest(rows.tails, [])[1] < gates.DRIFT_ODDS_OF_INLIERS:
+    inliers = (rows.tails.weights >= OUTLIER_WEIGHT).all(1).double().mean()  # a minority says nothing
+    if not named and inliers > MOST_OUTLIERS and likeliest(rows.tails, [])[1] < gates.DRIFT_ODDS_OF_INLIERS:
         return []
     return [*kept, *(replace(part, variance=size) for part in parts)]
 
