@@ -13,6 +13,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else every process that a test starts compiles the package
 
 
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +90,21 @@ def given_scales(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", with_usual_scales)
 
 
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Chromium, where this machine has it."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    names = "chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
+    path = next(filter(None, map(shutil.which, names)), None)
+    if path is None:
+        pytest.skip("no Chromium on this machine: apt install chromium")
+    with playwright.sync_playwright() as running:
+        root = hasattr(os, "geteuid") and os.geteuid() == 0  # Chromium's sandbox refuses root
+        started = running.chromium.launch(executable_path=path, args=["--no-sandbox"] if root else [])
+        yield started
+        started.close()
+
+
 BY_KIND = (
     *("test_matrix.py", "test_kinds_judged.py", "test_init.py", "test_live_campaign.py", "test_expected_errors.py"),
     *("test_registered_kinds.py", "test_predicted_readings.py", "test_laws_of_kinds.py", "test_golden.py"),
@@ -96,8 +113,8 @@ BY_KIND = (
 LONGEST = (
     *BY_KIND,
     *("test_keops.py", "test_torch_program.py", "test_report.py", "test_registered.py", "test_recalibrate.py"),
-    *("test_documentation.py", "test_outliers.py", "test_sockets.py", "test_transforms.py", "test_rigid.py"),
-    *("test_hidden_markers.py", "test_planned_sensors.py", "test_json_results.py"),
+    *("test_documentation.py", "test_outliers.py", "test_sockets.py", "test_tool.py", "test_rigid.py"),
+    *("test_planned_sensors.py", "test_json_results.py"),
     *("test_distributed.py", "test_analysis.py", "test_evaluators.py", "test_readings.py", "test_tree_calibrations.py"),
     *("test_registration.py", "test_calibrate.py", "test_hardware.py", "test_unusual_data.py"),
     *("test_refused.py", "test_second_device.py", "test_fit.py"),

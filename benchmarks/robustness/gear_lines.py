@@ -38,9 +38,9 @@ import diffeo_calib as dc
 from diffeo_calib.calibration import choose_scales
 from diffeo_calib.calibration.diagnostics.plausibility import registered
 from diffeo_calib.calibration.identification.identification import identify
-from diffeo_calib.calibration.scales.gear_lines import find_gear_lines
 from diffeo_calib.calibration.scales.leave_one_out import weighed
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
+from diffeo_calib.calibration.scales.position_errors import find_gear_lines
 from diffeo_calib.calibration.scales.selection import defaults, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.kinematics.nominal import GeometryMap
@@ -111,7 +111,7 @@ def drawn(poses: int, draws: int) -> Record:
 @contextmanager
 def no_scan() -> Iterator[None]:
     """Calibrations without gear lines."""
-    scan = choose_scales.gear_lines
+    scan = choose_scales.position_errors
     before, scan.find_gear_lines = scan.find_gear_lines, lambda *_: ()
     try:
         yield

@@ -45,7 +45,6 @@ from diffeo_calib.calibration.diagnostics.row_order import warn_of_contradiction
 from diffeo_calib.calibration.expected_errors import with_open_directions
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.result import CalibrationResult, parts
-from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.checks import check_count, check_seed
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import InputError, as_written, few, kept_warnings, warn_user
@@ -204,20 +203,18 @@ def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: P
     """The exact model, fitted from the geometric calibration."""
     data = chosen.data
     problem = robot_problem(data, chosen.selection.scales)
-    count = _count(controls, data)
+    count = None if controls in ("auto", "all") else controls
+    if (
+        controls == "auto"
+        and not data.nominal.load.by_row
+        and data.y.numel() > MAX_DENSE
+        and len(data.x) > AUTO_CONTROLS
+    ):
+        count = AUTO_CONTROLS
     start = replace(problem.zero(), theta=data.theta) if count is None else None  # coarse fits find one of their own
     solver = GaussNewton(tolerance=RESIDUAL_TOLERANCE)
     fitted = fit(problem, solver, controls=count, backend=backend, start=start, progress=progress)
     return replace(fitted, advice=ADVICE)
-
-
-def _count(controls: Controls, data: TangentData) -> int | None:
-    """Number of configurations that carry momenta; None for all."""
-    if controls == "all" or (controls == "auto" and data.nominal.load.by_row):
-        return None
-    if controls == "auto":
-        return AUTO_CONTROLS if data.y.numel() > MAX_DENSE and len(data.x) > AUTO_CONTROLS else None
-    return controls
 
 
 def _result(

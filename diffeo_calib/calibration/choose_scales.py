@@ -28,8 +28,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.calibration.scales import gear_lines
-from diffeo_calib.calibration.scales.axis_errors import with_axis_errors
+from diffeo_calib.calibration.scales import position_errors
 from diffeo_calib.calibration.scales.leave_one_out import (
     LeaveOneOut,
     cross_validated_inflation,
@@ -38,6 +37,7 @@ from diffeo_calib.calibration.scales.leave_one_out import (
     variance_ratio,
     weighed,
 )
+from diffeo_calib.calibration.scales.position_errors import with_axis_errors
 from diffeo_calib.calibration.scales.selection import Selection, defaults, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import InputError, sentence, warn_user
@@ -135,7 +135,12 @@ def choose_scales(
         warn_user(sentence(f"{count} are too few to select scales: defaults are used", fix=fix))
         found = Selection(centre, f"defaults, since {count} are too few to select them")
     else:
-        found, data = _selected(centre, data, seed, progress)
+        found = select(centre, data, seed=seed, progress=progress)
+        data = weighed(data, found.scales, seed)
+        if not found.interrupted:
+            start = None if data.tails.gross else found.scales  # which let the fields explain gross errors
+            found = select(centre, data, start=start, seed=seed, progress=progress)
+            found, data = _supported(found, data, seed)
         found = replace(found, scales=with_payload_factor(data, found.scales, seed))
         how = {"poses": poses, "lines": measurements.line_numbers, "seed": seed, "progress": progress}
         centre, found, data = _with_position_errors(centre, found, data, **how)
@@ -182,19 +187,6 @@ def noise_of_few(data: TangentData, poses: int, registration: Identification, id
     return max(identification.noise, NOISE_SHARE * registration.noise)
 
 
-def _selected(
-    centre: Hyperparameters, data: TangentData, seed: int, progress: Progress
-) -> tuple[Selection, TangentData]:
-    """Scales by marginal likelihood, and the measurements with the weights that follow."""
-    first = select(centre, data, seed=seed, progress=progress)
-    data = weighed(data, first.scales, seed)
-    if first.interrupted:
-        return first, data
-    start = None if data.tails.gross else first.scales  # which let the fields explain gross errors
-    second = select(centre, data, start=start, seed=seed, progress=progress)
-    return _supported(second, data, seed)
-
-
 def _supported(found: Selection, data: TangentData, seed: int) -> tuple[Selection, TangentData]:
     """Drop amplitudes that the data do not support, and with the weights that follow."""
     noise = data.noise_model.mean_covariance(found.scales, data.jacobian)
@@ -213,13 +205,13 @@ def _with_position_errors(
     progress: Progress,
 ) -> tuple[Hyperparameters, Selection, TangentData]:
     """Add the gear lines, then the axes, that the data show; choose the other scales again for what is left."""
-    for stage in ("gear lines",) * (poses >= gear_lines.FEWEST_POSES) + ("axes",):
+    for stage in ("gear lines",) * (poses >= position_errors.FEWEST_POSES) + ("axes",):
         if found.interrupted:
             break
         progress(stage, 0, 1)
         if stage == "axes":
             start = with_axis_errors(data, found.scales, lines)
-        elif gears := gear_lines.find_gear_lines(data, start := found.scales, seed):
+        elif gears := position_errors.find_gear_lines(data, start := found.scales, seed):
             start = replace(start, lines=gears)
         if start is not found.scales:
             data = data.with_position_errors(start)

@@ -107,7 +107,7 @@ class _Lines:
     def __init__(self, file: Path, text: str) -> None:
         self.what, self.words, self.written = f"file '{file}'", dict[str, list[list[str]]](), dict[str, str]()
         if text.lstrip().startswith("<"):
-            text = re.sub(r"<(\w+)[^<>]*>", r"\n\1: ", re.sub("<[/!?][^<>]*>", "\n", text))
+            text = re.sub(r"<(\w+)\b[^<>]*>", r"\n\1: ", re.sub("<[/!?][^<>]*>", "\n", text))
         text = re.sub("#.*", "", text)
         if text.count("[") != text.count("]"):
             raise InputError.of(self.what, expected=FORMS, got="a list without an end", fix="check the file")

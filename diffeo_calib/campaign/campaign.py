@@ -31,8 +31,9 @@ from diffeo_calib.robots.tree import Tree
 
 FIRST_ROWS = 12
 """Accepted rows of the first model."""
-ROWS_GROWTH_PER_MODEL = 1.5
-"""Factor by which the accepted rows grow between two models."""
+ROWS_GROWTH_PER_MODEL, WAITING_GROWTH, TOGETHER = 1.5, 4.0, 24
+"""Factor by which the accepted rows grow between two models, and between those while more rows wait; most rows that are
+judged together."""
 FIRST_SCALES, SCALES_GROWTH = 20, 2.0
 """Accepted rows at which scales are selected first; factor by which these grow until they are selected again."""
 NEAR, NEAR_GROWTH = 1.5, 1.15
@@ -112,7 +113,7 @@ class Campaign:
         self._model: CampaignModel | None = None
         self._made: list[CampaignModel] = []
         self._maker: Thread | None = None
-        self._tried = 0
+        self._tried = self._waiting = 0
         self._obstacle = ""  # why there is no first model
 
     def __len__(self) -> int:
@@ -145,12 +146,15 @@ class Campaign:
         return self.goal is not None and (self.error_limit or inf) <= self.goal
 
     @small_work()
-    def add(self, q_or_table: object, y: object = None) -> list[Verdict]:
+    def add(self, q_or_table: object, y: object = None, *, waiting: int = 0) -> list[Verdict]:
         """Judge rows, one after the other, and take in those that fit.
+
+        The verdicts are those of single rows, but new models are made less often as long as more rows wait.
 
         Args:
             q_or_table: rows of any kind that :func:`calibrate` takes; or joint values (N, n) or (n,), rad or m.
             y: with joint values, the measured positions (N, P, 3), (N, 3) or (3,), m.
+            waiting: rows that are there and follow in another call.
 
         Returns:
             a :class:`Verdict` for every row. Rows that look wrong are kept but not accepted, see :meth:`accept`.
@@ -167,9 +171,8 @@ class Campaign:
         numbered, lines = self._numbered(table)
         whole = numbered if self.table is None else joined_tables([self.table, numbered])
         self._lines += lines
-        for row in range(start, len(whole)):
-            self.table = whole.rows(slice(0, row + 1))
-            self._add(row)
+        while len(self) < len(whole):
+            self._add(whole, waiting)
         return self.verdicts[start:]
 
     @small_work()
@@ -233,18 +236,22 @@ class Campaign:
             self._maker.join()
         self.poll()
 
-    def _add(self, row: int) -> None:
-        """Judge one row of the table, and renew the model if it is due."""
+    def _add(self, whole: Any, waiting: int) -> None:
+        """Judge some rows of a table, and renew the model if it is due."""
         self.poll()
+        row, most = len(self), ceil(min(TOGETHER, self._due - len(self.accepted)))
+        self.table = whole.rows(slice(0, min(len(whole), row + max(1, most) if self._model else row + 1)))
         if self._model is None:
             self.verdicts.append(Verdict(row, None, accepted=True, line=self._lines[row]))
         else:
             self._judge(self._model, self.table)
+        self.table, self._waiting = whole.rows(slice(0, len(self))), len(whole) - len(self) + waiting
         self._renew()
         why = {"cause": self._obstacle} if self._model is None else {}
-        self.verdicts[row] = replace(self.verdicts[row], expected_error=self.expected_error, **why)
-        for one in self.verdicts[:row]:
-            if one.again and float((self.table.q[one.row] - self.table.q[row]).abs().max()) < SAME_POSE:
+        self.verdicts[-1] = replace(self.verdicts[-1], expected_error=self.expected_error, **why)
+        for one in [one for one in self.verdicts if one.again]:
+            after = self.table.q[max(row, one.row + 1) :]
+            if bool(((after - self.table.q[one.row]).abs().amax(1) < SAME_POSE).any()):
                 self.verdicts[one.row] = replace(one, again=False)
 
     def _numbered(self, table: Any) -> tuple[Any, list[int]]:
@@ -268,9 +275,8 @@ class Campaign:
 
     def _renew(self) -> None:
         """Make a new model if it is due."""
-        count, model = len(self.accepted), self._model
-        due = FIRST_ROWS if model is None else min(ROWS_GROWTH_PER_MODEL * model.count, self._next_scales(model))
-        if count < due or count == self._tried or self._maker is not None:
+        count = len(self.accepted)
+        if count < self._due or count == self._tried or self._maker is not None:
             return
         self._tried = count
         arguments = self.table, list(self.verdicts)
@@ -280,6 +286,17 @@ class Campaign:
         else:
             self._make(*arguments)
             self.poll()
+
+    @property
+    def _due(self) -> float:
+        """Accepted rows at which a model is due."""
+        if self._model is None:
+            return max(FIRST_ROWS, ROWS_GROWTH_PER_MODEL * self._tried if self._waiting else 0)
+        scales, end = self._next_scales(self._model), len(self.accepted) + self._waiting
+        due = min(ROWS_GROWTH_PER_MODEL * self._model.count, scales)
+        if end < 2 * due:
+            return due
+        return end / WAITING_GROWTH ** int(log(end / due, WAITING_GROWTH)) if self._model.around.selected else scales
 
     def _next_scales(self, model: CampaignModel) -> float:
         """Accepted rows at which scales are selected again."""
@@ -341,7 +358,9 @@ class Campaign:
         try:
             model.judge(table, self.verdicts, self._lines)
         except DiffeoCalibError as error:  # a device that has no place yet
-            row = len(table) - 1
+            row = len(self.verdicts)
+            if len(table) > row + 1:
+                return self._judge(model, table.rows(slice(0, row + 1)))
             self.verdicts.append(Verdict(row, None, accepted=True, cause=str(error), line=self._lines[row]))
 
 

@@ -32,9 +32,9 @@ takes it in, "repeat" leaves it out and puts its pose first among the next. The 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from functools import partial
 from queue import Queue
-from typing import Any
+from typing import IO, Any
 
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, as_written
 
@@ -42,8 +42,8 @@ DECISIONS = ("accept", "reject", "repeat")
 """Decisions of a user on a row: methods of a campaign."""
 ID = "id"
 """Column that tells rows apart."""
-LARGEST, LONGEST_WORD = 1e300, 200
-"""Number and characters of a cell."""
+LARGEST, LONGEST_WORD, LONGEST_LINE = 1e300, 200, 1 << 20
+"""Number and characters of a cell, and bytes of a line."""
 
 Entry = dict[str, Any]
 Inbox = Queue[Entry | DiffeoCalibError | None]
@@ -75,9 +75,9 @@ def check_cells(entry: Entry) -> None:
         raise InputError.of(f"'{ID}' of a row", expected="a number or a word", got=json.dumps(entry[ID]), fix=fix)
 
 
-def read_lines(lines: Iterable[bytes], inbox: Inbox) -> None:
+def read_lines(stream: IO[bytes], inbox: Inbox) -> None:
     """Put what lines hold into an inbox."""
-    for text in lines:
+    for text in iter(partial(stream.readline, LONGEST_LINE), b""):
         try:
             inbox.put(parsed(text))
         except InputError as error:

@@ -25,6 +25,7 @@ from contextlib import ExitStack, suppress
 from io import FileIO
 from itertools import chain, starmap
 from pathlib import Path
+from stat import S_ISREG
 from typing import IO, TYPE_CHECKING, Any
 
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few, warn_user
@@ -60,7 +61,7 @@ class Journal:
         with ExitStack() as stack:
             try:
                 if path.exists() and not path.is_file():  # a pipe would be waited for
-                    raise self._error("a folder, a pipe or a device")
+                    raise self.damaged("a folder, a pipe or a device")
                 self._file = stack.enter_context(path.open("a+b", buffering=0))
                 locked = lock_file(self._file, wait=False)
                 if locked is False:
@@ -91,7 +92,7 @@ class Journal:
         """The entries, without a line that was torn; InputError, and the file as it is, if there is anything else."""
         self._file.seek(0)
         if not FIRST.startswith(self._file.read(2)):
-            raise self._error("another text")
+            raise self.damaged("another text")
         self._file.seek(0)
         content = self._file.read()
         *whole, torn = content.split(b"\n")
@@ -101,17 +102,18 @@ class Journal:
             with suppress(ValueError, RecursionError):
                 entry = json.loads(text)
             if not _is_entry(entry, lines, rows):
-                raise self._error(f"{text[:60].decode(errors='replace')!r} in line {place + 1}")
+                raise self.damaged(f"{text[:60].decode(errors='replace')!r} in line {place + 1}")
             lines, rows = lines + ("line" in entry), rows + len(entry.get("rows", ()))
             found.append(entry)
         ours = torn.rstrip(b"\0")[:1] in (b"", b"{") if found else FIRST.startswith(torn[: len(FIRST)])
         if not ours:
-            raise self._error(f"{torn[:60].decode(errors='replace')!r} at its end")
+            raise self.damaged(f"{torn[:60].decode(errors='replace')!r} at its end")
         if torn:
             os.ftruncate(self._file.fileno(), len(content) - len(torn))
         return found
 
-    def _error(self, got: str) -> InputError:
+    def damaged(self, got: str) -> InputError:
+        """An error about its content."""
         fix = "name another table, or move the file away to judge all rows anew"
         return InputError.of(f"{self.path} is not the journal of a campaign", got=got, fix=fix)
 
@@ -176,6 +178,8 @@ class GrowingTable:
         """Complete lines that were appended since the last call; InputError if what was there has changed."""
         try:
             status = self.path.stat()
+            if not S_ISREG(status.st_mode):  # a pipe would be waited for, a device may never end
+                raise InputError.of(f"{self.path} is no file to which lines are appended", fix="name another one")
             state = status.st_size, status.st_mtime_ns, status.st_ino
             if state == self._state:
                 return []

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from itertools import combinations
 from math import inf, isinf, pi
 from typing import Any
@@ -17,6 +17,7 @@ from torch import Tensor
 from diffeo_calib.calibration.choose_scales import VARIANCE_RATIO, choose_scales, noise_of_few
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import changes_of
+from diffeo_calib.calibration.diagnostics.plausibility import check_joints
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.placing.placement import Elsewhere
 from diffeo_calib.calibration.planning.candidates import candidates, ranges_around
@@ -24,7 +25,7 @@ from diffeo_calib.calibration.planning.knowledge import greedy
 from diffeo_calib.calibration.scales.leave_one_out import variance_ratio
 from diffeo_calib.calibration.scales.selection import GROWTH, defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.campaign.verdicts import Seen, Verdict, find_change
+from diffeo_calib.campaign.verdicts import Change, InOrder, Seen, Verdict, find_change
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError, few
 from diffeo_calib.common.quantiles import chi2_above
@@ -92,6 +93,7 @@ class Around:
         """
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DiffeoCalibWarning)  # few rows leave much open
+            check_joints(robot, rows)
             placed = place(robot, rows, silent)
             data, stages = placed.tangent_data(), (placed.registration, placed.identification)
             known = None if same is None else same.scales
@@ -107,8 +109,8 @@ class Around:
         how = (0 if first else len(rows), inf) if same is None else (same.selected, same.deviation)
         return cls(placed, chosen.data, chosen.selection.scales, *asked, *how)
 
-    def rows(self, others: Any) -> tuple[TangentData, Callable[[], list[Hypothesis]]]:
-        """Rows of the campaign around the places, and what may change of robot, tool and devices.
+    def rows(self, others: Any) -> tuple[TangentData, Callable[[slice], list[Hypothesis]]]:
+        """Rows of the campaign around the places, and what may change among some of robot, tool and devices.
 
         MeasurementError for devices that have no place.
         """
@@ -122,8 +124,8 @@ class Around:
         whole = joined_tables([anchors, others])
         placed, data = self.placed.beside(whole, self.data)
         index = torch.arange(len(anchors), len(whole), device=HOST)
-        rows = data.rows(index)
-        return rows, lambda: changes_of(rows, placed.placement.hypotheses(data, CHANGE), index)
+        rows, devices = data.rows(index), cache(lambda: placed.placement.hypotheses(data, CHANGE))
+        return rows, lambda some: changes_of(rows.rows(_numbers(some.start, some.stop)), devices(), index[some])
 
     def noise(self, data: TangentData) -> Tensor:
         """(N, R, R) of what rows tell, m^2."""
@@ -242,7 +244,8 @@ class CampaignModel:
         around: places and scales. table: all rows. verdicts: on them. ratios: of accepted rows, see :attr:`typical`.
 
     Attributes:
-        seen: rows of the campaign when this was made. window: numbers of the last rows, ``last`` linearised.
+        seen: rows of the campaign when this was made. window: numbers of the last rows; ``numbers`` and
+            ``noise`` are what these tell.
         process: what is known by the accepted rows but the last ones. now: by all of them.
         covariance: (T r, T r) of the errors over the target, m^2.
     """
@@ -255,9 +258,12 @@ class CampaignModel:
         first = accepted[(len(accepted) + 1) // 2]  # the others hold what is known
         self.window = [one.row for one in judged[-gates.WINDOW :] if one.row >= first]
         self.process = around.process(table, [row for row in accepted if row not in self.window])
-        self.last = around.rows(table.rows(self.window))[0]
-        self._target, self._options = (self.process.features(each[0]) for each in (around.errors, around.options))
-        self._at = self.process.features(self.last.numbers(around.scales).at)
+        last = around.rows(table.rows(self.window))[0]
+        self.numbers, self.noise = last.numbers(around.scales), around.noise(last)
+        ats = self.numbers.at, around.errors[0], around.options[0]
+        self._at, self._target, self._options = map(self.process.features, ats)
+        self._cross = self._at.by_fields_with(self._target)
+        _ = self._target.by_fields  # what later ones are lowered from
         self._learn(verdicts)
 
     def rebuilt(self, table: Any, verdicts: Sequence[Verdict]) -> CampaignModel:
@@ -310,7 +316,10 @@ class CampaignModel:
         return order, (3 * lowered).clamp(min=0).sqrt().tolist()
 
     def judge(self, table: Any, verdicts: list[Verdict], lines: Sequence[int]) -> None:
-        """Judge the last row of a table, add its verdict, and learn from it if it is accepted.
+        """Judge the rows of a table after those with a verdict, add theirs, and learn from those that are accepted.
+
+        It ends before another row than the first that does not fit or shows a change: one by one they would all have
+        the same verdicts.
 
         Args:
             lines: of all rows, see :attr:`Verdict.line`.
@@ -318,56 +327,89 @@ class CampaignModel:
         Raises:
             MeasurementError: a device that is not known.
         """
-        row, full = len(table) - 1, int(len(self.window) > gates.WINDOW)
-        window = [*self.window[full:], row]
-        last, changes = self.around.rows(table.rows(window))
-        own = last.rows(_number(len(window) - 1))
-        at = self.process.features(own.numbers(self.around.scales).at)
-        single, typical = self._seen(own, at), self.typical
-        if full and verdicts[self.window[0]].accepted:
-            self.process = self.around.given(self.process, self.last.rows(_number(0)))
-        self.window, self.last = window, last
-        found = single.measure(_freedom(own))
-        fits = found.fits(typical)
-        if fits:
-            self.ratios.append(found.square / chi2_above(1.0 - gates.TYPICAL_SHARE, found.freedom))
-        cause = "" if fits else self._cause(table, own, single)
-        shown = self.around.placed.shown(table.rows([row]).parts[0])
-        verdicts.append(Verdict(row, fits, fits, found.error, found.expected, cause, shown=shown, line=lines[row]))
-        numbers, some = last.numbers(self.around.scales), [verdicts[number] for number in window]
-        kept = self._at.rows(torch.arange(full, len(window) - 1 + full, device=HOST))
-        kept, new = (self.process.features(one.at, one) for one in (kept, at))
-        self._at = kept.followed_by(new, numbers.at)
-        flags = _flags([one.accepted for one in some]), _flags([not one.cause for one in some])
-        how: Any = {"single": found, "typical": typical, "coordinates": last.y.shape[1]}
-        change = None
-        if not cause:
-            seen = Seen.of(self.process, numbers, self.around.noise(last), self._at)
-            change = find_change(seen, window, changes(), flags, **how)
-        if change is not None:
-            known = verdicts[window[0]].change
-            if known is not None and change.row == window[0]:  # it is older than these rows
-                change = replace(change, row=known.row)
-            change = replace(change, line=lines[change.row])
-            for number in window:
-                one, before = verdicts[number], number < change.row
-                if one.change is not None or not (before or one.cause or one.decided):
-                    accepted = before and bool(one.fits)
-                    verdicts[number] = replace(one, accepted=accepted, change=None if before else change)
+        first, before = len(verdicts), len(self.window)
+        window = [*self.window, *range(first, len(table))]
+        data, changes = self.around.rows(table.rows(window))
+        numbers, noise = data.numbers(self.around.scales), self.around.noise(data)
+        new = self.process.features(numbers.rows(_numbers(before, len(window))).at)
+        near, far = (one.by_fields_with(new) for one in (self._at, self._target))
+        at, cross = self._at.followed_by(new, near), torch.cat([self._cross, far.T])
+        accepted = [verdicts[row].accepted for row in self.window] + [True] * (len(window) - before)
+        seen = InOrder.of(Seen.of(self.process, numbers, noise, at), _flags(accepted))
+        expected = self._expected_errors(seen, cross + at.unknown.T @ self._target.unknown)
+        for number in range(before, len(window)):
+            row, single, typical = window[number], seen.rows(number, number + 1), self.typical
+            found = single.measure(_freedom(data.rows(_numbers(number, number + 1))))
+            fits = found.fits(typical)
+            if number > before and not fits:
+                break
+            cause = (
+                ""
+                if fits
+                else self._cause(table.rows(slice(0, row + 1)), data.rows(_numbers(number, number + 1)), single)
+            )
+            verdict = Verdict(row, fits, fits, found.error, found.expected, cause, line=lines[row])
+            last = slice(max(0, number - gates.WINDOW), number + 1)
+            some, change = [*(verdicts[row] for row in window[last][:-1]), verdict], None
+            if not cause:
+                flags = _flags([one.accepted for one in some]), _flags([not one.cause for one in some])
+                how: Any = {"single": found, "typical": typical, "coordinates": data.y.shape[1]}
+                change = find_change(seen.rows(last.start, last.stop), window[last], changes(last), flags, **how)
+            if number > before and change is not None:
+                break
+            if fits:
+                self.ratios.append(found.square / chi2_above(1.0 - gates.TYPICAL_SHARE, found.freedom))
+            shown = self.around.placed.shown(table.rows([row]).parts[0])
+            verdicts.append(replace(verdict, shown=shown, expected_error=expected[number]))
+            if change is not None:
+                _change(verdicts, window[last], change, lines)
+            if change is not None or not fits:
+                break
+        self.window, self.numbers, self.noise, self._at, self._cross = (
+            window[: before + len(verdicts) - first],
+            numbers,
+            noise,
+            at,
+            cross,
+        )
+        self._let_go(verdicts)
         self._learn(verdicts)
+
+    def _expected_errors(self, seen: InOrder, cross: Tensor) -> list[float]:
+        """RMS error over the target after each of some rows, m, whose numbers have a covariance (N R, T r) with it."""
+        compared = self.around.errors[1]
+        white = torch.linalg.solve_triangular(seen.root, seen.seen.numbers.there(cross) @ compared, upper=False)
+        lowered = white.square().sum(1).cumsum(0)[seen.ends(seen.seen.numbers.shape[0]) - 1] / len(compared)
+        variance = self.around.covariance(self._target).diagonal().mean() - lowered
+        return (3 * variance).clamp(min=0).sqrt().tolist()
+
+    def _let_go(self, verdicts: Sequence[Verdict]) -> None:
+        """Keep as many of the last rows as are looked at together; those of the others that are accepted are known."""
+        size, count = self.numbers.shape[1], max(0, len(self.window) - gates.WINDOW - 1)
+        gone, kept = (self.window[:count], _numbers(count, len(self.window)))
+        rows = _flags([verdicts[row].accepted for row in gone]).nonzero()[:, 0]
+        if len(rows):
+            at = (rows[:, None] * size + torch.arange(size, device=HOST)).flatten()
+            oldest, before = self.numbers.rows(rows), self.process.size
+            self.process = self.process.given(oldest, self.noise[rows], self._at.rows(rows))
+            blocks = (self._at, self._at.by_fields[at]), (self._target, self._cross[at])
+            self._at, self._target = (self.process.features(one.at, one, oldest.there(own)) for one, own in blocks)
+            self._cross = self._cross - self._at.known[before:].T @ self._target.known[before:]
+        self.window, self.numbers, self.noise = self.window[count:], self.numbers.rows(kept), self.noise[kept]
+        self._at, self._cross = self._at.rows(kept), self._cross[count * size : (count + len(kept)) * size]
 
     def _learn(self, verdicts: Sequence[Verdict]) -> None:
         """What is known now. Of the last rows those not accepted tell nothing."""
-        accepted, noise = _flags([verdicts[row].accepted for row in self.window]), self.around.noise(self.last)
-        noise = without_hidden(noise, accepted[:, None].expand(noise.shape[:2]))
-        self.now = self.process.given(self.last.numbers(self.around.scales), noise, self._at)
-        self._target = self.process.features(self._target.at, self._target)
-        self.covariance = self.around.covariance(self.now.features(self._target.at, self._target))
+        accepted = _flags([verdicts[row].accepted for row in self.window])
+        noise = without_hidden(self.noise, accepted[:, None].expand(self.noise.shape[:2]))
+        self.now = self.process.given(self.numbers, noise, self._at)
+        target = self.now.features(self._target.at, self._target, self.numbers.there(self._cross))
+        self.covariance = self.around.covariance(target)
 
-    def _seen(self, data: TangentData, sooner: Features | None = None) -> Seen:
-        """Rows as the accepted ones before them predict them; ``sooner``: their features by the process."""
+    def _seen(self, data: TangentData) -> Seen:
+        """Rows as the accepted ones before them predict them."""
         numbers = data.numbers(self.around.scales)
-        return Seen.of(self.now, numbers, self.around.noise(data), self.now.features(numbers.at, sooner))
+        return Seen.of(self.now, numbers, self.around.noise(data), self.now.features(numbers.at))
 
     def _cause(self, table: Any, own: TangentData, seen: Seen) -> str:
         """Why the last row is wrong, in words; empty if nothing that is undone makes it fit."""
@@ -403,7 +445,7 @@ class CampaignModel:
         copies = table.rows([len(table) - 1] * len(joints))
         others = self.around.rows(with_joints(copies, torch.stack([*joints.values()])))[0]
         for number, words in enumerate(joints):
-            yield words, self._seen(others.rows(_number(number)))
+            yield words, self._seen(others.rows(_numbers(number, number + 1)))
 
 
 def with_joints(table: Any, q: Tensor) -> Any:
@@ -415,8 +457,21 @@ def _flags(values: Sequence[bool]) -> Tensor:
     return torch.tensor(values, dtype=torch.bool, device=HOST)
 
 
-def _number(row: int) -> Tensor:
-    return torch.tensor([row], dtype=torch.int64, device=HOST)
+def _numbers(first: int, last: int) -> Tensor:
+    return torch.arange(first, last, device=HOST)
+
+
+def _change(verdicts: list[Verdict], window: Sequence[int], change: Change, lines: Sequence[int]) -> None:
+    """Take rows out that came after a change, and those before it in again that an earlier one had taken out."""
+    known = verdicts[window[0]].change
+    if known is not None and change.row == window[0]:  # it is older than these rows
+        change = replace(change, row=known.row)
+    change = replace(change, line=lines[change.row])
+    for number in window:
+        one, before = verdicts[number], number < change.row
+        if one.change is not None or not (before or one.cause or one.decided):
+            accepted = before and bool(one.fits)
+            verdicts[number] = replace(one, accepted=accepted, change=None if before else change)
 
 
 def _freedom(data: TangentData) -> int:

@@ -5,7 +5,7 @@ A row is judged by d^2 = e^T S^-1 e, chi-squared if it is right. Two kinds of ca
 * of one row: its unit, its joints are those of another row, two markers are exchanged, one marker is wrong. A cause is
   named if the row fits when it is undone.
 * from a row k on: a device has moved, a marker has slipped, a joint has another offset. By chance such a hypothesis
-  gains chi-squared (process/evidence.py) from the errors of the last rows. Rows that were taken in one by one
+  gains chi-squared (regression/conditional.py) from the errors of the last rows. Rows that were taken in one by one
   count again here: small changes show in several rows only. A single wrong row, which six unknowns of a device explain
   as well, is no change.
 """
@@ -21,8 +21,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.quantiles import chi2_above, chi2_probability
 from diffeo_calib.maps.linearisation import Numbers
+from diffeo_calib.maps.noise import HIDDEN_VARIANCE
 from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.regression.conditional import Features, Process
 from diffeo_calib.sensors.devices import Hypothesis
@@ -141,6 +143,39 @@ class Seen(NamedTuple):
         return Measure(square, freedom, float(self.error.square().mean().sqrt()), expected)
 
 
+class InOrder(NamedTuple):
+    """Rows one after the other, each as those before it predict it that are accepted.
+
+    Args:
+        seen: all of them, as those before all of them predict them. root: lower Cholesky factor of their covariance, in
+            which those that are not accepted tell nothing. white: root^-1 error.
+    """
+
+    seen: Seen
+    root: Tensor
+    white: Tensor
+
+    @classmethod
+    def of(cls, seen: Seen, accepted: Tensor) -> InOrder:
+        """By which of the rows are accepted, (N,) boolean."""
+        hidden = HIDDEN_VARIANCE * (~accepted[seen.numbers.owner]).to(seen.error)
+        root = torch.linalg.cholesky(seen.covariance + torch.diag(hidden))
+        return cls(seen, root, torch.linalg.solve_triangular(root, seen.error[:, None], upper=False)[:, 0])
+
+    def ends(self, count: int) -> Tensor:
+        """(count,) how many numbers the first rows have, one of them, two, ..."""
+        owner = self.seen.numbers.owner
+        return torch.searchsorted(owner, torch.arange(1, count + 1, device=owner.device))
+
+    def rows(self, first: int, last: int) -> Seen:
+        """Rows from the first to before the last, as accepted ones before the first predict them."""
+        index = torch.arange(first, last, device=self.root.device)
+        start, end = (int(self.ends(count)[-1]) if count else 0 for count in (first, last))
+        own, before = slice(start, end), self.root[start:end, :start]
+        error = self.seen.error[own] - before @ self.white[:start]
+        return Seen(self.seen.numbers.rows(index), error, self.seen.covariance[own, own] - before @ before.T)
+
+
 def find_change(
     seen: Seen,
     numbers: list[int],
@@ -160,25 +195,31 @@ def find_change(
     """
     if not hypotheses:
         return None
-    known, doubted = flags
-    owner, found, effects = seen.numbers.owner, [], [seen.numbers.of_table(one.effects) for one in hypotheses]
-    for first in range(len(numbers) - gates.ROWS_AFTER_CHANGE + 1):
-        after, before = (owner >= first) & doubted[owner], (owner < first) & known[owner]
-        used, count = seen.some(before | after), int(before.sum())
-        factor = torch.linalg.cholesky(used.covariance)
-        white = torch.linalg.solve_triangular(factor, used.error[:, None], upper=False)[count:, 0]  # given those before
-        many = torch.cat([E[after] for E in effects], 1)
-        many = torch.linalg.solve_triangular(factor[count:, count:], many, upper=False)
-        total, rows = float(white.square().sum()), len(white)
-        for one, E, W in zip(hypotheses, effects, many.split([E.shape[1] for E in effects], 1), strict=True):
-            spare = rows - E.shape[1]
-            if spare < gates.SPARE_NUMBERS:
-                continue
-            g = W.T @ white
-            u = Evidence(g, W.T @ W).size
-            gain = float(g @ u) / typical
-            if total / typical - gain <= chi2_above(gates.LEFT_CHANCE, spare):
-                found.append((gain - E.shape[1] * log(rows), gain, first, one, E[after] @ u, u, rows))
+    known, doubted = (flag[seen.numbers.owner] for flag in flags)
+    later = seen.numbers.owner >= torch.arange(len(numbers) - gates.ROWS_AFTER_CHANGE + 1, device=HOST)[:, None]
+    after = later & doubted  # (F, M) numbers, for each first row of a change
+    used = after | (~later & known)
+    effects = [seen.numbers.of_table(one.effects) for one in hypotheses]
+    right = torch.cat([(seen.error * used)[:, :, None], torch.cat(effects, 1) * after[:, :, None]], 2)
+    masks, which = used.unique(dim=0, return_inverse=True)
+    for number, mask in enumerate(masks):
+        own = which == number
+        root = torch.linalg.cholesky(torch.where(mask[:, None] & mask, seen.covariance, torch.diag(~mask)))
+        columns = torch.linalg.solve_triangular(root, right[own].transpose(0, 1).flatten(1), upper=False)
+        right[own] = columns.unflatten(1, (-1, right.shape[2])).transpose(0, 1)
+    right *= after[:, :, None]  # given the rows before, which come first
+    white, W = right[:, :, 0], right[:, :, 1:]
+    counts, total = after.sum(1).tolist(), (white.square().sum(1) / typical).tolist()
+    g, H, found, start = (W.mT @ white[:, :, None])[..., 0], W.mT @ W, [], 0
+    for one, E in zip(hypotheses, effects, strict=True):
+        size, own = E.shape[1], slice(start, start + E.shape[1])
+        start += size
+        u = Evidence(g[:, own], H[:, own, own]).size
+        for first, gain in enumerate(((g[:, own] * u).sum(1) / typical).tolist()):
+            rows, spare = counts[first], counts[first] - size
+            if spare >= gates.SPARE_NUMBERS and total[first] - gain <= chi2_above(gates.LEFT_CHANCE, spare):
+                moved = E[after[first]] @ u[first]
+                found.append((gain - size * log(rows), gain, first, one, moved, u[first], rows))
     best = max(found, key=lambda one: one[0], default=None)
     if best is None or chi2_probability(best[1], len(best[5])) > gates.JUMP_CHANCE:
         return None

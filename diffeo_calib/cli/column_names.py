@@ -30,6 +30,12 @@ ROLES = {
     "joint": "q j joint joints jnt axis axes ax a rax achse gelenk theta th qpos jpos pos position positions angle "
     "angles state states 关节 軸 轴 関節",
     "external": "e ext external extax eax rail track slide linear",
+    "pixel": "px pixel pixels",
+    "distance": "r d sd dist distance range slope rho radius strecke schragstrecke schragdistanz",
+    "around": "hz az azimuth azim azimut horizontal horiz hor ha",
+    "elevation": "elevation elev el",
+    "zenith": "zenith zen",
+    "vertical": "elevation elev el zenith zen v va vz vertical vert",
     "machine": "robot flange tcp tool ee eef effector gripper hand command cmd base",
     "seen": "board camera cam marker tracker tag charuco aruco pattern target object world",
 }
@@ -38,7 +44,7 @@ ROLES = {
 A machine has poses of its own, beside what was seen.
 """
 WORDS = {role: frozenset(words.split()) for role, words in ROLES.items()}
-UNITS = {unit: unit for unit in ("mm", "m", "cm", "um", "inch", "rad", "mrad", "deg", "kg")}
+UNITS = {unit: unit for unit in ("mm", "m", "cm", "um", "inch", "rad", "mrad", "deg", "gon", "kg")}
 UNITS |= {"in": "inch", "毫米": "mm", "厘米": "cm", "米": "m", "弧度": "rad"}
 UNITS |= dict.fromkeys(("degree", "degrees", "grad", "度"), "deg")
 LENGTHS = {"mm", "m", "cm", "um", "inch"}
@@ -57,7 +63,7 @@ class Column:
 
     name: str  # as written
     words: tuple[str, ...]  # in lower case, without the unit; numbers and axes are words of their own
-    unit: str = ""  # mm, m, cm, um, inch, rad, mrad, deg or kg; empty where the name says none
+    unit: str = ""  # mm, m, cm, um, inch, rad, mrad, deg, gon or kg; empty where the name says none
 
     @property
     def plain(self) -> str:

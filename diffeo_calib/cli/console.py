@@ -118,7 +118,7 @@ def plain(text: object) -> str:
 
 
 KEYWORDS = "length angle joint_length sep decimal duplicates joints position marker rotation convention rotation_angle"
-KEYWORDS += " std rotation_std controls tip payload"
+KEYWORDS += " spherical std rotation_std controls tip payload"
 """Keywords of Python that are options."""
 
 

@@ -8,11 +8,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
+from itertools import accumulate, product
+from math import pi
 from os.path import relpath
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.column_names import LENGTHS, WORDS, Column, Group, column, groups, whole
 from diffeo_calib.cli.options import CORNERS, Places
@@ -22,14 +24,12 @@ from diffeo_calib.measurements.csv.joined import joined_file
 from diffeo_calib.measurements.csv.lines import HEAD, CsvLines, read_cells
 from diffeo_calib.measurements.csv.sensors import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.readings import MILLIMETRES
-from diffeo_calib.measurements.table_format import ZERO
+from diffeo_calib.measurements.table_format import SPHERICAL, SPHERICAL_UNITS, ZERO
 from diffeo_calib.sensors.kinds import known_kinds
 
 SEPARATORS = (",", ";", "\t", "|", " ")
 DECIMALS = (".", ",")
 ROWS_LOOKED_AT = 50
-PIXELS = ("u", "v"), ("pixelu", "pixelv"), ("upx", "vpx")
-"""Names of columns of images."""
 LENS, SOME_LENS = "FX,FY,CX,CY", "1000,1000,500,500"
 """Placeholder for the user to fill in, and the value that replaces it while the other rows are read."""
 
@@ -86,6 +86,11 @@ class Sheet:
         header, rows = read_cells(self.path, self.sep)
         return {name: [cells[k].strip() for _, cells in rows] for k, name in enumerate(header)}
 
+    def joint_columns(self, joints: Sequence[str]) -> list[JointColumns]:
+        """As :func:`guess_joints`; without constant columns if need be: of axes that a controller alone knows."""
+        varying = [name for name in self.numbers if len({*self.cells[name]}) > 1]
+        return guess_joints(self.numbers, joints) or guess_joints(varying, joints)
+
 
 def guess_sheet(path: Path) -> Sheet:
     """The separator and decimal mark with which most columns are numbers; MeasurementError says why none is right."""
@@ -114,7 +119,9 @@ def guess_sheet(path: Path) -> Sheet:
                     odd += wrong  # most are numbers, or they look like numbers
             why = str(bad_cells(path, odd, "a number", number_hint(odd[0][2], decimal))) if odd else ""
             found.append(Sheet(path, sep, decimal, tuple(columns), tuple(numbers), tuple(file.notes), why))
-    best = max(found, key=lambda sheet: len(sheet.numbers), default=None)
+    most = max((len(sheet.numbers) for sheet in found), default=0)
+    likely = [sheet for sheet in found if len(sheet.numbers) == most]  # columns may have different decimal marks
+    best = max(likely, key=lambda own: sum(own.decimal in "".join(own.cells[k]) for k in own.numbers), default=None)
     width, reason = max(reasons, key=lambda one: one[0], default=(0, None))
     if reason is not None and (best is None or not best.numbers or width > 2 * len(best.numbers)):
         raise reason
@@ -210,6 +217,7 @@ class Body(NamedTuple):
     turn: list[str]
     usual: str = ""  # what such names of a rotation usually mean
     left: str = ""  # what the place is, if no device measured it
+    spherical: tuple[str, ...] = ()  # how the place may be written, if it is a distance and two angles
 
     @property
     def words(self) -> set[str]:
@@ -247,6 +255,32 @@ def bodies_in(columns: Sequence[str]) -> list[Body]:
     return bodies
 
 
+def _numbered(columns: Sequence[str]) -> list[Body]:
+    """Series of three numbers that may be places; else the first columns of another file, which has no names."""
+    each = (own for labels in ("123", "012") for own in whole(columns, labels) if not _goes_on(columns, own))
+    found = [own.names.values() for own in each if not (own.wished or own.says("rate", "deviation", "turn"))]
+    counted = [name for name in columns if name.isdecimal()]
+    return [Body([*names], []) for names in found or [counted[:3]] * (len(counted) > 2)]
+
+
+def spherical_in(sheet: Sheet, columns: Sequence[str]) -> list[Body]:
+    """A place as a distance and two angles, of which the second is above the horizon or from the zenith."""
+    found = list[Column]()
+    for role, units in (("distance", {*LENGTHS}), ("around", {*SPHERICAL_UNITS}), ("vertical", {*SPHERICAL_UNITS})):
+        own = (one for one in map(column, columns) if WORDS[role] & {*one.words} and one.unit in {*units, ""})
+        found += [one for one in own if one not in found][:1]
+    if len(found) < 3:
+        return []
+    names, words, known = [one.name for one in found], {*found[2].words}, {one.unit for one in found[1:]} - {""}
+    turned = numbers_in(sheet.cells[names[1]], sheet.decimal)
+    large = any(abs(value) > 2 * pi for value in turned if value is not None)
+    known = known or {*SPHERICAL_UNITS} - ({"rad"} if large else set())
+    ways = [way for way in SPHERICAL if way.rpartition("_")[2] in known]
+    for role in ("elevation", "zenith"):
+        ways = [way for way in ways if way.startswith(role) or not WORDS[role] & words]
+    return [Body(names, [], spherical=tuple(ways))]
+
+
 def _rotations(columns: Sequence[str], labels: Sequence[str]) -> Iterator[Group]:
     """Columns that differ by the labels of a rotation and hold one: no series of joints, no place, no speed."""
     following = [f"q{len(labels) + int(labels[0][1])}"] if labels[0] in JOINTS else []
@@ -270,25 +304,9 @@ def guess_readings(columns: Sequence[str]) -> dict[str, list[str]]:
             own = next(([there[name] for name in names] for names in each if set(names) <= set(there)), None)
             if own is not None and own not in found.values():
                 found[f"{word}={','.join(own)}"] = own
-    names = {one.plain: one.name for one in described}
-    pixels = next(([names[name] for name in pair] for pair in PIXELS if set(pair) <= set(names)), None)
-    if pixels is not None:
-        found[f"image={','.join(pixels)},{LENS}"] = pixels
+    pixels = [*whole(columns, "uv"), *(own for own in whole(columns, "xy") if own.says("pixel"))]
+    found |= {f"image={','.join(own.names.values())},{LENS}": [*own.names.values()] for own in pixels[:1]}
     return found
-
-
-def guess_deviations(columns: Sequence[str], triples: Sequence[Sequence[str]]) -> list[str] | None:
-    """Columns whose names are those of the positions but for a word such as std, in their order; None if one lacks."""
-    deviations = [one for one in map(column, columns) if {*one.words} & WORDS["deviation"]]
-    known = {_without(one, WORDS["deviation"]): one.name for one in deviations}
-    known |= {_without(one, WORDS["deviation"] | WORDS["measured"]): one.name for one in deviations}
-    wanted = [column(name) for triple in triples for name in triple]
-    found = [known.get(one.plain) or known.get(_without(one, WORDS["measured"])) for one in wanted]
-    return None if None in found else [name for name in found if name is not None]
-
-
-def _without(one: Column, words: frozenset[str]) -> str:
-    return "".join(word for word in one.words if word not in words)
 
 
 # --- what was measured ---
@@ -385,7 +403,7 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
     others = [name for name in sheet.numbers if name not in joints]
     nameless = all(name.isdecimal() for name in sheet.header) and len(others) > 2
     bodies = [Body(others[:3], [])] if nameless else [own for own in found if not own.left]
-    bodies = bodies or matrices_in(sheet, others)[:1]
+    bodies = bodies or matrices_in(sheet, others)[:1] or spherical_in(sheet, others)
     if not bodies and len(joints) == 2:  # a machine in a plane, and what was measured in it
         flat = [own for own in whole(others, "xy") if not (own.wished or own.says("rate", "deviation"))]
         bodies = [Body([*own.names.values(), ZERO], []) for own in flat]
@@ -395,6 +413,7 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
     if bodies or sockets or len(readings) > 1:  # beside other kinds of rows, or one another, some cells are empty
         there = (text for text, own in devices.items() if all("" in sheet.cells[name] for name in own))
         readings = [*corners, *there]
+    bodies = bodies or ([] if sockets or readings else _numbered(others))
     if not bodies and not sockets and not readings:
         expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
         common = next((name for name in sheet.header if name not in joints), "COLUMN")
@@ -410,6 +429,17 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
     }
     named = {option: names[0] for option, names in guessed.items() if names}
     return RowColumns(bodies, sockets, readings, named, left)
+
+
+def marker_of_lines(sheet: Sheet, joints: Sequence[str]) -> str | None:
+    """The column whose texts tell apart the lines of each pose, if the first of them alone holds joint values."""
+    values = zip(*(sheet.cells.get(name, ()) for name in joints), strict=False)
+    poses = list(accumulate(any(cells) for cells in values))
+    for name, texts in sheet.cells.items():
+        named = 1 < len({*texts}) <= gates.MOST_MARKERS and "" not in texts
+        if named and poses and poses[0] > 0 and poses[-1] < len(poses) == len({*zip(poses, texts, strict=True)}):
+            return name
+    return None
 
 
 def matrices_in(sheet: Sheet, columns: Sequence[str]) -> list[Body]:

@@ -257,11 +257,9 @@ def expanded(arguments: Sequence[str]) -> list[str]:
 
 
 def _entries(path: Path) -> dict[str, Any]:
+    content = read_regular(path, "campaign file", LONGEST_FILE)
     try:
-        entries = tomllib.loads(read_regular(path, "campaign file", LONGEST_FILE).decode("utf-8-sig"))
-        return {name.replace("_", "-"): value for name, value in entries.items()}
-    except InputError:
-        raise
+        return {name.replace("_", "-"): value for name, value in tomllib.loads(content.decode("utf-8-sig")).items()}
     except (ValueError, RecursionError) as error:  # TOML, text or a name that is none, or lists in lists
         fix = 'write one option per line: length = "mm"'
         raise InputError.of(f"{path} is no TOML", got=str(error), fix=fix) from error

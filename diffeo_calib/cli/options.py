@@ -175,6 +175,7 @@ class Rows(Places, Units):
     """Columns of the measurements in a table, of any kinds."""
 
     position: list[str] | None = option(metavar="X,Y,Z")
+    spherical: str | None = option()
     socket: str | None = option(
         "Columns that name the socket in which a ball on the tool rested, in rows without a position.", "PLACE,SOCKET"
     )
@@ -205,6 +206,7 @@ class Rows(Places, Units):
     rotation_std: list[str] | None = option(metavar="A,B,C")
     needs = (
         ("--lever", "--rotation"),
+        ("--spherical", "--position"),
         ("--camera-on-tool", "--rotation --reading"),
         ("--places", "--by"),
         ("--by", "--places"),

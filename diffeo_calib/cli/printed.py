@@ -12,8 +12,7 @@ from rich.console import Console, ConsoleOptions
 from rich.table import Table
 from torch import Tensor
 
-from diffeo_calib.calibration.expected_errors import ExpectedError, expected_errors
-from diffeo_calib.calibration.judgement import Accuracy
+from diffeo_calib.calibration.expected_errors import Accuracy, ExpectedError, expected_errors
 from diffeo_calib.cli.console import plain, say, text_table
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import InputError

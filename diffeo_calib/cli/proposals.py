@@ -21,7 +21,7 @@ from diffeo_calib.calibration.diagnostics import gates, likely_mistakes
 from diffeo_calib.calibration.diagnostics.plausibility import marker_column, unmeasured_markers
 from diffeo_calib.calibration.identification.registration import register, register_sockets, spread
 from diffeo_calib.calibration.placing.readings import rough_error
-from diffeo_calib.cli.column_names import column
+from diffeo_calib.cli.column_names import WORDS, Column, column
 from diffeo_calib.cli.guesses import (
     LENS,
     SOME_LENS,
@@ -30,14 +30,14 @@ from diffeo_calib.cli.guesses import (
     RowColumns,
     Sheet,
     entries,
-    guess_deviations,
+    marker_of_lines,
 )
 from diffeo_calib.cli.options import Rows
 from diffeo_calib.cli.tables import readings_columns
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, MeasurementError, few
 from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD, quiet
-from diffeo_calib.measurements.csv.files import read_joints, read_observations
+from diffeo_calib.measurements.csv.files import read_observations
 from diffeo_calib.measurements.csv.joints import JointExpressions
 from diffeo_calib.measurements.csv.sensors import SocketColumns
 from diffeo_calib.measurements.readings import Readings
@@ -61,6 +61,8 @@ FEWEST_IMAGES = 8
 """Rows of a camera from which a projection, 11 numbers, can be contradicted."""
 MOST_LENGTHS = 2
 """Units of length, by the size of the robot, with which meanings of the joints are sought."""
+LARGEST_TURN_DEG = 3600.0
+"""Joint values beyond ten turns are no degrees."""
 SMALLEST_SPREAD_M = 1e-9
 """Of points that never move."""
 LARGEST_DEVIATION = 0.01
@@ -170,21 +172,25 @@ class Source:
         lengths = ["mm"] if no_length else list(UNITS_PER_METRE)
         angles = ("rad", "deg") if any(self.robot.periodic) else ("rad",)
         cameras = (False, True) if self.rows.of_boards else (False,)
-        for length, angle, slide, camera in product(lengths, angles, lengths if slides else [None], cameras):
+        ways = next((own.spherical for own in self.rows.bodies if own.spherical), (None,))
+        own = product(lengths, angles, lengths if slides else [None], cameras, ways)
+        for length, angle, slide, camera, way in own:
             if slide != length:
-                yield self.into(length=length, angle=angle, joint_length=slide, camera_on_tool=camera)
+                units = {"length": length, "angle": angle, "joint_length": slide}
+                yield self.into(**units, camera_on_tool=camera, spherical=way)
 
     def other_units(self) -> list[str]:
         """Columns of joints and positions whose names say other units."""
         turning = [name for name, turns in zip(self.joints, self.robot.periodic, strict=True) if turns]
-        places = [name for triple in self.rows.markers for name in triple]
+        lengths = 1 if self.table.spherical else None  # the others are angles
+        places = [name for triple in self.rows.markers for name in triple[:lengths]]
         pairs = *product(turning, (self.table.angle,)), *product(places, (self.table.length,))
         return [name for name, unit in pairs if column(name).unit not in ("", unit)]
 
     @property
     def q(self) -> Tensor:
         """(N, n) joint values, rad or m."""
-        return read_joints(self.sheet.path, replace(self.table, joints=self.joints, kinds=self.robot.kinds))
+        return self.data.q
 
 
 def ranked(ways: Iterable[Source]) -> list[Source]:
@@ -257,12 +263,23 @@ def with_joint_columns(source: Source, found: Sequence[JointColumns]) -> Source:
 def with_measured(source: Source) -> Source:
     """Without markers that are copies, or that the nominal robot explains in some units and others not.
 
-    With the column that names the marker of each row, if the nominal robot explains the rows by several alone.
+    With the column that names the marker of each row, if the nominal robot explains the rows by several alone, or some
+    lines have no joint values.
     """
+    if names := marker_of_lines(source.sheet, source.joints):
+        why = "names the marker of each line: the first line alone of every pose holds its joint values"
+        return source.saying(Choice("marker", names, why))
     rows, found = source.rows, dict[int, str]()
     for _, data in source.positions() if len(rows.bodies) > 1 else ():
         every = unmeasured_markers(source.robot, data)
         found = found or {marker: words for marker, words, proved in every if proved}
+    if not found and len(rows.bodies) > 1 and not source.tips:  # perhaps in units of their own
+        each = (replace(source, rows=replace(rows, bodies=[own])) for own in rows.bodies)
+        alone = [min(one.left for one in own.in_units()) for own in each]
+        far = max(alone)
+        for k, left in enumerate(alone) if gates.DIGITS_SHARE < far < LARGEST_RESIDUAL else ():
+            if left < min(gates.FOLLOWED * far, gates.NOMINAL_SHARE):
+                found[k] = f"the nominal robot leaves {percent(left)} of them, and {percent(far)} of others: computed"
     kept = [k for k in range(len(rows.bodies)) if k not in found]
     left = [f"{few(rows.markers[k])}: {words} (counted from 0)" for k, words in found.items()]
     rows = replace(rows, bodies=[rows.bodies[k] for k in kept], left=[*rows.left, *left])
@@ -316,13 +333,16 @@ def with_units(source: Source) -> Source:
     why = f"{what} {percent(best.left, 2)}, {than}{why}"
     no_length = source.rows.without_length and all(periodic)
     length, angle = ("of lengths that you add: the table holds none", why) if no_length else (why, "the same")
-    camera, slides = "the same; else the board is on the tool", "the same: the slides are in another unit"
-    return best.saying(*entries([best.table], length=length, angle=angle, joint_length=slides, camera_on_tool=camera))
+    others = {"joint_length": "the same: the slides are in another unit", "spherical": "the same"}
+    others["camera_on_tool"] = "the same; else the board is on the tool"
+    return best.saying(*entries([best.table], length=length, angle=angle, **others))
 
 
 def _unclear(found: Sequence[Source], *, excluded: bool) -> InputError:
     parts = [(one.left, one.table) for one in found if one.left < inf]
-    units = [(t.length, t.angle, t.joint_length, "camera on the tool" * t.camera_on_tool) for _, t in parts]
+    units = [
+        (t.length, t.angle, t.joint_length, t.spherical, "camera on the tool" * t.camera_on_tool) for _, t in parts
+    ]
     each = zip(units, parts, strict=True)
     got = "; ".join(f"{' and '.join(filter(None, words))}: {percent(left)}" for words, (left, _) in each)
     got += "; the units that the file states exclude others" * excluded
@@ -331,6 +351,15 @@ def _unclear(found: Sequence[Source], *, excluded: bool) -> InputError:
         fix = "no signs, zeros, coupling or units of the joints do either: "
     fix += "check the table's joints against the robot's, or write the file yourself; of a robot with several tips "
     fix += "the columns of each are to be named after it, such as left_x"
+    for one in (own for own in found if own.table.angle == "deg" and own.left < inf):
+        largest = zip(one.joints, one.robot.periodic, one.q.abs().amax(0).rad2deg().tolist(), strict=True)
+        if far := {name: most for name, turns, most in largest if turns and most > LARGEST_TURN_DEG}:
+            got = f"up to {max(far.values()):.4g} in {few([*far])}: no angles, but pulses or ticks of encoders"
+            fix = (
+                f'write joints = "360/COUNTS*{{{next(iter(far))}}},..." with the counts per turn of each axis, as the '
+            )
+            fix += "controller states them, negative where it counts the other way"
+            return InputError.of("columns of the joints", expected="rad or deg", got=got, fix=fix)
     for one, own in _of_one_size(found[0]):
         fix = likely_mistakes.likely_mistake(one.robot, own, one.left * spread(own.points)) or fix
         third = len(own) // 3
@@ -375,7 +404,7 @@ def _with_meanings(best: Source) -> Source:
             why = f"the nominal robot then leaves {percent(meaning.left, 2)} of what the rows vary, with the columns "
             why += f"as they are {percent(best.left)}{more}"
             said.append(Choice("joints", ",".join(own.texts(joints.columns, *units)), why, sure=len(found) == 1))
-        said += entries([one.table], length="with these joints", angle="the same")
+        said += entries([one.table], length="with these joints", angle="the same", spherical="the same")
         names = str(said[0].value).split(",") if said[0].sure else best.joints
         return with_measured(replace(one, joints=names).saying(*said))  # the robot explains the rows only now
     return best
@@ -414,6 +443,20 @@ def with_rotation(source: Source, *, camera: bool = False) -> Source:
     turned = Choice("rotation", written[0] if len(written) == 1 else written, alone)
     turn = entries([best.table], convention=why, rotation_angle="the same")
     return best.saying(*entries([best.table], **units), turned, *turn)
+
+
+def guess_deviations(columns: Sequence[str], triples: Sequence[Sequence[str]]) -> list[str] | None:
+    """Columns whose names are those of the positions but for a word such as std, in their order; None if one lacks."""
+    deviations = [one for one in map(column, columns) if {*one.words} & WORDS["deviation"]]
+    known = {_without(one, WORDS["deviation"]): one.name for one in deviations}
+    known |= {_without(one, WORDS["deviation"] | WORDS["measured"]): one.name for one in deviations}
+    wanted = [column(name) for triple in triples for name in triple]
+    found = [known.get(one.plain) or known.get(_without(one, WORDS["measured"])) for one in wanted]
+    return None if None in found else [name for name in found if name is not None]
+
+
+def _without(one: Column, words: frozenset[str]) -> str:
+    return "".join(word for word in one.words if word not in words)
 
 
 def with_deviations(source: Source) -> Source:

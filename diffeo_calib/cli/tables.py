@@ -30,7 +30,7 @@ from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
 from diffeo_calib.measurements.csv.sensors import ImageColumns, ReadingColumns, SocketColumns, columns_of
 from diffeo_calib.measurements.poses import by_frame
-from diffeo_calib.measurements.table_format import LEVER, TableFormat
+from diffeo_calib.measurements.table_format import BESIDE, LEVER, TableFormat
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.kinds import known_kinds
@@ -62,7 +62,7 @@ def table_format(units: Units) -> TableFormat:
 def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
     """Add the columns that options name, but for readings; lever in the unit of length."""
     Rows.check_together(vars(rows))
-    as_typed = "convention", "rotation_angle", "remounted", "payload", "time", "temperature", "session", "marker"
+    as_typed = "convention", "rotation_angle", "remounted", "session", "marker", "spherical", *BESIDE
     return replace(
         table,
         **{name: getattr(rows, name) for name in as_typed},
@@ -148,7 +148,7 @@ def rows_in_table(csv: Path, rows: Rows) -> tuple[Rows, list[str]]:
     missing = [kind for kind, has in there.items() if not has]
     changes: dict[str, Any] = {} if rows.session in header else {"session": None, "remounted": False}
     if "--position" in missing:
-        changes |= {"position": None, "std": None, "rotation": None, "rotation_std": None}
+        changes |= {"position": None, "spherical": None, "std": None, "rotation": None, "rotation_std": None}
     if "--socket" in missing:
         changes |= {"socket": None, "distance": None, "distance_std": None}
     kept = [text for text in rows.reading or () if f"--reading {text}" not in missing]

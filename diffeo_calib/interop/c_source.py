@@ -107,6 +107,13 @@ def write_c(
     program = program.at(carrier)
     check_frame(frame)
     chosen = (model.tool if tool is None else tool_transform(tool)).numpy()
+    of_tip = f" {carrier}" * (len(robot.tips) > 1)
+    matrix = "; ".join(" ".join(f"{value:.9g}" for value in row) for row in chosen[:3])
+    remarks, rows = [f"The tool in the frame of the tip{of_tip}, [R t]: {matrix}."], len(model.configurations)
+    if model.markers == 1:
+        remarks.append("One marker was measured: the tool's roll about the last axis is known from the prior alone.")
+    made = model.provenance
+    remarks.append(f"The model was {made.sentence(robot.name, rows) if made else f'fitted to {rows} configurations'}.")
     texts = c_source(
         program,
         source.stem,
@@ -117,7 +124,7 @@ def write_c(
         robot=_comment(robot.name),
         joints=[_comment(line) for line in _joints(robot)],
         frame_name=FRAME_NAMES[frame],
-        remarks=[_comment(line) for line in _remarks(model, chosen, carrier)],
+        remarks=[_comment(line) for line in remarks],
     )
     files = CFiles(source, header, name, texts)
     if write:
@@ -129,17 +136,6 @@ def _joints(robot: Tree) -> Iterator[str]:
     for name, turns, (low, high) in zip(robot.joint_names, robot.periodic, robot.limits.tolist(), strict=True):
         limits = "no limits" if isinf(low) and isinf(high) else f"{low:.6g} to {high:.6g}"
         yield f"{name} [{'rad' if turns else 'm'}]: {limits}"
-
-
-def _remarks(model: CalibratedKinematics, tool: Array, tip: str) -> list[str]:
-    of_tip = f" {tip}" * (len(model.robot.tips) > 1)
-    matrix = "; ".join(" ".join(f"{value:.9g}" for value in row) for row in tool[:3])
-    remarks = [f"The tool in the frame of the tip{of_tip}, [R t]: {matrix}."]
-    if model.markers == 1:
-        remarks.append("One marker was measured: the tool's roll about the last axis is known from the prior alone.")
-    rows, provenance = len(model.configurations), model.provenance
-    fitted = f"fitted to {rows} configurations" if provenance is None else provenance.sentence(model.robot.name, rows)
-    return [*remarks, f"The model was {fitted}."]
 
 
 def _comment(text: str) -> str:
@@ -160,17 +156,14 @@ def c_source(
         limits: (n, 2) of the active joints [rad or m].
         texts: ``robot``, its name; ``joints``, a line for each; ``frame_name`` of the results; ``remarks``, sentences.
     """
-    chain, nominal, joints = program.chain, program.chain.nominal, len(program.chain.nominal.axes)
+    chain, nominal = program.chain, program.chain.nominal
     named = (
         ("joint", "phi^-1: corrections of the joints", program.joint_flow),
         ("task", "psi: corrections of positions", program.task_flow),
     )
     flows = [_flow_constants(*flow) for flow in named if not flow[2].vanishes]
     terms = [term for flow in flows for term in flow["terms"]]
-    runs, first = [], 0  # markers of one tip that follow one another: tip, first and number
-    for tip, run in groupby(program.on):
-        runs.append((tip, first, len(list(run))))
-        first += runs[-1][2]
+    runs = (list(own) for _, own in groupby(range(len(program.on)), program.on.__getitem__))
     contents = texts | {
         "stem": stem,
         "prefix": prefix,
@@ -179,9 +172,10 @@ def c_source(
         "markers": len(program.markers),
         "generated": f"{GENERATED} {package_version()}",
         "lanes": LANES,
-        "on_path": nominal.ancestors[joints:][: len(chain.tips)] * 1,
-        "groups": runs,
-        "program_tip": program.tip,
+        "on_path": nominal.ancestors[len(nominal.axes) :][: len(chain.tips)] * 1,
+        # markers of one tip that follow one another: tip, first and number
+        "groups": [(program.on[own[0]], own[0], len(own)) for own in runs],
+        "program": program,
         "flows": flows,
         "flow_names": [flow["name"] for flow in flows],
         "profiles": sorted({term["term"].profile for term in terms}),
@@ -189,11 +183,7 @@ def c_source(
         "tabulated": any(flow["tables"] for flow in flows),
         "chain": chain,
         "nominal": nominal,
-        "waves": chain.waves,
-        "axis_waves": chain.axes,
-        "moving": joints,
         "sag": None if chain.sag is None else _sag_constants(nominal, chain.sag),
-        "markers_in_flange": program.markers,
         "tool_points": tool_points(tool),
         "frame": frame,
         "limits": limits,
@@ -208,8 +198,7 @@ def _flow_constants(name: str, title: str, flow: RecordedFlow) -> dict[str, Any]
     Of its tables, one after the other by stages, then joints: knots (rows,) rad; f, f', f'' (rows, 3) there; the first
     row of every table, and the number of rows.
     """
-    found: dict[str, Any] = {"name": name, "title": title, "size": flow.size, "steps": flow.steps, "tables": None}
-    found |= {"stages": len(flow.weights), "coefficients": flow.coefficients, "weights": flow.weights}
+    found: dict[str, Any] = vars(flow) | {"name": name, "title": title, "stages": len(flow.weights)}
     found["terms"] = [_term_constants(f"{name}_term{k}", term) for k, term in enumerate(flow.terms, 1)]
     if flow.tables is not None:
         every = [table for stage in flow.tables.stages for table in stage]

@@ -277,8 +277,17 @@ def ur_transforms(geometry: Geometry, urdf: bytes) -> Tensor:
         what = f"the URDF has no link '{prefix}{TOOL}' below '{chain.base}', with which the file's frames end"
         raise RobotError.of(what, got=str(error), fix="pass a URDF with it: `robot`, or --robot URDF") from error
     _, ideal, tool = zero_frames(Geometry.nominal(robot))
-    frames, places = zero_frames(geometry)[1], _ideal_places(robot, ideal, tool)
-    moved = (own @ torch.linalg.inv(was) @ place for own, was, place in zip(frames, ideal, places, strict=True))
+    rows, before, after = links(ideal, robot.axes, tool, HALF_TURN)
+    starts = zip(
+        [before, *after[:-1]], rows, strict=True
+    )  # the file's frames of an ideal robot: Craig's, tool0 the last
+    places = [frame @ row_transform(DHRow(0.0, 0.0, row.d, row.theta)) for frame, row in starts]
+    places[-1] = on_axis(tool, ideal[-1][:3, :3] @ robot.axes[-1], ideal[-1][:3, 3])
+    if (away := float((places[-1] - tool).abs().max())) > TOOL_TOLERANCE:
+        what, expected = f"'{robot.tip}' of robot '{robot.name}'", "a frame on the axis of the last joint"
+        raise RobotError.of(what, expected=expected, got=f"{away:.1e} beside it", fix=OTHERS)
+    frames = zip(zero_frames(geometry)[1], ideal, places, strict=True)
+    moved = (own @ torch.linalg.inv(was) @ place for own, was, place in frames)
     return torch.stack([torch.linalg.inv(before) @ after for before, after in pairwise([HALF_TURN, *moved])])
 
 
@@ -306,15 +315,3 @@ def _prefix(chain: Tree) -> str:
         fix = f"calibrate with --base {prefix}{BASE}, where the file's transforms begin"
         raise RobotError.of(f"the base of robot '{chain.name}'", expected=prefix + BASE, got=chain.base, fix=fix)
     return prefix
-
-
-def _ideal_places(robot: Tree, frames: list[Tensor], tool: Tensor) -> list[Tensor]:
-    """The file's frames of the nominal robot in its base, all joints at zero: Craig's frames, tool0 the last."""
-    rows, before, after = links(frames, robot.axes, tool, HALF_TURN)
-    starts = zip([before, *after[:-1]], rows, strict=True)
-    places = [frame @ row_transform(DHRow(0.0, 0.0, row.d, row.theta)) for frame, row in starts]
-    places[-1] = on_axis(tool, frames[-1][:3, :3] @ robot.axes[-1], frames[-1][:3, 3])
-    if (away := float((places[-1] - tool).abs().max())) > TOOL_TOLERANCE:
-        what, expected = f"'{robot.tip}' of robot '{robot.name}'", "a frame on the axis of the last joint"
-        raise RobotError.of(what, expected=expected, got=f"{away:.1e} beside it", fix=OTHERS)
-    return places

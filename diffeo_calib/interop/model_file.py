@@ -186,9 +186,7 @@ def _tensors_of_rows(fitted: FittedMap) -> Tensors:
         rows = by_row.load if isinstance(by_row, GeometryMap | SessionMarkers) else NO_PAYLOAD
         if not rows.by_row:
             raise InputError.of("the model cannot be saved: the payloads of its rows are not known")
-        sag = nominal.sag
-        folded = torch.cat([theta[: sag.start], nominal.elasticity.folded(theta[sag]), theta[sag.stop :]])
-        found |= zip(PAYLOADS, (rows.masses, fitted.geodesic.task_controls, folded), strict=True)
+        found |= zip(PAYLOADS, (rows.masses, fitted.geodesic.task_controls, nominal.folded(theta)), strict=True)
     return found
 
 

@@ -127,9 +127,9 @@ class NumpyKinematics:
 
     def _at(self, tip: str | None, frame: str) -> Program:
         check_frame(frame)
-        if tip not in (*self.program.tips, None) or (tip is None and len(self.program.tips) > 1):
-            fix = f"pass one of {', '.join(self.program.tips)}"
-            raise InputError.of("`tip`", expected="the name of a tip", got=tip, fix=fix)
+        tips = self.program.chain.nominal.tips
+        if tip not in (*tips, None) or (tip is None and len(tips) > 1):
+            raise InputError.of("`tip`", expected="the name of a tip", got=tip, fix=f"pass one of {', '.join(tips)}")
         return self.program if tip is None else self.program.at(tip)
 
     def _tool(self, tool: object) -> Array:
@@ -190,27 +190,21 @@ def _numbers(value: object, name: str) -> Array:
 def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
     nominal, integrator, steps = header["nominal"], header["integrator"], header["integrator"].get("steps")
     kernels = header["joint_kernel"], header["task_kernel"]
-    own = ", ".join(term["kernel"] for terms in kernels for term in terms if "kernel" in term)
+    foreign = ", ".join(term["kernel"] for terms in kernels for term in terms if "kernel" in term)
     for wrong, what, expected, got in (
         (nominal["kind"] != "robot", "the model", "that of a robot", "a plain function"),
         (integrator["kind"] not in TABLEAUS, "the time stepping", "fixed steps, of RK4 or RK8", integrator["kind"]),
-        (own, "the model's kernels", "kernels of this package", own),
+        (foreign, "the model's kernels", "kernels of this package", foreign),
         (type(steps) is not int or not 1 <= steps <= MOST_STEPS, "the time steps", f"1 to {MOST_STEPS}", steps),
     ):
         if wrong:
             raise InputError.of(what, expected=expected, got=got, fix="use `dc.load`")
     chain, tool = nominal_chain(nominal), arrays["tool"]
     on = [chain.tips.index(tip) for tip in nominal.get("on", ())] or [0] * len(tool)
-    waves, axes, size = nominal.get("waves", []), nominal.get("axes", []), 6 + 6 * len(chain.axes)
-    theta = arrays.get("unladen_theta", arrays["theta"])
-    shifts, last = theta[size : size + tool.size].reshape(-1, 3), len(theta) - sum(6 * int(axis[3]) for axis in axes)
-    ends = [size + tool.size, last - 2 * len(waves), last]
-    sag, periodic, crooked = np.split(theta, ends)[1:]
-    errors = {"waves": (waves, periodic), "axes": (axes, crooked)}
-    k0 = calibrated_chain(
-        chain, arrays["base"], arrays["joint_errors"], theta, sag if nominal["elastic"] else None, **errors
-    )
-    tableau = TABLEAUS[integrator["kind"]]()
+    theta, tableau = arrays.get("unladen_theta", arrays["theta"]), TABLEAUS[integrator["kind"]]()
+    shifts = theta[6 + 6 * len(chain.axes) :][: tool.size].reshape(-1, 3)
+    own = {"elastic": nominal["elastic"], "waves": nominal.get("waves", ()), "axes": nominal.get("axes", ())}
+    k0 = calibrated_chain(chain, arrays["base"], arrays["joint_errors"], theta, len(tool), **own)
     joint, xi = recorded_stages(kernels[0], arrays["x"], arrays["momenta_x"], tableau, steps)
     tip, markers = tip_poses(k0, xi[0])[:, on], tool + shifts  # (N, P, 4, 4); of every control those of its session
     if "session" in arrays:
@@ -221,4 +215,4 @@ def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
     flows = [recorded_flow(k, stages, *tableau) for k, stages in zip(kernels, (joint, task), strict=True)]
     seen = arrays.get("registration_markers", tool + shifts)
     at = on if len(seen) == len(tool) else [on[0]] * len(seen)
-    return Program(flows[0], k0, flows[1], seen, tuple(at), chain.tips)
+    return Program(flows[0], k0, flows[1], seen, tuple(at))

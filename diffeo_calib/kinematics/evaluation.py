@@ -27,11 +27,10 @@ from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.coordinates import Beside, check_shown, sensor_of
+from diffeo_calib.sensors.coordinates import Beside, Places, check_shown, known_devices, sensor_of
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
 from diffeo_calib.sensors.known_drift import KnownDrift
-from diffeo_calib.sensors.places import Places, known_devices
-from diffeo_calib.sensors.tables import divided, measured_positions, rows_of_one_kind
+from diffeo_calib.sensors.tables import divided, measured_positions, rows_of_one_kind, with_points
 
 LARGEST_ERROR_PER_REACH = 0.1
 """Median position errors above this fraction of the robot's reach are implausible."""
@@ -228,7 +227,7 @@ def positions_of(model: CalibratedKinematics, places: Places, data: Any) -> Meas
     if own is None:
         return None
     own = places.aligned(own)
-    return sensor_of(own).with_points(own if drift is None else drift.undone(own), model)
+    return with_points(own if drift is None else drift.undone(own), model)
 
 
 def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> str | None:

@@ -20,8 +20,9 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.device_readings import own_shifts
+from diffeo_calib.measurements.bodies import transform_words, triple
 from diffeo_calib.measurements.images import ONLY_CAMERA
-from diffeo_calib.measurements.poses import inverse_poses, pose_directions, poses_from_marks, rotation_numbers
+from diffeo_calib.measurements.poses import inverse_poses, pose_directions, poses_from_marks
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import skew
 from diffeo_calib.sensors.set_ups import NUMBERS_OF_A_FRAME, SESSION, TRANSFORMS, frame_slopes, own_slopes
@@ -56,10 +57,9 @@ class KnownPose:
 
     def sentences(self, what: str) -> Iterator[str]:
         """Pose and deviations in mm and degrees."""
-        turn = rotation_numbers(self.pose[None, :3, :3], "rotvec", angle="deg")[0]
         position, rotation = self.deviations.split(3)
-        yield f"{what}: {_numbers(1e3 * self.pose[:3, 3])} mm, rotation vector {_numbers(turn)} deg"
-        yield f"  known to {_numbers(1e3 * position)} mm and {_numbers(rotation.rad2deg())} deg (standard deviations)"
+        yield f"{what}: {transform_words(self.pose)}"
+        yield f"  known to {triple(1e3 * position)} mm and {triple(rotation.rad2deg())} deg (standard deviations)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,12 +136,6 @@ class HandEye:
         return {f"{name}_{own.key}": own.entry() for name, own in vars(self).items()}
 
 
-def hand_eye_entry(found: Mapping[str, HandEye]) -> dict[str, object]:
-    """Camera and board for programs; of several cameras by their names; nothing of none."""
-    each = {name: own.entry() for name, own in found.items()}
-    return {"hand_eyes": each} if len(each) > 1 else dict(zip(("hand_eye",), each.values(), strict=False))
-
-
 def hand_eye_sentences(found: Mapping[str, HandEye]) -> Iterator[str]:
     """Every camera and the board with their deviations."""
     for name, own in found.items():
@@ -216,7 +210,3 @@ def _covariance(fitted: FittedMap, part: slice, slopes: Tensor, columns: Tensor,
     left = slopes @ fitted.open_directions[numbers]
     at = fitted.parameters_as_points(numbers).projected(slopes[None])
     return fitted.with_shifts(at, effects[None], columns)[0] + left @ left.mT
-
-
-def _numbers(values: Tensor) -> str:
-    return " ".join(f"{value:.3f}" for value in values.tolist())

@@ -85,6 +85,12 @@ class GeometryMap(NominalMap):
         """Split theta into parameters of the geometry and coefficients of the elasticity (empty without elasticity)."""
         return theta[: self.geometry.size], theta[self.sag]
 
+    def folded(self, theta: Tensor) -> Tensor:
+        """The theta of a robot for which the payload is a part of its own weight, see :meth:`GravitySag.folded`."""
+        if self.elasticity is None:
+            return theta
+        return torch.cat([theta[: self.sag.start], self.elasticity.folded(theta[self.sag]), theta[self.sag.stop :]])
+
     def with_geometry(self, geometry: Geometry) -> GeometryMap:
         """The same parameters around another geometry of the same chain."""
         return self.changed(geometry=geometry)

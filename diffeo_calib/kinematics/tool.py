@@ -225,20 +225,13 @@ def _program(deformation: Deformation) -> Program | None:
     radial = all(isinstance(term, RadialKernel) for flow in flows for term in flow.kernel.terms)
     if not radial or not isinstance(deformation.integrator, RungeKutta) or deformation.x.device.type != "cpu":
         return None
-    geometry, (errors, coefficients) = nominal.geometry, nominal.split(theta)
-    chain = calibrated_chain(
-        geometry.chain.arrays,
-        _array(geometry.base),
-        _array(geometry.joint_errors),
-        _array(errors),
-        None if nominal.elasticity is None else _array(nominal.elasticity.folded(coefficients)),
-        waves=(nominal.own.waves, _array(theta[nominal.parts["waves"]])),
-        axes=(nominal.own.axes, _array(theta[nominal.parts["axes"]])),
-    )
+    geometry, elastic = nominal.geometry, nominal.elasticity is not None
+    parts = (_array(part) for part in (geometry.base, geometry.joint_errors, nominal.folded(theta)))
+    chain = calibrated_chain(geometry.chain.arrays, *parts, geometry.markers, elastic=elastic, **nominal.own._asdict())
     joint, task = (_recorded(flow, deformation.integrator) for flow in flows)
-    points = geometry.absorb(errors.detach().cpu()).tool if other is None else other.points
-    tips, on = geometry.chain.tips, geometry.on if other is None else other.map.geometry.on
-    return Program(joint, chain, task, _array(points), tuple(map(tips.index, on)), tips)
+    points = geometry.absorb(nominal.split(theta)[0].detach().cpu()).tool if other is None else other.points
+    on = geometry.on if other is None else other.map.geometry.on
+    return Program(joint, chain, task, _array(points), tuple(map(geometry.chain.tips.index, on)))
 
 
 def _recorded(flow: Flow, integrator: RungeKutta) -> RecordedFlow:

@@ -268,6 +268,11 @@ class Numbers:
         there = self.in_table(torch.ones_like(self.cells)).to(matrix)
         return matrix[place[:, :, None], place[:, None]] * (there[:, :, None] * there[:, None])
 
+    def rows(self, index: Tensor) -> Numbers:
+        """Those of some rows."""
+        shown = self.in_table(torch.ones_like(self.cells)) > 0
+        return Numbers.of(self.at.rows(index), self.in_table(self.target)[index], shown[index])
+
     def joined(self, other: Numbers) -> Numbers:
         """These and others, in order."""
         cells = torch.cat([self.cells, other.cells + self.shape.numel()])

@@ -13,7 +13,7 @@ import torch
 
 from diffeo_calib.cameras.detection import opencv
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError, few, warn_user
+from diffeo_calib.common.errors import DiffeoCalibError, InputError, MeasurementError, few, warn_user
 from diffeo_calib.measurements.csv.joined import Array, Recording
 from diffeo_calib.measurements.poses import rotation_matrices, rotation_numbers
 from diffeo_calib.robots.se3 import transforms
@@ -191,7 +191,7 @@ def _png(message: Any, content: bytes, topic: str) -> bytes:
 def _messages(bag: Path, wanted: tuple[str, ...], optional: str = "") -> Iterator[tuple[str, Any]]:
     """Topic and content of the messages of some topics."""
     try:
-        from rosbags.highlevel import AnyReader, AnyReaderError  # pyright: ignore[reportMissingImports]  # noqa: PLC0415
+        from rosbags.highlevel import AnyReader  # pyright: ignore[reportMissingImports]  # noqa: PLC0415
         from rosbags.typesys import Stores, get_typestore  # pyright: ignore[reportMissingImports]  # noqa: PLC0415
     except ImportError as error:
         what, fix = "bags are read by the package rosbags, which is not installed", "pip install 'diffeo_calib[ros]'"
@@ -206,7 +206,9 @@ def _messages(bag: Path, wanted: tuple[str, ...], optional: str = "") -> Iterato
             connections = [one for one in reader.connections if one.topic in (*wanted, optional)]
             for one, _, raw in reader.messages(connections=connections):
                 yield one.topic, reader.deserialize(raw, one.msgtype)
-    except (OSError, AnyReaderError) as error:
+    except DiffeoCalibError:
+        raise
+    except Exception as error:  # rosbags raises errors of many kinds for damaged files
         expected = "the folder of a ROS 2 bag, with metadata.yaml, or a ROS 1 file"
         fix = "give the file of a ROS 1 bag, with a name that ends in .bag, or convert it with rosbags-convert"
         raise InputError.of(f"{bag} cannot be read", expected=expected, got=str(error), fix=fix) from error

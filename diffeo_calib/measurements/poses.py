@@ -9,6 +9,7 @@ the pose back. One frame is measured or one on each of several tips: (N, T, 4, 4
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from math import pi
 
 import torch
 from torch import Tensor
@@ -279,6 +280,21 @@ def transforms_of_frames(rotations: Tensor, places: Tensor) -> Tensor:
     """Poses (N, T, 4, 4) of rotations (N, T, 3, 3) and places (N, T, 3), m; NaN as a whole where either is."""
     frames = transforms(rotations, places)
     return frames.masked_fill(frames.isnan().any(3, keepdim=True).any(2, keepdim=True), torch.nan)
+
+
+def from_spherical(numbers: Tensor, how: str) -> Tensor:
+    """Places (..., 3), m, of distances, m, and angles, rad, see SPHERICAL of table_format."""
+    distance, around, up = numbers.unbind(-1)
+    sign, up = -1.0 if "clockwise" in how else 1.0, 0.5 * pi - up if "zenith" in how else up
+    return torch.stack([around.cos() * up.cos(), sign * around.sin() * up.cos(), up.sin()], -1) * distance[..., None]
+
+
+def to_spherical(places: Tensor, how: str) -> Tensor:
+    """The inverse of :func:`from_spherical`."""
+    x, y, z = places.unbind(-1)
+    sign, flat = -1.0 if "clockwise" in how else 1.0, x.hypot(y)
+    up = torch.atan2(flat, z) if "zenith" in how else torch.atan2(z, flat)
+    return torch.stack([places.norm(dim=-1), torch.atan2(sign * y, x), up], -1)
 
 
 def directions_of_frames(frames: Tensor, lever: float) -> Tensor:

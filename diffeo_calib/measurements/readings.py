@@ -229,10 +229,9 @@ class Readings(RowGroups):
     @property
     def shown(self) -> tuple[str, tuple[float, ...], tuple[float, ...]]:
         """Unit in which readings are shown, and what their r numbers are multiplied by and shifted by to be in it."""
-        r = self.values.shape[1]
         if self.kind == "image":
             return self.unit[0], self.intrinsics[:2], self.intrinsics[2:]
-        return self.unit[0], (self.unit[1],) * r, (0.0,) * r
+        return self.unit[0], (self.unit[1],) * (r := self.values.shape[1]), (0.0,) * r
 
     @property
     def sha256(self) -> str:

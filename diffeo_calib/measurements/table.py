@@ -346,9 +346,8 @@ class Measurements(ImageTable):
         names, turns = ([f"{prefix}{name}" for prefix in self.prefixes for name in own] for own in (XYZ, TURNS))
         columns |= zip(names, self.origins.flatten(1).T, strict=False)
         if self.frames is not None:
-            columns |= zip(
-                turns, pose_math.rotation_numbers(self.frames[..., :3, :3], "rotvec").flatten(1).T, strict=False
-            )
+            vectors = pose_math.rotation_numbers(self.frames[..., :3, :3], "rotvec")
+            columns |= zip(turns, vectors.flatten(1).T, strict=False)
         for known, own in ((self.std, names), (self.rotation_std, turns)):
             columns |= {} if known is None else zip([f"std_{name}" for name in own], known.flatten(1).T, strict=False)
         return columns if self.session is None else columns | {"session": self.device_names}

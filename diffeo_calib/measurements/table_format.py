@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from itertools import product
+from math import pi
 from textwrap import dedent
 from typing import Any
 
@@ -36,6 +37,10 @@ ROTATION_NAMES = {
     "matrix": tuple(f"r{i}{j}" for i in "123" for j in "123"),
 }
 """Default names of the columns of a rotation that is written; euler1, ... for Euler angles."""
+SPHERICAL_UNITS = {"rad": 1.0, "deg": 180.0 / pi, "gon": 200.0 / pi}
+"""Units of the angles of devices, per rad."""
+SPHERICAL = tuple(map("".join, product(("elevation", "zenith"), ("_", "_clockwise_"), SPHERICAL_UNITS)))
+"""How a place is written as a distance, a horizontal angle, and one above the horizon, or from the zenith."""
 BESIDE = ("time", "temperature", "payload")
 """Columns with one number a row beside joints and what was measured, which any table may have."""
 
@@ -74,6 +79,8 @@ class TableFormat:
         kinds: of each joint; by default those of the robot, or all revolute.
         position: the three position columns of a marker; several of them for more markers. Empty cells: hidden in that
             row. A third name "0" that is no column: all are in the plane of x and y. None in Python without positions.
+        spherical: positions are a distance, a horizontal angle and one above the horizon, or from the zenith, as
+            trackers and total stations report them: elevation_deg, zenith_gon, elevation_clockwise_rad, ...
         sockets: columns of a ball in sockets. readings: of each kind of reading, and of images (csv/sensors.py).
         session: column that names the set-up of the device for every row.
         on: names of the tips that carry the markers or frames, one for each, for a robot with several tips.
@@ -104,6 +111,7 @@ class TableFormat:
     joints: Any = ()
     kinds: Sequence[str] | None = None
     position: Names | None = None
+    spherical: str | None = None
     sockets: Any = None
     readings: tuple[Any, ...] = ()
     session: str | None = None
@@ -117,6 +125,7 @@ class TableFormat:
         check_choice("angle", self.angle, ANGLE_UNITS)
         check_choice("joint_length", self.joint_unit, tuple(UNITS_PER_METRE))
         check_choice("decimal", self.decimal, (".", ","))
+        check_choice("spherical", self.spherical or SPHERICAL[0], SPHERICAL)
         sep = self.sep
         if not isinstance(sep, str) or len(sep) != 1 or sep in '"\r\n':
             fix = "pass ',' or ';' or '\\t'"

@@ -87,6 +87,11 @@ class Factor:
                 values = values[len(rows) :]
         return torch.cat(parts[1:])
 
+    def below(self, n: int) -> Tensor:
+        """The block of L of the numbers after the first n."""
+        M = len(self.first)
+        return self.added[n - M :, n:] if n >= M else self.L[n:, n:]
+
     def beside(self, H: Tensor) -> Factor:
         """The factor of K + H H^T for more features (M, k), with its inverse by that of K (M. Woodbury, 1950)."""
         W, V = torch.cat([self.W, self.white(H)], 1), self.inverse @ H

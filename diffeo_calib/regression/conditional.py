@@ -63,14 +63,18 @@ class Features:
         known, unknown, mixed = (part.unflatten(1, (M, -1))[:, index].flatten(1) for part in parts)
         found = Features(self.at.rows(index), known, unknown)
         vars(found)["mixed"] = mixed
+        if "by_fields" in vars(self):
+            by_fields = self.by_fields.unflatten(0, (M, -1))[index].flatten(0, 1)
+            vars(found)["by_fields"] = by_fields.unflatten(1, (M, -1))[:, index].flatten(1)
         return found
 
-    def followed_by(self, other: Features, at: Linearisation) -> Features:
-        """Features of these configurations and others by the same process; ``at``: all of them."""
+    def followed_by(self, other: Features, cross: Tensor) -> Features:
+        """Features of these configurations and others by the same process; ``cross``: :meth:`by_fields_with` them."""
         parts = [(one.known, one.unknown, vars(one)["mixed"]) for one in (self, other)]
         known, unknown, mixed = (torch.cat(both, 1) for both in zip(*parts, strict=True))
-        found = Features(at, known, unknown)
-        vars(found)["mixed"] = mixed
+        found = Features(Linearisation.joined([self.at, other.at]), known, unknown)
+        by_fields = torch.cat([torch.cat([self.by_fields, cross], 1), torch.cat([cross.T, other.by_fields], 1)])
+        vars(found).update(mixed=mixed, by_fields=by_fields)
         return found
 
     def blocks(self) -> Tensor:
@@ -82,10 +86,15 @@ class Features:
         """Covariance (M r, M' r') with others, by default themselves."""
         if other is None:
             return self.by_fields.addmm(self.unknown.T, self.unknown)
+        by_fields = self.by_fields_with(other)
+        with large_work(by_fields.numel()):
+            return by_fields.addmm_(self.unknown.T, other.unknown)
+
+    def by_fields_with(self, other: Features) -> Tensor:
+        """(M r, M' r') of :attr:`by_fields` with others."""
         fields = self.at.fields.gram(other.at.fields)
         with large_work(fields.numel()):
-            fields.addmm_(self.known.T, other.known, alpha=-1.0)
-            return fields.addmm_(self.unknown.T, other.unknown)
+            return fields.addmm_(self.known.T, other.known, alpha=-1.0)
 
 
 class Conditional(ABC):
@@ -217,17 +226,25 @@ class Process(Conditional):
         E = E / E.norm(dim=0).clamp(min=torch.finfo(E.dtype).tiny) if size is None else size * E
         return replace(self, factor=self.factor.beside(E))
 
-    def features(self, at: Linearisation, sooner: Features | None = None) -> Features:
-        """Features of a linearisation; ``sooner``: the same by the first of these rows alone."""
+    def features(self, at: Linearisation, sooner: Features | None = None, cross: Tensor | None = None) -> Features:
+        """Features of a linearisation.
+
+        Args:
+            sooner: the same by the first of these rows alone. cross: covariance of the numbers of the others with it by
+                the fields, given the first ones, see :meth:`Features.by_fields_with`; computed by default.
+        """
         found = self.before.features(at) if sooner is None else sooner
         k, mixed = self.known.shape[1], found.unknown
         if sooner is not None:
             mixed = vars(sooner)["mixed"]
         if (n := len(found.known) - k) == len(self.alpha):
             return found
-        cross = self.numbers.gram(at, n).addmm_(self.known[n:], found.known[:k], alpha=-1.0)
-        with large_work(cross.numel()):
-            more = self.factor.further(cross, found.known[k:])
+        if cross is None:
+            cross = self.numbers.gram(at, n).addmm_(self.known[n:], found.known[:k], alpha=-1.0)
+            with large_work(cross.numel()):
+                more = self.factor.further(cross, found.known[k:])
+        else:
+            more = torch.linalg.solve_triangular(self.factor.below(n), cross, upper=False)
         mixed = mixed - self.factor.W[n:].T @ more
         unknown = torch.linalg.solve_triangular(self.factor.B, mixed, upper=False)
         new = Features(at, torch.cat([found.known, more]), unknown)

@@ -111,11 +111,11 @@ class ConjugateGradientRegression(Conditional):
             NumericalError: the iteration did not converge.
         """
         x = torch.zeros_like(values)
-        residual, size = values, _norm(values)
+        residual, size = values, _dot(values, values).sqrt()
         z = self.preconditioner.solve(residual)
         direction, rz = z, _dot(residual, z)
         for _ in range(MAX_ITERATIONS):
-            if bool((_norm(residual) <= self.tolerance * size).all()):
+            if bool((_dot(residual, residual).sqrt() <= self.tolerance * size).all()):
                 break
             image = self.linearisation.product(direction) + self.noise.multiply(direction)
             step = _ratio(rz, _dot(direction, image))
@@ -124,7 +124,7 @@ class ConjugateGradientRegression(Conditional):
             z = self.preconditioner.solve(residual)
             rz, before = _dot(residual, z), rz
             direction = z + _ratio(rz, before) * direction
-        worst = float((_norm(residual) / size.clamp(min=1e-300)).max())
+        worst = float((_dot(residual, residual).sqrt() / size.clamp(min=1e-300)).max())
         if worst > ACCEPTABLE_RESIDUAL:
             raise NumericalError.of(
                 f"conjugate gradients did not converge in {MAX_ITERATIONS} iterations",
@@ -164,10 +164,6 @@ class ConjugateGradientRegression(Conditional):
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
     return (a * b).sum((0, 1))
-
-
-def _norm(a: Tensor) -> Tensor:
-    return _dot(a, a).sqrt()
 
 
 def _ratio(a: Tensor, b: Tensor) -> Tensor:

@@ -90,8 +90,12 @@ class ControlPointRegression(Conditional):
         pull = x.new_zeros(size, 1)
         with large_work(size * noise.covariance.shape[:2].numel()):
             for rows in self._blocks(size):
-                value, white = self._white_rows(rows)
-                _add_square(hessian, white)
+                value, at = self._linearised(rows)
+                a = self._rows(at)
+                a[:, size - self._shifts :] = self.noise.shared[rows].flatten(0, 1)
+                white = self._whiten(self.noise.whiten(a.view(len(rows), -1, size), rows).flatten(0, 1).T)  # of B^T
+                for first, last in pairwise(k * size // STRIPS for k in range(STRIPS + 1)):  # the lower triangle alone
+                    hessian[first:last, :last].addmm_(white[first:last], white[:last].T)
                 if residual is not None:
                     pull += white @ self.noise.whiten(residual(rows, value)[:, :, None], rows).reshape(-1, 1)
             hessian, pull = self._ranks.total([hessian, pull])
@@ -162,13 +166,6 @@ class ControlPointRegression(Conditional):
             columns.append(torch.stack(terms).sum(0) if len(terms) > 1 else terms[0])
         return torch.cat([*columns, of_parameters(at, self.like.theta.numel() + self._shifts).flatten(0, 1)], 1)
 
-    def _white_rows(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """k1 (M, m) at the data with these row numbers, and their columns of B^T: (size, M r)."""
-        value, at = self._linearised(rows)
-        a = self._rows(at)
-        a[:, a.shape[1] - self._shifts :] = self.noise.shared[rows].flatten(0, 1)
-        return value, self._whiten(self.noise.whiten(a.view(len(rows), -1, a.shape[1]), rows).flatten(0, 1).T)
-
     def _white_momenta(self) -> Tensor:
         """L^T of the deformation's momenta, without shared shifts: (size, 1)."""
         b, p, theta = self.like.tensors
@@ -189,12 +186,6 @@ class ControlPointRegression(Conditional):
             for root, part in zip(self._roots, (b, p), strict=True)
         ]
         return torch.cat([*solved, theta * self.spec.prior_variance.sqrt()[:, None], shifts])
-
-
-def _add_square(matrix: Tensor, values: Tensor) -> None:
-    """Add values values^T, (n, k) (k, n), to the lower triangle of a matrix (n, n)."""
-    for first, last in pairwise(k * len(matrix) // STRIPS for k in range(STRIPS + 1)):
-        matrix[first:last, :last].addmm_(values[first:last], values[:last].T)
 
 
 def _root(kernel: Kernel, nodes: list[NodeSensitivity]) -> Tensor:

@@ -63,11 +63,21 @@ def region_scale(
     values = squares[seen].numpy(force=True)
     dims = np.full(len(values), dim) if isinstance(dim, int) else dim[seen].numpy(force=True)
     shares = np.ones(len(values)) if weights is None else weights[seen].double().numpy(force=True)
-    density = _posterior(values, dims, shares, efolds)
+    nu, s = FREEDOMS[:, None], SCALES  # of every pair the probability: (len(FREEDOMS), len(SCALES))
+    logs = -0.5 * (np.log(nu / FREEDOM) / FREEDOM_EFOLDS) ** 2 - 0.5 * (np.log(s) / efolds) ** 2
+    d2, k, count, freedoms = map(torch.from_numpy, (values, dims, shares, FREEDOMS))
+    likelihood = torch.stack([student_likelihood(d2 / each, k, freedoms, count) for each in s.tolist()], 1).numpy()
+    logs = logs + likelihood - 0.5 * (dims @ shares) * np.log(s)
+    density = np.exp(logs - logs.max())
+    density = density / density.sum()
     counts = {int(k): float(shares[dims == k].sum() / shares.sum()) for k in np.unique(dims)}
     high = smallest(lambda at: _held(exp(at), counts, density) >= CONFIDENCE, *map(log, FACTORS))
     number = float(shares.sum())
-    own = _log_quantile(values / np.array([chi2_above(1.0 - CONFIDENCE, k) for k in dims]), shares)
+    ratios = values / np.array([chi2_above(1.0 - CONFIDENCE, k) for k in dims])
+    order = np.argsort(ratios)  # a new one of n lies below the k-th with the probability k / (n + 1)
+    effective = shares.sum() ** 2 / np.square(shares).sum()
+    below = shares[order].cumsum() / shares.sum() * effective / (effective + 1.0)
+    own = float(np.interp(CONFIDENCE, below, np.log(ratios[order].clip(min=np.finfo(float).tiny))))
     return float(np.exp((number * own + ROWS * high) / (number + ROWS)))
 
 
@@ -90,15 +100,6 @@ def region_factor(freedom: float, dim: int) -> float:
     return dim * f_below(CONFIDENCE, dim, freedom) / chi2_above(1.0 - CONFIDENCE, dim)
 
 
-def _log_quantile(ratios: np.ndarray, shares: np.ndarray) -> float:
-    """Logarithm of the value below which a new one of n lies with the confidence: the quantile at (n + 1) / n of it."""
-    order = np.argsort(ratios)
-    own = shares[order]
-    number = own.sum() ** 2 / np.square(own).sum()
-    below = own.cumsum() / own.sum() * number / (number + 1.0)
-    return float(np.interp(CONFIDENCE, below, np.log(ratios[order].clip(min=np.finfo(float).tiny))))
-
-
 def student_likelihood(squares: Tensor, dim: Tensor, freedoms: Tensor, shares: Tensor | None = None) -> Tensor:
     """Log likelihood (F,) of n errors under Student's t of each nu (F,), relative to (2 pi)^(-k/2) of each error.
 
@@ -112,17 +113,6 @@ def student_likelihood(squares: Tensor, dim: Tensor, freedoms: Tensor, shares: T
         density = torch.lgamma(half) - torch.lgamma(0.5 * freedoms) - 0.5 * k * (0.5 * freedoms).log()
         value = value + count.sum() * density - half * distances
     return value
-
-
-def _posterior(values: np.ndarray, dims: np.ndarray, shares: np.ndarray, efolds: float) -> np.ndarray:
-    """Probability of every pair of nu and s: (len(FREEDOMS), len(SCALES))."""
-    nu, s = FREEDOMS[:, None], SCALES
-    logs = -0.5 * (np.log(nu / FREEDOM) / FREEDOM_EFOLDS) ** 2 - 0.5 * (np.log(s) / efolds) ** 2
-    d2, k, count, freedoms = map(torch.from_numpy, (values, dims, shares, FREEDOMS))
-    likelihood = torch.stack([student_likelihood(d2 / each, k, freedoms, count) for each in s.tolist()], 1).numpy()
-    logs = logs + likelihood - 0.5 * (dims @ shares) * np.log(s)
-    density = np.exp(logs - logs.max())
-    return density / density.sum()
 
 
 def _held(factor: float, counts: dict[int, float], density: np.ndarray) -> float:

@@ -18,7 +18,7 @@ from diffeo_calib.reports.analysis.findings import Findings, find
 from diffeo_calib.reports.analysis.stages import Kinematics
 from diffeo_calib.reports.html import sections, sentences
 from diffeo_calib.reports.html.document import page
-from diffeo_calib.sensors.places import Places
+from diffeo_calib.sensors.coordinates import Places
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

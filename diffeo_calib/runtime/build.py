@@ -21,7 +21,6 @@ from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow
 from diffeo_calib.runtime.tables import JointTables, PeriodicSum, Table, tabulate
 
 ROTARY = ("revolute", "continuous")
-NOTHING = np.zeros(0)
 MOST_TABULATED = 1500
 """With more controls, tables would take longer to make than they save: the time grows with the square."""
 
@@ -116,26 +115,28 @@ def calibrated_chain(
     base: Array,
     joint_errors: Array,
     theta: Array,
-    coefficients: Array | None = None,
+    markers: int = 0,
     *,
-    waves: tuple[Sequence[Sequence[float]], Array] = ((), NOTHING),
-    axes: tuple[Sequence[Sequence[float]], Array] = ((), NOTHING),
+    elastic: bool = False,
+    waves: Sequence[Sequence[float]] = (),
+    axes: Sequence[Sequence[float]] = (),
 ) -> CalibratedChain:
     """A chain with its errors.
 
     Args:
         nominal: the robot. base: (4, 4) [m]. joint_errors: (n_all, 4, 4) [m].
-        theta: (6 + 6 n_all,) error twists of base and joints [m, rad].
-        coefficients: of the gravity sag (robots/gravity.py); None without it.
-        waves, axes: the arguments of :func:`gear_waves` and :func:`axis_waves`, and their coefficients.
+        theta: (K,) error twists of base and joints [m, rad], shifts of the markers, coefficients of the gravity sag of
+            an elastic robot (robots/gravity.py), of waves and of axes.
+        markers: how many. waves, axes: the arguments of :func:`gear_waves` and :func:`axis_waves`.
     """
-    L, T = len(nominal.axes), len(nominal.tips)
-    periodic = gear_waves(waves[0], nominal.coupling.shape[1]).times(waves[1]) if waves[0] else None
-    crooked = axis_waves(axes[0], L).times(axes[1]) if axes[0] else None
-    twists = theta[: 6 + 6 * L].reshape(-1, 6)
-    offsets = nominal.offsets[:L] @ joint_errors
+    L, T, last = len(nominal.axes), len(nominal.tips), len(theta) - sum(6 * int(axis[3]) for axis in axes)
+    ends = 6 + 6 * L, 6 + 6 * L + 3 * markers, last - 2 * len(waves), last
+    own, _, coefficients, by_wave, by_axis = np.split(theta, ends)
+    periodic = gear_waves(waves, nominal.coupling.shape[1]).times(by_wave) if waves else None
+    crooked = axis_waves(axes, L).times(by_axis) if axes else None
+    twists, offsets = own.reshape(-1, 6), nominal.offsets[:L] @ joint_errors
     sag, constant = None, twists[1:]
-    if coefficients is not None and coefficients.any():
+    if elastic and coefficients.any():
         sag = Masses.of(nominal.compliances, nominal).sag(coefficients)
     if sag is None and crooked is None:
         offsets, constant = offsets @ transforms(constant), np.zeros_like(constant)

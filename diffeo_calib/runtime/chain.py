@@ -248,7 +248,11 @@ class CalibratedChain:
             if self.axes is not None:
                 slopes[:, range(L), :, range(L)] += wave_slopes(self.axes, x).reshape(-1, L, 6).swapaxes(0, 1)
             shifts = (frames[..., :3, :3] @ slopes[..., :3, :])[:, None]
-            turns = (R @ _right_jacobian(twists[..., 3:]) @ slopes[..., 3:, :])[:, None]  # (N, 1, L, 3, L)
+            w = twists[..., 3:]
+            x, W = (w * w).sum(-1)[..., None, None], skew(w)
+            Jr = ONE - 0.5 * np.sinc(np.sqrt(x) / (2 * np.pi)) ** 2 * W  # the right Jacobian of SO(3)
+            Jr = Jr + smooth(x, 3, lambda a: (a - np.sin(a)) / a**3, np.where) * (W @ W)
+            turns = (R @ Jr @ slopes[..., 3:, :])[:, None]  # (N, 1, L, 3, L)
             moved = shifts + cross(turns.swapaxes(3, 4), arms[..., None, :]).swapaxes(3, 4)
             sums = [(part * on_path[..., None]).sum(2) for part in (moved, turns)]
             by_moving = by_moving + np.concatenate(sums, axis=2)
@@ -347,16 +351,6 @@ def load_slopes(robot: Any, sag: Any, nominal: Any) -> Any:
     slopes_m = (sag.moments @ moved.swapaxes(2, 3).reshape(N, 3 * F, L)).reshape(*e.shape, L)
     slopes_e = cross(spun, e[:, :, None]) * robot.moved[sag.joints][None, :, :, None]  # (N, K, L, 3)
     return (e[:, :, None] @ slopes_m)[:, :, 0] + (slopes_e @ m[..., None])[..., 0]
-
-
-def _right_jacobian(w: Array) -> Array:
-    """Jr of SO(3): (..., 3) -> (..., 3, 3)."""
-    x, W = (w * w).sum(-1)[..., None, None], skew(w)
-    return (
-        ONE
-        - 0.5 * np.sinc(np.sqrt(x) / (2 * np.pi)) ** 2 * W
-        + smooth(x, 3, lambda a: (a - np.sin(a)) / a**3, np.where) * (W @ W)
-    )
 
 
 def smooth(x: Any, order: int, closed: Callable[[Any], Any], where: Callable[..., Any]) -> Any:

@@ -33,12 +33,11 @@ class Program:
     task_flow: RecordedFlow  # psi
     markers: Array  # (P, 3) the measured markers in the frames of their tips [m]
     on: tuple[int, ...]  # numbers of the tips of the markers, P of them
-    tips: tuple[str, ...] = ("",)  # names of the tips
     tip: int = 0  # number of the tip that carries other points
 
     def at(self, tip: str) -> Program:
         """The same program for points on another tip."""
-        return replace(self, tip=self.tips.index(tip))
+        return replace(self, tip=self.chain.nominal.tips.index(tip))
 
     def points(self, q: Array, points: Array | None = None) -> Array:
         """Points in the measuring frame: q (N, n), points (P, 3) in the tip's frame -> (N, P, 3) [m]."""

@@ -7,27 +7,26 @@ middles are found; other devices report readings. :func:`sensor_of` knows the ki
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError, few, listed
+from diffeo_calib.common.errors import InputError, MeasurementError, few, listed, sentence, warn_user
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES, rare_names
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.devices import Devices, Extrinsics
-from diffeo_calib.sensors.errors import ERRORS, READINGS, SPREAD, Evaluation, Evaluations
+from diffeo_calib.sensors.devices import Devices, Extrinsics, check_devices
+from diffeo_calib.sensors.errors import ERRORS, READINGS, SPREAD, Evaluation, Evaluations, socket_errors
 from diffeo_calib.sensors.kinds import kind_of
-from diffeo_calib.sensors.places import BALL_IS_THE_MARKER, Places, joined, placed
-from diffeo_calib.sensors.set_ups import ROWS, Turns, check_same_markers, set_up_kind
-from diffeo_calib.sensors.sockets import SocketPlaces, socket_errors, sockets_of
+from diffeo_calib.sensors.set_ups import ROWS, SetUps, Turns, check_same_markers, mounted_kind, set_up_kind
 from diffeo_calib.sensors.tables import Coordinates
+from diffeo_calib.sensors.tool_frames import SocketPlaces
 
 KNOWN_DEVIATION = 1e-8
 """Prior deviations of increments below this, m or rad, are those of numbers that are known."""
@@ -36,6 +35,87 @@ REMAINING_SPREAD, SMALLEST_MOTION_M = 0.2, 1e-9
 """Largest part of the spread within sockets, relative to the tip's motion, that remains where a mistake is undone."""
 LARGEST_MEDIAN_M = 5e-3
 """Of readings around a calibrated robot: with larger errors it is another robot or another ball."""
+
+
+BALL_IS_THE_MARKER = (
+    "the model was calibrated without a measuring device: the frame of these positions was found from them, 6 numbers, "
+    "as if the marker were the ball; if it is another one, register the model first (`model.registered`, "
+    "evaluate --free both)"
+)
+
+
+@dataclass(frozen=True)
+class Places:
+    """Devices beside a model."""
+
+    # by kind: set-ups of measured positions, where these are in other frames, and devices of readings
+    devices: Mapping[str, Any] = field(default_factory=dict)
+    ball: bool = False  # whether the last marker is a ball that no device of positions measures
+    found: tuple[str, ...] = ()  # what was found from the rows that are judged, in sentences
+    numbers: int = 0  # how many numbers that took
+
+    def aligned(self, data: Any) -> Any:
+        """Measured positions in the frame of the model."""
+        for own in self.devices.values():
+            data = own.aligned(data)
+        return data
+
+    def beside(self, other: Places) -> Places:
+        """Both of them."""
+        devices, found = joined([*self.devices.values(), *other.devices.values()]), (*self.found, *other.found)
+        return Places(devices, self.ball or other.ball, found, self.numbers + other.numbers)
+
+
+def joined(devices: Iterable[Extrinsics]) -> dict[str, Any]:
+    """Join devices of each kind."""
+    found = dict[str, Any]()
+    for own in devices:
+        found[own.kind] = found[own.kind].beside(own) if own.kind in found else own
+    return found
+
+
+def known_devices(model: object) -> dict[str, Any]:
+    """The devices that a model knows, by kind; none for other kinematics."""
+    return joined(getattr(model, "placement", None) or ())
+
+
+def mounted_of(model: Any) -> SetUps:
+    """What is on the tool in every set-up that a calibrated model knows, for rows that were mounted anew."""
+    return mounted_kind(model.lever).among(known_devices(model), model.turns)
+
+
+LARGEST_SHARE = 0.5
+"""Median residual of readings of the rows that are judged, relative to the RMS distance of what they see from its
+middle: wrong rows or units, not a robot that errs."""
+CHECK_READINGS = "check the columns of the readings, their unit, and which device each row names"
+
+
+def fitting_devices(data: Readings, points: Tensor) -> Devices:
+    """The devices where they fit readings best, for known points (N, P, 3) of the tool, m."""
+    kind = kind_of(data)
+    seen = kind.points_of(points)
+    return kind.at(data, seen).refined(data, seen)
+
+
+def placed(data: Readings, points: Tensor) -> Devices:
+    """Place the devices of rows that a user passes.
+
+    Raises:
+        MeasurementError: too few rows of a device. Warns: readings that no place of it explains.
+    """
+    check_devices(data)
+    what, fix = "no place of the devices explains the readings", CHECK_READINGS
+    try:
+        found = fitting_devices(data, points)
+    except InputError as error:  # the ball at a fixed point or behind a camera
+        raise MeasurementError.of(f"{what} ({error})", fix=fix) from None
+    seen = found.points_of(points)
+    error = float(found.errors(data, seen).square().sum(1).median().sqrt())
+    most = LARGEST_SHARE * float((seen - seen.mean(0)).square().sum(1).mean().sqrt())
+    if error > most:
+        expected = f"residuals well below {1e3 * most:.0f} mm for points that far apart"
+        warn_user(sentence(what, expected=expected, got=f"a median of {1e3 * error:.3g} mm", fix=fix))
+    return found
 
 
 @dataclass(frozen=True)
@@ -68,10 +148,6 @@ class Sensor(ABC):
     def check_angles(self, data: Any, model: Any) -> None:  # noqa: B027
         """Raise MeasurementError for rows that fit a model far better with joint values in another unit of angles."""
 
-    def with_points(self, data: Any, model: Any) -> Any:
-        """The rows with all points of a model: those that they do not tell are hidden."""
-        return data
-
     @abstractmethod
     def place(self, data: Any, beside: Beside) -> Places:
         """Place what the kinematics do not know on these rows."""
@@ -100,10 +176,6 @@ class Positions(Sensor):
             what = f"the model was calibrated with {own.kind}"
             raise InputError.of(what, expected=f"measured {own.kind}", got=seen.kind, fix=self.fix)
         check_tips(data, model.on[: data.markers if model.ball else None])
-
-    def with_points(self, data: Measurements, model: Any) -> Measurements:
-        """With a hidden ball where the model has one more point."""
-        return data.with_markers(model.markers) if model.ball else data
 
     def place(self, data: Measurements, beside: Beside) -> Places:
         """The frames of set-ups: those that the model knows stay, the others are found.
@@ -178,7 +250,8 @@ class Contacts(Sensor):
         def share(q: Tensor) -> float:
             tips = model.robot.tip_poses(q)[..., 0, :3, 3]
             motion = float((tips - tips.mean(0)).square().sum(1).mean().sqrt())
-            away = socket_errors(model(q).detach()[:, -1], *sockets_of(data))[0].norm(dim=1)
+            resting = data.socket_numbers.to(q.device), data.known_sockets
+            away = socket_errors(model(q).detach()[:, -1], *resting)[0].norm(dim=1)
             return float(away.nanmedian()) / max(motion, SMALLEST_MOTION_M)
 
         own = share(data.q)
@@ -187,10 +260,6 @@ class Contacts(Sensor):
             if other < REMAINING_SPREAD * own:
                 expected = f"a spread within sockets of {1e2 * other:.2g} % of the tip's motion, as in the other unit"
                 raise MeasurementError.of("the joint values", expected=expected, got=f"{1e2 * own:.2g} %", fix=fix)
-
-    def with_points(self, data: Measurements, model: Any) -> Measurements:
-        self.check(data, model)
-        return data.with_markers(model.markers)
 
     def place(self, data: Measurements, beside: Beside) -> Places:
         """The middles of the sockets, which :meth:`errors` finds."""
@@ -203,7 +272,8 @@ class Contacts(Sensor):
 
     def errors(self, data: Measurements, points: Tensor, places: Places) -> Evaluation:
         """Spread within sockets, and errors of known distances."""
-        away, distances = socket_errors(points[:, -1], *sockets_of(data))
+        resting = data.socket_numbers.to(points.device), data.known_sockets
+        away, distances = socket_errors(points[:, -1], *resting)
         size, lines, names = away.norm(dim=1, keepdim=True), data.line_numbers, data.row_sockets
         return Evaluation(size, None, away[:, None], lines, distances, what=SPREAD, kind="socket", devices=names)
 
@@ -270,7 +340,7 @@ def of_devices(data: Any, names: Collection[str]) -> Any:
     return data.rows([number for number, name in enumerate(data.device_names) if name in names])
 
 
-SENSORS: dict[str, Sensor] = {"position": Positions(), "pose": Poses(), "socket": Contacts(), "mixture": Contacts()}
+SENSORS: dict[str, Sensor] = {"position": Positions(), "pose": Poses(), "socket": Contacts()}
 
 
 def errors_of_kinds(errors: Tensor, own: Coordinates | None, readings: Sequence[Any]) -> Evaluations:

@@ -13,7 +13,8 @@ from diffeo_calib.common.data_frames import data_frame, table_html
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, listed
 from diffeo_calib.common.quantiles import known, quantile
-from diffeo_calib.sensors.sockets import DistanceError
+from diffeo_calib.measurements.rows import NO_SOCKET
+from diffeo_calib.measurements.sockets import Sockets
 
 NAMES = ("rms", "median", "p95", "max")
 SIZES = ("RMS", "median", "95 %", "max")
@@ -33,6 +34,46 @@ COMPONENTS = ("dx", "dy", "dz")
 def shown_unit(unit: str) -> tuple[str, float]:
     """Unit in which numbers are shown, and how many of it are one of ``unit``."""
     return ("mm", 1e3) if unit == "m" else (unit, 1.0)
+
+
+@dataclass(frozen=True)
+class DistanceError:
+    """A known distance between two sockets, and the distance between the middles of predicted positions.
+
+    Args:
+        first, second: names of the sockets. known, found: distances, m.
+    """
+
+    first: str
+    second: str
+    known: float
+    found: float
+
+    @property
+    def error(self) -> float:
+        """Found minus known, m."""
+        return self.found - self.known
+
+
+def socket_errors(predicted: Tensor, socket: Tensor, sockets: Sockets) -> tuple[Tensor, tuple[DistanceError, ...]]:
+    """Compare predicted positions (N, 3), m, of rows in sockets (N,) with one another: the middle is their mean.
+
+    Returns:
+        (N, 3) from the predicted position of each row to the middle of its socket, m; NaN without one, and of a row
+        that is alone in its socket, whose middle it is. Known distances between sockets that both have rows.
+    """
+    inside = socket != NO_SOCKET
+    own = socket[inside]
+    count = torch.bincount(own, minlength=len(sockets.names)).to(predicted)
+    middles = predicted.new_zeros(len(sockets.names), 3).index_add(0, own, predicted[inside]) / count[:, None]
+    seen = (count > 0).tolist()
+    distances = tuple(
+        DistanceError(sockets.names[a], sockets.names[b], known, float((middles[a] - middles[b]).norm()))
+        for a, b, known in sockets.distances
+        if seen[a] and seen[b]
+    )
+    judged = inside & (count > 1)[socket]
+    return (middles[socket] - predicted).masked_fill(~judged[:, None], torch.nan), distances
 
 
 @dataclass(frozen=True, repr=False)

@@ -26,8 +26,7 @@ from diffeo_calib.sensors.image import Cameras
 from diffeo_calib.sensors.known_drift import KnownDrift
 from diffeo_calib.sensors.range import FixedPoints
 from diffeo_calib.sensors.set_ups import MeasuringFrames, MountedFrames, MountedMarkers
-from diffeo_calib.sensors.sockets import SocketPlaces
-from diffeo_calib.sensors.tool_frames import Contacts, HeldTools, Trackers
+from diffeo_calib.sensors.tool_frames import Contacts, HeldTools, SocketPlaces, Trackers
 
 KINDS: dict[str, type[Devices]] = {
     kind.kind: kind for kind in (FixedPoints, Planes, Cameras, HeldTools, Trackers, Contacts)

@@ -84,6 +84,11 @@ def measured_positions(data: Any) -> Measurements | None:
     return None if own is None or own.table.without_device else own.table.device_rows()
 
 
+def with_points(data: Measurements, model: Any) -> Measurements:
+    """Measured positions with all points of a model: a ball that no device shows is hidden."""
+    return data.with_markers(model.markers) if model.ball else data
+
+
 def with_positions(data: Any, change: Callable[[Any], Any]) -> Any:
     """Any table with a change of its rows whose positions or poses a device measured; the other ones stay."""
     parts = [own if own.without_device else change(own) for own in data.parts]

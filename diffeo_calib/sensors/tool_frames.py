@@ -1,4 +1,4 @@
-"""What else shows a tool whose poses are measured: a tracker's marker, a ball in a socket, the robot's other hand.
+"""Sockets of a ball, and what else shows a tool whose poses are measured: a tracker's marker, the robot's other hand.
 
 With the measured pose T of the tool, a point p that is fixed to it, and a device in the place B that is not known,
 
@@ -21,10 +21,14 @@ from torch import Tensor
 
 from diffeo_calib.measurements.bodies import triple
 from diffeo_calib.measurements.poses import POINTS
+from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import LEVER
-from diffeo_calib.robots.placement import place
+from diffeo_calib.robots.placement import PLACES, place
 from diffeo_calib.robots.se3 import nearest_rotations
-from diffeo_calib.sensors.devices import Devices, least_squares, moved_pose
+from diffeo_calib.sensors.devices import Devices, Extrinsics, least_squares, moved_pose
+
+IN_SOCKET_M = 0.02
+"""Largest distance of the ball from the place of a socket, stated roughly, at which it counts as resting there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +58,59 @@ class Trackers(Devices):
         marker, std = 1e3 * self.constants[number, 12:], 1e3 * deviations[6:]
         place = f"{triple(marker)} +- {triple(std)} mm in the measured frame"
         return f"marker of '{self.names[number]}': {place}; lengths are its own and the board's"
+
+
+@dataclass(frozen=True, eq=False)
+class SocketPlaces(Devices):
+    """Sockets, in which a ball shows nothing but that it is there: constants are their places (3), m."""
+
+    kind, reads, stated_as = "socket", False, "X,Y,Z"
+    size_fix = "pass a known distance between two sockets"
+    numbers_each, increments_each = 3, 3
+
+    @classmethod
+    def start(cls, values: Tensor, bodies: Tensor) -> Tensor:
+        return (bodies - values).mean(0)
+
+    @staticmethod
+    def read(constants: Tensor, body: Tensor) -> Tensor:
+        return body - constants
+
+    @classmethod
+    def stated(cls, numbers: Tensor) -> Tensor:
+        return numbers
+
+    @property
+    def places(self) -> Tensor:
+        return self.constants
+
+    def sees(self, points: Tensor, device: Tensor) -> Tensor:
+        return (points - self.constants[device]).norm(dim=1) < IN_SOCKET_M
+
+    @classmethod
+    def around(cls, ball: Tensor, data: Measurements) -> SocketPlaces:
+        """The middles of balls (N, 3), m; a single row deviates as those of others do."""
+        socket, known = data.socket_numbers.to(ball.device), data.known_sockets
+        numbers = socket.unique()
+        own = [ball[socket == number] for number in numbers]
+        middles = torch.stack([rows.mean(0) for rows in own])
+        spreads = [rows.var(0) for rows in own if len(rows) > 1]
+        single = torch.stack(spreads).mean(0).sqrt() if spreads else torch.full_like(middles[0], PLACES.found_m_rad)
+        each = [rows.std(0) / len(rows) ** 0.5 if len(rows) > 1 else single for rows in own]
+        return cls(tuple(known.names[number] for number in numbers.tolist()), middles, torch.stack(each))
+
+    def same_set(self, other: Extrinsics) -> bool:
+        """Sockets are all of one set."""
+        return self.kind == other.kind
+
+    def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
+        return self.constants @ T[:3, :3].mT + T[:3, 3]
+
+    def where(self, number: int) -> str:
+        return f"{triple(1e3 * self.constants[number])} mm"
+
+    def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
+        return f"socket '{self.names[number]}': {self.where(number)} in {frame}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from kind_bank import kind_named, rigid_rms
-from product_bank import usual_scales
+from kind_bank import kind_named
 from simulated_camera import BOARD_PRIOR, HEIGHT, WIDTH, CameraArm, camera_arm, true_camera
 from simulated_sockets import rest_in_sockets
 from table_bank import refused, warned
@@ -27,8 +26,6 @@ from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
-
-SCALES = usual_scales(SimulatedArm().nominal)
 
 
 @cache
@@ -48,18 +45,6 @@ def of_corners(corners: Tensor, q: Tensor | None = None, **known: Any) -> dc.Mea
     q = data().q if q is None else q
     known = {"board": BoardPrior(scale=2e-4), "camera": (WIDTH, HEIGHT), **known}
     return dc.Measurements.from_images(q, corners, joint_names=arm().arm.nominal.joint_names, **known)
-
-
-def error_mm(model: Any, seen: CameraArm | None = None) -> float:
-    seen = seen or arm()
-    return 1e3 * rigid_rms(model(seen.q).detach(), seen.arm.true_points(seen.q))
-
-
-def test_pixels_are_better_than_poses() -> None:
-    camera: Any = data().poses
-    poses = dc.Measurements.from_poses(data().q, torch.linalg.inv(camera), data().joint_names, camera_on_tool=True)
-    by_poses = dc.calibrate(arm().arm.nominal, poses, hyperparameters=SCALES)
-    assert error_mm(calibrated().model) < 0.85 * error_mm(by_poses.model)
 
 
 def test_lens_and_board_are_found_with_the_robot() -> None:
@@ -156,15 +141,6 @@ def test_the_size_comes_from_board_and_tracker() -> None:
     assert abs(float(own.unknowns[SCALE] - truth.unknowns[SCALE])) < 4 * float(own.deviations[SCALE])
     said = " ".join(kind().result.placement.sentences())
     assert "lengths are its own and the board's" in said
-
-
-def test_the_tracker_makes_the_workspace_known() -> None:
-    images: Any = kind().data.parts[0]
-    alone = dc.calibrate(kind().robot, images, hyperparameters=kind().scales)
-    assert kind().result.expected.workspace < 0.5 * alone.expected.workspace
-    q = kind().source.rows.parts[1].q
-    truth = kind().source.truth(q)
-    assert rigid_rms(kind().model(q).detach(), truth) < 0.5 * rigid_rms(alone.model(q).detach(), truth)
 
 
 @pytest.mark.slow

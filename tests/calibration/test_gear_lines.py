@@ -22,9 +22,8 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.calibration.choose_scales import scales_of_models
 from diffeo_calib.calibration.identification.identification import Prior
-from diffeo_calib.calibration.scales.axis_errors import with_axis_errors
-from diffeo_calib.calibration.scales.gear_lines import _fall, _Scan, find_gear_lines
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
+from diffeo_calib.calibration.scales.position_errors import _fall, _Scan, find_gear_lines, with_axis_errors
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.interop.numpy_model import load_numpy

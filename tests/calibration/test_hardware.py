@@ -9,7 +9,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from product_bank import Case, ur10_measurements, ur10_scales
@@ -53,17 +52,6 @@ def test_the_fit_converges_and_its_deviations_hold(ur10: Case) -> None:
     assert 0.92 < coverage(ur10) < 0.99
     assert len(ur10.result.outliers) <= 0.02 * len(ur10.train)  # gross errors are not invented
     assert ur10.result.left_out_rms == pytest.approx(ur10.held_out()[2], rel=0.25)
-
-
-def test_fewer_poses(ur10_folder: Path) -> None:
-    robot, data = ur10_measurements(ur10_folder)
-    train, test = data.split(0.7, seed=0)
-    some = train.rows(np.sort(np.random.default_rng(0).permutation(len(train))[:FEWER]))
-    case = Case(robot, some, test, dc.calibrate(robot, some))
-    _, geometry, diffeomorphic = case.held_out()
-    assert diffeomorphic < 0.8 * geometry
-    assert 1e3 * diffeomorphic < LARGEST_OF_FEWER
-    assert coverage(case) > COVERED
 
 
 def fr3(folder: Path, *, poses: bool) -> tuple[dc.Chain, dc.Measurements]:

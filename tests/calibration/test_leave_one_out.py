@@ -9,7 +9,7 @@ from math import inf
 import numpy as np
 import pytest
 import torch
-from product_bank import covered, usual_scales
+from product_bank import usual_scales
 from scipy.stats import chi2
 from tangent_bank import Setting, built, covariance, normal, prior_covariance
 from torch.testing import assert_close
@@ -155,14 +155,3 @@ def test_right_scales_are_hardly_widened(monkeypatch: pytest.MonkeyPatch) -> Non
         found.append(cross_validated_inflation(scales, scales, drawn, rows, seed=seed) or 0.0)
     assert min(found) > 0.5
     assert 0.9 < np.median(found) < 1.7, found
-
-
-@pytest.mark.slow
-def test_coverage_with_few_poses() -> None:
-    """The 95 % regions of new measurements, two arms with 30 poses."""
-    found = []
-    for seed in range(2):
-        simulated = SimulatedArm(seed=seed)
-        data = dc.Measurements(*simulated.measure(330, seed))
-        found.append(covered(dc.calibrate(simulated.nominal, data[:30]).model, data[30:]))
-    assert 0.9 < np.mean(found) < 0.995, found

@@ -18,14 +18,12 @@ from reading_bank import readings, scales
 from table_bank import warned
 from tangent_bank import Setting, covariance
 from torch import Tensor
-from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.gates import CHANGE_ROWS
 from diffeo_calib.calibration.diagnostics.judge import changes
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.rows import with_attributes
-from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.sensors.devices import Hypothesis
 
@@ -129,21 +127,6 @@ def test_levers_in_another_unit_are_refused(lever: float) -> None:
     q = ARM.sample(ROWS, 1)
     with pytest.raises(MeasurementError, match=rf"lever.* got {1e3 * lever:g} mm"):
         dc.calibrate(ARM.nominal, dc.Measurements.from_poses(q, ARM.truth.poses(q), lever=lever))
-
-
-def test_evidence_for_unknowns_is_that_of_weighted_least_squares() -> None:
-    root, E, r = normal(12, 12, seed=1), normal(12, 2, seed=2), 5.0 * normal(12, seed=3)
-    L = torch.linalg.cholesky(root @ root.mT + torch.eye(12, dtype=torch.float64))
-    white = torch.linalg.solve(L, torch.cat([E, r[:, None]], 1))
-    W, r = white[:, :2], white[:, 2]
-    found = Evidence(W.T @ r, W.T @ W, float(r @ r), len(r))
-    expected = torch.linalg.lstsq(white[:, :2], white[:, 2:]).solution[:, 0]
-    left = white[:, 2] - white[:, :2] @ expected
-    assert_close(found.size, expected, rtol=1e-6, atol=0)
-    assert float(found.gain) == pytest.approx(float(white[:, 2].square().sum() - left.square().sum()))
-    assert float(found.excess) == pytest.approx(float(left.square().mean()))
-    assert float(found.excess) > 1.0
-    assert float(found._replace(g=1e-3 * found.g, total=1e-6 * found.total).excess) == 1.0, "smaller ones are no excess"
 
 
 # --- changes ----------------------------------------------------------------------------------------------------------

@@ -264,6 +264,14 @@ def test_signs_and_zeros_of_a_scara() -> None:
     assert found(SCARA, read, points) == ["a,{b}+90,-{c},d"]
 
 
+def test_percent_of_limits_beside_a_joint_that_stands_still() -> None:
+    """Such as a gripper."""
+    joints = (*SCARA[:2], SCARA[3], ("revolute", [0.0, 0.0, 0.1], X, 0.2, 0.8))
+    q, points = measured((*joints[:3], (*joints[3][:3], 0.4, 0.4001)))
+    read = q * torch.tensor([100.0 / math.degrees(one[4]) for one in joints])
+    assert found(joints, read, points)[0].startswith("1.3178*{a},1.43239*{b},1.71887*{c},")
+
+
 def test_expressions_that_were_read_are_composed() -> None:
     """Not nested: "-{-{b}+90}"."""
     q, points = measured(SCARA)

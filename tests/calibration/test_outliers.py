@@ -1,18 +1,38 @@
-"""Outliers: they must not spoil the fit, and the result names them with a probable cause; few fits choose scales."""
+"""Rows that look wrong: they must not spoil the fit, and are named with a cause; few fits choose scales."""
 
 from __future__ import annotations
 
+import re
+import warnings
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from kind_bank import kind_named
+from math_bank import normal
 from product_bank import Case, simulated, usual_scales, with_usual_scales
+from reading_bank import scales
+from simulated_sockets import rest_in_sockets
+from table_bank import warned
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.outliers import FAR, Outlier
+from diffeo_calib.calibration.diagnostics.open_directions import warn_of_flat_places
+from diffeo_calib.calibration.diagnostics.outliers import FAR, Outlier, contradicted, excluded
+from diffeo_calib.calibration.diagnostics.row_order import (
+    block_text,
+    find_block,
+    out_of_step,
+    steps_of,
+)
+from diffeo_calib.calibration.expected_errors import workspace_deviation
+from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
+from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.se3 import rotation
 
 # Several outliers among few rows make the noise hard to estimate, and the calibration warns of it.
@@ -151,3 +171,293 @@ def test_regions_of_the_robot_hold_beside_gross_rows(share: float, *, chosen: bo
     inside = (error.mT @ torch.linalg.solve(covariance.view(-1, 1, 3, 3), error)).flatten() < 7.8147
     assert float(inside.double().mean()) >= 0.9
     assert float(result.selection.scales.sensor_noise) < 1.1 * arm.noise
+
+
+# --- rows that a model contradicts ------------------------------------------------------------------------------------
+
+ASIDE = torch.tensor([0.2, 0.0, 0.0], dtype=torch.float64)
+
+
+def changed(case: Case, rows: slice, change: Tensor, count: int = 60) -> dc.Measurements:
+    """Some of the held-out rows, a part of them displaced."""
+    points = case.test.points[:count].clone()
+    points[rows] += change
+    return dc.Measurements(case.test.q[:count], points).with_line_numbers(range(2, count + 2))
+
+
+def test_a_new_row_that_is_wrong_is_named(arm: Case, pair: Case) -> None:
+    for case in (arm, pair):
+        assert contradicted(case.model, case.test) == []
+        assert steps_of(case.model, case.test) == []
+    (found,) = contradicted(arm.model, changed(arm, slice(7, 8), 0.01 * ASIDE))
+    assert (found.row, found.number, found.weight) == (7, 9, None)
+    assert found.distance == pytest.approx(0.002, rel=0.1)
+
+
+def test_a_wrong_pose_is_named(posed: Case) -> None:
+    assert contradicted(posed.model, posed.test) == []
+    poses = posed.test.poses.clone()
+    poses[4, :3, 3] += 0.1 * ASIDE
+    poses[9, :3, :3] = poses[9, :3, [1, 2, 0]]
+    found = contradicted(posed.model, dc.Measurements.from_poses(posed.test.q, poses))
+    assert {one.row for one in found} == {4, 9}
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [(slice(50, 60), "lines 52 to 61 to the end of the table: got"), (slice(20, 30), "lines 22 to 31: got")],
+)
+def test_a_block_of_rows_that_moved_together(rows: slice, words: str, arm: Case) -> None:
+    data = changed(arm, rows, ASIDE)
+    text = block_text(arm.model, data, contradicted(arm.model, data))
+    assert text.startswith(f"10 rows look wrong that follow one another: {words} a median error of 200 mm")
+    assert "moving the measuring device by 200 mm" in text
+
+
+def test_the_block_is_where_the_wrong_rows_are() -> None:
+    """Random rows are rarely one."""
+    generator = torch.Generator().manual_seed(1)
+    for share in (0.02, 0.1, 0.3):
+        found = [find_block(torch.rand(80, generator=generator) < share) for _ in range(300)]
+        assert sum(place is not None for place in found) <= 2
+    wrong = torch.zeros(100, dtype=torch.bool)
+    wrong[40:50] = True
+    wrong[[3, 77]] = True
+    assert find_block(wrong) == (40, 50)
+    wrong[45] = False
+    assert find_block(wrong) == (40, 50)
+    assert find_block(~wrong) is None  # nearly all rows
+
+
+# --- wrong labels -----------------------------------------------------------------------------------------------------
+
+ARM, ROWS = SimulatedArm(seed=0), 60
+
+
+def test_a_session_that_begins_earlier_than_said_and_a_payload_that_rows_did_not_carry() -> None:
+    """Of right labels nothing is said."""
+    whole = dc.Measurements(*ARM.measure(ROWS, seed=1))
+    points, names = whole.points.clone(), ["before"] * 33 + ["after"] * 27
+    points[30:] += torch.tensor([2e-3, -1e-3, 5e-4], dtype=torch.float64)
+    masses = torch.tensor([0.0, 5.0, 10.0], dtype=torch.float64)[torch.arange(ROWS) % 3]
+    laden, labels = dc.Measurements(*ARM.measure(ROWS, seed=1, payload=masses)), masses.clone()
+    labels[2:9:3] = 0.0
+    for data, words in (
+        (dc.Measurements(whole.q, points).with_sessions(names), "3 rows .* fit session 'after': lines 30, 31, 32"),
+        (laden.with_payload(labels), "fit a payload of 10: lines 2,"),
+        (laden.with_payload(masses), ""),
+    ):
+        _, texts = warned(dc.calibrate, ARM.nominal, data, hyperparameters=scales())
+        found = [one for one in texts if "look wrong and fit" in one]
+        assert len(found) == bool(words)
+        assert all(re.search(words, one) for one in found), found
+
+
+# --- names that few rows carry ----------------------------------------------------------------------------------------
+
+
+RENAMED: dict[str, Callable[[Any, list[str]], Any]] = {
+    "ball in sockets": lambda data, names: dc.Measurements.from_sockets(data.q, names, data.joint_names),
+    "sessions": lambda data, names: data.with_sessions(names),
+    "heights": lambda data, names: dc.Readings.heights(data.q, data.values[:, 0], names, data.joint_names),
+}
+
+
+def with_a_lone_name(kind: str, data: Any) -> tuple[Any, str]:
+    """Rows of which one carries a name of its own, and what must be said of it."""
+    names = list(data.row_sockets if kind == "ball in sockets" else data.device_names)
+    usual, names[5] = names[5], f"{names[5]}x"
+    return RENAMED[kind](data, names), rf"'{usual}x' in 1 row \(5\), perhaps meant as '{usual}'"
+
+
+@pytest.mark.parametrize("name", RENAMED)
+def test_a_lone_name_is_told_by_its_row(name: str) -> None:
+    kind = kind_named(name)
+    data, words = with_a_lone_name(name, kind.data)
+    with pytest.raises(MeasurementError, match=words):
+        dc.calibrate(kind.robot, data, hyperparameters=kind.scales)
+
+
+def test_a_lone_socket_of_new_rows_is_told_by_its_row() -> None:
+    kind = kind_named("ball in sockets")
+    new, words = with_a_lone_name("ball in sockets", kind.new)
+    found = " ".join(dc.evaluate(kind.model, new).placed)
+    assert "1 of 12 rows show no error" in found
+    assert re.search(words, found)
+    for verb in (dc.recalibrate, dc.compare):
+        with pytest.warns(DiffeoCalibWarning, match=words):
+            verb(kind.model, new)
+
+
+# --- single rows in sockets -------------------------------------------------------------------------------------------
+
+WRONG = [10, 45]
+SHIFT_M = 8e-4
+RESTING = SimulatedArm(seed=2)
+
+
+def in_their_sockets(seed: int, places: int) -> dc.Measurements:
+    """The sockets of three places lie near a plane as those of any three do."""
+    rows, names = rest_in_sockets(RESTING, seed=seed, places=places, rows=10), RESTING.nominal.joint_names
+    return dc.Measurements.from_sockets(rows.q, rows.names, names, distances={("0", "1"): 0.05}, distance_std=1e-5)
+
+
+@pytest.fixture(scope="module")
+def result() -> Any:
+    """Of rows two of which are wrong; nobody says that a plane is too little for the workspace."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*lie near.*")
+        return dc.calibrate(RESTING.nominal, moved(in_their_sockets(2, 3), WRONG), hyperparameters=scales())
+
+
+def moved(data: dc.Measurements, rows: list[int]) -> dc.Measurements:
+    """Some rows with joint values at which the ball is 0.8 mm beside its socket."""
+    q = data.q.clone()
+    slopes = RESTING.truth.jacobian(q[rows])[:, 0]
+    away = torch.tensor([0.0, SHIFT_M, 0.0], dtype=q.dtype)
+    q[rows] += torch.linalg.pinv(slopes) @ away
+    return with_attributes(data, q=q)
+
+
+def test_wrong_rows_are_named_also_where_they_took_no_part(result: Any) -> None:
+    new = in_their_sockets(7, 1)
+    assert contradicted_in_sockets(result.model, new) == []
+    found = contradicted_in_sockets(result.model, moved(new, [7]))
+    assert sorted(one.row for one in result.outliers) == WRONG
+    assert all(one.weight < 0.3 for one in result.outliers)
+    assert [(one.row, one.weight) for one in found] == [(7, None)]
+    assert all(one.distance == pytest.approx(SHIFT_M, rel=0.4) for one in (*result.outliers, *found))
+    two = moved(new, [7]).rows([0, 7])
+    assert contradicted_in_sockets(result.model, two) == [], "two rows cannot tell which of them is wrong"
+
+
+def test_a_row_in_a_socket_is_judged_as_all_others_predict_it(result: Any) -> None:
+    """By the conditional mean and covariance of its error given theirs, with dense matrices."""
+    new, model = moved(in_their_sockets(7, 1), [7]), result.model.map
+    (found,) = contradicted_in_sockets(result.model, new)
+    rests = new.socket_numbers[:, None] == new.socket_numbers
+    eye, seen = torch.eye(3, dtype=torch.float64), model(new.q).detach()
+    middles = rests.double() @ seen / rests.sum(1, keepdim=True)
+    K = model.joint_covariance(new.q) + PLACES.found_m_rad**2 * torch.kron(rests.double(), eye)
+    K, error = K + torch.kron(torch.eye(len(new)), model.new_noise), (middles - seen).flatten()
+    own = torch.arange(3 * len(new)) // 3 == 7
+    gain = torch.linalg.solve(K[~own][:, ~own], K[~own][:, own]).mT
+    away = error[own] - gain @ error[~own]
+    assert found.distance == pytest.approx(float(away.norm()), rel=1e-4)
+
+
+def test_a_plane_is_named_where_it_matters(result: Any) -> None:
+    found, expected = result.sockets, workspace_deviation(result.model.map)
+    flat = found.positions.clone()
+    flat[:, 2] = 0.2
+    tall = flat.clone()
+    tall[[0, 3], 2] = 0.9
+
+    def named(positions: Tensor, expected_error: float) -> list[str]:
+        rows = found.device, found.sockets.place, expected_error
+        return warned(warn_of_flat_places, result.model.map, positions, *rows)[1]
+
+    assert named(flat, expected) == named(tall, 10 * expected) == []
+    (large,) = named(flat, 10 * expected)
+    assert re.search("the sockets lie near a plane.*raise or tilt the block at one place", large)
+
+
+# --- rows out of step with their joints -------------------------------------------------------------------------------
+
+
+def shifted(data: dc.Measurements, first: int, lag: int) -> dc.Measurements:
+    """The measured values from row ``first`` on belong to the joints ``lag`` rows below; row 0 is line 2."""
+    wanted = torch.arange(len(data))
+    wanted[first:] += lag
+    kept = wanted < len(data)
+    lines = torch.arange(2, len(data) + 2)[kept].tolist()
+    return dc.Measurements(data.q[kept], data.points[wanted[kept]]).with_line_numbers(lines)
+
+
+@pytest.mark.slow
+def test_a_table_that_is_out_of_step_is_refused() -> None:
+    arm, train, _ = simulated(40)
+    words = "do not fit this robot: from line 22 on the measured values belong to the joints 1 line above: got .* rows"
+    with pytest.raises(MeasurementError, match=words):
+        dc.calibrate(arm.nominal, shifted(train, 20, -1))
+
+
+NOISE = 1e-3
+TYPICAL = 1.5 * NOISE
+"""Median length of three coordinates."""
+
+
+def out_of_step_table(rows: int, first: int, last: int, lag: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """Predictions, measured values of which the rows first ... last - 1 belong ``lag`` rows below, and line numbers."""
+    predicted, wanted = normal(rows, 1, 3, seed=seed), torch.arange(rows)
+    wanted[first:last] += lag
+    kept = (wanted >= 0) & (wanted < rows)
+    measured = predicted[wanted.clamp(0, rows - 1)] + NOISE * normal(rows, 1, 3, seed=seed + 1)
+    return predicted[kept], measured[kept], torch.arange(2, rows + 2)[kept]
+
+
+@pytest.mark.parametrize("lag", [-5, -1, 2])
+@pytest.mark.parametrize("first", [5, 25])
+def test_from_a_line_on(first: int, lag: int) -> None:
+    (step,) = out_of_step(*out_of_step_table(40, first, 40, lag), typical=TYPICAL)
+    assert (step.first, step.lag, step.to_the_end) == (first + 2, lag, True)
+    there = 40 - first - 2 * max(lag, 0)  # the last rows have lost their measured values
+    assert there - 2 <= step.rows <= there
+
+
+def test_a_block_in_the_middle_and_rows_in_any_order_with_gaps() -> None:
+    """As after a split: 70 % of the rows, and thus half of the pairs."""
+    (step,) = out_of_step(*out_of_step_table(40, 10, 22, -1), typical=TYPICAL)
+    assert (step.first, step.last, step.lag, step.to_the_end) == (12, 23, -1, False)
+    assert step.sentence().startswith("in lines 12 to 23 the measured values belong to the joints 1 line above")
+    rows = torch.randperm(100, generator=torch.Generator().manual_seed(3))[:70]
+    (step,) = out_of_step(*(part[rows] for part in out_of_step_table(100, 50, 100, -1)), typical=TYPICAL)
+    assert (step.lag, step.to_the_end) == (-1, True)
+    assert abs(step.first - 52) <= 2
+
+
+@pytest.mark.parametrize("rows", [4, 60])
+def test_nothing_in_tables_that_are_right(rows: int) -> None:
+    """With heavy tails, with every fifth row far off, and with a pair of rows exchanged."""
+    for seed in range(10):
+        predicted, measured, lines = out_of_step_table(rows, 0, 0, 0, seed=seed)
+        assert out_of_step(predicted, measured, lines, TYPICAL) == []
+        measured = measured + NOISE * normal(rows, 1, 3, seed=seed + 50) / normal(rows, 1, 1, seed=seed + 60).abs()
+        measured[::5] += 0.2
+        measured[[1, 2]] = measured[[2, 1]]
+        assert out_of_step(predicted, measured, lines, TYPICAL) == []
+
+
+def test_nothing_on_a_slow_path() -> None:
+    """Where the next row is nearer than the error of the nominal robot."""
+    t = torch.linspace(0, 1, 200, dtype=torch.float64)
+    predicted = torch.stack([t.cos(), t.sin(), t], 1)[:, None]
+    measured = predicted + 5e-3 * torch.stack([(3 * t).sin(), (2 * t).cos(), t], 1)[:, None]
+    typical = float((predicted - measured).norm(dim=-1).median())
+    assert out_of_step(predicted, measured, torch.arange(200), typical) == []
+
+
+# --- the rule that says which rows look wrong, on clean errors and beside gross ones ----------------------------------
+
+TABLES = 600
+
+
+@pytest.mark.parametrize("freedom", [1, 6])
+@pytest.mark.parametrize("rows", [5, 40])
+@pytest.mark.parametrize("expected", [0.05, 20.0])
+def test_one_of_a_hundred_clean_tables_is_suspected_however_few_its_rows(
+    freedom: int, rows: int, expected: float
+) -> None:
+    """Whatever the model expects of the errors: the others tell how large they are."""
+    drawn = torch.Generator().manual_seed(rows)
+    squares = expected * torch.randn(TABLES, rows, freedom, generator=drawn, dtype=torch.float64).square().sum(2)
+    each = torch.full((rows, 1), float(freedom), dtype=torch.float64)
+    suspected = sum(bool(excluded(one[:, None], each, least=0.0).any()) for one in squares)
+    assert suspected < 0.02 * TABLES
+
+
+def test_a_gross_error_is_named_and_hidden_markers_are_not() -> None:
+    squares = torch.randn(30, 2, 3, generator=torch.Generator().manual_seed(0)).double().square().sum(2)
+    squares[4, 1], squares[7, 0] = 100.0, torch.nan
+    found = excluded(squares, torch.full_like(squares, 3.0))
+    assert found.nonzero().tolist() == [[4, 1]]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -11,17 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from product_bank import Case, noise_blocks, sliding_robot
+from product_bank import Case, sliding_robot
 from table_bank import refused
-from tangent_bank import built, shaken, tangent_covariance
 from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.robots import Geometry, SimulatedArm
+from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.sensors.set_ups import frame_slopes
 
 MARKER = torch.tensor([[0.1, 0.0, 0.1]], dtype=torch.float64)
@@ -60,21 +57,6 @@ def test_greedy_choice_is_that_of_brute_force_for_a_model(pair: Case) -> None:
     plan = dc.plan(model, q, 5)
     assert by_rank(plan) == rows
     assert_close(plan.expected_rms, torch.tensor(rms, dtype=torch.float64), rtol=1e-5, atol=0)
-
-
-def test_greedy_choice_is_that_of_brute_force_for_a_robot() -> None:
-    """The covariance of the bank: written a second time, with gravity and all priors."""
-    arm = SimulatedArm(seed=1)
-    scales = shaken(built("two markers").scales, seed=3)
-    q = arm.sample(20, seed=8)
-    geometry = replace(Geometry.nominal(arm.nominal), tool=MARKER)
-    nominal = GeometryMap(geometry, elastic=True)
-    K = tangent_covariance(scales, nominal, torch.zeros(nominal.parameters, dtype=torch.float64), q)
-    rows, rms = brute_force(K, noise_blocks(scales, geometry, q), [0, 3, 7], 6)
-    plan = dc.plan(arm.nominal, q, 6, target=q[[0, 3, 7]], marker=MARKER, hyperparameters=scales)
-    assert by_rank(plan) == rows
-    assert_close(plan.expected_rms, torch.tensor(rms, dtype=torch.float64), rtol=1e-5, atol=0)
-    assert not plan.assumed
 
 
 @pytest.mark.parametrize("case", ["pair", "slider", "posed"])

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import reading_bank
 import torch
 import two_arms_bank
 from kind_bank import Kind, kind_named, marked
@@ -33,11 +32,6 @@ pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning
 STEP = 1e-6
 ARM = SimulatedArm(seed=0)
 """That of the bank's readings."""
-NEW = {
-    "distances": dc.Sensor.distances(reading_bank.POINTS),
-    "heights": dc.Sensor.heights([[0.0, 0.0, 2.0, 0.1], [0.8, 0.0, 0.6, 0.3], [0.0, 1.0, 0.0, 0.2]]),
-    "images": dc.Sensor.images([[*eye, 0.0, 0.0, 0.4] for eye in reading_bank.EYES.tolist()]),
-}
 
 
 every_kind = pytest.mark.parametrize("name", marked("distances", "heights", "images"))
@@ -101,24 +95,6 @@ def test_devices_of_a_fit_against_the_whole_covariance(name: str) -> None:
     taken = [(int(plan.rows[k]), own[plan.devices[k]]) for k in order]
     expected = torch.tensor(naive_rms(result, q, taken), dtype=torch.float64)
     torch.testing.assert_close(plan.expected_rms, expected, rtol=1e-3, atol=0)
-
-
-@every_kind
-def test_planned_rows_beat_random_rows_for_the_same_devices(name: str) -> None:
-    """A tracker that measured no row of the fit is better, once its first rows say where it stands."""
-    model, q = kind_named(name).model, ARM.sample(100, seed=8)
-
-    def plan(rows: Tensor, sensor: Any) -> dc.Plan:
-        return dc.plan(model, rows, 12, target=q, sensor=sensor)
-
-    best = float(plan(q, NEW[name]).expected_rms[-1])
-    assert best < min(float(plan(q[k : k + 12], NEW[name]).expected_rms[-1]) for k in (0, 30, 60))
-    tracker = plan(q, dc.Sensor.positions())
-    rms = tracker.expected_rms
-    assert float(rms[-1]) < best
-    assert float(rms[1]) > 0.999 * float(rms[0])
-    assert float(rms[12]) < 0.6 * float(rms[0])
-    assert tracker.devices == ()
 
 
 @pytest.mark.slow
@@ -309,25 +285,6 @@ def test_views() -> None:
     folding.unknowns[4:9] = torch.tensor([-0.3, 0.0, 0.0, 0.0, 0.0])
     ahead[0, 3] = 0.4 * 1.8  # tangent 1.8 comes back to 0.05
     assert not bool(shown(folding, ahead[None]).any())
-
-
-@pytest.mark.slow
-def test_planned_images_come_true() -> None:
-    """Ten more images, measured in simulation and fitted, at those that are planned."""
-    arm, kind = camera_arm(60), wrist()
-    q = drawn("images of a board")
-    plan = dc.plan(kind.model, q, 10)
-    boards = inverse_poses(poses_from_marks(arm.arm.true_points(plan.q), LEVER))
-    corners = seen_corners(boards, 0.1, 3, arm.camera)
-    first_q, first = arm.shown(0.1)
-    count = len(first) * 3 // 4
-    known: Any = {"board": BOARD_PRIOR, "camera_on_tool": True}
-    both = dc.Measurements.from_images(
-        torch.cat([first_q[:count], plan.q]), torch.cat([first[:count], corners]), (WIDTH, HEIGHT), **known
-    )
-    model = dc.calibrate(kind.robot, both, hyperparameters=kind.scales).model
-    expected_mm, true_mm = 1e3 * float(plan.expected_rms[-1]), kind.error_mm(model(q).detach(), q)
-    assert true_mm < 1.6 * expected_mm
 
 
 @pytest.mark.slow

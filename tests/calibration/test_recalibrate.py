@@ -16,7 +16,7 @@ import again_bank
 import pytest
 import reading_bank
 import torch
-from again_bank import ELSEWHERE, NEW, OTHERWISE, WORN, WORN_ROWS, height, model, positions, true_error
+from again_bank import ELSEWHERE, NEW, OTHERWISE, WORN, WORN_ROWS, model, positions, true_error
 from campaigns import CAMPAIGNS
 from deformation_bank import made
 from kind_bank import kind_named
@@ -132,19 +132,6 @@ def test_a_ball_the_model_does_not_know_is_one_more_marker() -> None:
 
 
 @few_rows
-def test_a_model_of_readings_is_recalibrated_from_its_file(tmp_path: Path) -> None:
-    dc.save(model(height), tmp_path / "model.safetensors")
-    loaded: Any = dc.load(tmp_path / "model.safetensors")
-    again = dc.recalibrate(loaded, height(ARM, 30, 5)).model
-    dc.save(again, tmp_path / "again.safetensors")
-    back: Any = dc.load(tmp_path / "again.safetensors")
-    q = ARM.sample(5, seed=3)
-    for one, other in ((back, again), (loaded, model(height))):
-        assert all(map(torch.equal, one.predict(q), other.predict(q)))
-    assert true_error(back, ARM) < true_error(loaded, ARM)
-
-
-@few_rows
 def test_old_rows_of_readings_keep_their_payloads() -> None:
     """Heights are linear in the points: rows linearised around the fit are the measured ones but for each plane."""
     laden = model(again_bank.laden_height)
@@ -170,21 +157,6 @@ def test_a_recalibrated_model_keeps_its_devices() -> None:
         further = 3.0 * (one.kind == "height")
         allowed = 5 * (one.deviations.square() + other.deviations.square()).sqrt()
         assert bool(((other.mean - one.mean - further).abs() < allowed)[one.mean.isfinite()].all()), one.device
-
-
-@few_rows
-def test_sockets_of_a_registered_model_are_known_as_means_of_their_rows() -> None:
-    kind = kind_named("mixture")
-    found = kind.model.registered(kind.moved)
-    sockets = next(own for own in found.placement if own.kind == "socket")
-    seen = found(kind.moved.q).detach()[:, -1].numpy()
-    again = set(kind.moved.row_sockets) - {""}
-    assert set(sockets.names) - again == set(kind.data.row_sockets) - {""} - again  # they stay where they were
-    for name, place, deviation in zip(sockets.names, sockets.constants, sockets.deviations, strict=True):
-        own = seen[[row for row, other in enumerate(kind.moved.row_sockets) if other == name]]
-        if name in again:
-            assert own.mean(0) == pytest.approx(place.numpy(), abs=1e-9)
-            assert own.std(0, ddof=1) / len(own) ** 0.5 == pytest.approx(deviation.numpy(), rel=1e-6)
 
 
 def test_a_ur10_measured_again(ur10_folder: Path) -> None:

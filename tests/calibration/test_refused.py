@@ -36,6 +36,7 @@ ROBOT, Q, POINTS = ARM.nominal, ROWS.q, ROWS.points
     [
         (180 / pi * Q, POINTS, "the joint values seem to be degrees.*check the angle unit"),
         (Q, POINTS.roll(1, 0), "one row too late: pair every configuration"),
+        (torch.cat([Q[:, :3], Q[:, 3:4].roll(1, 0), Q[:, 4:]], 1), POINTS, "those of the row before: pair them"),
         (Q, torch.cat([POINTS[:15].roll(1, 0), POINTS[15:]]), ""),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -179,6 +180,9 @@ def test_files_keep_a_camera(tmp_path: Path) -> None:
     assert same.noise == FOUND.camera.noise
     path.write_text(camera_text(FOUND.camera, ros=True))
     assert (read_camera(path).half_size, read_camera(path).root.shape) == (0.0, (len(UNKNOWNS), 0))
+    K, _, R, P = (torch.tensor(json.loads(data)) for data in re.findall(r"data: (\[[^]]*\])", path.read_text()))
+    assert_close(P.view(3, 4), torch.nn.functional.pad(K.view(3, 3), (0, 1)), rtol=0, atol=0)
+    assert_close(R.view(3, 3), torch.eye(3), rtol=0, atol=0)
 
 
 NINE, FIVE = "500.0, 0.0, 310.0, 0.0, 510.0, 235.0, 0.0, 0.0, 1.0", "-0.1, 0.02, 0.001, -0.0002, 0.0"
@@ -219,6 +223,7 @@ REFUSED = {
     "columns": (ECHO.format("plumb_bob", FIVE).replace(NINE, "500, 0, 0, 0, 510, 0, 310, 235, 1"), "row by row"),
     "no size": (STORAGE.replace("image_size", "size") + f"D: [{FIVE}]\n", "image_width"),
     "nothing": ("", r"camera\.yaml.*camera_matrix"),
+    "a tag without an end": ("<" + 900_000 * "a", "camera_matrix"),  # which quadratic time would not read
     "words": ("camera_matrix:\n  data: [1, x]\n", r"camera\.yaml.*camera_matrix"),
     "no lens": ("a: [1, 2]\nimage_width: 3\nimage_height: 3\nd: [0, 0, 0, 0]", r"`camera_matrix`.*`k`.*Kalibr.*fx"),
 }
@@ -255,7 +260,7 @@ REFUSED |= {
     damage: (re.sub(pattern, other, FILE, flags=re.S), rf"camera\.yaml.*{message}")
     for damage, (pattern, other, message) in DAMAGED.items()
 }
-for piece in ("camera_matrix:\n", "camera_matrix:\n data: [", " "):  # which quadratic time would not read
+for piece in ("camera_matrix:\n", "camera_matrix:\n data: [", " "):  # nor these
     REFUSED[f"long {piece}"] = "camera_matrix:" + piece * (900_000 // len(piece)), "camera_matrix"
     REFUSED[f"too long {piece}"] = piece * (1_100_000 // len(piece)), "too large for a camera file: .* at most 1 MB"
 

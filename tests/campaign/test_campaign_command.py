@@ -22,7 +22,7 @@ from command_bank import PROGRAM, Command, Outcome
 from table_bank import refused
 
 import diffeo_calib as dc
-from diffeo_calib.campaign.feeds import as_line, check_cells, parsed
+from diffeo_calib.campaign.feeds import LONGEST_LINE, Inbox, as_line, check_cells, parsed, read_lines
 from diffeo_calib.campaign.journal import GrowingTable, Journal
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.csv.files import write_measurements
@@ -150,6 +150,7 @@ def test_what_cannot_be_appended_whole_is_taken_back(tmp_path: Path, monkeypatch
 def test_half_a_line_waits_for_its_end(tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     table, seen = GrowingTable(path), list[bytes]()
+    refused(("is no file to which lines", GrowingTable(Path("/dev/zero")).new_lines))
     assert table.new_lines() == []
     for text in ("a", ",b\n1", ",2\n3,", "4\n", "\n5,6\n7"):
         with path.open("a") as file:
@@ -195,6 +196,9 @@ def test_lines_that_are_no_rows() -> None:
     for bad in (b'{"a": 1', b'{"a": 1}', b"[1]\n", b"1\n", b"\xff\n", deep, huge):
         with pytest.raises(InputError, match="a line of JSON"):
             parsed(bad)
+    inbox = Inbox()
+    read_lines(io.BytesIO(b"x" * (LONGEST_LINE + 1)), inbox)  # of no program, perhaps without an end
+    assert [type(inbox.get()) for _ in range(inbox.qsize())] == [InputError, InputError, type(None)]
     assert parsed(b'{"a": 1.5, "b": null, "c": "x"}\n') == {"a": 1.5, "b": None, "c": "x"}
     for value in ("NaN", "1e999", "-Infinity", "true", "[1]", "{}", '"x\\n"', f'"{999 * "x"}"', 400 * "9"):
         for name in ("a", "id"):
@@ -235,14 +239,20 @@ def test_rows_that_are_there_before_are_judged_as_with_once(
     wrong = ",".join(["1000"] * len(lines[0].split(","))) + "\n"
     (tmp_path / "run.csv").write_text("".join([*lines[:14], wrong, lines[14], "x" + lines[18]]))
     accepted = []
-    for how, known in (("--once", "mm expected"), ("--stdin", '"expected_error_mm": 0.')):  # the latter answers in JSON
-        done = command("campaign", tmp_path / "campaign.toml", how, "--accepted", tmp_path / "accepted.csv")
-        assert done.code == 0
+    goal = '"error_limit_mm": null, "more_rows": '
+    for how, known in (  # the last one answers in JSON
+        (["--once"], "mm expected"),
+        (["--stdin", "--tolerance", "1um"], goal),
+        (["--stdin"], '"expected_error_mm": 0.'),
+    ):
+        done = command("campaign", tmp_path / "campaign.toml", *how, "--accepted", tmp_path / "accepted.csv")
+        assert done.code == (4 if known == goal else 0)
         for words in ("row 15 looks wrong", known, "run.csv', line 17"):
             assert words in done.out
+        assert (goal in done.out) == (known == goal)
         accepted.append((tmp_path / "accepted.csv").read_text())
         (tmp_path / "run.csv.journal").unlink()
-    assert accepted[0] == accepted[1] == "".join([*lines[:14], lines[14]])
+    assert accepted[0] == accepted[1] == accepted[2] == "".join([*lines[:14], lines[14]])
 
 
 @pytest.mark.slow
@@ -280,6 +290,9 @@ def test_a_campaign_goes_on_as_it_was_begun(tmp_path: Path, lines: list[str], co
     assert (tmp_path / "run.csv.journal").read_bytes() == journal
     assert command(*words, "--joints", ",".join(lines[0].split(",")[:6]), "--tolerance", "1mm").code == 4
     old = journal.split(b"\n", 1)[1]  # of versions that did not say it
+    twice = old.replace(b"}]}", b'}, {"fits": null, "accepted": true}]}', 1)
+    (tmp_path / "run.csv.journal").write_bytes(twice)
+    assert "got 4 verdicts of 3 rows; name another table" in command(*words).error
     (tmp_path / "run.csv.journal").write_bytes(old)
     assert command(*words).code == 0
 

@@ -85,14 +85,15 @@ def test_rows_that_came_before_the_first_model_are_judged_by_it(measured: tuple[
 def test_rows_that_give_no_model_are_tried_once(
     measured: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tries = []
+    (q, y), tries = measured, []
+    still = dc.Campaign(ARM.nominal).add(q[:1].repeat(12, 1), y[:1].repeat(12, 1, 1))
+    assert "all 12 rows hold the same configuration" in still[-1].cause
 
     def refused(_: Any, table: Any, *__: Any, **___: Any) -> None:
         tries.append(len(table))
         raise dc.DiffeoCalibError("these rows do not say where the device is")
 
     monkeypatch.setattr("diffeo_calib.campaign.campaign.Around.of", refused)
-    q, y = measured
     campaign = dc.Campaign(ARM.nominal, candidates=q, target=q)
     campaign.add(q[:12], y[:12])
     campaign.reject(0)
@@ -140,6 +141,23 @@ def test_a_moved_device_and_a_joint_are_named_and_their_rows_taken_out(
         assert campaign.accepted == list(range(ROWS))
     assert 1 < change.size < 4
     assert change.unit == "mrad"
+
+
+def test_rows_together_have_the_verdicts_of_single_ones(running: dc.Campaign, measured: tuple[Tensor, Tensor]) -> None:
+    """With a wrong row among them. Of a large table few models are made."""
+    q, y = (part[ROWS : ROWS + 5].clone() for part in measured)
+    y[2] += 5 * MM
+    campaign, verdicts = after(running, q, y)
+    other: Any = copy.deepcopy(running)
+    for row, one in enumerate(verdicts):
+        (single,) = other.add(q[row], y[row])
+        assert (one.fits, one.accepted, one.cause) == (row != 2, row != 2, single.cause)
+        found, expected = ((each.error, each.expected, each.expected_error) for each in (one, single))
+        assert found == pytest.approx(expected, rel=1e-8)
+    assert campaign.expected_error == pytest.approx(other.expected_error, rel=1e-8)
+    assert other._due == 30
+    other._waiting = 1000 - len(other.accepted)
+    assert other._due == 62.5
 
 
 def test_the_next_poses_help_more_than_any_others(running: dc.Campaign) -> None:

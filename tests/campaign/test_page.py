@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import http.client
 import json
-import os
-import shutil
 import socket
 from collections.abc import Iterator
 from queue import Queue
@@ -21,7 +19,6 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.reports.live import Page, served, state_of
 from diffeo_calib.robots import SimulatedArm
 
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 ARM = SimulatedArm(3)
 
 
@@ -104,44 +101,39 @@ def test_the_state_is_short_and_finite(campaign: dc.Campaign) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine: apt install chromium")
 @pytest.mark.parametrize(("width", "scheme"), [(1400, "light"), (390, "dark")])
-def test_the_page_in_a_browser(page: Page, campaign: dc.Campaign, width: int, scheme: Any) -> None:
-    playwright = pytest.importorskip("playwright.sync_api")
+def test_the_page_in_a_browser(page: Page, campaign: dc.Campaign, browser: Any, width: int, scheme: Any) -> None:
     state = state_of(campaign, ("0.5 mm expected", "next: 1, 2"), campaign.next(1))
-    with playwright.sync_playwright() as running:
-        root = hasattr(os, "geteuid") and os.geteuid() == 0  # Chromium's sandbox refuses root
-        browser = running.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"] if root else [])
-        seen = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
-        said: list[str] = []
-        seen.on("pageerror", lambda error: said.append(str(error)))
-        seen.on("request", lambda asked: said.append(asked.url))
-        seen.goto(page.url)
-        page.publish(state)
-        seen.wait_for_selector("li")
-        assert seen.text_content("#error") == f"{state['error']:.2g} mm"
-        assert seen.locator("li .bad").count() == 1
-        drawn = "() => [...document.querySelectorAll('canvas')].map((c) => c.toDataURL())"
-        before = seen.evaluate(drawn)
-        seen.focus("#robot")
-        seen.keyboard.press("ArrowLeft")
-        after = seen.evaluate(drawn)
-        assert [a == b for a, b in zip(before, after, strict=True)] == [True, False]
-        assert seen.evaluate("document.documentElement.scrollWidth <= innerWidth")
-        with seen.expect_response("**/reject?**"):
-            seen.get_by_label("reject row 15", exact=True).focus()
-            seen.keyboard.press("Enter")
-        with seen.expect_response("**/accept?**"):
-            seen.get_by_label("accept row 14", exact=True).focus()
-            seen.keyboard.press("Enter")
-        assert decided(page) == [("reject", 15), ("accept", 14)]
-        for row in (9, 15):
-            with seen.expect_response("**/repeat?**"):
-                seen.get_by_label(f"repeat row {row}", exact=True).click()
-        assert decided(page) == [("repeat", 9), ("repeat", 15)]
-        seen.reload()
-        seen.wait_for_selector("li")
-        page.publish(state | {"error": 0.123})
-        seen.wait_for_function("() => document.title === '0.12 mm'")
-        browser.close()
+    seen = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
+    said: list[str] = []
+    seen.on("pageerror", lambda error: said.append(str(error)))
+    seen.on("request", lambda asked: said.append(asked.url))
+    seen.goto(page.url)
+    page.publish(state)
+    seen.wait_for_selector("li")
+    assert seen.text_content("#error") == f"{state['error']:.2g} mm"
+    assert seen.locator("li .bad").count() == 1
+    drawn = "() => [...document.querySelectorAll('canvas')].map((c) => c.toDataURL())"
+    before = seen.evaluate(drawn)
+    seen.focus("#robot")
+    seen.keyboard.press("ArrowLeft")
+    after = seen.evaluate(drawn)
+    assert [a == b for a, b in zip(before, after, strict=True)] == [True, False]
+    assert seen.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    with seen.expect_response("**/reject?**"):
+        seen.get_by_label("reject row 15", exact=True).focus()
+        seen.keyboard.press("Enter")
+    with seen.expect_response("**/accept?**"):
+        seen.get_by_label("accept row 14", exact=True).focus()
+        seen.keyboard.press("Enter")
+    assert decided(page) == [("reject", 15), ("accept", 14)]
+    for row in (9, 15):
+        with seen.expect_response("**/repeat?**"):
+            seen.get_by_label(f"repeat row {row}", exact=True).click()
+    assert decided(page) == [("repeat", 9), ("repeat", 15)]
+    seen.reload()
+    seen.wait_for_selector("li")
+    page.publish(state | {"error": 0.123})
+    seen.wait_for_function("() => document.title === '0.12 mm'")
+    seen.close()
     assert {urlsplit(url).netloc for url in said} == {urlsplit(page.url).netloc}

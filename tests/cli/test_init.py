@@ -18,6 +18,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.cli.main import expanded
 from diffeo_calib.measurements.csv.files import write_measurements
+from diffeo_calib.measurements.poses import to_spherical
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
@@ -94,11 +95,18 @@ def test_two_arms_that_explain_the_rows_alike_are_not_guessed(tmp_path: Path, pr
     q, points = rows()
     _, text = proposed(([f"q{k}" for k in range(6)], q), (XYZ, points), robot="two.urdf")
     assert "expected some that explain the rows far better, got left_waist_joint" in text
-    assert (
-        proposed(([f"right_{name}" for name in NAMES], q), (XYZ, points), robot="two.urdf")[0]["tip"] == "right_flange"
+    right = [f"right_{name}" for name in NAMES], q
+    assert proposed(right, (XYZ, points), robot="two.urdf")[0]["tip"] == "right_flange"
+    places = [[f"{side} ball {axis}" for axis in XYZ] for side in ("left", "right")]
+    both = (
+        ([f"left_{name}" for name in NAMES], q.roll(1, 0)),
+        (places[0], points.roll(1, 0)),
+        (places[1], points),
     )
+    assert proposed(right, *both, robot="two.urdf")[0]["tip"] == ["left_flange", "right_flange"]
 
 
+GON = 200.0 / pi
 GIVEN = ["--length", "mm", "--angle", "deg", "--position", "x,y,z"]
 
 
@@ -195,6 +203,34 @@ def test_wished_places_are_known_by_their_numbers_or_names(proposed: Proposed) -
     assert "m2_x, m2_y, m2_z: marker 1 is a copy of marker 0 (counted from 0); not used" in text
     _, text = proposed((SERIES, q), (["goal_x", "goal_y", "goal_z"], nominal))
     assert "got goal_x, goal_y, goal_z: wished places" in text
+
+
+@pytest.mark.parametrize(
+    ("names", "written"),
+    [(("Hz [gon]", "V [gon]"), "zenith_clockwise_gon"), (("Azimuth", "Elevation"), "elevation_gon")],
+)
+def test_places_as_a_distance_and_angles(names: tuple[str, str], written: str, proposed: Proposed) -> None:
+    """Only the robot tells in which direction the angles count, and, without names of units, in which unit."""
+    q, points = rows()
+    found, _ = proposed(
+        (SERIES, q), (["Slope dist", *names], to_spherical(points, written) * torch.tensor([1.0, GON, GON]))
+    )
+    assert (found["position"], found["spherical"]) == ([f"Slope dist,{names[0]},{names[1]}"], written)
+    assert (found["length"], found["angle"]) == ("mm", "deg")
+
+
+def test_axes_that_stand_still_and_joint_values_in_the_first_line_of_a_pose(
+    tmp_path: Path, proposed: Proposed, init: Proposed
+) -> None:
+    q, points = rows()
+    found, _ = proposed((SERIES, q), (["j7", "j8"], torch.zeros(ROWS, 2)), (XYZ, points))
+    assert found["joints"] == ",".join(SERIES)
+    lines = [",".join([*SERIES, "ball", *XYZ])]
+    for values, place in zip(q.tolist(), points.tolist(), strict=True):
+        lines += [",".join([*map(repr, values), "A", *map(repr, place)]), ",".join([*[""] * 6, "B", *map(repr, place)])]
+    (tmp_path / "t.csv").write_text("\n".join([*lines, lines[-2], lines[-1]]))
+    found, _ = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
+    assert (found["marker"], found["duplicates"]) == ("ball", "drop")
 
 
 @pytest.mark.parametrize("by_rows", [True, False])
@@ -349,10 +385,15 @@ def test_cells_that_are_no_numbers_are_named(tmp_path: Path, init: Proposed, pro
     assert "line 6, column 'y2': expected a number, got '#VALUE!'" in text
 
 
-@pytest.mark.parametrize(("count", "message"), [(ROWS, "one clear reading"), (3, "3 row(s)")])
-def test_a_robot_that_explains_nothing_is_refused(count: int, message: str, tmp_path: Path, proposed: Proposed) -> None:
+@pytest.mark.parametrize(
+    ("count", "per_degree", "message"),
+    [(ROWS, 1.0, "one clear reading"), (3, 1.0, "3 row(s)"), (ROWS, 90.0, "pulses or ticks of encoders; write joints")],
+)
+def test_a_robot_that_explains_nothing_is_refused(
+    count: int, per_degree: float, message: str, tmp_path: Path, proposed: Proposed
+) -> None:
     points = 1e3 * SimulatedArm(seed=4).measure(count, seed=9)[1][:, 0]
-    entries, text = proposed((NAMES, rows()[0][:count]), (XYZ, points))
+    entries, text = proposed((NAMES, per_degree * rows()[0][:count]), (XYZ, points))
     assert message in text
     assert not entries
     assert not (tmp_path / "c.toml").exists()

@@ -65,29 +65,6 @@ def test_the_ur10(ur10_folder: Path, init: Proposed) -> None:
     assert "Timestamp, Goal x" in text.splitlines()[-1]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("convention", "unit", "names"),
-    [
-        ("zyx", "deg", ["roll", "pitch", "yaw"]),
-        ("ZXZ", "rad", ["m_rx", "m_ry", "m_rz"]),
-        ("quat_xyzw", None, ["qx", "qy", "qz", "qw"]),
-        ("matrix", None, [f"R{i}{j}" for i in "012" for j in "012"]),
-    ],
-)
-def test_rotations_are_proposed_in_the_convention_that_fits(
-    convention: str, unit: str | None, names: list[str], tmp_path: Path, init: Proposed
-) -> None:
-    arm, data, _ = simulated_poses(ROWS)
-    arm.write_urdf(tmp_path / "arm.urdf")
-    table = TableFormat("mm", "deg", rotation=names, convention=convention, rotation_angle=unit)
-    position = ("m_x", "m_y", "m_z") if names[0].startswith("m_") else ("x", "y", "z")
-    write_measurements(tmp_path / "t.csv", data, table, position=position)
-    written, _ = init(tmp_path / "t.csv", tmp_path / "arm.urdf")
-    assert (written["rotation"], written["convention"]) == (",".join(names), convention)
-    assert written.get("rotation-angle") == unit
-
-
 def test_rotations_that_no_convention_explains_are_named_and_not_used(tmp_path: Path, init: Proposed) -> None:
     arm, data, _ = simulated_poses(ROWS)
     arm.write_urdf(tmp_path / "arm.urdf")

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from diffeo_calib.common.quantiles import chi2_above, chi2_median, f_below, known, largest_known
+from diffeo_calib.common.quantiles import binomial_band, chi2_above, chi2_median, f_below, known, largest_known
 
 
 @pytest.mark.parametrize("freedom", [1, 2, 3, 6, 17.5, 400])
@@ -35,3 +35,10 @@ def test_largest_known_value() -> None:
     assert_close(largest_known(values), expected, rtol=0, atol=0, equal_nan=True)
     assert_close(largest_known(values.T, 0), expected, rtol=0, atol=0, equal_nan=True)
     assert known(values).tolist() == [1.0, 3.0, -5.0, -7.0, inf, 0.0]
+
+
+def test_successes_and_failures_have_mirrored_bands() -> None:
+    assert binomial_band(10, 0.5, 0.05) == (2, 8)  # at most 1 of 10 coins: 11 of 1024
+    for count, share in ((20, 0.95), (300, 0.9), (7, 0.3)):
+        low, high = binomial_band(count, share, 0.01)
+        assert (count - high, count - low) == binomial_band(count, 1.0 - share, 0.01)

@@ -1,9 +1,13 @@
-"""Denavit-Hartenberg tables of any chain: the same poses, few numbers, and no offsets of hundreds of metres."""
+"""Denavit-Hartenberg tables of any chain: the same poses, few numbers, and no offsets of hundreds of metres.
+
+The kinematics file of Universal Robots' packages: by their formula it gives the poses of the geometry.
+"""
 
 from __future__ import annotations
 
 import csv
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +19,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError
-from diffeo_calib.interop.dh import dh_table, write_dh
-from diffeo_calib.robots import Chain, Geometry, Joint
+from diffeo_calib.cli.commands.export import HASH
+from diffeo_calib.common.errors import InputError, RobotError
+from diffeo_calib.interop.dh import dh_table, ur_text, write_dh, write_ur_kinematics
+from diffeo_calib.robots import Chain, Geometry, Joint, SimulatedArm
 
 EVERY = {**CHAINS, "every kind of mimic joint": CHAIN}
 both_conventions = pytest.mark.parametrize("convention", ["standard", "craig"])
@@ -128,3 +133,151 @@ def test_wrong_options(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be written"):
         write_dh(geometry, tmp_path / "none" / "dh.csv")
     assert not (tmp_path / "dh.csv").exists()
+
+
+LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+QUARTER = math.pi / 2
+JOINTS = {
+    "shoulder_pan_joint": ("base_link", "shoulder_link", "0 0 0.1273", "0 0 0", "0 0 1"),
+    "shoulder_lift_joint": ("shoulder_link", "upper_arm_link", "0 0.220941 0", f"0 {QUARTER!r} 0", "0 1 0"),
+    "elbow_joint": ("upper_arm_link", "forearm_link", "0 -0.1719 0.612", "0 0 0", "0 1 0"),
+    "wrist_1_joint": ("forearm_link", "wrist_1_link", "0 0 0.5723", f"0 {QUARTER!r} 0", "0 1 0"),
+    "wrist_2_joint": ("wrist_1_link", "wrist_2_link", "0 0.1149 0", "0 0 0", "0 0 1"),
+    "wrist_3_joint": ("wrist_2_link", "wrist_3_link", "0 0 0.1157", "0 0 0", "0 1 0"),
+    "tool0_joint": ("wrist_3_link", "tool0", "0 0.0922 0", f"{-QUARTER!r} 0 0", ""),
+    "gripper_joint": ("wrist_3_link", "fingers", "0.01 0.2 0.03", "0.3 0.2 0.1", ""),
+}
+"""A UR10 as its description had it before the transforms were in a file of their own, and a tool."""
+IDEAL = {  # config/ur10/default_kinematics.yaml has these, wrist_3's angles as (pi/2, pi, pi)
+    "shoulder": (0, 0, 0.1273, 0, 0, 0),
+    "upper_arm": (0, 0, 0, QUARTER, 0, 0),
+    "forearm": (-0.612, 0, 0, 0, 0, 0),
+    "wrist_1": (-0.5723, 0, 0.163941, 0, 0, 0),
+    "wrist_2": (0, -0.1157, 0, QUARTER, 0, 0),
+    "wrist_3": (0, 0.0922, 0, -QUARTER, 0, 0),
+}
+
+
+def urdf(prefix: str = "") -> str:
+    joints = [
+        f'<joint name="{prefix}{name}" type="{"revolute" if axis else "fixed"}"><origin xyz="{xyz}" rpy="{rpy}"/>'
+        f'<parent link="{prefix}{parent}"/><child link="{prefix}{child}"/><axis xyz="{axis or "1 0 0"}"/>'
+        '<limit lower="-6" upper="6" effort="1" velocity="1"/></joint>'
+        for name, (parent, child, xyz, rpy, axis) in JOINTS.items()
+    ]
+    links = dict.fromkeys(prefix + link for ends in JOINTS.values() for link in ends[:2])
+    return "<robot name='ur10'>" + "".join(f'<link name="{link}"/>' for link in links) + "".join(joints) + "</robot>"
+
+
+def load(path: Path, text: str, tip: str = "tool0", base: str = "base_link") -> Chain:
+    path.write_text(text, encoding="utf-8")
+    return dc.load_urdf(path, base, tip)
+
+
+def read_yaml(path: Path) -> tuple[dict[str, list[float]], str]:
+    """The numbers of each link, and the hash; every line is checked against the grammar of YAML 1.1."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    assert lines[0] == "kinematics:"
+    assert len(lines) == 1 + 6 * 7 + 1
+    number = r"[-+]?[0-9]+\.[0-9]*(?:[eE][-+][0-9]+)?"  # of PyYAML and yaml-cpp: a point, and a sign of the exponent
+    found: dict[str, list[float]] = {}
+    for k, link in enumerate(LINKS):
+        block = lines[1 + 7 * k : 8 + 7 * k]
+        assert block[0] == f"  {link}:"
+        found[link] = []
+        for line, entry in zip(block[1:], ("x", "y", "z", "roll", "pitch", "yaw"), strict=True):
+            match = re.fullmatch(rf"    {entry}: ({number})", line)
+            assert match, line
+            found[link].append(float(match[1]))
+    assert lines[-1].startswith("  hash: ")
+    return found, lines[-1].removeprefix("  hash: ")
+
+
+def their_poses(links: dict[str, list[float]], q: Tensor) -> Tensor:
+    """Poses of tool0 in base_link by the formula of ur_description: urdf/ur_macro.xacro."""
+    poses = []
+    for row in q.numpy():
+        T = np.diag([-1.0, -1.0, 1.0, 1.0])  # base_link -> base_link_inertia: rpy="0 0 pi"
+        for link, value in zip(LINKS, row, strict=True):
+            origin, turn = np.eye(4), np.eye(4)
+            origin[:3, 3] = links[link][:3]
+            origin[:3, :3] = Rotation.from_euler("xyz", links[link][3:]).as_matrix()
+            turn[:3, :3] = Rotation.from_rotvec([0, 0, value]).as_matrix()
+            T = T @ origin @ turn
+        poses.append(T)
+    return torch.from_numpy(np.stack(poses))
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-3, 0.05])
+@pytest.mark.parametrize("prefix", ["", "left_"])
+def test_their_formula_gives_the_geometry_s_poses(prefix: str, size: float, tmp_path: Path) -> None:
+    """Of any tip beyond the last joint."""
+    robot = load(tmp_path / "ur.urdf", urdf(prefix), f"{prefix}fingers", f"{prefix}base_link")
+    tool = dc.load_urdf(tmp_path / "ur.urdf", f"{prefix}base_link", f"{prefix}tool0")
+    zero = torch.zeros(1, 6, dtype=torch.float64)
+    for tip, rest in (
+        (tool, torch.eye(4, dtype=torch.float64)),
+        (robot, torch.linalg.inv(tool(zero)[0]) @ robot(zero)[0]),
+    ):
+        geometry, q = wrong(tip, size), configurations(tip)
+        write_ur_kinematics(geometry, tmp_path / "ur.yaml")
+        links, _ = read_yaml(tmp_path / "ur.yaml")
+        torch.testing.assert_close(their_poses(links, q) @ rest, own_poses(geometry, q), rtol=0, atol=1e-12)
+
+
+def test_an_ideal_robot_has_the_numbers_of_their_package(tmp_path: Path) -> None:
+    write_ur_kinematics(Geometry.nominal(load(tmp_path / "ur.urdf", urdf())), tmp_path / "ur.yaml")
+    links, own = read_yaml(tmp_path / "ur.yaml")
+    for name, expected in IDEAL.items():
+        assert links[name] == pytest.approx(expected, abs=1e-13), name
+    assert re.fullmatch(r"diffeo_calib_[0-9a-f]{16}", own)
+
+
+def test_short_numbers_with_exponents_are_numbers_in_yaml(tmp_path: Path) -> None:
+    """1e-05 is a word to YAML 1.1, 1.0e-05 is a number."""
+    links = torch.eye(4, dtype=torch.float64).repeat(6, 1, 1)
+    links[:, :3, 3] = torch.tensor([1e-5, -2e-22, 3e16], dtype=torch.float64)
+    (tmp_path / "ur.yaml").write_text(ur_text(links, None), encoding="utf-8")
+    assert read_yaml(tmp_path / "ur.yaml")[0]["wrist_3"] == [1e-5, -2e-22, 3e16, 0, 0, 0]
+
+
+def test_the_hash_of_the_robot_s_own_calibration(tmp_path: Path) -> None:
+    geometry = Geometry.nominal(load(tmp_path / "ur.urdf", urdf()))
+    write_ur_kinematics(geometry, tmp_path / "ur.yaml", hash="calib_4890363623803256388")
+    assert read_yaml(tmp_path / "ur.yaml")[1] == "calib_4890363623803256388"
+    assert [own[1] for own in HASH.finditer((tmp_path / "ur.yaml").read_text())] == ["calib_4890363623803256388"]
+    write_ur_kinematics(geometry, tmp_path / "ur.yaml")
+    assert HASH.search((tmp_path / "ur.yaml").read_text()) is None
+    for text in ("two words", "a: b", "", "a\nb", "'quoted'", "# none"):
+        with pytest.raises(InputError, match=r"`hash`: expected letters, digits and _"):
+            write_ur_kinematics(geometry, tmp_path / "ur.yaml", hash=text)
+
+
+def test_the_real_ur10(ur10_folder: Path, tmp_path: Path) -> None:
+    """Its file has angles of 12 digits, which turn tool0 from the axis by 5e-12 rad."""
+    robot = dc.load_urdf(ur10_folder / "ur10_robot.urdf", "base_link", "tool0")
+    geometry, q = wrong(robot), configurations(robot)
+    write_ur_kinematics(geometry, tmp_path / "ur.yaml")
+    links, _ = read_yaml(tmp_path / "ur.yaml")
+    theirs, ours = their_poses(links, q), own_poses(geometry, q)
+    rest = torch.linalg.inv(theirs) @ ours
+    torch.testing.assert_close(rest, rest[:1].expand_as(rest), rtol=0, atol=1e-14)
+    torch.testing.assert_close(rest[0], torch.eye(4, dtype=torch.float64), rtol=0, atol=1e-11)
+
+
+def test_other_robots_are_refused(tmp_path: Path) -> None:
+    new, path = tmp_path / "ur.yaml", tmp_path / "ur.urdf"
+    with pytest.raises(RobotError, match=r"the joints of robot 'simulated_arm': expected shoulder_pan_joint, .*--urdf"):
+        write_ur_kinematics(Geometry.nominal(SimulatedArm().nominal), new)
+    text = urdf()
+    for change, tip, base, message in (
+        (("", ""), "tool0", "shoulder_link", r"expected shoulder_pan_joint"),
+        (('name="elbow_joint" type="revolute"', 'name="elbow_joint" type="prismatic"'), "tool0", "base_link", "joints"),
+        (("tool0", "tcp"), "fingers", "base_link", r"has no link 'tool0' below 'base_link'.*--robot URDF"),
+        (("base_link", "ground"), "tool0", "ground", r"the base of robot 'ur10': expected base_link, got ground"),
+        (("0 0.0922 0", "0.001 0.0922 0"), "tool0", "base_link", r"'tool0' .*on the axis of the last joint"),
+    ):
+        robot = load(path, text.replace(*change), tip, base)
+        with pytest.raises(RobotError, match=message):
+            write_ur_kinematics(Geometry.nominal(robot), new)
+    assert not new.exists()

@@ -23,14 +23,13 @@ from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.robots.se3 import rotation, transforms
+from diffeo_calib.sensors.coordinates import placed
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.height import Planes
 from diffeo_calib.sensors.image import Cameras
 from diffeo_calib.sensors.kinds import stored_devices
-from diffeo_calib.sensors.places import placed
 from diffeo_calib.sensors.range import FixedPoints
-from diffeo_calib.sensors.sockets import SocketPlaces
-from diffeo_calib.sensors.tool_frames import Contacts, HeldTools, Trackers
+from diffeo_calib.sensors.tool_frames import Contacts, HeldTools, SocketPlaces, Trackers
 
 ROWS, STEP = 60, 1e-6
 

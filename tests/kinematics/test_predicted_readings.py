@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import isfinite
 from typing import Any
 
@@ -70,6 +71,9 @@ def test_the_place_of_the_whole_scene_moves_no_reading() -> None:
     assert all(0.0 < one < other for one, other in zip(bare, whole, strict=True))
     (placed,) = kind.model.placement
     assert float(1e3 * placed.deviations[:, :3].median()) > 2 * float(np.median(bare))
+    old = kind.model.changed(placement=(replace(placed, shown=None),))  # of a file that does not say the unit: metres
+    for one, own in zip(of_rows(old, part), of_rows(kind.model, part), strict=True):
+        assert_close(1e3 * one.mean, own.mean)
 
 
 def test_means_are_the_observations_of_the_model(tmp_path: Any) -> None:
@@ -106,17 +110,6 @@ def test_the_command_writes_lengths_in_the_unit_of_the_table(command: Command, t
             assert all(map(isfinite, table[column]))
         assert f"{own.kind}_{own.device}" in done.out
         assert {"px": "in px", "mm": "in mm"}[own.unit] in done.out
-
-
-def test_a_payload_of_all_rows_is_a_number(command: Command, tmp_path: Any) -> None:
-    kind = kind_named("payloads")
-    path = tmp_path / "q.csv"
-    path.write_text("\n".join(",".join(map(str, r)) for r in [kind.robot.joint_names, *kind.q(2).rad2deg().tolist()]))
-    done = command("predict", kind.file, path, *UNITS, "--payload", "4", "-o", tmp_path / "p.csv")
-    assert done.code == 0, done.err
-    table = np.genfromtxt(tmp_path / "p.csv", delimiter=",", names=True)
-    expected = 1e3 * kind.model.with_payload(4.0)(kind.q(2)).detach()[:, 0]
-    np.testing.assert_allclose(np.stack([table[axis] for axis in "xyz"], 1), expected, atol=1e-3)
 
 
 def test_devices_of_a_kind_that_is_not_registered_are_warned_of(tmp_path: Any, monkeypatch: Any) -> None:

@@ -183,8 +183,8 @@ def test_bags_that_hold_something_else_are_named(bag: Bag, tmp_path: Path, recor
     times, q = motion(10)
     bag.poses(times + 1000, place(q))
     bag.packed([], PNG)
-    other, unknown, cut = Bag(), Bag(), Bag()
-    for one in (other, unknown, cut):
+    other, unknown, cut, damaged = Bag(), Bag(), Bag(), Bag()
+    for one in (other, unknown, cut, damaged):
         one.topics[JOINTS] = bag.topics[JOINTS]
     other.packed(MIDDLES, b"something")
     unknown.images(MIDDLES, PIXELS, "bayer_rggb8")
@@ -192,6 +192,8 @@ def test_bags_that_hold_something_else_are_named(bag: Bag, tmp_path: Path, recor
     cut.topics[PICTURES][1][2][1].data = np.zeros(3, np.uint8)
     written = {name: one.write(tmp_path / name) for name, one in locals().items() if isinstance(one, Bag)}
     Bag().write(tmp_path / "empty")
+    file = written["damaged"] / "damaged.db3"
+    file.write_bytes(file.read_bytes().replace(b"schema_version", b"schema_vers\xdfon"))
     for path, topic, more, words in (
         (written["bag"], "/other", [], ["/other", PLACES]),
         (written["bag"], PICTURES, [], [PICTURES, "0"]),
@@ -203,9 +205,11 @@ def test_bags_that_hold_something_else_are_named(bag: Bag, tmp_path: Path, recor
         (written["other"], PICTURES, ["--still", "0.001,2"], ["stops"]),
         (written["other"], PICTURES, ["--still", "0,1"], ["--still: expected a number above 0"]),
         (written["other"], PICTURES, ["--still", "1,2,3"], ["expected MOTION, or MOTION,SECONDS"]),
+        (written["other"], PICTURES, ["--offset", "nan"], ["--offset: expected a number"]),
         (written["unknown"], PICTURES, [], ["bayer_rggb8", "bgr8"]),
         (written["cut"], PICTURES, [], ["5 x 4", "3 bytes"]),
         (tmp_path / "empty", PLACES, [], ["empty", PLACES]),
         (tmp_path / "none", PLACES, [], ["none"]),
+        (written["damaged"], PLACES, [], ["cannot be read", "utf-8"]),
     ):
         record.refused(path, topic, *words, more=more)

@@ -19,7 +19,7 @@ from diffeo_calib.cli.guesses import guess_sheet
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.csv.files import read_joints, read_measurements, read_observations
 from diffeo_calib.measurements.csv.lines import read_cells
-from diffeo_calib.measurements.poses import angle_between, rotation_matrices, transforms
+from diffeo_calib.measurements.poses import rotation_matrices, transforms
 from diffeo_calib.measurements.table_format import TableFormat
 
 quietly = pytest.mark.filterwarnings("ignore::diffeo_calib.common.errors.DiffeoCalibWarning")
@@ -45,8 +45,16 @@ SPACED = [
     for own, row in zip(GERMAN, GROUPED, strict=True)
 ]
 ALIGNED = "".join("".join(f"{cell:>12}" for cell in row) + "\n" for row in [NAMES, *CELLS])
+
+
+def _lists(each: str, mark: str) -> str:
+    rows = ([str(k), each.format(mark.join(row[:2])), each.format(mark.join(row[2:]))] for k, row in enumerate(CELLS))
+    return "n,q,seen_pos\n" + "".join(f'{number},"{q}","{place}"\n' for number, q, place in rows)
+
+
+LISTED = ["q_1", "q_2", "seen_pos_x", "seen_pos_y", "seen_pos_z"]
 SEMICOLONS, COMMAS = {"sep": ";"}, {"sep": ";", "decimal": ","}
-READ: dict[str, tuple[str | bytes, dict[str, str], str]] = {
+READ: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
     "byte order mark": ("\ufeff" + PLAIN.replace("\n", "\r\n"), {}, ""),
     "UTF-16": (PLAIN.encode("utf-16"), {}, "text in utf-16"),
     "Windows": (("Kraft, größe\n" + PLAIN).encode("cp1252"), {}, "text in cp1252, not UTF-8"),
@@ -67,9 +75,19 @@ READ: dict[str, tuple[str | bytes, dict[str, str], str]] = {
     "comments between rows": (
         PLAIN.replace("0.200,", "# moved the tripod\n0.200,") + "#9,9,9,9,9\n",
         {},
-        "2 line(s) with comments, names or nothing skipped (line 4, 11)",
+        "2 line(s) with comments, names, statistics or nothing skipped (line 4, 11)",
     ),
-    "lines of separators": (PLAIN + ",,,,\n" * 3, {}, "3 line(s) with comments, names or nothing skipped"),
+    "lines of separators": (PLAIN + ",,,,\n" * 3, {}, "3 line(s) with comments, names, statistics or nothing skipped"),
+    "statistics below": (
+        separated(",", [["pose", *NAMES], *([f"p{k}", *row] for k, row in enumerate(CELLS)), ["Mean:", *CELLS[0]]])
+        + "Std. dev.,0,0,0,0,0\n",
+        {},
+        "statistics or nothing skipped (line 10, 11)",
+    ),
+    "lists in cells": (_lists("[{}]", ", "), {"names": LISTED}, ""),
+    "arrays of ROS in cells": (_lists("array('d', [{}])", ", "), {"names": LISTED}, ""),
+    "lists of NumPy, with spaces": (_lists("[{} ]", "  "), {"names": LISTED}, ""),
+    "lists without quotes": (_lists("({})", ", ").replace('"', ""), {"names": LISTED}, ""),
     "trailing separators": (PLAIN.replace("\n", ",\n"), {}, ""),
     "trailing separators of rows alone": (
         PLAIN.replace("\n", ";\n").replace("z;", "z").replace(",", ";"),
@@ -81,6 +99,11 @@ READ: dict[str, tuple[str | bytes, dict[str, str], str]] = {
     "thousands in quotes": (PLAIN.replace("1000.50", '"1,000.50"'), {}, ""),
     "Swiss thousands": (separated("\t", [NAMES, *SWISS]), {"sep": "\t"}, ""),
     "thousands and decimal commas": (separated(";", [NAMES, *SPACED]), COMMAS, ""),
+    "decimal commas in one column": (
+        separated(";", [NAMES, *([*own[:2], row[2], *own[3:]] for own, row in zip(CELLS, GERMAN, strict=True))]),
+        SEMICOLONS,
+        "",
+    ),
     "minus signs": (PLAIN.replace("-", "\u2212"), {}, ""),
     "spaces that do not break": (PLAIN.replace(",", "\u00a0,\u00a0"), {}, ""),
     "columns that spaces align": (separated("   ", [NAMES, *CELLS]), {"sep": " "}, ""),
@@ -309,6 +332,31 @@ def test_empty_cells_and_usual_marks_hide_a_marker(read: Reader, cell: str) -> N
         assert "line 3" in str(said[0].message)  # pyright: ignore[reportIndexIssue]
 
 
+def test_lines_without_joint_values(read: Reader) -> None:
+    """They are left out; of several markers they belong to the pose above."""
+    rows = [[*NAMES, "ball"], *([*row, "a"] for row in CELLS[:2]), ["", "", "5", "6", "7", "b"], [*CELLS[2], "a"]]
+    with pytest.warns(DiffeoCalibWarning, match="no joint values in line 4: 1 row"):
+        assert read(separated(",", rows), **FORMAT).line_numbers.tolist() == [2, 3, 5]
+    data = read(separated(",", rows), marker="ball", **FORMAT)
+    assert_close(1e3 * data.points[1, 1], torch.tensor([5.0, 6.0, 7.0], dtype=torch.float64))
+    assert (len(data), data.markers) == (3, 2)
+
+
+def test_angles_in_minutes_and_places_as_angles(read: Reader) -> None:
+    text = "q1;q2;sd;hz;v\n0;0;2;270°;90°\n0;1;2;0°0'0\";0\n1;1;2;45° 30' 36,0\";120°\n"
+    how: dict[str, Any] = {
+        "length": "m",
+        "angle": "rad",
+        "sep": ";",
+        "decimal": ",",
+        "spherical": "zenith_clockwise_deg",
+    }
+    data = read(text, JOINTS, ["sd", "hz", "v"], **how)
+    turn, up = math.radians(-45.51), math.radians(-30.0)
+    last = [2 * math.cos(up) * math.cos(turn), 2 * math.cos(up) * math.sin(turn), 2 * math.sin(up)]
+    assert_close(data.points[:, 0].tolist(), [[0.0, 2.0, 0.0], [0.0, 0.0, 2.0], last], rtol=1e-14, atol=1e-14)
+
+
 def test_a_line_without_any_marker_is_left_out_and_named(read: Reader) -> None:
     with pytest.warns(DiffeoCalibWarning, match="no marker was seen in line 5: 1 row"):
         assert read(HIDDEN.format("", "") + "0.7,0.8,,,,,,\n", position=TWO).visible.tolist() == SEEN
@@ -386,52 +434,3 @@ def test_deviations_are_read(names: Any, expected: Any, read: Reader) -> None:
         assert_close(held(found)[1, 0], torch.tensor(expected[0], dtype=torch.float64))
         assert data.points[1, -1].isnan().all()
         assert held(data.covariance).isfinite().all()
-
-
-UR10_JOINTS = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", *(f"wrist_{k}_joint" for k in (1, 2, 3))]
-UR10: dict[str, Any] = {"length": "mm", "angle": "rad", "sep": ";", "decimal": ","}
-UR10_STD = {
-    "std": [f"measurement_std_{axis}" for axis in "xyz"],
-    "rotation_std": [f"measurement_std_r{axis}" for axis in "xyz"],
-}
-
-
-def relative_spread(measured: torch.Tensor, nominal: torch.Tensor) -> torch.Tensor:
-    """How far turns between poses differ, measured against nominal: neither base nor tool frame matters for angles."""
-    first, others = measured[:1, :3, :3], measured[1:, :3, :3]
-    start, rest = nominal[:1, :3, :3], nominal[1:, :3, :3]
-    turned = angle_between(first.expand_as(others), others) - angle_between(start.expand_as(rest), rest)
-    return turned.abs()
-
-
-def test_ur10_poses_are_read(ur10_folder: Path) -> None:
-    """The convention is right: turns between poses are those between the commanded flange poses."""
-    path = ur10_folder / "measurements_iso_cubes.csv"
-
-    def read(before: str, names: str, turns: list[str], **how: Any) -> Any:
-        own = UR10 | {"rotation": [f"{before}{name}" for name in turns], **how}
-        return read_measurements(path, UR10_JOINTS, [f"{before}{name}" for name in names], **own)
-
-    turned = {"convention": "XYZ", "rotation_angle": "deg"}
-    data = read("measurement_", "xyz", ["rx", "ry", "rz"], **turned, **UR10_STD)
-    goal = {"convention": "xyz", "rotation_angle": "rad", "duplicates": "keep", "length": "m"}
-    commanded = read("Goal ", "xyz", ["roll", "pitch", "yaw"], **goal)
-    assert float(relative_spread(held(data.poses), held(commanded.poses)).max()) < math.radians(0.3)
-    wrong = read("measurement_", "xyz", ["rx", "ry", "rz"], **turned | {"convention": "xyz"})
-    assert float(relative_spread(held(wrong.poses), held(commanded.poses)).max()) > math.radians(0.5)
-    assert_close(held(data.std)[0, 0] * 1e3, torch.tensor([0.00095905, 0.0022901, 0.0019936]).double())
-    assert_close(held(data.rotation_std)[0].rad2deg(), torch.tensor([0.00094925, 0.0014176, 0.0011736]).double())
-    assert torch.linalg.matrix_rank(held(data.covariance), rtol=1e-12).unique().tolist() == [6]
-
-
-def test_fr3_poses_are_read(ur10_folder: Path) -> None:
-    """Matrices of a camera, against those that the controller reports."""
-    path = ur10_folder.parent / "franka_fr3" / "franka_fr3_camera.csv"
-    joints = [f"q{i}_rad" for i in range(1, 8)]
-    matrix = [f"cam_T{i}{j}" for i in range(3) for j in range(3)]
-    options: dict[str, Any] = {"length": "m", "angle": "rad", "convention": "matrix"}
-    data = read_measurements(path, joints, ["cam_T03", "cam_T13", "cam_T23"], rotation=matrix, **options)
-    assert len(data) == 114
-    reported = [f"tcp_{4 * i + j}" for i in range(3) for j in range(3)]
-    tcp = read_measurements(path, joints, ["tcp_3", "tcp_7", "tcp_11"], rotation=reported, **options)
-    assert float(relative_spread(held(data.poses), held(tcp.poses)).median()) < math.radians(1.0)

@@ -17,7 +17,7 @@ from diffeo_calib.measurements.table_format import TableFormat
 TABLE = HEADER + ROWS
 GERMAN = HEADER.replace(",", ";")
 Case = tuple[str | bytes, dict[str, Any], str]
-DECIMALS = GERMAN + "1;2;3;4;5\n1,5;2;3;4;5\n1;2;3,5;4;5,5\n"
+DECIMALS = GERMAN + "1.5;2;3.5;4;5.5\n1,5;2;3;4;5\n1;2;3,5;4;5,5\n"
 COPIES = TABLE + "9,9,9,9,9\n" + ROWS.replace("0.1,", "0.10,")
 STATED = "expected mm, as stated, got {} in its header; state the unit"
 FILES: list[Case] = [
@@ -34,7 +34,11 @@ FILES: list[Case] = [
     (HEADER, {"position": ["x", "y", "height"]}, "no column ['height'] ... written in the header"),
     (GERMAN + "1;2;3;4;5\n", {}, "single column 'q1;q2;x;y;z' without ',' ... pass sep=';'"),
     (DECIMALS, {"sep": ";"}, "line 3, column 'q1' (and 2 more, on line 4) ... '1,5' ... decimal comma ... decimal=','"),
-    (GERMAN + "1.5;2;3;4;5\n", {"sep": ";", "decimal": ","}, "line 2, column 'q1' ... got '1.5' ... decimal='.'"),
+    (
+        GERMAN + "1.5;2;3;4;5\n1,5;2;3;4;5\n",
+        {"sep": ";", "decimal": ","},
+        "line 2, column 'q1' ... got '1.5' ... decimal='.'",
+    ),
     (GERMAN + "1;2;1.234;4;5\n", {"sep": ";", "decimal": ","}, "column 'x' ... thousands"),
     (GERMAN + "1;2;1,000;4;5\n", {"sep": ";"}, "line 2, column 'x' ... decimal=',' ... thousands"),
     (HEADER + "1,2,far,4,5\n", {}, "line 2, column 'x': expected a number, got 'far'"),

@@ -142,6 +142,7 @@ def assert_same(found: Any, wanted: Any) -> None:
         *(("poses on tips", replace(DEGREES, convention=own, rotation_angle="rad")) for own in ("matrix", "ZYX")),
         *(("poses", replace(SI, convention=own)) for own in ("quat_xyzw", "quat_wxyz")),
         ("boards", replace(DEGREES, camera_on_tool=True)),
+        *(("positions", replace(DEGREES, spherical=own)) for own in ("elevation_rad", "zenith_clockwise_gon")),
     ],
 )
 def test_written_tables_are_read_back(kind: str, table: TableFormat, tmp_path: Path) -> None:

@@ -39,6 +39,18 @@ def _two_sheets(path: Path) -> None:
     book.save(path)
 
 
+def _joined_sheets(path: Path) -> None:
+    """Joints and places of the same stops, in another order."""
+    book = openpyxl.Workbook()
+    for title, names, values in (("robot", ["q_1", "q_2"], JOINTS), ("tracker", ["p_x", "p_y", "p_z"], PLACES[::-1])):
+        stops = range(7) if title == "robot" else reversed(range(7))
+        rows = [["stop", *names], *([k, *own] for k, own in zip(stops, values.tolist(), strict=True))]
+        sheet = book.create_sheet(title)
+        for row in rows:
+            sheet.append(row)
+    book.save(path)
+
+
 def _named(path: Path) -> None:
     names = ["q_1", "q_2", "p_x", "p_y", "p_z"]
     np.save(path, np.array([tuple(row) for row in ROWS], dtype=[(name, float) for name in names]))
@@ -51,9 +63,11 @@ def _struct(path: Path) -> None:
 WRITERS: dict[str, tuple[str, Callable[[Path], object], str, str]] = {
     "a spreadsheet": ("t.xlsx", _book, *NAMES),
     "the sheet with rows": ("t.xlsx", _two_sheets, *NAMES),
+    "two sheets of the same stops": ("t.xlsx", _joined_sheets, *NAMES),
     "an array": ("t.npy", lambda path: np.save(path, ROWS), "1,2", "3,4,5"),
     "an array with names": ("t.npy", _named, *NAMES),
     "arrays": ("t.npz", lambda path: np.savez(path, q=JOINTS, p=PLACES, gain=np.eye(3)), *NAMES),
+    "arrays of columns": ("t.npz", lambda path: np.savez(path, q=JOINTS.T, p=PLACES.T, s=np.eye(3)), *NAMES),
     "variables": ("t.mat", lambda path: savemat(path, {"q": JOINTS, "p": PLACES}), *NAMES),
     "variables of old": ("t.mat", lambda path: savemat(path, {"q": JOINTS, "p": PLACES}, format="4"), *NAMES),
     "a structure": ("t.mat", _struct, "log_q_1,log_q_2", "log_p_x,log_p_y,log_p_z"),
@@ -63,7 +77,9 @@ WRITERS: dict[str, tuple[str, Callable[[Path], object], str, str]] = {
 NOTES = {
     "a spreadsheet": "line 1, 2 before the header skipped",
     "the sheet with rows": "sheet 'Sheet' read, not notes",
+    "two sheets of the same stops": "sheets 'robot' and 'tracker' joined by 'stop'",
     "an array": "no header line",
+    "arrays of columns": "arrays s left out",
     "arrays": "arrays gain left out: no numbers or texts of 7 rows",
 }
 

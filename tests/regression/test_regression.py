@@ -48,8 +48,6 @@ PROBLEMS = {
 
 
 every_problem = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=PROBLEMS.keys())
-SEEN = {name: problem for name, problem in PROBLEMS.items() if name != "hidden"}
-every_seen = pytest.mark.parametrize("problem", SEEN.values(), ids=SEEN.keys())
 
 
 def poorly(problem: Problem, at: GeodesicDeformation, rank: int = 4) -> ConjugateGradientRegression:
@@ -172,40 +170,7 @@ def test_any_kernel_in_both_flows(kernel: Kernel) -> None:
     close(Process.of_rows(data, problem.noise).covariance(queries), expected, prior, 1e-10)
 
 
-def with_parameters(problem: Problem, at: GeodesicDeformation, x: Tensor, wide: float) -> Linearisation:
-    """A linearisation with three parameters, the last of them fixed."""
-    spec = replace(problem.spec, prior_variance=torch.tensor([wide, 0.5, 0.0], dtype=torch.float64))
-    lin = at.linearise(x)
-    slopes = torch.stack(
-        [(x.sum(1, keepdim=True) * (k + 1) + torch.arange(problem.y.shape[1])).sin() for k in range(3)]
-    )
-    return replace(lin, spec=spec, sensitivity=slopes.movedim(0, -1))
-
-
-@every_seen
-def test_solving_beside_parameters_is_that_of_the_whole_matrix(problem: Problem) -> None:
-    at = deformed(problem)
-    data = with_parameters(problem, at, problem.x, 2.0)
-    factor, K = Process.of_rows(data, problem.noise).factor, data.gram() + matrix_of(problem)
-    values = normal(len(K), 3, seed=8)
-    torch.testing.assert_close(factor.solve(values), torch.linalg.solve(K, values), rtol=1e-6, atol=1e-6)
-    C = torch.stack([factor.of_white(column) for column in torch.eye(len(K), dtype=torch.float64)], 1)
-    torch.testing.assert_close(C.T @ K @ C, torch.eye(len(K), dtype=torch.float64), rtol=0, atol=1e-6)
-
-
 # --- momenta -------------------------------------------------------------------------------------------------------
-
-
-@every_problem
-def test_product_with_parameters(problem: Problem) -> None:
-    """For a nominal map with theta, the product includes the finite-rank part."""
-    lin = deformed(problem).linearise()
-    m = problem.y.shape[1]
-    sensitivity = normal(len(problem.x), m, 3, seed=5)
-    model = replace(problem.spec, prior_variance=torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64))
-    lin = replace(lin, spec=model, sensitivity=sensitivity)
-    mu = normal(*problem.y.shape, 2, seed=6)
-    torch.testing.assert_close(lin.product(mu).flatten(0, 1), lin.gram() @ mu.flatten(0, 1), rtol=1e-11, atol=1e-11)
 
 
 def mode(found: Any, target: Tensor) -> Momenta:

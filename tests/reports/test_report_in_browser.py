@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,12 +11,7 @@ from product_bank import Case
 
 import diffeo_calib as dc
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-BROWSER = next((found for found in map(shutil.which, BROWSERS) if found), None)
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine: apt install chromium"),
-]
+pytestmark = pytest.mark.slow
 
 CONTRAST = """() => {
   const luminance = (rgb) => {
@@ -60,16 +53,6 @@ SVG_TEXT = """() => [...document.querySelectorAll("figure svg")].map((svg) => {
   const sizes = [...svg.querySelectorAll("text")].map((text) => parseFloat(getComputedStyle(text).fontSize));
   return scale * Math.min(...sizes);
 })"""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    playwright = pytest.importorskip("playwright.sync_api")
-    with playwright.sync_playwright() as running:
-        root = hasattr(os, "geteuid") and os.geteuid() == 0  # Chromium's sandbox refuses root
-        started = running.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"] if root else [])
-        yield started
-        started.close()
 
 
 @pytest.fixture(scope="module")

@@ -192,12 +192,13 @@ class _Search:
             yield _joined(mixed)
         strange = bool((large | small | ~turning).all())
         percent = bool(((self.q * self.per_rad)[:, turning].abs() <= LARGEST_PERCENT).all())
+        moving = turning & (span > gates.FIXED_RANGE)
         for number, factor in enumerate(self.factors() if bool(turning.any()) else ()):
-            part = (factor * span / width)[turning]
+            part = (factor * span / width)[moving]
             possible = strange or (percent and number < 2)
             if possible and bool(((part < MOST_PART) & (part > LEAST_PART)).all()):
                 own = self.starts(torch.where(turning, factor, 1.0)[:, None] * one, self.zeros(ZEROS // 2))
-                yield own._replace(scaled=(turning & (number < 2)).expand_as(own.offset))  # limits are rough
+                yield own._replace(scaled=(moving & (number < 2)).expand_as(own.offset))  # limits are rough
         for odd in (large, large | small):
             if 0 < int(odd.sum()) < max(int(turning.sum()), 2):
                 own = self.starts(one, self.zeros(ZEROS))

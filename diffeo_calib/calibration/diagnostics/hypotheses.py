@@ -18,22 +18,26 @@ from diffeo_calib.sensors.set_ups import frame_slopes
 
 
 class SampledRows(NamedTuple):
-    """Rows that stand for all of a calibration, beside a model.
+    """N rows that stand for all, beside a model.
 
     Args:
-        data: N rows. index: (N,) their numbers among all. process: what is known by them, of M numbers.
+        index: (N,) their numbers among all. process: what is known by them, of M numbers.
+        basis: (N, m, r) of what poses tell, see :class:`TangentData`; None where rows tell their coordinates.
     """
 
-    data: TangentData
     index: Tensor
     process: Process
-    scales: Hyperparameters
+    basis: Tensor | None
 
     @classmethod
-    def of(cls, data: TangentData, scales: Hyperparameters) -> SampledRows:
-        """Hypotheses of a calibration with these scales."""
+    def of(cls, data: TangentData, scales: Hyperparameters) -> tuple[SampledRows, TangentData]:
+        """Those of a calibration with these scales, and their measurements."""
         index, some = data.sample(len(data.x), gates.JUDGED_COORDINATES, seed=0)
-        return cls(some, index, some.process(scales), scales)
+        return cls(index, some.process(scales), some.basis), some
+
+    def in_coordinates(self, values: Tensor) -> Tensor:
+        """Motions (N, r, U) of what the rows tell as those of all coordinates: (N, m, U)."""
+        return values if self.basis is None else self.basis @ values
 
     def columns(self, effects: Tensor, codes: Tensor | None = None) -> Tensor:
         """Effects (N, R, U) on what rows tell, in each row times its code (N,), as those on the numbers (M, U)."""
@@ -41,7 +45,7 @@ class SampledRows(NamedTuple):
 
     def distances(self, effects: Tensor, u: Tensor) -> Tensor:
         """(N, B) motions, m, of the points, or numbers, of each row by unknowns (U,) with effects (N, R, U)."""
-        motion = self.data.in_coordinates(effects) @ u
+        motion = self.in_coordinates(effects) @ u
         return motion.unflatten(1, (-1, 3 if motion.shape[1] % 3 == 0 else motion.shape[1])).norm(dim=2)
 
 

@@ -46,6 +46,7 @@ from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.process.tails import FACTORS
 from diffeo_calib.regression.conditional import Process
+from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import MILLIMETRE, Hypothesis
 
 ROUNDS = 20
@@ -108,16 +109,16 @@ def judge(
             change of devices in unknown places. bodies: better names of the measuring device and of what is on the
             tool. opens: whether it may be opened.
     """
-    rows, lines = SampledRows.of(data, scales), lines.to(data.x.device)
+    (rows, some), lines = SampledRows.of(data, scales), lines.to(data.x.device)
     if len(rows.index) < 4 * gates.CHANGE_ROWS:
         return None
-    changes, own = changes_of(rows.data, devices, rows.index), lines[rows.index]
+    changes, own = changes_of(some, devices, rows.index), lines[rows.index]
     named = [one._replace(name=bodies.get(one.name, one.name)) for one in changes]
     own_names = [names[row] for row in rows.index.tolist()]
     found = [*changed(rows, named, own, own_names, excess=max(1.0, variance_ratio(data, left_out)))]
     if len(own) >= gates.MIXED_ROWS:
         found += [own for one in changes if one.name == MARKERS for own in two_tools(rows, one.effects, lines)]
-        found += other_payloads(rows, data, lines)
+        found += other_payloads(rows, some, data, scales, lines)
     opens &= len(rows.index) == len(data.x)
     before = left_out_rms(rows.process)
     shares = ((left_out_rms(rows.process.opened(one.columns)) / (before * one.most), one) for one in found)
@@ -130,7 +131,7 @@ def judge(
     fix, columns = best.fix, None
     if best.opens and opens and moved < OPENED_M:
         fix += f"; the model holds for {best.opens}"
-        columns = rows.data.in_coordinates(rows.process.numbers.in_table(best.columns))
+        columns = rows.in_coordinates(rows.process.numbers.in_table(best.columns))
         columns = OPENED_M * columns / columns[columns.any(2)].square().sum(1).mean().sqrt()
     return Finding(sentence(best.what, expected=best.expected, got=got, fix=fix), columns)
 
@@ -167,7 +168,7 @@ class Change(NamedTuple):
         distances = rows.distances(self.hypothesis.effects, self.size)
         typical = distances[distances.amax(1) > 0].median(0).values
         distance = float(typical[typical > 0].median())
-        if name == MARKERS and rows.data.basis is None:
+        if name == MARKERS and rows.basis is None:
             distance = float(typical.max())
             single = float(typical.min()) < gates.OTHER_MARKERS * distance
             name = f"marker {int(typical.argmax())}" if single else name
@@ -304,7 +305,7 @@ class Mixture:
 
 def two_tools(rows: SampledRows, effects: Tensor, lines: Tensor) -> Iterator[Candidate]:
     """Markers or tools that take turns, by the effects (N, R, U) of their shifts; lines of all rows."""
-    E, N = effects * rows.data.place_deviation, len(effects)
+    E, N = effects * PLACES.found_m_rad, len(effects)
     mixed = Mixture(rows, E, E.new_tensor([-0.5, 0.5]).expand(N, 2))
     own = mixed.pulls(E.new_zeros(N), E.new_zeros(E.shape[2]))
     size = own.H.diagonal(dim1=1, dim2=2).sum(1, keepdim=True)
@@ -323,13 +324,15 @@ def two_tools(rows: SampledRows, effects: Tensor, lines: Tensor) -> Iterator[Can
         yield Candidate(what, "one tool", fix, columns, gates.TWO_TOOLS_LEFT, opens="the other rows")
 
 
-def other_payloads(rows: SampledRows, data: TangentData, lines: Tensor) -> Iterator[Candidate]:
+def other_payloads(
+    rows: SampledRows, some: TangentData, data: TangentData, scales: Hyperparameters, lines: Tensor
+) -> Iterator[Candidate]:
     """Payloads that would explain the rows far better than their own.
 
     Args:
-        rows: those that are judged. data: all rows. lines: (N,) of all rows in their file.
+        rows, some: those that are judged, and their measurements. data, lines: all rows, and theirs in their file.
     """
-    load, some = data.nominal.load, rows.data
+    load = data.nominal.load
     masses = load.masses.to(data.x)
     if not load.by_row or len(masses.unique()) > gates.MOST_MASSES:
         return
@@ -337,7 +340,7 @@ def other_payloads(rows: SampledRows, data: TangentData, lines: Tensor) -> Itera
     loaded = torch.arange(part.start, part.stop, device=masses.device)[some.nominal.elasticity.loaded]
     full = some.nominal.under(torch.full_like(own, load.unit))  # the sag of every row under the same mass
     S = full.sensitivities(some.x, some.theta)[..., loaded]
-    sizes = some.prior_variance(replace(rows.scales, payload=1.0))[loaded].sqrt()
+    sizes = some.prior_variance(replace(scales, payload=1.0))[loaded].sqrt()
     E = some.motions_in_numbers(S if some.slopes is None else some.slopes @ S) * sizes
     mixed = Mixture(rows, E, masses.unique() / load.unit - own[:, None])
     others = {words: other[rows.index] / load.unit - own for words, other in _other_columns(masses, lines)}
@@ -386,10 +389,10 @@ def variation(data: TangentData, scales: Hyperparameters, hypotheses: Sequence[H
     """
     if not hypotheses:
         return None
-    rows = SampledRows.of(data, scales)
+    rows, some = SampledRows.of(data, scales)
 
     def sized(rows: SampledRows, one: Hypothesis) -> tuple[float, float, Hypothesis]:
-        own = rows.columns(rows.data.motions_in_numbers(one.effects[rows.index]))
+        own = rows.columns(some.motions_in_numbers(one.effects[rows.index]))
         E = torch.nn.functional.one_hot(rows.process.numbers.owner).to(own) * own
         E = E[:, E.any(0)]
         sizes = VARIATION_M.to(E) / float(E[E.any(1)].square().sum(1).mean().sqrt())
@@ -400,9 +403,9 @@ def variation(data: TangentData, scales: Hyperparameters, hypotheses: Sequence[H
     odds, _, best = max(found, key=lambda own: own[0])
     if odds < gates.ROW_ODDS:
         return None
-    tails = rows.data.tails
+    tails = some.tails
     tails = replace(tails, weights=tails.weights.where(tails.weights < 1.0 / FACTORS[0], 1.0))
-    _, size, _ = sized(rows._replace(process=rows.data.with_tails(tails).process(scales)), best)
+    _, size, _ = sized(rows._replace(process=some.with_tails(tails).process(scales)), best)
     moved = 1e3 * size * float((3 * best.effects[best.effects != 0].square().mean()).sqrt())
     got = f"about {best.amount(size)}, which moves the tool by {moved:.2g} mm"
     what, expected = f"{best.name} seems to differ", "the same for all rows"
@@ -470,13 +473,13 @@ def lengths(data: TangentData, scales: Hyperparameters, devices: Iterable[Hypoth
     most = torch.where(turning, inf, gates.USUAL_SLIDE).to(scales.transmission_amplitude)
     usual["transmission_amplitude"] = scales.transmission_amplitude.minimum(most)
     known = replace(scales, **usual)
-    rows = SampledRows.of(data, scales if torch.equal(known.vector, scales.vector) else known)
-    links, others = [*links_of(rows.data)], (one._replace(effects=one.effects[rows.index]) for one in devices)
-    causes = [*lengths_of(rows.data), *others, *links]
+    rows, some = SampledRows.of(data, scales if torch.equal(known.vector, scales.vector) else known)
+    links, others = [*links_of(some)], (one._replace(effects=one.effects[rows.index]) for one in devices)
+    causes = [*lengths_of(some), *others, *links]
     E, process = torch.cat([one.effects for one in causes], 2), rows.process
-    columns = rows.columns(rows.data.motions_in_numbers(E))
+    columns = rows.columns(some.motions_in_numbers(E))
     g, H, total = columns.T @ process.mu, columns.T @ process.factor.solve(columns), process.numbers.target @ process.mu
-    motions = (3 * (E - E.mean(0))[rows.data.visible].square().mean(0)).sqrt().tolist()
+    motions = (3 * (E - E.mean(0))[some.visible].square().mean(0)).sqrt().tolist()
     least, found, alone = LEAST_OWN * H.diagonal(), dict[int, Length](), dict[int, Length]()
     left, first = H.diagonal().nonzero()[:, 0].tolist(), len(causes) - len(links)
     allowed, apart = chi2_above(gates.LENGTH_CHANCE / max(len(left), 1), 1) ** 0.5, gates.CHANGES_TOLD_APART

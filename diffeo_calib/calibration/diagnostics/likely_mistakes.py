@@ -167,7 +167,7 @@ def likely_mistake(
 
 
 def other_points(robot: Tree, data: Measurements) -> Iterator[Reading]:
-    """Points in another unit, of the row before or after, in a frame of the other hand, or of exchanged tips."""
+    """Points in another unit, in a frame of the other hand, of exchanged tips; they or a joint of other rows."""
     own, bodies = Reading.of(robot, data), data.points.unflatten(1, (data.origins.shape[1], -1))
     for factor, times, size in _units_of_length():
         points = (bodies + (factor - 1.0) * data.origins[:, :, None]).flatten(1, 2)  # a pose stays as large
@@ -176,6 +176,11 @@ def other_points(robot: Tree, data: Measurements) -> Iterator[Reading]:
     words = "the points seem to be one row too {}: pair every configuration with its own"
     yield replace(own, q=data.q[:-1], points=data.points[1:], words=words.format("late"))
     yield replace(own, q=data.q[1:], points=data.points[:-1], words=words.format("early"))
+    for joint, name in enumerate(robot.joint_names):
+        for which, own_rows, others in (("after", slice(1, None), slice(-1)), ("before", slice(-1), slice(1, None))):
+            q, words = data.q[own_rows].clone(), f"the values of {name} seem to be those of the row {which}"
+            q[:, joint] = data.q[others, joint]
+            yield replace(own, q=q, points=data.points[own_rows], words=f"{words}: pair them with their own rows")
     words = "the frame of the measurements seems to be left-handed: exchange two position columns, or change a sign"
     for mirrored in data.bodies.mirrored(data):
         yield replace(own, points=mirrored, words=words)
@@ -255,7 +260,7 @@ def other_columns(robot: Tree, data: Measurements) -> Iterator[Reading]:
             q[:, k] = _joint_values(columns, spare[name], slides=not robot.periodic[k]).to(q.device)
             words = f"column '{shown(name)}' fits as {joint} in place of '{shown(own)}': check the joint columns"
             yield replace(as_read, q=q, words=words)
-    for marker, triple in enumerate(columns.table.triples):
+    for marker, triple in enumerate([] if columns.table.spherical else columns.table.triples):
         for axis, own in enumerate(triple):
             for name in _similar([own], spare):
                 points = with_coordinate(data, marker, axis, spare[name] / columns.table.per_metre)
@@ -314,7 +319,7 @@ def conventions_of(robot: Tree, data: Measurements, angle: str, judge: Judge = r
 
     def left(q: Tensor) -> float:
         residual, size = judge(replace(own, q=q))
-        return residual / size
+        return residual / max(size, 1e-12)
 
     return conventions(robot, data, left, degrees(1.0) if angle == "deg" else 1.0)
 

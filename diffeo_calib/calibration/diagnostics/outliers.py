@@ -23,7 +23,7 @@ from diffeo_calib.common.quantiles import above_estimated, chi2_above, chi2_medi
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.rows import REPEAT_TOLERANCE
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.sensors.coordinates import errors_of_kinds, sensor_of
+from diffeo_calib.sensors.coordinates import errors_of_kinds
 
 FAR = "far from where the other rows predict it"
 MAX_MARKERS_FOR_EXCHANGE = 12
@@ -141,7 +141,6 @@ def contradicted(model: CalibratedKinematics, data: Measurements) -> list[Outlie
 
     Their distances are judged by the model's own deviations, or by the median distance if the model is overconfident.
     """
-    data = sensor_of(data).with_points(data, model)
     found = data.bodies.predicted(model.at_payloads(data.payload), data.q)
     errors = data.bodies.errors(data, found.points)  # (N, bodies, 3 or 6) m and rad, NaN for hidden markers
     squares = (errors * torch.linalg.solve(found.covariance, errors[..., None])[..., 0]).sum(-1)

@@ -277,24 +277,20 @@ def with_large_offsets(data: Measurements, registration: Identification, inliers
     plain, other = (identify(one, data.q[inliers], data.points[inliers]) for one in (geometry, again.geometry))
     if other.left_out > LEFT_OUT * plain.left_out:
         return registration
+    smallest = REPORTED * float(offsets.abs().max())
+    named = zip(chain.joint_names, offsets.tolist(), chain.periodic, strict=True)
+    large = ", ".join(
+        f"{name} by {math.degrees(offset):.1f} degrees" if turns else f"{name} by {1e3 * offset:.1f} mm"
+        for name, offset, turns in named
+        if abs(offset) >= smallest
+    )
     text = sentence(
-        f"joint offsets are far from the robot's description: {_large_offsets(chain, offsets)}",
+        f"joint offsets are far from the robot's description: {large}",
         got=f"residuals of {1e3 * before:.3g} mm, and of {1e3 * after:.3g} mm with these offsets added to the joints",
         fix="the calibration starts from these offsets; check those in the description, and the order of the joints",
     )
     warn_user(text)
     return again
-
-
-def _large_offsets(chain: Tree, offsets: Tensor) -> str:
-    """The largest offsets (n,), with names and units."""
-    smallest = REPORTED * float(offsets.abs().max())
-    named = zip(chain.joint_names, offsets.tolist(), chain.periodic, strict=True)
-    return ", ".join(
-        f"{name} by {math.degrees(offset):.1f} degrees" if turns else f"{name} by {1e3 * offset:.1f} mm"
-        for name, offset, turns in named
-        if abs(offset) >= smallest
-    )
 
 
 def _inliers(robot: Tree, data: Measurements, on: tuple[str, ...]) -> Tensor:

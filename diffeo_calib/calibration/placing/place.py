@@ -39,7 +39,6 @@ from diffeo_calib.calibration.placing.placement import Elsewhere, OtherLabel, Ot
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
     ball_of,
-    check_known,
     reading_sets,
     register_readings,
 )
@@ -59,10 +58,9 @@ from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.coordinates import errors_of_kinds
+from diffeo_calib.sensors.coordinates import Places, errors_of_kinds, fitting_devices
 from diffeo_calib.sensors.devices import ROW
 from diffeo_calib.sensors.errors import Evaluations, shown_unit
-from diffeo_calib.sensors.places import Places, fitting_devices
 from diffeo_calib.sensors.tables import (
     Coordinates,
     OtherReadings,
@@ -364,5 +362,12 @@ def _by_readings(robot: Tree, data: Any, readings: list[OtherReadings], progress
     rows = Rows(registration.geometry, tuple(map(ReadRows, tables, registration.devices)))
     found = estimated(rows, held_parameters(rows.geometry, adrift=True), Prior())
     LOG.info("registration RMS %.4f mm, geometry %.4f mm", 1e3 * registration.rms, 1e3 * found.rms)
-    check_known(tables, registration, found)
+    if any(free := [devices.freed() for devices in registration.devices]):  # what was said to be known is tested
+        each = zip(tables, registration.devices, free, strict=True)
+        parts = tuple(ReadRows(data, opened or own) for data, own, opened in each)
+        again = estimated(
+            Rows(registration.geometry, parts), held_parameters(registration.geometry, adrift=True), Prior()
+        )
+        for devices in again.devices:
+            devices.check_freed(found.noise, again.noise)
     return Placed(data, None, Placement(reading_sets(readings, found.devices)), registration, found)

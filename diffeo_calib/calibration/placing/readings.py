@@ -24,8 +24,6 @@ from diffeo_calib.calibration.identification.identification import (
     ReadRows,
     Rows,
     described,
-    estimated,
-    held_parameters,
     solve,
 )
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
@@ -128,8 +126,13 @@ def register_readings(bare: Geometry, tables: Sequence[Readings]) -> Identificat
         DiffeoCalibWarning: readings that no place of ball and devices explains in either unit.
     """
     most, found = LARGEST_SHARE * bare.chain.reach, _rough_fits(bare, tables, bare.tool[:1])
-    if found and found[0].worst[0] > DOUBTED_SHARE * bare.chain.reach:
-        _refuse_another_unit(bare, tables, found[0])
+    doubted = bool(found) and found[0].worst[0] > DOUBTED_SHARE * bare.chain.reach
+    for factor, words in ((1e3, "small"), (1e-3, "large")) if doubted else ():
+        other = [replace(own, values=factor * own.values) if own.unit[0] == "mm" else own for own in tables]
+        there = _rough_fits(bare, other, bare.tool[:1])
+        if there and there[0].worst[0] < min(most, FAR_BETTER * found[0].worst[0]):
+            fix = f"they seem to be 1000 times too {words}: check the units of the readings (mm or m)"
+            raise MeasurementError.of(UNEXPLAINED, **found[0].said(most), fix=fix)
     if not found or found[0].worst[0] > most:
         balls = BALL_SPREAD_M * torch.randn(BALLS_TRIED, 3, dtype=torch.float64, generator=seeded(0), device=HOST)
         found = sorted([*found, *_rough_fits(bare, tables, balls)], key=itemgetter(0))
@@ -213,31 +216,3 @@ def reading_sets(
     """Sets of devices and the rows that they measured; ``frame``: that of the devices, in words."""
     each = zip(readings, devices, strict=True)
     return tuple(ReadingDevices(own, table, frame).measuring(rows, own.numbers(table)) for (table, rows), own in each)
-
-
-def check_known(tables: Sequence[Readings], registration: Identification, found: Identification) -> None:
-    """Test what was said to be known of devices by a geometric calibration that leaves it open.
-
-    Args:
-        tables: readings. registration: theirs. found: their geometric calibration.
-    """
-    freed = [devices.freed() for devices in registration.devices]
-    if all(devices is None for devices in freed):
-        return
-    each = zip(tables, registration.devices, freed, strict=True)
-    parts = tuple(ReadRows(data, own if free is None else free) for data, own, free in each)
-    held = held_parameters(registration.geometry, adrift=True)
-    again = estimated(Rows(registration.geometry, parts), held, Prior())
-    for devices in again.devices:
-        devices.check_freed(found.noise, again.noise)
-
-
-def _refuse_another_unit(bare: Geometry, tables: Sequence[Readings], best: RoughFit) -> None:
-    """Raise MeasurementError for readings that fit in mm or m, in place of the other unit, far better than ``best``."""
-    most = LARGEST_SHARE * bare.chain.reach
-    for factor, words in ((1e3, "small"), (1e-3, "large")):
-        other = [replace(own, values=factor * own.values) if own.unit[0] == "mm" else own for own in tables]
-        found = _rough_fits(bare, other, bare.tool[:1])
-        if found and found[0].worst[0] < min(most, FAR_BETTER * best.worst[0]):
-            fix = f"they seem to be 1000 times too {words}: check the units of the readings (mm or m)"
-            raise MeasurementError.of(UNEXPLAINED, **best.said(most), fix=fix)

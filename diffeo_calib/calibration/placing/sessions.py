@@ -79,8 +79,18 @@ class Sessions(DeviceSet):
         progress("sessions", 0, 1)
         rows = table.device_rows()
         found, median = cls.find(robot, rows, set_up_kind(rows))
-        if rows.lever is None:
-            _doubt(robot, rows, median)
+        with suppress(MeasurementError):
+            other = MeasuringFrames if rows.remounted else MountedMarkers
+            ratio = cls.find(robot, rows, other)[1] / median if rows.lever is None else 1.0
+            if ratio < TOLD_APART:
+                moved = ("markers were mounted anew", "device"), ("device was moved", "markers")
+                what, stayed = moved[rows.remounted]
+                words = (
+                    f"the sessions fit {1 / ratio:.2g} times better if the {what} between them and the {stayed} stayed"
+                )
+                option = "leave out" if rows.remounted else "add"
+                fix = f"{option} --remounted (in Python `remounted=True` of `with_sessions`) if that is so"
+                warn_user(sentence(words, fix=fix))
         return [found.of_rows(own.rows[table.socket_numbers < 0])], found.devices.aligned(table)
 
     @classmethod
@@ -186,23 +196,6 @@ class Sessions(DeviceSet):
             number = self.devices.numbers(device.table)
             rows, number = other.coordinates.rows[device.rows][number != NO_SOCKET], number[number != NO_SOCKET]
         return replace(self, centre=other.centre).measuring(rows, number)
-
-
-def _doubt(robot: Tree, data: Measurements, median: float) -> None:
-    """Warn where rows fit far better if the markers were mounted anew and the device stayed, or the other way round.
-
-    Args:
-        robot: n joints. data: rows of sessions. median: of their distances, see :meth:`Sessions.find`.
-    """
-    with suppress(MeasurementError):
-        ratio = Sessions.find(robot, data, MeasuringFrames if data.remounted else MountedMarkers)[1] / median
-        if ratio < TOLD_APART:
-            moved = ("markers were mounted anew", "device"), ("device was moved", "markers")
-            what, stayed = moved[data.remounted]
-            words = f"the sessions fit {1 / ratio:.2g} times better if the {what} between them and the {stayed} stayed"
-            option = "leave out" if data.remounted else "add"
-            fix = f"{option} --remounted (in Python `remounted=True` of `with_sessions`) if that is so"
-            warn_user(sentence(words, fix=fix))
 
 
 FRAME_M_RAD, GROWTH, OFFSET_RAD_M = 1e-3, 3e-4, 1e-3

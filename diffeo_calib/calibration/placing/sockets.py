@@ -50,8 +50,9 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import VALUE, Hypothesis
+from diffeo_calib.sensors.errors import socket_errors
 from diffeo_calib.sensors.set_ups import frame_slopes
-from diffeo_calib.sensors.sockets import IN_SOCKET_M, SocketPlaces, socket_errors
+from diffeo_calib.sensors.tool_frames import IN_SOCKET_M, SocketPlaces
 
 ALIKE = 0.05
 """Deviation of a block's distance from one place to another, relative to that of the distance itself."""

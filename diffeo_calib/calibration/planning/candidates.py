@@ -119,7 +119,7 @@ ROUNDING = 1e-6
 """Of limits in files, rad or m."""
 MOST = 10_000_000
 CONFIGURATIONS_AT_ONCE = 4096
-"""Configurations that are drawn together."""
+"""Configurations that are drawn together, at most: for sockets four times as many as are asked for at first."""
 FIRST_DRAWS = 100_000
 REACHING_STEPS, LARGEST_STEP, REACHING_DAMPING_M = 25, 0.5, 0.01
 """Damped Gauss-Newton steps that bring a ball to its place, the longest of a joint [rad or m], and their damping."""
@@ -185,9 +185,10 @@ def candidates(
     generator, found = seeded(check_seed(seed)), [lower.new_empty(0, robot.n)]
     seen = dict.fromkeys(criteria, 0)
     passed = dict.fromkeys(criteria, 0)
-    drawn = accepted = 0
+    drawn, accepted, together = 0, 0, CONFIGURATIONS_AT_ONCE if places is None else count
     while accepted < count:
-        q = torch.rand(CONFIGURATIONS_AT_ONCE, robot.n, dtype=torch.float64, device=HOST, generator=generator)
+        together = min(CONFIGURATIONS_AT_ONCE, 4 * together)
+        q = torch.rand(together, robot.n, dtype=torch.float64, device=HOST, generator=generator)
         q = lower + (upper - lower) * q
         if places is not None:
             q = brought_to(robot, q, at_ball, sockets[torch.arange(len(q), device=sockets.device) % len(sockets)])
@@ -195,7 +196,7 @@ def candidates(
             seen[name] += len(q)
             q = q[_allowed(name, criterion, q)] if len(q) else q
             passed[name] += len(q)
-        drawn, accepted = drawn + CONFIGURATIONS_AT_ONCE, accepted + len(q)
+        drawn, accepted = drawn + together, accepted + len(q)
         found.append(q)
         if accepted < count and drawn >= FIRST_DRAWS and accepted < LEAST_SHARE * drawn:
             raise _too_few(drawn, accepted, seen, passed)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.planning.candidates import Criterion, Tracker, all_of, candidates, check_limits
 from diffeo_calib.calibration.planning.knowledge import FREE, Scene, of_model, of_robot
-from diffeo_calib.calibration.planning.sensors import Options, Positions, Sensor, Told, sensors_for
+from diffeo_calib.calibration.planning.sensors import Options, Positions, Sensor, sensors_for
 from diffeo_calib.common.checks import check_count
 from diffeo_calib.common.data_frames import data_frame
 from diffeo_calib.common.device import HOST, outside_inference_mode
@@ -228,7 +228,11 @@ def plan(
     targets, *before, wanted = at
     measured_rows = list(_measured(scene, sensors, *before))
     told = [own for one in sensors for own in one.told(scene, wanted)]
-    _check_reachable(told, count)
+    reachable = len(torch.cat([one.rows for one in told]).unique())
+    if reachable < count:
+        fix = "pass other candidates: those at which the devices see the tool or its board, or that bring the ball to "
+        what, fix = "candidates that can be measured", fix + "its sockets"
+        raise InputError.of(what, expected=f"at least {count}", got=str(reachable), fix=fix)
     options = Options.of(scene, told)
     new = options.noise.new_ones(options.at.sensitivity.shape[2] - scene.columns)
     posterior: Conditional = Opened(scene.known, scene.columns, new)
@@ -252,16 +256,6 @@ def plan(
         kinds=robot.kinds,
         payload=None if isinstance(robot_or_model, Tree) else robot_or_model.payload,
     )
-
-
-def _check_reachable(told: Sequence[Told], count: int) -> None:
-    """Raise InputError for fewer candidates that can be measured than poses."""
-    reachable = len(torch.cat([one.rows for one in told]).unique())
-    if reachable < count:
-        fix = "pass other candidates: those at which the devices see the tool or its board, or that bring the ball to "
-        fix += "its sockets"
-        what = "candidates that can be measured"
-        raise InputError.of(what, expected=f"at least {count}", got=str(reachable), fix=fix)
 
 
 def _measured(scene: Scene, sensors: Sequence[Sensor], known: Tensor, registration: Tensor) -> Iterator[Options]:

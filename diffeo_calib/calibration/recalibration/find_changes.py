@@ -362,24 +362,18 @@ def _changes_of(rows: NewRows, *, level: float, seed: int) -> tuple[Changes, lis
         as_good = [each for each, own in ratios.items() if parts[each].offset and own.value > least]
         found.append((best.probability, tuple(as_good)))
     changes = tuple(_change(rows, drift, *why) for drift, why in zip(drifts, found, strict=True))
-    return Changes(changes, first, noise, len(rows), level, () if drifts else _smallest(rows)), drifts
+    chain, smallest = rows.marks.fitted.geometry.chain, list[Offset]()
+    for joint, part in enumerate([] if drifts else offsets_of(rows.fitted)):
+        size = SHOWN * OFFSET_DEVIATION_RAD_M / float(rows.evidence(part.root(rows.at)).H.sqrt())
+        size = size if size < LARGEST_OFFSET_RAD_M else inf
+        smallest.append(Offset(chain.joint_names[joint], chain.kinds[joint] != "prismatic", size))
+    return Changes(changes, first, noise, len(rows), level, tuple(smallest)), drifts
 
 
 SHOWN = 5.5
 """Standard deviations of an offset that is named in nine cases of ten at a level of 1 %."""
 LARGEST_OFFSET_RAD_M = 5e-3
 """The largest one that is tested, see SIZES."""
-
-
-def _smallest(rows: NewRows) -> tuple[Offset, ...]:
-    """See :class:`Changes`."""
-    chain, found = rows.marks.fitted.geometry.chain, []
-    for joint, part in enumerate(offsets_of(rows.fitted)):
-        evidence = rows.evidence(part.root(rows.at))
-        size = SHOWN * OFFSET_DEVIATION_RAD_M / float(evidence.H.sqrt())
-        size = size if size < LARGEST_OFFSET_RAD_M else inf
-        found.append(Offset(chain.joint_names[joint], chain.kinds[joint] != "prismatic", size))
-    return tuple(found)
 
 
 def _change(rows: NewRows, part: ChangedPart, probability: float, others: tuple[str, ...]) -> Change:

@@ -5,24 +5,29 @@ new_rows.py, after a start in closed form (robots/placement.py). A marker either
 moved a little (1 mm), or is another one (0.3 m): the marginal likelihood of the rows chooses. The base may be anywhere.
 
 Leaving rows J out lowers their quadratic form by mu_J^T (K^-1)_JJ^-1 mu_J. Compared with what remains, this is an F
-test (externally studentised residuals), so that an outlier does not hide itself. Single rows are tried first, then
-pairs, which may hide each other.
+test (externally studentised residuals), so that an outlier does not hide itself. Rows whose weights say that they are
+gross go first, together: they may hide each other.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from math import exp, log
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.recalibration.new_rows import NewRows, NewSetUp, UsualNoise
+from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.hypotheses import BASE, MARKERS, NEW_SET_UP, TWO_ROBOTS, SampledRows
+from diffeo_calib.calibration.diagnostics.judge import best_of, changed, two_tools
+from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows, NewSetUp, UsualNoise
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few, sentence, warn_user
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.evaluation import LARGEST_ERROR_PER_REACH
 from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.registered_map import (
     HARDLY,
@@ -36,9 +41,11 @@ from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_points, tool_transform
 from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.poses import kind_of_points, own_blocks, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.process.tails import Tails
 from diffeo_calib.robots.placement import PLACES, place, rigid_fit
 from diffeo_calib.robots.se3 import skew
 from diffeo_calib.sensors.coordinates import check_joint_order
+from diffeo_calib.sensors.devices import CHANGE, Hypothesis
 from diffeo_calib.sensors.tables import Coordinates
 
 FREE = ("both", "base", "marker")
@@ -53,6 +60,8 @@ UNMOVED_LOG_ODDS = log(10.0)
 """Before the rows are seen: markers that nobody names as moved have not been touched."""
 MOST_ROWS = 200
 """Of more rows, so many evenly spaced ones take part."""
+BEYOND_REACH = 10.0
+"""Distance of rows from their middle, in reaches of the robot or m, from which their unit is wrong."""
 LARGEST_OUTLIER_PART = 0.34
 """Largest part of the rows that are taken for outliers."""
 NEGLIGIBLE_PROBABILITY = 0.01
@@ -69,6 +78,7 @@ def find_place(
     free: str = "both",
     marker_std: float | None = None,
     ball: bool = False,
+    opens: bool = False,
 ) -> tuple[NewRows, Registration]:
     """Find where the device stands and where the markers sit.
 
@@ -76,6 +86,7 @@ def find_place(
         model: the map, placed anew before or not. lever: of its frames, m; None for markers.
         data: the rows. free, marker_std: see :meth:`CalibratedKinematics.registered`.
         ball: whether the last marker is a ball that no row shows, and that stays where it was on the tool.
+        opens: whether something may have changed among the rows.
 
     Returns:
         the rows around the most probable places, with their prior, and the record.
@@ -94,6 +105,7 @@ def find_place(
         check_number(marker_std, "`marker_std`, in m", above=0.0)
     evenly = [round(k * (len(data) - 1) / (MOST_ROWS - 1)) for k in range(MOST_ROWS)]
     some = data if len(data) <= MOST_ROWS else data.rows(evenly)
+    spread = _refuse_others(some.points - some.points.nanmean((0, 1)), BEYOND_REACH * max(chain.reach, 1.0))
     search = Search.of(model, lever, some, free, ball=ball)
     priors = {name: first for name, (first, _) in MARKER_DEVIATIONS.items() if search.known or name == "other"}
     priors = priors if marker_std is None else {"stated": marker_std}
@@ -106,7 +118,13 @@ def find_place(
         found[name] = max(settled, key=lambda each: each.given.log_evidence())
     kept, outliers = torch.arange(len(some), device=some.q.device), list[int]()
     while True:
-        odds = _odds(found)
+        scale = max(1.0, float(scale_of([*found.values()][-1])[0]))  # large errors under the widest prior are none
+        logs = {
+            name: own.given.log_evidence(scale) + UNMOVED_LOG_ODDS * (name == "same") for name, own in found.items()
+        }
+        odds = {name: exp(own - max(logs.values())) for name, own in logs.items()}
+        likely = {name: own for name, own in odds.items() if own > NEGLIGIBLE_PROBABILITY * sum(odds.values())}
+        odds = {name: own / sum(likely.values()) for name, own in likely.items()}
         best = found[max(odds, key=odds.__getitem__)]
         worst = worst_rows(best)
         if not worst or len(outliers) + len(worst) > LARGEST_OUTLIER_PART * len(some):
@@ -114,6 +132,10 @@ def find_place(
         outliers += kept[worst].tolist()
         stay = kept.new_tensor([row for row in range(len(kept)) if row not in worst])
         kept, found = kept[stay], {name: rows.kept(stay).settled() for name, rows in found.items()}
+    most = max(LARGEST_ERROR_PER_REACH * chain.reach, gates.REGISTERED_RESIDUAL * spread)
+    _refuse_others(best.given.shown(best.given.residual).unflatten(1, (-1, 3)), most)
+    if opens and (beside := opened(best, some.rows(kept))) is not best:
+        best = beside.settled()
     said = {
         "lever": search.data.lever,
         "free": free,
@@ -250,18 +272,18 @@ def _check_enough(data: Measurements, *, framed: bool, known: bool) -> None:
         raise MeasurementError.of(what, expected=f"at least {least} rows", got=len(data), fix=fix)
 
 
-def _odds(found: dict[str, NewRows]) -> dict[str, float]:
-    """Probabilities of the priors that count. Errors as large as those under the widest prior are no evidence."""
-    scale = max(1.0, float(scale_of([*found.values()][-1])[0]))
-    logs = {name: each.given.log_evidence(scale) + UNMOVED_LOG_ODDS * (name == "same") for name, each in found.items()}
-    odds = {name: exp(each - max(logs.values())) for name, each in logs.items()}
-    likely = {name: each for name, each in odds.items() if each > NEGLIGIBLE_PROBABILITY * sum(odds.values())}
-    return {name: each / sum(likely.values()) for name, each in likely.items()}
+def _refuse_others(away: Tensor, most: float) -> float:
+    """Typical length of vectors (N, P, 3), m; MeasurementError if those of no calibrated robot are as long."""
+    typical = float(away.norm(dim=-1).nanmedian())
+    if typical > most:
+        what, fix = "no place of device and markers explains these rows", "check that they are of this robot, `length`"
+        fix += " and `angle`, and the order of the columns"
+        raise MeasurementError.of(what, expected=f"at most {most:.3g} m", got=f"a median of {typical:.3g} m", fix=fix)
+    return typical
 
 
 PRIOR_FREEDOM = 10.0
 """The model's own covariance counts as an estimate of the scale with so many degrees of freedom."""
-MOST_PAIRS = 800
 FALSE_ALARM_PROBABILITY = 0.001
 """Probability that clean rows have an outlier."""
 
@@ -279,26 +301,52 @@ def scale_of(rows: NewRows, falls: Tensor | float = 0.0, coordinates: Tensor | i
 
 
 def worst_rows(rows: NewRows) -> list[int]:
-    """The one or two rows that contradict all others, or none."""
+    """The row that contradicts all others, or rows that are more likely gross than good; or none."""
     from scipy.special import fdtrc  # noqa: PLC0415  # slow to import, not needed to use a model
 
+    if (tails := rows.with_weights().tails).gross:
+        return (tails.weights < OUTLIER_WEIGHT).any(1).nonzero()[:, 0].tolist()
     given = rows.given
-    M, m = given.residual.shape
-    for size in (1, 2):
-        sets = torch.combinations(torch.arange(M, device=given.residual.device), size)
-        if M - size < LEAST_POINTS or len(sets) > MOST_PAIRS:
-            continue
-        at = (sets[..., None] * m + torch.arange(m, device=sets.device)).flatten(1)  # (K, size m)
-        blocks, chosen = given.factor.inverse[at[:, :, None], at[:, None, :]], given.solved.flatten()[at]
-        falls = (chosen * torch.linalg.solve(blocks, chosen[..., None])[..., 0]).sum(1)
-        coordinates = given.visible.sum(1)[sets].sum(1).to(falls)
-        variances, freedom = scale_of(rows, falls, coordinates)
-        ratios = falls / coordinates / variances
-        chances = torch.from_numpy(fdtrc(*(each.numpy(force=True) for each in (coordinates, freedom, ratios))))
-        best = int(ratios.masked_fill((chances > chances.min()).to(ratios.device), 0.0).argmax())  # of equal chances
-        if float(chances[best]) * len(sets) < FALSE_ALARM_PROBABILITY:
-            return sets[best].tolist()
-    return []
+    if len(rows) <= LEAST_POINTS:
+        return []
+    falls, coordinates = given.left_out_squares, given.visible.sum(1).to(given.residual)
+    variances, freedom = scale_of(rows, falls, coordinates)
+    ratios = falls / coordinates / variances
+    chances = torch.from_numpy(fdtrc(*(each.numpy(force=True) for each in (coordinates, freedom, ratios))))
+    best = int(ratios.masked_fill((chances > chances.min()).to(ratios.device), 0.0).argmax())  # of equal chances
+    return [best] if float(chances[best]) * len(rows) < FALSE_ALARM_PROBABILITY else []
+
+
+def opened(rows: NewRows, data: Any) -> NewRows:
+    """The rows beside what has changed of device and tool among them; as they are if nothing has.
+
+    Args:
+        rows: new rows. data: the same as they were measured.
+    """
+    if len(rows) < 4 * gates.CHANGE_ROWS:
+        return rows
+    shown, chain, mine = rows.visible[..., None], rows.nominal.geometry.chain, rows.placement
+    frame, markers = (rows.by_places * shown).tensor_split([6], 2)
+    found = [Hypothesis(BASE, own, fix=NEW_SET_UP) for own in (frame, frame[..., :3])]
+    found.append(Hypothesis(MARKERS, markers, fix=NEW_SET_UP))
+    for joint, (name, turns) in enumerate(zip(chain.joint_names, chain.periodic, strict=True)):
+        effects = rows.at.joint_to_start[:, :, joint, None] * shown
+        found.append(Hypothesis(name, effects, ("mrad" if turns else "mm", 1e-3), TWO_ROBOTS))
+    found = [own for own in (*found, *mine.hypotheses(rows, CHANGE)) if bool((own.effects != 0).any())]
+    named = [own._replace(name=mine.bodies.get(own.name, own.name)) for own in found]
+    told = SampledRows(torch.arange(len(rows), device=shown.device), rows.process, None)
+    found = changed(told, named, data.line_numbers, data.row_names)
+    causes = [one for one in found if TWO_ROBOTS not in one.fix]  # of the robot, see find_changes.py
+    if len(rows) >= gates.MIXED_ROWS:
+        causes += two_tools(told, markers, data.line_numbers)
+    best = best_of(causes, told)
+    if best is None:
+        return rows
+    columns, none = (
+        rows.shared[..., :0] if best.columns is None else best.columns,
+        Tails.none(*rows.tails.weights.shape),
+    )
+    return rows.changed(shared=torch.cat([columns, rows.shared], 2), tails=none, changed_among=best.text)
 
 
 def _record(best: NewRows, said: dict[str, object], *, known: bool) -> Registration:
@@ -342,13 +390,18 @@ UNLIKELY = 0.01
 """Probability of what is said of the markers, below which it is warned of."""
 
 
-def warn_about(found: Registration | None, *, outliers: bool = True, excess: bool = True, marker: str = "") -> None:
+def warn_about(
+    found: Registration | None, *, outliers: bool = True, excess: bool = True, marker: str = "", among: str = ""
+) -> None:
     """Warn of outliers, of exchanged markers, of directions that rows do not determine, and of errors that remain.
 
     Args:
         found: the registration, if a device measured coordinates. marker: what is said of the markers.
         outliers: whether to name the rows that took no part. excess: whether to warn of errors that remain.
+        among: what has changed among the rows, in a sentence.
     """
+    if among:
+        warn_user(among)
     if found is None:
         return
     if found.outliers and outliers:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import inf
 from typing import Any, NamedTuple
 
 import torch
@@ -26,19 +27,19 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
 from diffeo_calib.kinematics.registered_map import Registration, place_slopes, robot_map, turned
-from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
+from diffeo_calib.maps.linearisation import Linearisation, Numbers
+from diffeo_calib.maps.noise import mean_block, without_hidden
 from diffeo_calib.maps.observation import Stacked
 from diffeo_calib.measurements.poses import block_diagonal, own_blocks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.tails import Tails, gross_weights, reweight
+from diffeo_calib.regression.conditional import Process
 from diffeo_calib.regression.linear_rows import LinearRows
 from diffeo_calib.regression.regions import OTHER_DATE, region_factor, region_scale
 from diffeo_calib.robots.se3 import rotation, transforms
-from diffeo_calib.sensors.coordinates import errors_of_kinds
+from diffeo_calib.sensors.coordinates import errors_of_kinds, fitting_devices
 from diffeo_calib.sensors.errors import Evaluations
-from diffeo_calib.sensors.places import fitting_devices
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings
 
 MAX_STEPS = 100
@@ -204,6 +205,7 @@ class NewRows:
     centre: Tensor  # (3,) about which the frame turns, m
     drifts: Tensor  # (M R, c) columns of unit variance of what has changed in the robot since, m
     marker: str  # which the markers are: "same", "moved", "other", or "stated" for a prior of a user
+    changed_among: str = ""  # what has changed among the rows, in a sentence
 
     def __len__(self) -> int:
         return len(self.q)
@@ -340,15 +342,17 @@ class NewRows:
         The scales were chosen for another session, with few rows of other places, temperatures or loads. The errors of
         every new row as predicted by the old model and all others judge them, see :func:`region_scale`.
         """
-        covariance, noise = torch.linalg.inv(self.given.precisions), self.noise
-        error = covariance @ self.given.solved[..., None]
-        if self.of_coordinates:
-            noise = noise * (self.new_noise.trace() / self.mean_noise.trace())
-        squares = self.noise_model.squares(covariance - self.weighted_noise + noise, error @ error.mT)
-        dim = self.noise_model.freedom
+        ratio = float(self.new_noise.trace() / self.mean_noise.trace()) if self.of_coordinates else 1.0
+        squares, dim = self._left_out_squares(ratio * self.noise), self.noise_model.freedom
         if (weights := gross_weights(squares, dim)) is not None:  # gross rows are named, and say nothing of the robot
             squares = squares.masked_fill(weights < OUTLIER_WEIGHT, torch.nan)
         return max(1.0, region_scale(squares, dim, efolds=OTHER_DATE))
+
+    def _left_out_squares(self, noise: Tensor) -> Tensor:
+        """(M, bodies) squared errors of new rows with this noise, as the old model and all other rows predict them."""
+        covariance = torch.linalg.inv(self.given.precisions)
+        error = covariance @ self.given.solved[..., None]
+        return self.noise_model.squares(covariance - self.weighted_noise + noise, error @ error.mT)
 
     @property
     def placed_residual(self) -> Tensor:
@@ -356,16 +360,11 @@ class NewRows:
         return self.given.shown(self.given.after_placing @ self.given.target)
 
     @property
-    def expected_residual(self) -> Tensor:
-        """(M, R) standard deviations of these that model and noise lead to expect, m; NaN where hidden."""
-        placed = self.given.after_placing
-        variances = ((placed @ Noise(self.noise).add_to(self.given.C)) * placed).sum(1).clamp(min=0.0)
-        return self.given.shown(variances.sqrt())
-
-    @property
-    def excess(self) -> float:
-        """Root mean square of the left-out errors of the better half of the rows in units of the expected ones."""
-        return float((self.given.left_out_squares / self.visible.sum(1)).median().sqrt())
+    def process(self) -> Process:
+        """What is known by the rows: of the old map too, with the covariance of its errors."""
+        rows = self.given
+        numbers, alpha = Numbers.of(self.at, rows.target.view_as(self.y)), rows.factor.white(rows.target[:, None])[:, 0]
+        return Process(self.fitted.conditional, numbers, alpha.new_zeros(len(alpha), 0), rows.factor, alpha)
 
     def by_kind(self, errors: Tensor) -> Evaluations:
         """Errors (M, R) of the numbers of all rows, m, NaN where nothing was measured, in the unit of each kind."""
@@ -396,7 +395,7 @@ class NewRows:
         return self.changed(drifts=torch.cat([self.drifts, *(root.flatten(0, 1) for root in roots)], 1))
 
     def with_weights(self) -> NewRows:
-        """Weigh the rows by Student's t, by expectation maximisation."""
+        """Weigh the rows by Student's t, by expectation maximisation, or as good and gross ones."""
         rows = self
         for _ in range(ROUNDS):
             noise, given = rows.weighted_noise, rows.given
@@ -405,6 +404,13 @@ class NewRows:
             tails = reweight(rows.noise_model.squares(rows.noise, moments), rows.noise_model.freedom)
             before, rows = rows.tails, rows.changed(tails=tails)
             if tails.settled(before):
+                break
+        for _ in range(ROUNDS):
+            weights = gross_weights(rows._left_out_squares(rows.noise), rows.noise_model.freedom)
+            if weights is None:
+                break
+            before, rows = rows.tails, rows.changed(tails=Tails(inf, weights, gross=True))
+            if rows.tails.settled(before):
                 break
         return rows
 
@@ -457,23 +463,6 @@ def noise_of_rows(fitted: FittedMap, new: Measurements, there: Measurements, T: 
         each = (own * sizes[:, None]) @ own.mT + slack.median(0).values[:, None, None] * eye
         total = usual.factor * block_diagonal(each)
     return total if new.covariance is None else larger(total, turned(new.covariance, T[:3, :3].mT))
-
-
-def typical_noise(noise: Noise) -> Tensor:
-    """The block (m, m) of median size among the rows that show everything: outliers have larger ones.
-
-    If no row does, the blocks of median size of every marker, as if their errors were independent.
-    """
-    whole = noise.visible.all(1)
-    if bool(whole.any()):
-        return _of_median_size(noise.covariance[whole])
-    own, seen = own_blocks(noise.covariance, noise.visible.shape[1] // 3), noise.visible[:, ::3]
-    return torch.block_diag(*[_of_median_size(own[seen[:, k], k]) for k in range(seen.shape[1])])
-
-
-def _of_median_size(blocks: Tensor) -> Tensor:
-    sizes = blocks.diagonal(dim1=1, dim2=2).sum(1)
-    return blocks[int(sizes.argsort()[(len(sizes) - 1) // 2])]
 
 
 def larger(first: Tensor, second: Tensor) -> Tensor:

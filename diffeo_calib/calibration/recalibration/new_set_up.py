@@ -22,8 +22,9 @@ from diffeo_calib.calibration.recalibration.find_place import (
     MARKER_DEVIATIONS,
     UNMOVED_LOG_ODDS,
     find_place,
+    opened,
 )
-from diffeo_calib.calibration.recalibration.new_rows import NewRows, NewSetUp, UsualNoise, typical_noise
+from diffeo_calib.calibration.recalibration.new_rows import NewRows, NewSetUp, UsualNoise
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few, sentence, warn_user
 from diffeo_calib.fitting.fitted_map import FittedMap
@@ -34,14 +35,13 @@ from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
 from diffeo_calib.kinematics.registered_map import Registration, fitted_markers, robot_map
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
-from diffeo_calib.maps.nominal import NominalMap
+from diffeo_calib.maps.noise import Noise
 from diffeo_calib.measurements.checks import in_other_unit
 from diffeo_calib.measurements.poses import own_blocks
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.sensors.coordinates import check_shown, sensor_of
-from diffeo_calib.sensors.places import mounted_of
+from diffeo_calib.sensors.coordinates import check_shown, mounted_of, sensor_of
 from diffeo_calib.sensors.tables import (
     ball_tip,
     check_markers,
@@ -52,7 +52,7 @@ from diffeo_calib.sensors.tables import (
 )
 
 
-def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidence") -> NewSetUp:
+def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidence", *, opens: bool = True) -> NewSetUp:
     """Find where device and markers are now.
 
     Args:
@@ -98,20 +98,21 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
         return replace(set_up, coordinates=own)
     # the rows judge "same", too
     stated = MARKER_DEVIATIONS[marker][0] if marker in ("moved", "other") else None
-    rows, found, seen = _place_of_device(old, model.lever, device.table, stated)
+    rows, found, seen = _place_of_device(old, model.lever, device.table, stated, opens=opens)
     geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])
     geometry = replace(geometry, base=found.transform @ geometry.base)
     sessions, own = Sessions.beside(own, device, geometry, seen)
     return replace(set_up, coordinates=own, sessions=sessions, registration=found, registered=rows)
 
 
-def weighed(set_up: NewSetUp, marker: str) -> NewRows:
+def weighed(set_up: NewSetUp, marker: str, *, opens: bool = False) -> NewRows:
     """The new rows with their weights, and with the markers as free as is asked or as is most probable.
 
     Rows have the noise of a typical old row, or their own where it is larger.
 
     Args:
         set_up: the rows, and where devices and markers are. marker: see :func:`diffeo_calib.recalibrate`.
+        opens: whether something may have changed among the rows.
     """
     fitted, found, ball = set_up.fitted, set_up.registration, None if set_up.new_ball else set_up.ball
     own = fitted_markers(fitted)
@@ -130,8 +131,27 @@ def weighed(set_up: NewSetUp, marker: str) -> NewRows:
         markers = other if name == "other" else own
         deviations = torch.cat([own.new_tensor(frame), MARKER_DEVIATIONS[name][1] * seen.to(own)])
         rows = set_up.rows((set_up.transform, markers), usual, deviations, marker=name)
-        likely.append(_levelled(rows).with_weights())
+        rows = _levelled(rows).with_weights()
+        beside = opened(rows, set_up.data) if opens else rows
+        likely.append(rows if beside is rows else beside.with_weights())
     return max(likely, key=lambda one: one.given.log_evidence() + UNMOVED_LOG_ODDS * (one.marker == "same"))
+
+
+def typical_noise(noise: Noise) -> Tensor:
+    """The block (m, m) of median size among the rows that show everything: outliers have larger ones.
+
+    If no row does, the blocks of median size of every marker, as if their errors were independent.
+    """
+    whole = noise.visible.all(1)
+    if bool(whole.any()):
+        return _of_median_size(noise.covariance[whole])
+    own, seen = own_blocks(noise.covariance, noise.visible.shape[1] // 3), noise.visible[:, ::3]
+    return torch.block_diag(*[_of_median_size(own[seen[:, k], k]) for k in range(seen.shape[1])])
+
+
+def _of_median_size(blocks: Tensor) -> Tensor:
+    sizes = blocks.diagonal(dim1=1, dim2=2).sum(1)
+    return blocks[int(sizes.argsort()[(len(sizes) - 1) // 2])]
 
 
 NOISE_LEVELS = 10.0 ** torch.linspace(-2, 2, 17, dtype=torch.float64, device="cpu")
@@ -163,7 +183,7 @@ def knows_ball(model: CalibratedKinematics) -> bool:
 
 
 def _place_of_device(
-    old: FittedMap, lever: float | None, device: Measurements, marker_std: float | None
+    old: FittedMap, lever: float | None, device: Measurements, marker_std: float | None, *, opens: bool
 ) -> tuple[NewRows, Registration, Tensor]:
     """Where the device of the largest session is, and the points (M, P, 3) of all rows in its frame, m."""
 
@@ -171,8 +191,8 @@ def _place_of_device(
         return old.geodesic.with_nominal(robot_map(old).under(rows.payload))(rows.q).detach().unflatten(1, (-1, 3))
 
     largest = device.largest_session()
-    check_size(predicted(largest), largest.points)
-    rows, found = find_place(old, lever, largest, marker_std=marker_std)
+    check_unit(predicted(largest), largest.points)
+    rows, found = find_place(old, lever, largest, marker_std=marker_std, opens=opens)
     ratio = size_ratio(*(each.unflatten(1, (-1, 3)) for each in (rows.points, rows.given.shown(rows.y))))
     if abs(ratio - 1.0) > USUAL_RATIO:
         what = f"distances between the new rows are {ratio:.4f} times those that the model predicts"
@@ -205,21 +225,19 @@ def with_ball(fitted: FittedMap, ball: Tensor, tip: str, deviation: float) -> Fi
     theta = torch.cat([theta[:end], theta.new_zeros(3), theta[end:]])
     p = old.momenta.task.view(len(old.x), -1, 3)
     p = torch.cat([p, p.new_zeros(len(p), 1, 3)], 1).flatten(0, 1)
-    spec = replace(old.spec, nominal=after, prior_variance=prior, at_controls=_of_rows(old.spec.at_controls, after))
+    by_row = old.spec.at_controls
+    if isinstance(by_row, SessionMarkers):  # the ball is at one place in all sessions
+        tools = torch.cat([by_row.tools, ball.expand(len(by_row.tools), 1, 3)], 1)
+        by_row = SessionMarkers(after.with_payload(by_row.load), by_row.session, tools)
+    elif isinstance(by_row, GeometryMap):
+        by_row = after.with_payload(by_row.load)
+    spec = replace(old.spec, nominal=after, prior_variance=prior, at_controls=by_row)
     deformation = GeodesicDeformation(spec, old.x, Momenta(old.momenta.joint, p, theta), old.integrator)
     markers = nominal.geometry.markers
     slopes = torch.nn.functional.pad(fitted.functionals, (0, 3))
     new_noise = torch.block_diag(fitted.new_noise, own_blocks(fitted.new_noise[None], markers)[0].mean(0))
     parts = fitted.noise, fitted.data, new_noise, fitted.workspace
     return FittedMap(deformation, *parts, slopes=slopes, y=fitted.measured())
-
-
-def _of_rows(by_row: NominalMap | None, after: GeometryMap) -> NominalMap | None:
-    """k0 of the controls with the ball at one place in all of them."""
-    if isinstance(by_row, SessionMarkers):
-        tools = torch.cat([by_row.tools, after.geometry.tool[-1:].expand(len(by_row.tools), 1, 3)], 1)
-        return SessionMarkers(after.with_payload(by_row.load), by_row.session, tools)
-    return after.with_payload(by_row.load) if isinstance(by_row, GeometryMap) else by_row
 
 
 Marker = Literal["evidence", "same", "moved", "other"]
@@ -255,21 +273,16 @@ def check_other_table(model: CalibratedKinematics, new: Any) -> None:
             raise InputError.of(what, fix="pass rows that were measured later")
 
 
-def check_size(predicted: Tensor, measured: Tensor) -> None:
-    """Doubt the length unit of rows: points (M, P, 3) by the old model, m, and measured ones.
-
-    Raises:
-        MeasurementError: lengths that fit in the other unit.
-    """
+def check_unit(predicted: Tensor, measured: Tensor) -> None:
+    """Raise MeasurementError where measured points (M, P, 3), m, are those of the old model in another unit."""
     ratio = size_ratio(predicted, measured)
-    if 1 / LARGEST_RATIO < ratio < LARGEST_RATIO:
-        return
-    what, expected = "the new rows do not have the robot's size", "distances between rows as the model predicts them"
-    fix = "check `length` and `angle`, and the order of the columns"
-    text = sentence(what, expected=expected, got=f"{ratio:.3g} times these", fix=fix)
-    if in_other_unit(ratio, OTHER_UNIT):
-        raise MeasurementError(text)
-    warn_user(text)
+    if not 1 / LARGEST_RATIO < ratio < LARGEST_RATIO and in_other_unit(ratio, OTHER_UNIT):
+        what, expected = (
+            "the new rows do not have the robot's size",
+            "distances between rows as the model predicts them",
+        )
+        fix = "check `length` and `angle`, and the order of the columns"
+        raise MeasurementError.of(what, expected=expected, got=f"{ratio:.3g} times these", fix=fix)
 
 
 def size_ratio(predicted: Tensor, measured: Tensor) -> float:

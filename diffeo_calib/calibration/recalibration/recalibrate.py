@@ -54,14 +54,15 @@ from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.provenance import Provenance, check_note
 from diffeo_calib.kinematics.registered_map import RegisteredMap, Registration, fitted_markers, moved
+from diffeo_calib.maps.noise import Noise
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.conditional import roots
 from diffeo_calib.robots.cartesian import is_cartesian, pose_inputs, turns_nowhere
 from diffeo_calib.robots.payload import common_mass, under_mass, words_of_mass
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.coordinates import mounted_of
 from diffeo_calib.sensors.errors import Evaluations
-from diffeo_calib.sensors.places import mounted_of
 
 LOG = logging.getLogger(__name__)
 CERTIFICATES = "coupling_residual", "end_residual", "energy", "status"
@@ -171,7 +172,7 @@ def recalibrate(
     check_seed(seed)
     progress("registration", 0, 1)
     before = place_again(model, new, marker)
-    rows = weighed(before, marker)
+    rows = weighed(before, marker, opens=True)
     LOG.info("registration: RMS %s of %d new rows", rows.by_kind(rows.placed_residual).rms_text, len(new))
     progress("changes", 0, 1)
     changes, drifts = find_changes(rows, seed=seed) if drift == "tested" else (Changes(), [])
@@ -179,12 +180,13 @@ def recalibrate(
     if groups := dict.fromkeys(one.where for one in changes.found if one.where):  # no model holds for all of them
         what = f"the new rows do not belong to one robot: only {' and '.join(groups)} deviates from the old model"
         warn_user(sentence(what, fix="check what happened between them, and recalibrate with the rows since then"))
-    warn_about(before.registration, outliers=False, excess=not drifts, marker=marker)
+    warn_about(before.registration, outliers=False, excess=not drifts, marker=marker, among=rows.changed_among)
     if drift == "tested":
         drifts = with_usual_drift(rows, drifts)
     if drifts:
         rows = rows.drifting([each.root(rows.at) for each in drifts]).with_weights()
-    warn_of_contradictions(rows, rows.excess if before.registration is None else before.registration.excess)
+    excess = float((rows.given.left_out_squares / rows.visible.sum(1)).median().sqrt())  # of the better half
+    warn_of_contradictions(rows, excess if before.registration is None else before.registration.excess)
     problem, start = both_dates(rows, rows.inflation, [each.root for each in drifts])
     solver, integrator = GaussNewton(tolerance=RESIDUAL_TOLERANCE), rows.fitted.geodesic.integrator
     fitted = fit(problem, solver, integrator, start=start, progress=progress)
@@ -347,7 +349,7 @@ def compare(
     measured, payload = not isinstance(other, CalibratedKinematics), None
     if measured:
         check_arguments(model, other, marker)
-        rows = weighed(place_again(model, other, marker), marker)
+        rows = weighed(place_again(model, other, marker), marker, opens=True)
     else:
         payload = common_mass(model.payload, other.payload)
         model = under_mass(model, payload).to(HOST)
@@ -355,17 +357,20 @@ def compare(
     changes, _ = find_changes(rows, level=level, seed=seed)
     if measured:
         unchanged = not changes.found
-        warn_about(rows.set_up.registration, outliers=unchanged, excess=unchanged, marker=marker)
+        warn_about(
+            rows.set_up.registration, outliers=unchanged, excess=unchanged, marker=marker, among=rows.changed_among
+        )
     q = model.configurations  # what is usual is expected at the rows of its fit
     _, covariance = model.predict(q[:: -(-len(q) // MOST_USUAL)], noise=False)
     variance = float(covariance.diagonal(dim1=-2, dim2=-1).mean().clamp(min=0))
     usual = (variance + rows.noise.diagonal(dim1=1, dim2=2)).sqrt()
-    usual = usual.masked_fill(~rows.visible, nan)
+    usual, placed = usual.masked_fill(~rows.visible, nan), rows.given.after_placing
+    expected = ((placed @ Noise(rows.noise).add_to(rows.given.C)) * placed).sum(1).clamp(min=0.0).sqrt()
     return Comparison(
         moved=rows.set_up.registration if measured else None,
         changes=changes,
         errors=rows.by_kind(rows.placed_residual),
-        expectations=rows.by_kind(rows.expected_residual),
+        expectations=rows.by_kind(rows.given.shown(expected)),
         usual=rows.by_kind(usual),
         hidden=hidden_offsets(model.robot, rows.set_up, changes) if measured else (),
         payload=payload,
@@ -401,7 +406,7 @@ def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) ->
     found = find_place(fitted, other.lever, measured(other, there, model(q)))[1]
     placed = RegisteredMap(moved(fitted, found.transform), found)
     new = measured(model, q, placed(there).unflatten(1, (-1, 3)))
-    rows = weighed(place_again(model, new, "other"), "other")
+    rows = weighed(place_again(model, new, "other", opens=False), "other")
     errors, _ = roots(placed.conditional.covariance_between(placed.geodesic.linearise(there)))
     return rows.drifting([errors.unflatten(0, (len(q), -1))]).with_weights()
 

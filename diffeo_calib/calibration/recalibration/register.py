@@ -44,12 +44,11 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conjugate_gradients import MAX_DENSE
 from diffeo_calib.robots.payload import joined_masses
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.sensors.coordinates import sensor_of
+from diffeo_calib.sensors.coordinates import mounted_of, sensor_of
 from diffeo_calib.sensors.devices import Extrinsics
 from diffeo_calib.sensors.known_drift import KnownDrift
-from diffeo_calib.sensors.places import mounted_of
 from diffeo_calib.sensors.set_ups import frame_slopes
-from diffeo_calib.sensors.tables import measured_positions, rows_of_one_kind
+from diffeo_calib.sensors.tables import measured_positions, rows_of_one_kind, with_points
 
 LOG = logging.getLogger(__name__)
 LARGEST_M_RAD = 0.03
@@ -68,11 +67,10 @@ def registered(
     check_same_robot(model, new)
     if rows is None:
         return model.changed(placement=devices_beside(model, new))
-    rows = mounted_of(model).in_any_frame(rows).largest_session()
-    rows = sensor_of(rows).with_points(rows, model)
+    rows = with_points(mounted_of(model).in_any_frame(rows).largest_session(), model)
     here = model.to(HOST)._carrying(model.nominal.load.under(rows.payload).typical)
     ball = model.ball and bool(rows.points[:, -1].isnan().all())
-    placed, found = _placed(here, rows, free=free, marker_std=marker_std, ball=ball, learn=learn)
+    placed, found = _placed(here, rows, free=free, marker_std=marker_std, ball=ball, learn=learn, opens=True)
     learns, before = placed.registration is None, getattr(model.registration, "table_sha256", "")
     found = replace(found, table_sha256=" ".join([before, new.sha256][: 1 + learns]).strip())
     vars(placed).update({} if learns else {"registration": found})
@@ -96,7 +94,7 @@ def _placed(
     """The map in its new place, by rows that say where the robot stands, and the record."""
     model = here.map
     (new, registration), fit = find_place(model, here.lever, data, **asked), model.unregistered
-    warn_about(registration)
+    warn_about(registration, among=new.changed_among)
     LOG.info("registered anew: RMS %.4f mm on %d rows", 1e3 * registration.rms_after, registration.rows)
     open_by = max(float(registration.frame_deviations.max()), registration.known_m)
     learn = learn and new.marks.same and open_by < LARGEST_M_RAD and not registration.doubtful

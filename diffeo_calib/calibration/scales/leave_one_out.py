@@ -79,23 +79,24 @@ def weighed(data: TangentData, scales: Hyperparameters, seed: int = 0) -> Tangen
     for _ in range(ROUNDS):
         squares = torch.empty_like(tails.weights)
         for rows, part in _parts(data, seed):
-            squares[rows] = _expected_squares(part, scales, tails.rows(rows))
+            part.expected(scales)  # the same for all weights
+            now = part.with_tails(tails.rows(rows))
+            process, noise = now.process(scales), now.weighted_noise(scales)
+            inverse = now.blocks_in_coordinates(process.numbers.blocks(process.inverse))
+            residual = noise @ now.in_coordinates(process.numbers.in_table(process.mu)[:, :, None])
+            moments = residual @ residual.mT + noise - noise @ inverse @ noise
+            squares[rows] = now.noise_model.squares(now.noise(scales), moments)
         before, tails = tails, reweight(squares, data.noise_model.freedom)
         if tails.settled(before):
             break
-    return data.with_tails(_among_gross(data, scales, tails, seed))
-
-
-def _among_gross(data: TangentData, scales: Hyperparameters, tails: Tails, seed: int) -> Tails:
-    """The weights beside gross rows, if left-out errors show any."""
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS):  # beside gross rows, if left-out errors show any
         weights = gross_weights(leave_one_out(data.with_tails(tails), scales, seed).squares, data.noise_model.freedom)
         if weights is None:
             break
         before, tails = tails, Tails(inf, weights, gross=True)
         if tails.settled(before):
             break
-    return tails
+    return data.with_tails(tails)
 
 
 def leave_one_out(data: TangentData, scales: Hyperparameters, seed: int = 0) -> LeaveOneOut:
@@ -126,17 +127,6 @@ def _parts(data: TangentData, seed: int) -> Iterator[tuple[Tensor, TangentData]]
         return
     order = torch.randperm(len(data.x), generator=seeded(seed), device=HOST).to(data.x.device)
     yield from ((rows, data.rows(rows)) for rows in order.tensor_split(count))
-
-
-def _expected_squares(part: TangentData, scales: Hyperparameters, tails: Tails) -> Tensor:
-    """Expected squared distances of the errors in units of the noise without tails: (N, bodies)."""
-    part.expected(scales)  # the same for all weights
-    data = part.with_tails(tails)
-    process, noise = data.process(scales), data.weighted_noise(scales)
-    inverse = data.blocks_in_coordinates(process.numbers.blocks(process.inverse))
-    residual = noise @ data.in_coordinates(process.numbers.in_table(process.mu)[:, :, None])
-    moments = residual @ residual.mT + noise - noise @ inverse @ noise
-    return data.noise_model.squares(data.noise(scales), moments)
 
 
 def left_out_rows(data: TangentData, scales: Hyperparameters, part: Tensor, new: Tensor) -> tuple[Tensor, Tensor]:

@@ -122,15 +122,6 @@ class NoiseModel:
         """Forget the noise that is known beforehand."""
         return replace(self, known=torch.zeros_like(self.known))
 
-    @property
-    def rigid_basis(self) -> Tensor | None:
-        """(N, R, 6 B) orthonormal columns, all motions of rigid poses; None unless all bodies are poses.
-
-        Errors of poses, and what moves them, are such motions: the other numbers of their points tell nothing.
-        """
-        of_poses = self.modes.shape[1] == self.bodies and self.size > FREEDOM_OF_POSES
-        return block_diagonal(torch.linalg.qr(self.modes).Q) if of_poses else None
-
     @cached_property
     def kind_count(self) -> int:
         """Kinds of devices."""

@@ -24,6 +24,7 @@ from diffeo_calib.maps.deformation import ModelSpec
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity, Numbers
 from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.maps.observation import Observation
+from diffeo_calib.measurements.poses import block_diagonal
 from diffeo_calib.process.scales import Hyperparameters, Pairs
 from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.conditional import BeforeData, Features, Process
@@ -137,11 +138,14 @@ class TangentData:
     def basis(self) -> Tensor | None:
         """(N, m, r) orthonormal columns of the numbers that rows tell; None where these are those of the rows.
 
-        Of every pose six numbers, m, for nine coordinates of its points. These are exactly rigid, and those of k0 are.
+        Of every pose six numbers, m, for nine coordinates of its points. These are exactly rigid, and those of k0 are:
+        errors of poses, and what moves them, are such motions.
         Only psi would bend them, by less than the slack of the noise model, so that the other three numbers hardly say
         anything; matrices are 2.25 times as large with them, and their factors 3.4 times as dear.
         """
-        return None if self.observe is not None else self.noise_model.rigid_basis
+        modes = self.noise_model.modes
+        of_poses = modes.shape[1] == self.noise_model.bodies and modes.shape[2] > modes.shape[3]
+        return block_diagonal(torch.linalg.qr(modes).Q) if of_poses and self.observe is None else None
 
     @property
     def size(self) -> int:

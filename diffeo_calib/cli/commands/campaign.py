@@ -15,7 +15,7 @@ from typing import Any
 
 import typer
 
-from diffeo_calib.campaign.campaign import Campaign, Next
+from diffeo_calib.campaign.campaign import TOGETHER, Campaign, Next
 from diffeo_calib.campaign.feeds import DECISIONS, ID, Entry, Inbox, as_line, check_cells, read_lines
 from diffeo_calib.campaign.journal import BEGUN, KEPT, GrowingTable, Journal, digest
 from diffeo_calib.campaign.verdicts import Verdict
@@ -101,7 +101,9 @@ class Live:
                 verdicts[entry["row"]] |= {name: entry[name] for name in KEPT if name in entry}
         readable = [line if "rows" in entry else b"\n" for line, entry in zip(lines, known, strict=False)]
         if verdicts:
-            self.campaign.resume(self._read(readable), [Verdict(row, **one) for row, one in enumerate(verdicts)])
+            if len(table := self._read(readable)) != len(verdicts):
+                raise self.journal.damaged(f"{len(verdicts)} verdicts of {len(table)} rows")
+            self.campaign.resume(table, [Verdict(row, **one) for row, one in enumerate(verdicts)])
             self.say(f"going on after {len(known)} lines{expected(self.campaign)}", self.state())
         self.said = [(one.accepted, one.again) for one in self.campaign.verdicts]
         self.waiting = lines[len(known) :]
@@ -125,9 +127,13 @@ class Live:
 
     def judge(self, lines: Sequence[bytes]) -> None:
         """Judge lines, and say what became of them; after the last what comes next."""
-        for left, line in zip(reversed(range(len(lines))), lines, strict=True):
-            number = self._add(line)
-            self._say(self.answer(number) | ({} if left or self.campaign.reached else self.state()))
+        for start in range(0, len(lines), TOGETHER):
+            part, left = lines[start : start + TOGETHER], max(0, len(lines) - start - TOGETHER)
+            first = len(self.lines)
+            self._add(part, left)
+            for number in range(first, len(self.lines)):
+                more = left or number + 1 < len(self.lines) or self.campaign.reached
+                self._say(self.answer(number) | ({} if more else self.state()))
             if self.campaign.reached:
                 self.ignored = left
                 return
@@ -198,21 +204,30 @@ class Live:
             self.say(f"half a line was removed from the end of {self.source.csv}: {torn}", {"removed": torn})
         *others, own = self.new_lines()
         self.judge(others)
-        return self._add(own)
+        self._add([own])
+        return len(self.lines) - 1
 
-    def _add(self, line: bytes) -> int:
-        """Judge a line, and bring that to the disk; its number."""
-        number = len(self.lines)
-        begun: list[Entry] = [] if number else [{BEGUN: self._begun()}]
-        entry: Entry = {"line": number + 2, "sha": digest(line)}
+    def _add(self, lines: Sequence[bytes], waiting: int = 0) -> None:
+        """Judge lines, after which others wait, and bring that to the disk."""
+        first, verdicts = len(self.lines), list[Verdict]()
+        begun: list[Entry] = [] if first else [{BEGUN: self._begun()}]
+        entries: list[Entry] = [{"line": first + k + 2, "sha": digest(line)} for k, line in enumerate(lines)]
         try:
-            verdicts = self.campaign.add(self._read([line], first=number))
-            entry["rows"] = [{name: getattr(one, name) for name in KEPT} for one in verdicts]
+            data = self._read(lines, first=first)
+            if len(lines) > len(set(data.line_numbers.tolist())) > 0:
+                raise InputError.of("lines without a row")
+            verdicts = self.campaign.add(data, waiting=waiting)
         except DiffeoCalibError as error:
-            entry["unreadable"] = self.unreadable[number] = str(error)
-        self._keep(line)
-        self.journal.add([*begun, entry, *self._revised()])
-        return number
+            if len(lines) > 1:  # one of them cannot be read
+                for left, line in zip(reversed(range(len(lines))), lines, strict=True):
+                    self._add([line], left + waiting)
+                return
+            entries[0]["unreadable"] = self.unreadable[first] = str(error)
+        for entry, line in zip(entries, lines, strict=True):
+            if own := [one for one in verdicts if one.line == entry["line"]]:
+                entry["rows"] = [{name: getattr(one, name) for name in KEPT} for one in own]
+            self._keep(line)
+        self.journal.add([*begun, *entries, *self._revised()])
 
     def _keep(self, line: bytes) -> None:
         self.lines.append(line)
@@ -235,7 +250,7 @@ class Live:
             return found | {"error": f"line {number + 2} left out: {self.unreadable[number]}"}
         own = [one for one in known if one.line == number + 2]
         found = own[0].entry() | found | {"text": "\n".join(map(str, own))}
-        revised, self.late = dict.fromkeys([*self.late, *self.revised]), []
+        revised, self.late, self.revised = dict.fromkeys([*self.late, *self.revised]), [], []
         return found | {"revised": [{"line": known[row].line, "accepted": known[row].accepted} for row in revised]}
 
     def _say(self, told: Entry) -> None:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.outliers import outlier_lines
-from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge
+from diffeo_calib.calibration.expected_errors import accuracy, expected_rms, judge
 from diffeo_calib.cli import models, printed
 from diffeo_calib.cli.console import out, plain, progress_bar, say
 from diffeo_calib.cli.declarations import EvaluateOptions, PredictOptions

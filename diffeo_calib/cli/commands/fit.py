@@ -12,7 +12,7 @@ import typer
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
 from diffeo_calib.calibration.diagnostics.outliers import Outlier, contradicted, outlier_lines
-from diffeo_calib.calibration.judgement import check_errors
+from diffeo_calib.calibration.expected_errors import check_errors
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.calibration.result import CALIBRATED, GEOMETRIC
 from diffeo_calib.cli import printed
@@ -25,7 +25,7 @@ from diffeo_calib.cli.tables import measured_table
 from diffeo_calib.common.errors import PACKAGE, few
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.evaluation import positions_of
-from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_entry, hand_eye_sentences
+from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_sentences
 from diffeo_calib.measurements.bodies import placement_lines
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table import Measurements
@@ -60,7 +60,8 @@ def run(given: FitOptions) -> None:
     hand_eye = {} if on_tool is None else HandEye.of_each(result.model, camera_on_tool=on_tool)
     save(result.model, given.output)  # before anything is printed: output may be cut off
     in_train, held_out = result.errors(train), {} if test is None else result.errors(test)
-    record.add(**hand_eye_entry(hand_eye))
+    each = {name: own.entry() for name, own in hand_eye.items()}
+    record.add(**({"hand_eyes": each} if len(each) > 1 else dict(zip(("hand_eye",), each.values(), strict=False))))
     _record(result, in_train, held_out, given)
     judged = _of_positions(held_out)
     say(*_verdict(result, judged))

@@ -62,6 +62,7 @@ def run_record(given: RecordOptions) -> None:
     values = stated_numbers("--still", given.still, (1, 2), "MOTION, or MOTION,SECONDS such as 0.001,0.5")
     for value in values:
         check_number(value, "--still", above=0.0)
+    check_number(offset or 0.0, "--offset", above=-1e12, below=1e12)
     limits = StopLimits(**dict(zip(("joints", "shortest"), values, strict=False)))
     joints, names, seen = read_bag(given.bag, given.joints, given.seen)
     if seen.values.shape[1]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from os.path import relpath
@@ -11,7 +13,7 @@ from statistics import median
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.cli import commanded_poses
-from diffeo_calib.cli.column_names import column
+from diffeo_calib.cli.column_names import Column, column
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.declarations import InitOptions
 from diffeo_calib.cli.guesses import (
@@ -20,7 +22,6 @@ from diffeo_calib.cli.guesses import (
     JointColumns,
     Sheet,
     entries,
-    guess_joints,
     guess_sheet,
     joints_without_column,
     rows_in,
@@ -70,6 +71,8 @@ def run(given: InitOptions) -> None:
         source = _commanded(given.robot, sheet) or _of_robot(given.robot or Path(), output.parent, sheet)
     except InputError as error:
         raise type(error)(f"{error} {sheet.odd}".strip()) from error
+    with quiet():
+        copies = len(source.data.copies())
     choices = [
         Choice("csv", relpath(given.csv, output.parent), "; ".join(["the table", *sheet.notes])),
         *joined,
@@ -77,6 +80,7 @@ def run(given: InitOptions) -> None:
         *source.said,
         Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it"),
         Choice("decimal", sheet.decimal, "the same"),
+        *[Choice("duplicates", "drop", f"{copies} line(s) repeat others exactly; real repeats differ")] * bool(copies),
         Choice("output", csv.with_suffix(".safetensors").name, "the model"),
         Choice("report", csv.with_suffix(".html").name, "the report"),
     ]
@@ -156,15 +160,11 @@ def _of_robot(robot: Path, folder: Path, sheet: Sheet) -> Source:
 
 def _read(robot: Path, sheet: Sheet, arm: Arm) -> Source:
     """The table as values of these joints; InputError if the robot does not explain the rows."""
-    leaves = [path[-1].child for path in chains_in(robot)] if is_urdf(robot) else []
     rows = rows_in(sheet, arm.columns.names)
-    known = {column(leaf).plain: leaf for leaf in leaves}
-    named = [known.get(column(triple[0]).plain.removesuffix("x")) for triple in rows.markers]
-    tips = [tip for tip in named if tip is not None]
-    tips = tips if len(tips) == len(named) and len(set(tips)) > 1 else []  # after which the columns of each are named
+    tips = _tips_named(chains_in(robot) if is_urdf(robot) else [], [column(triple[0]) for triple in rows.markers])
     chain = load_robot(robot, replace(arm.links, tip=tips or arm.links.tip))
     source = Source(sheet, chain, arm.columns.names, rows, TableFormat("mm", "deg", sheet.sep, sheet.decimal), tips)
-    guessed = guess_joints(sheet.numbers, chain.joint_names) or [arm.columns]
+    guessed = sheet.joint_columns(chain.joint_names) or [arm.columns]
     source = with_units(with_measured(with_joint_columns(source, guessed)))
     about = [Choice("base", arm.links.base or "", "root of the URDF")] if is_urdf(robot) else []
     about += entries([arm.links], dh_convention="the convention with which it explains the rows")
@@ -172,6 +172,22 @@ def _read(robot: Path, sheet: Sheet, arm: Arm) -> Source:
     if source.tips:
         return source.saying(Choice("tip", list(source.tips), "leaves after which the columns are named"))
     return _with_tip(robot, source, arm)
+
+
+def _tips_named(paths: Sequence[list[JointElement]], markers: Sequence[Column]) -> list[str]:
+    """The leaf that the columns of each marker are named after, or by a word that no other arm has; none if one lacks.
+
+    Fingers of a gripper are no arms: each has a joint or none of its own.
+    """
+    words = {path[-1].child: {*column(path[-1].child).words} for path in paths}
+    counts = Counter(word for own in words.values() for word in own)
+    uses = Counter(joint.name for path in paths for joint in path if joint.kind != "fixed")
+    arms = [path[-1].child for path in paths if sum(uses[joint.name] == 1 for joint in path) > 1]
+    tips = list[str]()
+    for marker in markers:
+        alike = [leaf for leaf in arms if any(counts[word] == 1 for word in words[leaf] & {*marker.words})]
+        tips += ([leaf for leaf in words if column(leaf).plain == marker.plain.removesuffix("x")] or alike)[:1]
+    return tips if len(tips) == len(markers) and len(set(tips)) > 1 else []
 
 
 def _with_tip(robot: Path, source: Source, arm: Arm) -> Source:
@@ -231,7 +247,7 @@ def _arms(robot: Path, sheet: Sheet) -> list[Arm]:
     arms = list[Arm]()
     for options, joints, ends in whole:
         for count in range(len(joints), 0, -1):
-            guessed = guess_joints(sheet.numbers, joints[:count])
+            guessed = sheet.joint_columns(joints[:count])
             series = bool(guessed) and guessed[0].how.startswith("numbered")
             if guessed and (2 * count > len(joints) or not series):  # a short series may be of anything
                 lacking = joints_without_column(sheet.numbers, joints) if count < len(joints) else ()
@@ -242,7 +258,8 @@ def _arms(robot: Path, sheet: Sheet) -> list[Arm]:
         longest = sorted((joints for _, joints, _ in whole), key=len)[:-4:-1]
         expected = " or ".join(few(joints, 20) for joints in longest if joints) or "a robot with joints"
         missing = few(joints_without_column(sheet.numbers, longest[0]), 20) if longest else "a joint"
-        fix = f"no column is named after {missing}: name the columns as the joints, or q1, q2, ... in their order"
+        fix = f"no column is named after {missing}" if missing else "numbered columns are more than the joints"
+        fix += ": name the columns as the joints, or q1, q2, ... in their order"
         got = few(sheet.numbers, 20)
         raise InputError.of(f"columns of the joints of '{robot}'", expected=expected, got=got, fix=fix)
     arms = [arm for arm in arms if arm.columns.how == "named as in the URDF"] or arms

@@ -112,12 +112,8 @@ def ranks() -> Ranks:
     if not messages.is_available():
         what = "the backend 'distributed' needs torch.distributed, which this build of torch lacks"
         raise InputError.of(what, fix="use the backend 'tiled'")
-    if not messages.is_initialized():
-        _connect()
-    return Ranks(messages.get_rank(), messages.get_world_size())
-
-
-def _connect() -> None:
+    if messages.is_initialized():
+        return Ranks(messages.get_rank(), messages.get_world_size())
     missing = [name for name in ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT") if name not in os.environ]
     if missing:
         what = "the backend 'distributed' needs a program that runs in several processes"
@@ -130,6 +126,7 @@ def _connect() -> None:
         what = f"the processes of this program do not find each other ({_first_line(error)})"
         raise LostRankError.of(what) from error
     atexit.register(lambda: messages.destroy_process_group() if messages.is_initialized() else None)
+    return Ranks(messages.get_rank(), messages.get_world_size())
 
 
 class Distributed(SumBackend):

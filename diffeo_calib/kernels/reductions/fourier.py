@@ -42,7 +42,8 @@ POINT_COST = 150.0  # time of a point beside its waves, relative to that of a pa
 WAVES_TIMES_POINTS_AT_ONCE = 1 << 20  # waves times points in memory at once
 CHECKED_ROWS = 24  # rows and columns at which every lattice is checked
 DERIVATIVES = 2  # the highest derivative of the kernel in a formula
-STEPS, FARTHEST = 4096, 60.0  # distances and frequencies that are looked at
+STEPS, FARTHEST = 4096, 60.0
+GRID = torch.linspace(0.0, FARTHEST, STEPS + 1, dtype=torch.float64, device=HOST)[1:]  # distances, or frequencies
 
 
 @lru_cache(maxsize=256)
@@ -51,33 +52,27 @@ def negligible_beyond(profile: Profile, dim: int, accuracy: float) -> float | No
 
     A factor of 3^dim is left for the copies of a kernel on a lattice.
     """
-    r = _grid()
-    kappa = profile.derivatives(r.square(), DERIVATIVES)
-    second = 2 * kappa[1].abs() + 4 * r.square() * kappa[2].abs()
-    size = torch.stack([kappa[0].abs(), 2 * r * kappa[1].abs(), second]).amax(0)
+    kappa = profile.derivatives(GRID.square(), DERIVATIVES)
+    second = 2 * kappa[1].abs() + 4 * GRID.square() * kappa[2].abs()
+    size = torch.stack([kappa[0].abs(), 2 * GRID * kappa[1].abs(), second]).amax(0)
     return _first_below(3.0**dim * size.flip(0).cummax(0).values.flip(0), accuracy)
 
 
 @lru_cache(maxsize=256)
 def bandwidth(profile: Profile, dim: int, accuracy: float) -> float | None:
     """The frequency beyond which the spectral density, with its first two moments, adds up to less than an accuracy."""
-    w = _grid()
-    density = profile.spectral_density(w.square(), dim)
+    density = profile.spectral_density(GRID.square(), dim)
     if density is None:
         return None
-    shell = density * (2.0 * pi ** (dim / 2) / gamma(dim / 2)) * w ** (dim - 1) * (FARTHEST / STEPS)
-    beyond = torch.stack([shell * w**k for k in range(DERIVATIVES + 1)]).flip(1).cumsum(1).flip(1)
+    shell = density * (2.0 * pi ** (dim / 2) / gamma(dim / 2)) * GRID ** (dim - 1) * (FARTHEST / STEPS)
+    beyond = torch.stack([shell * GRID**k for k in range(DERIVATIVES + 1)]).flip(1).cumsum(1).flip(1)
     return _first_below(beyond.amax(0), accuracy)
-
-
-def _grid() -> Tensor:
-    return torch.linspace(0.0, FARTHEST, STEPS + 1, dtype=torch.float64, device=HOST)[1:]
 
 
 def _first_below(values: Tensor, level: float) -> float | None:
     """Where on the grid decreasing values fall below a level."""
     below = values < level
-    return float(_grid()[below][0]) if bool(below[-1]) else None
+    return float(GRID[below][0]) if bool(below[-1]) else None
 
 
 def sums(

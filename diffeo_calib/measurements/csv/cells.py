@@ -23,6 +23,9 @@ _MISSING = re.compile(
     r"|invisible|not (visible|tracked|found|available)",
     re.IGNORECASE,
 )
+_DEGREES = re.compile(
+    r"([+-]?)(\d+(?:\.\d+)?) ?°(?: ?(\d+(?:\.\d+)?) ?['′])?(?: ?(\d+(?:\.\d+)?) ?(?:\"|''|″))?", re.ASCII
+)
 _INFINITE = re.compile(r"[+-]?inf(inity)?", re.IGNORECASE)
 _TYPOGRAPHY = str.maketrans("\u2212\u2013\u2019\u00a0\u202f\u2009", "--'   ")
 
@@ -81,13 +84,20 @@ def _near(missing: Sequence[str], free: Sequence[str]) -> str:
 
 
 def numbers_in(texts: Sequence[str], decimal: str) -> list[float | None]:
-    """The numbers of a column, see :func:`number`; "1,481" is one where another cell such as "1,481.25" proves it."""
+    """The numbers of a column, see :func:`number`; "1,481" is one where another cell such as "1,481.25" proves it.
+
+    A column that holds numbers with the other decimal mark alone, which no thousands explain, has this one.
+    """
     plain = texts if decimal == "." else [text.replace(".", "?").replace(decimal, ".") for text in texts]
     if _PLAIN.fullmatch("".join(plain)):
         with suppress(ValueError):
             return [float(text) for text in plain]
     grouped = any(_GROUP[decimal] in text and number(text, decimal) is not None for text in texts)
-    return [number(text, decimal, grouped=grouped) for text in texts]
+    found = [number(text, decimal, grouped=grouped) for text in texts]
+    if None in found and any(number(text, decimal, grouped=True) is None for text in texts):
+        other = [number(text, _GROUP[decimal]) for text in texts]
+        return found if None in other else other
+    return found
 
 
 _GROUP = {".": ",", ",": "."}
@@ -98,13 +108,16 @@ def number(text: str, decimal: str, *, grouped: bool = False) -> float | None:
     """Return the number, finite or not; NaN for an empty cell or a word such as "n/a"; None for anything else.
 
     Thousands may be grouped by spaces, apostrophes, or by the other decimal mark where the cell shows both or several
-    groups; with ``grouped`` also elsewhere.
+    groups; with ``grouped`` also elsewhere. Degrees, minutes and seconds such as 12°34'56.7" are degrees.
     """
     if _MISSING.fullmatch(text):
         return math.nan
     text = text.translate(_TYPOGRAPHY)
     if _INFINITE.fullmatch(text):
         return math.inf
+    if "°" in text and (angle := _DEGREES.fullmatch(text.replace(decimal, "."))):
+        parts = [float(part or 0.0) for part in angle.groups()[1:]]
+        return float(f"{angle[1]}1") * (parts[0] + parts[1] / 60.0 + parts[2] / 3600.0)
     for mark in (_GROUP[decimal], "'", " "):
         if mark in text:
             pattern = rf"[+-]?[1-9]\d{{0,2}}((?:{re.escape(mark)}\d{{3}})+)({re.escape(decimal)}\d*)?"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -16,6 +15,7 @@ from diffeo_calib.measurements.checks import unlikely_units
 from diffeo_calib.measurements.csv.cells import repeated
 from diffeo_calib.measurements.csv.joints import JointExpressions, PoseColumns
 from diffeo_calib.measurements.table_format import (
+    SPHERICAL_UNITS,
     UNITS_PER_METRE,
     TableFormat,
     check_choice,
@@ -24,7 +24,7 @@ from diffeo_calib.measurements.table_format import (
 )
 from diffeo_calib.robots.joint import KINDS
 
-PER_SI = {**UNITS_PER_METRE, "rad": 1.0, "deg": 180.0 / math.pi, None: 1.0}
+PER_SI = {**UNITS_PER_METRE, **SPHERICAL_UNITS, None: 1.0}
 """Units per rad or m; numbers without a unit are as they are."""
 
 

@@ -240,7 +240,8 @@ def write_predictions(
         prefixes: what the names of the columns of each marker or frame begin with. more: k names of further columns.
         poses: whether the blocks hold poses. columns: further fields of the format, such as ``joints`` and ``kinds``.
     """
-    table = replace(table, **columns, position=[[f"{prefix}{axis}" for axis in "xyz"] for prefix in prefixes])
+    position = [[f"{prefix}{axis}" for axis in "xyz"] for prefix in prefixes]
+    table = replace(table, **columns, position=position, spherical=None)
     table = replace(table, std=[f"{prefix}std_{axis}" for prefix in prefixes for axis in "xyz"])
     table = table.for_writing(rotation_std=True, prefixes=prefixes) if poses else table
     numeric = columns_of(table)

@@ -30,7 +30,7 @@ from diffeo_calib.common.errors import MeasurementError, few, shown
 from diffeo_calib.measurements.csv.cells import find_columns, number
 from diffeo_calib.measurements.csv.lines import TextTable, csv_text, read_cells
 
-SEPARATORS = (",", ";", "\t", "|")
+SEPARATORS = (",", ";", "\t", "|", " ")
 MOVED = 1e-3
 """Part of the range of a column by which it moves at least, unless its noise is larger."""
 CLOCKS_AGREE = 0.1

@@ -11,8 +11,8 @@ import csv
 import io
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import combinations, islice, zip_longest
-from math import isfinite, isnan
+from itertools import combinations, islice, takewhile, zip_longest
+from math import isfinite, isnan, prod
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from typing import NamedTuple
 from diffeo_calib.common.errors import MeasurementError, few, listed
 from diffeo_calib.common.files import WholeFile
 from diffeo_calib.measurements.csv.cells import number, repeated
-from diffeo_calib.measurements.csv.sheets import MARKS, as_text
+from diffeo_calib.measurements.csv.sheets import MARKS, as_text, names_of
 from diffeo_calib.measurements.table_format import ZERO, TableFormat
 
 Lines = list[tuple[int, list[str]]]
@@ -43,8 +43,17 @@ COMMENTS = "#", "%", "//"
 DAMAGED = re.compile(r"#[A-Z/0]+[!?]")
 """Cells such as #VALUE! and #DIV/0!, with which spreadsheets say that a formula failed: no comments."""
 LENGTHS = {"m": "m", "mm": "mm", "cm": "cm", "um": "um", "µm": "um", "in": "inch", "inch": "inch"}
-ANGLES = {"rad": "rad", "radians": "rad", "mrad": "mrad", "deg": "deg", "degrees": "deg", "°": "deg"}
+ANGLES = {"rad": "rad", "radians": "rad", "mrad": "mrad", "deg": "deg", "degrees": "deg", "°": "deg", "gon": "gon"}
 """Units as they are written, and their names."""
+LIST = re.compile(r"(?:[\w.]+\((?:'\w', *)?)?([\[(].*[\])])(?:, *dtype=[\w.]+)?\)?", re.DOTALL)
+"""A list in one cell, as Python, NumPy and ROS write it: [0.1, 0.2], (0.1, 0.2), [0.1 0.2], array('d', [0.1, 0.2])."""
+UNQUOTED = r"(?m)(^|{0})[ \t]*([\[(][-+\d.][^\[\]()\n]*[\])])[ \t]*(?={0}|\r?$)"
+STATISTICS = re.compile(
+    r"(mean|average|avg|mittel|moyenne|media|median|std|st\.? ?dev|standard|sigma|σ|rms|min|max|range|spannweite|count"
+    r"|anzahl|sum|ecart|écart)\w*[.:]?( ?(abw|dev|value|wert|error)\w*\.?)?:?",
+    re.IGNORECASE,
+)
+"""Words before the statistics of columns, below the rows."""
 OTHERS = re.compile(r"[mu]?s|sec|min|h|k?g|nm?|°?c|k|v|px|pixels?|%|-|none")
 
 
@@ -70,7 +79,11 @@ class CsvLines:
         self._aligned, self._commented = False, True
         self._last, self._extra = 0, 0  # line before the rows, and empty cells at the end of rows
         self._text, notes = _text(path, sep)
-        lines = list(islice(self._cells(), HEAD))
+        if sep != " " and '"' not in self._text:  # lists whose commas are no separators
+            self._text = re.sub(UNQUOTED.format(re.escape(sep)), r'\1"\2"', self._text)
+        self._lists = dict[int, tuple[int, ...]]()  # shapes of the lists that columns hold
+        self._lists = _lists(lines := list(islice(self._cells(), HEAD)))
+        lines = list(islice(self._cells(), HEAD)) if self._lists else lines
         if (width := max((len(cells) for _, cells in lines), default=0)) > MOST_COLUMNS:
             what, fix = f"file '{path}'", "check the separator (`sep`); one row is one configuration"
             raise MeasurementError.of(what, expected=f"at most {MOST_COLUMNS} columns", got=width, fix=fix)
@@ -99,6 +112,10 @@ class CsvLines:
             and not (named and cells[:expected] == self.header)
             and not (self._commented and _is_comment(cells))
         ]
+        words = [next(filter(None, cells)) for _, cells in kept]
+        last = list(takewhile(STATISTICS.fullmatch, reversed(words)))
+        if len({*last}) == len(last) < len(kept):  # not a word in all rows
+            kept = kept[: len(kept) - len(last)]
         sizes = expected, expected + self._extra
         bad = [(line, len(cells)) for line, cells in kept if len(cells) not in sizes or any(cells[expected:])]
         if bad:
@@ -109,7 +126,8 @@ class CsvLines:
             what, fix = f"file '{self.path}' has a header but no rows", "check that it was exported completely"
             raise MeasurementError.of(what, expected="at least one row of numbers", fix=fix)
         if skipped := sorted({line for line, _ in below} - {line for line, _ in kept}):
-            self.notes.append(f"{len(skipped)} line(s) with comments, names or nothing skipped (line {few(skipped)})")
+            what = "comments, names, statistics or nothing"
+            self.notes.append(f"{len(skipped)} line(s) with {what} skipped (line {few(skipped)})")
         return [(line, cells[:expected]) for line, cells in kept]
 
     def _cells(self) -> Iterator[tuple[int, list[str]]]:
@@ -120,7 +138,7 @@ class CsvLines:
         try:
             for cells in reader:
                 first, line = line + 1, reader.line_num  # a quoted cell may span lines
-                stripped = [cell.strip() for cell in cells]
+                stripped = [part for k, cell in enumerate(cells) for part in _parts(cell.strip(), self._lists.get(k))]
                 if len(stripped) > 1 or any(stripped):
                     yield first, stripped
         except csv.Error as error:
@@ -256,7 +274,7 @@ def _named(lines: Lines, comments: Sequence[bool], start: int, sizes: Sequence[i
     words = [
         (k, cells)
         for k, cells in before
-        if len(cells) in sizes and not _is_units(cells) and not any(map(_value, cells))
+        if len(cells) in sizes and not _is_units(cells) and (_counted(cells) or not any(map(_value, cells)))
     ]
     for k, cells in words:
         if all(cells[: sizes[0]]) and not repeated(cells[: sizes[0]]):
@@ -273,9 +291,9 @@ def _named(lines: Lines, comments: Sequence[bool], start: int, sizes: Sequence[i
 
 
 def _joined(names: list[list[str]]) -> list[str]:
-    """The names of the last of some lines; those that repeat with the names above them, such as "marker_X"."""
+    """The names of the last of some lines; those that repeat, or count, with the names above, such as "marker_X"."""
     *above, header = names
-    twice = {name for name in repeated(header) if name}
+    twice = {name for name in repeated(header) if name} | {*filter(str.isdecimal, header)}
     for line in above:
         for k in range(1, len(line)):
             line[k] = line[k] or line[k - 1]  # a name stands above the first of its columns alone
@@ -285,6 +303,35 @@ def _joined(names: list[list[str]]) -> list[str]:
         if twice and not any(repeated(found)):
             return found
     return header
+
+
+def _items(text: str) -> list[str]:
+    """The items of a list in one cell; none of another cell."""
+    found = LIST.fullmatch(text)
+    return re.findall(r"[^\s,;\[\]()'\"]+", re.sub(r"\w+\.\w+\(([^()]*)\)", r"\1", found[1])) if found else []
+
+
+def _lists(lines: Lines) -> dict[int, tuple[int, ...]]:
+    """Shapes of the lists that most lines hold in a place."""
+    found = dict[int, tuple[int, ...]]()
+    for place in range(max((len(cells) for _, cells in lines), default=0)):
+        texts = [cells[place] for _, cells in lines if len(cells) > place and cells[place]]
+        counts = [len(_items(text)) for text in texts]
+        count = max(counts, key=counts.count, default=0)
+        if count > 1 and 2 * counts.count(count) > len(counts):
+            rows = max(texts[counts.index(count)].count("[") - 1, 1)
+            found[place] = (rows, count // rows) if rows > 1 and count % rows == 0 else (count,)
+    return found
+
+
+def _parts(cell: str, shape: tuple[int, ...] | None) -> list[str]:
+    """The cells of columns that one column of lists stands for: their names, or what a list holds."""
+    if shape is None:
+        return [cell]
+    items, count = _items(cell), prod(shape)
+    if cell and not items and number(cell, ".") is None:
+        return [*names_of(cell, shape)]
+    return items if len(items) == count else [cell] * count if not items else [cell, *[""] * (count - 1)]
 
 
 def unit_of(text: str) -> str:
@@ -324,8 +371,13 @@ def _numbers(cells: Sequence[str]) -> int:
     """How many cells are numbers; 0 where they are less than half of those that are filled, or count the columns."""
     filled = [cell for cell in cells if number(cell, ".") is None or _value(cell)]
     found = sum(map(_value, filled))
-    counted = found > 3 and filled in ([str(k + first) for k in range(len(filled))] for first in (0, 1))
-    return 0 if counted or 2 * found < len(filled) else found
+    return 0 if _counted(cells) or 2 * found < len(filled) else found
+
+
+def _counted(cells: Sequence[str]) -> bool:
+    """Whether the numbers among some cells count joints or columns."""
+    found = [cell for cell in cells if _value(cell)]
+    return len(found) > 3 and found in ([str(k + first) for k in range(len(found))] for first in (0, 1))
 
 
 def write_rows(path: str | PathLike[str], names: Sequence[str], blocks: Iterable[Cells], table: TableFormat) -> None:

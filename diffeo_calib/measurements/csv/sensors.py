@@ -19,10 +19,12 @@ from diffeo_calib.measurements.csv.tables import FileRows
 from diffeo_calib.measurements.images import Known
 from diffeo_calib.measurements.observations import WITH_POSITION
 from diffeo_calib.measurements.poses import (
+    from_spherical,
     inverse_poses,
     of_frames,
     rotation_matrices,
     rotation_numbers,
+    to_spherical,
     transforms_of_frames,
 )
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
@@ -122,6 +124,9 @@ class PositionColumns(SensorColumns):
             [kind._replace(name=name) for names, kind in zip(own, kinds, strict=True) for name in names]
             for own in self.each
         ]
+        if form.spherical:
+            unit = form.spherical.rpartition("_")[2]
+            each = [[own[0], *(Column(one.name, unit) for one in own[1:3]), *own[3:]] for own in each]
         some = dict.fromkeys(one for own in each for one in own if one.check == DEVIATION or one.name == ZERO)
         shared = [one for one in some if sum(one in own for own in each) > 1]
         found = [Body([one for one in own if one not in shared], f"shows this {word}") for own in each]
@@ -135,6 +140,7 @@ class PositionColumns(SensorColumns):
         form, names, joints = self.form, None, rows.columns.joints.texts
         places = (rows.numbers(own.place) for own in self.each)
         points = torch.stack([torch.cat([own, 0.0 * own[:, : 3 - own.shape[1]]], 1) for own in places], 1)  # in a plane
+        points = from_spherical(points, form.spherical) if form.spherical else points
         std, turn_std = (
             torch.stack([rows.numbers(own[k]).expand(-1, 3) for own in self.each], 1) if self.each[0][k] else None
             for k in (2, 3)
@@ -198,6 +204,7 @@ class PositionColumns(SensorColumns):
         self, places: Tensor, frames: Tensor | None, std: Tensor | None, turn_std: Tensor | None
     ) -> dict[str, Tensor]:
         """Places (N, B, 3), rotations of frames (N, B, 4, 4), and deviations (N, B, 3), in SI, by their columns."""
+        places = to_spherical(places, self.form.spherical) if self.form.spherical else places
         turns = None if frames is None else rotation_numbers(frames[..., :3, :3], self.form.convention or "rotvec")
         parts = [(k, own) for k, own in enumerate((places, turns, std, turn_std)) if own is not None]
         each = ((own[:, body], names[k]) for body, names in enumerate(self.each) for k, own in parts)

@@ -2,7 +2,8 @@
 
 An array (N, k) has a column for each k, named after it and numbered from 1; (N, 3) of an array in a file of several is
 x, y, z where the name is that of places; of poses (N, 4, 4) the columns are numbered by row and column, 00 to 33. Of
-several arrays those with the most common number of rows are the table.
+several arrays those with the most common number of rows are the table; (k, N) among them is turned. Two sheets are one
+table if one column of both has the same texts.
 """
 
 from __future__ import annotations
@@ -88,10 +89,29 @@ def _spreadsheet(path: Path, file: BinaryIO) -> tuple[Rows, list[str]]:
     if not any(filled.values()):
         raise _no_table(path, "a spreadsheet without cells", "check that it was saved completely")
     best = max(filled, key=filled.__getitem__)
+    if (joined := _joined_sheets({name: sheets[name] for name in sheets if filled[name]})) is not None:
+        return joined
     others, rows = [name for name in sheets if name != best and filled[name]], sheets[best]
     used = [k for k in range(max(map(len, rows))) if any(len(row) > k and row[k] is not None for row in rows)]
     cells = [[_cell(row[k]) if len(row) > k else "" for k in used] for row in rows]
     return cells, [f"sheet '{best}' read, not {few(others)}"] * bool(others)
+
+
+def _joined_sheets(sheets: Mapping[str, Rows]) -> tuple[Rows, list[str]] | None:
+    """Two sheets whose first lines have one common name, with the same different texts below it, side by side."""
+    each = [[[*map(_cell, row)] for row in rows if any(row)] for rows in sheets.values()]
+    common = {*each[0][0]} & {*each[-1][0]} - {""} if len(each) == 2 else set[str]()
+    if len(common) != 1:
+        return None
+    (by,), (one, other) = common, each
+    first, second = ({row[rows[0].index(by)]: row for row in rows} for rows in each)
+    if {*first} != {*second} or len({len(own) for own in (one, other, first)}) > 1:
+        return None
+    cells = [
+        [*row, *(cell for name, cell in zip(other[0], second[key], strict=True) if name != by)]
+        for key, row in first.items()
+    ]
+    return cells, [f"sheets {' and '.join(map(repr, sheets))} joined by '{by}'"]
 
 
 def _cell(value: Any) -> str:
@@ -139,21 +159,24 @@ def _joined(path: Path, arrays: Mapping[str, Any]) -> tuple[Rows, list[str]]:
     cells = {name: array for name, array in known.items() if array.dtype.kind == "O"}  # of MATLAB
     known |= {name: array.astype(str) for name, array in cells.items() if all(isinstance(v, str) for v in array.flat)}
     usable = {name: array for name, array in known.items() if array.dtype.kind in "fiubUS" and 0 < array.ndim < 4}
-    counts = Counter[int]()
-    for array in usable.values():
-        counts[len(array)] += array[:1].size
+    tables, counts = Counter[int](), Counter[int]()  # arrays with so many rows or, of two axes, columns
+    for shape in (array.shape for array in usable.values()):
+        sizes = {*shape[:2]} if len(shape) == 2 else {shape[0]}
+        counts.update(sizes)
+        tables.update(sizes if len({*shape}) > 1 else ())
     if not counts:
         raise _no_table(path, f"the arrays {few(list(known))}", "save numbers of shape (N,) or (N, columns)")
-    rows = counts.most_common(1)[0][0]
+    rows = max(counts, key=lambda size: (tables[size], counts[size], size))
+    usable = {name: array.T if array.ndim == 2 and len(array) != rows else array for name, array in usable.items()}
     own = {name: array for name, array in usable.items() if len(array) == rows}
-    header = [column for name, array in own.items() for column in _names(name, array.shape[1:])]
+    header = [column for name, array in own.items() for column in names_of(name, array.shape[1:])]
     values = zip(*(_texts(array.reshape(rows, math.prod(array.shape[1:]))) for array in own.values()), strict=True)
     left = [name for name in known if name not in own]
     notes = [f"arrays {few(left)} left out: no numbers or texts of {rows} rows"] * bool(left)
     return [header, *([cell for part in row for cell in part] for row in values)], notes
 
 
-def _names(name: str, shape: tuple[int, ...]) -> Iterator[str]:
+def names_of(name: str, shape: tuple[int, ...]) -> Iterator[str]:
     """Columns of an array."""
     if not shape:
         yield name

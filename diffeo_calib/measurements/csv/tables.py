@@ -20,7 +20,7 @@ from diffeo_calib.measurements.checks import file_sha256
 from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, bad_cells, find_columns, number_hint, numbers_in
 from diffeo_calib.measurements.csv.columns import Body, Columns
 from diffeo_calib.measurements.csv.joints import PoseColumns
-from diffeo_calib.measurements.csv.lines import ANGLES, CsvLines, read_cells, stated_unit
+from diffeo_calib.measurements.csv.lines import ANGLES, CsvLines, Lines, read_cells, stated_unit
 from diffeo_calib.measurements.poses import (
     POINTS,
     inverse_poses,
@@ -133,7 +133,8 @@ def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
 
     Args:
         columns: which columns it has, and their units; the text "nan" is empty.
-        zeros: whether markers that are at 0, 0, 0 far from other rows are hidden there.
+        zeros: whether markers that are at 0, 0, 0 far from other rows are hidden there, and lines without joint values
+            are left out.
 
     Raises:
         MeasurementError: any mistake in the file; standard deviations that are not positive, negative payloads.
@@ -150,7 +151,10 @@ def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
     columns = replace(columns, numbers=tuple(one for one in columns.numbers if not (in_a_plane and one.name == ZERO)))
     places = find_columns(path, file.header, [*columns.names, *named], file.sep)
     _check_units(file, columns)
-    lines, rows = zip(*file.rows(), strict=True)
+    some = file.rows()
+    if columns.table.triples and zeros:
+        some = _with_joints(path, some, places[: len(columns.joints.columns)], fill=columns.table.marker is not None)
+    lines, rows = zip(*some, strict=True)
     cells = [[row[place] for row in rows] for place in places]
     words = [["" if text.lower() == "nan" else text for text in own] for own in cells[len(columns.names) :]]
     numbers, notes = _numbers(path, columns, lines, cells[: len(columns.names)])
@@ -177,6 +181,21 @@ def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
     if gone := [lines[row] for row in (~seen).nonzero()[:, 0].tolist()]:
         warn_user(f"file '{path}': no marker was seen in line {few(gone)}: {len(gone)} row(s) left out")
     return whole.of(seen)
+
+
+def _with_joints(path: Path, rows: Lines, places: Sequence[int], *, fill: bool) -> Lines:
+    """Lines with joint values: those without any are left out, or, where lines ``fill`` a pose, have those above."""
+    empty = {line for line, cells in rows if not any(cells[place] for place in places)}
+    if not empty or len(empty) == len(rows):
+        return rows
+    if not fill:
+        warn_user(f"file '{path}': no joint values in line {few(sorted(empty))}: {len(empty)} row(s) left out")
+        return [(line, cells) for line, cells in rows if line not in empty]
+    above, filled = dict[int, str](), list[tuple[int, list[str]]]()
+    for line, cells in rows:
+        above = above if line in empty else {place: cells[place] for place in places}
+        filled.append((line, [above.get(place, cell) for place, cell in enumerate(cells)]))
+    return filled
 
 
 def _numbers(
@@ -232,7 +251,7 @@ def _hide_marks(path: Path, columns: Columns, numbers: Tensor, lines: Sequence[i
     """
     at = columns.places([one for one in own.columns if one.what == "positions"])
     points, q = numbers[:, at], numbers[:, : len(columns.joints.columns)]
-    alike = (points == points[:, :1]).all(1)
+    alike = (points == points[:, :1]).all(1) & ((points[:, 0] == 0.0) | (len(at) > 1))  # a distance alone may repeat
     for mark in points[alike, 0].unique().tolist():
         lost = alike & (points[:, 0] == mark)
         seen = points[~lost & points.isfinite().all(1)] - mark

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.outliers import Outlier
 from diffeo_calib.calibration.diagnostics.row_order import common_cause
-from diffeo_calib.calibration.expected_errors import expected_errors
-from diffeo_calib.calibration.judgement import Accuracy, accuracy, judge
+from diffeo_calib.calibration.expected_errors import Accuracy, accuracy, expected_errors, judge
 from diffeo_calib.calibration.result import Part, parts
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
@@ -32,8 +31,8 @@ from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.predictions import FitRows, Predictions, forecast
 from diffeo_calib.reports.analysis.stages import Deviations, Kinematics, Repeats, repeats_of, stages_of
+from diffeo_calib.sensors.coordinates import Places
 from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
-from diffeo_calib.sensors.places import Places
 from diffeo_calib.sensors.tables import divided, measured_positions, measured_rows
 
 LOG = logging.getLogger(__name__)

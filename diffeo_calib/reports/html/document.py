@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from torch import Tensor
 
-from diffeo_calib.common.errors import printable
 from diffeo_calib.reports.plots import style
 from diffeo_calib.reports.plots.panels import joint_label, joint_values
 from diffeo_calib.robots.tree import Tree
@@ -114,11 +113,6 @@ def page(**parts: Any) -> str:
 def millimetres(metres: float) -> str:
     """A length in mm, as text."""
     return f"{1e3 * metres:.3f}"
-
-
-def marker_name(number: int, tips: Sequence[str]) -> str:
-    """A marker's number, with the tip that carries it where there are several: ``tips`` are those of all markers."""
-    return f"{number} on {printable(tips[number])}" if len(set(tips)) > 1 else str(number)
 
 
 def joint_values_by_row(robot: Tree, q: Tensor) -> list[list[str]]:

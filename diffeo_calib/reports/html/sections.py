@@ -21,7 +21,7 @@ from diffeo_calib.reports.analysis.findings import Findings, RowsOfKind
 from diffeo_calib.reports.analysis.predictions import FitRows, Predictions
 from diffeo_calib.reports.analysis.stages import STANDARD_REPEATS, Kinematics
 from diffeo_calib.reports.html import sentences
-from diffeo_calib.reports.html.document import Picture, Section, Table, joint_values_by_row, marker_name
+from diffeo_calib.reports.html.document import Picture, Section, Table, joint_values_by_row
 from diffeo_calib.reports.html.document import millimetres as mm
 from diffeo_calib.reports.html.document import rough_millimetres as rough
 from diffeo_calib.reports.plots import panels
@@ -256,7 +256,8 @@ def _largest(found: Findings, own: RowsOfKind) -> Table:
         lines.append(["expected RMS [mm]", *(mm(float(seen.claimed[row, body[row]])) for row in order)])
     lines += joint_values_by_row(found.model.robot, own.q[order])
     if own.errors.errors.shape[1] > 1:
-        lines.insert(0, ["marker", *(marker_name(int(body[row]), found.model.on) for row in order)])
+        on = [f" on {printable(tip)}" * (len({*found.model.on}) > 1) for tip in found.model.on]
+        lines.insert(0, ["marker", *(f"{number}{on[number]}" for number in body[order].tolist())])
     return Table(what, ["row", *(str(int(own.lines[row])) for row in order)], lines)
 
 
