@@ -54,6 +54,8 @@ FEWEST_POSES = 12
 """Different poses below which the data cannot determine the scales: defaults are used."""
 NOISE_SHARE = 0.3
 """Of the registration's residual, which counts as noise where the geometry has more parameters than there are data."""
+DOUBTED_WEIGHT = 0.25
+"""Of a row beside the geometric calibration, below which the first search for scales leaves it out."""
 FEWEST_JUDGED = 30
 """Rows below which leave-one-out errors are too few to judge the scales."""
 VARIANCE_RATIO = 2.5
@@ -135,12 +137,16 @@ def choose_scales(
         warn_user(sentence(f"{count} are too few to select scales: defaults are used", fix=fix))
         found = Selection(centre, f"defaults, since {count} are too few to select them")
     else:
-        found = select(centre, data, seed=seed, progress=progress)
+        # fields explain gross errors where these weigh as much as beside the geometry, whose errors are larger
+        found = select(centre, data.trusted(DOUBTED_WEIGHT), seed=seed, progress=progress)
         data = weighed(data, found.scales, seed)
-        if not found.interrupted:
-            start = None if data.tails.gross else found.scales  # which let the fields explain gross errors
+        again = True
+        while again and not found.interrupted:  # from the start once more where gross errors show only now
+            gross = data.tails.gross
+            start = None if gross else found.scales  # which let the fields explain gross errors
             found = select(centre, data, start=start, seed=seed, progress=progress)
             found, data = _supported(found, data, seed)
+            again = data.tails.gross and not gross
         found = replace(found, scales=with_payload_factor(data, found.scales, seed))
         how = {"poses": poses, "lines": measurements.line_numbers, "seed": seed, "progress": progress}
         centre, found, data = _with_position_errors(centre, found, data, **how)

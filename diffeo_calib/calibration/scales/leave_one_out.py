@@ -186,7 +186,8 @@ def cross_validated_inflation(
     rows, data = data.sample(len(data.x), MOST_COORDINATES, seed)
     numbers, new = motions(data.x, groups[rows]), new[rows]
     if centre is None or len(numbers[new].unique()) >= FEWEST_OUTSIDE:
-        squares = left_out_squares(data, scales, torch.where(torch.isin(numbers, numbers[new]), numbers, -1))
+        part = torch.where(torch.isin(numbers, numbers[new]), numbers, -1)
+        squares = left_out_rows(data, scales, part, data.noise_of_new_rows(scales))[1]
         squares[~new] = nan
     else:
         squares, folds = torch.full_like(data.tails.weights, nan), random_folds(numbers, FOLDS, seed)
@@ -197,7 +198,8 @@ def cross_validated_inflation(
                 if again.interrupted:
                     return None
                 part = torch.where(torch.isin(numbers, numbers[rows]), numbers, -1)
-                squares[rows] = left_out_squares(data, again.scales, part)[rows]
+                own = left_out_rows(data, again.scales, part, data.noise_of_new_rows(again.scales))[1]
+                squares[rows] = own[rows]
         except KeyboardInterrupt:
             return None
     squares = squares.masked_fill(data.tails.weights < OUTLIER_WEIGHT, nan)
@@ -261,11 +263,3 @@ def motions(x: Tensor, groups: Tensor) -> Tensor:
             labels = lowest.scatter_reduce(0, together, labels, "amin")[together]
     found = labels.unique(return_inverse=True)[1]
     return found if int(found.max()) + 1 >= FEWEST_MOTIONS else groups.unique(return_inverse=True)[1]
-
-
-def left_out_squares(data: TangentData, scales: Hyperparameters, part: Tensor) -> Tensor:
-    """Squared errors (N, bodies) of rows predicted without their part (N,), in units of those predicted for new rows.
-
-    NaN for hidden markers, and for rows of no part.
-    """
-    return left_out_rows(data, scales, part, data.noise_of_new_rows(scales))[1]

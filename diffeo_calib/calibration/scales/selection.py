@@ -91,7 +91,7 @@ def select(
     Returns:
         the best scales that were evaluated; Ctrl-C ends the search early.
     """
-    subset = data.sample(POSES, COORDINATES, seed)[1].good
+    subset = data.sample(POSES, COORDINATES, seed)[1].trusted(0.5 * data.tails.gross)  # likely good ones
     search = _Search(centre, subset, progress)
     try:
         if start is not None:

@@ -209,13 +209,10 @@ class TangentData:
         rows = order[:count].sort().values.to(self.x.device)
         return rows, self.rows(rows)
 
-    @property
-    def good(self) -> TangentData:
-        """Leave out what is more likely gross: by its weights it would hold the noise where it was."""
-        if not self.tails.gross:
-            return self
-        gross = (self.tails.weights < 0.5).repeat_interleave(self.noise_model.size, 1)
-        return self._variant(noise_model=replace(self.noise_model, visible=self.visible & ~gross))
+    def trusted(self, least: float) -> TangentData:
+        """Leave out what has smaller weights: by these it would hold the noise where it was."""
+        small = (self.tails.weights < least).repeat_interleave(self.noise_model.size, 1)
+        return self._variant(noise_model=replace(self.noise_model, visible=self.visible & ~small))
 
     def with_tails(self, tails: Tails) -> TangentData:
         """Change the weights."""
