@@ -48,6 +48,10 @@ class SampledRows(NamedTuple):
         motion = self.in_coordinates(effects) @ u
         return motion.unflatten(1, (-1, 3 if motion.shape[1] % 3 == 0 else motion.shape[1])).norm(dim=2)
 
+    def left(self, E: Tensor) -> float:
+        """Part of the RMS left-out error that remains beside unknowns of any size with effects (M, U)."""
+        return left_out_rms(self.process.opened(E)) / left_out_rms(self.process)
+
 
 def left_out_rms(process: Process) -> float:
     """RMS of the errors of rows, m, as all other rows predict them."""

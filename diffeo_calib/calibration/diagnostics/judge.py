@@ -120,16 +120,20 @@ def judge(
         found += [own for one in changes if one.name == MARKERS for own in two_tools(rows, one.effects, lines)]
         found += other_payloads(rows, some, data, scales, lines)
     opens &= len(rows.index) == len(data.x)
-    before = left_out_rms(rows.process)
-    shares = ((left_out_rms(rows.process.opened(one.columns)) / (before * one.most), one) for one in found)
+    return best_of([one if opens else one._replace(opens="") for one in found], rows)
+
+
+def best_of(found: Iterable[Candidate], rows: SampledRows) -> Finding | None:
+    """That with which left-out errors fall most, relative to what may remain."""
+    shares = ((rows.left(one.columns) / one.most, one) for one in found)
     share, best = min(shares, key=lambda own: own[0], default=(inf, None))
     if best is None or share > 1.0:
         return None
     left = share * best.most
-    moved = before * (1.0 - left**2) ** 0.5
+    moved = left_out_rms(rows.process) * (1.0 - left**2) ** 0.5
     got = f"about {1e3 * moved:.2g} mm of error, and leave-one-out errors that fall to {100 * left:.0f} % beside it"
     fix, columns = best.fix, None
-    if best.opens and opens and moved < OPENED_M:
+    if best.opens and moved < OPENED_M:
         fix += f"; the model holds for {best.opens}"
         columns = rows.in_coordinates(rows.process.numbers.in_table(best.columns))
         columns = OPENED_M * columns / columns[columns.any(2)].square().sum(1).mean().sqrt()
