@@ -30,8 +30,10 @@ from torch import Tensor
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.scales import position_errors
 from diffeo_calib.calibration.scales.leave_one_out import (
+    FEWEST_HALVED,
     LeaveOneOut,
     cross_validated_inflation,
+    inflation_by_parts,
     inflation_by_places,
     leave_one_out,
     variance_ratio,
@@ -48,6 +50,7 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.observation import LinearFunctionals, Observation
 from diffeo_calib.process.scales import DEVIATIONS, FOUND, SCALES, GearLine, Hyperparameters
+from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.tree import Tree
 
 FEWEST_POSES = 12
@@ -174,6 +177,8 @@ def _inflated(
         if centre is None or (poses >= FEWEST_POSES and not found.interrupted):
             inflation = cross_validated_inflation(centre, found.scales, data, groups, seed=seed, progress=progress)
             found = replace(found, interrupted=inflation is None)
+        if is_cartesian(data.nominal.geometry.chain) and poses >= FEWEST_HALVED:
+            inflation = max(inflation or few, inflation_by_parts(data, found.scales, seed))
         least = float(data.tails.gross or measurements.without_device)  # no reading shows every direction
         factor = max(inflation or few, least)
         row_scales = found.scales if factor < 1.0 else None  # narrow regions make no outliers

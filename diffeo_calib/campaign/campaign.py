@@ -31,7 +31,7 @@ from diffeo_calib.robots.tree import Tree
 
 FIRST_ROWS = 12
 """Accepted rows of the first model."""
-ROWS_GROWTH_PER_MODEL, WAITING_GROWTH, TOGETHER = 1.5, 4.0, 24
+ROWS_GROWTH_PER_MODEL, WAITING_GROWTH, TOGETHER = 1.5, 2.5, 24
 """Factor by which the accepted rows grow between two models, and between those while more rows wait; most rows that are
 judged together."""
 FIRST_SCALES, SCALES_GROWTH = 20, 2.0

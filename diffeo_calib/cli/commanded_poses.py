@@ -123,6 +123,9 @@ def source_of(sheet: Sheet) -> Source:
         got = f"{percent(found[0].left)} of what the rows vary unexplained" if found else "no way to read them"
         what = f"poses of the machine in {few(used, 16)}"
         fix = "check that the rows belong together, or write the campaign file yourself; for joints name the robot"
+        if not machine.turn:  # by two axes, in columns of any names
+            fix += "; if the machine turns too, a function makes its poses: "
+            fix += f"fit --robot-pose {','.join(used)},...=FILE.py:NAME"
         raise InputError.of(what, expected="a convention and units that explain the rows", got=got, fix=fix)
     limit = gates.READINGS_TOLD_APART * found[0].left
     metres, units = limit * _varied(found[0]), (found[0].table.length, found[0].table.joint_length)

@@ -154,17 +154,14 @@ class Source:
         size = float(torch.cat([one.reported.flatten() for one in lengths]).square().mean().sqrt())
         return rough_error(Geometry.nominal(self.robot), lengths) / max(size, SMALLEST_SPREAD_M)
 
-    @property
-    def largest_set_up(self) -> Measurements | None:
-        """Its positions; None where there are none, or the table cannot be read so."""
-        with quiet(), suppress(DiffeoCalibError):
-            found = measured_positions(self.data) if self.rows.markers else None
-            return None if found is None else found.largest_session()
-        return None
-
     def positions(self) -> Iterator[tuple[Source, Measurements]]:
         """Ways in all units that can be read, with the positions of the largest set-up; none where there are none."""
-        return ((one, own) for one in self.in_units() if (own := one.largest_set_up) is not None)
+        for one in self.in_units() if self.rows.markers else ():
+            found = None
+            with quiet(), suppress(DiffeoCalibError):
+                found = measured_positions(one.data)
+            if found is not None:
+                yield one, found.largest_session()
 
     def in_units(self, *, slides: bool = False) -> Iterator[Source]:
         """Ways in units of length and angle, and with a camera on the tool; ``slides`` in another unit than lengths."""
@@ -186,11 +183,6 @@ class Source:
         places = [name for triple in self.rows.markers for name in triple[:lengths]]
         pairs = *product(turning, (self.table.angle,)), *product(places, (self.table.length,))
         return [name for name, unit in pairs if column(name).unit not in ("", unit)]
-
-    @property
-    def q(self) -> Tensor:
-        """(N, n) joint values, rad or m."""
-        return self.data.q
 
 
 def ranked(ways: Iterable[Source]) -> list[Source]:
@@ -307,7 +299,7 @@ def with_units(source: Source) -> Source:
         found = others if is_clear(others) else found
     if not any(periodic):  # all lengths in another unit are another size, which the rows do not show
         low, high = source.robot.limits.unbind(1)
-        values = [(one, one.q) for one in found if one.left < inf]
+        values = [(one, one.data.q) for one in found if one.left < inf]
         inside = [(one, q.amax(0) - q.amin(0)) for one, q in values if bool(((q >= low) & (q <= high)).all())]
         if chosen := [one for one, moved in inside if float((moved / (high - low)).max()) > SMALLEST_PART]:
             found, why = chosen, ", by the limits of the joints: the numbers leave it open"
@@ -352,7 +344,7 @@ def _unclear(found: Sequence[Source], *, excluded: bool) -> InputError:
     fix += "check the table's joints against the robot's, or write the file yourself; of a robot with several tips "
     fix += "the columns of each are to be named after it, such as left_x"
     for one in (own for own in found if own.table.angle == "deg" and own.left < inf):
-        largest = zip(one.joints, one.robot.periodic, one.q.abs().amax(0).rad2deg().tolist(), strict=True)
+        largest = zip(one.joints, one.robot.periodic, one.data.q.abs().amax(0).rad2deg().tolist(), strict=True)
         if far := {name: most for name, turns, most in largest if turns and most > LARGEST_TURN_DEG}:
             got = f"up to {max(far.values()):.4g} in {few([*far])}: no angles, but pulses or ticks of encoders"
             fix = (

@@ -204,6 +204,8 @@ class MeasuredTable:
         session = given.session if triples or not given.readings else None  # of readings it names their devices
         table = replace(of_robot(given, robot), session=session)
         data = read_observations(self.csv, table, duplicates=self.duplicates, growing=self.growing)
+        if not self.growing:
+            data.warn_of_copies()
         named: Any = given.marker and data.origin.columns.table.marker
         if given.marker != named:  # later tables have the same order
             say(f"markers: {', '.join(data.marker_names)}, numbered from 0 in this order")

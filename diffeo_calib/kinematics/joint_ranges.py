@@ -61,12 +61,10 @@ def fitted_configurations(model: object) -> Tensor:
 
 
 def repeated_lines(model: Any, q: Tensor) -> list[str]:
-    """A sentence if all configurations (N, n) are those of the fit: they say little about other poses."""
-    fitted = fitted_configurations(model)
-    if not len(q) or bool((torch.cdist(q, fitted.to(q), p=inf).amin(1) > REPEATED).any()):
-        return []
-    what = f"all {len(q)} rows repeat joint values of the fit: errors at other poses are larger, and copies of its rows"
-    return [f"{what}, also with fewer digits, tell nothing new"]
+    """A sentence if configurations (N, n) are those of the fit: they say little about other poses."""
+    count = int((torch.cdist(q, fitted_configurations(model).to(q), p=inf).amin(1) <= REPEATED).sum()) if len(q) else 0
+    what = f"{count} of {len(q)} rows repeat joint values of the fit: errors at other poses are larger, and copies of"
+    return [f"{what} its rows, also with fewer digits, tell nothing new"] * bool(count)
 
 
 def refuse_other_angles(model: Any, q: object) -> None:

@@ -148,17 +148,21 @@ class RowGroups:
 
     def doubted(self, doubt: bool = True) -> Self:
         """Warn about exact copies of rows and joint values that look like degrees."""
-        pairs = self.copies() if doubt else []
-        if pairs:
-            where = f"first row {pairs[0][1]}, of row {pairs[0][0]}"
-            text = f"{len(pairs)} of {len(self)} rows repeat an earlier row exactly: {where}"
-            warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
+        if doubt:
+            self.warn_of_copies()
         largest, joint = (float(value) for value in self.q.abs().amax(dim=0).max(dim=0))
         if doubt and largest > checks.LARGEST_JOINT_ANGLE_RAD:  # the kinds of the joints are not known
             name = f" ('{self.joint_names[int(joint)]}')" if self.joint_names else ""
             text = f"`q`, column {int(joint)}{name} reaches {largest:g}: values look like degrees, or like millimetres"
             warn_user(f"{text} of a prismatic joint; convert them to rad or m if they are.")
         return self
+
+    def warn_of_copies(self) -> None:
+        """Warn about exact copies of rows, which predict each other."""
+        if pairs := self.copies():
+            earlier, later = (self.row_names[row] for row in pairs[0])
+            text = f"{len(pairs)} of {len(self)} rows repeat an earlier row exactly: first {later}, of {earlier}"
+            warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
 
     @classmethod
     def in_one(cls, tables: Sequence[Self]) -> Self:

@@ -9,21 +9,26 @@ from math import inf
 import numpy as np
 import pytest
 import torch
-from product_bank import usual_scales
+from product_bank import scales_of, usual_scales
 from scipy.stats import chi2
 from tangent_bank import Setting, built, covariance, normal, prior_covariance
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.scales import leave_one_out as one_out
 from diffeo_calib.calibration.scales.leave_one_out import (
     LeaveOneOut,
     cross_validated_inflation,
+    halved,
+    inflation_by_parts,
     leave_one_out,
     motions,
     random_folds,
+    variance_ratio,
 )
 from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.fitting.result import silent
 from diffeo_calib.process.tails import Tails, reweight
 from diffeo_calib.robots import SimulatedArm
 
@@ -155,3 +160,25 @@ def test_right_scales_are_hardly_widened(monkeypatch: pytest.MonkeyPatch) -> Non
         found.append(cross_validated_inflation(scales, scales, drawn, rows, seed=seed) or 0.0)
     assert min(found) > 0.5
     assert 0.9 < np.median(found) < 1.7, found
+
+
+def test_parts_of_the_space_show_errors_that_no_row_does() -> None:
+    """A field below the noise, three times as large as the scales say."""
+    x = 0.5 * torch.rand(192, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    data = place(dc.cartesian(x), dc.Measurements(x, x + 1e-4 * normal(*x.shape, seed=0)), silent).tangent_data()
+    quiet = dict.fromkeys(("transmission_amplitude", "task_amplitude", "joint_noise"), 1e-8)
+    right, small = (
+        scales_of(3, 3, coupled_lengthscale=0.15, coupled_amplitude=size, sensor_noise=1e-4, **quiet)
+        for size in (6e-5, 2e-5)
+    )
+    factor, by_parts, by_rows = torch.linalg.cholesky(covariance(data, right)), [], []
+    for seed in range(3):
+        target = (factor @ normal(data.y.numel(), seed=seed)).view_as(data.y)
+        drawn = replace(data, y=data.y + target - data.target)
+        by_rows.append(variance_ratio(drawn, leave_one_out(drawn, small)))
+        by_parts.append([inflation_by_parts(drawn, scales) for scales in (right, small)])
+    found = np.median(by_parts, 0)
+    assert 0.9 < found[0] < 1.4, by_parts
+    assert found[1] > 1.25 * np.median(by_rows), (by_parts, by_rows)
+    assert halved(x.repeat(2, 1))[:192].equal(halved(x.repeat(2, 1))[192:])  # repeats are left out together
+    assert halved(x).bincount().tolist() == [6] * 32

@@ -157,7 +157,7 @@ def test_rows_together_have_the_verdicts_of_single_ones(running: dc.Campaign, me
     assert campaign.expected_error == pytest.approx(other.expected_error, rel=1e-8)
     assert other._due == 30
     other._waiting = 1000 - len(other.accepted)
-    assert other._due == 62.5
+    assert other._due == 64
 
 
 def test_the_next_poses_help_more_than_any_others(running: dc.Campaign) -> None:

@@ -90,11 +90,14 @@ def test_absurd_errors_without_a_known_mistake_are_printed(
 
 
 def test_rows_that_repeat_those_of_the_fit_are_said(site: Site, path: Path, command: Command, tmp_path: Path) -> None:
-    """A copy of the fit's rows with fewer digits, but not rows of other poses."""
-    train, test = site.data.split(0.7, seed=0)
-    for q, points, repeated in ((train.q.round(decimals=4), train.points, True), (test.q, test.points, False)):
-        done = command("evaluate", path, written(site, tmp_path / "t.csv", q, points), *TABLE)
-        assert ("rows repeat joint values of the fit" in " ".join(done.out.split())) == repeated
+    """A copy of rows of the fit with fewer digits, but not rows of other poses; and copies among the new rows."""
+    (train, test), copies = site.data.split(0.7, seed=0), site.data[[0, 1, 1]]
+    q, points = site.data.q.round(decimals=4), site.data.points
+    for one, own, count in ((q, points, len(train)), (test.q, test.points, 0)):
+        done = command("evaluate", path, written(site, tmp_path / "t.csv", one, own), *TABLE)
+        assert (f"{count} of 40 rows repeat joint values of the fit" in " ".join(done.out.split())) == bool(count)
+    done = command("evaluate", path, written(site, tmp_path / "t.csv", copies.q, copies.points), *TABLE)
+    assert "1 of 3 rows repeat an earlier row exactly: first row 4, of row 3" in done.warnings[0]
 
 
 def test_wrong_rows_are_named(site: Site, path: Path, command: Command, tmp_path: Path) -> None:

@@ -194,6 +194,7 @@ def test_marks_of_rows_are_labels_where_all_have_them(read: Reader) -> None:
     disabled = [NAMES, *([f"#{row[0]}", *row[1:]] for row in CELLS[:6]), *CELLS[6:]]
     with pytest.warns(DiffeoCalibWarning, match="6 line"):
         assert len(read(separated(",", disabled), **FORMAT)) == 2
+    assert len(read(separated(",", [["id", *NAMES], ["P1", *CELLS[0]], ["max", *CELLS[1]]]), **FORMAT)) == 2
     damaged = [NAMES, *CELLS[:2], ["#VALUE!", *CELLS[2][1:]], *CELLS[3:]]
     with pytest.raises(MeasurementError, match="line 4, column 'q1': expected a number, got '#VALUE!'"):
         read(separated(",", damaged), **FORMAT)

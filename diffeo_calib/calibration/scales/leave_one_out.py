@@ -18,6 +18,10 @@ repeats, help each other: they are left out together, and count as one.
 Rows in sockets have a fold for each place. What decides about errors elsewhere, such as the size of the robot, shows
 only by place: each place is one degree of freedom of the ratio, however many rows it has. Positions that were measured
 beside them show it too, and add one for each configuration.
+
+A machine with commanded poses is known by a field alone. With many rows its error is far below the noise of each, where
+no row contradicts it. Neighbours share it: parts of the space are left out, and their errors judged along the few
+directions in which these are the most uncertain, close to the means over the part.
 """
 
 from __future__ import annotations
@@ -158,6 +162,9 @@ OUTLIER_WEIGHT = 0.05
 """Of a row below which it is a gross error, which no region is meant to hold."""
 FEWEST_PLACES = 2
 """Places that a single one counts as: without a second one nothing can be left out."""
+HALVINGS, FEWEST_HALVED, PART_MODES = 5, 100, 3
+"""How often the space of commanded poses is halved into parts that are left out, rows from which it is, and directions
+in which the error of a part is judged."""
 
 
 def cross_validated_inflation(
@@ -231,6 +238,36 @@ def inflation_by_places(
     count = int(resting[owner].sum()) - 3 * sockets
     units = max(len(place[resting].unique()), FEWEST_PLACES) + len(groups[~resting].unique())
     return max(total / max(count, 1), 1.0) * region_factor(units, 3)
+
+
+def inflation_by_parts(data: TangentData, scales: Hyperparameters, seed: int = 0) -> float:
+    """Inflation of a field by parts of the space of inputs that are left out, scales kept.
+
+    Args:
+        data: the measurements. scales: held fixed. seed: draws the rows that stand for all where there are many.
+    """
+    data = data.sample(len(data.x), MOST_COORDINATES, seed)[1]
+    process = data.process(scales)
+    part = halved(data.x)[process.numbers.owner]
+    errors, covariance = process.left_out(part)
+    squares = list[Tensor]()
+    for own in part.unique():
+        at = (part == own).nonzero()[:, 0]
+        values, modes = torch.linalg.eigh(covariance[at[:, None], at])
+        squares.append(((modes.mT @ errors[at]).square() / values)[-PART_MODES:].mean())  # hidden rows have fewer
+    return region_scale(PART_MODES * torch.stack(squares), PART_MODES)
+
+
+def halved(x: Tensor) -> Tensor:
+    """(N,) part of the space, 0 to 31, of inputs (N, n): halved along the widest one; repeats stay together."""
+    scaled = (x - x.amin(0)) / (x.amax(0) - x.amin(0)).clamp(min=torch.finfo(x.dtype).tiny)
+    part = torch.zeros(len(x), dtype=torch.int64, device=x.device)
+    for _ in range(HALVINGS):
+        for own in part.unique().flip(0):  # no new number is still to be halved
+            at = (part == own).nonzero()[:, 0]
+            along = scaled[at, (scaled[at].amax(0) - scaled[at].amin(0)).argmax()]
+            part[at] = 2 * own + (along > along.median())
+    return part
 
 
 def random_folds(groups: Tensor, count: int, seed: int) -> list[tuple[Tensor, Tensor]]:

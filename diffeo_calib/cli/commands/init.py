@@ -193,7 +193,7 @@ def _tips_named(paths: Sequence[list[JointElement]], markers: Sequence[Column]) 
 def _with_tip(robot: Path, source: Source, arm: Arm) -> Source:
     """Drop joints at the end that no marker follows, and say why the tip is there."""
     left_out = list[str]()
-    moved = (source.q.amax(0) - source.q.amin(0)).tolist()
+    moved = (source.data.q.amax(0) - source.data.q.amin(0)).tolist()
     while len(arm.joints) > 1 and source.value("joints"):
         count = len(arm.joints) - 1
         shorter, last = arm.first(count), arm.joints[count]

@@ -48,12 +48,13 @@ ANGLES = {"rad": "rad", "radians": "rad", "mrad": "mrad", "deg": "deg", "degrees
 LIST = re.compile(r"(?:[\w.]+\((?:'\w', *)?)?([\[(].*[\])])(?:, *dtype=[\w.]+)?\)?", re.DOTALL)
 """A list in one cell, as Python, NumPy and ROS write it: [0.1, 0.2], (0.1, 0.2), [0.1 0.2], array('d', [0.1, 0.2])."""
 UNQUOTED = r"(?m)(^|{0})[ \t]*([\[(][-+\d.][^\[\]()\n]*[\])])[ \t]*(?={0}|\r?$)"
+"""A list between separators, which its own commas are not."""
 STATISTICS = re.compile(
-    r"(mean|average|avg|mittel|moyenne|media|median|std|st\.? ?dev|standard|sigma|σ|rms|min|max|range|spannweite|count"
-    r"|anzahl|sum|ecart|écart)\w*[.:]?( ?(abw|dev|value|wert|error)\w*\.?)?:?",
+    r"(?:(mean|average|avg|mittel|moyenne|media|std|st\.? ?dev|standard|rms)|median|sigma|σ|min|max|range|spannweite"
+    r"|count|anzahl|sum|ecart|écart)\w*[.:]?( ?(abw|dev|value|wert|error)\w*\.?)?:?",
     re.IGNORECASE,
 )
-"""Words before the statistics of columns, below the rows."""
+"""Words before the statistics of columns, below the rows; a mean or a deviation is among them."""
 OTHERS = re.compile(r"[mu]?s|sec|min|h|k?g|nm?|°?c|k|v|px|pixels?|%|-|none")
 
 
@@ -79,7 +80,7 @@ class CsvLines:
         self._aligned, self._commented = False, True
         self._last, self._extra = 0, 0  # line before the rows, and empty cells at the end of rows
         self._text, notes = _text(path, sep)
-        if sep != " " and '"' not in self._text:  # lists whose commas are no separators
+        if sep != " " and re.search(r"[\[(][-+\d.]", self._text[:AT_ONCE]) and '"' not in self._text:
             self._text = re.sub(UNQUOTED.format(re.escape(sep)), r'\1"\2"', self._text)
         self._lists = dict[int, tuple[int, ...]]()  # shapes of the lists that columns hold
         self._lists = _lists(lines := list(islice(self._cells(), HEAD)))
@@ -112,9 +113,9 @@ class CsvLines:
             and not (named and cells[:expected] == self.header)
             and not (self._commented and _is_comment(cells))
         ]
-        words = [next(filter(None, cells)) for _, cells in kept]
-        last = list(takewhile(STATISTICS.fullmatch, reversed(words)))
-        if len({*last}) == len(last) < len(kept):  # not a word in all rows
+        found = (STATISTICS.fullmatch(next(filter(None, cells))) for _, cells in reversed(kept))
+        last = [(own[0], own[1]) for own in takewhile(bool, found) if own]
+        if len({*last}) == len(last) < len(kept) and any(sure for _, sure in last):  # no word of all rows, or a name
             kept = kept[: len(kept) - len(last)]
         sizes = expected, expected + self._extra
         bad = [(line, len(cells)) for line, cells in kept if len(cells) not in sizes or any(cells[expected:])]
@@ -138,7 +139,9 @@ class CsvLines:
         try:
             for cells in reader:
                 first, line = line + 1, reader.line_num  # a quoted cell may span lines
-                stripped = [part for k, cell in enumerate(cells) for part in _parts(cell.strip(), self._lists.get(k))]
+                stripped = [cell.strip() for cell in cells]
+                if self._lists:
+                    stripped = [part for k, cell in enumerate(stripped) for part in _parts(cell, self._lists.get(k))]
                 if len(stripped) > 1 or any(stripped):
                     yield first, stripped
         except csv.Error as error:

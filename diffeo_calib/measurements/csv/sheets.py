@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from io import BytesIO, StringIO
-from itertools import product
+from itertools import compress, product
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -107,10 +107,8 @@ def _joined_sheets(sheets: Mapping[str, Rows]) -> tuple[Rows, list[str]] | None:
     first, second = ({row[rows[0].index(by)]: row for row in rows} for rows in each)
     if {*first} != {*second} or len({len(own) for own in (one, other, first)}) > 1:
         return None
-    cells = [
-        [*row, *(cell for name, cell in zip(other[0], second[key], strict=True) if name != by)]
-        for key, row in first.items()
-    ]
+    kept = [name != by for name in other[0]]
+    cells = [[*row, *compress(second[key], kept)] for key, row in first.items()]
     return cells, [f"sheets {' and '.join(map(repr, sheets))} joined by '{by}'"]
 
 
