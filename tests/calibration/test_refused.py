@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 from kind_bank import kind_named
+from math_bank import normal
 from product_bank import Case, simulated, with_usual_scales
 from table_bank import refused, warned
 from torch import Tensor
@@ -25,10 +26,6 @@ from diffeo_calib.robots import Joint, SimulatedArm
 NOT_THIS_ROBOT = "the measurements do not fit this robot"
 ARM, ROWS, _ = simulated(30)
 ROBOT, Q, POINTS = ARM.nominal, ROWS.q, ROWS.points
-
-
-def normal(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 # --- refused ----------------------------------------------------------------------------------------------------------

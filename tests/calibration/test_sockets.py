@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -12,7 +13,7 @@ from kind_bank import kind_named
 from product_bank import with_usual_scales
 from reading_bank import scales
 from simulated_sockets import SocketRows, rest_in_sockets
-from table_bank import refused
+from table_bank import refused, warned
 from tangent_bank import covariance
 from torch import Tensor
 
@@ -191,6 +192,18 @@ def test_rows_in_a_wrong_socket_are_named(plain: SimulatedArm, some: SocketRows)
     names[3], names[20] = "0/1", "0/0"
     with pytest.warns(dc.DiffeoCalibWarning, match=r"2 of 36 rows .* row 3 fits '0/0', row 20 fits '1/1'"):
         place(plain.nominal, table(some, tuple(names)), silent)
+
+
+def test_a_known_distance_is_judged_by_how_well_its_own_rows_fit(plain: SimulatedArm, some: SocketRows) -> None:
+    """Bent links leave its sockets apart from the others."""
+    data, found = table(some), register_sockets(plain.nominal, some.q, table(some).socket_numbers)
+    positions, own = found.positions.clone(), data.socket_numbers < 2
+    positions[1] += positions[1] - positions[0]
+    spread = found.distances.masked_fill(own, 0.02)
+    for distances, doubted in ((found.distances, True), (spread, False)):
+        again = replace(found, positions=positions, distances=distances)
+        _, texts = warned(check_socket_registration, plain.nominal, data, again)
+        assert any("known distance of the sockets" in one for one in texts) == doubted
 
 
 @pytest.mark.filterwarnings("ignore:the known distance")

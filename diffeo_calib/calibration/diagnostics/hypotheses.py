@@ -117,7 +117,7 @@ OF_MIMIC = "check the multiplier of this joint in the robot's description"
 
 
 def lengths_of(data: TangentData) -> Iterator[Hypothesis]:
-    """The whole robot, the axes of its measuring device, and single links."""
+    """The whole robot, the axes of its measuring device, slides, and what joints are to those that they follow."""
     geometry = data.nominal.geometry
     away = data.places.unflatten(1, (-1, 3)) - geometry.base[:3, 3].to(data.x.device)
 
@@ -143,6 +143,12 @@ def lengths_of(data: TangentData) -> Iterator[Hypothesis]:
             value = q @ chain.coupling[joint].to(q)
             along = (moved * value[:, None])[..., None]
             yield Hypothesis(f"the multiplier of {name}", along, fix=OF_MIMIC, **ratio)
+
+
+def links_of(data: TangentData) -> Iterator[Hypothesis]:
+    """Single links."""
+    chain = data.nominal.geometry.chain
+    for joint, name in enumerate(chain.moving_names):
         offset = chain.offsets[joint].to(data.x.device)
         length = float(offset[:3, 3].norm())
         if chain.before[joint] >= 0 and length > gates.LINK_M:  # the first joint's is where the base stands

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import inf, log
+from math import hypot, inf, log
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -34,6 +34,7 @@ from diffeo_calib.calibration.diagnostics.hypotheses import (
     changes_of,
     left_out_rms,
     lengths_of,
+    links_of,
     worth_it,
 )
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, variance_ratio
@@ -100,7 +101,7 @@ def judge(
     bodies: Mapping[str, str] = MappingProxyType({}),
     opens: bool = True,
 ) -> Finding | None:
-    """The explanation with which left-out errors fall most, relative to what its kind asks for; None without any.
+    """The explanation with which left-out errors fall most, relative to what may remain; None without any.
 
     Args:
         data, scales, left_out: the rows of a calibration, its scales and left-out errors. lines: (N,) of the rows in
@@ -426,12 +427,17 @@ def warn_of_taken_scales(taken: LeaveOneOut, own: LeaveOneOut) -> None:
 # --- lengths against what they are said to be -------------------------------------------------------------------------
 
 
+LEAST_OWN = 1e-6
+"""Part of what rows say of a length that must be left beside links of any size, else they tell nothing of it."""
+
+
 class Length(NamedTuple):
     """A length against what it is said to be.
 
     Args:
         cause: what. value, deviation: how much it differs, in m or relative. motion: RMS motion of a point by a unit of
             it, m. unnoticed: largest value that a usual robot shows by chance, and that passes without a warning.
+        taken_up: whether it is surely the robot's, and so part of the fit.
     """
 
     cause: Hypothesis
@@ -439,6 +445,12 @@ class Length(NamedTuple):
     deviation: float
     motion: float
     unnoticed: float
+    taken_up: bool
+
+    @property
+    def gain(self) -> float:
+        """What it explains, in log evidence."""
+        return 0.5 * (self.value / self.deviation) ** 2
 
     def __str__(self) -> str:
         unit, size = self.cause.unit or MILLIMETRE
@@ -453,6 +465,9 @@ class Length(NamedTuple):
 def lengths(data: TangentData, scales: Hyperparameters, devices: Iterable[Hypothesis] = ()) -> list[Length]:
     """Lengths against what they are said to be, that of the whole robot first, beside errors of usual size.
 
+    Links that explain the rows far better than anything that a device may have wrong are the robot's, and are opened
+    for all others; if then nothing else is wrong.
+
     Args:
         data: the measurements. scales: those of the model. devices: what devices are said to hold, such as a focal
             length.
@@ -463,27 +478,40 @@ def lengths(data: TangentData, scales: Hyperparameters, devices: Iterable[Hypoth
     usual["transmission_amplitude"] = scales.transmission_amplitude.minimum(most)
     known = replace(scales, **usual)
     rows, some = SampledRows.of(data, scales if torch.equal(known.vector, scales.vector) else known)
-    causes = [*lengths_of(some), *(one._replace(effects=one.effects[rows.index]) for one in devices)]
+    links, others = [*links_of(some)], (one._replace(effects=one.effects[rows.index]) for one in devices)
+    causes = [*lengths_of(some), *others, *links]
     E, process = torch.cat([one.effects for one in causes], 2), rows.process
     columns = rows.columns(some.motions_in_numbers(E))
-    H, total = (columns * process.factor.solve(columns)).sum(0), float(process.numbers.target @ process.mu)
-    each = Evidence((columns.T @ process.mu)[:, None], H[:, None, None], total, len(columns))
-    deviations = (each.excess / H + H.new_tensor([one.usual for one in causes]).square()).sqrt()
-    motions = (3 * (E - E.mean(0))[some.visible].square().mean(0)).sqrt()
-    seen = [number for number, own in enumerate(H.tolist()) if own > 0.0]
-    allowed = chi2_above(gates.LENGTH_CHANCE / max(len(seen), 1), 1) ** 0.5
-    sizes, sd, moved = (values.flatten().tolist() for values in (each.size, deviations, motions))
-    return [Length(causes[k], sizes[k], sd[k], moved[k], allowed * sd[k]) for k in seen]
+    g, H, total = columns.T @ process.mu, columns.T @ process.factor.solve(columns), process.numbers.target @ process.mu
+    motions = (3 * (E - E.mean(0))[some.visible].square().mean(0)).sqrt().tolist()
+    least, found, alone = LEAST_OWN * H.diagonal(), dict[int, Length](), dict[int, Length]()
+    left, first = H.diagonal().nonzero()[:, 0].tolist(), len(causes) - len(links)
+    allowed, apart = chi2_above(gates.LENGTH_CHANCE / max(len(left), 1), 1) ** 0.5, gates.CHANGES_TOLD_APART
+    while left:
+        each = Evidence(g[left, None], H.diagonal()[left, None, None], float(total), len(columns))
+        deviations = (each.excess / each.H[:, 0, 0]).sqrt().tolist()
+        for k, size, chance in zip(left, each.size[:, 0].tolist(), deviations, strict=True):
+            sd, taken_up = hypot(chance, causes[k].usual), causes[k].usual > 0.0 and abs(size) <= gates.TAKEN_UP
+            found[k] = Length(causes[k], size, sd, motions[k], allowed * sd, taken_up)
+        gains = {k: found[k].gain for k in left}
+        best = max((k for k in left if k >= first), key=lambda k: gains[k], default=left[0])
+        doubts = max((gains[k] for k in left if k < first), default=0.0)
+        if gains[best] < max(0.5 * allowed**2, doubts + apart) or best < first:
+            break
+        alone, apart = alone or dict(found), 0.0  # where one link is wrong, others probably are
+        found[best], step = found[best]._replace(taken_up=True), H[best] / H[best, best]
+        total, g, H = total - g[best].square() / H[best, best], g - step * g[best], H - torch.outer(step, H[best])
+        left = (H.diagonal() > least).nonzero()[:, 0].tolist()
+    unclear = any(abs(one.value) > one.unnoticed and not one.taken_up for one in found.values())
+    return [*(alone if alone and unclear else found).values()]
 
 
 def warn_of_lengths(found: list[Length]) -> float | None:
     """Warn of the least probable length, if it is too improbable; by how much any such length moves points, m."""
-    wrong = [one for one in found if abs(one.value) > one.unnoticed]
-    if not wrong:
+    if not (wrong := [one for one in found if abs(one.value) > one.unnoticed]):
         return None
-    worst = max(wrong, key=lambda one: abs(one.value) / one.deviation)
-    doubted = [one for one in wrong if not one.cause.usual or abs(one.value) > gates.TAKEN_UP]
-    moved = max((abs(one.value) * one.motion for one in doubted), default=None)
+    worst = max(wrong, key=lambda one: one.gain)
+    moved = max((abs(one.value) * one.motion for one in wrong if not one.taken_up), default=None)
     text = sentence(
         f"{worst.cause.name} seems to differ by {worst.cause.amount(worst.value, '+')} from what it is said to be",
         expected=f"at most about {worst.cause.amount(3 * worst.deviation)}: links and devices are seldom that wrong",

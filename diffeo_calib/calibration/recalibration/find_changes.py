@@ -394,6 +394,8 @@ def _change(rows: NewRows, part: ChangedPart, probability: float, others: tuple[
 
 USUAL_LOG, EFOLDS = -6.0, 2.5
 """Log-normal prior of s^2: the logarithm of its centre, and the standard deviation of its logarithm."""
+MOST_DRIFT = 0.5
+"""The s^2 up to which a robot may differ from the old one although only a minority of the rows fits that."""
 LOG_SIZES = torch.linspace(-12.0, 4.0, 65, dtype=torch.float64, device="cpu")
 """Logarithms of the s^2 that are tried."""
 
@@ -425,7 +427,8 @@ def with_usual_drift(rows: NewRows, named: Sequence[ChangedPart]) -> list[Change
     (_, odds, size), kept = max(found, key=itemgetter(0))
     if odds < gates.DRIFT_ODDS and all(each.joint is not None for each in named):
         return [*named]
-    if not named and likeliest(rows.tails, [])[1] < gates.DRIFT_ODDS_OF_INLIERS:
+    most = size > MOST_DRIFT or (rows.tails.weights >= OUTLIER_WEIGHT).all(1).double().mean() > MOST_OUTLIERS
+    if not named and most and likeliest(rows.tails, [])[1] < gates.DRIFT_ODDS_OF_INLIERS:  # a minority says nothing
         return []
     return [*kept, *(replace(part, variance=size) for part in parts)]
 
