@@ -321,13 +321,15 @@ def run(tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> Ca
     def sent(lines: Iterable[bytes], *words: object) -> tuple[Outcome, Answers]:
         failed: list[BaseException] = []
 
-        def buffer() -> Iterator[bytes]:
+        def readline(_: int) -> bytes:
             try:
-                yield from lines
+                return next(rest, b"")
             except BaseException as error:  # in a thread of its own
                 failed.append(error)
+                return b""
 
-        monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=buffer()))
+        rest = iter(lines)
+        monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=SimpleNamespace(readline=readline)))
         robot = ["--robot", tmp_path / "robot.urdf", *WORDS, "--accepted", tmp_path / "accepted.csv"]
         done = command("campaign", tmp_path / "run.csv", *robot, "--stdin", *words)
         for error in failed:
