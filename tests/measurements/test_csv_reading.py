@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import threading
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -408,6 +409,9 @@ def test_a_marker_near_the_origin_or_a_single_one_not_clearly_far_away_stays(rea
     (tmp_path / "table.csv").write_text(lost(3))  # rows that come one by one cannot be judged by those that come later
     table = TableFormat(**FORMAT, joints=JOINTS, position=[tuple(POSITION)])
     assert len(read_observations(tmp_path / "table.csv", table, growing=True)) == 8
+    (tmp_path / "table.csv").write_text(READ["decimal commas in one column"][0])  # as later ones may have points there
+    with pytest.raises(MeasurementError, match="looks like a decimal comma"):
+        read_observations(tmp_path / "table.csv", replace(table, sep=";"), growing=True)
 
 
 # --- poses and deviations -------------------------------------------------------------------------------------------

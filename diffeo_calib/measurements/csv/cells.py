@@ -84,10 +84,10 @@ def _near(missing: Sequence[str], free: Sequence[str]) -> str:
     return "; ".join(hints) if hints else "pass the names as written in the header"
 
 
-def numbers_in(texts: Sequence[str], decimal: str) -> list[float | None]:
+def numbers_in(texts: Sequence[str], decimal: str, *, whole: bool = True) -> list[float | None]:
     """The numbers of a column, see :func:`number`; "1,481" is one where another cell such as "1,481.25" proves it.
 
-    A column that holds numbers with the other decimal mark alone, which no thousands explain, has this one.
+    A ``whole`` column that holds numbers with the other decimal mark alone, which no thousands explain, has this one.
     """
     plain = texts if decimal == "." else [text.replace(".", "?").replace(decimal, ".") for text in texts]
     if _PLAIN.fullmatch("".join(plain)):
@@ -95,7 +95,7 @@ def numbers_in(texts: Sequence[str], decimal: str) -> list[float | None]:
             return [float(text) for text in plain]
     grouped = any(_GROUP[decimal] in text and number(text, decimal) is not None for text in texts)
     found = [number(text, decimal, grouped=grouped) for text in texts]
-    if None in found and any(number(text, decimal, grouped=True) is None for text in texts):
+    if whole and None in found and any(number(text, decimal, grouped=True) is None for text in texts):
         other = [number(text, _GROUP[decimal]) for text in texts]
         return found if None in other else other
     return found

@@ -133,8 +133,8 @@ def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
 
     Args:
         columns: which columns it has, and their units; the text "nan" is empty.
-        zeros: whether markers that are at 0, 0, 0 far from other rows are hidden there, and lines without joint values
-            are left out.
+        zeros: whether markers that are at 0, 0, 0 far from other rows are hidden there, lines without joint values are
+            left out, and columns may have the other decimal mark.
 
     Raises:
         MeasurementError: any mistake in the file; standard deviations that are not positive, negative payloads.
@@ -159,7 +159,7 @@ def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
     file.units |= {file.header[place]: "deg" for place, own in zip(places, cells, strict=True) if "°" in "".join(own)}
     _check_units(file, columns)
     words = [["" if text.lower() == "nan" else text for text in own] for own in cells[len(columns.names) :]]
-    numbers, notes = _numbers(path, columns, lines, cells[: len(columns.names)])
+    numbers, notes = _numbers(path, columns, lines, cells[: len(columns.names)], whole=zeros)
     for column, values in zip(columns.numbers, numbers[:, len(columns.joints.columns) :].T, strict=True):
         check = column.check
         wrong = [] if check is None else (values < 0 if check.zero else values <= 0).nonzero()[:, 0].tolist()
@@ -208,14 +208,15 @@ def _with_joints(path: Path, rows: Lines, places: Sequence[int], names: int | No
 
 
 def _numbers(
-    path: Path, columns: Columns, lines: Sequence[int], cells: Sequence[Sequence[str]]
+    path: Path, columns: Columns, lines: Sequence[int], cells: Sequence[Sequence[str]], *, whole: bool
 ) -> tuple[Tensor, list[str]]:
     """Numbers (N, c) of the cells of each column, NaN where a marker is hidden, and what was taken as empty.
 
+    ``whole``: whether no rows will be added.
     MeasurementError for other cells without a number.
     """
     names, decimal, hideable = columns.names, columns.table.decimal, columns.hideable
-    found = [numbers_in(column, decimal) for column in cells]
+    found = [numbers_in(column, decimal, whole=whole) for column in cells]
     if any(None in column for column in found):
         rows = zip(lines, zip(*cells, strict=True), zip(*found, strict=True), strict=True)
         bad = [(line, names[k], texts[k]) for line, texts, own in rows for k, one in enumerate(own) if one is None]
