@@ -336,8 +336,7 @@ def opened(rows: NewRows, data: Any) -> NewRows:
     named = [own._replace(name=mine.bodies.get(own.name, own.name)) for own in found]
     told = SampledRows(torch.arange(len(rows), device=shown.device), rows.process, None)
     found = changed(told, named, data.line_numbers, data.row_names)
-    of_robot = tuple(f"{name} seems" for name in chain.joint_names)  # see find_changes.py
-    causes = [one for one in found if not one.what.startswith(of_robot)]
+    causes = [one for one in found if one.what.split(" seems")[0] not in chain.joint_names]  # see find_changes.py
     if len(rows) >= gates.MIXED_ROWS:
         causes += two_tools(told, markers, data.line_numbers)
     best = best_of(causes, told)
