@@ -63,12 +63,15 @@ def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
     """Add the columns that options name, but for readings; lever in the unit of length."""
     Rows.check_together(vars(rows))
     as_typed = "convention", "rotation_angle", "remounted", "session", "marker", *BESIDE
-    spherical = next((one.partition("=")[0] for one in rows.position or () if _place(one) != one), None)
+    places = [_place(text) for text in rows.position or ()]
+    if len(ways := dict.fromkeys(way for way, _ in places)) > 1:
+        got, fix = " and ".join(way or "x, y and z" for way in ways), "convert those of one device"
+        raise InputError.of("--position", expected="places that are all written in one way", got=got, fix=fix)
     return replace(
         table,
         **{name: getattr(rows, name) for name in as_typed},
-        position=[_split_names(_place(text)) for text in rows.position or ()] or None,
-        spherical=spherical,
+        position=[_split_names(columns) for _, columns in places] or None,
+        spherical=next(iter(ways), None),
         rotation=_names_of_each(rows.rotation),
         lever=LEVER if rows.lever is None else rows.lever / table.per_metre,
         camera_on_tool=rows.camera_on_tool and not rows.images,
@@ -141,7 +144,10 @@ def rows_in_table(csv: Path, rows: Rows) -> tuple[Rows, list[str]]:
     """Options without the kinds of rows that a table has no column of, if it has those of others; and these kinds."""
     table = table_format(rows)
     header = set(read_cells(with_places(csv, rows, table), table.sep)[0])
-    kinds = {"--position": [*map(_place, rows.position or ())], "--socket": [rows.socket] * (rows.socket is not None)}
+    kinds = {
+        "--position": [_place(text)[1] for text in rows.position or ()],
+        "--socket": [rows.socket] * (rows.socket is not None),
+    }
     kinds |= {f"--reading {text}": [text.partition("=")[2]] for text in rows.reading or () if CORNERS not in text}
     named = {kind: {name.strip() for text in texts for name in text.split(",")} for kind, texts in kinds.items()}
     there = {kind: bool(names & header) for kind, names in named.items() if names}
@@ -278,10 +284,10 @@ def with_rotation(table: TableFormat, given: Targets) -> TableFormat:
     return replace(table, convention=convention, rotation_angle=angle).for_writing(rotation_std=False)
 
 
-def _place(text: str) -> str:
-    """The columns of a place, without the way in which these are a distance and two angles."""
+def _place(text: str) -> tuple[str | None, str]:
+    """How a place is a distance and two angles, None for x, y and z; and its columns."""
     way, _, columns = text.partition("=")
-    return columns if way in SPHERICAL else text
+    return (way, columns) if way in SPHERICAL else (None, text)
 
 
 def _split_names(text: str) -> list[str]:

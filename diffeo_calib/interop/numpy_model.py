@@ -25,7 +25,7 @@ from diffeo_calib.common.errors import InputError, ModelFileError
 from diffeo_calib.runtime.arrays import MOST_STEPS, TABLEAUS, Array
 from diffeo_calib.runtime.build import calibrated_chain, nominal_chain, recorded_flow, recorded_stages
 from diffeo_calib.runtime.chain import tip_poses
-from diffeo_calib.runtime.program import Program, check_frame
+from diffeo_calib.runtime.program import LONGEST_TOOL, Program, check_frame
 
 FORMAT = 3
 """Version of the file layout; files of other versions are refused."""
@@ -135,17 +135,17 @@ class NumpyKinematics:
     def _tool(self, tool: object) -> Array:
         if tool is None:
             return self.tool
-        given, out = _numbers(tool, "tool"), np.eye(4)
+        given = _numbers(tool, "tool")
         if given.shape not in ((3,), (4, 4)) or not np.isfinite(given).all():
             raise InputError.of("`tool`", expected="finite numbers, (4, 4) or (3,)", got=given.shape)
-        if given.ndim == 1:
-            out[:3, 3] = given
-            return out
-        R, rest = given[:3, :3], given[3].tolist()
+        pose = given if given.ndim == 2 else np.block([[np.eye(3), given[:, None]], [np.eye(4)[3]]])
+        R, t, rest = pose[:3, :3], pose[:3, 3].tolist(), pose[3].tolist()
+        if max(map(abs, t)) > LONGEST_TOOL:
+            raise InputError.of("`tool`", expected=f"at most {LONGEST_TOOL:g} m", got=t, fix="pass metres")
         if rest != [0, 0, 0, 1] or np.abs(R.T @ R - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0:
             fix = "pass [[R, t], [0, 0, 0, 1]] in m, not its transpose"
             raise InputError.of("`tool`", expected="a rigid transform (4, 4)", got=given.tolist(), fix=fix)
-        return given
+        return pose
 
     def _joints(self, q: object) -> Array:
         values, n = _numbers(named_columns(q, self.joint_names, "q"), "q"), len(self.joint_names)

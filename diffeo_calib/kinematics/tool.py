@@ -34,11 +34,8 @@ from diffeo_calib.runtime import program
 from diffeo_calib.runtime.arrays import Array
 from diffeo_calib.runtime.build import calibrated_chain, recorded_flow
 from diffeo_calib.runtime.flow import RecordedFlow
-from diffeo_calib.runtime.program import TOOL_LEVER, Program, check_frame
+from diffeo_calib.runtime.program import LONGEST_TOOL, TOOL_LEVER, Program, check_frame
 from diffeo_calib.sensors.set_ups import frame_slopes
-
-LONGEST_TOOL = 1e3
-"""m; beyond it the three points of a tool lose digits."""
 
 
 class ToolKinematics:

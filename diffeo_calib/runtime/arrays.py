@@ -65,7 +65,7 @@ def combined(x: Array, coefficients: Iterable[float], slopes: Sequence[Array]) -
 NUMPY = SimpleNamespace(
     sin=np.sin,
     cos=np.cos,
-    exp=lambda a: np.exp(a, out=a),  # these three in place: formulas pass values that nothing else reads
+    exp=lambda a: np.exp(a, out=a),  # both in place: formulas pass values that nothing else reads
     sqrt=lambda a: np.sqrt(a, out=a),
     relu=lambda a: np.maximum(a, 0.0),
     clip=np.clip,

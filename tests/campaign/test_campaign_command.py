@@ -16,6 +16,7 @@ from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from command_bank import PROGRAM, Command, Outcome
@@ -234,10 +235,22 @@ def test_the_command_ends_at_its_target_and_goes_on(tmp_path: Path, lines: list[
 def test_rows_that_are_there_before_are_judged_as_with_once(
     tmp_path: Path, lines: list[str], command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also without a row that comes later; a line that cannot be read is named by its place in the table."""
+    """Also without a row that comes later; a line that cannot be read is named by its place in the table.
+
+    No line can be read where a column is missing or a disk is full: the campaign ends, and the journal says nothing.
+    """
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"")))
     wrong = ",".join(["1000"] * len(lines[0].split(","))) + "\n"
     (tmp_path / "run.csv").write_text("".join([*lines[:14], wrong, lines[14], "x" + lines[18]]))
+    done = command("campaign", tmp_path / "campaign.toml", "--once", "--position", "x,y,w")
+    assert done.code == 1
+    assert "run.csv', header: no column ['w']" in done.error
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", Mock(side_effect=OSError(errno.EFBIG, "File too large")))
+        done = command("campaign", tmp_path / "campaign.toml", "--once")
+    assert done.code == 1
+    assert "run.csv cannot be written to a temporary table (File too large); free" in done.error
+    assert (tmp_path / "run.csv.journal").read_bytes() == b""
     accepted = []
     goal = '"error_limit_mm": null, "more_rows": '
     for how, known in (  # the last one answers in JSON
@@ -275,9 +288,10 @@ def test_a_campaign_goes_on_as_it_was_begun(tmp_path: Path, lines: list[str], co
         (["--angle", "rad"], "expected angle deg, got angle rad;"),
         (["--position", "y,x,z"], "expected position ['x,y,z'], got position ['y,x,z'];"),
         (["--joints", ",".join(reversed(lines[0].split(",")[:6]))], "another order"),
-        (["--joints", ",".join([*lines[0].split(",")[:5], "x"])], "expected joints"),
+        (["--joints", ",".join([*lines[0].split(",")[:5], "w"])], "expected joints"),
+        (["--joints", ",".join([*lines[0].split(",")[:5], "x"])], "got ['x'] twice"),
         (["--tip", "output_link"], "another robot and tip than"),
-        (["--payload", "z"], "expected payload none, got payload z;"),
+        (["--payload", "w"], "expected payload none, got payload w;"),
     ):
         assert named in command(*words, *more).error, more
     (tmp_path / "robot.urdf").write_text(robot.replace("0.145 0 0.254", "0.146 0 0.254"))
@@ -321,13 +335,15 @@ def run(tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> Ca
     def sent(lines: Iterable[bytes], *words: object) -> tuple[Outcome, Answers]:
         failed: list[BaseException] = []
 
-        def buffer() -> Iterator[bytes]:
+        def readline(_: int) -> bytes:
             try:
-                yield from lines
+                return next(rest, b"")
             except BaseException as error:  # in a thread of its own
                 failed.append(error)
+                return b""
 
-        monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=buffer()))
+        rest = iter(lines)
+        monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=SimpleNamespace(readline=readline)))
         robot = ["--robot", tmp_path / "robot.urdf", *WORDS, "--accepted", tmp_path / "accepted.csv"]
         done = command("campaign", tmp_path / "run.csv", *robot, "--stdin", *words)
         for error in failed:

@@ -46,6 +46,8 @@ def test_a_corrected_urdf(arm: Case, path: Path, command: Command, tmp_path: Pat
     assert "no gravity sag" in done.out
     place = " ".join(f"{1e3 * value:.3f}" for value in rigid.geometry.base[:3, 3].tolist())
     assert f"their robot base in the measuring frame: {place} mm" in done.out
+    (tmp_path / "own.urdf").write_text(model.robot.source or "")
+    assert "is the robot's own URDF; name another" in command("export", path, "--urdf", tmp_path / "own.urdf").error
 
 
 @pytest.mark.slow

@@ -68,6 +68,7 @@ REFUSED = {
     r"--sep and --decimal: expected different characters.*--sep ';'": given("--sep", ","),
     r"no link 'hand'.*its links are base_link, .*flange": given("--tip", "hand"),
     r"did you mean 'flange'": given("--tip", "flnage"),
+    r"--position: .* in one way, got x, y and z and zenith_gon": given("--position", "zenith_gon=x,y,z"),
     r"--tip: expected 1, one for each --position, got 2": given("--tip", "flange", "--tip", "wrist_link"),
     r"no moving joint from 'output_link' to 'flange'": given("--base", "output_link"),
     r"do not fit this robot, even with geometric errors.* as the tip": given("--tip", "wrist_link"),

@@ -170,9 +170,11 @@ def test_arguments(tmp_path: Path) -> None:
         model.jacobian(q)
     transposed = np.eye(4)
     transposed[3, :3] = 0.2
-    for tool in (np.ones(4), np.full(3, np.inf), np.diag([1.0, 1.0, -1.0, 1.0]), transposed):
-        with pytest.raises(InputError, match="`tool`"):
-            model.tool_poses(np.zeros((1, 6)), tool)
+    mirrored, far = np.diag([1.0, 1.0, -1.0, 1.0]), np.array([0.0, -2e3, 0.0])
+    for tool in (np.ones(4), np.full(3, np.inf), mirrored, transposed, far):
+        for own in (model, dc.load(path)):
+            with pytest.raises(InputError, match="tool"):
+                own.tool_poses(np.zeros((1, 6)), tool)
     with pytest.raises(InputError, match="`frame`: expected 'base' or 'measuring'"):
         model.tool_poses(np.zeros((1, 6)), frame="world")
 

@@ -195,6 +195,16 @@ def test_marks_of_rows_are_labels_where_all_have_them(read: Reader) -> None:
     with pytest.warns(DiffeoCalibWarning, match="6 line"):
         assert len(read(separated(",", disabled), **FORMAT)) == 2
     assert len(read(separated(",", [["id", *NAMES], ["P1", *CELLS[0]], ["max", *CELLS[1]]]), **FORMAT)) == 2
+    named = ["mean", "A", "Mittelpunkt", "mean"]
+    assert (
+        len(
+            read(
+                separated(",", [["id", *NAMES], *([name, *row] for name, row in zip(named, CELLS, strict=False))]),
+                **FORMAT,
+            )
+        )
+        == 4
+    )
     damaged = [NAMES, *CELLS[:2], ["#VALUE!", *CELLS[2][1:]], *CELLS[3:]]
     with pytest.raises(MeasurementError, match="line 4, column 'q1': expected a number, got '#VALUE!'"):
         read(separated(",", damaged), **FORMAT)
@@ -341,6 +351,9 @@ def test_lines_without_joint_values(read: Reader) -> None:
     data = read(separated(",", rows), marker="ball", **FORMAT)
     assert_close(1e3 * data.points[1, 1], torch.tensor([5.0, 6.0, 7.0], dtype=torch.float64))
     assert (len(data), data.markers) == (3, 2)
+    again = separated(",", [*rows[:4], ["", "", "5", "6", "7", "b"], rows[4]])
+    with pytest.raises(MeasurementError, match="line 5, column 'q1'"):  # of a pose without joint values
+        read(again, marker="ball", **FORMAT)
 
 
 def test_angles_in_minutes_and_places_as_angles(read: Reader) -> None:
@@ -356,6 +369,8 @@ def test_angles_in_minutes_and_places_as_angles(read: Reader) -> None:
     turn, up = math.radians(-45.51), math.radians(-30.0)
     last = [2 * math.cos(up) * math.cos(turn), 2 * math.cos(up) * math.sin(turn), 2 * math.sin(up)]
     assert_close(data.points[:, 0].tolist(), [[0.0, 2.0, 0.0], [0.0, 0.0, 2.0], last], rtol=1e-14, atol=1e-14)
+    assert "--position zenith_clockwise_deg=sd,hz,v" in data.origin.options
+    assert "--spherical" not in data.origin.options
 
 
 def test_a_line_without_any_marker_is_left_out_and_named(read: Reader) -> None:

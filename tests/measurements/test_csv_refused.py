@@ -19,7 +19,8 @@ GERMAN = HEADER.replace(",", ";")
 Case = tuple[str | bytes, dict[str, Any], str]
 DECIMALS = GERMAN + "1.5;2;3.5;4;5.5\n1,5;2;3;4;5\n1;2;3,5;4;5,5\n"
 COPIES = TABLE + "9,9,9,9,9\n" + ROWS.replace("0.1,", "0.10,")
-STATED = "expected mm, as stated, got {} in its header; state the unit"
+PARTS = {"position": ["p_x", "p_y", "p_z"]}
+STATED = "expected mm, as stated, got {} in the file; state the unit"
 FILES: list[Case] = [
     ("", {}, "is empty: expected a header"),
     (",,\n,,\n", {}, "is empty"),
@@ -50,6 +51,10 @@ FILES: list[Case] = [
     (b"\0\1" + TABLE.encode(), {}, "is no text but binary"),
     (TABLE.replace("x,", "x (cm),"), {"position": ["x (cm)", "y", "z"], "length": "mm"}, STATED.format("cm")),
     (HEADER + "rad,rad,m,mm,mm\n" + ROWS, {"length": "mm"}, "column 'x': " + STATED.format("m")),
+    (TABLE.replace("0.1,", "12°30',"), {}, "column 'q1': expected rad, as stated, got deg"),
+    (TABLE.replace("0.1,", "12°75',"), {"angle": "deg"}, "column 'q1': expected a number, got \"12°75'"),
+    ('q1,q2,p\n0,0,"[1, 2, 3]"\n1,1,"[1, 2, 4]"\n1,2,7\n', PARTS, "line 4, column 'p_x' ... got '7_1'"),
+    ("q1;q2;p\n0;0;[0,1 0,2 0,3]\n1;1;[0,1 0,2 0,4]\n", PARTS | {"sep": ";", "decimal": ","}, "no column ['p_x'"),
     (TABLE.replace("q1", "q1 [°]"), {"joints": ["q1 [°]", "q2"]}, "column 'q1 [°]': expected rad, as stated, got deg"),
 ]
 OPTIONS: list[Case] = [
@@ -127,7 +132,7 @@ POSES: list[Case] = [
     (
         POSE.replace("a,b,c", ",".join(RAD)),
         {"rotation": RAD},
-        "column 'a [rad]': expected deg, as stated, got rad in its",
+        "column 'a [rad]': expected deg, as stated, got rad in the",
     ),
 ]
 FRAMES: dict[str, Any] = {

@@ -19,6 +19,7 @@ from diffeo_calib.measurements.csv.files import read_measurements
 from diffeo_calib.measurements.csv.lines import CsvLines
 
 ROWS = np.random.default_rng(0).uniform(-1.0, 1.0, (7, 5))
+ROWS[0, :2] = 0.0
 JOINTS, PLACES = ROWS[:, :2], ROWS[:, 2:]
 UNITS = {"length": "m", "angle": "rad"}
 NAMES = "q_1,q_2", "p_x,p_y,p_z"
@@ -40,9 +41,12 @@ def _two_sheets(path: Path) -> None:
 
 
 def _joined_sheets(path: Path) -> None:
-    """Joints and places of the same stops, in another order."""
+    """Joints and places of the same stops, in another order; the first is at zero, and no line has a remark."""
     book = openpyxl.Workbook()
-    for title, names, values in (("robot", ["q_1", "q_2"], JOINTS), ("tracker", ["p_x", "p_y", "p_z"], PLACES[::-1])):
+    for title, names, values in (
+        ("robot", ["q_1", "q_2", "remark"], JOINTS),
+        ("tracker", ["p_x", "p_y", "p_z"], PLACES[::-1]),
+    ):
         stops = range(7) if title == "robot" else reversed(range(7))
         rows = [["stop", *names], *([k, *own] for k, own in zip(stops, values.tolist(), strict=True))]
         sheet = book.create_sheet(title)
@@ -66,7 +70,11 @@ WRITERS: dict[str, tuple[str, Callable[[Path], object], str, str]] = {
     "two sheets of the same stops": ("t.xlsx", _joined_sheets, *NAMES),
     "an array": ("t.npy", lambda path: np.save(path, ROWS), "1,2", "3,4,5"),
     "an array with names": ("t.npy", _named, *NAMES),
-    "arrays": ("t.npz", lambda path: np.savez(path, q=JOINTS, p=PLACES, gain=np.eye(3)), *NAMES),
+    "arrays": (
+        "t.npz",
+        lambda path: np.savez(path, q=JOINTS, p=PLACES, gain=np.ones((2, 4)), dh=np.ones((2, 3))),
+        *NAMES,
+    ),
     "arrays of columns": ("t.npz", lambda path: np.savez(path, q=JOINTS.T, p=PLACES.T, s=np.eye(3)), *NAMES),
     "variables": ("t.mat", lambda path: savemat(path, {"q": JOINTS, "p": PLACES}), *NAMES),
     "variables of old": ("t.mat", lambda path: savemat(path, {"q": JOINTS, "p": PLACES}, format="4"), *NAMES),
@@ -80,7 +88,7 @@ NOTES = {
     "two sheets of the same stops": "sheets 'robot' and 'tracker' joined by 'stop'",
     "an array": "no header line",
     "arrays of columns": "arrays s left out",
-    "arrays": "arrays gain left out: no numbers or texts of 7 rows",
+    "arrays": "arrays gain, dh left out: no numbers or texts of 7 rows",
 }
 
 

@@ -30,6 +30,8 @@ from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.csv.joints import PoseColumns
+from diffeo_calib.measurements.csv.sensors import columns_of
+from diffeo_calib.measurements.table_format import ZERO
 from diffeo_calib.reports.live import Page, served, state_of
 
 JOURNAL = ".journal"
@@ -50,13 +52,12 @@ class Live:
     table: GrowingTable = field(init=False)  # the file
     columns: Columns = field(init=False)  # those of its joints
     lines: list[bytes] = field(default_factory=list)  # all that were judged
-    waiting: list[bytes] = field(default_factory=list)  # those that were there at the start and were not
+    waiting: list[bytes] = field(default_factory=list)  # those that were read and were not
     said: list[tuple[bool, bool]] = field(default_factory=list)  # whether each row is accepted, and to be repeated
     ids: dict[str, int] = field(default_factory=dict)  # number of the line of each id
     unreadable: dict[int, str] = field(default_factory=dict)  # lines that are no rows, and why
     revised: list[int] = field(default_factory=list)  # rows that the last line changed
     late: list[int] = field(default_factory=list)  # rows that a new model changed, not told yet
-    ignored: int = 0  # lines after the one with which the target was reached
     _found: tuple[object, Next | None] | None = None
 
     def __post_init__(self) -> None:
@@ -75,11 +76,10 @@ class Live:
         """Go on after the lines that the journal knows."""
         known = [one for one in self.journal.entries if "line" in one]
         lines = self.table.new_lines()
-        named = {cell.strip() for cell in self.table.cells(self.table.header)}
-        places = [name for name in self.columns.joints.columns if name.isdecimal() and name not in named]
+        places = [name for name in self.missing if name in self.columns.joints.columns and name.isdecimal()]
         if self.table.header and places:  # columns are named by their places, and the first line is a row
             what = f"{self.source.csv} has no column {few(places)}: a table that grows needs a header line"
-            got = f"the first line {few(sorted(named))}"
+            got = f"the first line {few(sorted(self.table.cells(self.table.header)))}"
             raise InputError.of(what, got=got, fix="name the columns in its first line")
         for number, entry in enumerate(known):
             if number >= len(lines) or digest(lines[number]) != entry["sha"]:
@@ -108,6 +108,14 @@ class Live:
         self.said = [(one.accepted, one.again) for one in self.campaign.verdicts]
         self.waiting = lines[len(known) :]
 
+    @property
+    def missing(self) -> list[str]:
+        """Columns that the header does not name."""
+        wanted = columns_of(of_robot(self.source.table, self.campaign.robot))
+        needed = [*wanted.names, *(name for name, needed in wanted.texts.items() if needed)]
+        named = {ZERO, *(cell.strip() for cell in self.table.cells(self.table.header))}
+        return [name for name in needed if name not in named]
+
     def _begun(self) -> dict[str, str]:
         """What rows are read and judged with; of long texts their hashes."""
         robot, source = self.campaign.robot, self.source
@@ -135,7 +143,7 @@ class Live:
                 more = left or number + 1 < len(self.lines) or self.campaign.reached
                 self._say(self.answer(number) | ({} if more else self.state()))
             if self.campaign.reached:
-                self.ignored = left
+                self.waiting = [*lines[start + TOGETHER :]]
                 return
 
     def poll(self) -> bool:
@@ -203,7 +211,9 @@ class Live:
             self.journal.add([{"removed": torn}])
             self.say(f"half a line was removed from the end of {self.source.csv}: {torn}", {"removed": torn})
         *others, own = self.new_lines()
-        self.judge(others)
+        while others:  # also those after the target was reached
+            self.judge(others)
+            others, self.waiting = self.waiting, []
         self._add([own])
         return len(self.lines) - 1
 
@@ -217,7 +227,9 @@ class Live:
             if len(lines) > len(set(data.line_numbers.tolist())) > 0:
                 raise InputError.of("lines without a row")
             verdicts = self.campaign.add(data, waiting=waiting)
-        except DiffeoCalibError as error:
+        except InputError as error:
+            if not len(self.campaign) and self.missing:  # nor can any other line be read
+                raise DiffeoCalibError(str(error)) from error
             if len(lines) > 1:  # one of them cannot be read
                 for left, line in zip(reversed(range(len(lines))), lines, strict=True):
                     self._add([line], left + waiting)
@@ -291,13 +303,18 @@ class Live:
 
     def _read(self, lines: Sequence[bytes], header: bytes = b"", first: int = 0) -> Any:
         """Lines as a table, in their order; ``first`` is the number of the first one, for messages."""
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / self.source.csv.name
-            path.write_bytes((header or self.table.header) + b"\n" * first + b"".join(lines))
-            try:
-                data = replace(self.source, csv=path, growing=True).read(self.campaign.robot, self.tips)
-            except DiffeoCalibError as error:
-                raise type(error)(str(error).replace(str(path), str(self.source.csv))) from error
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / self.source.csv.name
+                path.write_bytes((header or self.table.header) + b"\n" * first + b"".join(lines))
+                try:
+                    data = replace(self.source, csv=path, growing=True).read(self.campaign.robot, self.tips)
+                except DiffeoCalibError as error:
+                    raise type(error)(str(error).replace(str(path), str(self.source.csv))) from error
+        except OSError as error:  # of no line: none counts as read
+            what = f"lines of {self.source.csv} cannot be written to a temporary table ({error.strerror})"
+            fix = "free some space, or name a folder on another disk by TMPDIR"
+            raise DiffeoCalibError.of(what, fix=fix) from error
         return data.rows(data.line_numbers.argsort(stable=True))
 
 
@@ -381,7 +398,7 @@ def _end(live: Live) -> None:
     state = live.state() | {"ended": True}
     record.add(rows=len(live.campaign), accepted=state["accepted_rows"], expected_error_m=live.campaign.expected_error)
     accepted = f"{state['accepted_rows']} of {state['rows']} rows accepted"
-    later = live.ignored + len(live.new_lines())
+    later = len(live.new_lines())
     rest = f"; the target is reached: {later} later lines of the table were not judged" * (later > 0)
     unread = f", {len(live.unreadable)} lines could not be read" * bool(live.unreadable)
     live.say(accepted + unread + expected(live.campaign) + rest, state)

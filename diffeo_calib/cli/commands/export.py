@@ -16,6 +16,7 @@ from diffeo_calib.cli.console import out, plain, say, text_table
 from diffeo_calib.cli.declarations import ExportOptions
 from diffeo_calib.cli.models import load_laden, tool_in_tip
 from diffeo_calib.cli.record import make_folder, record
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.files import write_together
 from diffeo_calib.interop.c_source import CFiles, write_c
 from diffeo_calib.interop.camera_files import camera_files
@@ -79,6 +80,10 @@ class _Export:
     def rigid(self, options: list[str], *, tables: bool) -> None:
         """URDF, DH table and UR kinematics: three forms of the same rigid kinematics."""
         urdf = urdf_of(self.model.robot, self.given.robot) if {"--urdf", "--ur-kinematics"} & {*options} else b""
+        new = self.given.urdf
+        if new is not None and new.is_file() and new.read_bytes() == urdf:
+            fix = "name another file: later fits need the robot as it is now"
+            raise InputError.of(f"--urdf {new} is the robot's own URDF", fix=fix)
         found = rigid_kinematics(self.model, transmission=tables)
         self.geometry, name = found.geometry, ", ".join(options)
         alone = {f"{name} alone": with_errors(self.model, found.geometry.joint_errors, found.how)} if tables else {}

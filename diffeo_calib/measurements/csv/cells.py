@@ -24,7 +24,8 @@ _MISSING = re.compile(
     re.IGNORECASE,
 )
 _DEGREES = re.compile(
-    r"([+-]?)(\d+(?:\.\d+)?) ?°(?: ?(\d+(?:\.\d+)?) ?['′])?(?: ?(\d+(?:\.\d+)?) ?(?:\"|''|″))?", re.ASCII
+    r"([+-]?)(\d+(?:\.\d+)?) ?°(?: ?((?:[0-5]?\d|60)(?:\.\d+)?) ?['′])?(?: ?((?:[0-5]?\d|60)(?:\.\d+)?) ?(?:\"|''|″))?",
+    re.ASCII,
 )
 _INFINITE = re.compile(r"[+-]?inf(inity)?", re.IGNORECASE)
 _TYPOGRAPHY = str.maketrans("\u2212\u2013\u2019\u00a0\u202f\u2009", "--'   ")

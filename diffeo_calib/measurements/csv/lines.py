@@ -50,8 +50,8 @@ LIST = re.compile(r"(?:[\w.]+\((?:'\w', *)?)?([\[(].*[\])])(?:, *dtype=[\w.]+)?\
 UNQUOTED = r"(?m)(^|{0})[ \t]*([\[(][-+\d.][^\[\]()\n]*[\])])[ \t]*(?={0}|\r?$)"
 """A list between separators, which its own commas are not."""
 STATISTICS = re.compile(
-    r"(?:(mean|average|avg|mittel|moyenne|media|std|st\.? ?dev|standard|rms)|median|sigma|σ|min|max|range|spannweite"
-    r"|count|anzahl|sum|ecart|écart)\w*[.:]?( ?(abw|dev|value|wert|error)\w*\.?)?:?",
+    r"(?:(mean|average|avg|mittel|moyenne|media|std|st\.? ?dev|standard ?(?=abw|dev|err)|rmse?)s?|(?:median|sigma|σ|min"
+    r"|max|range|spannweite|count|anzahl|sum|ecart|écart)\w*)[.:]?([ _]?(abw|dev|value|wert|error)\w*\.?)?:?",
     re.IGNORECASE,
 )
 """Words before the statistics of columns, below the rows; a mean or a deviation is among them."""
@@ -113,9 +113,10 @@ class CsvLines:
             and not (named and cells[:expected] == self.header)
             and not (self._commented and _is_comment(cells))
         ]
-        found = (STATISTICS.fullmatch(next(filter(None, cells))) for _, cells in reversed(kept))
-        last = [(own[0], own[1]) for own in takewhile(bool, found) if own]
-        if len({*last}) == len(last) < len(kept) and any(sure for _, sure in last):  # no word of all rows, or a name
+        first = [next(filter(None, cells)) for _, cells in kept]
+        last = [own for own in takewhile(bool, map(STATISTICS.fullmatch, reversed(first))) if own]
+        once = all(first.count(own[0]) == 1 for own in last)  # no name of a marker, or word of all rows
+        if once and len(last) < len(kept) and any(own[1] for own in last):
             kept = kept[: len(kept) - len(last)]
         sizes = expected, expected + self._extra
         bad = [(line, len(cells)) for line, cells in kept if len(cells) not in sizes or any(cells[expected:])]
@@ -309,8 +310,10 @@ def _joined(names: list[list[str]]) -> list[str]:
 
 
 def _items(text: str) -> list[str]:
-    """The items of a list in one cell; none of another cell."""
+    """The items of a list in one cell; none of another cell, or where commas may be decimal marks."""
     found = LIST.fullmatch(text)
+    if found and "." not in text and re.search(r"\d,\d", text) and re.search(r"\d *;|\d +[-+\d]", text):
+        return []
     return re.findall(r"[^\s,;\[\]()'\"]+", re.sub(r"\w+\.\w+\(([^()]*)\)", r"\1", found[1])) if found else []
 
 
@@ -320,8 +323,8 @@ def _lists(lines: Lines) -> dict[int, tuple[int, ...]]:
     for place in range(max((len(cells) for _, cells in lines), default=0)):
         texts = [cells[place] for _, cells in lines if len(cells) > place and cells[place]]
         counts = [len(_items(text)) for text in texts]
-        count = max(counts, key=counts.count, default=0)
-        if count > 1 and 2 * counts.count(count) > len(counts):
+        count = max(filter(None, counts), key=counts.count, default=0)
+        if count > 1 and 2 * counts.count(count) >= len(counts):  # a line of names, and at least one row
             rows = max(texts[counts.index(count)].count("[") - 1, 1)
             found[place] = (rows, count // rows) if rows > 1 and count % rows == 0 else (count,)
     return found
@@ -332,7 +335,7 @@ def _parts(cell: str, shape: tuple[int, ...] | None) -> list[str]:
     if shape is None:
         return [cell]
     items, count = _items(cell), prod(shape)
-    if cell and not items and number(cell, ".") is None:
+    if cell and not items and not isnan(number(cell, ".") or 0.0):
         return [*names_of(cell, shape)]
     return items if len(items) == count else [cell] * count if not items else [cell, *[""] * (count - 1)]
 

@@ -2,8 +2,8 @@
 
 An array (N, k) has a column for each k, named after it and numbered from 1; (N, 3) of an array in a file of several is
 x, y, z where the name is that of places; of poses (N, 4, 4) the columns are numbered by row and column, 00 to 33. Of
-several arrays those with the most common number of rows are the table; (k, N) among them is turned. Two sheets are one
-table if one column of both has the same texts.
+several arrays those with the number of rows that most columns have are the table; (k, N) among them is turned. Two
+sheets are one table if one column of both has the same texts.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from io import BytesIO, StringIO
-from itertools import compress, product
+from itertools import compress, product, zip_longest
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -88,18 +88,23 @@ def _spreadsheet(path: Path, file: BinaryIO) -> tuple[Rows, list[str]]:
     filled = {name: sum(cell is not None for row in rows for cell in row) for name, rows in sheets.items()}
     if not any(filled.values()):
         raise _no_table(path, "a spreadsheet without cells", "check that it was saved completely")
-    best = max(filled, key=filled.__getitem__)
-    if (joined := _joined_sheets({name: sheets[name] for name in sheets if filled[name]})) is not None:
+    tables = {name: _filled(rows) for name, rows in sheets.items() if filled[name]}
+    if (joined := _joined_sheets(tables)) is not None:
         return joined
-    others, rows = [name for name in sheets if name != best and filled[name]], sheets[best]
-    used = [k for k in range(max(map(len, rows))) if any(len(row) > k and row[k] is not None for row in rows)]
-    cells = [[_cell(row[k]) if len(row) > k else "" for k in used] for row in rows]
-    return cells, [f"sheet '{best}' read, not {few(others)}"] * bool(others)
+    best = max(filled, key=filled.__getitem__)
+    others = [name for name in tables if name != best]
+    return tables[best], [f"sheet '{best}' read, not {few(others)}"] * bool(others)
 
 
-def _joined_sheets(sheets: Mapping[str, Rows]) -> tuple[Rows, list[str]] | None:
+def _filled(rows: Sequence[Sequence[Any]]) -> list[list[str]]:
+    """Lines of equal length of a sheet, without the columns in which no line holds anything."""
+    each = list(zip_longest(*([_cell(cell) for cell in row] for row in rows), fillvalue=""))
+    return [list(row) for row in zip(*filter(any, each), strict=True)]
+
+
+def _joined_sheets(sheets: Mapping[str, list[list[str]]]) -> tuple[Rows, list[str]] | None:
     """Two sheets whose first lines have one common name, with the same different texts below it, side by side."""
-    each = [[[*map(_cell, row)] for row in rows if any(row)] for rows in sheets.values()]
+    each = [[row for row in rows if any(row)] for rows in sheets.values()]
     common = {*each[0][0]} & {*each[-1][0]} - {""} if len(each) == 2 else set[str]()
     if len(common) != 1:
         return None
@@ -157,14 +162,15 @@ def _joined(path: Path, arrays: Mapping[str, Any]) -> tuple[Rows, list[str]]:
     cells = {name: array for name, array in known.items() if array.dtype.kind == "O"}  # of MATLAB
     known |= {name: array.astype(str) for name, array in cells.items() if all(isinstance(v, str) for v in array.flat)}
     usable = {name: array for name, array in known.items() if array.dtype.kind in "fiubUS" and 0 < array.ndim < 4}
-    tables, counts = Counter[int](), Counter[int]()  # arrays with so many rows or, of two axes, columns
-    for shape in (array.shape for array in usable.values()):
-        sizes = {*shape[:2]} if len(shape) == 2 else {shape[0]}
-        counts.update(sizes)
-        tables.update(sizes if len({*shape}) > 1 else ())
-    if not counts:
+    written, turned = Counter[int](), Counter[int]()  # columns of arrays with so many rows, as they are and if turned
+    for array in usable.values():
+        rows, columns = len(array), array[:1].size
+        few_columns = min(rows, columns) if array.shape[1:] != (rows,) else 0  # a square may be either
+        written[rows] += few_columns
+        turned[max(rows, columns) if array.ndim == 2 else rows] += few_columns
+    if not usable:
         raise _no_table(path, f"the arrays {few(list(known))}", "save numbers of shape (N,) or (N, columns)")
-    rows = max(counts, key=lambda size: (tables[size], counts[size], size))
+    rows = max(written, turned, key=lambda counts: max(counts.values())).most_common(1)[0][0]
     usable = {name: array.T if array.ndim == 2 and len(array) != rows else array for name, array in usable.items()}
     own = {name: array for name, array in usable.items() if len(array) == rows}
     header = [column for name, array in own.items() for column in names_of(name, array.shape[1:])]

@@ -150,12 +150,14 @@ def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
     in_a_plane = ZERO not in file.header and any(names[2] == ZERO for names in columns.table.triples)
     columns = replace(columns, numbers=tuple(one for one in columns.numbers if not (in_a_plane and one.name == ZERO)))
     places = find_columns(path, file.header, [*columns.names, *named], file.sep)
-    _check_units(file, columns)
-    some = file.rows()
+    some, marker = file.rows(), columns.table.marker
     if columns.table.triples and zeros:
-        some = _with_joints(path, some, places[: len(columns.joints.columns)], fill=columns.table.marker is not None)
+        names = file.header.index(marker.partition("=")[0]) if marker is not None else None
+        some = _with_joints(path, some, places[: len(columns.joints.columns)], names)
     lines, rows = zip(*some, strict=True)
     cells = [[row[place] for row in rows] for place in places]
+    file.units |= {file.header[place]: "deg" for place, own in zip(places, cells, strict=True) if "°" in "".join(own)}
+    _check_units(file, columns)
     words = [["" if text.lower() == "nan" else text for text in own] for own in cells[len(columns.names) :]]
     numbers, notes = _numbers(path, columns, lines, cells[: len(columns.names)])
     for column, values in zip(columns.numbers, numbers[:, len(columns.joints.columns) :].T, strict=True):
@@ -183,17 +185,24 @@ def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
     return whole.of(seen)
 
 
-def _with_joints(path: Path, rows: Lines, places: Sequence[int], *, fill: bool) -> Lines:
-    """Lines with joint values: those without any are left out, or, where lines ``fill`` a pose, have those above."""
+def _with_joints(path: Path, rows: Lines, places: Sequence[int], names: int | None) -> Lines:
+    """Lines with joint values: those without any are left out, or have those above where a column names the marker.
+
+    Not where the marker was named since: the joint values of that pose are missing.
+    """
     empty = {line for line, cells in rows if not any(cells[place] for place in places)}
     if not empty or len(empty) == len(rows):
         return rows
-    if not fill:
+    if names is None:
         warn_user(f"file '{path}': no joint values in line {few(sorted(empty))}: {len(empty)} row(s) left out")
         return [(line, cells) for line, cells in rows if line not in empty]
-    above, filled = dict[int, str](), list[tuple[int, list[str]]]()
+    above, filled, seen = dict[int, str](), list[tuple[int, list[str]]](), set[str]()
     for line, cells in rows:
-        above = above if line in empty else {place: cells[place] for place in places}
+        if line not in empty:
+            above, seen = {place: cells[place] for place in places}, set()
+        elif cells[names] in seen:
+            above = {}
+        seen.add(cells[names])
         filled.append((line, [above.get(place, cell) for place, cell in enumerate(cells)]))
     return filled
 
@@ -281,7 +290,7 @@ def _check_units(file: CsvLines, columns: Columns) -> None:
     wrong = [name for name, unit in read.items() if isinstance(unit, str) and stated[name] not in (None, unit)]
     for name in sorted(wrong, key=lambda name: stated[name] in (*UNITS_PER_METRE, *ANGLE_UNITS)):  # cm, inch first
         what, fix = f"file '{file.path}', column '{shown(name)}'", "state the unit of the file, or convert it"
-        got = f"{stated[name]} in its header"
+        got = f"{stated[name]} in the file"
         raise MeasurementError.of(what, expected=f"{read[name]}, as stated", got=got, fix=fix)
 
 
