@@ -26,14 +26,11 @@ from io import FileIO
 from itertools import chain, starmap
 from pathlib import Path
 from stat import S_ISREG
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few, warn_user
 from diffeo_calib.common.files import FULL, bring_to_disk, lock_file
 from diffeo_calib.measurements.csv.cells import number
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 KEPT = ("fits", "accepted", "error", "expected", "cause", "decided", "again", "shown")
 """Fields of a verdict in a journal."""
@@ -46,7 +43,7 @@ STILL_SECONDS = 5.0
 """Time after which no program is writing half a line any more."""
 
 
-class Journal:
+class Journal(ExitStack):
     """The journal beside a table, open for one process: a context, whose ``entries`` are those it had.
 
     Raises:
@@ -57,6 +54,7 @@ class Journal:
     """
 
     def __init__(self, path: Path) -> None:
+        super().__init__()
         self.path = path
         with ExitStack() as stack:
             try:
@@ -72,13 +70,7 @@ class Journal:
                 raise InputError.of(f"{path} cannot be opened ({error.strerror})", fix="check the folder") from error
             if locked is None:
                 warn_user(f"{path} cannot be locked: run no second campaign of this table at the same time.")
-            self._stack = stack.pop_all()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
+            self.push(stack.pop_all())
 
     def add(self, entries: Iterable[dict[str, Any]]) -> None:
         """Append entries, whole or not at all; DiffeoCalibError where the disk is full."""

@@ -19,24 +19,23 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import changes_of
 from diffeo_calib.calibration.diagnostics.plausibility import check_joints
 from diffeo_calib.calibration.placing.place import Placed, place
-from diffeo_calib.calibration.placing.placement import Elsewhere
 from diffeo_calib.calibration.planning.candidates import candidates, ranges_around
 from diffeo_calib.calibration.planning.knowledge import greedy
 from diffeo_calib.calibration.scales.leave_one_out import variance_ratio
 from diffeo_calib.calibration.scales.selection import GROWTH, defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.campaign.verdicts import Change, InOrder, Seen, Verdict, find_change
+from diffeo_calib.campaign.verdicts import Change, Seen, Verdict, find_change
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError, few
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.fitting.result import silent
-from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.maps.linearisation import Linearisation, Numbers
 from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.regression.conditional import Conditional, Features, Process, diagonal_blocks
+from diffeo_calib.regression.conditional import Features, Process, diagonal_blocks
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import CHANGE, Hypothesis
@@ -127,35 +126,26 @@ class Around:
         rows, devices = data.rows(index), cache(lambda: placed.placement.hypotheses(data, CHANGE))
         return rows, lambda some: changes_of(rows.rows(_numbers(some.start, some.stop)), devices(), index[some])
 
-    def noise(self, data: TangentData) -> Tensor:
-        """(N, R, R) of what rows tell, m^2."""
-        return data.noise_of_numbers(self.scales)
-
-    def given(self, before: Conditional, data: TangentData) -> Process:
-        """What is known after more rows."""
-        return before.given(data.numbers(self.scales), self.noise(data))
+    def told(self, data: TangentData) -> tuple[Numbers, Tensor]:
+        """What rows tell, and its noise (N, R, R), m^2."""
+        return data.numbers(self.scales), data.noise_of_numbers(self.scales)
 
     def process(self, table: Any, accepted: Sequence[int]) -> Process:
         """What is known by rows of the campaign."""
         place_of = {row: number for number, row in enumerate(self.placed.data.line_numbers.tolist())}
         mine = [place_of[row] for row in accepted if row in place_of]
         later = [row for row in accepted if row not in place_of]
-        if not mine:
-            return self.given(self.data.prior(self.scales), self.rows(table.rows(later))[0])
-        own = self.data.rows(torch.tensor(mine, dtype=torch.int64, device=HOST))
-        found = own.sample(len(mine), MOST_COORDINATES, 0)[1].process(self.scales)
-        return self.given(found, self.rows(table.rows(later))[0]) if later else found
+        found: Any = self.data.prior(self.scales)
+        if mine:
+            own = self.data.rows(torch.tensor(mine, dtype=torch.int64, device=HOST))
+            found = own.sample(len(mine), MOST_COORDINATES, 0)[1].process(self.scales)
+        return found.given(*self.told(self.rows(table.rows(later))[0])) if later else found
 
     @cached_property
     def like(self) -> int:
         """Number of the last row as which some of the candidates can be measured; else the very last."""
         last = len(self.placed.data) - 1
         return next((row for row in range(last, -1, -1) if bool(self._sees(row, self.candidates).any())), last)
-
-    @property
-    def _elsewhere(self) -> list[Elsewhere]:
-        """That row at the candidates."""
-        return self.placed.elsewhere(self.like, self.candidates)
 
     def _sees(self, row: int, q: Tensor) -> Tensor:
         """(M,) boolean: configurations in which a row can be measured."""
@@ -169,7 +159,8 @@ class Around:
 
     def with_open_candidates(self, count: int, seed: int) -> Around:
         """Draw ``count`` candidates that can be measured where some of the present ones cannot."""
-        geometry, places = self.placed.identification.geometry, [own.places for own in self._elsewhere]
+        elsewhere = self.placed.elsewhere(self.like, self.candidates)
+        geometry, places = self.placed.identification.geometry, [own.places for own in elsewhere]
         chain, base = geometry.chain, geometry.base
         how: Any = {"ranges": ranges_around(chain, self.placed.data.q), "keep": partial(self._sees, self.like)}
         if any(map(len, places)):
@@ -182,11 +173,12 @@ class Around:
     @cached_property
     def options(self) -> tuple[Linearisation, Tensor]:
         """What the candidates would tell, and its noise (M, r, r), m^2."""
-        copies = with_joints(self.placed.data.rows([self.like] * len(self.candidates)), self.candidates)
-        for own in self._elsewhere:
+        copies = self.placed.data.rows([self.like] * len(self.candidates))
+        copies: Any = with_attributes(copies.parts[0], q=self.candidates)
+        for own in self.placed.elsewhere(self.like, self.candidates):
             copies = own.changed(copies)
-        data = self.rows(copies)[0]
-        return data.numbers(self.scales).at, self.noise(data)
+        numbers, noise = self.told(self.rows(copies)[0])
+        return numbers.at, noise
 
     @cached_property
     def errors(self) -> tuple[Linearisation, Tensor]:
@@ -258,8 +250,7 @@ class CampaignModel:
         first = accepted[(len(accepted) + 1) // 2]  # the others hold what is known
         self.window = [one.row for one in judged[-gates.WINDOW :] if one.row >= first]
         self.process = around.process(table, [row for row in accepted if row not in self.window])
-        last = around.rows(table.rows(self.window))[0]
-        self.numbers, self.noise = last.numbers(around.scales), around.noise(last)
+        self.numbers, self.noise = around.told(around.rows(table.rows(self.window))[0])
         ats = self.numbers.at, around.errors[0], around.options[0]
         self._at, self._target, self._options = map(self.process.features, ats)
         self._cross = self._at.by_fields_with(self._target)
@@ -330,31 +321,28 @@ class CampaignModel:
         first, before = len(verdicts), len(self.window)
         window = [*self.window, *range(first, len(table))]
         data, changes = self.around.rows(table.rows(window))
-        numbers, noise = data.numbers(self.around.scales), self.around.noise(data)
+        numbers, noise = self.around.told(data)
         new = self.process.features(numbers.rows(_numbers(before, len(window))).at)
         near, far = (one.by_fields_with(new) for one in (self._at, self._target))
         at, cross = self._at.followed_by(new, near), torch.cat([self._cross, far.T])
         accepted = [verdicts[row].accepted for row in self.window] + [True] * (len(window) - before)
-        seen = InOrder.of(Seen.of(self.process, numbers, noise, at), _flags(accepted))
-        expected = self._expected_errors(seen, cross + at.unknown.T @ self._target.unknown)
+        root, given = Seen.of(self.process, numbers, noise, at).in_order(_flags(accepted))
+        expected = self._expected_errors(numbers, root, cross + at.unknown.T @ self._target.unknown)
         for number in range(before, len(window)):
-            row, single, typical = window[number], seen.rows(number, number + 1), self.typical
-            found = single.measure(_freedom(data.rows(_numbers(number, number + 1))))
+            row, single, typical = window[number], given(number, number + 1), self.typical
+            own = data.rows(_numbers(number, number + 1))
+            found = single.measure(_freedom(own))
             fits = found.fits(typical)
             if number > before and not fits:
                 break
-            cause = (
-                ""
-                if fits
-                else self._cause(table.rows(slice(0, row + 1)), data.rows(_numbers(number, number + 1)), single)
-            )
+            cause = "" if fits else self._cause(table.rows(slice(0, row + 1)), own, single)
             verdict = Verdict(row, fits, fits, found.error, found.expected, cause, line=lines[row])
             last = slice(max(0, number - gates.WINDOW), number + 1)
             some, change = [*(verdicts[row] for row in window[last][:-1]), verdict], None
             if not cause:
                 flags = _flags([one.accepted for one in some]), _flags([not one.cause for one in some])
                 how: Any = {"single": found, "typical": typical, "coordinates": data.y.shape[1]}
-                change = find_change(seen.rows(last.start, last.stop), window[last], changes(last), flags, **how)
+                change = find_change(given(last.start, last.stop), window[last], changes(last), flags, **how)
             if number > before and change is not None:
                 break
             if fits:
@@ -365,21 +353,20 @@ class CampaignModel:
                 _change(verdicts, window[last], change, lines)
             if change is not None or not fits:
                 break
-        self.window, self.numbers, self.noise, self._at, self._cross = (
-            window[: before + len(verdicts) - first],
-            numbers,
-            noise,
-            at,
-            cross,
-        )
+        self.window = window[: before + len(verdicts) - first]
+        self.numbers, self.noise, self._at, self._cross = numbers, noise, at, cross
         self._let_go(verdicts)
         self._learn(verdicts)
 
-    def _expected_errors(self, seen: InOrder, cross: Tensor) -> list[float]:
-        """RMS error over the target after each of some rows, m, whose numbers have a covariance (N R, T r) with it."""
+    def _expected_errors(self, numbers: Numbers, root: Tensor, cross: Tensor) -> list[float]:
+        """RMS error over the target after each of some rows, m, whose numbers have a covariance (N R, T r) with it.
+
+        ``root``: lower Cholesky factor of their own.
+        """
         compared = self.around.errors[1]
-        white = torch.linalg.solve_triangular(seen.root, seen.seen.numbers.there(cross) @ compared, upper=False)
-        lowered = white.square().sum(1).cumsum(0)[seen.ends(seen.seen.numbers.shape[0]) - 1] / len(compared)
+        white = torch.linalg.solve_triangular(root, numbers.there(cross) @ compared, upper=False)
+        last = numbers.owner.bincount(minlength=numbers.shape[0]).cumsum(0) - 1
+        lowered = white.square().sum(1).cumsum(0)[last] / len(compared)
         variance = self.around.covariance(self._target).diagonal().mean() - lowered
         return (3 * variance).clamp(min=0).sqrt().tolist()
 
@@ -405,11 +392,6 @@ class CampaignModel:
         self.now = self.process.given(self.numbers, noise, self._at)
         target = self.now.features(self._target.at, self._target, self.numbers.there(self._cross))
         self.covariance = self.around.covariance(target)
-
-    def _seen(self, data: TangentData) -> Seen:
-        """Rows as the accepted ones before them predict them."""
-        numbers = data.numbers(self.around.scales)
-        return Seen.of(self.now, numbers, self.around.noise(data), self.now.features(numbers.at))
 
     def _cause(self, table: Any, own: TangentData, seen: Seen) -> str:
         """Why the last row is wrong, in words; empty if nothing that is undone makes it fit."""
@@ -443,14 +425,10 @@ class CampaignModel:
             "it seems to have been measured at the joint values of the row before": table.q[-2],
         }
         copies = table.rows([len(table) - 1] * len(joints))
-        others = self.around.rows(with_joints(copies, torch.stack([*joints.values()])))[0]
+        others = self.around.rows(with_attributes(copies.parts[0], q=torch.stack([*joints.values()])))[0]
         for number, words in enumerate(joints):
-            yield words, self._seen(others.rows(_numbers(number, number + 1)))
-
-
-def with_joints(table: Any, q: Tensor) -> Any:
-    """Rows of one kind at other joint values (N, n)."""
-    return with_attributes(table.parts[0], q=q)
+            numbers, noise = self.around.told(others.rows(_numbers(number, number + 1)))
+            yield words, Seen.of(self.now, numbers, noise, self.now.features(numbers.at))
 
 
 def _flags(values: Sequence[bool]) -> Tensor:

@@ -12,7 +12,7 @@ A row is judged by d^2 = e^T S^-1 e, chi-squared if it is right. Two kinds of ca
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from math import log
 from typing import Any, NamedTuple
@@ -142,38 +142,26 @@ class Seen(NamedTuple):
         expected = float(self.covariance.diagonal().mean().clamp(min=0).sqrt())
         return Measure(square, freedom, float(self.error.square().mean().sqrt()), expected)
 
+    def in_order(self, accepted: Tensor) -> tuple[Tensor, Callable[[int, int], Seen]]:
+        """One row after the other, each as those before it predict it that are accepted, (N,) boolean.
 
-class InOrder(NamedTuple):
-    """Rows one after the other, each as those before it predict it that are accepted.
+        Returns:
+            lower Cholesky factor of the covariance, in which rows that are not accepted tell nothing; and a function:
+            rows from one to before another, as the accepted ones before them predict them.
+        """
+        owner = self.numbers.owner
+        hidden = HIDDEN_VARIANCE * (~accepted[owner]).to(self.error)
+        root = torch.linalg.cholesky(self.covariance + torch.diag(hidden))
+        white = torch.linalg.solve_triangular(root, self.error[:, None], upper=False)[:, 0]
 
-    Args:
-        seen: all of them, as those before all of them predict them. root: lower Cholesky factor of their covariance, in
-            which those that are not accepted tell nothing. white: root^-1 error.
-    """
+        def rows(first: int, last: int) -> Seen:
+            start, end = (int((owner < row).sum()) for row in (first, last))
+            own, before = slice(start, end), root[start:end, :start]
+            numbers = self.numbers.rows(torch.arange(first, last, device=owner.device))
+            error = self.error[own] - before @ white[:start]
+            return Seen(numbers, error, self.covariance[own, own] - before @ before.T)
 
-    seen: Seen
-    root: Tensor
-    white: Tensor
-
-    @classmethod
-    def of(cls, seen: Seen, accepted: Tensor) -> InOrder:
-        """By which of the rows are accepted, (N,) boolean."""
-        hidden = HIDDEN_VARIANCE * (~accepted[seen.numbers.owner]).to(seen.error)
-        root = torch.linalg.cholesky(seen.covariance + torch.diag(hidden))
-        return cls(seen, root, torch.linalg.solve_triangular(root, seen.error[:, None], upper=False)[:, 0])
-
-    def ends(self, count: int) -> Tensor:
-        """(count,) how many numbers the first rows have, one of them, two, ..."""
-        owner = self.seen.numbers.owner
-        return torch.searchsorted(owner, torch.arange(1, count + 1, device=owner.device))
-
-    def rows(self, first: int, last: int) -> Seen:
-        """Rows from the first to before the last, as accepted ones before the first predict them."""
-        index = torch.arange(first, last, device=self.root.device)
-        start, end = (int(self.ends(count)[-1]) if count else 0 for count in (first, last))
-        own, before = slice(start, end), self.root[start:end, :start]
-        error = self.seen.error[own] - before @ self.white[:start]
-        return Seen(self.seen.numbers.rows(index), error, self.seen.covariance[own, own] - before @ before.T)
+        return root, rows
 
 
 def find_change(

@@ -305,8 +305,8 @@ def guess_readings(columns: Sequence[str]) -> dict[str, list[str]]:
             if own is not None and own not in found.values():
                 found[f"{word}={','.join(own)}"] = own
     pixels = [*whole(columns, "uv"), *(own for own in whole(columns, "xy") if own.says("pixel"))]
-    found |= {f"image={','.join(own.names.values())},{LENS}": [*own.names.values()] for own in pixels[:1]}
-    return found
+    names = [[*own.names.values()] for own in pixels if not own.says("rate", "deviation")]  # no currents of phases
+    return found | {f"image={','.join(own)},{LENS}": own for own in names[:1]}
 
 
 # --- what was measured ---

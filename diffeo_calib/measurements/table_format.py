@@ -254,11 +254,12 @@ def options_of(table: TableFormat) -> list[str]:
     """The options with which the command line reads positions or poses that are written so, word by word."""
     lever = f"{table.lever * table.per_metre:.17g}" if table.rotation and table.lever != LEVER else None
     texts = {field.name: getattr(table, field.name) for field in fields(table)}
-    texts |= {"position": table.triples, "lever": lever, "joints": ",".join(table.joints)}
-    texts |= {"std": ",".join(flat_names(table.std))}
+    way = f"{table.spherical}=" * (table.spherical is not None)
+    texts |= {"position": [[way + ",".join(names)] for names in table.triples], "lever": lever}
+    texts |= {"joints": ",".join(table.joints), "std": ",".join(flat_names(table.std))}
     words = list[str]()
     for name, value in texts.items():
-        if value and name not in ("kinds", "on", "sockets", "readings"):
+        if value and name not in ("kinds", "on", "sockets", "readings", "spherical"):
             option = f"--{name.replace('_', '-')}"
             each = [value] if isinstance(value, str) else [] if value is True else map(",".join, value)
             words += [option] if value is True else [word for text in each for word in (option, text)]

@@ -369,6 +369,8 @@ def test_angles_in_minutes_and_places_as_angles(read: Reader) -> None:
     turn, up = math.radians(-45.51), math.radians(-30.0)
     last = [2 * math.cos(up) * math.cos(turn), 2 * math.cos(up) * math.sin(turn), 2 * math.sin(up)]
     assert_close(data.points[:, 0].tolist(), [[0.0, 2.0, 0.0], [0.0, 0.0, 2.0], last], rtol=1e-14, atol=1e-14)
+    assert "--position zenith_clockwise_deg=sd,hz,v" in data.origin.options
+    assert "--spherical" not in data.origin.options
 
 
 def test_a_line_without_any_marker_is_left_out_and_named(read: Reader) -> None:
