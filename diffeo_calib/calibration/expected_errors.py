@@ -306,9 +306,8 @@ def with_open_directions(fitted: FittedMap, measurements: Measurements, registra
     least[parts["joints"]] = (unseen[:, None] * twist).flatten()
     least[nominal.sag] = _unseen_sag(nominal, q)
     variance = torch.maximum(before, least.square())
-    return (
-        fitted if torch.equal(variance, before) else replace(fitted, deformation=fitted.geodesic.with_prior(variance))
-    )
+    deformation = fitted.geodesic.with_spec(prior_variance=variance)
+    return fitted if torch.equal(variance, before) else replace(fitted, deformation=deformation)
 
 
 def _unseen_sag(nominal: GeometryMap, q: Tensor) -> Tensor:

@@ -114,7 +114,8 @@ class GeodesicDeformation(Deformation):
         other.joint_flow, other.task_flow = self.joint_flow.using(backend), self.task_flow.using(backend)
         return other
 
-    def _with_spec(self, **changes: object) -> GeodesicDeformation:
+    def with_spec(self, **changes: object) -> GeodesicDeformation:
+        """The same deformation with another nominal map, or other prior variances of theta for covariances."""
         other = copy(self)
         vars(other).pop("_slopes", None)
         other.spec = replace(self.spec, **changes)
@@ -125,16 +126,12 @@ class GeodesicDeformation(Deformation):
 
         The controls stay those of the fit; evaluate and linearise the result at given configurations only.
         """
-        return self._with_spec(nominal=nominal)
+        return self.with_spec(nominal=nominal)
 
     def at_rows(self, index: slice) -> GeodesicDeformation:
         """The same at some of the rows that its nominal map was made for."""
         some = self.spec.nominal.rows(index)
         return self if some is self.spec.nominal else self.with_nominal(some)
-
-    def with_prior(self, variance: Tensor) -> GeodesicDeformation:
-        """The same deformation with other prior variances (K,) of theta, for covariances."""
-        return self._with_spec(prior_variance=variance)
 
     def linearise(self, x: Tensor | None = None) -> Linearisation:
         """First-order response of k1(x) to the fields v_t, w_t and to theta.

@@ -214,6 +214,11 @@ def test_evidence_of_unknowns_is_that_of_their_covariance(case: Case) -> None:
     plain = W.T @ r, W.T @ W, float(r @ r), len(r)
     for one, other in zip(found, plain, strict=True):
         assert_close(torch.as_tensor(one), torch.as_tensor(other), rtol=1e-6, atol=1e-6)
+    left = r - W @ torch.linalg.lstsq(W, r[:, None]).solution[:, 0]
+    assert float(found.gain) == pytest.approx(float(r @ r - left @ left), rel=1e-6)
+    for scale in (1e-3, 1e3):  # errors as large as K says, or smaller, are no excess
+        own = Evidence(scale * found.g, found.H, scale**2 * found.total, found.count)
+        assert float(own.excess) == pytest.approx(max(1.0, scale**2 * float(left.square().mean())), rel=1e-6)
     odds = Evidence(torch.stack([found.g, 2.0 * found.g]), found.H).log_odds(variances)
     for row, variance in enumerate(variances):
         for column, target in enumerate((y, 2.0 * y)):

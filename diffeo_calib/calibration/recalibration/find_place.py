@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.hypotheses import BASE, MARKERS, NEW_SET_UP, TWO_ROBOTS, SampledRows
+from diffeo_calib.calibration.diagnostics.hypotheses import BASE, MARKERS, NEW_SET_UP, SampledRows
 from diffeo_calib.calibration.diagnostics.judge import best_of, changed, two_tools
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows, NewSetUp, UsualNoise
 from diffeo_calib.common.checks import check_number
@@ -93,7 +93,7 @@ def find_place(
 
     Raises:
         InputError: arguments of another kind, or markers that are to stay, but other ones were measured.
-        MeasurementError: no more coordinates than unknowns without a prior.
+        MeasurementError: no more coordinates than unknowns without a prior, or rows that no place explains.
     """
     if free not in FREE:
         raise InputError.of("`free`", expected=" or ".join(map(repr, FREE)), got=as_written(free))
@@ -331,22 +331,20 @@ def opened(rows: NewRows, data: Any) -> NewRows:
     found.append(Hypothesis(MARKERS, markers, fix=NEW_SET_UP))
     for joint, (name, turns) in enumerate(zip(chain.joint_names, chain.periodic, strict=True)):
         effects = rows.at.joint_to_start[:, :, joint, None] * shown
-        found.append(Hypothesis(name, effects, ("mrad" if turns else "mm", 1e-3), TWO_ROBOTS))
+        found.append(Hypothesis(name, effects, ("mrad" if turns else "mm", 1e-3)))
     found = [own for own in (*found, *mine.hypotheses(rows, CHANGE)) if bool((own.effects != 0).any())]
     named = [own._replace(name=mine.bodies.get(own.name, own.name)) for own in found]
     told = SampledRows(torch.arange(len(rows), device=shown.device), rows.process, None)
     found = changed(told, named, data.line_numbers, data.row_names)
-    causes = [one for one in found if TWO_ROBOTS not in one.fix]  # of the robot, see find_changes.py
+    causes = [one for one in found if one.what.split(" seems")[0] not in chain.joint_names]  # see find_changes.py
     if len(rows) >= gates.MIXED_ROWS:
         causes += two_tools(told, markers, data.line_numbers)
     best = best_of(causes, told)
     if best is None:
         return rows
-    columns, none = (
-        rows.shared[..., :0] if best.columns is None else best.columns,
-        Tails.none(*rows.tails.weights.shape),
-    )
-    return rows.changed(shared=torch.cat([columns, rows.shared], 2), tails=none, changed_among=best.text)
+    columns = rows.shared[..., :0] if best.columns is None else best.columns
+    shared, tails = torch.cat([columns, rows.shared], 2), Tails.none(*rows.tails.weights.shape)
+    return rows.changed(shared=shared, tails=tails, changed_among=best.text)
 
 
 def _record(best: NewRows, said: dict[str, object], *, known: bool) -> Registration:

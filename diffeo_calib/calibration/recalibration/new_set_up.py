@@ -191,7 +191,11 @@ def _place_of_device(
         return old.geodesic.with_nominal(robot_map(old).under(rows.payload))(rows.q).detach().unflatten(1, (-1, 3))
 
     largest = device.largest_session()
-    check_unit(predicted(largest), largest.points)
+    ratio = size_ratio(predicted(largest), largest.points)
+    if in_other_unit(ratio, OTHER_UNIT):
+        what, expected = "do not have the robot's size", "distances between rows as the model predicts them"
+        fix, got = "check `length` and `angle`, and the order of the columns", f"{ratio:.3g} times these"
+        raise MeasurementError.of(f"the new rows {what}", expected=expected, got=got, fix=fix)
     rows, found = find_place(old, lever, largest, marker_std=marker_std, opens=opens)
     ratio = size_ratio(*(each.unflatten(1, (-1, 3)) for each in (rows.points, rows.given.shown(rows.y))))
     if abs(ratio - 1.0) > USUAL_RATIO:
@@ -243,9 +247,8 @@ def with_ball(fitted: FittedMap, ball: Tensor, tip: str, deviation: float) -> Fi
 Marker = Literal["evidence", "same", "moved", "other"]
 LARGEST_TURN_RAD = 0.1
 """Standard deviation of the turn of the measuring device from which its place is open."""
-LARGEST_RATIO, OTHER_UNIT = 5.0, 0.5
-"""Ratio of measured and predicted distances that is doubted, and its relative error from which it is no unit's: markers
-may be others."""
+OTHER_UNIT = 0.5
+"""Relative error of a thousand times the measured distances: markers that sit elsewhere lengthen and shorten them."""
 USUAL_RATIO = 3e-3
 """Relative error of distances that no robot has."""
 FARTHEST_PAIRS = 0.5
@@ -271,18 +274,6 @@ def check_other_table(model: CalibratedKinematics, new: Any) -> None:
         if used:
             what = f"the model was fitted to {used} of these {len(new)} measurements: they would count twice"
             raise InputError.of(what, fix="pass rows that were measured later")
-
-
-def check_unit(predicted: Tensor, measured: Tensor) -> None:
-    """Raise MeasurementError where measured points (M, P, 3), m, are those of the old model in another unit."""
-    ratio = size_ratio(predicted, measured)
-    if not 1 / LARGEST_RATIO < ratio < LARGEST_RATIO and in_other_unit(ratio, OTHER_UNIT):
-        what, expected = (
-            "the new rows do not have the robot's size",
-            "distances between rows as the model predicts them",
-        )
-        fix = "check `length` and `angle`, and the order of the columns"
-        raise MeasurementError.of(what, expected=expected, got=f"{ratio:.3g} times these", fix=fix)
 
 
 def size_ratio(predicted: Tensor, measured: Tensor) -> float:
