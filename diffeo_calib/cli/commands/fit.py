@@ -68,12 +68,11 @@ def run(given: FitOptions) -> None:
     _show_errors(result, in_train, None if test is None else held_out)
     _show_findings(result, len(train))
     wrong = list[Outlier]()
-    if test is not None:  # rows that were not fitted and look wrong, the worst first
+    if test is not None:
         seen, (own, _) = positions_of(result.model, result.places(), test), divided(test)
         wrong += [] if own is None else contradicted_in_sockets(result.model, own.table)
         wrong += [] if seen is None else contradicted(result.model, seen)
-        wrong.sort(key=lambda outlier: -outlier.distance)
-    say(*outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"))
+        say(*outlier_lines(sorted(wrong, key=lambda one: -one.distance), len(test), "held-out rows"))
     say(*_lines_about_places(result, data, held_out, hand_eye))
     say(*_advice(judged, wrong=bool(wrong), partial=result.partial), f"model: {given.output}")
     if given.report is not None:
