@@ -332,11 +332,11 @@ def with_units(source: Source) -> Source:
 
 def _unclear(found: Sequence[Source], *, excluded: bool) -> InputError:
     parts = [(one.left, one.table) for one in found if one.left < inf]
-    units = [
+    words = (
         (t.length, t.angle, t.joint_length, t.spherical, "camera on the tool" * t.camera_on_tool) for _, t in parts
-    ]
-    each = zip(units, parts, strict=True)
-    got = "; ".join(f"{' and '.join(filter(None, words))}: {percent(left)}" for words, (left, _) in each)
+    )
+    each = zip((" and ".join(filter(None, own)) for own in words), parts, strict=True)
+    got = "; ".join(f"{own}: {percent(left)}" for own, (left, _) in each)
     got += "; the units that the file states exclude others" * excluded
     rows, fix = found[0].rows, ""
     if rows.markers and not (rows.sockets or rows.readings):
@@ -347,10 +347,8 @@ def _unclear(found: Sequence[Source], *, excluded: bool) -> InputError:
         largest = zip(one.joints, one.robot.periodic, one.data.q.abs().amax(0).rad2deg().tolist(), strict=True)
         if far := {name: most for name, turns, most in largest if turns and most > LARGEST_TURN_DEG}:
             got = f"up to {max(far.values()):.4g} in {few([*far])}: no angles, but pulses or ticks of encoders"
-            fix = (
-                f'write joints = "360/COUNTS*{{{next(iter(far))}}},..." with the counts per turn of each axis, as the '
-            )
-            fix += "controller states them, negative where it counts the other way"
+            fix = f'write joints = "360/COUNTS*{{{next(iter(far))}}},..." with the counts per turn of each axis, as '
+            fix += "the controller states them, negative where it counts the other way"
             return InputError.of("columns of the joints", expected="rad or deg", got=got, fix=fix)
     for one, own in _of_one_size(found[0]):
         fix = likely_mistakes.likely_mistake(one.robot, own, one.left * spread(own.points)) or fix

@@ -168,13 +168,12 @@ def _named(folders: Sequence[Path], names: Sequence[str]) -> list[list[str | Non
 
 def _ordered(folders: Sequence[Path], joints: Path, count: int) -> list[list[str]]:
     """The file of each row in every folder, in the order of the numbers in their names: 2.png before 10.png."""
-
-    def by_numbers(name: str) -> list[tuple[str, int]]:
-        parts = re.findall(r"(\D*)(\d*)", name.lower())
-        return [*((text, int(number or -1)) for text, number in parts), (name, 0)]
-
+    parts = re.compile(r"(\D*)(\d*)")
     names = ([own.name for own in folder.iterdir() if own.suffix.lower() in SUFFIXES] for folder in folders)
-    files = [sorted(own, key=by_numbers) for own in names]
+    places = (
+        {name: [(text, int(k or -1)) for text, k in parts.findall(name.lower())] for name in own} for own in names
+    )
+    files = [sorted(own, key=lambda name: (own[name], name)) for own in places]
     others = [f"{len(own)} in '{folder}'" for folder, own in zip(folders, files, strict=True) if len(own) != count]
     if others:
         expected, got = f"{count} images, one for each row of '{joints}'", few(others)

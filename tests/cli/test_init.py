@@ -18,7 +18,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.cli.main import expanded
 from diffeo_calib.measurements.csv.files import write_measurements
-from diffeo_calib.measurements.poses import to_spherical
+from diffeo_calib.measurements.poses import rotation_numbers, to_spherical
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
@@ -234,7 +234,7 @@ def test_axes_that_stand_still_and_joint_values_in_the_first_line_of_a_pose(
 
 
 @pytest.mark.parametrize("by_rows", [True, False])
-def test_poses_as_numbers_of_matrices(by_rows: bool, proposed: Proposed) -> None:
+def test_poses_as_numbers_of_matrices_and_of_other_conventions(by_rows: bool, proposed: Proposed) -> None:
     """Sixteen, or twelve: these keep the last joint though its place does not move."""
     q = rows()[0]
     q[:, 5] *= 0.1
@@ -251,6 +251,10 @@ def test_poses_as_numbers_of_matrices(by_rows: bool, proposed: Proposed) -> None
         names = [f"T{row}{k}" for row in range(3) for k in range(4)]
         written, _ = proposed((SERIES, q), (names, poses[:, :3].flatten(1)))
         assert (written["joints"], written["convention"]) == (",".join(SERIES), "matrix")
+    own, name, unit = (["qx", "qy", "qz", "qw"], "quat_xyzw", None) if by_rows else (["rx", "ry", "rz"], "ZXZ", "rad")
+    numbers = rotation_numbers(poses[:, :3, :3], name, angle=unit or "rad")
+    written, _ = proposed((SERIES, q), (XYZ, poses[:, :3, 3]), (own, numbers))
+    assert (written["rotation"], written["convention"], written.get("rotation-angle")) == (",".join(own), name, unit)
 
 
 def test_names_that_contradict_the_numbers_or_lack_a_joint(proposed: Proposed) -> None:

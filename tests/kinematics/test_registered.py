@@ -172,11 +172,16 @@ def test_rows_teach_the_robot_where_nothing_else_has_changed(arm: Case) -> None:
     assert len(kept.configurations) == count
 
 
-WRONG = {3: (0.0, 0.02, 0.0)}, *({2: shift, 5: shift} for shift in ((0.0, 0.002, -0.002), (0.0, 0.02, 0.0)))
+WRONG = (
+    *({3: (0.0, y, 0.0)} for y in (0.02, 1e4)),
+    *({2: shift, 5: shift} for shift in ((0.0, 0.002, -0.002), (0.0, 0.02, 0.0))),
+)
 THIRD = {row: (0.0, 0.002 * (-1) ** row, 0.001 * row) for row in range(1, 40, 3)}
 
 
-@pytest.mark.parametrize("wrong", [*WRONG, THIRD], ids=["one", "two by 3 mm", "two by 20 mm", "a third"])
+@pytest.mark.parametrize(
+    "wrong", [*WRONG, THIRD], ids=["one", "one of a lost reflector", "two by 3 mm", "two by 20 mm", "a third"]
+)
 def test_wrong_rows_take_no_part(wrong: dict[int, tuple[float, ...]], arm: Case) -> None:
     """Of eight, or of forty; those that are wrong alike hide each other, and are found together only."""
     T, count = transform(9), 8 if len(wrong) < 3 else 40

@@ -105,7 +105,8 @@ def find_place(
         check_number(marker_std, "`marker_std`, in m", above=0.0)
     evenly = [round(k * (len(data) - 1) / (MOST_ROWS - 1)) for k in range(MOST_ROWS)]
     some = data if len(data) <= MOST_ROWS else data.rows(evenly)
-    spread = _refuse_others(some.points - some.points.nanmean((0, 1)), BEYOND_REACH * max(chain.reach, 1.0))
+    middle = some.points.flatten(0, 1).nanmedian(0).values
+    spread = _refuse_others(some.points - middle, BEYOND_REACH * max(chain.reach, 1.0))
     search = Search.of(model, lever, some, free, ball=ball)
     priors = {name: first for name, (first, _) in MARKER_DEVIATIONS.items() if search.known or name == "other"}
     priors = priors if marker_std is None else {"stated": marker_std}

@@ -151,9 +151,7 @@ def run(given: ExportOptions) -> None:
     model = load_laden(given.model, given.payload)
     own = tool_in_tip(model, given.tool, TableFormat(given.length, given.angle))
     tool = None if given.tool is None else own
-    source = (
-        None if given.c is None else write_c(model, given.c, tool, given.frame or "base", tip=given.tip, write=False)
-    )
+    source = given.c and write_c(model, given.c, tool, given.frame or "base", tip=given.tip, write=False)
     export, rigid = _Export(model, given), [option for option in wanted if option in RIGID]
     if rigid:
         export.rigid(rigid, tables="--correction-tables" in wanted)

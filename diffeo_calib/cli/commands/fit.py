@@ -67,8 +67,12 @@ def run(given: FitOptions) -> None:
     say(*_verdict(result, judged))
     _show_errors(result, in_train, None if test is None else held_out)
     _show_findings(result, len(train))
-    wrong = [] if test is None else _wrong(result, test)
-    say(*outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"))
+    wrong = list[Outlier]()
+    if test is not None:
+        seen, (own, _) = positions_of(result.model, result.places(), test), divided(test)
+        wrong += [] if own is None else contradicted_in_sockets(result.model, own.table)
+        wrong += [] if seen is None else contradicted(result.model, seen)
+        say(*outlier_lines(sorted(wrong, key=lambda one: -one.distance), len(test), "held-out rows"))
     say(*_lines_about_places(result, data, held_out, hand_eye))
     say(*_advice(judged, wrong=bool(wrong), partial=result.partial), f"model: {given.output}")
     if given.report is not None:
@@ -83,14 +87,6 @@ def run(given: FitOptions) -> None:
 def _of_positions(errors: Errors) -> list[dict[str, Evaluation]]:
     """Errors of measured positions by stage, in a list; an empty one without any."""
     return [stages for stages in errors.values() if stages[CALIBRATED].what == ERRORS]
-
-
-def _wrong(result: CalibrationResult, test: Any) -> list[Outlier]:
-    """Rows that were not fitted and look wrong, the worst first."""
-    seen, (own, _) = positions_of(result.model, result.places(), test), divided(test)
-    wrong = [] if own is None else contradicted_in_sockets(result.model, own.table)
-    wrong += [] if seen is None else contradicted(result.model, seen)
-    return sorted(wrong, key=lambda outlier: -outlier.distance)
 
 
 def _verdict(result: CalibrationResult, judged: list[Any]) -> Iterator[str]:

@@ -88,18 +88,15 @@ def _spreadsheet(path: Path, file: BinaryIO) -> tuple[Rows, list[str]]:
     filled = {name: sum(cell is not None for row in rows for cell in row) for name, rows in sheets.items()}
     if not any(filled.values()):
         raise _no_table(path, "a spreadsheet without cells", "check that it was saved completely")
-    tables = {name: _filled(rows) for name, rows in sheets.items() if filled[name]}
+    each = {
+        name: zip_longest(*(map(_cell, row) for row in sheets[name]), fillvalue="") for name in sheets if filled[name]
+    }
+    tables = {name: [[*row] for row in zip(*filter(any, columns), strict=True)] for name, columns in each.items()}
     if (joined := _joined_sheets(tables)) is not None:
         return joined
     best = max(filled, key=filled.__getitem__)
     others = [name for name in tables if name != best]
     return tables[best], [f"sheet '{best}' read, not {few(others)}"] * bool(others)
-
-
-def _filled(rows: Sequence[Sequence[Any]]) -> list[list[str]]:
-    """Lines of equal length of a sheet, without the columns in which no line holds anything."""
-    each = list(zip_longest(*([_cell(cell) for cell in row] for row in rows), fillvalue=""))
-    return [list(row) for row in zip(*filter(any, each), strict=True)]
 
 
 def _joined_sheets(sheets: Mapping[str, list[list[str]]]) -> tuple[Rows, list[str]] | None:
