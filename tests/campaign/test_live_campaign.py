@@ -228,7 +228,7 @@ def test_other_kinds_of_rows(name: str) -> None:
     order = torch.randperm(len(rows), generator=torch.Generator("cpu").manual_seed(0))[: 100 if rows.parts[1:] else 36]
     first = 2 * len(order) // 3
     campaign = begun(rows.rows(order[:first]), kind.robot, candidates=kind.q(20), target=kind.q(10))
-    judged = [one for one in campaign.add(rows.rows(order[first:])) if one.fits is not None]
+    judged = [one for row in order[first:, None] for one in campaign.add(rows.rows(row)) if one.fits is not None]
     assert len(judged) > 10, [str(one) for one in campaign.verdicts]
     assert sum(one.fits is False for one in judged) <= 0.05 * len(judged), [str(o) for o in judged if not o.fits]
     found: Any = campaign.next(2)
