@@ -1,8 +1,9 @@
-"""What may be wrong: unknowns with effects on the rows, of what changes, and of lengths."""
+"""What may be wrong: unknowns with effects on the rows, of what changes, differs from row to row, and of lengths."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -10,8 +11,11 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.common.errors import sentence
 from diffeo_calib.kinematics.nominal import rigid_motions
+from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.scales import Hyperparameters
+from diffeo_calib.process.tails import FACTORS
 from diffeo_calib.regression.conditional import Process
 from diffeo_calib.sensors.devices import Hypothesis
 from diffeo_calib.sensors.set_ups import frame_slopes
@@ -155,3 +159,40 @@ def links_of(data: TangentData) -> Iterator[Hypothesis]:
             along, start = offset[:3, :3].mT @ offset[:3, 3] / length, 6 + 6 * joint
             own = data.sensitivities[..., start : start + 3] @ along[:, None]
             yield Hypothesis(f"the link before {name} ({1e3 * length:.4g} mm)", own, fix=OF_LINK)
+
+
+VARIATION_M = torch.logspace(-6, -2, 41, dtype=torch.float64, device="cpu")
+"""RMS motions of the points by unknowns of which the size is sought."""
+
+
+def variation(data: TangentData, scales: Hyperparameters, hypotheses: Sequence[Hypothesis]) -> tuple[float, str] | None:
+    """The likeliest number that differs from row to row, if it is clear: an unknown u_i ~ N(0, s^2) of every row i.
+
+    It is clear beside the tails of the noise, but seems small beside those that it makes: s counts all but gross rows.
+
+    Returns:
+        s, m, rad or relative, and a sentence about it.
+    """
+    if not hypotheses:
+        return None
+    rows, some = SampledRows.of(data, scales)
+
+    def sized(rows: SampledRows, one: Hypothesis) -> tuple[float, float, Hypothesis]:
+        own = rows.columns(some.motions_in_numbers(one.effects[rows.index]))
+        E = torch.nn.functional.one_hot(rows.process.numbers.owner).to(own) * own
+        E = E[:, E.any(0)]
+        sizes = VARIATION_M.to(E) / float(E[E.any(1)].square().sum(1).mean().sqrt())
+        odds = Evidence.of(E, rows.process).log_odds(sizes.square())
+        return float(odds.max()), float(sizes[odds.argmax()]), one
+
+    found = (sized(rows, one) for one in hypotheses)
+    odds, _, best = max(found, key=lambda own: own[0])
+    if odds < gates.ROW_ODDS:
+        return None
+    tails = some.tails
+    tails = replace(tails, weights=tails.weights.where(tails.weights < 1.0 / FACTORS[0], 1.0))
+    _, size, _ = sized(rows._replace(process=some.with_tails(tails).process(scales)), best)
+    moved = 1e3 * size * float((3 * best.effects[best.effects != 0].square().mean()).sqrt())
+    got = f"about {best.amount(size)}, which moves the tool by {moved:.2g} mm"
+    what, expected = f"{best.name} seems to differ", "the same for all rows"
+    return size, sentence(what, expected=expected, got=got, fix=best.fix)
