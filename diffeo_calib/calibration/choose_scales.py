@@ -141,7 +141,8 @@ def choose_scales(
         found = Selection(centre, f"defaults, since {count} are too few to select them")
     else:
         # fields explain gross errors where these weigh as much as beside the geometry, whose errors are larger
-        found = select(centre, data.trusted(DOUBTED_WEIGHT), seed=seed, progress=progress)
+        least = 0.0 if measurements.without_device else DOUBTED_WEIGHT  # spreads in sockets are the geometry's own
+        found = select(centre, data.trusted(least), seed=seed, progress=progress)
         data = weighed(data, found.scales, seed)
         again = True
         while again and not found.interrupted:  # from the start once more where gross errors show only now
