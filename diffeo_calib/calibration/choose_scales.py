@@ -141,7 +141,7 @@ def choose_scales(
         found = Selection(centre, f"defaults, since {count} are too few to select them")
     else:
         # fields explain gross errors where these weigh as much as beside the geometry, whose errors are larger
-        least = 0.0 if measurements.without_device else DOUBTED_WEIGHT  # spreads in sockets are the geometry's own
+        least = DOUBTED_WEIGHT * (not measurements.without_device)  # spreads in sockets are the geometry's own
         found = select(centre, data.trusted(least), seed=seed, progress=progress)
         data = weighed(data, found.scales, seed)
         again = True
