@@ -87,7 +87,7 @@ class Sheet:
         return {name: [cells[k].strip() for _, cells in rows] for k, name in enumerate(header)}
 
     def joint_columns(self, joints: Sequence[str]) -> list[JointColumns]:
-        """As :func:`guess_joints`; without constant columns if need be: of axes that a controller alone knows."""
+        """Series that may be the joints; constant columns, of axes that the URDF lacks, count only if needed."""
         varying = [name for name in self.numbers if len({*self.cells[name]}) > 1]
         return guess_joints(self.numbers, joints) or guess_joints(varying, joints)
 

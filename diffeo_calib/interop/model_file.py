@@ -74,7 +74,7 @@ MAP_TENSORS = {
 }
 """Tensors that only some models have -> attributes of the map."""
 ROBOT_TENSORS = ("rigid_errors", "scales")
-"""The same of a robot's model: joint errors of the geometric calibration alone, scales of kernels, priors and noise."""
+"""Tensors of every robot's model: joint errors by geometry alone; scales of kernels, priors and noise."""
 PAYLOADS = ("payloads", "task_controls", "unladen_theta")
 """Tensors of a model with payloads: mass of every control; then, for readers without the formulas of a payload, the
 places of the controls' markers before the task-space flow, and theta of a robot for which the payload of the model is
