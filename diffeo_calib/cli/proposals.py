@@ -21,6 +21,7 @@ from diffeo_calib.calibration.diagnostics import gates, likely_mistakes
 from diffeo_calib.calibration.diagnostics.plausibility import marker_column, unmeasured_markers
 from diffeo_calib.calibration.identification.registration import register, register_sockets, spread
 from diffeo_calib.calibration.placing.readings import rough_error
+from diffeo_calib.calibration.placing.sockets import resting_rows
 from diffeo_calib.cli.column_names import WORDS, Column, column
 from diffeo_calib.cli.guesses import (
     LENS,
@@ -45,7 +46,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, UNITS_PER_METRE, TableFormat, numbers_of
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.tables import check_poses, divided, measured_positions
+from diffeo_calib.sensors.tables import check_poses, measured_positions
 
 CLEAR_RATIO = 5.0
 """A way is clear if every other one leaves more by this factor."""
@@ -139,15 +140,12 @@ class Source:
                 )
                 raise MeasurementError.of(what, expected=expected, fix="measure more rows")
             return left / max(spread(own.points), SMALLEST_SPREAD_M)
-        own, readings = divided(self.data)
-        if own is not None:
-            if own.table.socket is None:
-                return inf
-            rests = register_sockets(self.robot, own.table.q, own.table.socket)
-            ball = rests.positions[own.table.socket]
+        tables = self.data.parts
+        if (resting := resting_rows(tables)) is not None:
+            rests = register_sockets(self.robot, resting.q, resting.device)
+            ball = rests.positions[resting.device]
             around = float((ball - ball.mean(0)).norm(dim=1).median())
             return float(rests.distances.median()) / around if around > 0.0 else inf
-        tables = [one.table for one in readings]
         lengths = [one for one in tables if one.kind != "image"]
         if not lengths:
             return max(_in_images(self.robot, one) for one in tables)

@@ -69,8 +69,8 @@ def run(given: FitOptions) -> None:
     _show_findings(result, len(train))
     wrong = list[Outlier]()
     if test is not None:
-        seen, (own, _) = positions_of(result.model, result.places(), test), divided(test)
-        wrong += [] if own is None else contradicted_in_sockets(result.model, own.table)
+        seen = positions_of(result.model, result.places(), test)
+        wrong += contradicted_in_sockets(result.model, test)
         wrong += [] if seen is None else contradicted(result.model, seen)
         say(*outlier_lines(sorted(wrong, key=lambda one: -one.distance), len(test), "held-out rows"))
     say(*_lines_about_places(result, data, held_out, hand_eye))
@@ -120,8 +120,8 @@ def _lines_about_places(
     for one in held_out.values():
         yield from printed.socket_lines(one[CALIBRATED], "held out")
     own, _ = divided(data)
-    if own is not None and not placed.free:
-        seen = own.table.device_rows()
+    if own is not None:
+        seen = own.table
         hidden = zip(seen.body_names, (~seen.seen_bodies).sum(0).tolist(), strict=True)
         if counts := [f"{name} in {count}" for name, count in hidden if count]:
             yield f"hidden in some of {len(seen)} rows: {few(counts)} of them"

@@ -33,7 +33,7 @@ from diffeo_calib.reports.analysis.predictions import FitRows, Predictions, fore
 from diffeo_calib.reports.analysis.stages import Deviations, Kinematics, Repeats, repeats_of, stages_of
 from diffeo_calib.sensors.coordinates import Places
 from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
-from diffeo_calib.sensors.tables import divided, measured_positions, measured_rows
+from diffeo_calib.sensors.tables import divided, measured_positions
 
 LOG = logging.getLogger(__name__)
 STEPS = 4
@@ -201,9 +201,8 @@ def _new_rows(model: CalibratedKinematics, data: Any, rows: FitRows) -> Tensor:
     if rows.of_positions and model.registration is None:
         other = torch.ones_like(new)
         own = divided(data)[0]
-        seen = None if own is None else measured_rows(own.table)
-        if own is not None and seen is not None:
-            other[own.rows[seen.rows].to(HOST)] = False
+        if own is not None:
+            other[own.rows.to(HOST)] = False
         new |= other
     return new
 
