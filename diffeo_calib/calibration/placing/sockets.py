@@ -287,7 +287,7 @@ def contradicted_in_sockets(model: CalibratedKinematics, data: Any) -> list[Outl
     noise, every = seen.new_noise[-3:, -3:].expand(N, -1, -1), torch.ones_like(predicted, dtype=torch.bool)
     rows = LinearRows(middles[socket] - predicted, places, own, noise, every, wide, wide[0] * 0.0, wide * 0.0)
     squares = rows.left_out_squares.masked_fill(~judged, torch.nan)
-    bad = excluded(squares, torch.full_like(squares, 3.0), least=0.0)[:, 0]
+    bad = excluded(squares, torch.full_like(squares, 3.0), least=0.0)
     found, sizes, names = list[Outlier](), rows.left_out.norm(dim=1), resting.row_names
     for row in bad.nonzero()[:, 0].tolist():
         small = gates.REMAINING_ERROR * float((predicted[row] - middles[socket[row]]).norm())
