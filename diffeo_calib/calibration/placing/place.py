@@ -66,6 +66,7 @@ from diffeo_calib.sensors.tables import (
     OtherReadings,
     ball_tip,
     check_poses,
+    check_sessions,
     divided,
     sees_frame,
     with_markers,
@@ -307,6 +308,7 @@ def place(robot: Tree, data: Any, progress: Progress) -> Placed:
     """
     check_poses(data)
     coordinates, readings = divided(data)
+    check_sessions(coordinates)
     check_readings(robot, [one.table for one in readings], alone=coordinates is None)
     if coordinates is None:
         return _by_readings(robot, data, readings, progress)
