@@ -37,8 +37,8 @@ from diffeo_calib.kinematics.registered_map import robot_map
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.process.evidence import Evidence
-from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.conditional import roots
+from diffeo_calib.regression.tails import Tails
 from diffeo_calib.robots.tree import Tree
 
 LEVEL = 0.01

@@ -40,7 +40,7 @@ from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_points, tool_transform
 from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.poses import kind_of_points, own_blocks, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.process.tails import Tails
+from diffeo_calib.regression.tails import Tails
 from diffeo_calib.robots.placement import PLACES, place, rigid_fit
 from diffeo_calib.robots.se3 import skew
 from diffeo_calib.sensors.coordinates import check_joint_order
