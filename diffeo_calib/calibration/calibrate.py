@@ -225,6 +225,8 @@ def _result(
     if placed.coordinates is not None:
         fitted_map = with_open_directions(fitted_map, placed.coordinates.table, placed.registration)
     fitted_map = fitted_map.without_rigid_motions() if placed.free else fitted_map
+    if chosen.unresolved is not None:
+        fitted_map = replace(fitted_map, unresolved=chosen.unresolved)
     placed = placed.settled(fitted, fitted_map, chosen)
     model = CalibratedKinematics(robot, fitted_map, lever=placed.lever, ball=placed.ball)
     for devices in placed.placement:

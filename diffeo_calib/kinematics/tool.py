@@ -173,7 +173,7 @@ def covariance_without_placement(model: Any, q: Tensor, tool: Tensor, tip: str |
     every = torch.linspace(0, len(known) - 1, min(len(known), REFERENCE_ROWS), dtype=torch.float64, device=known.device)
     rows = torch.cat([known[every.round().long()], q.detach()])
     points, at = kinematics.deformation.linearised_value(rows)
-    covariance = fitted.conditional.covariance_between(at)  # open directions are those of both motions
+    covariance = fitted.covariance_between(at)  # open directions are those of both motions
     points = points.unflatten(1, (3, 3))
     base, own = frame_slopes(points, points.mean((0, 1))), tool_points(tool).to(points)  # a motion of the base moves
     flange = FlangePoints(kinematics.nominal, own, on=(kinematics.tip,) * 3)  # the points, one of the tool these
