@@ -36,7 +36,6 @@ from diffeo_calib.robots import Geometry, Joint, SimulatedArm, from_dh
 # --- columns of one value ---------------------------------------------------------------------------------------------
 
 HELD = {
-    "positions": ("position", "z"),
     "poses": ("pose", "z"),
     "images and a tracker": ("marker", "marker 2"),
     "inclinations": ("inclination", "inclination 2"),
@@ -70,7 +69,7 @@ def test_a_stuck_column_is_named(name: str) -> None:
     kind, (rows, column) = kind_named(name), HELD[name]
     data = stuck(kind.data, rows)
     placed, _ = warned(place, kind.robot, data, silent)
-    (text,) = warned(warn_of_stuck, placed.tangent_data(), stuck_columns(data))[1]
+    (text,) = warned(warn_of_stuck, placed.tangent_data(), data)[1]
     assert f"'{column}' of the {rows}s" in text
 
 

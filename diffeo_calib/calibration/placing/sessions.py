@@ -27,7 +27,7 @@ from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register, register_inliers, spread
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherLabel, OtherRows, Seen, Settled
-from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
+from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
 from diffeo_calib.fitting.result import Progress
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.readings import Readings
@@ -67,15 +67,11 @@ class Sessions(DeviceSet):
         """The sessions of rows, and these as those of one; none for one session.
 
         Raises:
-            MeasurementError: a session with too few rows, rows that do not fit the robot, or sessions without a device.
+            MeasurementError: a session with too few rows, or rows that do not fit the robot.
         """
         table = own.table
         if len(table.present_sessions) < 2:
             return [], table
-        if table.without_device:
-            fix = "give the sockets of each session names of their own, and leave the sessions out"
-            got = few(table.present_sessions)
-            raise MeasurementError.of("rows with sockets", expected="no sessions", got=got, fix=fix)
         progress("sessions", 0, 1)
         rows = table.device_rows()
         found, median = cls.find(robot, rows, set_up_kind(rows))
