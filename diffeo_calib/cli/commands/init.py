@@ -125,7 +125,7 @@ def _of_robot(robot: Path, sheet: Sheet) -> Source:
         best = best.remarking(remark)
     if best.options.socket:
         best = with_distances(best)
-    if best.bodies and best.options.rotation is None:
+    if best.bodies and not best.options.rotation:
         best = with_deviations(with_rotation(best))
     return best.into({"robot": "a URDF" if is_urdf(robot) else f"a DH table, {DHFile.read(robot).units}"})
 
