@@ -489,7 +489,9 @@ def with_deviations(source: Source) -> Source:
 
 def with_distances(source: Source) -> Source:
     """With known distances between the sockets that a column names, for the user to complete: no table holds them."""
-    sockets, unit = (source.options.socket or "").rpartition(",")[2], source.options.length or ""
+    if source.options.socket is None:
+        return source
+    sockets, unit = source.options.socket.rpartition(",")[2], source.options.length or ""
     names = list(dict.fromkeys(filter(None, source.sheet.cells[sockets])))
     if len(names) < 2:
         return source.remarking("there is one socket alone, and no distance to know: the URDF gives the robot's size")

@@ -123,8 +123,7 @@ def _of_robot(robot: Path, sheet: Sheet) -> Source:
     if others := best.other_units():
         remark = f"{few(others)}: the names say another unit than the robot finds in the numbers: check it"
         best = best.remarking(remark)
-    if best.options.socket:
-        best = with_distances(best)
+    best = with_distances(best)
     if best.bodies and not best.options.rotation:
         best = with_deviations(with_rotation(best))
     return best.into({"robot": "a URDF" if is_urdf(robot) else f"a DH table, {DHFile.read(robot).units}"})
