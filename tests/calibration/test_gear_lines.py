@@ -29,7 +29,7 @@ from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.process.scales import DEVIATIONS, SCALES, TRANSMISSION_PROFILE, Hyperparameters, axis_deviations
-from diffeo_calib.process.tails import Tails
+from diffeo_calib.regression.tails import Tails
 from diffeo_calib.reports.analysis.predictions import FitRows
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.dh import from_dh

@@ -30,7 +30,7 @@ from diffeo_calib.calibration.scales.leave_one_out import (
 )
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.fitting.result import silent
-from diffeo_calib.process.tails import Tails, reweight
+from diffeo_calib.regression.tails import Tails, reweight
 from diffeo_calib.robots import SimulatedArm
 
 

@@ -15,8 +15,8 @@ from diffeo_calib.common.errors import sentence
 from diffeo_calib.kinematics.nominal import rigid_motions
 from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.process.tails import FACTORS
 from diffeo_calib.regression.conditional import Process
+from diffeo_calib.regression.tails import FACTORS
 from diffeo_calib.sensors.devices import Hypothesis
 from diffeo_calib.sensors.set_ups import frame_slopes
 

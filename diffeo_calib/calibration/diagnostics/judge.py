@@ -52,6 +52,7 @@ ROUNDS = 20
 """Of the codes of a mixture."""
 MISTYPED = (10.0, 0.1, 1000.0, 0.001, 1 / 0.45359237, 0.45359237)
 """Factors of one payload in another unit, or with a wrong digit: g, pounds."""
+ONE_SET_UP = "one set-up for all rows, in the order of their numbers"
 OPENED_M = 0.01
 """Prior RMS motion by what is opened in a model, more than what is found. Larger motions are gross, such as exchanged
 markers, and left to the weights of the rows."""
@@ -185,10 +186,13 @@ def changed(
     process, order = rows.process, lines.argsort()
     found = [*changes(hypotheses, process, order, excess=excess)]
     best = max(found, key=lambda one: one.evidence)
-    if best.evidence < gates.CHANGE_EVIDENCE:
+    what, _, _, advice, *_ = best.hypothesis
+    sudden, clear = best.row is not None, best.evidence >= gates.CHANGE_EVIDENCE
+    once, fix = sudden * max(best.evidence, 0.0), f"check what happened then; {advice}"
+    for one in (each for each in hypotheses if each.unit is None or (clear and each.name == what)):
+        yield from changed_twice(rows, one, order, names, once, excess=excess)
+    if not clear:
         return
-    (what, E, _, advice, *_), sudden = best.hypothesis, best.row is not None
-    expected, fix = "one set-up for all rows, in the order of their numbers", f"check what happened then; {advice}"
     others = [
         one
         for one in found
@@ -200,19 +204,30 @@ def changed(
     words += " (these rows do not tell which)" * bool(others)
     words += " over the rows" if best.row is None else f" near {names[order[best.row]]}"
     kept, advice = ("the rows before it", fix) if sudden else ("the middle of the rows", SLOW)
-    yield Candidate(words, expected, advice, rows.columns(E, best.codes), gates.WORTH, opens=kept)
-    if sudden:
-        return
-    # three set-ups look like a drift: the first change is sought once more beside the second one
-    first, second = (_likeliest(*scans([E], process, order)), 0)
+    columns = rows.columns(best.hypothesis.effects, best.codes)
+    yield Candidate(words, ONE_SET_UP, advice, columns, gates.WORTH, opens=kept)
+
+
+def changed_twice(
+    rows: SampledRows, one: Hypothesis, order: Tensor, names: Sequence[str], once: float, *, excess: float
+) -> Iterator[Candidate]:
+    """Three set-ups, which look like a drift, or what moves back, which looks like little.
+
+    Each change is sought once more beside the other one. ``once``: evidence of a single one; others as of
+    :func:`changes`.
+    """
+    (what, E, _, advice, *_), process = one, rows.process
+    first, second = _likeliest(*scans([E], process, order)), 0
     for _ in range(2):
         beside = process.opened(rows.columns(E, _from(order, first)))
         first, second = _likeliest(*scans([E], beside, order)), first
-    if abs(first - second) >= gates.CHANGE_ROWS:
+    columns = torch.cat([rows.columns(E, _from(order, row)) for row in (first, second)], 1)
+    both = Evidence.of(columns, process)
+    evidence = float(both.gain) / max(excess, float(both.excess)) - (columns.shape[1] + 2) * log(len(order))
+    if abs(first - second) >= gates.CHANGE_ROWS and evidence >= once + gates.CHANGE_EVIDENCE:
         near = " and ".join(names[order[row]] for row in sorted((first, second)))
-        columns = torch.cat([rows.columns(E, _from(order, row)) for row in (first, second)], 1)
-        words = f"{what} seems to have moved more than once, near {near}"
-        yield Candidate(words, expected, fix, columns, gates.WORTH**2, opens="the rows before them")
+        words, fix = f"{what} seems to have moved more than once, near {near}", f"check what happened then; {advice}"
+        yield Candidate(words, ONE_SET_UP, fix, columns, gates.WORTH**2, opens="the rows before them")
 
 
 def changes(

@@ -33,10 +33,10 @@ from diffeo_calib.maps.observation import Stacked
 from diffeo_calib.measurements.poses import block_diagonal, own_blocks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.evidence import Evidence
-from diffeo_calib.process.tails import Tails, gross_weights, reweight
 from diffeo_calib.regression.conditional import Process
 from diffeo_calib.regression.linear_rows import LinearRows
 from diffeo_calib.regression.regions import OTHER_DATE, region_factor, region_scale
+from diffeo_calib.regression.tails import Tails, gross_weights, reweight
 from diffeo_calib.robots.se3 import rotation, transforms
 from diffeo_calib.sensors.coordinates import errors_of_kinds, fitting_devices
 from diffeo_calib.sensors.errors import Evaluations

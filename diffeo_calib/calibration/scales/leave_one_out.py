@@ -1,7 +1,7 @@
 """Errors of the tangent model that decide about outliers and about the size of regions.
 
-Weights by heavy tails (process/tails.py) need the errors of the measurements, not the residuals of the fit, which are
-smaller. The second moments of the errors under the posterior are exact:
+Weights by heavy tails (regression/tails.py) need the errors of the measurements, not the residuals of the fit, which
+are smaller. The second moments of the errors under the posterior are exact:
 
     E[r r^T] = R mu mu^T R + R - R [(G + R)^-1]_ii R.
 
@@ -39,8 +39,8 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.quantiles import chi2_median
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.process.tails import Tails, gross_weights, reweight
 from diffeo_calib.regression.regions import region_factor, region_scale
+from diffeo_calib.regression.tails import Tails, gross_weights, reweight
 
 BLOCK_COORDINATES = KEPT_COORDINATES
 """Measured coordinates of one block: a few hundred poses predict another pose nearly as well as thousands do."""
