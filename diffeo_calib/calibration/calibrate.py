@@ -28,6 +28,7 @@ from diffeo_calib.calibration.choose_scales import (
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import worth_it
 from diffeo_calib.calibration.diagnostics.judge import Finding, judge, lengths, warn_of_lengths, warn_of_taken_scales
+from diffeo_calib.calibration.diagnostics.judged_rows import warn_of_contradictions
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.outliers import (
     outliers,
@@ -40,7 +41,6 @@ from diffeo_calib.calibration.diagnostics.plausibility import (
     warn_of_no_errors,
     warn_of_rounding,
 )
-from diffeo_calib.calibration.diagnostics.row_order import warn_of_contradictions
 from diffeo_calib.calibration.expected_errors import with_open_directions
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.result import CalibrationResult, parts
@@ -203,7 +203,7 @@ def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: P
     data = chosen.data
     problem = robot_problem(data, chosen.selection.scales)
     many = not data.nominal.load.by_row and data.y.numel() > MAX_DENSE and len(data.x) > AUTO_CONTROLS
-    count = {"auto": AUTO_CONTROLS if many else None, "all": None}.get(controls, controls)
+    count = controls if isinstance(controls, int) else AUTO_CONTROLS if many and controls == "auto" else None
     start = replace(problem.zero(), theta=data.theta) if count is None else None  # coarse fits find one of their own
     solver = GaussNewton(tolerance=RESIDUAL_TOLERANCE)
     fitted = fit(problem, solver, controls=count, backend=backend, start=start, progress=progress)

@@ -242,17 +242,23 @@ def first_guess(images: Images, board: BoardPrior, half_size: float | None = Non
     return Camera(images.width, images.height, size, unknowns, root)
 
 
+def projection(seen: Tensor, points: Tensor) -> Tensor:
+    """P (3, k + 1) with P (z, 1) ~ (u, v, 1) of images (N, 2) of points z (N, k), by direct linear transformation.
+
+    Source: R. Hartley, A. Zisserman, "Multiple view geometry in computer vision", 2003, section 7.1.
+    """
+    at = torch.cat([points, torch.ones_like(points[:, :1])], 1)
+    rows = torch.cat([torch.cat([at * (k == 0), at * (k == 1), -seen[:, k : k + 1] * at], 1) for k in range(2)])
+    return torch.linalg.svd(rows, full_matrices=len(rows) < rows.shape[1]).Vh[-1].view(3, -1)
+
+
 def homographies(images: Images) -> Tensor:
-    """(N, 3, 3) from the board's plane, m, to pixels from the middle of the image, by direct linear transformation."""
+    """(N, 3, 3) from the board's plane, m, to pixels from the middle of the image."""
     found, middle = [], images.pixels.new_tensor([(images.width - 1) / 2, (images.height - 1) / 2])
     for points, pixels, seen in zip(images.points, images.pixels, images.seen, strict=True):
         flat, own = points[seen][:, :2], pixels[seen] - middle
         size, scale = flat.abs().max(), own.abs().max()
-        at, to = flat / size, own / scale
-        at = torch.cat([at, torch.ones_like(at[:, :1])], 1)
-        zero = torch.zeros_like(at)
-        rows = [torch.cat([at, zero, -to[:, :1] * at], 1), torch.cat([zero, at, -to[:, 1:] * at], 1)]
-        H = torch.linalg.svd(torch.cat(rows)).Vh[-1].view(3, 3)
+        H = projection(own / scale, flat / size)
         H = torch.diag(H.new_tensor([float(scale), float(scale), 1.0])) @ H
         H = H @ torch.diag(H.new_tensor([1 / float(size), 1 / float(size), 1.0]))
         found.append(H / H[:, :2].norm(dim=0).mean())

@@ -36,7 +36,6 @@ from diffeo_calib.robots import Geometry, Joint, SimulatedArm, from_dh
 # --- columns of one value ---------------------------------------------------------------------------------------------
 
 HELD = {
-    "positions": ("position", "z"),
     "poses": ("pose", "z"),
     "images and a tracker": ("marker", "marker 2"),
     "inclinations": ("inclination", "inclination 2"),

@@ -154,6 +154,14 @@ LARGE_PER_REACH, LARGE_PER_USUAL, MOST_LARGE = 0.01, 20.0, 0.25
 are no errors of a calibrated robot; share of the rows from which they fail a fit."""
 LARGE_PER_EXPECTED = 2.0
 """RMS errors from this multiple of the expected ones on are warned about."""
+LARGEST_PER_REACH, LARGEST_PER_EXPECTED = 0.1, 20.0
+"""Median errors above this share of the robot's reach, or this multiple of the expected ones, are implausible."""
+LEAST_EXPLAINED, AS_GOOD = 0.5, 0.02
+"""Part of the squared error, per degree of freedom, that a motion of device or markers must explain; motions that
+explain so little less than the best one are named, too."""
+LEAST_EXCESS, MOST_LEFT = 2.0, 5.0
+"""Multiple of the expected errors below which a motion is not sought, and up to which errors may remain beside one: a
+wrong unit is no motion."""
 
 # --- what a campaign leaves open ---
 

@@ -27,7 +27,6 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few, sentence, warn_user
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kinematics.evaluation import LARGEST_ERROR_PER_REACH
 from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.registered_map import (
     HARDLY,
@@ -133,7 +132,7 @@ def find_place(
         outliers += kept[worst].tolist()
         stay = kept.new_tensor([row for row in range(len(kept)) if row not in worst])
         kept, found = kept[stay], {name: rows.kept(stay).settled() for name, rows in found.items()}
-    most = max(LARGEST_ERROR_PER_REACH * chain.reach, gates.REGISTERED_RESIDUAL * spread)
+    most = max(gates.LARGEST_PER_REACH * chain.reach, gates.REGISTERED_RESIDUAL * spread)
     _refuse_others(best.given.shown(best.given.residual).unflatten(1, (-1, 3)), most)
     if opens and (beside := opened(best, some.rows(kept))) is not best:
         best = beside.settled()

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics.judged_rows import common_cause, judge
 from diffeo_calib.calibration.diagnostics.outliers import Outlier
-from diffeo_calib.calibration.diagnostics.row_order import common_cause
-from diffeo_calib.calibration.expected_errors import Accuracy, accuracy, expected_errors, judge
+from diffeo_calib.calibration.expected_errors import Accuracy, accuracy, expected_errors
 from diffeo_calib.calibration.result import Part, parts
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
