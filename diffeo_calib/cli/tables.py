@@ -25,7 +25,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError, few, senten
 from diffeo_calib.common.files import PROGRAM
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.files import read_observations
-from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
+from diffeo_calib.measurements.csv.joined import HeldFile, joined_file
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
 from diffeo_calib.measurements.csv.sensors import ImageColumns, ReadingColumns, SocketColumns, columns_of
@@ -88,7 +88,7 @@ def measured_table(csv: Path, rows: Rows, duplicates: str = "keep") -> MeasuredT
         raise typer.BadParameter(text, param_hint="--position")
     table, names = table_format(rows), list[str]()
     csv = with_places(csv, rows, table)
-    if isinstance(csv, JoinedFile):
+    if isinstance(csv, HeldFile):
         say(csv.sentence)
     if csv.is_file() and any(_number(text.partition("=")[2]) is not None for text in rows.reading or ()):
         with suppress(MeasurementError):  # rows may come later
