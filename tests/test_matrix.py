@@ -14,10 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import pytest
 import torch
-from command_bank import STAGES, Command, Outcome, leave_undrawn
+from command_bank import STAGES, VALIDATOR, Command, Outcome, leave_undrawn
 from kind_bank import (
     FREE,
     HELD_OUT,
@@ -39,7 +38,6 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibError
-from diffeo_calib.reports.results import SCHEMA
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 
@@ -131,7 +129,7 @@ class Bench:
 def results(path: Path) -> dict[str, Any]:
     """Those of a file for programs, which is as the schema says."""
     written = json.loads(path.read_text(encoding="utf-8"))
-    jsonschema.validate(written, SCHEMA)
+    VALIDATOR.validate(written)
     return written["results"]
 
 
@@ -377,11 +375,9 @@ def _(bench: Bench) -> None:
 @verb("recalibrate")
 def _(bench: Bench) -> None:
     kind = bench.kind
-    tool = torch.eye(4, dtype=torch.float64)
-    tool[2, 3] = 0.1
     one_tip = kind.name != "several tips"
     share_places(kind, "recalibrate", bench.command.monkeypatch)
-    found = dc.recalibrate(kind.model.with_tool(tool) if one_tip else kind.model, kind.moved)
+    found = kind.recalibrated
     check_accuracy(kind, found.model, NEW_ROWS_FACTOR)
     assert not one_tip or found.model.tool_poses(kind.q(2)).shape[-2:] == (4, 4)
     assert found.model.summary is not None

@@ -203,7 +203,7 @@ def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: P
     data = chosen.data
     problem = robot_problem(data, chosen.selection.scales)
     many = not data.nominal.load.by_row and data.y.numel() > MAX_DENSE and len(data.x) > AUTO_CONTROLS
-    count = {"auto": AUTO_CONTROLS if many else None, "all": None}.get(controls, controls)
+    count = controls if isinstance(controls, int) else AUTO_CONTROLS if many and controls == "auto" else None
     start = replace(problem.zero(), theta=data.theta) if count is None else None  # coarse fits find one of their own
     solver = GaussNewton(tolerance=RESIDUAL_TOLERANCE)
     fitted = fit(problem, solver, controls=count, backend=backend, start=start, progress=progress)

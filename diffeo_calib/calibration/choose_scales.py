@@ -331,7 +331,8 @@ def scales_of_models(models: Sequence[CalibratedKinematics], like: Hyperparamete
     mean = torch.where(deviations, vectors.square().mean(0).sqrt(), vectors.log().mean(0).exp())
     share = len(models) ** -0.5
     lines = tuple(replace(line, amplitude=share * line.amplitude) for model in models for line in _lines(model))
-    return replace(like.with_vector(mean), lines=lines)
+    mean = torch.cat([mean.log(), like.logarithms()[len(mean) :]])  # scales that only some have are kept
+    return replace(like.from_logarithms(mean), lines=lines)
 
 
 def _lines(model: CalibratedKinematics) -> list[GearLine]:

@@ -81,8 +81,8 @@ class Factor:
         start, M, parts = len(sooner), len(self.first), [sooner]
         for n, rows in ((start, self.first[start:]), (max(start, M), self.added[max(start - M, 0) :])):
             if len(rows):
-                known = torch.cat(parts) if len(parts) > 1 else sooner
-                right = values[: len(rows)] - rows[:, :n] @ known
+                sooner_rows = torch.cat(parts) if len(parts) > 1 else sooner
+                right = values[: len(rows)] - rows[:, :n] @ sooner_rows
                 parts.append(torch.linalg.solve_triangular(rows[:, n:], right, upper=False))
                 values = values[len(rows) :]
         return torch.cat(parts[1:])

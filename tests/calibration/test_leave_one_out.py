@@ -12,6 +12,7 @@ import torch
 from product_bank import scales_of, usual_scales
 from scipy.stats import chi2
 from tangent_bank import Setting, built, covariance, normal, prior_covariance
+from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
@@ -161,6 +162,13 @@ def test_right_scales_are_hardly_widened(monkeypatch: pytest.MonkeyPatch) -> Non
         found.append(cross_validated_inflation(scales, scales, drawn, rows, seed=seed) or 0.0)
     assert min(found) > 0.5
     assert 0.9 < np.median(found) < 1.7, found
+
+
+def test_markers_and_repeats_of_a_row_count_as_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    shares = list[Tensor]()
+    monkeypatch.setattr(one_out, "region_scale", lambda *given: float(shares.append(given[2]) is None))
+    cross_validated_inflation(None, arm(2, 40).scales, arm(2, 40).tangent_data, torch.arange(40) // 2)
+    assert float(shares[0].sum()) == pytest.approx(20.0)
 
 
 def test_parts_of_the_space_show_errors_that_no_row_does() -> None:

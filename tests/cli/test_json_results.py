@@ -9,7 +9,7 @@ from typing import Any
 
 import jsonschema
 import pytest
-from command_bank import Command
+from command_bank import VALIDATOR, Command
 from product_bank import Case
 
 import diffeo_calib as dc
@@ -36,7 +36,7 @@ def ran(command: Command, folder: Path, *arguments: object, code: int = 0) -> di
     done = command(*words, "--json", folder / "out.json")
     assert done.code == code, done.err
     written = json.loads((folder / "out.json").read_text(encoding="utf-8"))
-    jsonschema.validate(written, SCHEMA)
+    VALIDATOR.validate(written)
     assert written["exit_code"] == code
     assert written["arguments"][0] == words[0]
     assert written["warnings"] == [line.removeprefix("warning: ") for line in done.warnings]
