@@ -191,6 +191,8 @@ class Hyperparameters:
 
 DEVIATIONS_OF_SOME = "axis_errors", "other_noise"
 SCALES_OF_SOME = (*DEVIATIONS_OF_SOME, "axis_lengthscale")
+PAYLOAD_FACTORS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
+"""Candidates of :attr:`Hyperparameters.payload`."""
 FOUND = "lines", "payload", "axes", "axis_errors", "axis_lengthscale"
 """Names of what is found beside other scales, before these are searched again."""
 SCALES = tuple(one.name for one in fields(Hyperparameters) if one.name not in (*FOUND, *SCALES_OF_SOME))

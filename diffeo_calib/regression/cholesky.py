@@ -101,6 +101,11 @@ class Factor:
         vars(other)["inverse"] = self.inverse.addmm(Y.T, Y, alpha=-1.0)
         return other
 
+    def with_features(self, columns: Tensor, H: Tensor) -> Factor:
+        """The factor with other features (M, k) in some of its columns (k,)."""
+        W = self.W.index_copy(1, columns, self.white(H))
+        return Factor(self.first, W, W.T @ W, self.added)
+
     @property
     def matrix(self) -> Tensor:
         """K (M, M)."""

@@ -226,6 +226,10 @@ class Process(Conditional):
         E = E / E.norm(dim=0).clamp(min=torch.finfo(E.dtype).tiny) if size is None else size * E
         return replace(self, factor=self.factor.beside(E))
 
+    def with_effects(self, unknowns: Tensor, E: Tensor) -> Process:
+        """The same rows with other effects (M, U) of some unknowns (U,) on them, in units of their prior deviations."""
+        return replace(self, factor=self.factor.with_features(unknowns, E))
+
     def features(self, at: Linearisation, sooner: Features | None = None, cross: Tensor | None = None) -> Features:
         """Features of a linearisation.
 
