@@ -183,11 +183,6 @@ class Hyperparameters:
         """All scales that any measurements have as one vector, without gear lines, as model files hold them."""
         return torch.cat([getattr(self, name).reshape(-1) for name in SCALES])
 
-    def with_vector(self, vector: Tensor) -> Hyperparameters:
-        """The inverse of :attr:`vector`, shaped like this object; scales that only some have are kept."""
-        parts = torch.split(vector, [getattr(self, name).numel() for name in SCALES])
-        return replace(self, **{k: v.reshape(getattr(self, k).shape) for k, v in zip(SCALES, parts, strict=True)})
-
     def amplitudes(self) -> Tensor:
         """Which entries of the vector of logarithms may shrink to zero: boolean."""
         scales = [(name in AMPLITUDES, getattr(self, name).reshape(-1)) for name in self.searched]
@@ -196,6 +191,8 @@ class Hyperparameters:
 
 DEVIATIONS_OF_SOME = "axis_errors", "other_noise"
 SCALES_OF_SOME = (*DEVIATIONS_OF_SOME, "axis_lengthscale")
+PAYLOAD_FACTORS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
+"""Candidates of :attr:`Hyperparameters.payload`."""
 FOUND = "lines", "payload", "axes", "axis_errors", "axis_lengthscale"
 """Names of what is found beside other scales, before these are searched again."""
 SCALES = tuple(one.name for one in fields(Hyperparameters) if one.name not in (*FOUND, *SCALES_OF_SOME))

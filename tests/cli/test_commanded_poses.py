@@ -169,7 +169,10 @@ READ: dict[str, tuple[Callable[[Path], Path], dict[str, Any], list[str]]] = {
 """What is in a table -> how it is written; entries, None for one that is missing or open; texts."""
 
 
-@pytest.mark.parametrize("what", READ)
+LONGEST = ("a degree and wrong rows", "inches", "never turned")
+
+
+@pytest.mark.parametrize("what", [pytest.param(what, marks=[pytest.mark.slow] * (what in LONGEST)) for what in READ])
 def test_init_finds_what_the_numbers_mean(what: str, tmp_path: Path, init: Any) -> None:
     write, expected, texts = READ[what]
     found, text = init(write(tmp_path / "t.csv"))
@@ -374,6 +377,7 @@ def test_a_slide_that_stood_still_is_corrected(tmp_path: Path, command: Command)
     assert float(added.max() - added.min()) > 0.1
 
 
+@pytest.mark.slow
 def test_a_table_with_two_slides_is_corrected_where_it_can_move(tmp_path: Path, command: Command, init: Any) -> None:
     went, measured = slides(0.0)
     table = write_columns(tmp_path / "t.csv", cmdx_cmdy=1e3 * went[:, :2], x_y_z=1e3 * measured)
