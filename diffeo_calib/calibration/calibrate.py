@@ -203,7 +203,7 @@ def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: P
     data = chosen.data
     problem = robot_problem(data, chosen.selection.scales)
     many = not data.nominal.load.by_row and data.y.numel() > MAX_DENSE and len(data.x) > AUTO_CONTROLS
-    count = {"auto": AUTO_CONTROLS if many else None, "all": None}.get(controls, controls)
+    count = controls if isinstance(controls, int) else AUTO_CONTROLS if many and controls == "auto" else None
     start = replace(problem.zero(), theta=data.theta) if count is None else None  # coarse fits find one of their own
     solver = GaussNewton(tolerance=RESIDUAL_TOLERANCE)
     fitted = fit(problem, solver, controls=count, backend=backend, start=start, progress=progress)
@@ -235,7 +235,9 @@ def _result(
     explained, found = parts(model), outliers(model, placed, data, chosen.judged, least)
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
     warn_of_outliers(found, placed.data)
-    warn_of_contradictions(model, placed.coordinates, found, placed.mislabelled(model, found) or (best and best.text))
+    said, mislabelled = best and best.text, placed.mislabelled(model, found)
+    said = said if best and best.columns is None else mislabelled or said  # a wrong column explains its wrong rows
+    warn_of_contradictions(model, placed.coordinates, found, said)
     warn_of_rounding(robot, placed.data, data, chosen.left_out)
     found_lengths = lengths(data, scales, placed.placement.hypotheses(data, VALUE))
     summary = Summary(

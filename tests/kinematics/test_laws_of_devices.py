@@ -72,7 +72,9 @@ def exact(kind: type[Devices]) -> tuple[Devices, Readings, Tensor]:
 @pytest.mark.parametrize("kind", KINDS)
 def test_exact_readings_find_both_devices(kind: type[Devices]) -> None:
     there, data, points = exact(kind)
-    found = kind.at(data, points).refined(data, points)
+    start = kind.at(data, points)
+    assert float(start.errors(data, points).abs().max()) < 1e-6  # in closed form
+    found = start.refined(data, points)
     assert float(found.errors(data, points).abs().max()) < 1e-9
     same = TOLD.get(kind, slice(None))
     assert_close(found.constants[:, same].abs(), there.constants[:, same].abs(), rtol=0, atol=1e-7)
@@ -193,6 +195,7 @@ def test_a_stated_camera_is_right_handed_and_looks_at_its_point() -> None:
     assert_close(R.mT @ t, -numbers[:, :3, None])
     line = numbers[:, 3:] - numbers[:, :3]
     assert_close(R[:, 2], line / line.norm(dim=1, keepdim=True))
+    assert triple(1e3 * numbers[0, :3]) in replace(exact(Cameras)[0], constants=Cameras.stated(numbers)).where(0)
 
 
 def test_pixels_are_metres_at_the_mean_depth_and_back() -> None:

@@ -67,7 +67,6 @@ class Selection:
     scales: Hyperparameters  # the scales
     status: str  # a sentence about the choice
     interrupted: bool = False  # whether Ctrl-C ended the search
-    likelihood: float | None = None  # log marginal likelihood of the subset that was used; None if nothing was selected
 
 
 def select(
@@ -110,7 +109,7 @@ def select(
     except KeyboardInterrupt:
         return Selection(search.best, "search interrupted, the best so far are kept", interrupted=True)
     status = f"log marginal likelihood {search.best_likelihood:.1f} on {len(subset.x)} poses"
-    return Selection(search.best, status, likelihood=search.best_likelihood)
+    return Selection(search.best, status)
 
 
 class LogPosterior(NamedTuple):
