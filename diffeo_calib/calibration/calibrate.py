@@ -207,7 +207,7 @@ def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: P
     start = replace(problem.zero(), theta=data.theta) if count is None else None  # coarse fits find one of their own
     solver = GaussNewton(tolerance=RESIDUAL_TOLERANCE)
     fitted = fit(problem, solver, controls=count, backend=backend, start=start, progress=progress)
-    return replace(fitted, advice=ADVICE)
+    return replace(fitted, advice=ADVICE, model=replace(fitted.model, unresolved=chosen.unresolved))
 
 
 def _result(
@@ -225,8 +225,6 @@ def _result(
     if placed.coordinates is not None:
         fitted_map = with_open_directions(fitted_map, placed.coordinates.table, placed.registration)
     fitted_map = fitted_map.without_rigid_motions() if placed.free else fitted_map
-    if chosen.unresolved is not None:
-        fitted_map = replace(fitted_map, unresolved=chosen.unresolved)
     placed = placed.settled(fitted, fitted_map, chosen)
     model = CalibratedKinematics(robot, fitted_map, lever=placed.lever, ball=placed.ball)
     for devices in placed.placement:

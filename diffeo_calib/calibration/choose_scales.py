@@ -190,15 +190,9 @@ def _inflated(
         row_scales = found.scales.inflated(max(factor, few) ** 0.5)
         units = measurements.places, measurements.socket_numbers, groups.to(resting.device)
         factor = max(factor, inflation_by_places(data, found.scales, *units))
-    unresolved = None if centre is None else unresolved_errors(found, centre, data, poses, seed, progress)
-    scales = found.scales.inflated(factor**0.5)
-    if unresolved is not None:
-        unresolved, status = (
-            factor * unresolved,
-            f"{found.status}; noise of the commands counts as the machine's errors",
-        )
-        found = replace(found, status=status)
-    found = replace(found, scales=scales)
+    unresolved = None if centre is None else unresolved_errors(found, centre, data, poses, seed=seed, factor=factor)
+    scales, words = found.scales.inflated(factor**0.5), "; noise of the commands counts as the machine's errors"
+    found = replace(found, scales=scales, status=found.status + words * (unresolved is not None))
     return ChosenScales(found, data, leave_one_out(data, scales, seed), row_scales, unresolved)
 
 
@@ -211,9 +205,9 @@ NOTHING = 1e-6
 
 
 def unresolved_errors(
-    found: Selection, centre: Hyperparameters, data: TangentData, poses: int, seed: int, progress: Progress
+    found: Selection, centre: Hyperparameters, data: TangentData, poses: int, *, seed: int = 0, factor: float = 1.0
 ) -> Tensor | None:
-    """Variances (n,) of a machine's errors that its fields do not resolve, m^2 or rad^2; None for none.
+    """Variances (n,) of a machine's errors that its fields do not resolve, times a factor, m^2 or rad^2; None for none.
 
     Without repeats, errors that change between neighbouring commands, as those of an arm near its wrist's singular
     poses, are the same as noise of the commands: a region of the machine without noise must hold them. Noise of the
@@ -226,13 +220,13 @@ def unresolved_errors(
     scales, without = found.scales, replace(centre, joint_noise=NOTHING * centre.joint_noise)
     moved = (data.jacobian * scales.joint_noise.square() * data.jacobian).sum(2).mean()
     start = replace(scales, joint_noise=without.joint_noise, sensor_noise=(scales.sensor_noise.square() + moved).sqrt())
-    other = select(without, data, start=start, seed=seed, progress=progress)
+    other = select(without, data, start=start, seed=seed)
     some = data.sample(POSES, COORDINATES, seed)[1]
-    if some.process(scales).evidence - some.process(other.scales).evidence < SUPPORT:
+    if other.interrupted or some.process(scales).evidence - some.process(other.scales).evidence < SUPPORT:
         return None
     slides = 1.0 - torch.tensor(chain.periodic, dtype=data.x.dtype, device=data.x.device)
     fields = scales.transmission_amplitude.square() + scales.coupled_amplitude.square()
-    return torch.minimum(scales.joint_noise.square(), fields + slides * scales.task_amplitude.square())
+    return factor * torch.minimum(scales.joint_noise.square(), fields + slides * scales.task_amplitude.square())
 
 
 def noise_of_few(data: TangentData, poses: int, registration: Identification, identification: Identification) -> float:
