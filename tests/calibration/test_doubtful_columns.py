@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from kind_bank import kind_named, marked
+from kind_bank import kind_named
 from product_bank import Case, simulated, with_usual_scales
 from table_bank import refused, warned
 from tangent_bank import normal
@@ -63,7 +63,8 @@ def stuck(data: Any, kind: str) -> Any:
     return with_attributes(data, points=points)
 
 
-@pytest.mark.parametrize("name", marked(*HELD))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", HELD)
 def test_a_stuck_column_is_named(name: str) -> None:
     """Before a calibration chooses scales and fits."""
     kind, (rows, column) = kind_named(name), HELD[name]

@@ -141,10 +141,11 @@ def write_dh_arm(folder: Path, convention: str, scale: float, joints: str) -> tu
     return q.rad2deg(), 1e3 * (robot(q) @ torch.tensor([0.08, 0.04, 0.1, 1.0], dtype=torch.float64))[:, :3]
 
 
-@pytest.mark.parametrize(("convention", "scale"), [("standard", 1.0), ("craig", 1e3)])
+@pytest.mark.parametrize("convention", ["craig", pytest.param("standard", marks=pytest.mark.slow)])
 def test_the_convention_that_explains_the_rows(
-    convention: str, scale: float, tmp_path: Path, command: Command, proposed: Proposed
+    convention: str, tmp_path: Path, command: Command, proposed: Proposed
 ) -> None:
+    scale = 1e3 if convention == "craig" else 1.0
     q, points = write_dh_arm(tmp_path, convention, scale, "J{}")
     columns = [f"J{k}" for k in range(1, 7)]
     entries, text = proposed((columns, q), (XYZ, points), robot="arm.csv")
@@ -415,7 +416,7 @@ SHOWN_WRONG = {
 }
 
 
-@pytest.mark.parametrize("case", SHOWN_WRONG)
+@pytest.mark.parametrize("case", ["moved", pytest.param("late", marks=pytest.mark.slow)])
 def test_what_explains_the_rows_is_said(case: str, proposed: Proposed) -> None:
     q, points = rows()
     changed, message, parts = SHOWN_WRONG[case]
