@@ -233,7 +233,9 @@ def _result(
     explained, found = parts(model), outliers(model, placed, data, chosen.judged, least)
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
     warn_of_outliers(found, placed.data)
-    warn_of_contradictions(model, placed.coordinates, found, placed.mislabelled(model, found) or (best and best.text))
+    said, mislabelled = best and best.text, placed.mislabelled(model, found)
+    said = said if best and best.columns is None else mislabelled or said  # a wrong column explains its wrong rows
+    warn_of_contradictions(model, placed.coordinates, found, said)
     warn_of_rounding(robot, placed.data, data, chosen.left_out)
     found_lengths = lengths(data, scales, placed.placement.hypotheses(data, VALUE))
     summary = Summary(

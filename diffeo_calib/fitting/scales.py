@@ -60,24 +60,24 @@ def choose_scales(problem: Problem, *, robust: bool = False, iterations: int = 1
     order = torch.randperm(len(problem.x), generator=seeded(seed), device=HOST).to(problem.x.device)
     parts = [rows.sort().values for rows in order.split(max(1, NUMBERS // problem.y.shape[1]))]
     visible, tails = problem.noise.visible.sum(1, keepdim=True), Tails.none(len(order), 1, device=order.device)
-    found = plain = _likeliest(problem, parts[0], iterations)
+    chosen = plain = _likeliest(problem, parts[0], iterations)
     for _ in range(ROUNDS if robust else 0):
         squares = problem.y.new_empty(len(order), 1)
         for rows in parts:
-            squares[rows] = _left_out_squares(found.subset(rows), tails.weights[rows])
+            squares[rows] = _left_out_squares(chosen.subset(rows), tails.weights[rows])
         # Scales chosen among gross rows hide some of these: Student's t, which gives them less weight, leads there.
         gross, before = gross_weights(squares, visible), tails
         tails = reweight(squares, visible) if gross is None else Tails(inf, gross, gross=True)
         if tails.settled(before):
             break
-        found = _likeliest(_weighted(problem, tails.weights), parts[0], iterations)
+        chosen = _likeliest(_weighted(problem, tails.weights), parts[0], iterations)
     if not tails.gross:
         return plain
     if len(rows := (tails.weights[:, 0] < GROSS_WEIGHT).nonzero()[:, 0].tolist()):
         warn_user(
             sentence(f"the errors of rows {few(rows)} are gross, and their noise was raised", fix="check these rows")
         )
-    return found
+    return chosen
 
 
 def _weighted(problem: Problem, weights: Tensor) -> Problem:
@@ -99,9 +99,8 @@ def _left_out_squares(problem: Problem, weights: Tensor) -> Tensor:
     """(N, 1) squares of the rows' left-out errors in units of their covariance, with the noise of rows of weight 1."""
     at, target = _tangent(problem)
     noise, process = problem.noise, Process.of_rows(at, problem.noise).about(target)
-    errors, covariance = process.left_out(process.numbers.owner)
-    C = process.numbers.blocks(covariance) + (weights[:, :, None] - 1.0) * noise.covariance
-    e = process.numbers.in_table(errors)[:, :, None]
+    errors, C = process.rows_left_out()
+    C, e = C + (weights[:, :, None] - 1.0) * noise.covariance, errors[:, :, None]
     return (e * torch.linalg.solve(without_hidden(C, noise.visible), e)).sum(1)
 
 

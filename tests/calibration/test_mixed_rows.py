@@ -68,7 +68,8 @@ def payloads(change: Any, rows: int = ROWS) -> list[str]:
     ("change", "rows", "words"),
     [
         (lambda m: m.roll(2), ROWS, "the payloads seem to be those 2 lines later"),
-        (lambda m: torch.where(m == 10, 1.0, m), ROWS, "the payloads seem to be 10 where they are 1"),
+        (lambda m: torch.where(m == 10, 1.0, m), ROWS, "10 times as large where they are 1"),
+        (lambda m: torch.cat([m[:40], 1000 * m[40:]]), ROWS, "1000 times as large where they are at most 10"),
         (lambda m: m.flip(0), 120, "rows seem to have carried payloads of other rows"),
         (lambda m: m, ROWS, ""),
     ],

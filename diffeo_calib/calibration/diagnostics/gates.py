@@ -30,7 +30,7 @@ MIXED_ROWS, TWO_TOOLS_LEFT = 40, 0.45
 tools in turn: noise that is halved by its sign leaves .8."""
 PAYLOAD_ODDS, PAYLOADS_LEFT = 12.0, 0.75
 """Log odds of other payloads, beyond those by chance where every row may have any, and the part of the left-out error
-that may remain with them: of right columns 5 at most beyond chance, and .9 or more remain; none of 60 was doubted."""
+that may remain with them."""
 ROW_ODDS = 6.0
 """Log odds of a number that differs from row to row: clean images have less than zero, focal lengths that differ by
 0.1 % fourteen and more."""
