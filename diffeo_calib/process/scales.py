@@ -150,12 +150,9 @@ class Hyperparameters:
         """
         level = NEGLIGIBLE_DISPLACEMENT * float(noise.diagonal(dim1=-2, dim2=-1).mean().sqrt())
         lever = jacobian.square().mean((0, 1)).sqrt()
-        transmission, coupled = (
-            torch.where(amplitude * lever < level, 0.0, amplitude)
-            for amplitude in (self.transmission_amplitude, self.coupled_amplitude)
-        )
-        task = torch.where(self.task_amplitude < level, 0.0, self.task_amplitude)
-        return replace(self, transmission_amplitude=transmission, coupled_amplitude=coupled, task_amplitude=task)
+        sizes = {"transmission_amplitude": lever, "coupled_amplitude": lever, "task_amplitude": 1.0}
+        found = {name: (getattr(self, name), size) for name, size in sizes.items()}
+        return replace(self, **{name: torch.where(own * size < level, 0.0, own) for name, (own, size) in found.items()})
 
     def inflated(self, factor: float) -> Hyperparameters:
         """All standard deviations times a factor: the same fit (up to known covariances), larger uncertainty."""

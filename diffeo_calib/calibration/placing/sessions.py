@@ -230,9 +230,8 @@ class Drift(DeviceSet):
 
     def settled(self, found: Settled) -> Drift:
         own = found.shifts.new_tensor([FRAME_M_RAD] * 6 + [GROWTH] + [OFFSET_RAD_M] * len(self.devices.joints))
-        shifts, deviations = (
-            own * each.view(len(self.names), -1) for each in (found.shifts, found.covariance.diagonal().sqrt())
-        )
+        shifts = own * found.shifts.view(len(self.names), -1)
+        deviations = own * found.covariance.diagonal().sqrt().view(len(self.names), -1)
         constants = torch.cat([self.devices.constants[:, :2], found.centre.expand(len(shifts), 3), shifts], 1)
         known = replace(self.devices, constants=constants, deviations=deviations)
         return replace(self, devices=known, centre=found.centre)
