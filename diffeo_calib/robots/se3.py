@@ -90,6 +90,13 @@ def twist_transform(twists: Tensor) -> Tensor:
     return transforms(rotation(twists[..., 3:]), twists[..., :3])
 
 
+def twist_at(place: Tensor) -> Tensor:
+    """(6, 6) from the shift of a body at the origin, and its turn, to those at a place (3,), m."""
+    there = torch.eye(6, dtype=place.dtype, device=place.device)
+    there[:3, 3:] = -skew(place)
+    return there
+
+
 def nearest_rotations(matrices: Tensor) -> Tensor:
     """The proper rotations nearest in the Frobenius norm: any matrices (..., 3, 3) -> (..., 3, 3).
 
