@@ -99,9 +99,8 @@ def _left_out_squares(problem: Problem, weights: Tensor) -> Tensor:
     """(N, 1) squares of the rows' left-out errors in units of their covariance, with the noise of rows of weight 1."""
     at, target = _tangent(problem)
     noise, process = problem.noise, Process.of_rows(at, problem.noise).about(target)
-    errors, covariance = process.left_out(process.numbers.owner)
-    C = process.numbers.blocks(covariance) + (weights[:, :, None] - 1.0) * noise.covariance
-    e = process.numbers.in_table(errors)[:, :, None]
+    errors, C = process.rows_left_out()
+    C, e = C + (weights[:, :, None] - 1.0) * noise.covariance, errors[:, :, None]
     return (e * torch.linalg.solve(without_hidden(C, noise.visible), e)).sum(1)
 
 

@@ -15,8 +15,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.joint_ranges import SAME_CONFIGURATION, check_same_robot, fitted_configurations
+from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.coordinates import Beside, Places, check_shown, known_devices, sensor_of
 from diffeo_calib.sensors.errors import Evaluations
@@ -39,7 +41,10 @@ def residuals(kinematics: Callable[[Tensor], Tensor], places: Places, data: Any)
 
 
 def check_rows(kinematics: Callable[[Tensor], Tensor], data: Any) -> None:
-    """Refuse rows of other joints, tips and kinds than those of a calibrated model, and rows that show no error."""
+    """Refuse what is no table, rows of other joints, tips and kinds than those of a model, and rows without errors."""
+    if not isinstance(data, RowGroups):
+        expected = "dc.Measurements, dc.Readings or Observations"
+        raise InputError.of("`data`", expected=expected, got=type(data).__name__)
     check_shown(data)
     if isinstance(kinematics, CalibratedKinematics):
         check_same_robot(kinematics, data)

@@ -327,6 +327,12 @@ class Process(Conditional):
             covariance[at[:, :, None], at[:, None]] = block
         return errors, covariance
 
+    def rows_left_out(self, group: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """The same by row, errors (N, R) and covariances (N, R, R); group: (N,), by default each by itself."""
+        owner = self.numbers.owner
+        errors, covariance = self.left_out(owner if group is None else group[owner])
+        return self.numbers.in_table(errors), self.numbers.blocks(covariance)
+
 
 class Estimated(Conditional):
     """Errors e(x) - B(x) w of the model beside unknowns w that were estimated from it, w = A e(X) + other errors.

@@ -16,6 +16,7 @@ its errors. There the weights are P(good) + P(gross) / c, never more than one.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import inf, log
 
@@ -117,3 +118,25 @@ def gross_weights(squares: Tensor, dim: int | Tensor) -> Tensor | None:
     if float(good.nanmean()) < 0.5:  # noise that is said to be far too small is not gross
         return None
     return (good + (1.0 - good) / c).nan_to_num(1.0)
+
+
+def estimated(tails: Tails, freedom: Tensor, squares: Callable[..., Tensor], rounds: int = 8) -> Tails:
+    """Tails by expectation maximisation, then beside gross measurements, if left-out errors show any.
+
+    Args:
+        tails: to begin with. freedom: (N, P) coordinates of each error. rounds: most of either.
+        squares: of errors beside some tails, as of :func:`reweight`: of rows that are ``left_out``, or as they are
+            expected under the posterior.
+    """
+    for _ in range(rounds):
+        before, tails = tails, reweight(squares(tails, left_out=False), freedom)
+        if tails.settled(before):
+            break
+    for _ in range(rounds):
+        weights = gross_weights(squares(tails, left_out=True), freedom)
+        if weights is None:
+            break
+        before, tails = tails, Tails(inf, weights, gross=True)
+        if tails.settled(before):
+            break
+    return tails

@@ -27,7 +27,6 @@ from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.registered_map import marker_slopes
 from diffeo_calib.measurements.bodies import Predicted
 from diffeo_calib.measurements.poses import angle_between
-from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.tree import Tree
@@ -66,9 +65,6 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Any) -> Evaluation | 
     if not callable(kinematics) or isinstance(kinematics, Tree):
         expected = "a calibrated model or another function of joint values"
         raise InputError.of("`kinematics`", expected=expected, got=type(kinematics).__name__)
-    if not isinstance(data, RowGroups):
-        expected = "dc.Measurements, dc.Readings or Observations"
-        raise InputError.of("`data`", expected=expected, got=type(data).__name__)
     places = place(kinematics, data)
     found = residuals(kinematics, places, data)
     if isinstance(kinematics, CalibratedKinematics):

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.hypotheses import BASE, MARKERS, NEW_SET_UP, SampledRows
+from diffeo_calib.calibration.diagnostics.hypotheses import SampledRows, changes_of_set_up
 from diffeo_calib.calibration.diagnostics.judge import best_of, changed, two_tools
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows, NewSetUp, UsualNoise
 from diffeo_calib.common.checks import check_number
@@ -44,7 +44,7 @@ from diffeo_calib.regression.tails import Tails
 from diffeo_calib.robots.placement import PLACES, place, rigid_fit
 from diffeo_calib.robots.se3 import skew
 from diffeo_calib.sensors.coordinates import check_joint_order
-from diffeo_calib.sensors.devices import CHANGE, Hypothesis
+from diffeo_calib.sensors.devices import CHANGE
 from diffeo_calib.sensors.tables import Coordinates
 
 FREE = ("both", "base", "marker")
@@ -327,13 +327,8 @@ def opened(rows: NewRows, data: Any) -> NewRows:
         return rows
     shown, chain, mine = rows.visible[..., None], rows.nominal.geometry.chain, rows.placement
     frame, markers = (rows.by_places * shown).tensor_split([6], 2)
-    found = [Hypothesis(BASE, own, fix=NEW_SET_UP) for own in (frame, frame[..., :3])]
-    found.append(Hypothesis(MARKERS, markers, fix=NEW_SET_UP))
-    for joint, (name, turns) in enumerate(zip(chain.joint_names, chain.periodic, strict=True)):
-        effects = rows.at.joint_to_start[:, :, joint, None] * shown
-        found.append(Hypothesis(name, effects, ("mrad" if turns else "mm", 1e-3)))
-    found = [own for own in (*found, *mine.hypotheses(rows, CHANGE)) if bool((own.effects != 0).any())]
-    named = [own._replace(name=mine.bodies.get(own.name, own.name)) for own in found]
+    found = changes_of_set_up(frame, markers, rows.at.joint_to_start * shown, chain) + mine.hypotheses(rows, CHANGE)
+    named = [own._replace(name=mine.bodies.get(own.name, own.name)) for own in found if bool(own.effects.any())]
     told = SampledRows(torch.arange(len(rows), device=shown.device), rows.process, None)
     found = changed(told, named, data.line_numbers, data.row_names)
     causes = [one for one in found if one.what.split(" seems")[0] not in chain.joint_names]  # see find_changes.py
