@@ -99,13 +99,13 @@ class Bench:
     def json(self, *words: object) -> dict[str, Any]:
         """The results of a command, for programs."""
         path = self.folder / "results.json"
-        self.run(*words, "--json", path)
-        return results(path)
+        return results(path, self.run(*words, "--json", path))
 
     def judged(self, *words: object) -> dict[str, Any]:
         """Of a command that tells errors: of every kind in its unit, in the JSON and in the text, which is "said"."""
         path = self.folder / "judged.json"
-        said, found = self.run(*words, "--json", path).out, results(path)
+        done = self.run(*words, "--json", path)
+        said, found = done.out, results(path, done)
         own = WHAT.get(self.kind.name, {("errors", "m")})
         shown = {(what, SHOWN.get(unit, unit)) for what, unit in own}
         leaves = {kind: list(_leaves(entry)) for kind, entry in found["kinds"].items()}
@@ -126,10 +126,13 @@ class Bench:
         return path
 
 
-def results(path: Path) -> dict[str, Any]:
-    """Those of a file for programs, which is as the schema says."""
+def results(path: Path, done: Outcome) -> dict[str, Any]:
+    """Those of a file for programs, which is as the schema says; beside them the exit code and the warnings."""
     written = json.loads(path.read_text(encoding="utf-8"))
     VALIDATOR.validate(written)
+    assert written["exit_code"] == done.code
+    assert written["warnings"] == [line.removeprefix("warning: ") for line in done.warnings]
+    assert all(Path(own).is_file() for own in written["results"].get("files", {}).values())
     return written["results"]
 
 

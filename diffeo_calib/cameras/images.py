@@ -201,21 +201,21 @@ def _known(images: Sequence[Images], cameras: Sequence[Camera | None], board: Bo
 
     The board's errors are counted once: they are those of the first camera that knows it, the other ones add lenses.
     """
-    size = max(one.half_size for one in images)
-    guesses = [first_guess(one, board, size) if own is None else own for one, own in zip(images, cameras, strict=True)]
-    first = next((k for k, own in enumerate(cameras) if own is not None and own.half_size), 0)
+    size = max(i.half_size for i in images)
+    guesses = [first_guess(i, board, size) if c is None else c for i, c in zip(images, cameras, strict=True)]
+    first = next((k for k, c in enumerate(cameras) if c is not None and c.half_size), 0)
     whole = guesses[first]
     if not whole.half_size:  # its lens is known alone
-        own = torch.diag(whole.unknowns.new_tensor(board.deviations(size)))
-        whole = replace(whole, half_size=size, root=torch.block_diag(whole.root[: len(LENS)], own))
+        c = torch.diag(whole.unknowns.new_tensor(board.deviations(size)))
+        whole = replace(whole, half_size=size, root=torch.block_diag(whole.root[: len(LENS)], c))
     nothing = torch.zeros_like(whole.root[: len(LENS)])
-    roots = [torch.linalg.qr(own.root[: len(LENS)].mT).R.mT for own in guesses]  # (9, c) of the lens alone
+    roots = [torch.linalg.qr(c.root[: len(LENS)].mT).R.mT for c in guesses]  # (9, c) of the lens alone
     lenses = [nothing[:, :0] if k == first else root for k, root in enumerate(roots)]
     unknowns = []
-    for k, (own, others) in enumerate(zip(guesses, torch.block_diag(*lenses).split(len(LENS)), strict=True)):
+    for k, (c, others) in enumerate(zip(guesses, torch.block_diag(*lenses).split(len(LENS)), strict=True)):
         lens = torch.cat([whole.root[: len(LENS)] if k == first else nothing, others], 1)
         root = torch.cat([lens, torch.nn.functional.pad(whole.root[len(LENS) :], (0, others.shape[1]))])
-        unknowns.append(replace(own, half_size=whole.half_size, unknowns=torch.cat([own.lens, whole.board]), root=root))
+        unknowns.append(replace(c, half_size=whole.half_size, unknowns=torch.cat([c.lens, whole.board]), root=root))
     return unknowns
 
 
@@ -242,13 +242,13 @@ def first_guess(images: Images, board: BoardPrior, half_size: float | None = Non
     return Camera(images.width, images.height, size, unknowns, root)
 
 
-def projection(seen: Tensor, points: Tensor) -> Tensor:
+def projection(pixels: Tensor, points: Tensor) -> Tensor:
     """P (3, k + 1) with P (z, 1) ~ (u, v, 1) of images (N, 2) of points z (N, k), by direct linear transformation.
 
     Source: R. Hartley, A. Zisserman, "Multiple view geometry in computer vision", 2003, section 7.1.
     """
     at = torch.cat([points, torch.ones_like(points[:, :1])], 1)
-    rows = torch.cat([torch.cat([at * (k == 0), at * (k == 1), -seen[:, k : k + 1] * at], 1) for k in range(2)])
+    rows = torch.cat([torch.cat([at * (k == 0), at * (k == 1), -pixels[:, k : k + 1] * at], 1) for k in range(2)])
     return torch.linalg.svd(rows, full_matrices=len(rows) < rows.shape[1]).Vh[-1].view(3, -1)
 
 
@@ -473,8 +473,8 @@ def expected(camera: Camera, poses: Tensor) -> tuple[Tensor, Tensor]:
     whole = replace(camera, root=eye)
     for some in poses.split(MOST_TOGETHER):
         images = Images(points.expand(len(some), -1, -1), points[:0], camera.width, camera.height)
-        seen = shown(camera, some)[..., None, None] / camera.noise
-        by_pose, by_unknowns = ((own * seen).flatten(1, 2) for own in State(images, whole, some, 0.0 * eye[0]).slopes())
+        unit = shown(camera, some)[..., None, None] / camera.noise
+        by_pose, by_unknowns = ((by * unit).flatten(1, 2) for by in State(images, whole, some, 0.0 * eye[0]).slopes())
         covariance = inverses(by_pose.mT @ by_pose)
         parts.append((covariance, covariance @ by_pose.mT @ by_unknowns))
     covariances, effects = (torch.cat(each) for each in zip(*parts, strict=True))

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from math import ceil, inf, nan
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -46,9 +46,8 @@ ALIKE, EXACT = 6.0, 1e-6
 """Ways that leave more than so many times what the best one leaves are wrong; and shares that are as good as none."""
 
 
-@dataclass(frozen=True)
-class Reading:
-    """One way to read the machine's rotation, or the measured one: convention, and unit of its angles."""
+class Reading(NamedTuple):
+    """One way to read the machine's rotation, or the measured one."""
 
     convention: str = ""
     angle: str = "rad"
@@ -179,14 +178,14 @@ def _ways(sheet: Sheet, machine: Body, rows: RowColumns, *, lengths: tuple[str, 
     units = {"length": other, "joint_length": None if length == other else length}
     for commanded, measured, camera in ways[:FEW_WAYS] if any(lengths) else ways:
         pose = PoseColumns((*machine.place, *machine.turn), commanded.convention).text
-        own = {**units, "angle": commanded.angle, "robot_pose": pose}
+        given: dict[str, Any] = {**units, "angle": commanded.angle, "robot_pose": pose}
         more: dict[str, Any] = {"camera_on_tool": camera}
         if turn:
             unit = measured.angle if len(turn) == 3 else None
             more |= {"rotation": [",".join(turn)], "convention": measured.convention, "rotation_angle": unit}
         with quiet(), suppress(DiffeoCalibError):
-            robot = cartesian(read_poses(sheet.path, table_format(Units(**own, **sheet.marks))))
-            yield source_of(sheet, robot, rows, **own, **more)
+            robot = cartesian(read_poses(sheet.path, table_format(Units(**given, **sheet.marks))))
+            yield source_of(sheet, robot, rows, **given, **more)
 
 
 def _numbers(sheet: Sheet, names: Sequence[str]) -> Tensor:
@@ -201,6 +200,10 @@ def _numbers(sheet: Sheet, names: Sequence[str]) -> Tensor:
 def _lengths(names: Sequence[str], values: Tensor) -> tuple[str, ...]:
     """Units of lengths that places may have, by their names, else by the size of the numbers; the likeliest first."""
     named = {column(name).unit for name in names} - {""}
+    if others := named - {*UNITS_PER_METRE}:
+        raise InputError.of(
+            f"{few(names)} in {few(sorted(others))}", expected=few([*UNITS_PER_METRE]), fix="convert them"
+        )
     if len(named) == 1:
         return (named.pop(),)
     largest = float(values.abs().max()) if values.numel() else 0.0

@@ -18,14 +18,13 @@ from diffeo_calib.cli.column_names import WORDS, Column, Group, column, groups, 
 from diffeo_calib.cli.options import CORNERS, Places
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, bad_cells, number, number_hint, numbers_in
-from diffeo_calib.measurements.csv.joined import joined_file
+from diffeo_calib.measurements.csv.joined import SEPARATORS, joined_file
 from diffeo_calib.measurements.csv.lines import HEAD, LENGTHS, CsvLines, read_cells
 from diffeo_calib.measurements.csv.sensors import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.readings import MILLIMETRES
 from diffeo_calib.measurements.table_format import SPHERICAL, SPHERICAL_UNITS, ZERO
 from diffeo_calib.sensors.kinds import known_kinds
 
-SEPARATORS = (",", ";", "\t", "|", " ")
 DECIMALS = (".", ",")
 ROWS_LOOKED_AT = 50
 LENS, SOME_LENS = "FX,FY,CX,CY", "1000,1000,500,500"

@@ -23,7 +23,7 @@ import torch
 
 from diffeo_calib.calibration.diagnostics import gates, likely_mistakes
 from diffeo_calib.calibration.diagnostics.plausibility import marker_column, unmeasured_markers
-from diffeo_calib.calibration.identification.registration import register, register_sockets, spread
+from diffeo_calib.calibration.identification.registration import register_sockets, registered_geometry, spread
 from diffeo_calib.calibration.placing.readings import images_error, rough_error
 from diffeo_calib.cli.column_names import column
 from diffeo_calib.cli.declarations import FitOptions
@@ -156,11 +156,8 @@ class Source:
         if positions is not None:
             own = positions.largest_session()
             if (left := likely_mistakes.residual_of(self.robot, own)) == inf:
-                what, expected = (
-                    f"{len(own)} row(s) of '{self.sheet.path}'",
-                    "enough for base and markers, at several places",
-                )
-                raise MeasurementError.of(what, expected=expected, fix="measure more rows")
+                what, expected = f"{len(own)} row(s) of '{self.sheet.path}'", "enough for base and markers"
+                raise MeasurementError.of(what, expected=expected, fix="measure more rows, at several places")
             return left / max(spread(own.points), SMALLEST_SPREAD_M)
         own, readings = divided(self.data)
         if own is not None:
@@ -206,10 +203,8 @@ class Source:
         periodic = self.robot.periodic
         lengths = ["mm"] if self.without_length and all(periodic) else list(UNITS_PER_METRE)
         angles = ("rad", "deg") if any(periodic) else ("rad",)
-        written = [
-            [own.written(way) for own in self.bodies] for own in self.bodies[:1] for way in own.spherical or ("",)
-        ]
-        places = written or [self.options.position]
+        ways = next((own.spherical for own in self.bodies if own.spherical), ("",))
+        places = [[own.written(way) for own in self.bodies] or None for way in ways]
         each = product(lengths, angles, lengths if slides else [None], (False, True)[: 1 + self.options.images], places)
         for length, angle, slide, camera, position in each:
             if slide != length:
@@ -219,22 +214,19 @@ class Source:
     def other_units(self) -> list[str]:
         """Columns of joints and positions whose names say other units."""
         turning = [name for name, turns in zip(self.joints, self.robot.periodic, strict=True) if turns]
-        places = [
-            name for own in self.bodies for name in own.place[: 1 if own.spherical else None]
-        ]  # others are angles
+        lengths = 1 if any(own.spherical for own in self.bodies) else None  # the others are angles
+        places = [name for own in self.bodies for name in own.place[:lengths]]
         pairs = *product(turning, (self.options.angle,)), *product(places, (self.options.length,))
         return [name for name, unit in pairs if column(name).unit not in ("", unit)]
 
 
 def source_of(sheet: Sheet, robot: Tree, rows: RowColumns, /, **options: Any) -> Source:
     """The table of a robot, what was measured, and other options."""
-    files = {
-        name: Path(sheet.path.with_suffix(end).name) for name, end in (("output", ".safetensors"), ("report", ".html"))
-    }
-    given = FitOptions(csv=sheet.path, **files, **sheet.marks, **rows.options, **options)
+    output, report = (Path(sheet.path.stem + end) for end in (".safetensors", ".html"))
+    options |= {**sheet.marks, **rows.options, "csv": sheet.path, "output": output, "report": report}
     why = {**REASONS, **rows.why, "csv": "; ".join(["the table", *sheet.notes])}
     why["sep"] = f"{len(sheet.numbers)} columns are numbers with it"
-    return Source(sheet, robot, rows.bodies, given, why, remarks=tuple(rows.left))
+    return Source(sheet, robot, rows.bodies, FitOptions(**options), why, remarks=tuple(rows.left))
 
 
 def _in_folder(name: str, value: Any, folder: Path) -> Any:
@@ -326,7 +318,7 @@ def with_measured(source: Source) -> Source:
     ways = list(source.positions()) if alone else []
     for _, data in ways[:1] if is_clear(source.units) else ways:
         with quiet(), suppress(DiffeoCalibError):
-            mixed = marker_column(register(source.robot, data.q, data.points).geometry, data)
+            mixed = marker_column(registered_geometry(source.robot, data.q, data.points), data)
             if mixed is not None:
                 return source.into({"marker": f"names the marker of each row: {mixed[1]}"}, marker=mixed[0])
     return source
@@ -406,7 +398,7 @@ def _of_one_size(source: Source) -> list[tuple[Source, Measurements]]:
     """Ways in units in which robot and positions are of one size, the likeliest first."""
     turning = torch.tensor(source.robot.periodic, dtype=torch.bool, device=HOST)
     likely = dict[str, tuple[float, Source, Measurements]]()
-    for one, own in source.positions():
+    for one, own in sorted(source.positions(), key=lambda pair: pair[0].options.angle != "rad"):
         small = bool((own.q[:, turning].abs() < LARGEST_JOINT_ANGLE_RAD).all())
         moved = spread(source.robot.tip_poses(own.q)[:, :1, :3, 3]), spread(own.points)
         if (one.options.angle == "deg" or small) and min(moved) > 0.0:

@@ -103,10 +103,8 @@ class Cameras(Devices):
     def hypotheses(self, points: Tensor, device: Tensor) -> Iterator[Hypothesis]:
         """Also focal lengths, which stretch the image, and principal points, which shift it, both in focal lengths."""
         yield from super().hypotheses(points, device)
-        image, fix = (
-            self.observation(device).value(points),
-            "check the intrinsic parameters, and the size of the images",
-        )
+        image = self.observation(device).value(points)
+        fix = "check the intrinsic parameters, and the size of the images"
         for name, own in self._of_each(image[..., None], device):
             yield Hypothesis(f"the focal length of '{name}'", own, ("%", 1e-2), fix, about=VALUE)
         for axis in range(2):

@@ -22,7 +22,7 @@ from diffeo_calib.calibration.identification.registration import (
     CONSISTENT,
     can_register,
     largest_distances,
-    register,
+    registered_geometry,
     spread,
 )
 from diffeo_calib.common.errors import MeasurementError, sentence
@@ -126,7 +126,7 @@ def check_row_order(robot: Tree, data: Measurements, registration: Identificatio
     steps = out_of_step(geometry.points(data.q), data.points, data.line_numbers, typical)
     near = largest_distances(geometry, data) <= gates.LAG_GROSS * typical
     if steps and int(near.sum()) >= gates.WINDOW_ROWS and can_register(data.points[near]):  # all that fit say more
-        geometry = register(robot, data.q[near], data.points[near], marker_tips(robot, data)).geometry
+        geometry = registered_geometry(robot, data.q[near], data.points[near], marker_tips(robot, data))
         typical = float(largest_distances(geometry, data)[near].median())
         steps = out_of_step(geometry.points(data.q), data.points, data.line_numbers, typical)
     if not steps or (steps[0].to_the_end and steps[0].first == int(data.line_numbers.min())):
@@ -143,7 +143,7 @@ def _consistent(robot: Tree, data: Measurements) -> Iterator[tuple[Geometry, flo
         own, other = _paired(data.line_numbers[rows], lag)
         q, points = data.q[rows][other], data.points[rows][own]
         if len(own) >= gates.WINDOW_ROWS and can_register(points):
-            geometry = register(robot, q, points, marker_tips(robot, data)).geometry
+            geometry = registered_geometry(robot, q, points, marker_tips(robot, data))
             typical = float(largest_known((geometry.points(q) - points).norm(dim=-1)).median())
             if typical <= limit:
                 yield geometry, typical
