@@ -223,7 +223,7 @@ def test_a_change_of_everything_is_followed_named_or_not(arm: Case, size: float,
     found, (still, _) = dc.recalibrate(arm.model, new), warned(dc.recalibrate, arm.model, new, drift="none")
     assert ("geometry" in [change.part for change in found.changes.found]) == named
     error = dc.evaluate(found.model, test).rms
-    assert error < min(0.12e-3, 0.95 * dc.evaluate(still.model, test).rms)
+    assert error < min(0.14e-3, 0.95 * dc.evaluate(still.model, test).rms)
     assert 0.9 < covered(found.model, test) <= 1.0
 
 

@@ -17,10 +17,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
-from math import degrees, inf
-from operator import itemgetter
-from typing import NamedTuple
+from functools import cached_property, partial
+from math import degrees, inf, log
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -32,12 +31,12 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import sentence, warn_user, with_deviation
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kernels.base import Kernel, SumKernel
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.registered_map import robot_map
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.process.evidence import Evidence
-from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.conditional import roots
 from diffeo_calib.robots.tree import Tree
 
@@ -161,6 +160,8 @@ class ChangedPart:
     joint: int | None = None  # whose errors they are; None for parameters of the nominal map
     offset: bool = False  # whether it is the offset of the joint, which all readings lack since then
     variance: float = 1.0  # of the change, relative to the old variance of the part
+    kernels: dict[int, float] = field(default_factory=dict)  # number of a term of the joint kernel -> variance of it
+    parameters: Tensor | float = 0.0  # (K,) variances of parameters of the nominal map
 
     def shapes(self, at: Linearisation) -> Tensor:
         """The columns, with the variance of the change."""
@@ -171,6 +172,25 @@ class ChangedPart:
         own = self.shapes(at)
         return own if self.joint is None else at.joint_to_start[:, :, self.joint, None] * own[:, None]
 
+    def before(self, at: Linearisation) -> Tensor:
+        """(M, m, c) columns of old rows in a problem of the robot as it is now, with :func:`grown` variances.
+
+        Of old errors f ~ N(0, P) those now, f + d with d ~ N(0, s^2 P), have the variance s^2 P where f is known. From
+        their prior N(0, (1 + s^2) P) and old rows that share errors of variance s^2 (1 + s^2) P the same follows; with
+        P and s^2 P it would be that of an old error, P, however much a part has worn.
+        """
+        return (1.0 + self.variance) ** 0.5 * self.root(at)
+
+
+def grown(spec: Any, drifts: Sequence[ChangedPart]) -> tuple[Kernel, Tensor]:
+    """Joint kernel and variances of parameters of a robot that differs from the old one by so much."""
+    terms, prior = [*spec.joint_kernel.terms], spec.prior_variance.clone()
+    for part in drifts:
+        prior += part.variance * part.parameters
+        for number, variance in part.kernels.items():
+            terms[number] = terms[number].scaled(1.0 + part.variance * variance / float(terms[number].variance))
+    return SumKernel(terms), prior
+
 
 def offsets_of(fitted: FittedMap) -> list[ChangedPart]:
     """The offsets of all joints, which are tested beside the parts: the geometry has them, among much else."""
@@ -178,16 +198,23 @@ def offsets_of(fitted: FittedMap) -> list[ChangedPart]:
     def same(at: Linearisation) -> Tensor:
         return torch.full_like(at.joint[0].points[:, :1], OFFSET_DEVIATION_RAD_M)
 
-    names = robot_map(fitted).geometry.chain.joint_names
-    return [ChangedPart(f"the offset of {name}", same, joint, offset=True) for joint, name in enumerate(names)]
+    geometry, found = robot_map(fitted).geometry, list[ChangedPart]()
+    for joint, name in enumerate(geometry.chain.joint_names):
+        number = geometry.chain.moving_names.index(name)
+        first = geometry.slices["joints"].start + 6 * number + 3 * int(geometry.chain.revolute[number])
+        own = torch.zeros_like(fitted.geodesic.spec.prior_variance)
+        own[first : first + 3] = (OFFSET_DEVIATION_RAD_M * geometry.chain.axes[number]).square()
+        found.append(ChangedPart(f"the offset of {name}", same, joint, offset=True, parameters=own))
+    return found
 
 
 def parts_of(fitted: FittedMap) -> list[ChangedPart]:
     """The parts of a robot's map: every joint with a transmission term, gravity, geometry."""
     spec, nominal = fitted.geodesic.spec, robot_map(fitted)
     names = nominal.geometry.chain.joint_names
-    own = {t.output: t for t in spec.joint_kernel.terms if isinstance(t, RadialKernel) and t.output is not None}
-    least = SMALLEST_AMPLITUDE_SHARE**2 * max((float(term.variance) for term in own.values()), default=0.0)
+    terms = enumerate(spec.joint_kernel.terms)
+    own = {t.output: (number, t) for number, t in terms if isinstance(t, RadialKernel) and t.output is not None}
+    least = SMALLEST_AMPLITUDE_SHARE**2 * max((float(term.variance) for _, term in own.values()), default=0.0)
 
     def of_joint(kernel: RadialKernel, joint: int, at: Linearisation) -> Tensor:
         points = at.joint[0].points
@@ -197,16 +224,20 @@ def parts_of(fitted: FittedMap) -> list[ChangedPart]:
         kept = values > NEGLIGIBLE_EIGENVALUE_SHARE * values[-1]
         return vectors[:, kept] * values[kept].sqrt()
 
-    def of_parameters(some: slice, at: Linearisation) -> Tensor:
+    def of_parameters(some: Tensor, at: Linearisation) -> Tensor:
         return at.sensitivity[..., some] * spec.prior_variance[some].sqrt()
 
     found: list[ChangedPart] = []
-    for joint, term in own.items() if least > 0 else ():
-        kernel = RadialKernel.from_config(term.to_config() | {"variance": max(float(term.variance), least)})
-        found.append(ChangedPart(names[joint], partial(of_joint, kernel, joint), joint))
-    parameters = {"gravity": nominal.sag, "geometry": nominal.geometry.slices["joints"]}
-    there = {name: some for name, some in parameters.items() if bool(spec.prior_variance[some].any())}
-    return found + [ChangedPart(name, partial(of_parameters, some)) for name, some in there.items()]
+    for joint, (number, term) in own.items() if least > 0 else ():
+        size = max(float(term.variance), least)
+        kernel = RadialKernel.from_config(term.to_config() | {"variance": size})
+        found.append(ChangedPart(names[joint], partial(of_joint, kernel, joint), joint, kernels={number: size}))
+    for name, some in {"gravity": nominal.sag, "geometry": nominal.geometry.slices["joints"]}.items():
+        variances = torch.zeros_like(spec.prior_variance)
+        variances[some] = spec.prior_variance[some]
+        if bool((at := variances.nonzero()[:, 0]).any()):
+            found.append(ChangedPart(name, partial(of_parameters, at), parameters=variances))
+    return found
 
 
 SIMULATED_DRAWS = 2000
@@ -341,12 +372,15 @@ def _changes_of(rows: NewRows, *, level: float, seed: int) -> tuple[Changes, lis
         return Changes(rows=len(rows), level=level), []
     parts = {part.name: part for part in (*parts_of(rows.fitted), *offsets_of(rows.fitted))}
     roots = {name: part.root(rows.at) for name, part in parts.items()}
-    rows = rows.changed(tails=rows.drifting(list(roots.values())).with_weights().tails)
+    drift = Drift(rows.with_weights())
+    few_fit = (drift.rows.tails.weights < OUTLIER_WEIGHT).any(1).double().mean() > MOST_OUTLIERS and drift.explains
+    rows = drift.doubted
     drifts, found, first, noise = list[ChangedPart](), list[tuple[float, tuple[str, ...]]](), dict[str, float](), 1.0
     while roots:
         ratios, factor = likelihood_ratios(rows, roots, seed)
         # A few outliers look like a change, and a change looks like outliers: it must stand out with either weights.
-        strict, _ = likelihood_ratios(rows.with_weights(), roots, seed)
+        # Where hardly a row fits the old model these are no outliers.
+        strict, _ = (ratios, factor) if few_fit else likelihood_ratios(rows.with_weights(), roots, seed)
         for name, (value, probability, variance) in ratios.items():
             other = strict[name]
             ratios[name] = Ratio(min(value, other.value), max(probability, other.probability), variance)
@@ -392,45 +426,108 @@ def _change(rows: NewRows, part: ChangedPart, probability: float, others: tuple[
     return Change(part.name, size, angle, displacement, probability, deviation, others)
 
 
-USUAL_LOG, EFOLDS = -6.0, 2.5
-"""Log-normal prior of s^2: the logarithm of its centre, and the standard deviation of its logarithm."""
-MOST_DRIFT = 0.5
-"""The s^2 up to which a robot may differ from the old one although only a minority of the rows fits that."""
-LOG_SIZES = torch.linspace(-12.0, 4.0, 65, dtype=torch.float64, device="cpu")
+USUAL_LOG, NAMED_LOG, EFOLDS, ALIKE_EFOLDS = -6.0, 0.0, 2.5, 1.5
+"""Log-normal priors of s^2: logarithms of the centres of what usually differs and of what is named, the standard
+deviation of all, and that of geometry, load and transmissions around their mean."""
+LOG_SIZES = torch.linspace(-12.0, 6.0, 37, dtype=torch.float64, device="cpu")
 """Logarithms of the s^2 that are tried."""
+NOTHING = -60.0
+"""That of what does not differ."""
+ROUNDS = 5
+"""Of a search for sizes, one after the other."""
+WRONG_SHARE = 0.05
+"""Probability that a row is wrong, before it is seen."""
 
 
-def with_usual_drift(rows: NewRows, named: Sequence[ChangedPart]) -> list[ChangedPart]:
+@dataclass(frozen=True, eq=False)
+class Drift:
     """What differs between the dates: what a test named, and all else: temperature, wear and screws change everything.
 
-    Errors of geometry, load and transmissions may differ from the old ones by s^2 times their old prior variance; s^2
-    maximises the evidence of the new rows with a wide prior below one percent. It has to be clear unless gravity or
-    the geometry are named: one worn joint changes nothing else. A change of everything looks like one of a part: what
-    was named stays only where the rows are likelier so.
+    Errors of offsets, transmissions, load and geometry may differ from the old ones by s^2 times their old prior
+    variance, another s^2 for each of the four and for each joint that is named; together these maximise the evidence of
+    the new rows. So may a sister robot.
 
     Args:
-        rows: the new rows as the old model sees them. named: parts that have changed.
+        rows: as the old model sees them. named: parts that have changed.
     """
-    if not (parts := parts_of(rows.fitted)):
-        return [*named]
-    root, sizes = torch.cat([part.root(rows.at) for part in parts], 2), LOG_SIZES.exp().to(rows.y)
-    prior = -0.5 * ((sizes.log() - USUAL_LOG) / EFOLDS).square()
 
-    def likeliest(tails: Tails, kept: Sequence[ChangedPart]) -> tuple[float, float, float]:
-        """Log evidence, that relative to no such drift, and s^2 beside some of the named parts."""
-        own = rows.changed(tails=tails).drifting([each.root(rows.at) for each in kept])
-        odds = own.evidence(root).log_odds(sizes) + prior
-        return own.given.log_evidence() + float(odds.max()), float(odds.max()), float(sizes[odds.argmax()])
+    rows: NewRows
+    named: Sequence[ChangedPart] = ()
 
-    doubted = rows.drifting([*(each.root(rows.at) for each in named), root]).with_weights().tails
-    found = [(likeliest(doubted, kept), kept) for kept in ([named, []] if named else [[]])]
-    (_, odds, size), kept = max(found, key=itemgetter(0))
-    if odds < gates.DRIFT_ODDS and all(each.joint is not None for each in named):
-        return [*named]
-    most = size > MOST_DRIFT or (rows.tails.weights >= OUTLIER_WEIGHT).all(1).double().mean() > MOST_OUTLIERS
-    if not named and most and likeliest(rows.tails, [])[1] < gates.DRIFT_ODDS_OF_INLIERS:  # a minority says nothing
-        return []
-    return [*kept, *(replace(part, variance=size) for part in parts)]
+    @cached_property
+    def groups(self) -> list[list[ChangedPart]]:
+        """Parts with one s^2: named joints, offsets, then the others."""
+        found = {part.name: [part] for part in self.named if part.joint is not None}
+        for part in (*offsets_of(self.rows.fitted), *parts_of(self.rows.fitted)):
+            if part.name not in found:
+                kind = "offsets" if part.offset else "transmissions" if part.joint is not None else f"all {part.name}"
+                found.setdefault(kind, []).append(part)
+        return [*found.values()]
+
+    @cached_property
+    def roots(self) -> list[Tensor]:
+        """(M, R, c) of each group."""
+        return [torch.cat([part.root(self.rows.at) for part in own], 2) for own in self.groups]
+
+    @cached_property
+    def doubted(self) -> NewRows:
+        """The rows with their weights if everything has changed."""
+        return self.rows.changed(tails=self.rows.drifting(self.roots).with_weights().tails)
+
+    @cached_property
+    def sizes(self) -> tuple[list[float], float, float]:
+        """Expected s^2 of each group, and the log odds with the likeliest of all that differs, and of what is usual."""
+        evidence, grid = self.doubted.evidence(torch.cat(self.roots, 2)), LOG_SIZES.to(self.rows.y)
+        counts = torch.tensor([root.shape[2] for root in self.roots], device=grid.device)
+        numbers = torch.arange(len(counts), device=grid.device)
+        joints = sum(part.joint is not None for part in self.named)
+        usual, alike = numbers >= joints, (numbers > joints).to(grid)
+        centre = torch.where(usual, USUAL_LOG, NAMED_LOG).to(grid)
+        covariance = torch.diag(EFOLDS**2 + alike * (ALIKE_EFOLDS**2 - EFOLDS**2)) + EFOLDS**2 * alike * alike[:, None]
+        precision = torch.linalg.inv(covariance)
+
+        def odds(tried: Tensor, some: Tensor) -> Tensor:
+            away = (tried - centre) * some
+            own = torch.where(some, tried, NOTHING).exp().repeat_interleave(counts, 1)
+            return evidence.log_odds_of(own) - 0.5 * ((away @ precision) * away).sum(1)
+
+        best, before, expected = centre, centre.new_full(centre.shape, NOTHING), list[float]()
+        tried = torch.where(usual, grid[:, None], centre)
+        for _ in range(ROUNDS):
+            best = tried[odds(tried, numbers >= 0).argmax()]
+            if torch.equal(best, before):
+                break
+            before, expected = best, []
+            for group in numbers.tolist():
+                tried = best.repeat(len(grid), 1)
+                tried[:, group] = grid
+                values = odds(tried, numbers >= 0)
+                best = tried[values.argmax()]
+                expected.append(float(values.softmax(0) @ grid.exp()))
+        found = float(odds(best[None], numbers >= 0))
+        return expected, found, found - float(odds(best[None], ~usual))
+
+    @property
+    def explains(self) -> bool:
+        """Whether it explains the rows better than that those are wrong which do not fit the old model."""
+
+        def evidence(rows: NewRows) -> float:
+            wrong = int((rows.tails.weights < OUTLIER_WEIGHT).any(1).sum())
+            return rows.given.log_evidence() + wrong * log(WRONG_SHARE)
+
+        return evidence(self.doubted) + self.sizes[1] - evidence(self.rows) > gates.DRIFT_ODDS
+
+    @property
+    def parts(self) -> list[ChangedPart]:
+        """What differs. Unless load or geometry are named it has to be clear: one worn joint changes nothing else."""
+        if not parts_of(self.rows.fitted):
+            return [*self.named]
+        if self.sizes[2] < gates.DRIFT_ODDS and all(each.joint is not None for each in self.named):
+            return [*self.named]
+        if not self.named and not self.explains:
+            return []
+        each = zip(self.groups, self.sizes[0], strict=True)
+        return [replace(part, variance=part.variance * size) for own, size in each for part in own]
 
 
 RANK_TOLERANCE = 1e-9

@@ -27,10 +27,10 @@ from diffeo_calib.calibration.recalibration.find_changes import (
     FEWEST_ROWS,
     LEVEL,
     Changes,
+    Drift,
     Offset,
     find_changes,
     hidden_offsets,
-    with_usual_drift,
 )
 from diffeo_calib.calibration.recalibration.find_place import find_place, warn_about
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows, NewSetUp
@@ -182,12 +182,12 @@ def recalibrate(
         warn_user(sentence(what, fix="check what happened between them, and recalibrate with the rows since then"))
     warn_about(before.registration, outliers=False, excess=not drifts, marker=marker, among=rows.changed_among)
     if drift == "tested":
-        drifts = with_usual_drift(rows, drifts)
+        drifts = Drift(rows, drifts).parts
     if drifts:
         rows = rows.drifting([each.root(rows.at) for each in drifts]).with_weights()
     excess = float((rows.given.left_out_squares / rows.visible.sum(1)).median().sqrt())  # of the better half
     warn_of_contradictions(rows, excess if before.registration is None else before.registration.excess)
-    problem, start = both_dates(rows, rows.inflation, [each.root for each in drifts])
+    problem, start = both_dates(rows, rows.inflation, drifts)
     solver, integrator = GaussNewton(tolerance=RESIDUAL_TOLERANCE), rows.fitted.geodesic.integrator
     fitted = fit(problem, solver, integrator, start=start, progress=progress)
     if fitted.solution.interrupted:
