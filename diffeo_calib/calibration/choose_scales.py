@@ -49,7 +49,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.observation import LinearFunctionals, Observation
-from diffeo_calib.process.scales import DEVIATIONS, FOUND, SCALES, GearLine, Hyperparameters
+from diffeo_calib.process.scales import DEVIATIONS, FOUND, PAYLOAD_FACTORS, SCALES, GearLine, Hyperparameters
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.tree import Tree
 
@@ -251,7 +251,6 @@ def _warn_of_wrong_scales(data: TangentData, left_out: LeaveOneOut) -> None:
         warn_user(text)
 
 
-FACTORS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 POSES, COORDINATES = 300, 1500
 """Most poses and coordinates on which the factor is chosen."""
 
@@ -262,7 +261,7 @@ def with_payload_factor(data: TangentData, scales: Hyperparameters, seed: int = 
     if sag is None or not bool(sag.loaded.any()):  # no coefficient depends on it
         return scales
     some = data.sample(POSES, COORDINATES, seed)[1]
-    tried = [replace(scales, payload=factor) for factor in FACTORS]
+    tried = [replace(scales, payload=factor) for factor in PAYLOAD_FACTORS]
     return max(tried, key=lambda one: some.process(one).evidence)
 
 
@@ -331,7 +330,8 @@ def scales_of_models(models: Sequence[CalibratedKinematics], like: Hyperparamete
     mean = torch.where(deviations, vectors.square().mean(0).sqrt(), vectors.log().mean(0).exp())
     share = len(models) ** -0.5
     lines = tuple(replace(line, amplitude=share * line.amplitude) for model in models for line in _lines(model))
-    return replace(like.with_vector(mean), lines=lines)
+    mean = torch.cat([mean.log(), like.logarithms()[len(mean) :]])  # scales that only some have are kept
+    return replace(like.from_logarithms(mean), lines=lines)
 
 
 def _lines(model: CalibratedKinematics) -> list[GearLine]:

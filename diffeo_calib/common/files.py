@@ -238,10 +238,10 @@ def _take_permissions(part: Path, target: Path) -> None:
         os.umask(mask)
         part.chmod(0o666 & ~mask)  # mkstemp's files are readable by their owner only
         return
-    known = target.stat()
+    status = target.stat()
     with suppress(OSError, AttributeError):  # not for other users' files, and not on Windows
-        os.chown(part, known.st_uid, known.st_gid)
-    part.chmod(known.st_mode & 0o777)
+        os.chown(part, status.st_uid, status.st_gid)
+    part.chmod(status.st_mode & 0o777)
 
 
 PROGRAM = ".py:"  # in FILE.py:NAME, a function in a file

@@ -267,9 +267,9 @@ class FittedMap:
         if not len(places):
             return root
         deviations = spec.prior_variance[places].sqrt()
-        every, seen = spec.nominal.sensitivities(self.x, torch.zeros_like(spec.prior_variance)), self.noise.visible
+        every, visible = spec.nominal.sensitivities(self.x, torch.zeros_like(spec.prior_variance)), self.noise.visible
         every = self.functionals @ every
-        slopes = every[seen] if every.shape[:2] == seen.shape else every.flatten(0, 1)  # registered: other points
+        slopes = every[visible] if every.shape[:2] == visible.shape else every.flatten(0, 1)  # registered: other points
         white = slopes[:, places] * deviations / len(slopes) ** 0.5
         _, s, Vt = torch.linalg.svd(torch.cat([white, white.new_zeros(len(places), len(places))]), full_matrices=False)
         noise = float(self.new_noise.diagonal().mean().sqrt())
@@ -296,10 +296,10 @@ class FittedMap:
         Displacements in open directions are of decimetres: then turns of milliradians count, too.
         """
         spec = self.geodesic.spec
-        own = torch.tensor(spec.nominal.turns, dtype=torch.int64, device=self.x.device)
-        if not len(own):
+        turns = torch.tensor(spec.nominal.turns, dtype=torch.int64, device=self.x.device)
+        if not len(turns):
             return 0.0
-        prior, posterior = spec.prior_variance[own], self.parameter_covariance(own).diagonal()
+        prior, posterior = spec.prior_variance[turns], self.parameter_covariance(turns).diagonal()
         total = float(torch.where(prior > OPEN_TURN_RAD**2, prior, posterior).sum())
         return total if total > NEGLIGIBLE_TURN_RAD**2 or self.open_directions.shape[1] else 0.0
 
@@ -351,11 +351,11 @@ class FittedMap:
                 fix = "calibrate again: files of this version keep what was measured"
                 raise InputError.of("the file of this model does not say what was measured", fix=fix)
             return self.y
-        values, seen = self.fitted_points, self.noise.visible
+        values, visible = self.fitted_points, self.noise.visible
         if self.y is not None:
-            return torch.where(seen, self.y, values)
+            return torch.where(visible, self.y, values)
         residual = self.noise.multiply(self.weighted_residual()[:, :, None])[:, :, 0]
-        return torch.where(seen, values + residual, values)
+        return torch.where(visible, values + residual, values)
 
     def linearised_rows(self) -> tuple[Tensor, Tensor]:
         """A (N, r, m) and what was measured of A k1 (N, r), around the fit; of coordinates A is the identity."""

@@ -287,7 +287,7 @@ def ur_transforms(geometry: Geometry, urdf: bytes) -> Tensor:
         what, expected = f"'{robot.tip}' of robot '{robot.name}'", "a frame on the axis of the last joint"
         raise RobotError.of(what, expected=expected, got=f"{away:.1e} beside it", fix=OTHERS)
     frames = zip(zero_frames(geometry)[1], ideal, places, strict=True)
-    moved = (own @ torch.linalg.inv(was) @ place for own, was, place in frames)
+    moved = (now @ torch.linalg.inv(was) @ place for now, was, place in frames)
     return torch.stack([torch.linalg.inv(before) @ after for before, after in pairwise([HALF_TURN, *moved])])
 
 
@@ -300,8 +300,8 @@ def ur_text(links: Tensor, hash: str | None) -> str:
         for entry, value in zip(ENTRIES, [*xyz, *rpy], strict=True):
             text = repr(value)  # to YAML an exponent needs a decimal point before it
             lines.append(f"    {entry}: {text if '.' in text else text.replace('e', '.0e')}")
-    own = hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
-    return "\n".join([*lines, f"  hash: {hash or f'diffeo_calib_{own}'}", ""])
+    checksum = hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
+    return "\n".join([*lines, f"  hash: {hash or f'diffeo_calib_{checksum}'}", ""])
 
 
 def _prefix(chain: Tree) -> str:

@@ -45,9 +45,9 @@ def origin_numbers(transform: Tensor) -> tuple[list[float], list[float]]:
 
 def check_units(length: str, angle: str) -> None:
     """Raise InputError for a unit that tables do not have."""
-    for name, value, known in (("length", length, LENGTHS), ("angle", angle, ANGLES)):
-        if value not in known:
-            raise InputError.of(f"`{name}`", expected=" or ".join(map(repr, known)), got=as_written(value))
+    for name, value, units in (("length", length, LENGTHS), ("angle", angle, ANGLES)):
+        if value not in units:
+            raise InputError.of(f"`{name}`", expected=" or ".join(map(repr, units)), got=as_written(value))
 
 
 def in_unit(values: Sequence[float], unit: str) -> list[float]:
@@ -134,10 +134,10 @@ def tables_text(tables: Sequence[CorrectionTable], length: str, angle: str) -> s
     return table_text(["joint", "unit", "value", "transmission_error", "correction_to_add"], rows)
 
 
-def offsets_text(found: JointOffsets, robot: Tree, length: str, angle: str) -> str:
+def offsets_text(best: JointOffsets, robot: Tree, length: str, angle: str) -> str:
     """Joint offsets as CSV; see :func:`write_joint_offsets`."""
     units = [angle if turns else length for turns in robot.periodic]
-    each = zip(robot.joint_names, units, found.offsets.tolist(), strict=True)
+    each = zip(robot.joint_names, units, best.offsets.tolist(), strict=True)
     rows = [[name, unit, *in_unit([offset], unit)] for name, unit, offset in each]
     return table_text(["joint", "unit", "offset_to_add_to_reading"], rows)
 
@@ -189,10 +189,10 @@ def field_text(model: CalibratedKinematics, grid: str, length: str) -> str:
     places = torch.cartesian_prod(*lines).view(-1, axes)
     q = torch.cat([places, places.new_zeros(len(places), robot.n - axes)], 1)
     targets = robot(q) @ model.tool
-    found = compensate(model, targets if robot.n > axes else targets[:, :3, 3], q)
+    compensation = compensate(model, targets if robot.n > axes else targets[:, :3, 3], q)
     base = model.geometry.base[:3, :3]
-    known = base.mT @ model.predict(q, noise=False)[1][:, 0] @ base
-    deviations = known.diagonal(dim1=1, dim2=2)[:, :axes].sqrt()
-    cells = LENGTHS[length] * torch.cat([places, found.correction[:, :axes], deviations], 1)
+    covariance = base.mT @ model.predict(q, noise=False)[1][:, 0] @ base
+    deviations = covariance.diagonal(dim1=1, dim2=2)[:, :axes].sqrt()
+    cells = LENGTHS[length] * torch.cat([places, compensation.correction[:, :axes], deviations], 1)
     header = [f"{word}{axis} [{length}]" for word in ("", "add_", "std_") for axis in "xyz"[:axes]]
     return table_text(header, cells.round(decimals=DIGITS).tolist())

@@ -137,5 +137,5 @@ def _chain(inputs: Tensor, middle: Tensor | None = None) -> Chain:
         origins = [transforms(middle.detach().cpu(), eye.new_zeros(3)), eye, eye]
         limits = [(max(least, -pi), min(most, pi)) for least, most in ends[3:]] or [(-pi, pi)] * 3
         turns = zip(TURNS, origins, eye[:3, :3].flip(0), limits, strict=True)
-        joints += [Joint(name, "revolute", origin, axis, *own) for name, origin, axis, own in turns]
+        joints += [Joint(name, "revolute", origin, axis, *bounds) for name, origin, axis, bounds in turns]
     return Chain("machine", "base", "flange", joints)

@@ -32,9 +32,9 @@ def skew(vectors: Tensor) -> Tensor:
 def rotation(w: Tensor) -> Tensor:
     """exp([w]x), Rodrigues: rotation vectors (..., 3) [rad] -> rotation matrices (..., 3, 3)."""
     x, W = (w * w).sum(-1)[..., None, None], skew(w)
-    one = torch.eye(3, dtype=w.dtype, device=w.device)
+    unit = torch.eye(3, dtype=w.dtype, device=w.device)
     sine, versine = _sine_and_versine(x)
-    return one + sine * W + versine * (W @ W)
+    return unit + sine * W + versine * (W @ W)
 
 
 def roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> Tensor:
@@ -62,8 +62,8 @@ def roll_pitch_yaw_angles(matrix: Tensor) -> list[float]:
 def right_jacobian(w: Tensor) -> Tensor:
     """Jr of SO(3), exp([w + e]x) = exp([w]x) exp([Jr(w) e]x) to first order: (..., 3) -> (..., 3, 3)."""
     x, W = (w * w).sum(-1)[..., None, None], skew(w)
-    one = torch.eye(3, dtype=w.dtype, device=w.device)
-    return one - _sine_and_versine(x)[1] * W + smooth(x, 3, lambda a: (a - a.sin()) / a**3, torch.where) * (W @ W)
+    unit = torch.eye(3, dtype=w.dtype, device=w.device)
+    return unit - _sine_and_versine(x)[1] * W + smooth(x, 3, lambda a: (a - a.sin()) / a**3, torch.where) * (W @ W)
 
 
 def transforms(rotations: Tensor, translations: Tensor) -> Tensor:

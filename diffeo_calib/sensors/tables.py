@@ -139,3 +139,10 @@ def check_poses(data: Any) -> None:
         got = " and ".join(f"{kind}s" for kind in kinds)
         fix = "give the positions of the poses alone (leave their rotation out)"
         raise MeasurementError.of("poses in a table of several kinds", expected="positions", got=got, fix=fix)
+
+
+def check_sessions(own: Coordinates | None) -> None:
+    """Raise MeasurementError for sessions without a device."""
+    if own is not None and own.table.without_device and len(names := own.table.present_sessions) > 1:
+        fix = "give the sockets of each session names of their own, and leave the sessions out"
+        raise MeasurementError.of("rows with sockets", expected="no sessions", got=few(names), fix=fix)

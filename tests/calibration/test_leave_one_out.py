@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from math import inf
 
 import numpy as np
@@ -12,6 +12,7 @@ import torch
 from product_bank import scales_of, usual_scales
 from scipy.stats import chi2
 from tangent_bank import Setting, built, covariance, normal, prior_covariance
+from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
@@ -29,7 +30,8 @@ from diffeo_calib.calibration.scales.leave_one_out import (
 )
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.fitting.result import silent
-from diffeo_calib.process.tails import Tails, reweight
+from diffeo_calib.regression import tails
+from diffeo_calib.regression.tails import Tails, reweight
 from diffeo_calib.robots import SimulatedArm
 
 
@@ -64,8 +66,8 @@ def test_weights_are_those_of_the_errors_under_the_posterior(name: str, monkeypa
     blocks = torch.stack([moments[m * i : m * (i + 1), m * i : m * (i + 1)] for i in range(n)])
     blocks = data.blocks_in_coordinates(blocks)
     expected = reweight(data.noise_model.squares(data.noise(scales), blocks), data.noise_model.freedom)
-    monkeypatch.setattr(one_out, "ROUNDS", 1)
-    monkeypatch.setattr(one_out, "gross_weights", lambda *_: None)
+    monkeypatch.setattr(tails, "gross_weights", lambda *_: None)
+    monkeypatch.setattr(one_out, "estimated", partial(tails.estimated, rounds=1))
     actual = one_out.weighed(data, scales).tails
     assert actual.freedom == expected.freedom < inf
     assert_close(actual.weights, expected.weights, rtol=1e-6, atol=1e-7)
@@ -160,6 +162,13 @@ def test_right_scales_are_hardly_widened(monkeypatch: pytest.MonkeyPatch) -> Non
         found.append(cross_validated_inflation(scales, scales, drawn, rows, seed=seed) or 0.0)
     assert min(found) > 0.5
     assert 0.9 < np.median(found) < 1.7, found
+
+
+def test_markers_and_repeats_of_a_row_count_as_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    shares = list[Tensor]()
+    monkeypatch.setattr(one_out, "region_scale", lambda *given: float(shares.append(given[2]) is None))
+    cross_validated_inflation(None, arm(2, 40).scales, arm(2, 40).tangent_data, torch.arange(40) // 2)
+    assert float(shares[0].sum()) == pytest.approx(20.0)
 
 
 def test_parts_of_the_space_show_errors_that_no_row_does() -> None:

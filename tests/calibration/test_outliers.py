@@ -21,14 +21,10 @@ from torch import Tensor
 from varied_arms import KINDS, VariedArm
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.diagnostics.judged_rows import block_text, steps_of
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_flat_places
 from diffeo_calib.calibration.diagnostics.outliers import FAR, Outlier, contradicted, excluded
-from diffeo_calib.calibration.diagnostics.row_order import (
-    block_text,
-    find_block,
-    out_of_step,
-    steps_of,
-)
+from diffeo_calib.calibration.diagnostics.row_order import find_block, out_of_step
 from diffeo_calib.calibration.expected_errors import workspace_deviation
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError

@@ -100,7 +100,7 @@ def test_every_camera_is_where_it_is_and_has_its_lens() -> None:
 
 def test_every_camera_of_a_recalibrated_model_is_where_it_is(tmp_path: Path) -> None:
     own = kind_named("two cameras on the tool")
-    again: Any = dc.recalibrate(own.model, own.moved).model
+    again: Any = own.recalibrated.model
     check_hand_eyes(again, 1.5e-4)
     dc.save(again, tmp_path / "again.safetensors")
     assert len(camera_files(dc.load(tmp_path / "again.safetensors"))) == 12  # pyright: ignore

@@ -53,7 +53,7 @@ from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.observation import Part, Stacked
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.process.tails import Tails
+from diffeo_calib.regression.tails import Tails
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import Payload
@@ -66,6 +66,7 @@ from diffeo_calib.sensors.tables import (
     OtherReadings,
     ball_tip,
     check_poses,
+    check_sessions,
     divided,
     sees_frame,
     with_markers,
@@ -307,6 +308,7 @@ def place(robot: Tree, data: Any, progress: Progress) -> Placed:
     """
     check_poses(data)
     coordinates, readings = divided(data)
+    check_sessions(coordinates)
     check_readings(robot, [one.table for one in readings], alone=coordinates is None)
     if coordinates is None:
         return _by_readings(robot, data, readings, progress)

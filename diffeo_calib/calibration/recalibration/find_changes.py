@@ -38,6 +38,7 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.regression.conditional import roots
+from diffeo_calib.regression.tails import Tails
 from diffeo_calib.robots.tree import Tree
 
 LEVEL = 0.01
@@ -147,8 +148,8 @@ SMALLEST_AMPLITUDE_SHARE = 0.5
 """A small transmission error counts with this share of the largest joint's amplitude: it may have grown."""
 OFFSET_DEVIATION_RAD_M = 3e-4
 """Of a joint offset, to which the sizes of changes are relative: they span 0.05 to 5 mrad."""
-NEGLIGIBLE_EIGENVALUE_SHARE = 1e-6
-"""Eigenvalues of a transmission's covariance below this share of the largest are left out."""
+NEGLIGIBLE_EIGENVALUE_SHARE = 1e-5
+"""Eigenvalues of a part's covariance below this share of the largest are left out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,7 +290,8 @@ def likelihood_ratios(rows: NewRows, roots: dict[str, Tensor], seed: int) -> tup
     samples = torch.cat([measured, levels[likeliest].sqrt()[:, None] * draws], 1)
     plain, sizes, ratios, variances = densities(samples), SIZES.to(base), dict[str, Tensor](), dict[str, float]()
     for name, root in roots.items():
-        E = aligned(root.flatten(0, 1)[seen])
+        U, s, _ = torch.linalg.svd(aligned(root.flatten(0, 1)[seen]), full_matrices=False)
+        E = (U * s)[:, s.square() > NEGLIGIBLE_EIGENVALUE_SHARE * s[0].square()]
         each = zip(E.T / levels[:, None], plain, strict=True)
         changed = torch.cat([own + Evidence((F @ samples).mT, F @ E).log_odds(sizes) for F, own in each])
         ratios[name] = 2.0 * (changed.amax(0) - plain.amax(0))
@@ -380,7 +382,8 @@ def _changes_of(rows: NewRows, *, level: float, seed: int) -> tuple[Changes, lis
         ratios, factor = likelihood_ratios(rows, roots, seed)
         # A few outliers look like a change, and a change looks like outliers: it must stand out with either weights.
         # Where hardly a row fits the old model these are no outliers.
-        strict, _ = (ratios, factor) if few_fit else likelihood_ratios(rows.with_weights(), roots, seed)
+        doubted = not few_fit and (not first or min(one.probability for one in ratios.values()) <= level)
+        strict = likelihood_ratios(rows.with_weights(), roots, seed)[0] if doubted else ratios
         for name, (value, probability, variance) in ratios.items():
             other = strict[name]
             ratios[name] = Ratio(min(value, other.value), max(probability, other.probability), variance)

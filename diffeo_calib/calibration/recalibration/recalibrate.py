@@ -56,8 +56,8 @@ from diffeo_calib.kinematics.provenance import Provenance, check_note
 from diffeo_calib.kinematics.registered_map import RegisteredMap, Registration, fitted_markers, moved
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.conditional import roots
+from diffeo_calib.regression.tails import Tails
 from diffeo_calib.robots.cartesian import is_cartesian, pose_inputs, turns_nowhere
 from diffeo_calib.robots.payload import common_mass, under_mass, words_of_mass
 from diffeo_calib.robots.tree import Tree

@@ -11,6 +11,7 @@ import csv
 import io
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from itertools import combinations, islice, takewhile, zip_longest
 from math import isfinite, isnan, prod
 from os import PathLike
@@ -42,8 +43,11 @@ WIDE = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 COMMENTS = "#", "%", "//"
 DAMAGED = re.compile(r"#[A-Z/0]+[!?]")
 """Cells such as #VALUE! and #DIV/0!, with which spreadsheets say that a formula failed: no comments."""
-LENGTHS = {"m": "m", "mm": "mm", "cm": "cm", "um": "um", "µm": "um", "in": "inch", "inch": "inch"}
-ANGLES = {"rad": "rad", "radians": "rad", "mrad": "mrad", "deg": "deg", "degrees": "deg", "°": "deg", "gon": "gon"}
+LENGTHS = {name: name for name in ("m", "mm", "cm", "um", "inch")}
+LENGTHS |= {"µm": "um", "in": "inch", "毫米": "mm", "厘米": "cm", "米": "m"}
+ANGLES = {name: name for name in ("rad", "mrad", "deg", "gon")}
+ANGLES |= {"radians": "rad", "弧度": "rad", "°": "deg", "degree": "deg", "degrees": "deg", "度": "deg"}
+UNITS = LENGTHS | ANGLES
 """Units as they are written, and their names."""
 LIST = re.compile(r"(?:[\w.]+\((?:'\w', *)?)?([\[(].*[\])])(?:, *dtype=[\w.]+)?\)?", re.DOTALL)
 """A list in one cell, as Python, NumPy and ROS write it: [0.1, 0.2], (0.1, 0.2), [0.1 0.2], array('d', [0.1, 0.2])."""
@@ -343,13 +347,13 @@ def _parts(cell: str, shape: tuple[int, ...] | None) -> list[str]:
 def unit_of(text: str) -> str:
     """The unit that a text is, in small letters without brackets; empty if it is none."""
     bare = text.lower().replace("\u03bc", "µ").strip("[](){}<> ")
-    return bare if bare in LENGTHS | ANGLES or OTHERS.fullmatch(bare) else ""
+    return bare if bare in UNITS or OTHERS.fullmatch(bare) else ""
 
 
 def stated_unit(column: str, units: Mapping[str, str]) -> str | None:
     """The unit of length or angle in brackets after the name of a column, or in a row of units; None without any."""
     bracket = re.search(r"[\[(][^\[(]*[\])]$", column)
-    return (LENGTHS | ANGLES).get(units.get(column) or (unit_of(bracket[0]) if bracket else ""))
+    return UNITS.get(units.get(column) or (unit_of(bracket[0]) if bracket else ""))
 
 
 def _is_units(cells: Sequence[str]) -> bool:
@@ -367,6 +371,7 @@ def _uncommented(cells: list[str], width: int) -> list[str]:
     return cells[1:] if not first and len(cells) > width > 0 else [first or cells[0], *cells[1:]]
 
 
+@lru_cache(maxsize=1 << 14)  # `init` reads a table in many units
 def _value(text: str) -> bool:
     """Whether a text is a number, with any decimal mark."""
     values = (number(text, decimal) for decimal in ".,")

@@ -98,8 +98,7 @@ class Deviations:
 def claimed(model: CalibratedKinematics, q: Tensor) -> Tensor:
     """(M,) RMS distance of the markers, or of the measured frame's origin, that the model claims at q (M, n), m."""
     q = q.to(model.configurations.device)
-    covariance = model.bodies.predicted(model, q, noise=False).places
-    return covariance.diagonal(dim1=-2, dim2=-1).sum(-1).mean(1).sqrt().to(HOST)
+    return model.bodies.predicted(model, q, noise=False).claimed.square().mean(1).sqrt().to(HOST)
 
 
 FEWEST_REPEATS = 5
