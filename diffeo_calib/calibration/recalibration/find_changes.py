@@ -15,30 +15,30 @@ extrapolation, not change.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
-from math import degrees, inf, log
-from typing import Any, NamedTuple
+from math import degrees, inf
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.row_order import find_block
+from diffeo_calib.calibration.recalibration.drift import (
+    NEGLIGIBLE_EIGENVALUE_SHARE,
+    OFFSET_DEVIATION_RAD_M,
+    ChangedPart,
+    Drift,
+    offsets_of,
+    parts_of,
+)
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows, NewSetUp
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import sentence, warn_user, with_deviation
 from diffeo_calib.common.quantiles import chi2_above
-from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kernels.base import Kernel, SumKernel
-from diffeo_calib.kernels.radial import RadialKernel
-from diffeo_calib.kinematics.registered_map import robot_map
-from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.regression.conditional import roots
-from diffeo_calib.regression.tails import Tails
 from diffeo_calib.robots.tree import Tree
 
 LEVEL = 0.01
@@ -142,103 +142,6 @@ class Changes:
             rows = f", {self.rows} rows" * bool(self.rows)
             return f"no change was found but {places} (tested at {100 * self.level:g} %{rows})"
         return "; ".join(map(str, self.found))
-
-
-SMALLEST_AMPLITUDE_SHARE = 0.5
-"""A small transmission error counts with this share of the largest joint's amplitude: it may have grown."""
-OFFSET_DEVIATION_RAD_M = 3e-4
-"""Of a joint offset, to which the sizes of changes are relative: they span 0.05 to 5 mrad."""
-NEGLIGIBLE_EIGENVALUE_SHARE = 1e-5
-"""Eigenvalues of a part's covariance below this share of the largest are left out."""
-
-
-@dataclass(frozen=True, eq=False)
-class ChangedPart:
-    """A part of a model that may have changed, by columns whose products are the prior covariance of the change."""
-
-    name: str  # of the joint, or "gravity" or "geometry"
-    columns: Callable[[Linearisation], Tensor]  # (M, m, c) at M configurations, m; of a joint's errors (M, c), rad or m
-    joint: int | None = None  # whose errors they are; None for parameters of the nominal map
-    offset: bool = False  # whether it is the offset of the joint, which all readings lack since then
-    variance: float = 1.0  # of the change, relative to the old variance of the part
-    kernels: dict[int, float] = field(default_factory=dict)  # number of a term of the joint kernel -> variance of it
-    parameters: Tensor | float = 0.0  # (K,) variances of parameters of the nominal map
-
-    def shapes(self, at: Linearisation) -> Tensor:
-        """The columns, with the variance of the change."""
-        return self.variance**0.5 * self.columns(at)
-
-    def root(self, at: Linearisation) -> Tensor:
-        """(M, m, c) the columns at M configurations, m."""
-        own = self.shapes(at)
-        return own if self.joint is None else at.joint_to_start[:, :, self.joint, None] * own[:, None]
-
-    def before(self, at: Linearisation) -> Tensor:
-        """(M, m, c) columns of old rows in a problem of the robot as it is now, with :func:`grown` variances.
-
-        Of old errors f ~ N(0, P) those now, f + d with d ~ N(0, s^2 P), have the variance s^2 P where f is known. From
-        their prior N(0, (1 + s^2) P) and old rows that share errors of variance s^2 (1 + s^2) P the same follows; with
-        P and s^2 P it would be that of an old error, P, however much a part has worn.
-        """
-        return (1.0 + self.variance) ** 0.5 * self.root(at)
-
-
-def grown(spec: Any, drifts: Sequence[ChangedPart]) -> tuple[Kernel, Tensor]:
-    """Joint kernel and variances of parameters of a robot that differs from the old one by so much."""
-    terms, prior = [*spec.joint_kernel.terms], spec.prior_variance.clone()
-    for part in drifts:
-        prior += part.variance * part.parameters
-        for number, variance in part.kernels.items():
-            terms[number] = terms[number].scaled(1.0 + part.variance * variance / float(terms[number].variance))
-    return SumKernel(terms), prior
-
-
-def offsets_of(fitted: FittedMap) -> list[ChangedPart]:
-    """The offsets of all joints, which are tested beside the parts: the geometry has them, among much else."""
-
-    def same(at: Linearisation) -> Tensor:
-        return torch.full_like(at.joint[0].points[:, :1], OFFSET_DEVIATION_RAD_M)
-
-    geometry, found = robot_map(fitted).geometry, list[ChangedPart]()
-    for joint, name in enumerate(geometry.chain.joint_names):
-        number = geometry.chain.moving_names.index(name)
-        first = geometry.slices["joints"].start + 6 * number + 3 * int(geometry.chain.revolute[number])
-        own = torch.zeros_like(fitted.geodesic.spec.prior_variance)
-        own[first : first + 3] = (OFFSET_DEVIATION_RAD_M * geometry.chain.axes[number]).square()
-        found.append(ChangedPart(f"the offset of {name}", same, joint, offset=True, parameters=own))
-    return found
-
-
-def parts_of(fitted: FittedMap) -> list[ChangedPart]:
-    """The parts of a robot's map: every joint with a transmission term, gravity, geometry."""
-    spec, nominal = fitted.geodesic.spec, robot_map(fitted)
-    names = nominal.geometry.chain.joint_names
-    terms = enumerate(spec.joint_kernel.terms)
-    own = {t.output: (number, t) for number, t in terms if isinstance(t, RadialKernel) and t.output is not None}
-    least = SMALLEST_AMPLITUDE_SHARE**2 * max((float(term.variance) for _, term in own.values()), default=0.0)
-
-    def of_joint(kernel: RadialKernel, joint: int, at: Linearisation) -> Tensor:
-        points = at.joint[0].points
-        one = points.new_zeros(len(points), 1, points.shape[1])
-        one[:, 0, joint] = 1.0
-        values, vectors = torch.linalg.eigh(kernel.gram(points, one, points, one))
-        kept = values > NEGLIGIBLE_EIGENVALUE_SHARE * values[-1]
-        return vectors[:, kept] * values[kept].sqrt()
-
-    def of_parameters(some: Tensor, at: Linearisation) -> Tensor:
-        return at.sensitivity[..., some] * spec.prior_variance[some].sqrt()
-
-    found: list[ChangedPart] = []
-    for joint, (number, term) in own.items() if least > 0 else ():
-        size = max(float(term.variance), least)
-        kernel = RadialKernel.from_config(term.to_config() | {"variance": size})
-        found.append(ChangedPart(names[joint], partial(of_joint, kernel, joint), joint, kernels={number: size}))
-    for name, some in {"gravity": nominal.sag, "geometry": nominal.geometry.slices["joints"]}.items():
-        variances = torch.zeros_like(spec.prior_variance)
-        variances[some] = spec.prior_variance[some]
-        if bool((at := variances.nonzero()[:, 0]).any()):
-            found.append(ChangedPart(name, partial(of_parameters, at), parameters=variances))
-    return found
 
 
 SIMULATED_DRAWS = 2000
@@ -427,110 +330,6 @@ def _change(rows: NewRows, part: ChangedPart, probability: float, others: tuple[
             deviation = float(shapes[0, 0]) * max(1.0 - float(evidence.H), 0.0) ** 0.5
     angle = part.joint is not None and kinds[part.joint] != "prismatic"
     return Change(part.name, size, angle, displacement, probability, deviation, others)
-
-
-USUAL_LOG, NAMED_LOG, EFOLDS, ALIKE_EFOLDS = -6.0, 0.0, 2.5, 1.5
-"""Log-normal priors of s^2: logarithms of the centres of what usually differs and of what is named, the standard
-deviation of all, and that of geometry, load and transmissions around their mean."""
-LOG_SIZES = torch.linspace(-12.0, 6.0, 37, dtype=torch.float64, device="cpu")
-"""Logarithms of the s^2 that are tried."""
-NOTHING = -60.0
-"""That of what does not differ."""
-ROUNDS = 5
-"""Of a search for sizes, one after the other."""
-WRONG_SHARE = 0.05
-"""Probability that a row is wrong, before it is seen."""
-
-
-@dataclass(frozen=True, eq=False)
-class Drift:
-    """What differs between the dates: what a test named, and all else: temperature, wear and screws change everything.
-
-    Errors of offsets, transmissions, load and geometry may differ from the old ones by s^2 times their old prior
-    variance, another s^2 for each of the four and for each joint that is named; together these maximise the evidence of
-    the new rows. So may a sister robot.
-
-    Args:
-        rows: as the old model sees them. named: parts that have changed.
-    """
-
-    rows: NewRows
-    named: Sequence[ChangedPart] = ()
-
-    @cached_property
-    def groups(self) -> list[list[ChangedPart]]:
-        """Parts with one s^2: named joints, offsets, then the others."""
-        found = {part.name: [part] for part in self.named if part.joint is not None}
-        for part in (*offsets_of(self.rows.fitted), *parts_of(self.rows.fitted)):
-            if part.name not in found:
-                kind = "offsets" if part.offset else "transmissions" if part.joint is not None else f"all {part.name}"
-                found.setdefault(kind, []).append(part)
-        return [*found.values()]
-
-    @cached_property
-    def roots(self) -> list[Tensor]:
-        """(M, R, c) of each group."""
-        return [torch.cat([part.root(self.rows.at) for part in own], 2) for own in self.groups]
-
-    @cached_property
-    def doubted(self) -> NewRows:
-        """The rows with their weights if everything has changed."""
-        return self.rows.changed(tails=self.rows.drifting(self.roots).with_weights().tails)
-
-    @cached_property
-    def sizes(self) -> tuple[list[float], float, float]:
-        """Expected s^2 of each group, and the log odds with the likeliest of all that differs, and of what is usual."""
-        evidence, grid = self.doubted.evidence(torch.cat(self.roots, 2)), LOG_SIZES.to(self.rows.y)
-        counts = torch.tensor([root.shape[2] for root in self.roots], device=grid.device)
-        numbers = torch.arange(len(counts), device=grid.device)
-        joints = sum(part.joint is not None for part in self.named)
-        usual, alike = numbers >= joints, (numbers > joints).to(grid)
-        centre = torch.where(usual, USUAL_LOG, NAMED_LOG).to(grid)
-        covariance = torch.diag(EFOLDS**2 + alike * (ALIKE_EFOLDS**2 - EFOLDS**2)) + EFOLDS**2 * alike * alike[:, None]
-        precision = torch.linalg.inv(covariance)
-
-        def odds(tried: Tensor, some: Tensor) -> Tensor:
-            away = (tried - centre) * some
-            own = torch.where(some, tried, NOTHING).exp().repeat_interleave(counts, 1)
-            return evidence.log_odds_of(own) - 0.5 * ((away @ precision) * away).sum(1)
-
-        best, before, expected = centre, centre.new_full(centre.shape, NOTHING), list[float]()
-        tried = torch.where(usual, grid[:, None], centre)
-        for _ in range(ROUNDS):
-            best = tried[odds(tried, numbers >= 0).argmax()]
-            if torch.equal(best, before):
-                break
-            before, expected = best, []
-            for group in numbers.tolist():
-                tried = best.repeat(len(grid), 1)
-                tried[:, group] = grid
-                values = odds(tried, numbers >= 0)
-                best = tried[values.argmax()]
-                expected.append(float(values.softmax(0) @ grid.exp()))
-        found = float(odds(best[None], numbers >= 0))
-        return expected, found, found - float(odds(best[None], ~usual))
-
-    @property
-    def explains(self) -> bool:
-        """Whether it explains the rows better than that those are wrong which do not fit the old model."""
-
-        def evidence(rows: NewRows) -> float:
-            wrong = int((rows.tails.weights < OUTLIER_WEIGHT).any(1).sum())
-            return rows.given.log_evidence() + wrong * log(WRONG_SHARE)
-
-        return evidence(self.doubted) + self.sizes[1] - evidence(self.rows) > gates.DRIFT_ODDS
-
-    @property
-    def parts(self) -> list[ChangedPart]:
-        """What differs. Unless load or geometry are named it has to be clear: one worn joint changes nothing else."""
-        if not parts_of(self.rows.fitted):
-            return [*self.named]
-        if self.sizes[2] < gates.DRIFT_ODDS and all(each.joint is not None for each in self.named):
-            return [*self.named]
-        if not self.named and not self.explains:
-            return []
-        each = zip(self.groups, self.sizes[0], strict=True)
-        return [replace(part, variance=part.variance * size) for own, size in each for part in own]
 
 
 RANK_TOLERANCE = 1e-9

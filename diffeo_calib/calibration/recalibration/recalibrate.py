@@ -23,11 +23,11 @@ from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE
 from diffeo_calib.calibration.placing.placement import Placement
+from diffeo_calib.calibration.recalibration.drift import Drift
 from diffeo_calib.calibration.recalibration.find_changes import (
     FEWEST_ROWS,
     LEVEL,
     Changes,
-    Drift,
     Offset,
     find_changes,
     hidden_offsets,

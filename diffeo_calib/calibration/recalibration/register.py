@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from diffeo_calib.calibration.recalibration.find_changes import ChangedPart, grown
+from diffeo_calib.calibration.recalibration.drift import ChangedPart, grown
 from diffeo_calib.calibration.recalibration.find_place import find_place, warn_about
 from diffeo_calib.calibration.recalibration.new_rows import NewRows
 from diffeo_calib.common.device import HOST
