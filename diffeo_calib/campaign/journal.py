@@ -30,7 +30,7 @@ from typing import IO, Any
 
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few, warn_user
 from diffeo_calib.common.files import FULL, bring_to_disk, lock_file
-from diffeo_calib.measurements.csv.cells import number
+from diffeo_calib.measurements.csv.cells import csv_text, number
 
 KEPT = ("fits", "accepted", "error", "expected", "cause", "decided", "again", "shown")
 """Fields of a verdict in a journal."""
@@ -258,9 +258,7 @@ class GrowingTable:
         return self._half
 
     def _line(self, cells: Sequence[object]) -> bytes:
-        text = io.StringIO()
-        csv.writer(text, delimiter=self._sep, lineterminator="\n").writerow(cells)
-        return text.getvalue().encode()
+        return csv_text([cells], self._sep).encode()
 
 
 def digest(line: bytes) -> str:

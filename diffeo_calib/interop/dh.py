@@ -29,10 +29,11 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, RobotError, as_written
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.interop.rigid import geometry_of
-from diffeo_calib.interop.tables import check_units, in_unit, origin_numbers, table_text
+from diffeo_calib.interop.tables import check_units, in_unit, origin_numbers
 from diffeo_calib.interop.urdf import urdf_of
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.tool import checked_tip
+from diffeo_calib.measurements.csv.cells import csv_text
 from diffeo_calib.robots.dh import CONVENTIONS, DHRow, from_dh, row_transform
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import transforms
@@ -145,7 +146,7 @@ def dh_text(table: DHTable, length: str, angle: str) -> str:
         driven = " + ".join(f"{slope!r} {by}" for by, slope in (row.mimic or {}).items())
         follows = [driven, row.mimic_offset if driven else ""] if mimics else []
         rows.append([name, row.kind, a, alpha, d, theta, beta, *[""] * 6, *follows])
-    return table_text(header, [*rows, fixed("tool", table.tool)])
+    return csv_text([header, *rows, fixed("tool", table.tool)])
 
 
 def zero_frames(geometry: Geometry, tip: str | None = None) -> tuple[list[int], list[Tensor], Tensor]:

@@ -27,8 +27,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from diffeo_calib.common.errors import MeasurementError, few, shown
-from diffeo_calib.measurements.csv.cells import find_columns, number
-from diffeo_calib.measurements.csv.lines import TextTable, csv_text, read_cells
+from diffeo_calib.measurements.csv.cells import csv_text, find_columns, number
+from diffeo_calib.measurements.csv.lines import TextTable, read_cells
 
 SEPARATORS = (",", ";", "\t", "|", " ")
 MOVED = 1e-3
@@ -190,7 +190,7 @@ def _written(tables: Sequence[_Table], pairs: Pairs, sep: str) -> bytes:
     for row, place in pairs:
         line, cells = measured.rows[place]
         lines[line] = [" ".join(cell.split()) for cell in (*table.rows[row][1], *cells)]
-    return csv_text((lines.get(line, []) for line in range(1, max(lines) + 1)), sep, "\n")
+    return csv_text((lines.get(line, []) for line in range(1, max(lines) + 1)), sep).encode()
 
 
 # --- stops

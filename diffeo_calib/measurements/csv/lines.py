@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from diffeo_calib.common.errors import MeasurementError, few, listed
 from diffeo_calib.common.files import WholeFile
-from diffeo_calib.measurements.csv.cells import number, repeated
+from diffeo_calib.measurements.csv.cells import csv_text, number, repeated
 from diffeo_calib.measurements.csv.sheets import MARKS, as_text, names_of
 from diffeo_calib.measurements.table_format import ZERO, TableFormat
 
@@ -403,16 +403,9 @@ def write_rows(path: str | PathLike[str], names: Sequence[str], blocks: Iterable
         return repr(value).replace(".", table.decimal) if isfinite(value) else ""
 
     with WholeFile(path) as file:
-        file.write(csv_text([names], table.sep))
+        file.write(csv_text([names], table.sep, "\r\n").encode())
         for block in blocks:
-            file.write(csv_text((map(cell, row) for row in block), table.sep))
-
-
-def csv_text(rows: Iterable[Iterable[object]], sep: str, end: str = "\r\n") -> bytes:
-    """Rows of cells as CSV."""
-    text = io.StringIO(newline="")
-    csv.writer(text, delimiter=sep, lineterminator=end).writerows(rows)
-    return text.getvalue().encode()
+            file.write(csv_text((map(cell, row) for row in block), table.sep, "\r\n").encode())
 
 
 def write_columns(path: Path, sheet: TextTable, cells: Mapping[str, Column], table: TableFormat) -> None:
