@@ -207,7 +207,7 @@ def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: P
     start = replace(problem.zero(), theta=data.theta) if count is None else None  # coarse fits find one of their own
     solver = GaussNewton(tolerance=RESIDUAL_TOLERANCE)
     fitted = fit(problem, solver, controls=count, backend=backend, start=start, progress=progress)
-    return replace(fitted, advice=ADVICE)
+    return replace(fitted, advice=ADVICE, model=replace(fitted.model, unresolved=chosen.unresolved))
 
 
 def _result(

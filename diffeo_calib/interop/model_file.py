@@ -34,7 +34,7 @@ from diffeo_calib.common.errors import (
     printable,
     warn_user,
 )
-from diffeo_calib.common.files import write_whole
+from diffeo_calib.common.files import as_path, write_whole
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows import integrator_from_config
 from diffeo_calib.interop.numpy_model import ENTRY, FORMAT, UNSOUND, Header, digest, read_arrays
@@ -71,6 +71,7 @@ MAP_TENSORS = {
     "workspace": "workspace",  # of a robot that no device has seen: where covariances leave rigid motions out
     "slopes": "slopes",  # linear functionals of the coordinates that were measured; without it, all coordinates were
     "measured": "y",  # what was measured; the first model files did not have it
+    "unresolved": "unresolved",  # variances of errors that are too short for the fields, if there are any
 }
 """Tensors that only some models have -> attributes of the map."""
 ROBOT_TENSORS = ("rigid_errors", "scales")
@@ -251,7 +252,7 @@ def _check(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         **{"x": (n_rows, n), "momenta_x": (n_rows, n), "momenta_y": (n_rows * m // dim, dim)},
         **{"theta": (size,), "prior_variance": (size,), "noise": (data, width, width), "new_noise": (m, m)},
         **{"data": (data, n), "workspace": ("M", n), "slopes": (data, width, m), "measured": (data, width)},
-        **{"session": (n_rows,), "payloads": (n_rows,), SHARED: (data, width, "c")},
+        **{"unresolved": (n,), "session": (n_rows,), "payloads": (n_rows,), SHARED: (data, width, "c")},
     }
     if robot is not None:
         shapes["scales"] = (5 * n + 2 * robot.geometry.chain.moving + 9,)
@@ -422,7 +423,7 @@ def load(
         DiffeoCalibWarning: devices of a kind that nobody registered here, whose readings are not predicted; a profile
             in a file of an old version, which cannot be compared with the one passed.
     """
-    classes, (header, tensors) = _checked(kernels), read(Path(path))
+    classes, (header, tensors) = _checked(kernels), read(as_path(path))
     try:
         return rebuild(header, tensors, nominal, classes)
     except (ModelFileError, MissingArgumentError):

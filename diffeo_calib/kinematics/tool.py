@@ -173,7 +173,7 @@ def covariance_without_placement(model: Any, q: Tensor, tool: Tensor, tip: str |
     every = torch.linspace(0, len(x_fit) - 1, min(len(x_fit), REFERENCE_ROWS), dtype=torch.float64, device=x_fit.device)
     rows = torch.cat([x_fit[every.round().long()], q.detach()])
     points, at = kinematics.deformation.linearised_value(rows)
-    covariance = fitted.conditional.covariance_between(at)  # open directions are those of both motions
+    covariance = fitted.covariance_between(at)  # open directions are those of both motions
     points = points.unflatten(1, (3, 3))
     base, spread = frame_slopes(points, points.mean((0, 1))), tool_points(tool).to(points)  # a motion of the base moves
     flange = FlangePoints(kinematics.nominal, spread, on=(kinematics.tip,) * 3)  # the points, one of the tool these

@@ -32,7 +32,7 @@ from diffeo_calib.calibration.recalibration.find_changes import (
     find_changes,
     hidden_offsets,
 )
-from diffeo_calib.calibration.recalibration.find_place import find_place, warn_about
+from diffeo_calib.calibration.recalibration.find_place import OTHER_MARKER, find_place, warn_about
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows, NewSetUp
 from diffeo_calib.calibration.recalibration.new_set_up import (
     Marker,
@@ -397,7 +397,7 @@ def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) ->
         return Measurements.of_points(q, points.detach(), None, model.lever).with_load(own.nominal.load)
 
     fitted = other.map.unregistered
-    found = find_place(fitted, other.lever, measured(other, there, model(q)))[1]
+    found = find_place(fitted, other.lever, measured(other, there, model(q)), marker_std=OTHER_MARKER)[1]
     placed = RegisteredMap(moved(fitted, found.transform), found)
     new = measured(model, q, placed(there).unflatten(1, (-1, 3)))
     rows = weighed(place_again(model, new, "other", opens=False), "other")
