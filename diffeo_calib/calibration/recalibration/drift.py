@@ -167,7 +167,7 @@ class Drift:
     def sizes(self) -> tuple[list[float], float, float]:
         """Expected s^2 of each group, and the log odds with the likeliest of all that differs, and of what is usual."""
         evidence, grid = self.doubted.evidence(torch.cat(self.roots, 2)), LOG_SIZES.to(self.rows.y)
-        counts = torch.tensor([root.shape[2] for root in self.roots], device=grid.device)
+        counts = torch.tensor([root.shape[2] for root in self.roots], dtype=torch.int64, device=grid.device)
         joints, each = sum(part.joint is not None for part in self.named), torch.arange(len(counts), device=grid.device)
         usual, alike = each >= joints, (each > joints).to(grid)
         best = centre = torch.where(usual, USUAL_LOG, NAMED_LOG).to(grid)
@@ -178,7 +178,7 @@ class Drift:
             away, own = (tried - centre) * some, torch.where(some, tried, NOTHING).exp()
             return evidence.log_odds_of(own.repeat_interleave(counts, 1)) - 0.5 * ((away @ precision) * away).sum(1)
 
-        moves, found, everything = torch.eye(len(counts), device=grid.device) > 0, list[float](), each >= 0
+        moves, found, everything = each == each[:, None], list[float](), each >= 0
         for moved in (usual, *moves.repeat(ROUNDS, 1)):
             tried = torch.where(moved, grid[:, None], best)
             values = odds(tried, everything)
