@@ -13,7 +13,7 @@ from torch import Tensor
 from diffeo_calib.cameras.images import UNKNOWNS, Camera
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, few, warn_user
-from diffeo_calib.common.files import read_regular
+from diffeo_calib.common.files import as_path, read_regular
 
 MATRIX = ("camera_matrix", "k", "intrinsics", "intrinsic_matrix", "mtx")
 COEFFS = ("coeffs", "coefs", "coeff", "coef", "coefficients", "parameters")
@@ -80,7 +80,7 @@ def read_camera(path: str | PathLike[str]) -> Camera:
         InputError: no such file, one that is no camera or several, or another lens than a pinhole with k1, k2, p1, p2
             and k3.
     """
-    file = Path(path)
+    file = as_path(path)
     try:
         text = read_regular(file, "camera file", LARGEST_FILE).decode("utf-8-sig")
     except UnicodeDecodeError as error:

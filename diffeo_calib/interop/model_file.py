@@ -34,7 +34,7 @@ from diffeo_calib.common.errors import (
     printable,
     warn_user,
 )
-from diffeo_calib.common.files import write_whole
+from diffeo_calib.common.files import as_path, write_whole
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows import integrator_from_config
 from diffeo_calib.interop.numpy_model import ENTRY, FORMAT, UNSOUND, Header, digest, read_arrays
@@ -423,7 +423,7 @@ def load(
         DiffeoCalibWarning: devices of a kind that nobody registered here, whose readings are not predicted; a profile
             in a file of an old version, which cannot be compared with the one passed.
     """
-    classes, (header, tensors) = _checked(kernels), read(Path(path))
+    classes, (header, tensors) = _checked(kernels), read(as_path(path))
     try:
         return rebuild(header, tensors, nominal, classes)
     except (ModelFileError, MissingArgumentError):

@@ -22,6 +22,7 @@ from safetensors import SafetensorError, safe_open
 
 from diffeo_calib.common.data_frames import named_columns, real_array
 from diffeo_calib.common.errors import InputError, ModelFileError
+from diffeo_calib.common.files import as_path
 from diffeo_calib.runtime.arrays import MOST_STEPS, TABLEAUS, Array
 from diffeo_calib.runtime.build import calibrated_chain, nominal_chain, recorded_flow, recorded_stages
 from diffeo_calib.runtime.chain import tip_poses
@@ -170,7 +171,7 @@ def load_numpy(path: str | os.PathLike[str]) -> NumpyKinematics:
     :func:`diffeo_calib.load`. InputError: a model of a plain function, with adaptive time steps, or with kernels of the
     user's own.
     """
-    header, arrays = read_arrays(Path(path))
+    header, arrays = read_arrays(as_path(path))
     try:
         program, tool = _program(header, arrays), np.array(header.get("tool", np.eye(4)), dtype=np.float64)
         return NumpyKinematics(program, program.chain.nominal.names, program.chain.nominal.limits, tool)

@@ -88,7 +88,11 @@ def numbered(names: object, rows: int, what: str = "the names of sessions") -> t
 
     MeasurementError if there is not one per row, or for None, NaN or an empty text.
     """
-    names = names.tolist() if isinstance(names, Tensor) else names
+    try:
+        names = names.tolist() if isinstance(names, Tensor) else names
+    except RuntimeError as error:  # of a sparse or quantized tensor, or one on the meta device
+        got = "a tensor that cannot be listed"
+        raise MeasurementError.of(what, expected=f"{rows} names, one per row", got=got) from error
     given = list(names) if isinstance(names, Iterable) and not isinstance(names, str) else []
     if len(given) != rows:
         raise MeasurementError.of(what, expected=f"{rows} names, one per row", got=len(given) or as_written(names))

@@ -178,7 +178,7 @@ def check_lever(lever: object) -> None:
 def _arms(poses: Tensor, lever: float) -> Tensor:
     """From the frame's origin to its points: (..., 3 points, 3)."""
     check_lever(lever)
-    return lever * (marks(poses.device) @ poses[..., :3, :3].mT)
+    return float(lever) * (marks(poses.device) @ poses[..., :3, :3].mT)
 
 
 def by_frame(values: Tensor) -> Tensor:

@@ -126,7 +126,7 @@ def _cells(path: Path, lines: Sequence[str]) -> tuple[list[str], list[list[str]]
     top = next((k for k, header in enumerate(headers) if {"a", "alpha", "d"} <= set(map(_what, header))), None)
     if top is None:
         what, expected = f"'{path}' is no DH table", "a header with the columns a, alpha, d and theta"
-        raise RobotError.of(what, expected=expected, got=shown(lines[0] if lines else ""), fix="or pass a URDF")
+        raise RobotError.of(what, expected=expected, got=shown((lines or ["no line"])[0]), fix="or pass a URDF")
     cells = [_split(line, seps[top]) for line in lines[top + 1 :] if line[0] not in "#%/"]
     names = [name for name in map(_what, headers[top]) if name not in ("", "unread")]
     bad = next((row for row in cells if len(row) != len(headers[top])), names if len(set(names)) < len(names) else None)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MOST_NAMES, InputError, RobotError, as_written, few, sentence, warn_user
-from diffeo_calib.common.files import read_regular
+from diffeo_calib.common.files import as_path, read_regular
 from diffeo_calib.robots.joint import KINDS, Joint
 from diffeo_calib.robots.tree import BASE, Chain, Ends, Tree, along
 from diffeo_calib.robots.urdf_elements import LARGEST_FILE, URDF, JointElement, harmless_faults, joint_of
@@ -50,7 +50,7 @@ def load_urdf(path: str | PathLike[str], base: str | None = None, tip: Names | N
             joint without limits like this), <mimic> of a fixed joint, an odd XML declaration; joints on the way to the
             tip that carry other branches, whose weight is left out.
     """
-    path = Path(path)
+    path = as_path(path)
     content = read_regular(path, "URDF", LARGEST_FILE, RobotError)
     robot, urdf, steps = _read(content, path, base, tip, load)
     ignored = urdf.ignored + [fault for step in steps for fault in harmless_faults(step.joint)]

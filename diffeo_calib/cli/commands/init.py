@@ -221,7 +221,7 @@ def _arms(robot: Path, sheet: Sheet) -> list[Arm]:
                 break
     if not arms:
         longest = sorted((joints for _, joints, _ in whole), key=len)[:-4:-1]
-        expected = " or ".join(few(joints, 20) for joints in longest if joints) or "a robot with joints"
+        expected = " or ".join(dict.fromkeys(few(joints, 20) for joints in longest if joints)) or "a robot with joints"
         missing = few(joints_without_column(sheet.numbers, longest[0]), 20) if longest else "a joint"
         fix = f"no column is named after {missing}" if missing else "numbered columns are more than the joints"
         fix += ": name the columns as the joints, or q1, q2, ... in their order"

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few, listed, shown, warn_user
+from diffeo_calib.common.files import as_path
 from diffeo_calib.measurements.checks import file_sha256, quiet
 from diffeo_calib.measurements.csv.cells import repeated
 from diffeo_calib.measurements.csv.columns import Columns, check_count
@@ -65,7 +66,7 @@ def read_observations(
         else :class:`Observations`. Rows are in the order of the file.
     """
     check_choice("duplicates", duplicates, ("error", "keep", "drop"))
-    file = path if isinstance(path, Path) else Path(path)
+    file = as_path(path)
     columns = columns_of(table)
     rows, alone = read_table(file, columns, zeros=not growing), len(columns.sensors) == 1
     tables = []
@@ -191,7 +192,7 @@ def read_joints(path: str | PathLike[str], table: TableFormat) -> Tensor:
 
 def read_configurations(path: str | PathLike[str], table: TableFormat) -> dict[str, Tensor]:
     """Joint values "q" as of :func:`read_joints`, with the "payload" (N,), "time" and "temperature" that are named."""
-    rows = read_table(path if isinstance(path, Path) else Path(path), Columns.of(table.joints_only()))
+    rows = read_table(as_path(path), Columns.of(table.joints_only()))
     return {"q": rows.q} | rows.beside
 
 
