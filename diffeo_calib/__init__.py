@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from diffeo_calib import interop as interop
     from diffeo_calib.calibration.calibrate import CalibrationResult as CalibrationResult
     from diffeo_calib.calibration.calibrate import calibrate as calibrate
+    from diffeo_calib.calibration.diagnostics.judged_rows import evaluate as evaluate
     from diffeo_calib.calibration.planning.candidates import Tracker as Tracker
     from diffeo_calib.calibration.planning.candidates import candidates as candidates
     from diffeo_calib.calibration.planning.plan import Plan as Plan
@@ -54,7 +55,6 @@ if TYPE_CHECKING:
     from diffeo_calib.kinematics.calibrated import CalibratedKinematics as CalibratedKinematics
     from diffeo_calib.kinematics.compensation.compensate import Compensation as Compensation
     from diffeo_calib.kinematics.compensation.compensate import compensate as compensate
-    from diffeo_calib.kinematics.evaluation import evaluate as evaluate
     from diffeo_calib.kinematics.evaluation import rows_used_in_fit as rows_used_in_fit
     from diffeo_calib.kinematics.joint_ranges import joints_outside_range as joints_outside_range
     from diffeo_calib.measurements.csv.files import read_measurements as read_measurements

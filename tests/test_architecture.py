@@ -26,7 +26,7 @@ FLOORS = (
     ("kernels", "kernels: profile + space + matrix; sums, stacks"),
     ("flows", "geodesics, their adjoint, integrators"),
     ("maps", "nominal maps, deformations, linearisation, noise"),
-    ("regression", "the linearised model conditioned on its data: one Gaussian process"),
+    ("regression", "the linearised model conditioned on its data: one Gaussian process; weights of rows"),
     ("fitting", "problems, solvers, fits of any smooth map"),
     # robots and tables, no kernel
     ("robots", "chains, DH, URDF, geometric errors, gravity sag"),
@@ -36,7 +36,7 @@ FLOORS = (
     # where they meet
     ("kinematics", "a robot's kinematics as maps: nominal, calibrated; errors on measurements"),
     ("paper", "the paper's own formulation"),
-    ("process", "scales of the fields, weights of rows, evidence of unknowns"),
+    ("process", "scales of the fields, evidence of unknowns"),
     ("calibration.identification", "registration, geometric errors, joint offsets"),
     ("calibration.scales", "kernel scales by marginal likelihood, leave-one-out"),
     ("calibration.diagnostics", "measurements that cannot be right"),

@@ -14,10 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import pytest
 import torch
-from command_bank import STAGES, Command, Outcome, leave_undrawn
+from command_bank import STAGES, VALIDATOR, Command, Outcome, leave_undrawn
 from kind_bank import (
     FREE,
     HELD_OUT,
@@ -39,7 +38,6 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibError
-from diffeo_calib.reports.results import SCHEMA
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 
@@ -101,13 +99,13 @@ class Bench:
     def json(self, *words: object) -> dict[str, Any]:
         """The results of a command, for programs."""
         path = self.folder / "results.json"
-        self.run(*words, "--json", path)
-        return results(path)
+        return results(path, self.run(*words, "--json", path))
 
     def judged(self, *words: object) -> dict[str, Any]:
         """Of a command that tells errors: of every kind in its unit, in the JSON and in the text, which is "said"."""
         path = self.folder / "judged.json"
-        said, found = self.run(*words, "--json", path).out, results(path)
+        done = self.run(*words, "--json", path)
+        said, found = done.out, results(path, done)
         own = WHAT.get(self.kind.name, {("errors", "m")})
         shown = {(what, SHOWN.get(unit, unit)) for what, unit in own}
         leaves = {kind: list(_leaves(entry)) for kind, entry in found["kinds"].items()}
@@ -128,10 +126,13 @@ class Bench:
         return path
 
 
-def results(path: Path) -> dict[str, Any]:
-    """Those of a file for programs, which is as the schema says."""
+def results(path: Path, done: Outcome) -> dict[str, Any]:
+    """Those of a file for programs, which is as the schema says; beside them the exit code and the warnings."""
     written = json.loads(path.read_text(encoding="utf-8"))
-    jsonschema.validate(written, SCHEMA)
+    VALIDATOR.validate(written)
+    assert written["exit_code"] == done.code
+    assert written["warnings"] == [line.removeprefix("warning: ") for line in done.warnings]
+    assert all(Path(own).is_file() for own in written["results"].get("files", {}).values())
     return written["results"]
 
 
@@ -377,11 +378,9 @@ def _(bench: Bench) -> None:
 @verb("recalibrate")
 def _(bench: Bench) -> None:
     kind = bench.kind
-    tool = torch.eye(4, dtype=torch.float64)
-    tool[2, 3] = 0.1
     one_tip = kind.name != "several tips"
     share_places(kind, "recalibrate", bench.command.monkeypatch)
-    found = dc.recalibrate(kind.model.with_tool(tool) if one_tip else kind.model, kind.moved)
+    found = kind.recalibrated
     check_accuracy(kind, found.model, NEW_ROWS_FACTOR)
     assert not one_tip or found.model.tool_poses(kind.q(2)).shape[-2:] == (4, 4)
     assert found.model.summary is not None

@@ -29,8 +29,8 @@ import harness
 import numpy as np
 import regions
 import torch
-from coverage import INSIDE_95
 from harness import Record
+from regions import INSIDE_95
 from torch import Tensor
 
 import diffeo_calib as dc

@@ -40,9 +40,10 @@ from itertools import product
 
 import harness
 import numpy as np
-from coverage import INSIDE_95, SERIES_A, split, squares
+import torch
 from harness import Record
 from robot_data import BUILT_IN, RobotData, data_folder, descriptor, read
+from scipy.stats import chi2
 from torch import Tensor
 from varied_arms import KINDS, VariedArm
 
@@ -57,6 +58,9 @@ TEST_ROWS, OLD_ROWS = 400, 150
 OLD_SERIES_ROWS = {"ipa_ur10_a": 700, "ipa_ur10": 442}
 OTHER_SERIES = {"ipa_ur10_a": "ipa_ur10", "ipa_ur10": "ipa_ur10_a"}
 MEASURED = (*OTHER_SERIES, "franka_fr3")
+SERIES_A = {"ipa_ur10_a": ("ipa_ur10", "measurements_grid_900.csv")}
+"""A second table of a data set."""
+INSIDE_95 = float(chi2.ppf(0.95, 3))
 SHARP = 0.9, 1.15
 """Target range of `sharpness`."""
 COLUMNS = ("method", "case", "rows", "seed", "drift", "new", "robot", "sharpness", "rms_mm", "seconds", "note")
@@ -122,6 +126,15 @@ def case(name: str, rows: int, seed: int, folder: Path | None) -> Case:
     return Case(found.robot, *split(found.measurements, rows, seed))
 
 
+def split(data: dc.Measurements, poses: int, seed: int) -> tuple[dc.Measurements, dc.Measurements]:
+    """About ``poses`` rows of random configurations with all their repeats, and the other rows."""
+    groups = data.groups().numpy()
+    order = np.random.default_rng([seed, 9]).permutation(groups.max() + 1)
+    rows = np.cumsum(np.bincount(groups)[order])
+    inside = np.isin(groups, order[: np.searchsorted(rows, poses) + 1])
+    return data[inside], data[~inside]
+
+
 @cache
 def other_robot(name: str, seed: int, folder: Path | None) -> dc.CalibratedKinematics:
     """The model of another robot of the same type."""
@@ -157,6 +170,11 @@ def judged(model: dc.CalibratedKinematics, found: Case) -> Record:
     if found.truth is not None:
         record["robot"] = _share(found.truth - mean, model.predict(found.test.q, noise=False)[1])
     return record
+
+
+def squares(errors: Tensor, covariance: Tensor) -> Tensor:
+    """Squared Mahalanobis distances: (..., 3), (..., 3, 3) -> (...)."""
+    return (errors * torch.linalg.solve(covariance, errors[..., None])[..., 0]).sum(-1)
 
 
 def _share(error: Tensor, covariance: Tensor) -> float:

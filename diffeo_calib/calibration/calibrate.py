@@ -28,10 +28,10 @@ from diffeo_calib.calibration.choose_scales import (
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import worth_it
 from diffeo_calib.calibration.diagnostics.judge import Finding, judge, lengths, warn_of_lengths, warn_of_taken_scales
+from diffeo_calib.calibration.diagnostics.judged_rows import warn_of_contradictions
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_single_joints, warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.outliers import (
     outliers,
-    stuck_columns,
     warn_of_outliers,
     warn_of_stuck,
 )
@@ -41,7 +41,6 @@ from diffeo_calib.calibration.diagnostics.plausibility import (
     warn_of_no_errors,
     warn_of_rounding,
 )
-from diffeo_calib.calibration.diagnostics.row_order import warn_of_contradictions
 from diffeo_calib.calibration.expected_errors import with_open_directions
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.result import CalibrationResult, parts
@@ -171,22 +170,22 @@ def calibrate(
         warn_of_single_joints(robot, measurements)
         data = placed.tangent_data()
         warn_of_no_errors(robot, data, placed.registration, placed.identification)
-        warn_of_stuck(data, stuck_columns(measurements))
+        warn_of_stuck(data, measurements)
         if placed.coordinates is None:
             warn_of_what_is_open(data, [own.devices for own in placed.readings])
         stages = placed.registration, placed.identification
-        choose = partial(choose_scales, given=hyperparameters, models=scales_of, seed=seed, progress=progress)
-        chosen = choose(data, measurements, *stages)
+        scales_for = partial(choose_scales, given=hyperparameters, models=scales_of, seed=seed, progress=progress)
+        chosen = scales_for(data, measurements, *stages)
         if not chosen.selection.interrupted and (drifting := placed.drifting()) is not None:
-            again = choose(drifting.tangent_data(), measurements, *stages)
+            again = scales_for(drifting.tangent_data(), measurements, *stages)
             if worth_it(chosen.left_out.errors, again.left_out.errors):
                 placed, chosen = drifting, again
         if scales_of and len(data.x) >= FEWEST_JUDGED and not chosen.selection.interrupted:
-            warn_of_taken_scales(chosen.left_out, choose(data, measurements, *stages, models=()).left_out)
+            warn_of_taken_scales(chosen.left_out, scales_for(data, measurements, *stages, models=()).left_out)
         how = chosen.selection
         if not how.interrupted and (widened := placed.widened(chosen.data, how.scales)):
             placed, text = widened
-            chosen = choose(placed.tangent_data(), measurements, *stages)
+            chosen = scales_for(placed.tangent_data(), measurements, *stages)
             warn_user(text)
         devices, bodies = placed.placement.hypotheses(chosen.data, CHANGE), placed.placement.bodies
         judged = chosen.data, chosen.selection.scales, chosen.left_out, placed.data.line_numbers
@@ -194,7 +193,7 @@ def calibrate(
             *judged, placed.data.row_names, devices=devices, bodies=bodies, opens=not chosen.selection.interrupted
         )
         if best and best.columns is not None:
-            chosen = choose(placed.tangent_data(best.columns), measurements, *stages)
+            chosen = scales_for(placed.tangent_data(best.columns), measurements, *stages)
         LOG.info("scales: %s", chosen.selection.status)
         fitted = _fit(chosen, controls, backend, progress)
         return _result(robot, placed, chosen, fitted, best, note=note, warned=warned)
@@ -204,18 +203,12 @@ def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: P
     """The exact model, fitted from the geometric calibration."""
     data = chosen.data
     problem = robot_problem(data, chosen.selection.scales)
-    count = None if controls in ("auto", "all") else controls
-    if (
-        controls == "auto"
-        and not data.nominal.load.by_row
-        and data.y.numel() > MAX_DENSE
-        and len(data.x) > AUTO_CONTROLS
-    ):
-        count = AUTO_CONTROLS
+    many = not data.nominal.load.by_row and data.y.numel() > MAX_DENSE and len(data.x) > AUTO_CONTROLS
+    count = controls if isinstance(controls, int) else AUTO_CONTROLS if many and controls == "auto" else None
     start = replace(problem.zero(), theta=data.theta) if count is None else None  # coarse fits find one of their own
     solver = GaussNewton(tolerance=RESIDUAL_TOLERANCE)
     fitted = fit(problem, solver, controls=count, backend=backend, start=start, progress=progress)
-    return replace(fitted, advice=ADVICE)
+    return replace(fitted, advice=ADVICE, model=replace(fitted.model, unresolved=chosen.unresolved))
 
 
 def _result(
@@ -240,7 +233,9 @@ def _result(
     explained, found = parts(model), outliers(model, placed, data, chosen.judged, least)
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
     warn_of_outliers(found, placed.data)
-    warn_of_contradictions(model, placed.coordinates, found, placed.mislabelled(model, found) or (best and best.text))
+    said, mislabelled = best and best.text, placed.mislabelled(model, found)
+    said = said if best and best.columns is None else mislabelled or said  # a wrong column explains its wrong rows
+    warn_of_contradictions(model, placed.coordinates, found, said)
     warn_of_rounding(robot, placed.data, data, chosen.left_out)
     found_lengths = lengths(data, scales, placed.placement.hypotheses(data, VALUE))
     summary = Summary(

@@ -49,7 +49,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.observation import LinearFunctionals, Observation
-from diffeo_calib.process.scales import DEVIATIONS, FOUND, SCALES, GearLine, Hyperparameters
+from diffeo_calib.process.scales import DEVIATIONS, FOUND, PAYLOAD_FACTORS, SCALES, GearLine, Hyperparameters
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.tree import Tree
 
@@ -77,12 +77,15 @@ class ChosenScales:
         left_out: leave-one-out errors with these scales.
         row_scales: narrower ones by which single rows are judged; None for the same. What places of sockets that are
             left out say concerns errors elsewhere, not a row that the others of its socket predict.
+        unresolved: (n,) variances of errors of a machine that are too short for its fields, see
+            :func:`unresolved_errors`; None for none.
     """
 
     selection: Selection
     data: TangentData
     left_out: LeaveOneOut
     row_scales: Hyperparameters | None = None
+    unresolved: Tensor | None = None
 
     @property
     def judged(self) -> LeaveOneOut:
@@ -187,9 +190,43 @@ def _inflated(
         row_scales = found.scales.inflated(max(factor, few) ** 0.5)
         units = measurements.places, measurements.socket_numbers, groups.to(resting.device)
         factor = max(factor, inflation_by_places(data, found.scales, *units))
-    scales = found.scales.inflated(factor**0.5)
-    found = replace(found, scales=scales)
-    return ChosenScales(found, data, leave_one_out(data, scales, seed), row_scales)
+    unresolved = None if centre is None else unresolved_errors(found, centre, data, poses, seed=seed, factor=factor)
+    scales, words = found.scales.inflated(factor**0.5), "; noise of the commands counts as the machine's errors"
+    found = replace(found, scales=scales, status=found.status + words * (unresolved is not None))
+    return ChosenScales(found, data, leave_one_out(data, scales, seed), row_scales, unresolved)
+
+
+FEWEST_REPEATS = 10
+"""Rows that repeat poses from which the noise is known by them."""
+SUPPORT = 2.0
+"""Log marginal likelihood by which noise of each command must be better than noise of the device alone: the two numbers
+that it has more along three axes (H. Akaike, "A new look at the statistical model identification", 1974)."""
+NOTHING = 1e-6
+
+
+def unresolved_errors(
+    found: Selection, centre: Hyperparameters, data: TangentData, poses: int, *, seed: int = 0, factor: float = 1.0
+) -> Tensor | None:
+    """Variances (n,) of a machine's errors that its fields do not resolve, times a factor, m^2 or rad^2; None for none.
+
+    Without repeats, errors that change between neighbouring commands, as those of an arm near its wrist's singular
+    poses, are the same as noise of the commands: a region of the machine without noise must hold them. Noise of the
+    device is none of the machine's. The rows tell them apart as far as that has no axes of the machine. Errors that
+    are too short are no larger than those of the fields: of a perfect machine there are none.
+    """
+    repeated, chain = len(data.x) - poses, data.nominal.geometry.chain
+    if not is_cartesian(chain) or repeated >= FEWEST_REPEATS or poses < FEWEST_POSES or found.interrupted:
+        return None
+    scales, without = found.scales, replace(centre, joint_noise=NOTHING * centre.joint_noise)
+    moved = (data.jacobian * scales.joint_noise.square() * data.jacobian).sum(2).mean()
+    start = replace(scales, joint_noise=without.joint_noise, sensor_noise=(scales.sensor_noise.square() + moved).sqrt())
+    other = select(without, data, start=start, seed=seed)
+    some = data.sample(POSES, COORDINATES, seed)[1]
+    if other.interrupted or some.process(scales).evidence - some.process(other.scales).evidence < SUPPORT:
+        return None
+    slides = 1.0 - torch.tensor(chain.periodic, dtype=data.x.dtype, device=data.x.device)
+    fields = scales.transmission_amplitude.square() + scales.coupled_amplitude.square()
+    return factor * torch.minimum(scales.joint_noise.square(), fields + slides * scales.task_amplitude.square())
 
 
 def noise_of_few(data: TangentData, poses: int, registration: Identification, identification: Identification) -> float:
@@ -251,7 +288,6 @@ def _warn_of_wrong_scales(data: TangentData, left_out: LeaveOneOut) -> None:
         warn_user(text)
 
 
-FACTORS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 POSES, COORDINATES = 300, 1500
 """Most poses and coordinates on which the factor is chosen."""
 
@@ -262,7 +298,7 @@ def with_payload_factor(data: TangentData, scales: Hyperparameters, seed: int = 
     if sag is None or not bool(sag.loaded.any()):  # no coefficient depends on it
         return scales
     some = data.sample(POSES, COORDINATES, seed)[1]
-    tried = [replace(scales, payload=factor) for factor in FACTORS]
+    tried = [replace(scales, payload=factor) for factor in PAYLOAD_FACTORS]
     return max(tried, key=lambda one: some.process(one).evidence)
 
 
@@ -331,7 +367,8 @@ def scales_of_models(models: Sequence[CalibratedKinematics], like: Hyperparamete
     mean = torch.where(deviations, vectors.square().mean(0).sqrt(), vectors.log().mean(0).exp())
     share = len(models) ** -0.5
     lines = tuple(replace(line, amplitude=share * line.amplitude) for model in models for line in _lines(model))
-    return replace(like.with_vector(mean), lines=lines)
+    mean = torch.cat([mean.log(), like.logarithms()[len(mean) :]])  # scales that only some have are kept
+    return replace(like.from_logarithms(mean), lines=lines)
 
 
 def _lines(model: CalibratedKinematics) -> list[GearLine]:

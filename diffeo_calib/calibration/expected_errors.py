@@ -16,7 +16,7 @@ is known as poorly: that of all joints is then no smaller than that of any robot
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from math import hypot
 from typing import Any, NamedTuple
@@ -24,34 +24,19 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.open_directions import (
     sampled_configurations,
     undetermined_places,
     without_shared,
 )
-from diffeo_calib.calibration.diagnostics.outliers import Outlier, contradicted
-from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
-from diffeo_calib.calibration.diagnostics.row_order import block_text, steps_of
 from diffeo_calib.calibration.identification.identification import Identification, Prior
-from diffeo_calib.common.errors import InputError, MeasurementError, printable, sentence
-from diffeo_calib.common.quantiles import known
+from diffeo_calib.common.errors import InputError, printable
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.evaluation import (
-    LARGEST_ERROR_PER_REACH,
-    Judgement,
-    expected,
-    judged,
-    positions_of,
-    some_rows,
-)
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import diagonal_blocks, roots
 from diffeo_calib.robots.placement import PLACES, rigid_fit
-from diffeo_calib.sensors.coordinates import Places
-from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
+from diffeo_calib.sensors.errors import ERRORS, Evaluation
 from diffeo_calib.sensors.tables import device_coordinates
 
 
@@ -338,78 +323,6 @@ def _share(rows: Tensor, anywhere: Tensor) -> float:
         return 1.0
     white = (rows - rows.mean(0)) @ (Vt[kept].mT / s[kept]) / len(rows) ** 0.5
     return float(torch.linalg.svdvals(white).square().clamp(max=1.0).sum()) / int(kept.sum())
-
-
-# --- what errors of measured rows mean --------------------------------------------------------------------------------
-
-
-def check_errors(model: CalibratedKinematics, found: Evaluation, usual: float) -> None:
-    """Raise MeasurementError if so many positions are far from a model that it holds for a part of the rows alone.
-
-    Args:
-        model: the fitted model. found: errors of positions, of rows that were held out if there are any.
-        usual: median error of the rows of the fit after a geometric calibration, m.
-    """
-    reach = model.robot.reach
-    limit = min(max(gates.LARGE_PER_REACH * reach, gates.LARGE_PER_USUAL * usual), LARGEST_ERROR_PER_REACH * reach)
-    share = float((known(found.errors) > limit).double().mean())
-    if share > gates.MOST_LARGE:
-        raise MeasurementError.of(
-            f"{100 * share:.0f} % of the judged positions are more than {1e3 * limit:.3g} mm from the model",
-            expected="errors of a calibrated robot",
-            got=f"an RMS error of {1e3 * found.rms:.4g} mm",
-            fix="did device, robot or tool move between rows? Name the set-ups (`session`); the model that was written "
-            "holds for a part of the rows at most",
-        )
-
-
-@dataclass(frozen=True)
-class JudgedRows(Judgement):
-    """Judged errors, and the positions that look wrong among ``rows`` evenly chosen ones."""
-
-    outliers: Sequence[Outlier] = ()
-    rows: int = 0
-
-
-def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> JudgedRows:
-    """Name rows that look wrong, and likely causes of large errors.
-
-    Args:
-        model: a calibrated model. places, data, found: see :func:`~diffeo_calib.kinematics.evaluation.residuals`.
-
-    Raises:
-        MeasurementError: another reading of the table explains impossible errors.
-    """
-    seen = positions_of(model, places, data)
-    if seen is None or found.positions is None:
-        return JudgedRows(judged(model, places, data, found).refusal)
-    some = some_rows(seen)
-    for step in steps_of(model, some):
-        return JudgedRows(step.sentence())
-    known, errors = judged(model, places, data, found), found.positions
-    if known.refusal is not None and not known.moved:
-        refuse_mistakes(model.robot, some)
-    if known.refusal is not None or known.causes:
-        return JudgedRows(known.refusal, known.causes, known.moved)
-    wrong = contradicted(model, some)
-    block, usual = block_text(model, some, wrong), expected_rms(model, seen, errors.errors.shape[1])
-    causes = [block] if block is not None else []
-    if not causes and not wrong and errors.rms >= gates.LARGE_PER_EXPECTED * usual:
-        what = f"the errors are {errors.rms / usual:.1f} times as large as the model expects: "
-        fix = "something has changed since the fit, or these poses are unlike those of the fit: compare, or recalibrate"
-        size = f"RMS {1e3 * errors.rms:.3f} mm"
-        causes = [sentence(what + size, expected=f"about {1e3 * usual:.3f} mm", fix=fix)]
-    return JudgedRows(None, causes, outliers=wrong, rows=len(some))
-
-
-def expected_rms(model: CalibratedKinematics, data: Measurements, bodies: int) -> float:
-    """RMS distance, m, between new measurements and predictions that a model expects of the poses of some rows.
-
-    Args:
-        model: a calibrated model. data: its markers. bodies: how many of them, or of its frames, a device measured.
-    """
-    covariance = expected(model, data).places[:, :bodies]
-    return float(covariance.diagonal(dim1=-2, dim2=-1).sum(-1).mean().sqrt())
 
 
 class Accuracy(NamedTuple):

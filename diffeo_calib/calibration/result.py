@@ -28,7 +28,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.transmission import NamedGearLine, gear_lines
-from diffeo_calib.process.tails import Tails
+from diffeo_calib.regression.tails import Tails
 from diffeo_calib.sensors.coordinates import Places, joined
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
 from diffeo_calib.sensors.tables import with_positions

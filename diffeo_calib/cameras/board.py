@@ -47,7 +47,7 @@ def real_board(points: Tensor, board: Tensor, size: float) -> Tensor:
 def board_slopes(points: Tensor, size: float) -> Tensor:
     """Derivatives (..., 3, 5) of the board's points by its parameters, in which they are linear."""
     units = torch.eye(len(BOARD), dtype=points.dtype, device=points.device)
-    return torch.stack([real_board(points, one, size) - points for one in units], -1)
+    return torch.stack([real_board(points, unit, size) - points for unit in units], -1)
 
 
 LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
@@ -64,7 +64,7 @@ def project_slopes(points: Tensor, lens: Tensor) -> tuple[Tensor, Tensor]:
     k1, k2, p1, p2, k3 = lens[4:]
     z = points[..., 2]
     x, y = points[..., 0] / z, points[..., 1] / z
-    s, zero, one = x * x + y * y, torch.zeros_like(x), torch.ones_like(x)
+    s, zero, unit = x * x + y * y, torch.zeros_like(x), torch.ones_like(x)
     g, slope = 1 + s * (k1 + s * (k2 + s * k3)), 2 * (k1 + s * (2 * k2 + 3 * s * k3))
     across = slope * x * y + 2 * p1 * x + 2 * p2 * y
     by_x = torch.stack([g + slope * x * x + 2 * p1 * y + 6 * p2 * x, across], -1)
@@ -74,7 +74,7 @@ def project_slopes(points: Tensor, lens: Tensor) -> tuple[Tensor, Tensor]:
     k = torch.stack([x * s, x * s**2, 2 * x * y, s + 2 * x * x, x * s**3], -1)
     m = torch.stack([y * s, y * s**2, s + 2 * y * y, 2 * x * y, y * s**3], -1)
     focal = lens[:2, None]
-    first = torch.stack([torch.stack([u, zero, one, zero], -1), torch.stack([zero, v, zero, one], -1)], -2)
+    first = torch.stack([torch.stack([u, zero, unit, zero], -1), torch.stack([zero, v, zero, unit], -1)], -2)
     return focal * by_point, torch.cat([first, focal * torch.stack([k, m], -2)], -1)
 
 
@@ -101,12 +101,12 @@ class View:
     facing: float
 
     @classmethod
-    def of(cls, seen: Tensor, poses: Tensor, points: Tensor) -> View:
-        """Views of images that showed corners ``seen`` (N, .) of a board at poses (N, 4, 4), m, with corners (K, 3)."""
+    def of(cls, pixels: Tensor, poses: Tensor, points: Tensor) -> View:
+        """Views of images with ``pixels`` (N, .) of a board at poses (N, 4, 4), m, with corners (K, 3)."""
         away, cosine = towards(poses, points)
         side = float(cosine.median().sign()) or 1.0
         facing = side * max(float((side * cosine).min()), 0.0)
-        return cls(points, int(seen.sum(1).min()), float(away.min()), float(away.max()), facing)
+        return cls(points, int(pixels.sum(1).min()), float(away.min()), float(away.max()), facing)
 
     @property
     def numbers(self) -> list[float]:

@@ -131,12 +131,12 @@ def misfit(points: np.ndarray, pixels: np.ndarray, grey: np.ndarray) -> tuple[fl
     cv2, best = opencv(), (0.0, 0.0) if len(points) <= 4 else (np.inf, np.inf)
     middle, flat = np.array(grey.shape[::-1]) / 2, np.column_stack([points[:, :2], np.ones(len(points))])
     for bend in BENDS if len(points) > 4 else ():
-        seen = (pixels - middle) / (1 + bend * ((pixels - middle) ** 2).sum(1) / (middle**2).sum())[:, None]
-        H = cv2.findHomography(points[:, :2], seen)[0]
+        undistorted = (pixels - middle) / (1 + bend * ((pixels - middle) ** 2).sum(1) / (middle**2).sum())[:, None]
+        H = cv2.findHomography(points[:, :2], undistorted)[0]
         if H is not None:
             ideal = flat @ H.T
-            away = float(np.median(np.linalg.norm(ideal[:, :2] / ideal[:, 2:] - seen, axis=1)))
-            best = min(best, (away / float(seen.std(0).max()), away))
+            away = float(np.median(np.linalg.norm(ideal[:, :2] / ideal[:, 2:] - undistorted, axis=1)))
+            best = min(best, (away / float(undistorted.std(0).max()), away))
         if best[0] > 4 * PLANE_SHARE:  # more than any lens bends
             break
     return best[1], best[0]
@@ -144,14 +144,14 @@ def misfit(points: np.ndarray, pixels: np.ndarray, grey: np.ndarray) -> tuple[fl
 
 def other_layout(images: Sequence[np.ndarray], board: Board) -> str | None:
     """The text of another board with the same markers that a plane explains in grey images; None if there is none."""
-    seen = [(grey, found[0], _snapped(grey, found[1])) for grey in images if len((found := board.markers(grey))[0]) > 1]
+    hit = [(grey, hits[0], _snapped(grey, hits[1])) for grey in images if len((hits := board.markers(grey))[0]) > 1]
     kind, size, *words = board.text.split(":")
-    if not seen or kind not in ("charuco", "aruco"):
+    if not hit or kind not in ("charuco", "aruco"):
         return None
-    grid, own, every = kind == "aruco", _size(size), np.concatenate([numbers for _, numbers, _ in seen])
+    grid, cells, every = kind == "aruco", _size(size), np.concatenate([numbers for _, numbers, _ in hit])
     best, likely = PLANE_SHARE / 2, None
     starts = dict.fromkeys([min(board.layout), int(every.min()), 0]) if grid else [0]
-    for across, given in [own, own[::-1], *((width, 0) for width in range(2, WIDEST))]:
+    for across, given in [cells, cells[::-1], *((width, 0) for width in range(2, WIDEST))]:
         for first, order in product(starts, ORDERS if grid else [""]):
             down = given or max(2, -(-(int(every.max()) + 1 - first) * (1 if grid else 2) // across))
             text = ":".join([kind, f"{across}x{down}", *words[:3], *[str(first), order] * grid])
@@ -160,12 +160,12 @@ def other_layout(images: Sequence[np.ndarray], board: Board) -> str | None:
             except InputError:  # more markers than the dictionary has
                 continue
             if set(layout).issuperset(every.tolist()):
-                each = (([layout[n] for n in numbers.tolist()], corners, grey) for grey, numbers, corners in seen)
+                each = (([layout[n] for n in numbers.tolist()], corners, grey) for grey, numbers, corners in hit)
                 share = max(misfit(np.concatenate(p), at.reshape(-1, 2), grey)[1] for p, at, grey in each)
                 best, likely = (share, text) if share < 0.8 * best else (best, likely)
     if likely is not None and set(board.layout).issuperset(every.tolist()):
-        found = Board.of(likely).layout
-        if all(np.allclose(found[number], board.layout[number]) for number in every.tolist()):
+        hits = Board.of(likely).layout
+        if all(np.allclose(hits[number], board.layout[number]) for number in every.tolist()):
             return None
     return likely
 
@@ -184,15 +184,15 @@ def other_dictionary(grey: np.ndarray) -> str | None:
 def edge_widths(grey: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """Median widths (4,) of the sharpest edges near corners along four directions, pixels: contrast per slope."""
     steps = np.array([[1.0, 0.0], [0.0, 1.0], [0.5**0.5, 0.5**0.5], [0.5**0.5, -(0.5**0.5)]])
-    found = []
+    widths = []
     for column, row in np.rint(pixels).astype(int):
         rows, columns = (slice(max(at - HALF_PATCH_PX, 0), at + HALF_PATCH_PX + 1) for at in (row, column))
         patch = grey[rows, columns].astype(float)
         if min(patch.shape) > HALF_PATCH_PX:
             down, right = np.gradient(patch)
             slopes = np.abs(right[..., None] * steps[:, 0] + down[..., None] * steps[:, 1]).max((0, 1))
-            found.append(np.ptp(patch) / np.maximum(slopes, 1e-9))
-    return np.median(found, 0) if found else np.zeros(4)
+            widths.append(np.ptp(patch) / np.maximum(slopes, 1e-9))
+    return np.median(widths, 0) if widths else np.zeros(4)
 
 
 def _size(word: str) -> tuple[int, int]:
@@ -204,11 +204,11 @@ def _size(word: str) -> tuple[int, int]:
 
 def _dictionary(cv2: Any, name: str) -> Any:
     """A dictionary of markers by OpenCV's name for it, with or without DICT_."""
-    known = [one for one in dir(cv2.aruco) if one.startswith("DICT_")]
+    names = [one for one in dir(cv2.aruco) if one.startswith("DICT_")]
     whole = name if name.startswith("DICT_") else f"DICT_{name}"
-    if whole not in known:
-        near = get_close_matches(whole, known, n=3)
-        raise InputError.of("the dictionary of markers", expected=f"such as {few(near or known[:3])}", got=name)
+    if whole not in names:
+        near = get_close_matches(whole, names, n=3)
+        raise InputError.of("the dictionary of markers", expected=f"such as {few(near or names[:3])}", got=name)
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, whole))
 
 
@@ -236,7 +236,7 @@ def _charuco(cv2: Any, words: list[str]) -> Made:
     markers = _dictionary(cv2, words[3])
     board, old = (cv2.aruco.CharucoBoard(_size(words[0]), *map(float, words[1:3]), markers) for _ in range(2))
     old.setLegacyPattern(True)  # boards printed before OpenCV 4.6 begin with a marker
-    detectors = [cv2.aruco.CharucoDetector(own) for own in (board, old)]
+    detectors = [cv2.aruco.CharucoDetector(pattern) for pattern in (board, old)]
 
     def find(grey: np.ndarray) -> Found:
         for detector in detectors:
@@ -258,8 +258,8 @@ def _chessboard(cv2: Any, words: list[str]) -> Made:
     points = float(words[1]) * np.stack([columns.ravel(), rows.ravel(), 0 * rows.ravel()], 1)
 
     def find(grey: np.ndarray) -> Found:
-        found, corners = cv2.findChessboardCornersSB(grey, (across, down), flags=cv2.CALIB_CB_ACCURACY)
-        return (np.arange(len(points)), corners.reshape(-1, 2).astype(float)) if found else NONE
+        complete, corners = cv2.findChessboardCornersSB(grey, (across, down), flags=cv2.CALIB_CB_ACCURACY)
+        return (np.arange(len(points)), corners.reshape(-1, 2).astype(float)) if complete else NONE
 
     return points, find, lambda _: NONE, {}
 
@@ -291,15 +291,15 @@ def _of_markers(cv2: Any, markers: Any, layout: dict[int, np.ndarray]) -> Made:
 
     def find(grey: np.ndarray) -> Found:
         numbers, corners = _all_markers(detector, grey)
-        known = [k for k, number in enumerate(numbers.tolist()) if number in layout]
-        if not known:
+        listed = [k for k, number in enumerate(numbers.tolist()) if number in layout]
+        if not listed:
             return NONE
-        places = np.concatenate([first[int(numbers[k])] + np.arange(4) for k in known])
-        found = corners[known].reshape(-1, 2)
-        away = misfit(points[places], found, grey)[0]
+        places = np.concatenate([first[int(numbers[k])] + np.arange(4) for k in listed])
+        pixels = corners[listed].reshape(-1, 2)
+        away = misfit(points[places], pixels, grey)[0]
         if away > SNAPPED_PX:
-            snapped = _snapped(grey, corners[known]).reshape(-1, 2)
-            found = snapped if misfit(points[places], snapped, grey)[0] < away / 2 else found
-        return places, found
+            snapped = _snapped(grey, corners[listed]).reshape(-1, 2)
+            pixels = snapped if misfit(points[places], snapped, grey)[0] < away / 2 else pixels
+        return places, pixels
 
     return points, find, lambda grey: _all_markers(detector, grey), layout

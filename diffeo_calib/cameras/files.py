@@ -13,7 +13,7 @@ from torch import Tensor
 from diffeo_calib.cameras.images import UNKNOWNS, Camera
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, few, warn_user
-from diffeo_calib.common.files import read_regular
+from diffeo_calib.common.files import as_path, read_regular
 
 MATRIX = ("camera_matrix", "k", "intrinsics", "intrinsic_matrix", "mtx")
 COEFFS = ("coeffs", "coefs", "coeff", "coef", "coefficients", "parameters")
@@ -63,12 +63,12 @@ def camera_text(camera: Camera, *, ros: bool = False) -> str:
     if ros:
         head += ["camera_name: camera", "distortion_model: plumb_bob"]
         eye, whole = [1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0], [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
-        own = [matrix, lens, ("rectification_matrix", 3, eye), ("projection_matrix", 3, whole)]
+        entries = [matrix, lens, ("rectification_matrix", 3, eye), ("projection_matrix", 3, whole)]
     else:
         head += [f"avg_reprojection_error: {camera.noise!r}", f"board_half_size: {camera.half_size!r}"]
         root = ROOT, len(UNKNOWNS), camera.root.flatten().tolist()
-        own = [matrix, lens, (BOARD, 1, camera.board.tolist()), root]
-    return "\n".join([*head, *(line for matrix in own for line in matrix_lines(*matrix, ros=ros)), ""])
+        entries = [matrix, lens, (BOARD, 1, camera.board.tolist()), root]
+    return "\n".join([*head, *(line for matrix in entries for line in matrix_lines(*matrix, ros=ros)), ""])
 
 
 def read_camera(path: str | PathLike[str]) -> Camera:
@@ -80,7 +80,7 @@ def read_camera(path: str | PathLike[str]) -> Camera:
         InputError: no such file, one that is no camera or several, or another lens than a pinhole with k1, k2, p1, p2
             and k3.
     """
-    file = Path(path)
+    file = as_path(path)
     try:
         text = read_regular(file, "camera file", LARGEST_FILE).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -92,13 +92,13 @@ def read_camera(path: str | PathLike[str]) -> Camera:
     if not (min(lens[:2]) > 0 and min(width, height) > 0):
         expected = "positive fx, fy, image_width and image_height"
         raise InputError.of(f"file '{file}'", expected=expected, got=f"{lens[0]}, {lens[1]}, {width}, {height}")
-    known: Tensor = torch.tensor(lens, dtype=torch.float64, device=HOST)
+    v: Tensor = torch.tensor(lens, dtype=torch.float64, device=HOST)
     if not lines.has(ROOT):
-        return Camera(width, height, 0.0, torch.cat([known, known.new_zeros(5)]), known.new_zeros(len(UNKNOWNS), 0))
+        return Camera(width, height, 0.0, torch.cat([v, v.new_zeros(5)]), v.new_zeros(len(UNKNOWNS), 0))
     root = lines.numbers((ROOT,), range(len(UNKNOWNS), len(UNKNOWNS) * LARGEST_FILE, len(UNKNOWNS)))
     half, noise = (lines.numbers((name,), (1,))[0] for name in ("board_half_size", "avg_reprojection_error"))
-    unknowns = torch.cat([known, known.new_tensor(lines.numbers((BOARD,), (5,)))])
-    return Camera(width, height, half, unknowns, known.new_tensor(root).view(len(UNKNOWNS), -1), noise)
+    unknowns = torch.cat([v, v.new_tensor(lines.numbers((BOARD,), (5,)))])
+    return Camera(width, height, half, unknowns, v.new_tensor(root).view(len(UNKNOWNS), -1), noise)
 
 
 class _Lines:
@@ -128,13 +128,13 @@ class _Lines:
 
     def numbers(self, names: Sequence[str], counts: Sequence[int]) -> list[float]:
         """The numbers of the one of these names that the file has."""
-        own = [words for name in names for words in self.words.get(name.replace("_", ""), [])]
-        own = [words for words in own if words != ["0"]] or own  # of a region of interest that is none
+        entries = [words for name in names for words in self.words.get(name.replace("_", ""), [])]
+        entries = [words for words in entries if words != ["0"]] or entries  # of a region of interest that is none
         expected = f"`{names[0]}` of {' or '.join(map(str, counts[:6]))} numbers below {LARGEST:.0e}"
-        if len({tuple(words) for words in own}) > 1:
-            got, fix = f"{len(own)} different ones", "write each camera to a file of its own"
+        if len({tuple(words) for words in entries}) > 1:
+            got, fix = f"{len(entries)} different ones", "write each camera to a file of its own"
             raise InputError.of(self.what, expected=f"one {expected}", got=got, fix=fix)
-        words = own[0] if own else []
+        words = entries[0] if entries else []
         try:
             values = [float(word) for word in words]
         except ValueError:

@@ -124,17 +124,17 @@ class Camera:
 
     def entry(self) -> dict[str, object]:
         """For programs: pixels, and ratios of the board."""
-        known = zip(UNKNOWNS, self.unknowns.tolist(), self.deviations.tolist(), strict=True)
-        found: dict[str, object] = {"width": self.width, "height": self.height, "noise_px": self.noise}
-        return found | {name: {"value": value, "std": std} for name, value, std in known}
+        values = zip(UNKNOWNS, self.unknowns.tolist(), self.deviations.tolist(), strict=True)
+        entry: dict[str, object] = {"width": self.width, "height": self.height, "noise_px": self.noise}
+        return entry | {name: {"value": value, "std": std} for name, value, std in values}
 
     def sentences(self) -> Iterator[str]:
         """The lens with standard deviations."""
         value, std = self.unknowns.tolist(), self.deviations.tolist()
-        own = [f"{name} {value[k]:.2f} +- {std[k]:.2f}" for k, name in enumerate(LENS[:4])]
-        yield f"camera: {', '.join(own)} px, corners to {self.noise:.3f} px"
-        own = [f"{name} {value[k]:.5f} +- {std[k]:.5f}" for k, name in enumerate(LENS[4:], 4)]
-        yield f"lens distortion: {', '.join(own)}"
+        texts = [f"{name} {value[k]:.2f} +- {std[k]:.2f}" for k, name in enumerate(LENS[:4])]
+        yield f"camera: {', '.join(texts)} px, corners to {self.noise:.3f} px"
+        texts = [f"{name} {value[k]:.5f} +- {std[k]:.5f}" for k, name in enumerate(LENS[4:], 4)]
+        yield f"lens distortion: {', '.join(texts)}"
 
     def board_sentence(self) -> str:
         """The board with standard deviations."""
@@ -181,11 +181,11 @@ def sighted_by_several(
     Raises:
         MeasurementError: an image with too few corners, or corners on a line; corners that are no image of the board.
     """
-    for one in images:
-        _check(one)
-    known = _known(images, cameras, board or BoardPrior())
-    v = torch.zeros_like(known[0].root[0])
-    states = [State(*own, first_poses(*own), v) for own in zip(images, known, strict=True)]
+    for group in images:
+        _check(group)
+    starts = _known(images, cameras, board or BoardPrior())
+    v = torch.zeros_like(starts[0].root[0])
+    states = [State(*parts, first_poses(*parts), v) for parts in zip(images, starts, strict=True)]
     weights = [_weights(state, state.errors().norm(dim=-1).nanmedian() / 1.2) for state in states]
     for _ in range(ROUNDS):
         states = _minimum(states, weights)
@@ -201,22 +201,22 @@ def _known(images: Sequence[Images], cameras: Sequence[Camera | None], board: Bo
 
     The board's errors are counted once: they are those of the first camera that knows it, the other ones add lenses.
     """
-    size = max(one.half_size for one in images)
-    known = [first_guess(one, board, size) if own is None else own for one, own in zip(images, cameras, strict=True)]
-    first = next((k for k, own in enumerate(cameras) if own is not None and own.half_size), 0)
-    whole = known[first]
+    size = max(i.half_size for i in images)
+    guesses = [first_guess(i, board, size) if c is None else c for i, c in zip(images, cameras, strict=True)]
+    first = next((k for k, c in enumerate(cameras) if c is not None and c.half_size), 0)
+    whole = guesses[first]
     if not whole.half_size:  # its lens is known alone
-        own = torch.diag(whole.unknowns.new_tensor(board.deviations(size)))
-        whole = replace(whole, half_size=size, root=torch.block_diag(whole.root[: len(LENS)], own))
+        c = torch.diag(whole.unknowns.new_tensor(board.deviations(size)))
+        whole = replace(whole, half_size=size, root=torch.block_diag(whole.root[: len(LENS)], c))
     nothing = torch.zeros_like(whole.root[: len(LENS)])
-    roots = [torch.linalg.qr(own.root[: len(LENS)].mT).R.mT for own in known]  # (9, c) of the lens alone
+    roots = [torch.linalg.qr(c.root[: len(LENS)].mT).R.mT for c in guesses]  # (9, c) of the lens alone
     lenses = [nothing[:, :0] if k == first else root for k, root in enumerate(roots)]
-    found = []
-    for k, (own, others) in enumerate(zip(known, torch.block_diag(*lenses).split(len(LENS)), strict=True)):
+    unknowns = []
+    for k, (c, others) in enumerate(zip(guesses, torch.block_diag(*lenses).split(len(LENS)), strict=True)):
         lens = torch.cat([whole.root[: len(LENS)] if k == first else nothing, others], 1)
         root = torch.cat([lens, torch.nn.functional.pad(whole.root[len(LENS) :], (0, others.shape[1]))])
-        found.append(replace(own, half_size=whole.half_size, unknowns=torch.cat([own.lens, whole.board]), root=root))
-    return found
+        unknowns.append(replace(c, half_size=whole.half_size, unknowns=torch.cat([c.lens, whole.board]), root=root))
+    return unknowns
 
 
 def first_guess(images: Images, board: BoardPrior, half_size: float | None = None) -> Camera:
@@ -242,21 +242,27 @@ def first_guess(images: Images, board: BoardPrior, half_size: float | None = Non
     return Camera(images.width, images.height, size, unknowns, root)
 
 
+def projection(pixels: Tensor, points: Tensor) -> Tensor:
+    """P (3, k + 1) with P (z, 1) ~ (u, v, 1) of images (N, 2) of points z (N, k), by direct linear transformation.
+
+    Source: R. Hartley, A. Zisserman, "Multiple view geometry in computer vision", 2003, section 7.1.
+    """
+    at = torch.cat([points, torch.ones_like(points[:, :1])], 1)
+    rows = torch.cat([torch.cat([at * (k == 0), at * (k == 1), -pixels[:, k : k + 1] * at], 1) for k in range(2)])
+    return torch.linalg.svd(rows, full_matrices=len(rows) < rows.shape[1]).Vh[-1].view(3, -1)
+
+
 def homographies(images: Images) -> Tensor:
-    """(N, 3, 3) from the board's plane, m, to pixels from the middle of the image, by direct linear transformation."""
-    found, middle = [], images.pixels.new_tensor([(images.width - 1) / 2, (images.height - 1) / 2])
-    for points, pixels, seen in zip(images.points, images.pixels, images.seen, strict=True):
-        flat, own = points[seen][:, :2], pixels[seen] - middle
-        size, scale = flat.abs().max(), own.abs().max()
-        at, to = flat / size, own / scale
-        at = torch.cat([at, torch.ones_like(at[:, :1])], 1)
-        zero = torch.zeros_like(at)
-        rows = [torch.cat([at, zero, -to[:, :1] * at], 1), torch.cat([zero, at, -to[:, 1:] * at], 1)]
-        H = torch.linalg.svd(torch.cat(rows)).Vh[-1].view(3, 3)
+    """(N, 3, 3) from the board's plane, m, to pixels from the middle of the image."""
+    matrices, middle = [], images.pixels.new_tensor([(images.width - 1) / 2, (images.height - 1) / 2])
+    for points, pixels, visible in zip(images.points, images.pixels, images.seen, strict=True):
+        flat, centred = points[visible][:, :2], pixels[visible] - middle
+        size, scale = flat.abs().max(), centred.abs().max()
+        H = projection(centred / scale, flat / size)
         H = torch.diag(H.new_tensor([float(scale), float(scale), 1.0])) @ H
         H = H @ torch.diag(H.new_tensor([1 / float(size), 1 / float(size), 1.0]))
-        found.append(H / H[:, :2].norm(dim=0).mean())
-    return torch.stack(found)
+        matrices.append(H / H[:, :2].norm(dim=0).mean())
+    return torch.stack(matrices)
 
 
 def first_poses(images: Images, camera: Camera) -> Tensor:
@@ -276,13 +282,13 @@ def first_poses(images: Images, camera: Camera) -> Tensor:
 def undistorted(pixels: Tensor, lens: Tensor) -> Tensor:
     """Tangents of angles (..., 2) whose images are these pixels, by Newton's method."""
     start = (pixels - lens[2:4]) / lens[:2]
-    found = start
+    estimate = start
     for _ in range(20):
-        at = torch.cat([found, torch.ones_like(found[..., :1])], -1)
+        at = torch.cat([estimate, torch.ones_like(estimate[..., :1])], -1)
         slope = project_slopes(at, lens)[0][..., :2]
         step = torch.linalg.solve(slope.nan_to_num(1.0) + 1e-12 * _eye(2, slope), pixels - project(at, lens))
-        found = found + step.clamp(-0.2, 0.2)
-    return torch.where((found - start).norm(dim=-1, keepdim=True) < 1.0, found, start)
+        estimate = estimate + step.clamp(-0.2, 0.2)
+    return torch.where((estimate - start).norm(dim=-1, keepdim=True) < 1.0, estimate, start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,15 +340,15 @@ class _Normal(NamedTuple):
     @classmethod
     def of(cls, state: State, weights: Tensor, damping: float = 0.0) -> _Normal:
         """The normal equations of one camera's images."""
-        by_pose, by_v = ((own * weights[..., None, None]).nan_to_num(0.0).flatten(1, 2) for own in state.slopes())
+        by_pose, by_v = ((slopes * weights[..., None, None]).nan_to_num(0.0).flatten(1, 2) for slopes in state.slopes())
         errors = (state.errors() * weights[..., None]).nan_to_num(0.0).flatten(1)[..., None]
         A, B = by_pose.mT @ by_pose, by_pose.mT @ by_v
         A = A + damping * torch.diag_embed(A.diagonal(dim1=1, dim2=2))
         inverse = inverses(A)
         push, effect = by_pose.mT @ errors, inverse @ B
-        known = (by_v.mT @ by_v - B.mT @ effect).sum(0)
+        information = (by_v.mT @ by_v - B.mT @ effect).sum(0)
         along = (by_v.mT @ errors - effect.mT @ push).sum(0)[:, 0]
-        return cls(inverse, effect, known, push[..., 0], along)
+        return cls(inverse, effect, information, push[..., 0], along)
 
 
 def inverses(A: Tensor) -> Tensor:
@@ -353,23 +359,23 @@ def inverses(A: Tensor) -> Tensor:
 
 def _together(parts: Sequence[_Normal]) -> Tensor:
     """K (c, c) of all cameras."""
-    return _eye(len(parts[0].along), parts[0].known) + sum(own.known for own in parts)
+    return _eye(len(parts[0].along), parts[0].known) + sum(part.known for part in parts)
 
 
 def _cost(states: Sequence[State], weights: Sequence[Tensor]) -> float:
     """Weighted squares of all errors, and of v."""
-    own = sum(state.cost(each) for state, each in zip(states, weights, strict=True))
-    return own + float(states[0].v.square().sum())
+    total = sum(state.cost(each) for state, each in zip(states, weights, strict=True))
+    return total + float(states[0].v.square().sum())
 
 
 def _minimum(states: Sequence[State], weights: Sequence[Tensor]) -> list[State]:
     """Levenberg and Marquardt's method with the poses eliminated."""
     damping, cost, states = 1e-6, _cost(states, weights), list(states)
     for _ in range(STEPS):
-        parts = [_Normal.of(state, own, damping) for state, own in zip(states, weights, strict=True)]
+        parts = [_Normal.of(state, part, damping) for state, part in zip(states, weights, strict=True)]
         K, v = _together(parts), states[0].v
-        dv = torch.linalg.solve(K + damping * torch.diag(K.diagonal()), sum(own.along for own in parts) - v)
-        steps = [(own.inverse @ own.push[..., None])[..., 0] - own.effect @ dv for own in parts]
+        dv = torch.linalg.solve(K + damping * torch.diag(K.diagonal()), sum(part.along for part in parts) - v)
+        steps = [(part.inverse @ part.push[..., None])[..., 0] - part.effect @ dv for part in parts]
         trial = [state.moved(step, v + dv) for state, step in zip(states, steps, strict=True)]
         reached = _cost(trial, weights)
         if reached <= cost:
@@ -399,16 +405,16 @@ def _weights(state: State, noise: Tensor | None = None) -> Tensor:
 
 
 def _result(states: Sequence[State], weights: Sequence[Tensor]) -> list[Sights]:
-    parts = [_Normal.of(state, own) for state, own in zip(states, weights, strict=True)]
+    parts = [_Normal.of(state, weight) for state, weight in zip(states, weights, strict=True)]
     root = torch.linalg.inv(torch.linalg.cholesky(_together(parts))).mT  # root root^T = K^-1
     every = torch.cat([state.images.points[state.images.seen] for state in states])
-    points, found = every.round(decimals=BOARD_DIGITS).unique(dim=0), []
-    for state, own, part in zip(states, weights, parts, strict=True):
-        noise = float((state.images.seen.sum() / own.square().sum()).sqrt())
+    points, sightings = every.round(decimals=BOARD_DIGITS).unique(dim=0), []
+    for state, weight, part in zip(states, weights, parts, strict=True):
+        noise = float((state.images.seen.sum() / weight.square().sum()).sqrt())
         view = View.of(state.images.seen, state.poses, points)
         camera = replace(state.camera, root=state.known.root @ root, noise=noise, view=view)
-        found.append(Sights(camera, state.poses, part.inverse, part.effect @ root))
-    return found
+        sightings.append(Sights(camera, state.poses, part.inverse, part.effect @ root))
+    return sightings
 
 
 def _check(images: Images) -> None:
@@ -417,8 +423,8 @@ def _check(images: Images) -> None:
     if short:
         got, fix = f"{int(counts[short[0]])} in image {short[0]}", "leave this image out"
         raise MeasurementError.of("corners of a board", expected=f"{FEWEST_CORNERS} or more", got=got, fix=fix)
-    for number, (points, seen) in enumerate(zip(images.points, images.seen, strict=True)):
-        flat = points[seen] - points[seen].mean(0)
+    for number, (points, visible) in enumerate(zip(images.points, images.seen, strict=True)):
+        flat = points[visible] - points[visible].mean(0)
         _, width, depth = torch.linalg.svdvals(flat).tolist()
         if width < 1e-6 or depth > 1e-6:
             got = "corners on a line" if width < 1e-6 else "corners that are not in a plane"
@@ -438,10 +444,10 @@ def sees(camera: Camera, poses: Tensor) -> Tensor:
     if camera.view is None:
         return torch.ones(len(poses), dtype=torch.bool, device=poses.device)
     view, (away, cosine) = camera.view, towards(poses, camera.view.points)
-    found = (away >= view.near) & (away <= view.far)
-    found &= (-1.0 if view.facing < 0 else 1.0) * cosine >= abs(view.facing)
-    found[found.clone()] = shown(camera, poses[found]).sum(1) >= view.fewest
-    return found
+    visible = (away >= view.near) & (away <= view.far)
+    visible &= (-1.0 if view.facing < 0 else 1.0) * cosine >= abs(view.facing)
+    visible[visible.clone()] = shown(camera, poses[visible]).sum(1) >= view.fewest
+    return visible
 
 
 def shown(camera: Camera, poses: Tensor) -> Tensor:
@@ -467,8 +473,8 @@ def expected(camera: Camera, poses: Tensor) -> tuple[Tensor, Tensor]:
     whole = replace(camera, root=eye)
     for some in poses.split(MOST_TOGETHER):
         images = Images(points.expand(len(some), -1, -1), points[:0], camera.width, camera.height)
-        seen = shown(camera, some)[..., None, None] / camera.noise
-        by_pose, by_unknowns = ((own * seen).flatten(1, 2) for own in State(images, whole, some, 0.0 * eye[0]).slopes())
+        unit = shown(camera, some)[..., None, None] / camera.noise
+        by_pose, by_unknowns = ((by * unit).flatten(1, 2) for by in State(images, whole, some, 0.0 * eye[0]).slopes())
         covariance = inverses(by_pose.mT @ by_pose)
         parts.append((covariance, covariance @ by_pose.mT @ by_unknowns))
     covariances, effects = (torch.cat(each) for each in zip(*parts, strict=True))

@@ -30,7 +30,7 @@ from typing import IO, Any
 
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few, warn_user
 from diffeo_calib.common.files import FULL, bring_to_disk, lock_file
-from diffeo_calib.measurements.csv.cells import number
+from diffeo_calib.measurements.csv.cells import csv_text, number
 
 KEPT = ("fits", "accepted", "error", "expected", "cause", "decided", "again", "shown")
 """Fields of a verdict in a journal."""
@@ -74,7 +74,7 @@ class Journal(ExitStack):
 
     def add(self, entries: Iterable[dict[str, Any]]) -> None:
         """Append entries, whole or not at all; DiffeoCalibError where the disk is full."""
-        text = "".join(json.dumps(one) + "\n" for one in entries)
+        text = "".join(json.dumps(entry) + "\n" for entry in entries)
         try:
             append_whole(self._file, text.encode())
         except OSError as error:
@@ -88,7 +88,7 @@ class Journal(ExitStack):
         self._file.seek(0)
         content = self._file.read()
         *whole, torn = content.split(b"\n")
-        found, lines, rows = list[dict[str, Any]](), 0, 0
+        entries, lines, rows = list[dict[str, Any]](), 0, 0
         for place, text in enumerate(whole):
             entry: Any = None
             with suppress(ValueError, RecursionError):
@@ -96,13 +96,13 @@ class Journal(ExitStack):
             if not _is_entry(entry, lines, rows):
                 raise self.damaged(f"{text[:60].decode(errors='replace')!r} in line {place + 1}")
             lines, rows = lines + ("line" in entry), rows + len(entry.get("rows", ()))
-            found.append(entry)
-        ours = torn.rstrip(b"\0")[:1] in (b"", b"{") if found else FIRST.startswith(torn[: len(FIRST)])
+            entries.append(entry)
+        ours = torn.rstrip(b"\0")[:1] in (b"", b"{") if entries else FIRST.startswith(torn[: len(FIRST)])
         if not ours:
             raise self.damaged(f"{torn[:60].decode(errors='replace')!r} at its end")
         if torn:
             os.ftruncate(self._file.fileno(), len(content) - len(torn))
-        return found
+        return entries
 
     def damaged(self, got: str) -> InputError:
         """An error about its content."""
@@ -114,15 +114,15 @@ def _is_entry(entry: Any, lines: int, rows: int) -> bool:
     """Whether something is an entry of a journal after so many lines and rows."""
     match entry:
         case {"line": int(line), "sha": str(), "rows": [_, *_] as judged}:
-            whole = all(isinstance(one, dict) and {"fits", "accepted"} <= {*one} for one in judged)
-            good = whole and all(starmap(_is_field, chain.from_iterable(one.items() for one in judged)))
+            whole = all(isinstance(item, dict) and {"fits", "accepted"} <= {*item} for item in judged)
+            good = whole and all(starmap(_is_field, chain.from_iterable(item.items() for item in judged)))
             return line == lines + 2 and len(entry) == 3 and good
         case {"line": int(line), "sha": str(), "unreadable": str()}:
             return line == lines + 2 and len(entry) == 3
         case {"row": int(row), **changed}:
             return 0 <= row < rows and all(starmap(_is_field, changed.items()))
-        case {"begun": dict(known)}:
-            return len(entry) == 1 and all(isinstance(text, str) for text in known.values())
+        case {"begun": dict(begun)}:
+            return len(entry) == 1 and all(isinstance(text, str) for text in begun.values())
         case {"removed": str()}:
             return len(entry) == 1
     return False
@@ -258,9 +258,7 @@ class GrowingTable:
         return self._half
 
     def _line(self, cells: Sequence[object]) -> bytes:
-        text = io.StringIO()
-        csv.writer(text, delimiter=self._sep, lineterminator="\n").writerow(cells)
-        return text.getvalue().encode()
+        return csv_text([cells], self._sep).encode()
 
 
 def digest(line: bytes) -> str:

@@ -11,6 +11,8 @@ from functools import cache
 from itertools import combinations, pairwise
 from typing import NamedTuple
 
+from diffeo_calib.measurements.csv.lines import UNITS
+
 ROLES = {
     "measured": "actual act measured meas measure measurement msr ist istwert reported encoder enc feedback fb "
     "observed observation obs gemessen mess messung messwert mesure mesuree misurato misurata medido medida real "
@@ -44,10 +46,8 @@ ROLES = {
 A machine has poses of its own, beside what was seen.
 """
 WORDS = {role: frozenset(words.split()) for role, words in ROLES.items()}
-UNITS = {unit: unit for unit in ("mm", "m", "cm", "um", "inch", "rad", "mrad", "deg", "gon", "kg")}
-UNITS |= {"in": "inch", "毫米": "mm", "厘米": "cm", "米": "m", "弧度": "rad"}
-UNITS |= dict.fromkeys(("degree", "degrees", "grad", "度"), "deg")
-LENGTHS = {"mm", "m", "cm", "um", "inch"}
+NAMED_UNITS = UNITS | {"kg": "kg", "grad": "deg"}
+"""Units as names of columns say them."""
 SAID = WORDS["measured"] | WORDS["wished"] | WORDS["deviation"]
 GLUED = {word: word for word in {*SAID, *WORDS["turn"], "t", "p", "m", "pos", "position", "trans", "tcp"} - {"q"}}
 GLUED |= {"d": "err", "e": "err", "s": "std"}
@@ -113,9 +113,9 @@ def column(name: str) -> Column:
     text = "".join(sign for sign in unicodedata.normalize("NFKD", text) if not unicodedata.combining(sign))
     text = re.sub("(?<![A-Za-z])[a-z][XYZW](?![A-Za-z])", lambda axis: axis[0].lower(), text)  # dX, rX
     words = [part for word in SPLIT.findall(text) for part in _parts(word.lower())]
-    units = [k for k, word in enumerate(words) if word in UNITS and k]
+    units = [k for k, word in enumerate(words) if word in NAMED_UNITS and k]
     at = [k for k in units if len(words[k]) > 2 or words[k] == "mm" or k + 1 == len(words)]
-    unit = UNITS[words.pop(at[-1])] if at else ""
+    unit = NAMED_UNITS[words.pop(at[-1])] if at else ""
     for place, word in enumerate(words):  # the current position, not the current of a motor
         if word == "current" and {*words[place + 1 :]} & ({*WORDS["joint"], *WORDS["tool"], *"xyz"} - {"a"}):
             words[place] = "actual"

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from math import ceil, inf, nan
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,8 +15,10 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.identification.registration import spread
 from diffeo_calib.cli.column_names import WORDS, Group, column, whole
-from diffeo_calib.cli.guesses import Body, Choice, RowColumns, Sheet, bodies_in, entries, matrices_in, rows_in
-from diffeo_calib.cli.proposals import LARGEST_RESIDUAL, Source, percent, ranked
+from diffeo_calib.cli.guesses import Body, RowColumns, Sheet, bodies_in, matrices_in, rows_in
+from diffeo_calib.cli.options import Units
+from diffeo_calib.cli.proposals import LARGEST_RESIDUAL, Source, percent, ranked, reason, source_of
+from diffeo_calib.cli.tables import table_format
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.checks import quiet
@@ -23,7 +26,7 @@ from diffeo_calib.measurements.csv.cells import numbers_in
 from diffeo_calib.measurements.csv.files import read_poses
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.poses import rotation_matrices
-from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, UNITS_PER_METRE, ZERO, TableFormat, numbers_of
+from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, UNITS_PER_METRE, ZERO, numbers_of
 from diffeo_calib.robots.cartesian import cartesian
 
 NUMBERED = "0123456", "1234567", "012345", "123456"
@@ -36,16 +39,15 @@ MOST_ROWS, STEPS = 40, (1, 3)
 """Rows whose motions are compared, and how many rows each of these spans."""
 MOST_WAYS, FEW_WAYS = 60, 6
 """Ways to read the rows that are tried with a registration; if half of so many are right, no rotation is sure."""
-TURNED = "robot-pose", "angle", "convention", "rotation-angle", "camera-on-tool"
+TURNED = "robot_pose", "angle", "convention", "rotation_angle", "camera_on_tool"
 GOOD_MOTIONS = 0.75
 """Share of the motions that are compared: those that agree best."""
 ALIKE, EXACT = 6.0, 1e-6
 """Ways that leave more than so many times what the best one leaves are wrong; and shares that are as good as none."""
 
 
-@dataclass(frozen=True)
-class Reading:
-    """One way to read the machine's rotation, or the measured one: convention, and unit of its angles."""
+class Reading(NamedTuple):
+    """One way to read the machine's rotation, or the measured one."""
 
     convention: str = ""
     angle: str = "rad"
@@ -88,7 +90,7 @@ def machine_of(bodies: Sequence[Body]) -> Body:
     return max(bodies, key=rank)
 
 
-def source_of(sheet: Sheet) -> Source:
+def commanded(sheet: Sheet) -> Source:
     """The table read as poses of a machine.
 
     Raises:
@@ -107,13 +109,13 @@ def source_of(sheet: Sheet) -> Source:
         what = f"what was measured of the machine in '{sheet.path}'"
         raise InputError.of(what, expected="columns beside its poses", got=f"{few(used, 16)} alone")
     rows = rows_in(replace(sheet, numbers=others), used)
-    body = rows.bodies[0] if rows.bodies else Body([], [])
-    if body.turn:  # poses of one frame
-        left = [f"{few(own.place)}: beside the pose of {few(body.place)}" for own in rows.bodies[1:]]
-        rows = replace(rows, bodies=[body], left=[*rows.left, *left])
+    if rows.bodies and rows.bodies[0].turn:  # poses of one frame
+        body, *others = rows.bodies
+        rows.left.extend(f"{few(own.place)}: beside the pose of {few(body.place)}; not used" for own in others)
+        rows = rows._replace(bodies=[body], options={**rows.options, "position": [body.written()]})
     tried = list[list[Source]]()
     for lengths in UNUSUAL_LENGTHS:
-        tried.append(ranked(_ways(sheet, machine, rows, body, lengths=lengths)))
+        tried.append(ranked(_ways(sheet, machine, rows, lengths=lengths)))
         if tried[-1] and tried[-1][0].left <= LARGEST_RESIDUAL:
             break
     found = min(tried, key=lambda own: own[0].left if own else inf)
@@ -127,51 +129,39 @@ def source_of(sheet: Sheet) -> Source:
             fix += "; if the machine turns too, a function makes its poses: "
             fix += f"fit --robot-pose {','.join(used)},...=FILE.py:NAME"
         raise InputError.of(what, expected="a convention and units that explain the rows", got=got, fix=fix)
-    limit = gates.READINGS_TOLD_APART * found[0].left
-    metres, units = limit * _varied(found[0]), (found[0].table.length, found[0].table.joint_length)
-    alike, worse = list[Source](), list[float]()
-    for one in found:  # who saw whom changes what a residual is a share of
-        same = (one.table.length, one.table.joint_length) == units and one.left <= LARGEST_RESIDUAL
-        if one.left < limit or (same and one.left * _varied(one) < metres):
-            alike.append(one)
-        else:
-            worse.append(one.left)
-    why = f"the machine's poses explain the rows but for {percent(found[0].left, 2)} of what they vary"
-    why += f", read in any other way {percent(worse[0])}" if worse else ""
-    said = [*_entries(alike, _lengths(machine.place, _numbers(sheet, machine.place)), why)]
-    if 2 * len(alike) >= len(found) >= MOST_WAYS:
-        said = [one._replace(sure=one.sure and one.name not in TURNED) for one in said]
-    return alike[0].saying(*said)
+    best, *_ = alike = [one for one in found if _as_good(one, found[0])]
+    why = f"{reason(best, *(one for one in found if one not in alike))}; by their names, in place of joint values"
+    by_size, whose = "the size of the numbers", _lengths(machine.place, _numbers(sheet, machine.place))
+    why = {"robot_pose": why, "length": by_size, "joint_length": by_size, "convention": "the same"}
+    why |= {"rotation": "beside the columns of its place", "camera_on_tool": "what stands is seen from the flange"}
+    best = best.into(why)
+    if len(whose) > 1 and best.options.joint_length is None:
+        more = f"{by_size}; which machine it is, they do not tell"
+        best = best.asking("length", dict.fromkeys(whose, more))
+    unsure = 2 * len(alike) >= len(found) >= MOST_WAYS
+    for name in TURNED:
+        values = dict.fromkeys(getattr(one.options, name) for one in alike)
+        if len(values) > 1 or unsure:
+            best = best.asking(name, {value: best.why[name] for value in values if value})
+    return best
 
 
-def _varied(one: Source) -> float:
-    """How far the places spread that are compared with the machine's, m."""
-    return spread(one.data.largest_session().points)
+def _as_good(one: Source, best: Source) -> bool:
+    """Whether the rows do not tell a way from the best one: who saw whom changes what a residual is a share of."""
+
+    def metres(own: Source) -> float:
+        return own.left * spread(own.data.largest_session().points)
+
+    factor = gates.READINGS_TOLD_APART
+    return one.left < factor * best.left or (one.left <= LARGEST_RESIDUAL and metres(one) < factor * metres(best))
 
 
-def _entries(alike: Sequence[Source], lengths: Sequence[str], why: str) -> Iterator[Choice]:
-    """Columns, units and conventions of the ways to read a table that explain it as well as each other."""
-    texts = dict.fromkeys(one.joints.text for one in alike)
-    named = f"{why}; by their names, commanded poses in place of joint values"
-    yield from (Choice("robot-pose", text, named, sure=len(texts) == 1) for text in texts)
-    tables = [one.table for one in alike]
-    size, several = "the size of the numbers", len(lengths) > 1 and tables[0].joint_length is None
-    size += "; which machine it is, they do not tell" * several
-    sized = [replace(tables[0], length=length) for length in lengths] if several else tables[:1]
-    yield from entries(sized, length=size)
-    yield from entries(tables, joint_length=size, angle=why)
-    if tables[0].rotation is not None:
-        yield Choice("rotation", ",".join(map(str, tables[0].rotation)), "beside the columns of its place")
-        yield from entries(tables, convention=why, rotation_angle="the same")
-    yield from entries(tables, camera_on_tool="what stands is seen from the flange")
-
-
-def _ways(sheet: Sheet, machine: Body, rows: RowColumns, body: Body, *, lengths: tuple[str, str]) -> Iterator[Source]:
+def _ways(sheet: Sheet, machine: Body, rows: RowColumns, *, lengths: tuple[str, str]) -> Iterator[Source]:
     """The likeliest ways to read the table.
 
     ``lengths``: units of the machine's places and of those measured; empty for the likeliest.
     """
-    place, turn, *_ = body
+    place, turn, *_ = rows.bodies[0] if rows.bodies else Body([], [])
     groups = machine.place, machine.turn, place, turn
     numbers = _numbers(sheet, [name for names in groups for name in names])
     if not len(numbers):
@@ -184,17 +174,18 @@ def _ways(sheet: Sheet, machine: Body, rows: RowColumns, body: Body, *, lengths:
         metres = [values / UNITS_PER_METRE[unit] for values, unit in ((commanded_at, length), (seen_at, other))]
         ways = _alike((metres[0], own), (metres[1], seen))
     else:
-        ways = list(product(own or [Reading()], seen or [Reading()], (False, True) if rows.of_boards else (False,)))
+        ways = list(product(own or [Reading()], seen or [Reading()], (False, True)[: 1 + rows.of_boards]))
+    units = {"length": other, "joint_length": None if length == other else length}
     for commanded, measured, camera in ways[:FEW_WAYS] if any(lengths) else ways:
-        pose = PoseColumns((*machine.place, *machine.turn), commanded.convention)
-        table = TableFormat(other, commanded.angle, sheet.sep, sheet.decimal)
-        table = replace(table, joint_length=None if length == other else length, camera_on_tool=camera)
+        pose = PoseColumns((*machine.place, *machine.turn), commanded.convention).text
+        given: dict[str, Any] = {**units, "angle": commanded.angle, "robot_pose": pose}
+        more: dict[str, Any] = {"camera_on_tool": camera}
         if turn:
             unit = measured.angle if len(turn) == 3 else None
-            table = replace(table, rotation=turn, convention=measured.convention, rotation_angle=unit)
+            more |= {"rotation": [",".join(turn)], "convention": measured.convention, "rotation_angle": unit}
         with quiet(), suppress(DiffeoCalibError):
-            robot = cartesian(read_poses(sheet.path, replace(table, joints=pose)))
-            yield Source(sheet, robot, replace(pose, robot=robot), rows, table)
+            robot = cartesian(read_poses(sheet.path, table_format(Units(**given, **sheet.marks))))
+            yield source_of(sheet, robot, rows, **given, **more)
 
 
 def _numbers(sheet: Sheet, names: Sequence[str]) -> Tensor:
@@ -209,6 +200,10 @@ def _numbers(sheet: Sheet, names: Sequence[str]) -> Tensor:
 def _lengths(names: Sequence[str], values: Tensor) -> tuple[str, ...]:
     """Units of lengths that places may have, by their names, else by the size of the numbers; the likeliest first."""
     named = {column(name).unit for name in names} - {""}
+    if others := named - {*UNITS_PER_METRE}:
+        raise InputError.of(
+            f"{few(names)} in {few(sorted(others))}", expected=few([*UNITS_PER_METRE]), fix="convert them"
+        )
     if len(named) == 1:
         return (named.pop(),)
     largest = float(values.abs().max()) if values.numel() else 0.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -10,24 +9,22 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, product
 from math import pi
-from os.path import relpath
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.cameras.files import read_camera
-from diffeo_calib.cli.column_names import LENGTHS, WORDS, Column, Group, column, groups, whole
+from diffeo_calib.cli.column_names import WORDS, Column, Group, column, groups, whole
 from diffeo_calib.cli.options import CORNERS, Places
 from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, bad_cells, number, number_hint, numbers_in
-from diffeo_calib.measurements.csv.joined import joined_file
-from diffeo_calib.measurements.csv.lines import HEAD, CsvLines, read_cells
+from diffeo_calib.measurements.csv.joined import SEPARATORS, joined_file
+from diffeo_calib.measurements.csv.lines import HEAD, LENGTHS, CsvLines, read_cells
 from diffeo_calib.measurements.csv.sensors import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.readings import MILLIMETRES
 from diffeo_calib.measurements.table_format import SPHERICAL, SPHERICAL_UNITS, ZERO
 from diffeo_calib.sensors.kinds import known_kinds
 
-SEPARATORS = (",", ";", "\t", "|", " ")
 DECIMALS = (".", ",")
 ROWS_LOOKED_AT = 50
 LENS, SOME_LENS = "FX,FY,CX,CY", "1000,1000,500,500"
@@ -79,6 +76,11 @@ class Sheet:
     numbers: tuple[str, ...]  # those that hold numbers alone
     notes: tuple[str, ...] = ()  # what the reader decided
     odd: str = ""  # which cells are no numbers in columns that seem to hold some
+
+    @property
+    def marks(self) -> dict[str, str]:
+        """As options."""
+        return {"sep": "tab" if self.sep == "\t" else self.sep, "decimal": self.decimal}
 
     @cached_property
     def cells(self) -> dict[str, list[str]]:
@@ -219,6 +221,10 @@ class Body(NamedTuple):
     left: str = ""  # what the place is, if no device measured it
     spherical: tuple[str, ...] = ()  # how the place may be written, if it is a distance and two angles
 
+    def written(self, way: str = "") -> str:
+        """The place as a value of `fit --position`."""
+        return f"{way}=" * bool(way) + ",".join(self.place)
+
     @property
     def words(self) -> set[str]:
         """Words of the names of the place."""
@@ -266,7 +272,7 @@ def _numbered(columns: Sequence[str]) -> list[Body]:
 def spherical_in(sheet: Sheet, columns: Sequence[str]) -> list[Body]:
     """A place as a distance and two angles, of which the second is above the horizon or from the zenith."""
     found = list[Column]()
-    for role, units in (("distance", {*LENGTHS}), ("around", {*SPHERICAL_UNITS}), ("vertical", {*SPHERICAL_UNITS})):
+    for role, units in (("distance", LENGTHS.values()), ("around", SPHERICAL_UNITS), ("vertical", SPHERICAL_UNITS)):
         own = (one for one in map(column, columns) if WORDS[role] & {*one.words} and one.unit in {*units, ""})
         found += [one for one in own if one not in found][:1]
     if len(found) < 3:
@@ -297,7 +303,7 @@ def guess_readings(columns: Sequence[str]) -> dict[str, list[str]]:
     found, described = dict[str, list[str]](), [column(name) for name in reversed(columns)]
     for kind in known_kinds().values():
         numbers = [""] if kind.numbers_each == 1 else [f"{k + 1}" for k in range(kind.numbers_each)]
-        units = LENGTHS if kind.unit == MILLIMETRES else {kind.unit[0]}
+        units = {*LENGTHS.values()} if kind.unit == MILLIMETRES else {kind.unit[0]}
         there = {one.plain: one.name for one in described if not one.unit or one.unit in units}
         for word, known in kind.columns().items():
             each = ([f"{column(name).plain}{number}" for number in numbers] for name in known)
@@ -309,6 +315,20 @@ def guess_readings(columns: Sequence[str]) -> dict[str, list[str]]:
     return found | {f"image={','.join(own)},{LENS}": own for own in names[:1]}
 
 
+def guess_deviations(columns: Sequence[str], triples: Sequence[Sequence[str]]) -> list[str] | None:
+    """Columns whose names are those of the positions but for a word such as std, in their order; None if one lacks."""
+
+    def without(one: Column, *roles: str) -> str:
+        return "".join(word for word in one.words if not any(word in WORDS[role] for role in roles))
+
+    deviations = [one for one in map(column, columns) if {*one.words} & WORDS["deviation"]]
+    known = {without(one, "deviation"): one.name for one in deviations}
+    known |= {without(one, "deviation", "measured"): one.name for one in deviations}
+    wanted = [column(name) for triple in triples for name in triple]
+    found = [known.get(one.plain) or known.get(without(one, "measured")) for one in wanted]
+    return None if None in found else [name for name in found if name is not None]
+
+
 # --- what was measured ---
 
 
@@ -317,80 +337,18 @@ BELOW = (12, 13, 14)
 """Places of the zeros below a rotation, of a matrix by rows."""
 
 
-class Choice(NamedTuple):
-    """One entry of the campaign file: an option, its value, and why; a remark if the option is empty."""
-
-    name: str
-    value: str | list[str] | bool
-    why: str
-    sure: bool = True
-
-    def line(self) -> str:
-        """A line of TOML; a comment where the user is to decide."""
-        values = self.value if isinstance(self.value, list) else [self.value]
-        written = [json.dumps(value, ensure_ascii=False) for value in values]
-        text = f"[{', '.join(written)}]" if isinstance(self.value, list) else written[0]
-        return f"{'# ' * (not self.sure)}{self.name} = {text}  # {self.why}" if self.name else f"# {self.why}"
-
-
-def entries(tables: Sequence[Any], **why: str) -> Iterator[Choice]:
-    """Fields of formats, each with its reason; where the formats differ, a remark for every value, to choose from."""
-    for name, text in why.items():
-        values = dict.fromkeys(getattr(table, name) for table in tables)
-        known = (value for value in values if value not in (None, False))
-        yield from (Choice(name.replace("_", "-"), value, text, sure=len(values) == 1) for value in known)
-
-
-@dataclass(frozen=True)
-class RowColumns:
+class RowColumns(NamedTuple):
     """Columns of what was measured, by their names."""
 
     bodies: list[Body]  # of positions or poses
-    sockets: list[str]  # of place and socket
-    readings: list[str]  # texts of `fit --reading`
-    named: dict[str, str]  # option -> column of the device or its set-up, the payload, time, temperature
-    left: Sequence[str] = ()  # not used, and why
-
-    @property
-    def markers(self) -> list[list[str]]:
-        """Columns of positions."""
-        return [own.place for own in self.bodies]
-
-    @property
-    def without_length(self) -> bool:
-        """Whether no column is a length."""
-        return not self.markers and all(text.endswith(LENS) for text in self.readings)
+    options: dict[str, Any]  # of `fit`, that name them and the device, the payload, time, temperature
+    why: dict[str, str]  # their reasons
+    left: list[str]  # columns that are not used, and why
 
     @property
     def of_boards(self) -> bool:
         """Whether the rows are corners of a board in images."""
-        return any(text.startswith(CORNERS) for text in self.readings)
-
-    def entries(self, folder: Path, spherical: str | None) -> Iterator[Choice]:
-        """Entries of a campaign in a folder that name them; places may be a distance and two angles."""
-        if self.markers:
-            names = [f"{spherical}=" * (spherical is not None) + ",".join(triple) for triple in self.markers]
-            yield Choice("position", names, f"{len(names)} marker(s), by their names")
-        yield from (Choice("", "", f"{text}; not used") for text in self.left)
-        if self.sockets:
-            why = "by their names; a ball on the tool rested in this socket of a block there"
-            yield Choice("socket", self.sockets, why)
-        if self.readings:
-            why = "by names; `displacement` is a distance with an unknown zero"
-            if any(text.endswith(LENS) for text in self.readings):
-                why += f"; replace {LENS} by the camera's focal lengths and principal point in pixels"
-            sizes = self.of_boards and not self.readings[0].endswith(".yaml")
-            why += "; the lens is that of the file beside the table" * (self.of_boards and not sizes)
-            why += "; width and height of the images are the least usual size that holds all corners" * sizes
-            files = [text.removeprefix(CORNERS) if text.endswith(".yaml") else "" for text in self.readings]
-            pairs = zip(files, self.readings, strict=True)
-            texts = [CORNERS + relpath(file, folder) if file else text for file, text in pairs]
-            yield Choice("reading", texts[0] if len(texts) == 1 else texts, why)
-        for option, name in self.named.items():
-            why = f"by its name: {NAMED[option][1]}"
-            remounted = option == "session" and bool(self.markers)
-            why += "; add `remounted = true` if it stayed and the markers were mounted anew" * remounted
-            yield Choice(option, name, why)
+        return any(text.startswith(CORNERS) for text in self.options["reading"] or ())
 
 
 def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
@@ -422,13 +380,29 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
         fix += "column such as `distance`, `wire` or `height`; `fit --help` lists all options, see --reading"
         got = "; ".join(left) or few(sheet.numbers, 20)
         raise InputError.of(f"positions in '{sheet.path}'", expected=expected, got=got, fix=fix)
-    columns = {"session": [] if sockets and not readings else [name for name in sheet.header if name not in joints]}
-    guessed = {
-        option: [name for name in columns.get(option, others) if column(name).plain in known.split()]
-        for option, (known, _) in NAMED.items()
-    }
-    named = {option: names[0] for option, names in guessed.items() if names}
-    return RowColumns(bodies, sockets, readings, named, left)
+    options: dict[str, Any] = {"position": [own.written() for own in bodies] or None, "reading": readings or None}
+    options["socket"] = ",".join(sockets) or None
+    why = {"position": f"{len(bodies)} marker(s), by their names", "reading": _of_readings(readings)}
+    why["socket"] = "by their names; a ball on the tool rested in this socket of a block there"
+    texts = {"session": [] if sockets and not readings else [name for name in sheet.header if name not in joints]}
+    for option, (words, what) in NAMED.items():
+        named = [name for name in texts.get(option, others) if column(name).plain in words.split()]
+        options[option] = next(iter(named), None)
+        why[option] = f"by its name: {what}"
+    if bodies:
+        why["session"] += "; add `remounted = true` if it stayed and the markers were mounted anew"
+    return RowColumns(bodies, options, why, [f"{text}; not used" for text in left])
+
+
+def _of_readings(texts: Sequence[str]) -> str:
+    """Why readings are taken, and what is left to the user."""
+    why = "by names; `displacement` is a distance with an unknown zero"
+    if any(text.endswith(LENS) for text in texts):
+        why += f"; replace {LENS} by the camera's focal lengths and principal point in pixels"
+    if any(text.startswith(CORNERS) for text in texts):
+        sizes = "width and height of the images are the least usual size that holds all corners"
+        why += f"; {'the lens is that of the file beside the table' if texts[0].endswith('.yaml') else sizes}"
+    return why
 
 
 def marker_of_lines(sheet: Sheet, joints: Sequence[str]) -> str | None:
@@ -477,10 +451,10 @@ def _corners_in(sheet: Sheet) -> list[str]:
     return [f"{CORNERS}{','.join(map(str, size))}"]
 
 
-def with_places(csv: Path, given: Places, folder: Path) -> tuple[Path, list[Choice]]:
-    """The table, joined with that of the measured places if there is one, and the entries of a campaign in a folder."""
+def with_places(csv: Path, given: Places) -> tuple[Path, str]:
+    """The table, joined with that of the measured places if there is one; and the common column."""
     if given.places is None:
-        return csv, []
+        return csv, ""
     joints, places = guess_sheet(csv), guess_sheet(given.places)
     common = {name: len({*own} & {*places.cells[name]}) for name, own in joints.cells.items() if name in places.cells}
     if not common:  # columns that name the same rows
@@ -492,6 +466,4 @@ def with_places(csv: Path, given: Places, folder: Path) -> tuple[Path, list[Choi
         fix = "add one, such as the number of the pose, or name two: --by COLUMN=OTHER"
         raise InputError.of("--places without --by", expected=expected, got=got, fix=fix)
     by = given.by or max(common, key=lambda name: common[name])
-    found = joined_file(csv, given.places, by, joints.sep, joints.decimal, several=True)
-    entries = [Choice("places", relpath(given.places, folder), "the measured places"), Choice("by", by, found.sentence)]
-    return found, entries
+    return joined_file(csv, given.places, by, joints.sep, joints.decimal, several=True), by

@@ -25,7 +25,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError, few, senten
 from diffeo_calib.common.files import PROGRAM
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.files import read_observations
-from diffeo_calib.measurements.csv.joined import JoinedFile, joined_file
+from diffeo_calib.measurements.csv.joined import HeldFile, joined_file
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.lines import CsvLines, read_cells
 from diffeo_calib.measurements.csv.sensors import ImageColumns, ReadingColumns, SocketColumns, columns_of
@@ -86,15 +86,20 @@ def measured_table(csv: Path, rows: Rows, duplicates: str = "keep") -> MeasuredT
     if not rows.named:
         text = "name the position columns, or those of --socket or --reading"
         raise typer.BadParameter(text, param_hint="--position")
-    table = with_rows(table_format(rows), rows)
-    csv, names = with_places(csv, rows, table), list[str]()
-    if isinstance(csv, JoinedFile):
+    table, names = table_format(rows), list[str]()
+    csv = with_places(csv, rows, table)
+    if isinstance(csv, HeldFile):
         say(csv.sentence)
     if csv.is_file() and any(_number(text.partition("=")[2]) is not None for text in rows.reading or ()):
         with suppress(MeasurementError):  # rows may come later
             names = CsvLines(csv, table.sep).header
-    readings = readings_columns(rows.reading or (), rows, names)
-    return MeasuredTable(csv, replace(table, readings=readings), duplicates)
+    return MeasuredTable(csv, described(rows, names), duplicates)
+
+
+def described(rows: Rows, names: Sequence[str] = ()) -> TableFormat:
+    """The format of a table that options describe; ``names`` of its columns, as of :func:`readings_columns`."""
+    table = with_rows(table_format(rows), rows)
+    return replace(table, readings=readings_columns(rows.reading or (), rows, names))
 
 
 def with_places(csv: Path, rows: Rows, table: TableFormat) -> Path:
@@ -200,24 +205,30 @@ class MeasuredTable:
     growing: bool = False  # whether rows will be added
 
     def read(self, robot: Tree, tips: Sequence[str] = ()) -> Any:
+        """The rows, with warnings of copies; later tables of the model have the same order of markers."""
+        data = self.rows(robot, tips)
+        if not self.growing:
+            data.warn_of_copies()
+        given = self.table
+        named: Any = given.marker and data.origin.columns.table.marker
+        if given.marker != named:
+            say(f"markers: {', '.join(data.marker_names)}, numbered from 0 in this order")
+            add_to_command_line(["--marker", named])
+        return data
+
+    def rows(self, robot: Tree, tips: Sequence[str] = ()) -> Any:
         """The rows of a robot, under the names of its own joints, as of :func:`read_observations`.
 
-        ``tips`` are those of every marker, for a robot with several.
+        ``tips`` are those of every marker, for a robot with several; none where a model knows them.
         """
         given, triples = self.table, self.table.position
-        several = len(tips) > 1 and given.sockets is None and not given.readings
+        several = bool(tips) and max(len(tips), len(robot.tips)) > 1 and given.sockets is None and not given.readings
         if several and triples is not None and len(tips) != len(triples):
             expected, fix = f"{len(triples)}, one for each --position", "repeat a tip that carries several markers"
             raise InputError.of("--tip", expected=expected, got=len(tips), fix=fix)
         session = given.session if triples or not given.readings else None  # of readings it names their devices
         table = replace(of_robot(given, robot), session=session)
         data = read_observations(self.csv, table, duplicates=self.duplicates, growing=self.growing)
-        if not self.growing:
-            data.warn_of_copies()
-        named: Any = given.marker and data.origin.columns.table.marker
-        if given.marker != named:  # later tables have the same order
-            say(f"markers: {', '.join(data.marker_names)}, numbered from 0 in this order")
-            add_to_command_line(["--marker", named])
         data = data.with_joint_names(robot.joint_names)
         return data.with_tips(tips) if several else data
 

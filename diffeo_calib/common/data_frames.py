@@ -140,12 +140,12 @@ def real_array(value: object) -> np.ndarray:
     Raises:
         TypeError, ValueError, OverflowError, RecursionError: no real numbers.
     """
-    found = value if isinstance(value, np.ndarray) else np.asarray(value)
-    if found.dtype.kind in ARRAY_KINDS:
-        raise TypeError(ARRAY_KINDS[found.dtype.kind])
-    if isinstance(found, np.ma.MaskedArray) and bool(np.ma.getmaskarray(found).any()):
+    array = value if isinstance(value, np.ndarray) else np.asarray(value)
+    if array.dtype.kind in ARRAY_KINDS:
+        raise TypeError(ARRAY_KINDS[array.dtype.kind])
+    if isinstance(array, np.ma.MaskedArray) and bool(np.ma.getmaskarray(array).any()):
         raise ValueError("masked values, which are missing")
-    if found.dtype == object and any(isinstance(entry, (bool, np.bool_, np.datetime64)) for entry in found.flat):
+    if array.dtype == object and any(isinstance(entry, (bool, np.bool_, np.datetime64)) for entry in array.flat):
         raise TypeError("objects that are no numbers")
     # torch wants memory that may be written to, and forwards; columns of data frames are often read-only
-    return np.require(found, np.float64, ["C", "W", "E"])
+    return np.require(array, np.float64, ["C", "W", "E"])

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, TYPE_CHECKING
 
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, as_written
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -38,6 +38,13 @@ FIXES = {
 _unfinished: set[Path] = set()  # temporary files of this process
 
 
+def as_path(path: object) -> Path:
+    """Raise InputError unless this can be the name of a file."""
+    if not isinstance(path, str | os.PathLike) or isinstance(os.fspath(path), bytes):
+        raise InputError.of("the name of a file", expected="text or a path", got=as_written(path))
+    return path if isinstance(path, Path) else Path(path)
+
+
 class WholeFile:
     """A file that takes its name when it is complete: a full disk or a kill leaves an existing file as it was.
 
@@ -55,7 +62,7 @@ class WholeFile:
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = Path(path)
+        self.path = as_path(path)
         self._target = Path(os.path.realpath(path))
         self._stack = ExitStack()
         self._part: Path | None = None
@@ -161,7 +168,7 @@ def write_together(contents: Mapping[Path, bytes]) -> None:
 
 def check_writable(path: str | os.PathLike[str]) -> None:
     """Raise InputError unless a file can be written, which stays as it is."""
-    path = Path(path)
+    path = as_path(path)
     with _one_sentence(path):
         if path.is_dir():
             raise OSError(errno.EISDIR, os.strerror(errno.EISDIR))
@@ -238,10 +245,10 @@ def _take_permissions(part: Path, target: Path) -> None:
         os.umask(mask)
         part.chmod(0o666 & ~mask)  # mkstemp's files are readable by their owner only
         return
-    known = target.stat()
+    status = target.stat()
     with suppress(OSError, AttributeError):  # not for other users' files, and not on Windows
-        os.chown(part, known.st_uid, known.st_gid)
-    part.chmod(known.st_mode & 0o777)
+        os.chown(part, status.st_uid, status.st_gid)
+    part.chmod(status.st_mode & 0o777)
 
 
 PROGRAM = ".py:"  # in FILE.py:NAME, a function in a file

@@ -16,9 +16,9 @@ def lazy_names(package: str) -> tuple[Callable[[str], object], Callable[[], list
     Those imports, ``from MODULE import NAME as NAME`` below ``if TYPE_CHECKING``, are the only list of its names. Its
     folders need none.
     """
-    own = sys.modules[package]
-    folders = {found.name for found in iter_modules(own.__path__) if found.ispkg}
-    module_of = dict(_imported(Path(own.__path__[0]) / "__init__.py"))
+    loaded = sys.modules[package]
+    folders = {entry.name for entry in iter_modules(loaded.__path__) if entry.ispkg}
+    module_of = dict(_imported(Path(loaded.__path__[0]) / "__init__.py"))
 
     def load(name: str) -> object:
         if name in folders:
@@ -27,12 +27,12 @@ def lazy_names(package: str) -> tuple[Callable[[str], object], Callable[[], list
             value = getattr(__import__(module_of[name], fromlist=[name]), name)  # or the module itself
         else:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        setattr(own, name, value)
+        setattr(loaded, name, value)
         return value
 
     def listed() -> list[str]:
         """Without what the package itself imports."""
-        return sorted({*(name for name in vars(own) if name.startswith("__")), *module_of, *folders})
+        return sorted({*(name for name in vars(loaded) if name.startswith("__")), *module_of, *folders})
 
     return load, listed, sorted(name for name, module in module_of.items() if module.count(".") > 1)  # no folders
 

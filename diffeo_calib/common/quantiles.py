@@ -69,8 +69,8 @@ def binomial_band(count: int, share: float, chance: float) -> tuple[int, int]:
 
 def largest_known(values: Tensor, dim: int = 1) -> Tensor:
     """Largest value along an axis, NaN left out; NaN where there is nothing else."""
-    found = values.nan_to_num(-inf, posinf=inf).amax(dim)
-    return found.masked_fill(values.isnan().all(dim), float("nan"))
+    largest = values.nan_to_num(-inf, posinf=inf).amax(dim)
+    return largest.masked_fill(values.isnan().all(dim), float("nan"))
 
 
 def known(values: Tensor) -> Tensor:

@@ -152,8 +152,8 @@ def _openblas(loaded: str) -> Any:
     """
     from threadpoolctl import ThreadpoolController  # noqa: PLC0415
 
-    found = ThreadpoolController()
-    openblas = [library for library in found.info() if library["internal_api"] == "openblas"]
+    every = ThreadpoolController()
+    openblas = [library for library in every.info() if library["internal_api"] == "openblas"]
     # some builds of torch have an OpenBLAS of their own in torch/lib or torch.libs
     paths = [library["filepath"] for library in openblas]
-    return found.select(filepath=[p for p in paths if not any(d.startswith("torch") for d in Path(p).parts[-3:-1])])
+    return every.select(filepath=[p for p in paths if not any(d.startswith("torch") for d in Path(p).parts[-3:-1])])

@@ -98,11 +98,11 @@ def fit(
     """
     solver = solver if solver is not None else (LBFGS() if formulation == "eulerian" else GaussNewton())
     _check_arguments(problem, solver, integrator, start)
-    own = solver.integrator
-    if integrator is not None and own is not None and integrator != own:
-        got = f"{integrator} and {own}"
+    of_solver = solver.integrator
+    if integrator is not None and of_solver is not None and integrator != of_solver:
+        got = f"{integrator} and {of_solver}"
         raise InputError.of("`integrator`", expected="the same for `fit` and its solver", got=got, fix="pass one")
-    integrator = own if integrator is None else integrator
+    integrator = of_solver if integrator is None else integrator
     problem = problem.using(backend, accuracy)
     begin = time.perf_counter()
     if isinstance(controls, Integral) and not isinstance(controls, bool):
@@ -118,14 +118,14 @@ def fit(
     objective = formulate(problem, formulation, errata)
     if start is not None:
         _check_start(start, objective)
-    known = None
+    run = None
     if integrator is not None:
         solution = solver.solve(objective, integrator, start, progress)
     else:
-        solution, integrator, known = _with_chosen_steps(objective, solver, start, progress)
-    found = certify(problem, objective, solution, integrator, time.perf_counter() - begin, known=known)
-    LOG.info("fit of %d rows: %s, %.1f s", len(problem.x), found.status, found.seconds)
-    return found
+        solution, integrator, run = _with_chosen_steps(objective, solver, start, progress)
+    result = certify(problem, objective, solution, integrator, time.perf_counter() - begin, known=run)
+    LOG.info("fit of %d rows: %s, %.1f s", len(problem.x), result.status, result.seconds)
+    return result
 
 
 def formulate(problem: Problem, formulation: str, errata: Mapping[str, object]) -> Problem:

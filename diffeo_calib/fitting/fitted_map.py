@@ -31,7 +31,7 @@ OPEN_TURN_RAD = 1.0
 changed robot widens by up to ten, and that of an open one, 2."""
 NEGLIGIBLE_TURN_RAD = 0.01
 """Standard deviation of the turn of all points below which errors of second order are left out, if nothing is open."""
-TENSORS = "data", "new_noise", "workspace", "slopes", "y"  # of a map, or None
+TENSORS = "data", "new_noise", "workspace", "slopes", "y", "unresolved"  # of a map, or None
 T = TypeVar("T")
 
 
@@ -55,6 +55,8 @@ class FittedMap:
         workspace: (M, n) configurations over which covariances leave rigid motions out; None if places were measured.
         slopes: (N, r, m) linear functionals of k1 that were measured; None for all m coordinates.
         y: (N, r) what was measured, or (N, m), m; None where it is not known (:meth:`measured` then derives it).
+        unresolved: (n,) variances, rad^2 or m^2, of errors of k1 in each joint that are too short for its fields. A new
+            measurement has them in its noise; None where there are none.
     """
 
     deformation: Deformation
@@ -64,6 +66,7 @@ class FittedMap:
     workspace: Tensor | None = None
     slopes: Tensor | None = field(default=None, kw_only=True)
     y: Tensor | None = field(default=None, kw_only=True)
+    unresolved: Tensor | None = field(default=None, kw_only=True)
     registration: Any = field(default=None, init=False)
     """Result of a registration, where the map has been placed anew."""
     _origin: FittedMap | None = field(default=None, init=False)
@@ -201,9 +204,11 @@ class FittedMap:
             mean, at = self.linearised_value(x[some], self.geodesic.at_rows(some))
             wanted = None if directions is None else directions(mean)
             means.append(mean)
-            blocks.append(self.covariance(at, wanted))
             if noise:
-                blocks[-1] += self.new_noise if wanted is None else wanted @ self.new_noise @ wanted.mT
+                own = self.new_noise if wanted is None else wanted @ self.new_noise @ wanted.mT
+                blocks.append(self._of_fields(at, wanted) + own)
+            else:
+                blocks.append(self.covariance(at, wanted))
         return torch.cat(means), torch.cat(blocks)
 
     def linearised_value(
@@ -237,6 +242,17 @@ class FittedMap:
             at: the linearisation.
             directions: (M, r, m') linear functions of the points whose covariance (M, r, r) is wanted instead.
         """
+        return self._of_fields(at, directions) + self._short_errors(at, directions)
+
+    def _short_errors(self, at: Linearisation, directions: Tensor | None = None) -> Tensor:
+        """Covariance (M, r, r) of what the fields do not resolve: independent at every configuration."""
+        variances = 0.0 if self.unregistered.unresolved is None else self.unregistered.unresolved
+        by_joints = sum((node.weight * node.effect for node in at.joint), torch.zeros_like(at.joint_to_start))
+        by_joints = by_joints if directions is None else directions @ by_joints
+        return by_joints * variances @ by_joints.mT
+
+    def _of_fields(self, at: Linearisation, directions: Tensor | None) -> Tensor:
+        """:meth:`covariance` without what the fields do not resolve."""
         return self.with_second_order(self.conditional.covariance(at, directions))
 
     def with_shifts(self, at: Linearisation, effects: Tensor, columns: Tensor) -> Tensor:
@@ -273,9 +289,9 @@ class FittedMap:
         if not len(places):
             return root
         deviations = spec.prior_variance[places].sqrt()
-        every, seen = spec.nominal.sensitivities(self.x, torch.zeros_like(spec.prior_variance)), self.noise.visible
+        every, visible = spec.nominal.sensitivities(self.x, torch.zeros_like(spec.prior_variance)), self.noise.visible
         every = self.functionals @ every
-        slopes = every[seen] if every.shape[:2] == seen.shape else every.flatten(0, 1)  # registered: other points
+        slopes = every[visible] if every.shape[:2] == visible.shape else every.flatten(0, 1)  # registered: other points
         white = slopes[:, places] * deviations / len(slopes) ** 0.5
         _, s, Vt = torch.linalg.svd(torch.cat([white, white.new_zeros(len(places), len(places))]), full_matrices=False)
         noise = float(self.new_noise.diagonal().mean().sqrt())
@@ -302,10 +318,10 @@ class FittedMap:
         Displacements in open directions are of decimetres: then turns of milliradians count, too.
         """
         spec = self.geodesic.spec
-        own = torch.tensor(spec.nominal.turns, dtype=torch.int64, device=self.x.device)
-        if not len(own):
+        turns = torch.tensor(spec.nominal.turns, dtype=torch.int64, device=self.x.device)
+        if not len(turns):
             return 0.0
-        prior, posterior = spec.prior_variance[own], self.parameter_covariance(own).diagonal()
+        prior, posterior = spec.prior_variance[turns], self.parameter_covariance(turns).diagonal()
         total = float(torch.where(prior > OPEN_TURN_RAD**2, prior, posterior).sum())
         return total if total > NEGLIGIBLE_TURN_RAD**2 or self.open_directions.shape[1] else 0.0
 
@@ -318,7 +334,9 @@ class FittedMap:
         spec = replace(spec, **kernels, prior_variance=factor * spec.prior_variance)
         noise = Noise(factor * self.noise.covariance, factor**0.5 * self.noise.shared)
         deformation = GeodesicDeformation(spec, old.x, momenta, old.integrator)
-        return replace(self, deformation=deformation, noise=noise, new_noise=factor * self.new_noise)
+        unresolved = None if self.unresolved is None else factor * self.unresolved
+        changes = {"noise": noise, "new_noise": factor * self.new_noise, "unresolved": unresolved}
+        return replace(self, deformation=deformation, **changes)
 
     def parameter_covariance(self, which: Tensor) -> Tensor:
         """Posterior covariance of the parameters theta with these numbers: (k,) -> (k, k) in m^2, m rad or rad^2."""
@@ -341,7 +359,11 @@ class FittedMap:
 
     def joint_covariance(self, x: Tensor) -> Tensor:
         """Posterior covariance of all coordinates of k1 at x (M, n) together: (M m, M m), m^2."""
-        return self.conditional.covariance_between(self.linearised_value(x)[1])
+        return self.covariance_between(self.linearised_value(x)[1])
+
+    def covariance_between(self, at: Linearisation) -> Tensor:
+        """Posterior covariance of all points of a linearisation together: (M m', M m')."""
+        return self.conditional.covariance_between(at) + torch.block_diag(*self._short_errors(at))
 
     def measured(self) -> Tensor:
         """(N, m) the measurements that lead to this map and its posterior, m, or (N, r) with slopes.
@@ -357,11 +379,11 @@ class FittedMap:
                 fix = "calibrate again: files of this version keep what was measured"
                 raise InputError.of("the file of this model does not say what was measured", fix=fix)
             return self.y
-        values, seen = self.fitted_points, self.noise.visible
+        values, visible = self.fitted_points, self.noise.visible
         if self.y is not None:
-            return torch.where(seen, self.y, values)
+            return torch.where(visible, self.y, values)
         residual = self.noise.multiply(self.weighted_residual()[:, :, None])[:, :, 0]
-        return torch.where(seen, values + residual, values)
+        return torch.where(visible, values + residual, values)
 
     def linearised_rows(self) -> tuple[Tensor, Tensor]:
         """A (N, r, m) and what was measured of A k1 (N, r), around the fit; of coordinates A is the identity."""

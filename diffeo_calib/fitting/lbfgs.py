@@ -155,13 +155,13 @@ class Descent:
         """Energy at the optimiser's variables; stores their gradient in ``grad``."""
         with torch.enable_grad():
             momenta = self.momenta()
-        found = slope(self.problem, self.integrator, momenta, self.variables)
-        self.overflowed = found is None
-        if found is None:
+        energy_and_slope = slope(self.problem, self.integrator, momenta, self.variables)
+        self.overflowed = energy_and_slope is None
+        if energy_and_slope is None:
             self.evaluations += 1
             self.variables.grad = torch.zeros_like(self.variables)
             return self.origin.new_tensor(OVERFLOW_ENERGY_RATIO * (abs(self.best_energy) + 1.0))
-        total, self.variables.grad = found
+        total, self.variables.grad = energy_and_slope
         self._note(momenta, float(total))
         return total
 

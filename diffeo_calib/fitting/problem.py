@@ -24,7 +24,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor, check_count, check_covariance, check_finite, positive, real_tensor
 from diffeo_calib.common.data_frames import refuse_data_frame
 from diffeo_calib.common.device import methods_outside_inference_mode, usable
-from diffeo_calib.common.errors import InputError, NumericalError
+from diffeo_calib.common.errors import InputError, NumericalError, sentence, warn_user
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows.integrators import RK4, Integrator
 from diffeo_calib.kernels.base import Kernel, check_kernel
@@ -109,6 +109,10 @@ class Problem:
         observe: Observation | None = None,
     ) -> None:
         refuse_data_frame(x, "x")
+        given = {"x": x, "y": y, "noise": noise, "prior_variance": prior_variance}
+        if live := [name for name, value in given.items() if isinstance(value, Tensor) and value.requires_grad]:
+            what = f"no gradient leads from a fit back to `{'`, `'.join(live)}`"
+            warn_user(sentence(what, fix="detach them, or compare fits by finite differences"))
         self.x = self.controls = as_tensor(x, "x", ("N", "n")).detach()
         self.y = as_tensor(y, "y", (len(self.x), "m"), fix="pass one measured point per configuration").detach()
         nominal, self.observe = as_nominal(nominal), observe

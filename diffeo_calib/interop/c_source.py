@@ -198,17 +198,17 @@ def _flow_constants(name: str, title: str, flow: RecordedFlow) -> dict[str, Any]
     Of its tables, one after the other by stages, then joints: knots (rows,) rad; f, f', f'' (rows, 3) there; the first
     row of every table, and the number of rows.
     """
-    found: dict[str, Any] = vars(flow) | {"name": name, "title": title, "stages": len(flow.weights)}
-    found["terms"] = [_term_constants(f"{name}_term{k}", term) for k, term in enumerate(flow.terms, 1)]
+    constants: dict[str, Any] = vars(flow) | {"name": name, "title": title, "stages": len(flow.weights)}
+    constants["terms"] = [_term_constants(f"{name}_term{k}", term) for k, term in enumerate(flow.terms, 1)]
     if flow.tables is not None:
         every = [table for stage in flow.tables.stages for table in stage]
-        found["tables"] = {
+        constants["tables"] = {
             "joints": np.flatnonzero(flow.tables.selection.any(0)),
             "first": [0, *np.cumsum([len(table.knots) for table in every]).tolist()],
             "knots": np.concatenate([table.knots for table in every]),
             "derivatives": np.concatenate([table.values for table in every]),
         }
-    return found
+    return constants
 
 
 def _term_constants(name: str, term: RadialTerm) -> dict[str, Any]:

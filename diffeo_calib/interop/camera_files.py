@@ -28,36 +28,36 @@ def camera_files(
 
     Raises InputError: a model without such a camera, or one that was registered again.
     """
-    cameras = {name: own for each in model.placement for name, own in each.cameras.items()}
+    cameras = {name: camera for each in model.placement for name, camera in each.cameras.items()}
     if not cameras and (model.lever is None or on_tool is None):
         fix = "calibrate with a table of `images`; of poses of a board say whether the camera is on the tool"
         raise InputError.of("the camera of the model", expected="one that saw a board", got="none", fix=fix)
     on_tool = bool(next(iter(cameras.values())).on_tool if cameras else on_tool)
-    found, each = dict[str, str](), HandEye.of_each(model, camera_on_tool=on_tool, geometry=geometry)
-    for name, own in each.items():
-        known, files = name.replace("/", "_"), dict[str, str]()
+    texts, each = dict[str, str](), HandEye.of_each(model, camera_on_tool=on_tool, geometry=geometry)
+    for name, camera in each.items():
+        prefix, files = name.replace("/", "_"), dict[str, str]()
         if cameras:
             lens = cameras[name.partition("/")[0] if name not in cameras else name].camera
             files = {"camera.yaml": camera_text(lens), "camera_info.yaml": camera_text(lens, ros=True)}
-        files |= {"hand_eye.yaml": _hand_eye(own)} | _of_ros(own, known, model.geometry.on[0], on_tool=on_tool)
-        found |= {file if len(each) == 1 else f"{known}_{file}": text for file, text in files.items()}
-    return found
+        files |= {"hand_eye.yaml": _hand_eye(camera)} | _of_ros(camera, prefix, model.geometry.on[0], on_tool=on_tool)
+        texts |= {file if len(each) == 1 else f"{prefix}_{file}": text for file, text in files.items()}
+    return texts
 
 
-def _hand_eye(own: HandEye) -> str:
+def _hand_eye(hand_eye: HandEye) -> str:
     """Camera and board as OpenCV's `FileStorage` reads them: R, t as of `calibrateHandEye`."""
-    lines = ["%YAML:1.0", "---", f'camera_parent: "{own.camera.link}"']
-    for name, fixed in vars(own).items():
+    lines = ["%YAML:1.0", "---", f'camera_parent: "{hand_eye.camera.link}"']
+    for name, fixed in vars(hand_eye).items():
         R, t = fixed.pose[:3, :3], fixed.pose[:3, 3]
         for part, rows, values in (("R", 3, R), ("t", 3, t), ("covariance", 6, fixed.covariance)):  # of shift, turn
             lines += matrix_lines(f"{name}_{part}", rows, values.flatten().tolist())
     return "\n".join([*lines, ""])
 
 
-def _of_ros(own: HandEye, name: str, tip: str, *, on_tool: bool) -> dict[str, str]:
+def _of_ros(hand_eye: HandEye, name: str, tip: str, *, on_tool: bool) -> dict[str, str]:
     """A calibration of easy_handeye2, a link and joint for xacro, a launch file of ROS 2 that publishes the frame."""
-    frame, parent, shift = f"{name}{FRAME}", own.camera.link, own.camera.pose[:3, 3].tolist()
-    turn = rotation_numbers(own.camera.pose[None, :3, :3], "quat_xyzw")[0].tolist()
+    frame, parent, shift = f"{name}{FRAME}", hand_eye.camera.link, hand_eye.camera.pose[:3, 3].tolist()
+    turn = rotation_numbers(hand_eye.camera.pose[None, :3, :3], "quat_xyzw")[0].tolist()
     translation, quaternion = (
         "\n".join(f"    {axis}: {value!r}" for axis, value in zip(axes, numbers, strict=True))
         for axes, numbers in (("xyz", shift), ("xyzw", turn))
@@ -65,12 +65,12 @@ def _of_ros(own: HandEye, name: str, tip: str, *, on_tool: bool) -> dict[str, st
     named = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), [*shift, *turn], strict=True)
     words = [f"--{entry} {value!r}" for entry, value in named]
     words += [f"--frame-id {parent}", f"--child-frame-id {frame}"]
-    xyz, rpy = (" ".join(map(repr, part)) for part in origin_numbers(own.camera.pose))
+    xyz, rpy = (" ".join(map(repr, part)) for part in origin_numbers(hand_eye.camera.pose))
     return {
         "easy_handeye2.calib": f"""parameters:
   name: "{name}"
   calibration_type: "{"eye_in_hand" if on_tool else "eye_on_base"}"
-  robot_base_frame: "{own.board.link if on_tool else parent}"
+  robot_base_frame: "{hand_eye.board.link if on_tool else parent}"
   robot_effector_frame: "{tip}"
   tracking_base_frame: "{frame}"
   tracking_marker_frame: "board"

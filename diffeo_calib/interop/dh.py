@@ -29,10 +29,11 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, RobotError, as_written
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.interop.rigid import geometry_of
-from diffeo_calib.interop.tables import check_units, in_unit, origin_numbers, table_text
+from diffeo_calib.interop.tables import check_units, in_unit, origin_numbers
 from diffeo_calib.interop.urdf import urdf_of
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.tool import checked_tip
+from diffeo_calib.measurements.csv.cells import csv_text
 from diffeo_calib.robots.dh import CONVENTIONS, DHRow, from_dh, row_transform
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import transforms
@@ -145,7 +146,7 @@ def dh_text(table: DHTable, length: str, angle: str) -> str:
         driven = " + ".join(f"{slope!r} {by}" for by, slope in (row.mimic or {}).items())
         follows = [driven, row.mimic_offset if driven else ""] if mimics else []
         rows.append([name, row.kind, a, alpha, d, theta, beta, *[""] * 6, *follows])
-    return table_text(header, [*rows, fixed("tool", table.tool)])
+    return csv_text([header, *rows, fixed("tool", table.tool)])
 
 
 def zero_frames(geometry: Geometry, tip: str | None = None) -> tuple[list[int], list[Tensor], Tensor]:
@@ -287,7 +288,7 @@ def ur_transforms(geometry: Geometry, urdf: bytes) -> Tensor:
         what, expected = f"'{robot.tip}' of robot '{robot.name}'", "a frame on the axis of the last joint"
         raise RobotError.of(what, expected=expected, got=f"{away:.1e} beside it", fix=OTHERS)
     frames = zip(zero_frames(geometry)[1], ideal, places, strict=True)
-    moved = (own @ torch.linalg.inv(was) @ place for own, was, place in frames)
+    moved = (now @ torch.linalg.inv(was) @ place for now, was, place in frames)
     return torch.stack([torch.linalg.inv(before) @ after for before, after in pairwise([HALF_TURN, *moved])])
 
 
@@ -300,8 +301,8 @@ def ur_text(links: Tensor, hash: str | None) -> str:
         for entry, value in zip(ENTRIES, [*xyz, *rpy], strict=True):
             text = repr(value)  # to YAML an exponent needs a decimal point before it
             lines.append(f"    {entry}: {text if '.' in text else text.replace('e', '.0e')}")
-    own = hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
-    return "\n".join([*lines, f"  hash: {hash or f'diffeo_calib_{own}'}", ""])
+    checksum = hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
+    return "\n".join([*lines, f"  hash: {hash or f'diffeo_calib_{checksum}'}", ""])
 
 
 def _prefix(chain: Tree) -> str:

@@ -34,7 +34,7 @@ from diffeo_calib.common.errors import (
     printable,
     warn_user,
 )
-from diffeo_calib.common.files import write_whole
+from diffeo_calib.common.files import as_path, write_whole
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows import integrator_from_config
 from diffeo_calib.interop.numpy_model import ENTRY, FORMAT, UNSOUND, Header, digest, read_arrays
@@ -71,6 +71,7 @@ MAP_TENSORS = {
     "workspace": "workspace",  # of a robot that no device has seen: where covariances leave rigid motions out
     "slopes": "slopes",  # linear functionals of the coordinates that were measured; without it, all coordinates were
     "measured": "y",  # what was measured; the first model files did not have it
+    "unresolved": "unresolved",  # variances of errors that are too short for the fields, if there are any
 }
 """Tensors that only some models have -> attributes of the map."""
 ROBOT_TENSORS = ("rigid_errors", "scales")
@@ -103,11 +104,11 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
 
     Raises InputError: not a calibrated model, the Eulerian formulation, or a part that cannot be saved.
     """
-    seen = model.map if isinstance(model, CalibratedKinematics) else model
-    if not isinstance(seen, FittedMap):
+    fitted = model.map if isinstance(model, CalibratedKinematics) else model
+    if not isinstance(fitted, FittedMap):
         expected, fix = "a calibrated model", "pass `result.model` or `fit.model`"
         raise InputError.of("`model`", expected=expected, got=type(model).__name__, fix=fix)
-    inner = seen.unregistered
+    inner = fitted.unregistered
     if inner.formulation != "exact":
         got, fix = f"the {inner.formulation} formulation", 'fit with formulation="exact"'
         raise InputError.of("`model`", expected="an exact model", got=got, fix=fix)
@@ -129,21 +130,21 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
     }
     if isinstance(model, CalibratedKinematics):
         tensors |= {name: getattr(model, name) for name in ROBOT_TENSORS}
-        known = {
+        entries = {
             "tool": None if torch.equal(model.tool, tool_transform(None)) else model.tool.tolist(),
             "tool_tip": model.tool_tip,
             "urdf": model.robot.source,
             "provenance": None if model.provenance is None else entries_of(model.provenance),
             "ball": True if model.ball and model.map.workspace is None else None,
-            "placement": [own.stored() for own in model.placement] or None,
+            "placement": [device.stored() for device in model.placement] or None,
         }
-        header |= {name: entry for name, entry in known.items() if entry is not None}
+        header |= {name: entry for name, entry in entries.items() if entry is not None}
         header |= {"report": model.report, "lever": model.lever}
-    if (found := model.registration) is not None:
-        shift = None if found.shift is None else found.shift.tolist()
-        learnt = {LEARNT: True} if seen.registration is None else {}
-        header["registration"] = entries_of(found, *ARRAYS, "shift") | {"shift": shift} | learnt
-        tensors |= {PREFIX + name: getattr(found, name) for name in ARRAYS}
+    if (registration := model.registration) is not None:
+        shift = None if registration.shift is None else registration.shift.tolist()
+        learnt = {LEARNT: True} if fitted.registration is None else {}
+        header["registration"] = entries_of(registration, *ARRAYS, "shift") | {"shift": shift} | learnt
+        tensors |= {PREFIX + name: getattr(registration, name) for name in ARRAYS}
     return header, {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items() if t is not None}
 
 
@@ -175,19 +176,19 @@ def _describe_kernel(kernel: Kernel) -> list[Header]:
 
 def _tensors_of_rows(fitted: FittedMap) -> Tensors:
     """The tensors of sessions and payloads; none where all rows are of one session, and nothing is carried."""
-    spec, theta, found = fitted.geodesic.spec, fitted.geodesic.momenta.theta, Tensors()
+    spec, theta, tensors = fitted.geodesic.spec, fitted.geodesic.momenta.theta, Tensors()
     nominal, by_row, shared = spec.nominal, spec.nominal_of_controls, fitted.noise.shared
     if isinstance(spec.at_controls, SessionMarkers):
         sessions = spec.at_controls
-        found |= zip(SESSIONS, (shared, sessions.session.to(torch.float64), sessions.tools), strict=True)
+        tensors |= zip(SESSIONS, (shared, sessions.session.to(torch.float64), sessions.tools), strict=True)
     elif shared.shape[2]:
-        found[SHARED] = shared
+        tensors[SHARED] = shared
     if isinstance(nominal, GeometryMap) and nominal.elasticity is not None and nominal.load:
         rows = by_row.load if isinstance(by_row, GeometryMap | SessionMarkers) else NO_PAYLOAD
         if not rows.by_row:
             raise InputError.of("the model cannot be saved: the payloads of its rows are not known")
-        found |= zip(PAYLOADS, (rows.masses, fitted.geodesic.task_controls, nominal.folded(theta)), strict=True)
-    return found
+        tensors |= zip(PAYLOADS, (rows.masses, fitted.geodesic.task_controls, nominal.folded(theta)), strict=True)
+    return tensors
 
 
 def rebuild(
@@ -218,16 +219,16 @@ def rebuild(
     fitted = FittedMap(deformation, Noise(noise, tensors.get(SHARED)), new_noise=new_noise, **of_map)
     learnt = None
     if "registration" in header:
-        found = rebuild_registration(header["registration"], tensors, x.shape[1])
-        learnt = found if LEARNT in header["registration"] else None
-        fitted = fitted if learnt else RegisteredMap(fitted, found)
+        placed = rebuild_registration(header["registration"], tensors, x.shape[1])
+        learnt = placed if LEARNT in header["registration"] else None
+        fitted = fitted if learnt else RegisteredMap(fitted, placed)
     if not isinstance(k0, GeometryMap):
         return fitted
     summary = Summary.from_dict(header["report"], positions=fitted.workspace is None) if header["report"] else None
     given: dict[str, Any] = {name: header.get(name) for name in ("lever", "tool", "tool_tip")}
     given |= {name: tensors.get(name) for name in ROBOT_TENSORS} | {"learnt": learnt}
     given["ball"] = header.get("ball", False) is True
-    given["placement"] = tuple(stored_devices(own, len(fitted.x)) for own in header.get("placement", ()))
+    given["placement"] = tuple(stored_devices(entry, len(fitted.x)) for entry in header.get("placement", ()))
     made = header.get("provenance")
     given["provenance"] = None if made is None else record_of(Provenance, made)
     return CalibratedKinematics(k0.geometry.chain, fitted, summary, **given)
@@ -236,22 +237,22 @@ def rebuild(
 def _check(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
     """Raise InputError unless all tensors are known, finite float64 of shapes that agree."""
     robot = nominal if isinstance(nominal, GeometryMap) else None
-    known = {*MOMENTA, *MAP_TENSORS, *PAYLOADS, *SESSIONS, *(PREFIX + name for name in ARRAYS)}
-    known |= {"probe"} if robot is None else {*GEOMETRY, *ROBOT_TENSORS}
-    if unknown := set(tensors) - known:
-        raise InputError.of("the tensors of the file", expected=sorted(known), got=sorted(unknown))
+    names = {*MOMENTA, *MAP_TENSORS, *PAYLOADS, *SESSIONS, *(PREFIX + name for name in ARRAYS)}
+    names |= {"probe"} if robot is None else {*GEOMETRY, *ROBOT_TENSORS}
+    if unknown := set(tensors) - names:
+        raise InputError.of("the tensors of the file", expected=sorted(names), got=sorted(unknown))
     if other := {name: tensor.dtype for name, tensor in tensors.items() if tensor.dtype != torch.float64}:
         raise InputError.of(f"the tensors {', '.join(other)}", expected="float64", got=next(iter(other.values())))
-    (n_rows, n), (_, seen, _) = tensors["x"].shape, tensors["noise"].shape
-    m = tensors["new_noise"].shape[0] if "slopes" in tensors else seen
+    (n_rows, n), (_, width, _) = tensors["x"].shape, tensors["noise"].shape
+    m = tensors["new_noise"].shape[0] if "slopes" in tensors else width
     dim, size, data = header["task_dim"], nominal.parameters, len(tensors.get("data", tensors["x"]))
     if type(dim) is not int or dim < 1 or m % dim or (robot is not None and dim != 3):
         raise InputError.of("the entry task_dim", expected=f"a divisor of {m}, 3 for a robot", got=dim)
     shapes = {
         **{"x": (n_rows, n), "momenta_x": (n_rows, n), "momenta_y": (n_rows * m // dim, dim)},
-        **{"theta": (size,), "prior_variance": (size,), "noise": (data, seen, seen), "new_noise": (m, m)},
-        **{"data": (data, n), "workspace": ("M", n), "slopes": (data, seen, m), "measured": (data, seen)},
-        **{"session": (n_rows,), "payloads": (n_rows,), SHARED: (data, seen, "c")},
+        **{"theta": (size,), "prior_variance": (size,), "noise": (data, width, width), "new_noise": (m, m)},
+        **{"data": (data, n), "workspace": ("M", n), "slopes": (data, width, m), "measured": (data, width)},
+        **{"unresolved": (n,), "session": (n_rows,), "payloads": (n_rows,), SHARED: (data, width, "c")},
     }
     if robot is not None:
         shapes["scales"] = (5 * n + 2 * robot.geometry.chain.moving + 9,)
@@ -305,14 +306,14 @@ def _rebuild_kernel(terms: list[Header], classes: KernelClasses) -> Kernel:
     kernels: list[Kernel] = []
     for term in terms:
         if "kernel" not in term:
-            own = partial(_own_profile, values=term.get(PROBE), classes=classes)
-            kernels.append(RadialKernel.from_config(term, own))
+            profile_of = partial(_own_profile, values=term.get(PROBE), classes=classes)
+            kernels.append(RadialKernel.from_config(term, profile_of))
             continue
         name = term["kernel"]
-        found = classes.get(name)
-        if not (isinstance(found, type) and issubclass(found, Kernel)):
+        given = classes.get(name)
+        if not (isinstance(given, type) and issubclass(given, Kernel)):
             raise _missing(f"kernel {name!r}", f"its class: load(path, kernels={{{name!r}: ...}})", classes)
-        kernels.append(found.from_config(term["arguments"]))
+        kernels.append(given.from_config(term["arguments"]))
     return kernels[0] if len(kernels) == 1 else SumKernel(kernels)
 
 
@@ -332,9 +333,9 @@ def _own_profile(name: str, values: list[float] | None, classes: KernelClasses) 
         text = "the model file is of an old version: whether the profile"
         warn_user(f"{text} {name!r} is that of its fit is not checked")
         return profile
-    own = torch.tensor([probe(profile), values], dtype=torch.float64, device=HOST)
-    if not torch.allclose(own[0], own[1], rtol=PROBE_TOLERANCE, atol=0.0):
-        got, wanted = (", ".join(f"{kappa:.6g}" for kappa in row) for row in own.tolist())
+    values_of_both = torch.tensor([probe(profile), values], dtype=torch.float64, device=HOST)
+    if not torch.allclose(values_of_both[0], values_of_both[1], rtol=PROBE_TOLERANCE, atol=0.0):
+        got, wanted = (", ".join(f"{kappa:.6g}" for kappa in row) for row in values_of_both.tolist())
         what = f"the profile {name!r} passed in `kernels` is not that of the model"
         expected = f"kappa = {wanted} at r2 = {', '.join(map(str, PROBED_R2))}"
         fix = "pass the profile of the fit, with the same parameters"
@@ -422,9 +423,9 @@ def load(
         DiffeoCalibWarning: devices of a kind that nobody registered here, whose readings are not predicted; a profile
             in a file of an old version, which cannot be compared with the one passed.
     """
-    known, (header, tensors) = _checked(kernels), read(Path(path))
+    classes, (header, tensors) = _checked(kernels), read(as_path(path))
     try:
-        return rebuild(header, tensors, nominal, known)
+        return rebuild(header, tensors, nominal, classes)
     except (ModelFileError, MissingArgumentError):
         raise
     except (*UNSOUND, DiffeoCalibError) as error:
@@ -435,18 +436,18 @@ def load(
 def _checked(kernels: object) -> KernelClasses:
     """Classes of kernels, and profiles whose derivatives are right, of classes without arguments, by their names."""
     given: dict[str, Any] = {} if kernels is None else dict(kernels) if isinstance(kernels, Mapping) else {"": None}
-    for name, one in given.items():
-        if isinstance(one, type) and issubclass(one, Kernel):
+    for name, kernel in given.items():
+        if isinstance(kernel, type) and issubclass(kernel, Kernel):
             continue
-        if not (isinstance(one, Profile) or (isinstance(one, type) and issubclass(one, Profile))):
+        if not (isinstance(kernel, Profile) or (isinstance(kernel, type) and issubclass(kernel, Profile))):
             fix = "pass the class itself, such as kernels={'MyKernel': MyKernel}, or {'my_profile': MyProfile(2.5)}"
             expected = "names -> subclasses of dc.Kernel, or profiles"
             raise InputError.of("`kernels`", expected=expected, got=as_written(kernels)[:80], fix=fix)
         try:
-            given[name] = one() if isinstance(one, type) else one
+            given[name] = kernel() if isinstance(kernel, type) else kernel
         except TypeError as error:
             fix = "pass the profile with the parameters of the fit, such as kernels={'my_profile': MyProfile(2.5)}"
-            raise InputError.of(f"`kernels`: {as_written(one)} needs arguments ({error})", fix=fix) from error
+            raise InputError.of(f"`kernels`: {as_written(kernel)} needs arguments ({error})", fix=fix) from error
         check_profile(given[name])
     return given
 

@@ -22,6 +22,7 @@ from safetensors import SafetensorError, safe_open
 
 from diffeo_calib.common.data_frames import named_columns, real_array
 from diffeo_calib.common.errors import InputError, ModelFileError
+from diffeo_calib.common.files import as_path
 from diffeo_calib.runtime.arrays import MOST_STEPS, TABLEAUS, Array
 from diffeo_calib.runtime.build import calibrated_chain, nominal_chain, recorded_flow, recorded_stages
 from diffeo_calib.runtime.chain import tip_poses
@@ -170,7 +171,7 @@ def load_numpy(path: str | os.PathLike[str]) -> NumpyKinematics:
     :func:`diffeo_calib.load`. InputError: a model of a plain function, with adaptive time steps, or with kernels of the
     user's own.
     """
-    header, arrays = read_arrays(Path(path))
+    header, arrays = read_arrays(as_path(path))
     try:
         program, tool = _program(header, arrays), np.array(header.get("tool", np.eye(4)), dtype=np.float64)
         return NumpyKinematics(program, program.chain.nominal.names, program.chain.nominal.limits, tool)
@@ -203,8 +204,8 @@ def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
     on = [chain.tips.index(tip) for tip in nominal.get("on", ())] or [0] * len(tool)
     theta, tableau = arrays.get("unladen_theta", arrays["theta"]), TABLEAUS[integrator["kind"]]()
     shifts = theta[6 + 6 * len(chain.axes) :][: tool.size].reshape(-1, 3)
-    own = {"elastic": nominal["elastic"], "waves": nominal.get("waves", ()), "axes": nominal.get("axes", ())}
-    k0 = calibrated_chain(chain, arrays["base"], arrays["joint_errors"], theta, len(tool), **own)
+    options = {"elastic": nominal["elastic"], "waves": nominal.get("waves", ()), "axes": nominal.get("axes", ())}
+    k0 = calibrated_chain(chain, arrays["base"], arrays["joint_errors"], theta, len(tool), **options)
     joint, xi = recorded_stages(kernels[0], arrays["x"], arrays["momenta_x"], tableau, steps)
     tip, markers = tip_poses(k0, xi[0])[:, on], tool + shifts  # (N, P, 4, 4); of every control those of its session
     if "session" in arrays:
@@ -213,6 +214,6 @@ def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
     start = arrays.get("task_controls", z0.reshape(-1, 3))  # rows with payloads of their own
     task, _ = recorded_stages(kernels[1], start, arrays["momenta_y"], tableau, steps)
     flows = [recorded_flow(k, stages, *tableau) for k, stages in zip(kernels, (joint, task), strict=True)]
-    seen = arrays.get("registration_markers", tool + shifts)
-    at = on if len(seen) == len(tool) else [on[0]] * len(seen)
-    return Program(flows[0], k0, flows[1], seen, tuple(at))
+    points = arrays.get("registration_markers", tool + shifts)
+    at = on if len(points) == len(tool) else [on[0]] * len(points)
+    return Program(flows[0], k0, flows[1], points, tuple(at))

@@ -90,9 +90,9 @@ def rigid_kinematics(model: CalibratedKinematics, *, transmission: bool = False)
         and so do its rigid kinematics. Cost: some ten least-squares fits of 6 + 6 n_all + 3 P parameters, one to two
         seconds for 400 configurations.
     """
-    on, own, start = Compared.of(model, transmission=transmission), model.geometry, model.nominal.geometry
-    if start.markers != own.markers:  # a registration found others
-        start = start.with_tool(own.tool, own.on)
+    on, geometry, start = Compared.of(model, transmission=transmission), model.geometry, model.nominal.geometry
+    if start.markers != geometry.markers:  # a registration found others
+        start = start.with_tool(geometry.tool, geometry.on)
     first = identify(start, on.x, on.y)  # prior deviations by maximum likelihood
     fits: dict[str, Callable[[Compared], Geometry]] = {PROJECTION: lambda rows: _refit(model, rows, like=first)}
     if model.rigid_errors is not None and not transmission:
@@ -189,8 +189,8 @@ def _refit(model: CalibratedKinematics, on: Compared, *, like: Identification) -
 
     Noise and prior deviations are those of another fit.
     """
-    own = model.geometry
-    start = replace(model.nominal.geometry.with_tool(own.tool, own.on), base=own.base)
+    geometry = model.geometry
+    start = replace(model.nominal.geometry.with_tool(geometry.tool, geometry.on), base=geometry.base)
     prior = replace(like.prior, base_translation=PLACE_STD, base_rotation=PLACE_STD, tool=PLACE_STD)
     return identify(start, on.x, on.y, noise=_noise(like.rms), prior=prior).geometry
 
@@ -202,5 +202,5 @@ def _placed(model: CalibratedKinematics, joint_errors: Tensor | None, on: Compar
     best = register(start, on.x, on.y)
     prior = Prior(FIXED_STD, FIXED_STD, base_translation=PLACE_STD, base_rotation=PLACE_STD, tool=PLACE_STD)
     near = identify(start, on.x, on.y, noise=_noise(best.rms), prior=prior)
-    found = near if near.rms < TOLERATED_RMS_RATIO * best.rms + SMALLEST_NOISE_M else best
-    return replace(found.geometry, joint_errors=start.joint_errors)
+    fitted = near if near.rms < TOLERATED_RMS_RATIO * best.rms + SMALLEST_NOISE_M else best
+    return replace(fitted.geometry, joint_errors=start.joint_errors)

@@ -7,11 +7,9 @@ offset is a constant e.
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from math import ceil, degrees, prod, radians
+from math import ceil, prod, radians
 from os import PathLike
 
 import torch
@@ -23,13 +21,13 @@ from diffeo_calib.common.files import write_whole
 from diffeo_calib.interop.rigid import JointOffsets, best_joint_offsets
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.compensate import compensate
-from diffeo_calib.measurements.table_format import UNITS_PER_METRE
+from diffeo_calib.measurements.csv.cells import csv_text
+from diffeo_calib.measurements.csv.columns import PER_SI
+from diffeo_calib.measurements.table_format import ANGLE_UNITS, UNITS_PER_METRE
 from diffeo_calib.robots.cartesian import SLIDES, is_cartesian
 from diffeo_calib.robots.se3 import roll_pitch_yaw_angles
 from diffeo_calib.robots.tree import Tree
 
-LENGTHS, ANGLES = UNITS_PER_METRE, {"rad": 1.0, "deg": degrees(1.0)}
-"""Units of tables, per metre and per radian."""
 TURN_STEP, SLIDE_STEP = radians(0.5), 5e-4
 """Distance between the rows of a table, rad and m."""
 MOST_ROWS = 100_000
@@ -45,21 +43,14 @@ def origin_numbers(transform: Tensor) -> tuple[list[float], list[float]]:
 
 def check_units(length: str, angle: str) -> None:
     """Raise InputError for a unit that tables do not have."""
-    for name, value, known in (("length", length, LENGTHS), ("angle", angle, ANGLES)):
-        if value not in known:
-            raise InputError.of(f"`{name}`", expected=" or ".join(map(repr, known)), got=as_written(value))
+    for name, value, units in (("length", length, UNITS_PER_METRE), ("angle", angle, ANGLE_UNITS)):
+        if value not in units:
+            raise InputError.of(f"`{name}`", expected=" or ".join(map(repr, units)), got=as_written(value))
 
 
 def in_unit(values: Sequence[float], unit: str) -> list[float]:
     """Lengths in m or angles in rad -> in a unit."""
-    return [value * (LENGTHS | ANGLES)[unit] for value in values]
-
-
-def table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A table as CSV; numbers are read back to the last bit."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([header, *rows])
-    return text.getvalue()
+    return [value * PER_SI[unit] for value in values]
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,15 +122,15 @@ def tables_text(tables: Sequence[CorrectionTable], length: str, angle: str) -> s
         unit = angle if table.turns else length
         columns = (in_unit(column.tolist(), unit) for column in (table.values, table.errors, table.corrections))
         rows += [[table.joint, unit, *row] for row in zip(*columns, strict=True)]
-    return table_text(["joint", "unit", "value", "transmission_error", "correction_to_add"], rows)
+    return csv_text([["joint", "unit", "value", "transmission_error", "correction_to_add"], *rows])
 
 
-def offsets_text(found: JointOffsets, robot: Tree, length: str, angle: str) -> str:
+def offsets_text(best: JointOffsets, robot: Tree, length: str, angle: str) -> str:
     """Joint offsets as CSV; see :func:`write_joint_offsets`."""
     units = [angle if turns else length for turns in robot.periodic]
-    each = zip(robot.joint_names, units, found.offsets.tolist(), strict=True)
+    each = zip(robot.joint_names, units, best.offsets.tolist(), strict=True)
     rows = [[name, unit, *in_unit([offset], unit)] for name, unit, offset in each]
-    return table_text(["joint", "unit", "offset_to_add_to_reading"], rows)
+    return csv_text([["joint", "unit", "offset_to_add_to_reading"], *rows])
 
 
 def _table(model: CalibratedKinematics, index: int, step: float, turns: bool) -> CorrectionTable:
@@ -189,10 +180,10 @@ def field_text(model: CalibratedKinematics, grid: str, length: str) -> str:
     places = torch.cartesian_prod(*lines).view(-1, axes)
     q = torch.cat([places, places.new_zeros(len(places), robot.n - axes)], 1)
     targets = robot(q) @ model.tool
-    found = compensate(model, targets if robot.n > axes else targets[:, :3, 3], q)
+    compensation = compensate(model, targets if robot.n > axes else targets[:, :3, 3], q)
     base = model.geometry.base[:3, :3]
-    known = base.mT @ model.predict(q, noise=False)[1][:, 0] @ base
-    deviations = known.diagonal(dim1=1, dim2=2)[:, :axes].sqrt()
-    cells = LENGTHS[length] * torch.cat([places, found.correction[:, :axes], deviations], 1)
+    covariance = base.mT @ model.predict(q, noise=False)[1][:, 0] @ base
+    deviations = covariance.diagonal(dim1=1, dim2=2)[:, :axes].sqrt()
+    cells = UNITS_PER_METRE[length] * torch.cat([places, compensation.correction[:, :axes], deviations], 1)
     header = [f"{word}{axis} [{length}]" for word in ("", "add_", "std_") for axis in "xyz"[:axes]]
-    return table_text(header, cells.round(decimals=DIGITS).tolist())
+    return csv_text([header, *cells.round(decimals=DIGITS).tolist()])

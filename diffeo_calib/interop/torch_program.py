@@ -162,9 +162,9 @@ class TorchProgram(nn.Module):
         self.of_robot = robot
         program, marks = program_of(deformation) if robot else None, None
         if isinstance(model, CalibratedKinematics) and output == "tool_poses":
-            own = model.tool if tool is None else tool_transform(tool)
-            body = ToolKinematics(model.map, model.nominal, own, frame, model.tool_tip)
-            deformation, marks = body.deformation, tool_points(own)
+            transform = model.tool if tool is None else tool_transform(tool)
+            body = ToolKinematics(model.map, model.nominal, transform, frame, model.tool_tip)
+            deformation, marks = body.deformation, tool_points(transform)
             self.to_frame = torch.linalg.inv(body.base) if frame == "base" else None
             program = None if program is None else program.at(body.tip)
         if program is None and dtype != torch.float64:
@@ -205,12 +205,12 @@ def export_torch(
     contents = io.BytesIO()
     with _recorded(model, path, output, **how) as (program, q, description):
         torch.export.save(program, contents, extra_files={DESCRIPTION: json.dumps(description)})
-        found = program.module()(q)
+        outputs = program.module()(q)
     precision, how = PRECISIONS[q.dtype], {name: value for name, value in how.items() if name != "dtype"}
     expected = model(q.double())
     if isinstance(model, CalibratedKinematics) and output != "points":
         expected = model.poses(q.double()) if output == "poses" else model.tool_poses(q.double(), **how)
-    difference = float((found - expected).abs().max())
+    difference = float((outputs - expected).abs().max())
     if not difference <= precision:
         what = f"the recorded program differs from the model by {difference:.2g} m"
         raise NumericalError.of(what, expected=f"at most {precision:g}", fix="report it with the model file")
@@ -240,10 +240,10 @@ def export_onnx(
         with _recorded(model, path, output, **how) as (program, _, description):
             table: Any = {torch.ops.aten.scalar_tensor.default: _exact_scalar}
             names = {"input_names": ["q"], "output_names": [output], "custom_translation_table": table}
-            found = torch.onnx.export(program, dynamo=True, verbose=False, **names)
+            exported = torch.onnx.export(program, dynamo=True, verbose=False, **names)
     finally:
         registry.setLevel(level)
-    proto = cast(torch.onnx.ONNXProgram, found).model_proto
+    proto = cast(torch.onnx.ONNXProgram, exported).model_proto
     for key, value in description.items():
         proto.metadata_props.add(key=key, value=value)
     write_whole(path, proto.SerializeToString())
@@ -279,9 +279,9 @@ def _check_arguments(model: CalibratedKinematics | FittedMap, output: str, tool:
         fix = "pass `result.model` or `fit.model`"
         raise InputError.of("`model`", expected="a calibrated model", got=type(model).__name__, fix=fix)
     robot = model if isinstance(model, CalibratedKinematics) else None
-    known = OUTPUTS[:1] if robot is None else OUTPUTS
-    if output not in known:
-        raise InputError.of("`output`", expected=" or ".join(map(repr, known)), got=as_written(output))
+    choices = OUTPUTS[:1] if robot is None else OUTPUTS
+    if output not in choices:
+        raise InputError.of("`output`", expected=" or ".join(map(repr, choices)), got=as_written(output))
     if output == "poses" and robot is not None and robot.lever is None:
         what, fix = "this model was calibrated with points: it has no poses", 'ask for "tool_poses" or "points"'
         raise InputError.of(what, fix=fix)

@@ -97,11 +97,11 @@ def corrected_urdf(geometry: Geometry, content: bytes) -> bytes:
     elements = _joint_elements(content)
     edits: list[tuple[slice, bytes]] = []
     for name, origin in origins.items():
-        found = [element for element in elements if element.name == name]
-        if len(found) != 1:
+        matches = [element for element in elements if element.name == name]
+        if len(matches) != 1:
             what, expected = f"the joint '{name}' in the URDF of robot '{chain.name}'", "one <joint> with this name"
-            raise RobotError.of(what, expected=expected, got=len(found), fix="pass its own URDF")
-        edits += _origin_edits(content, found[0], origin)
+            raise RobotError.of(what, expected=expected, got=len(matches), fix="pass its own URDF")
+        edits += _origin_edits(content, matches[0], origin)
     for place, text in sorted(edits, key=lambda edit: edit[0].start, reverse=True):  # so that places stay right
         content = content[: place.start] + text + content[place.stop :]
     _check_read_back(geometry, content)
@@ -119,16 +119,16 @@ class _Element:
 
 def _joint_elements(content: bytes) -> list[_Element]:
     """The joints of a robot, at the places that the parser reports: comments and CDATA cannot mislead it."""
-    found: list[_Element] = []
+    elements: list[_Element] = []
     path: list[str] = []
     parser = expat.ParserCreate()
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         path.append(tag)
         if path[1:] == ["joint"]:
-            found.append(_Element(attributes.get("name", ""), parser.CurrentByteIndex))
-        elif path[1:] == ["joint", "origin"] and found[-1].origin is None:
-            found[-1].origin = parser.CurrentByteIndex
+            elements.append(_Element(attributes.get("name", ""), parser.CurrentByteIndex))
+        elif path[1:] == ["joint", "origin"] and elements[-1].origin is None:
+            elements[-1].origin = parser.CurrentByteIndex
 
     def end(_: str) -> None:
         path.pop()
@@ -138,7 +138,7 @@ def _joint_elements(content: bytes) -> list[_Element]:
         parser.Parse(content, True)
     except expat.ExpatError as error:
         raise RobotError.of(f"the URDF is not well-formed XML ({error})", fix="pass a URDF file") from error
-    return found
+    return elements
 
 
 def _origin_edits(content: bytes, joint: _Element, origin: Tensor) -> Iterator[tuple[slice, bytes]]:
@@ -167,9 +167,9 @@ def _attributes(content: bytes, start: int, tag: bytes) -> tuple[dict[bytes, sli
         what = f"the <{tag.decode()}> tags of the URDF cannot be found in its text"
         raise RobotError.of(what, fix="save the file in UTF-8, without entities, and pass it: `robot`, or --robot URDF")
     places = {}
-    while found := ATTRIBUTE.match(content, stop):
-        places[found[1]] = slice(found.start(2) + 1, found.end(2) - 1)
-        stop = found.end()
+    while match := ATTRIBUTE.match(content, stop):
+        places[match[1]] = slice(match.start(2) + 1, match.end(2) - 1)
+        stop = match.end()
     return places, stop
 
 
@@ -241,8 +241,8 @@ def mjcf_text(geometry: Geometry) -> str:
         turn = rotation_numbers(placed[None, :3, :3], "quat_wxyz", angle="rad")[0]
         place = {"pos": _text(placed[:3, 3]), "quat": _text(turn)}
         bodies[number] = body = etree.SubElement(bodies[parent], "body", name=link, **place)
-        if inertial is not None and (found := _inertial(link, inertial)):
-            etree.SubElement(body, "inertial", **found)
+        if inertial is not None and (inertia := _inertial(link, inertial)):
+            etree.SubElement(body, "inertial", **inertia)
         if joint.kind != "fixed":
             etree.SubElement(body, "joint", name=joint.name, **_motion(joint))
     for tip in chain.tips:
@@ -261,10 +261,10 @@ def mjcf_text(geometry: Geometry) -> str:
 
 def _motion(joint: Joint) -> dict[str, str]:
     """A joint's kind, axis and, where it has both, limits."""
-    found = {"type": "slide" if joint.kind == "prismatic" else "hinge", "axis": _text(joint.axis)}
+    attributes = {"type": "slide" if joint.kind == "prismatic" else "hinge", "axis": _text(joint.axis)}
     if isfinite(joint.lower) and isfinite(joint.upper) and joint.kind != "continuous" and joint.lower < joint.upper:
-        found["range"] = f"{joint.lower!r} {joint.upper!r}"
-    return found
+        attributes["range"] = f"{joint.lower!r} {joint.upper!r}"
+    return attributes
 
 
 def _links(chain: Tree) -> dict[str, tuple[str, Any]]:

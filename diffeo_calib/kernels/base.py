@@ -145,14 +145,14 @@ class Kernel(ABC):
         x = torch.linspace(-0.5, 0.7, PROBE_POINTS * dim, dtype=torch.float64, device=HOST).sin().view(-1, dim)
         expected = f"a symmetric positive semi-definite float64 matrix ({len(x) * dim}, {len(x) * dim})"
         try:
-            found = self.to(x.device).matrix(x, x).detach()
-            got = f"shape {tuple(found.shape)}, {found.dtype}"
-            good = found.shape == (len(x) * dim, len(x) * dim) and found.dtype == torch.float64
+            values = self.to(x.device).matrix(x, x).detach()
+            got = f"shape {tuple(values.shape)}, {values.dtype}"
+            good = values.shape == (len(x) * dim, len(x) * dim) and values.dtype == torch.float64
         except (RuntimeError, ValueError, IndexError, TypeError, AttributeError) as error:
-            found, got, good = x, f"the error {error}", False
+            values, got, good = x, f"the error {error}", False
         if good:
-            level = ROUNDING_RATIO * float(found.abs().max().clamp(min=1e-300))
-            skew, least = float((found - found.T).abs().max()), float(torch.linalg.eigvalsh(found).min())
+            level = ROUNDING_RATIO * float(values.abs().max().clamp(min=1e-300))
+            skew, least = float((values - values.T).abs().max()), float(torch.linalg.eigvalsh(values).min())
             good = skew <= level and least >= -level
             got = f"an asymmetry of {skew:.1e}, a smallest eigenvalue of {least:.1e}"
         if not good:
@@ -282,7 +282,7 @@ class SumKernel(Kernel):
 
     def rescaled(self, logs: Tensor) -> SumKernel:
         each = logs.split([term.scales for term in self.terms])
-        return SumKernel([term.rescaled(own) for term, own in zip(self.terms, each, strict=True)])
+        return SumKernel([term.rescaled(factors) for term, factors in zip(self.terms, each, strict=True)])
 
     def check(self, dim: int, name: str) -> None:
         for term in self.terms:
@@ -293,8 +293,8 @@ class SumKernel(Kernel):
 
     def gram(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor) -> Tensor:
         diagonals = [term.diagonal_components(x, y) for term in self.terms]
-        parts = [t.gram(x, left, y, right) for t, own in zip(self.terms, diagonals, strict=True) if own is None]
-        present = [own for own in diagonals if own is not None]
+        parts = [t.gram(x, left, y, right) for t, d in zip(self.terms, diagonals, strict=True) if d is None]
+        present = [d for d in diagonals if d is not None]
         if present:
             parts.append(component_gram(chain.from_iterable(present), left, right))
         return reduce(torch.add, parts)

@@ -114,8 +114,8 @@ class RadialKernel(Kernel):
     def _with(self, lengthscale: Tensor, variance: Tensor) -> RadialKernel:
         other = copy(self)
         other.lengthscale, other.variance, other._maps = lengthscale, variance, {}
-        for known in ("_fixed_amplitude", "vanishes"):
-            vars(other).pop(known, None)
+        for cached in ("_fixed_amplitude", "vanishes"):
+            vars(other).pop(cached, None)
         return other
 
     def scaled(self, factor: float) -> RadialKernel:
@@ -143,8 +143,8 @@ class RadialKernel(Kernel):
 
     def to_config(self) -> dict[str, Any]:
         """The constructor's arguments as JSON values, the profile by its name, and if it is a user's by some values."""
-        own = {} if type(self.profile) in SHIPPED else {PROBE: probe(self.profile)}
-        return own | {
+        probed = {} if type(self.profile) in SHIPPED else {PROBE: probe(self.profile)}
+        return probed | {
             "profile": self.profile.name,
             "lengthscale": self.lengthscale.tolist(),
             "variance": self.variance.tolist(),

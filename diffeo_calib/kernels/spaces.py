@@ -69,11 +69,11 @@ class FeatureMap:
     @cached_property
     def _sides(self) -> list[tuple[slice | list[int], slice | list[int], int]]:
         """Indices of lines and of circles in the coordinates of x, and in the length scales, and their number."""
-        found = []
+        sides = []
         for wanted in (False, True):
             places = [k for k, circle in enumerate(self.periodic) if circle == wanted]
-            found.append((as_index([self.columns[k] for k in places]), as_index(places), len(places)))
-        return found
+            sides.append((as_index([self.columns[k] for k in places]), as_index(places), len(places)))
+        return sides
 
     def _scales(self) -> Tensor:
         return (1.0 / self.lengthscale).expand(len(self.columns))
@@ -87,15 +87,15 @@ class FeatureMap:
         """The derivative of this order of every feature by its own coordinate: (..., n) -> (..., D)."""
         scales = (self._scales() if self.lengthscale.requires_grad else self._fixed_scales).to(x)
         (lines, of_lines, L), (circles, of_circles, C) = self._sides
-        found: list[Tensor] = []
+        columns: list[Tensor] = []
         if L:
             at, scale = x[..., lines], scales[of_lines]
-            found.append(at * scale if order == 0 else (scale if order == 1 else 0.0 * scale).expand_as(at))
+            columns.append(at * scale if order == 0 else (scale if order == 1 else 0.0 * scale).expand_as(at))
         if C:
             angle, scale = x[..., circles], scales[of_circles]
             cosine, sine = angle.cos() * scale, angle.sin() * scale
-            found += ([cosine, sine], [-sine, cosine], [-cosine, -sine])[order]
-        return _joined(found)
+            columns += ([cosine, sine], [-sine, cosine], [-cosine, -sine])[order]
+        return _joined(columns)
 
     def lift(self, x: Tensor) -> Tensor:
         """F(x): (..., n) -> (..., D)."""

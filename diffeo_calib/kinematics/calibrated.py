@@ -82,8 +82,8 @@ class CalibratedKinematics:
         self.robot, self.map, self.summary, self.lever = robot, map, summary, lever
         self.tool = tool_transform(tool)
         self.tool_tip = None if tool_tip is None else checked_tip(robot, tool_tip)
-        known = rigid_errors is not None
-        self.rigid_errors = replace(self.nominal.geometry, joint_errors=rigid_errors).joint_errors if known else None
+        rigid = rigid_errors is not None
+        self.rigid_errors = replace(self.nominal.geometry, joint_errors=rigid_errors).joint_errors if rigid else None
         self.provenance, self.placement, self.scales, self.learnt = provenance, placement, scales, learnt
         self.ball = ball or map.workspace is not None
 
@@ -122,8 +122,8 @@ class CalibratedKinematics:
         number = number_of(mass)
         if number is None or not 0 <= number < inf:
             raise InputError.of("`mass` of the payload", expected="a number of 0 or more", got=as_written(mass))
-        one = self.nominal.load.weighing(torch.tensor(number, dtype=torch.float64, device=HOST))
-        return self._carrying(one.checked())
+        load = self.nominal.load.weighing(torch.tensor(number, dtype=torch.float64, device=HOST))
+        return self._carrying(load.checked())
 
     def at_payloads(self, masses: Tensor | None) -> CalibratedKinematics:
         """The model at rows, each under its payload: for queries at N configurations, one for each mass (N,).
@@ -137,8 +137,8 @@ class CalibratedKinematics:
         return self._carrying(self.nominal.load.under(masses).checked())
 
     def _carrying(self, load: Payload) -> CalibratedKinematics:
-        known = self.nominal
-        return self if load is known.load else self.changed(map=self.map.with_nominal(known.with_payload(load)))
+        nominal = self.nominal
+        return self if load is nominal.load else self.changed(map=self.map.with_nominal(nominal.with_payload(load)))
 
     def registered(
         self, measurements: Measurements, *, free: str = "both", marker_std: float | None = None, learn: bool = True
@@ -195,8 +195,8 @@ class CalibratedKinematics:
         """Base, joint errors and markers, refined together with the deformations; without gravity sag."""
         nominal = self.nominal
         refined = nominal.geometry.absorb(nominal.split(self.map.deformation.momenta.theta)[0])
-        found = self.registration
-        return refined if found is None else replace(refined, tool=found.markers)
+        registration = self.registration
+        return refined if registration is None else replace(refined, tool=registration.markers)
 
     def turns(self, q: Tensor) -> Tensor:
         """(N, P, 3, 3) turns of the tips that carry the points at (N, n) joint values, by the geometry."""
@@ -248,15 +248,15 @@ class CalibratedKinematics:
 
     def _repr_html_(self) -> str:
         """For notebooks: robot, measurements, errors at the fit and provenance."""
-        robot, made, found = self.robot, self.provenance, self.summary
+        robot, made, summary = self.robot, self.provenance, self.summary
         facts: dict[str, object] = {
             "robot": f"{printable(robot.name)}, {printable(robot.base)} to {printable(robot.tip)}, {robot.n} joints",
             "measured": measured_words(self),
             "rows of the fit": len(self.configurations),
         }
-        if found is not None and found.geometry_rms is not None and found.leave_one_out_rms is not None:
-            facts["geometric calibration, RMS"] = f"{1e3 * found.geometry_rms:.4f} mm on the rows of the fit"
-            facts["calibrated, RMS"] = f"{1e3 * found.leave_one_out_rms:.4f} mm, each row predicted by all others"
+        if summary is not None and summary.geometry_rms is not None and summary.leave_one_out_rms is not None:
+            facts["geometric calibration, RMS"] = f"{1e3 * summary.geometry_rms:.4f} mm on the rows of the fit"
+            facts["calibrated, RMS"] = f"{1e3 * summary.leave_one_out_rms:.4f} mm, each row predicted by all others"
         if self.registration is not None:
             facts["registered anew"] = f"{self.registration.rows} rows, RMS {1e3 * self.registration.rms_after:.4f} mm"
         if made is not None:
@@ -279,9 +279,9 @@ class CalibratedKinematics:
         Raises:
             ImportError: pandas is not installed.
         """
-        found = self.bodies.predicted(self, q)
-        names = [f"{prefix}{name}" for prefix in self.bodies.prefixes(self) for name in found.names]
-        mean, std = found.mean.flatten(1), found.covariance.diagonal(dim1=-2, dim2=-1).sqrt().flatten(1)
+        frame = self.bodies.predicted(self, q)
+        names = [f"{prefix}{name}" for prefix in self.bodies.prefixes(self) for name in frame.names]
+        mean, std = frame.mean.flatten(1), frame.covariance.diagonal(dim1=-2, dim2=-1).sqrt().flatten(1)
         columns = dict(zip([*names, *(f"std_{name}" for name in names)], [*mean.T, *std.T], strict=True))
         return data_frame(columns, getattr(q, "index", None) if is_data_frame(q) else None)
 
@@ -303,10 +303,10 @@ class CalibratedKinematics:
             InputError: wrong shape, or values that are not finite.
         """
         q = self._joints(q)
-        known = self.map.deformation.at_controls(q) if takes_program(q) else None
-        if known is None and (program := program_of(self.map.deformation, q)) is not None:
+        at_rows = self.map.deformation.at_controls(q) if takes_program(q) else None
+        if at_rows is None and (program := program_of(self.map.deformation, q)) is not None:
             return torch.from_numpy(program.points(q.numpy()))
-        return (self.map.deformation(q) if known is None else known).unflatten(1, (-1, 3))
+        return (self.map.deformation(q) if at_rows is None else at_rows).unflatten(1, (-1, 3))
 
     def poses(self, q: object) -> Tensor:
         """Poses of the measured frame in the measuring frame, by a least-squares fit to its three points.
@@ -414,9 +414,9 @@ class CalibratedKinematics:
         return self._tool(tool, frame, tip).predict(self._joints(q).detach())
 
     def _tool(self, tool: object, frame: str, tip: str | None) -> ToolKinematics:
-        own = self.tool if tool is None else tool_transform(tool)
+        transform = self.tool if tool is None else tool_transform(tool)
         fitted = self.map.unregistered if frame == "base" else self.map  # where the device stands does not matter there
-        return ToolKinematics(fitted, self.nominal, own, frame, tip or self.tool_tip)
+        return ToolKinematics(fitted, self.nominal, transform, frame, tip or self.tool_tip)
 
     def inverse(self, points: object, start: object) -> Tensor:
         """Joint configurations that bring the markers to given positions; see :meth:`FittedMap.inverse`.
@@ -435,7 +435,7 @@ class CalibratedKinematics:
 
     def changed(self, **changes: Any) -> CalibratedKinematics:
         """A copy with other values of some of the constructor's arguments."""
-        return CalibratedKinematics(**{name: own for name, own in vars(self).items() if name != "bodies"} | changes)
+        return CalibratedKinematics(**{name: value for name, value in vars(self).items() if name != "bodies"} | changes)
 
     def _joints(self, q: object) -> Tensor:
         return self.robot.joint_values(q)  # pyright: ignore[reportArgumentType]

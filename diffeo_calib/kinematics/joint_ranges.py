@@ -54,10 +54,10 @@ def joints_outside_range(model: Any, q: object) -> Tensor:
 
 def fitted_configurations(model: object) -> Tensor:
     """(N, n) configurations that a model was fitted to."""
-    found = getattr(model, "configurations", None)
-    if not isinstance(found, Tensor):
+    configurations = getattr(model, "configurations", None)
+    if not isinstance(configurations, Tensor):
         raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
-    return found
+    return configurations
 
 
 def repeated_lines(model: Any, q: Tensor) -> list[str]:

@@ -101,8 +101,8 @@ class GeometryMap(NominalMap):
 
     def changed(self, **changes: Any) -> GeometryMap:
         """The same map with other arguments."""
-        own = {"geometry": self.geometry, "own": self.own, "payload": self.load, "rigid": self.rigid}
-        return GeometryMap(elastic=self.elasticity is not None, **own | changes)
+        arguments = {"geometry": self.geometry, "own": self.own, "payload": self.load, "rigid": self.rigid}
+        return GeometryMap(elastic=self.elasticity is not None, **arguments | changes)
 
     def around(self, nominal: GeometryMap) -> GeometryMap:
         """Another nominal map under the payloads of the rows of this one."""
@@ -177,14 +177,14 @@ class GeometryMap(NominalMap):
 
     def along_axis(self, x: Tensor, joint: int) -> Tensor:
         """By theta, what errors of its axis add to the value of an active joint that moves alone, rad or m: (N, K)."""
-        chain, found = self.geometry.chain, x.new_zeros(len(x), self.parameters)
+        chain, slopes = self.geometry.chain, x.new_zeros(len(x), self.parameters)
         moving = chain.moving_names.index(chain.joint_names[joint])
         if self.own.axes and int(chain.coupling[:, joint].count_nonzero()) == 1:
             axes, turns = self._errors_of("axes", x), 3 * int(chain.revolute[moving])
             functions = wave_angles(axes, chain.moving_values(x), torch).cos() * (axes.joints == moving)  # (N, K')
             along = torch.nn.functional.pad(chain.axes[moving], (turns, 3 - turns)).to(x)
-            found[:, self.parts["axes"]] = (functions[..., None] * along).flatten(1)
-        return found
+            slopes[:, self.parts["axes"]] = (functions[..., None] * along).flatten(1)
+        return slopes
 
     def _errors(self, x: Tensor, theta: Tensor) -> Tensor:
         """Error parameters of the geometry: (K,), or (N, K) where the robot deflects or an axis is crooked."""
@@ -246,18 +246,18 @@ class FlangePoints(NominalMap):
 
     def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
         """By the fitted parameters, m/m or m/rad: (N, 3 P', K)."""
-        own, markers = self.map.geometry.slices["tool"], self.fitted.geometry.slices["tool"]
+        of_points, markers = self.map.geometry.slices["tool"], self.fitted.geometry.slices["tool"]
         slopes = self.map.sensitivities(x, self._own(theta))
         if self.same:
             return slopes
         unmoved = slopes.new_zeros(*slopes.shape[:2], markers.stop - markers.start)
-        return torch.cat([slopes[..., : own.start], unmoved, slopes[..., own.stop :]], dim=-1)
+        return torch.cat([slopes[..., : of_points.start], unmoved, slopes[..., of_points.stop :]], dim=-1)
 
     def rows(self, index: Tensor | slice) -> FlangePoints:
         """The map at some of the rows whose payloads it knows."""
         some = self.fitted.rows(index)
-        own = self.map.geometry
-        return self if some is self.fitted else FlangePoints(some, self.points, same=self.same, on=own.on)
+        geometry = self.map.geometry
+        return self if some is self.fitted else FlangePoints(some, self.points, same=self.same, on=geometry.on)
 
     def shifts(self, x: Tensor, theta: Tensor) -> Tensor:
         """By shifts of the points in the tip's frame, m/m: (N, 3 P', 3 P')."""
@@ -306,6 +306,6 @@ class SessionMarkers(NominalMap):
 
     def _by_session(self, of: Callable[[GeometryMap, Tensor], Tensor]) -> Tensor:
         rows = [(self.session.cpu() == number).nonzero()[:, 0] for number in range(len(self.maps))]
-        parts = [of(nominal.rows(own), own) for nominal, own in zip(self.maps, rows, strict=True) if len(own)]
+        parts = [of(nominal.rows(index), index) for nominal, index in zip(self.maps, rows, strict=True) if len(index)]
         together = torch.cat(parts)
         return together[torch.cat(rows).argsort().to(together.device)]

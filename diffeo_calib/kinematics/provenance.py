@@ -128,8 +128,8 @@ class Summary:
 
     def to_dict(self) -> dict[str, Any]:
         """Entries named with their units, as model files hold them, of what is known; the parts are the last ones."""
-        known = {name: value for name, value in entries_of(self, "parts").items() if value is not None}
-        return known | {f"{part}{LENGTH_UNIT}": displacement for part, displacement in self.parts.items()}
+        given = {name: value for name, value in entries_of(self, "parts").items() if value is not None}
+        return given | {f"{part}{LENGTH_UNIT}": displacement for part, displacement in self.parts.items()}
 
     @classmethod
     def from_dict(cls, entries: Mapping[str, Any], *, positions: bool = True) -> Summary:
@@ -141,11 +141,11 @@ class Summary:
         Raises:
             TypeError: an entry is missing or unknown, or its value has another type.
         """
-        own = {one.metadata.get("name", one.name) for one in fields(cls)}
-        others = [name for name in entries if name not in own and name.endswith(LENGTH_UNIT)]
+        names = {f.metadata.get("name", f.name) for f in fields(cls)}
+        others = [name for name in entries if name not in names and name.endswith(LENGTH_UNIT)]
         parts = {name.removesuffix(LENGTH_UNIT): _read(entries[name], float, name) for name in others}
-        found = record_of(cls, {k: v for k, v in entries.items() if k not in others}, parts=parts)
-        return found if positions else replace(found, **dict.fromkeys(OF_POSITIONS))
+        record = record_of(cls, {k: v for k, v in entries.items() if k not in others}, parts=parts)
+        return record if positions else replace(record, **dict.fromkeys(OF_POSITIONS))
 
 
 OF_POSITIONS = ("registration_rms", "geometry_rms", "diffeomorphic_rms", "leave_one_out_rms")
@@ -158,7 +158,7 @@ Record = TypeVar("Record")
 
 def entries_of(record: Any, *without: str) -> dict[str, Any]:
     """The fields of a dataclass, or some of them, under their names in files."""
-    named = {one.metadata.get("name", one.name): getattr(record, one.name) for one in fields(record)}
+    named = {f.metadata.get("name", f.name): getattr(record, f.name) for f in fields(record)}
     plain = {name: INFINITE if value == inf else value for name, value in named.items() if name not in without}
     return {name: list(value) if isinstance(value, tuple) else value for name, value in plain.items()}
 
@@ -169,15 +169,15 @@ def record_of(kind: type[Record], entries: Mapping[str, Any], **given: Any) -> R
     Raises:
         TypeError: an entry is missing or unknown, or its value has another type than the field.
     """
-    known: dict[str, str] = {one.metadata.get("name", one.name): one.name for one in fields(kind)}  # pyright: ignore[reportArgumentType]
-    hints, values = get_type_hints(kind), {known.get(name, name): value for name, value in entries.items()}
+    names: dict[str, str] = {f.metadata.get("name", f.name): f.name for f in fields(kind)}  # pyright: ignore[reportArgumentType]
+    hints, values = get_type_hints(kind), {names.get(name, name): value for name, value in entries.items()}
     return kind(**{name: _read(value, hints.get(name, object), name) for name, value in values.items()}, **given)
 
 
 def _read(value: Any, hint: Any, name: str) -> Any:
     """A value of a file as its type says: a float, an int, text, true or false, a tuple of these, or None."""
     if get_origin(hint) is tuple and isinstance(value, list):
-        return tuple(_read(one, get_args(hint)[0], name) for one in value)
+        return tuple(_read(entry, get_args(hint)[0], name) for entry in value)
     kinds = get_args(hint) or (hint,)
     if value == INFINITE and float in kinds:
         return inf

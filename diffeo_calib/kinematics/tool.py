@@ -28,7 +28,8 @@ from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
 from diffeo_calib.kinematics.registered_map import marker_slopes
 from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.maps.geodesic import GeodesicDeformation
-from diffeo_calib.measurements.poses import mark_points, marks, pose_directions, poses_from_marks, rigid_poses
+from diffeo_calib.measurements.poses import mark_points, marks, pose_directions, poses_from_marks
+from diffeo_calib.robots.se3 import rigid_poses
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime import program
 from diffeo_calib.runtime.arrays import Array
@@ -71,15 +72,15 @@ class ToolKinematics:
     def poses(self, q: Tensor) -> Tensor:
         """(N, n) rad or m -> (N, 4, 4) m; detached outside of torch.func transforms."""
         q = q if wrapped(q) else q.detach()
-        if (known := self._program_for(q)) is not None:
-            return torch.from_numpy(known.poses(q.numpy(), self.tool.numpy(), self.frame))
+        if (constants := self._program_for(q)) is not None:
+            return torch.from_numpy(constants.poses(q.numpy(), self.tool.numpy(), self.frame))
         return self._in_frame(poses_from_marks(self.deformation(q).unflatten(1, (3, 3)), TOOL_LEVER))
 
     def jacobian(self, q: Tensor) -> Tensor:
         """(N, 6, n): linear velocity of the TCP [m/rad or m/m], then angular velocity, about the axes of the frame."""
         q = q if wrapped(q) else q.detach()
-        if (known := self._program_for(q)) is not None:
-            return torch.from_numpy(known.poses_and_jacobian(q.numpy(), self.tool.numpy(), self.frame)[1])
+        if (constants := self._program_for(q)) is not None:
+            return torch.from_numpy(constants.poses_and_jacobian(q.numpy(), self.tool.numpy(), self.frame)[1])
         points, slopes = (t.unflatten(1, (3, 3)) for t in (self.deformation(q), self.deformation.jacobian(q)))
         return self._turned() @ pose_slopes(points, slopes)
 
@@ -94,15 +95,15 @@ class ToolKinematics:
         held = self.nominal.geometry.slices["base"] if without_base else slice(0)
         for rows in q.detach().split(PREDICT_ROWS):
             points, at = self.fitted.linearised_value(rows, self.deformation, held)
-            seen = poses_from_marks(points.unflatten(1, (3, 3)), TOOL_LEVER)
-            poses.append(self._in_frame(seen))
-            blocks.append(self.fitted.covariance(at, turn @ pose_directions(seen, TOOL_LEVER)))
+            nearest = poses_from_marks(points.unflatten(1, (3, 3)), TOOL_LEVER)
+            poses.append(self._in_frame(nearest))
+            blocks.append(self.fitted.covariance(at, turn @ pose_directions(nearest, TOOL_LEVER)))
         return torch.cat(poses), torch.cat(blocks)
 
     def _program_for(self, q: Tensor) -> Program | None:
         """The constants that answer a query; None where torch must."""
-        known = program_of(self.fitted.deformation, q)
-        return None if known is None else known.at(self.tip)
+        constants = program_of(self.fitted.deformation, q)
+        return None if constants is None else constants.at(self.tip)
 
     def _in_frame(self, poses: Tensor) -> Tensor:
         return poses if self.frame == "measuring" else torch.linalg.inv(self.base.to(poses.device)) @ poses
@@ -169,21 +170,21 @@ def covariance_without_placement(model: Any, q: Tensor, tool: Tensor, tip: str |
     """
     fitted = model.map.unregistered
     kinematics = ToolKinematics(fitted, model.nominal, tool, "measuring", tip or model.tool_tip)
-    known = model.configurations
-    every = torch.linspace(0, len(known) - 1, min(len(known), REFERENCE_ROWS), dtype=torch.float64, device=known.device)
-    rows = torch.cat([known[every.round().long()], q.detach()])
+    x_fit = model.configurations
+    every = torch.linspace(0, len(x_fit) - 1, min(len(x_fit), REFERENCE_ROWS), dtype=torch.float64, device=x_fit.device)
+    rows = torch.cat([x_fit[every.round().long()], q.detach()])
     points, at = kinematics.deformation.linearised_value(rows)
-    covariance = fitted.conditional.covariance_between(at)  # open directions are those of both motions
+    covariance = fitted.covariance_between(at)  # open directions are those of both motions
     points = points.unflatten(1, (3, 3))
-    base, own = frame_slopes(points, points.mean((0, 1))), tool_points(tool).to(points)  # a motion of the base moves
-    flange = FlangePoints(kinematics.nominal, own, on=(kinematics.tip,) * 3)  # the points, one of the tool these
-    by_place = marker_slopes(kinematics.deformation, flange, at) @ frame_slopes(own[None], own.mean(0))[0]
+    base, spread = frame_slopes(points, points.mean((0, 1))), tool_points(tool).to(points)  # a motion of the base moves
+    flange = FlangePoints(kinematics.nominal, spread, on=(kinematics.tip,) * 3)  # the points, one of the tool these
+    by_place = marker_slopes(kinematics.deformation, flange, at) @ frame_slopes(spread[None], spread.mean(0))[0]
     motions = torch.cat([base, by_place], 2).flatten(0, 1)  # (9 (R + M), 12)
     reference, asked = motions.split([9 * len(every), 9 * len(q)])
-    eye = torch.eye(len(asked), dtype=own.dtype, device=own.device)
+    eye = torch.eye(len(asked), dtype=spread.dtype, device=spread.device)
     rest = torch.cat([-asked @ torch.linalg.pinv(reference, rtol=SMALLEST_MOTION), eye], 1)
-    seen = poses_from_marks(points[len(every) :], TOOL_LEVER)
-    rest = pose_directions(seen, TOOL_LEVER) @ rest.unflatten(0, (-1, 9))  # (M, 6, 9 (R + M))
+    nearest = poses_from_marks(points[len(every) :], TOOL_LEVER)
+    rest = pose_directions(nearest, TOOL_LEVER) @ rest.unflatten(0, (-1, 9))  # (M, 6, 9 (R + M))
     return rest @ covariance @ rest.mT
 
 

@@ -30,11 +30,11 @@ def smooth_transmission(deformation: Deformation, robot: Tree, joint: str, value
     """The same without gear lines, for pictures whose points lie too far apart for them."""
     x, index = _configurations(robot, joint, values)
     terms = deformation.spec.joint_kernel.terms
-    own = [t for t in terms if isinstance(t, RadialKernel) and t.columns == (index,) and t.output == index]
-    fields = (term.field(x, deformation.x, deformation.momenta.joint)[:, index] for term in own)
-    nominal, found = deformation.spec.nominal, sum(fields, torch.zeros_like(x[:, index]))
+    of_joint = [t for t in terms if isinstance(t, RadialKernel) and t.columns == (index,) and t.output == index]
+    fields = (term.field(x, deformation.x, deformation.momenta.joint)[:, index] for term in of_joint)
+    nominal, error = deformation.spec.nominal, sum(fields, torch.zeros_like(x[:, index]))
     theta = deformation.momenta.theta
-    return found + nominal.along_axis(x, index) @ theta if isinstance(nominal, GeometryMap) else found
+    return error + nominal.along_axis(x, index) @ theta if isinstance(nominal, GeometryMap) else error
 
 
 def _configurations(robot: Tree, joint: str, values: object) -> tuple[Tensor, int]:
@@ -90,10 +90,10 @@ def gear_lines(model: Any) -> tuple[NamedGearLine, ...]:
     sensitivities, coefficients = nominal.sensitivities(model.configurations, theta)[..., part], theta[part].view(-1, 2)
     effects = (sensitivities * coefficients.flatten()).unflatten(-1, (-1, 2)).sum(-1)  # (N, 3 P, K)
     moved = effects.unflatten(1, (-1, 3)).square().sum(2).mean((0, 1)).sqrt().tolist()
-    found = []
+    lines = []
     for k, (joint, frequency) in enumerate(waves):
         C, S = coefficients[k].tolist()
-        others = [m for m in MULTIPLES if any(abs(frequency / m - one) <= SAME_RATIO for _, one in waves)]
+        others = [m for m in MULTIPLES if any(abs(frequency / m - other) <= SAME_RATIO for _, other in waves)]
         what = model.robot.joint_names[joint], frequency, hypot(C, S), atan2(S, C), [*others, 1][0]
-        found.append(NamedGearLine(*what, moved[k]))
-    return tuple(sorted(found, key=lambda line: -line.displacement))
+        lines.append(NamedGearLine(*what, moved[k]))
+    return tuple(sorted(lines, key=lambda line: -line.displacement))

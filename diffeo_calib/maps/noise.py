@@ -79,8 +79,8 @@ class Noise:
     @property
     def visible(self) -> Tensor:
         """(N, m) boolean: the coordinates that were measured; all of them in units so small that none would be."""
-        seen = measured_coordinates(self.covariance)
-        return seen if bool(seen.any()) else ~seen
+        measured = measured_coordinates(self.covariance)
+        return measured if bool(measured.any()) else ~measured
 
     @property
     def mean(self) -> Tensor:

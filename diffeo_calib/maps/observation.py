@@ -153,9 +153,9 @@ class Part:
         """The part of some of ``count`` rows, (K,); None if it has none of them."""
         place = torch.full((count,), -1, dtype=torch.int64, device=index.device)
         place[self.rows] = torch.arange(len(self.rows), device=index.device)
-        own = place[index]
-        kept = (own >= 0).nonzero()[:, 0]
-        return replace(self, rows=kept, observe=self.observe.rows(own[kept])) if len(kept) else None
+        numbers = place[index]
+        kept = (numbers >= 0).nonzero()[:, 0]
+        return replace(self, rows=kept, observe=self.observe.rows(numbers[kept])) if len(kept) else None
 
     def to(self, device: torch.device | str) -> Part:
         """The same part on a device."""
@@ -189,10 +189,10 @@ class Stacked(Observation):
         return Stacked(self.count, self.size, self.dim, [part.to(device) for part in self.parts])
 
     def value(self, points: Tensor) -> Tensor:
-        found = points.new_zeros(len(points), self.size)
+        values = points.new_zeros(len(points), self.size)
         for part in self.parts:
-            found[part.rows[:, None], part.numbers] = part.observe.value(part.seen(points))
-        return found
+            values[part.rows[:, None], part.numbers] = part.observe.value(part.seen(points))
+        return values
 
     def places(self, points: Tensor) -> Tensor:
         found = points.clone()
@@ -201,11 +201,11 @@ class Stacked(Observation):
         return found
 
     def slope(self, points: Tensor) -> Tensor:
-        found = points.new_zeros(len(points), self.size, self.dim)
+        slopes = points.new_zeros(len(points), self.size, self.dim)
         for part in self.parts:
             rows = part.rows[:, None, None]
-            found[rows, part.numbers[:, None], part.points] = part.observe.slope(part.seen(points))
-        return found
+            slopes[rows, part.numbers[:, None], part.points] = part.observe.slope(part.seen(points))
+        return slopes
 
 
 def observed_dim(observe: object, y: Tensor, markers: int) -> int:

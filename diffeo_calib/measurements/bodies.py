@@ -40,6 +40,11 @@ class Predicted(NamedTuple):
         """(N, B, 3, 3) covariances of the origins, m^2."""
         return self.covariance[..., :3, :3]
 
+    @property
+    def claimed(self) -> Tensor:
+        """(N, B) RMS distances of the origins, m."""
+        return self.places.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+
 
 @dataclass(frozen=True)
 class Bodies:

@@ -276,10 +276,10 @@ class EulerianProblem(Problem):
         Raises:
             InputError: an unknown switch, or fewer control points than data.
         """
-        known = list(Eulerian.__dataclass_fields__)
-        unknown = [name for name in switches if name not in known]
+        names = list(Eulerian.__dataclass_fields__)
+        unknown = [name for name in switches if name not in names]
         if unknown:
-            expected = f"{', '.join(known)} of the Eulerian formulation"
+            expected = f"{', '.join(names)} of the Eulerian formulation"
             raise InputError.of("keywords of `fit`", expected=expected, got=", ".join(unknown))
         return cls(exact, Eulerian(**switches))  # pyright: ignore[reportArgumentType]
 
@@ -298,8 +298,8 @@ class EulerianProblem(Problem):
 
     @cached_property
     def _factor(self) -> Process:
-        known = self._conditional
-        return known if isinstance(known, Process) else self.exact.preconditioner(self.exact.zero(), RK4(1))
+        conditional = self._conditional
+        return conditional if isinstance(conditional, Process) else self.exact.preconditioner(self.exact.zero(), RK4(1))
 
     @cached_property
     def _conditional(self) -> Process | ConjugateGradientRegression:
@@ -314,13 +314,13 @@ class EulerianProblem(Problem):
             end = deformation.end_momenta.view_as(self.y)  # P_1
             miss = self.y - deformation.z1 - self.noise.multiply(end[:, :, None])[:, :, 0]
             change = self.unknowns(self._conditional.momenta(miss))
-            step, found = 1.0, None
-            while found is None and step >= SHORTEST_SHOT:
+            step, better = 1.0, None
+            while better is None and step >= SHORTEST_SHOT:
                 trial = at.unflatten(at.flatten() + step * change.flatten())
-                found, evaluations, step = self._better(trial, integrator, best), evaluations + 1, 0.5 * step
-            if found is None:
+                better, evaluations, step = self._better(trial, integrator, best), evaluations + 1, 0.5 * step
+            if better is None:
                 break
-            at, (deformation, best) = trial, found
+            at, (deformation, best) = trial, better
         return at, evaluations
 
     def _better(self, at: Momenta, integrator: Integrator, best: float) -> tuple[EulerianDeformation, float] | None:

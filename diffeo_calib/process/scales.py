@@ -112,8 +112,8 @@ class Hyperparameters:
         """K_V on the joint space: diag_l a_l^2 k_l + c_l^2 k_all."""
         lengthscale, variance = self.coupled_lengthscale, self.coupled_amplitude**2
         coupled = RadialKernel(COUPLED_PROFILE, lengthscale=lengthscale, variance=variance, periodic=space.periodic)
-        own = self.transmission_lengthscale, self.transmission_amplitude**2
-        return PerJoint(*own, space, TRANSMISSION_PROFILE) + coupled
+        smooth = self.transmission_lengthscale, self.transmission_amplitude**2
+        return PerJoint(*smooth, space, TRANSMISSION_PROFILE) + coupled
 
     def task_kernel(self) -> Kernel:
         """K_W on R^3."""
@@ -131,8 +131,8 @@ class Hyperparameters:
         places = twist.new_full((6 + 3 * geometry.markers,), place_deviation)
         deviations = torch.cat([places[:6], twist.repeat(geometry.chain.moving), places[6:]])
         if elasticity is not None:
-            own, lateral = self.compliance[elasticity.joints], self.lateral_compliance[elasticity.joints]
-            elastic = torch.where(elasticity.own, own, lateral) * self.gravity[elasticity.components]
+            axial, lateral = self.compliance[elasticity.joints], self.lateral_compliance[elasticity.joints]
+            elastic = torch.where(elasticity.own, axial, lateral) * self.gravity[elasticity.components]
             elastic = torch.where(elasticity.loaded, self.payload * elastic, elastic)
             deviations = torch.cat([deviations, elastic])
         lines = [line.amplitude for line in self.lines for _ in range(2)]
@@ -150,12 +150,9 @@ class Hyperparameters:
         """
         level = NEGLIGIBLE_DISPLACEMENT * float(noise.diagonal(dim1=-2, dim2=-1).mean().sqrt())
         lever = jacobian.square().mean((0, 1)).sqrt()
-        transmission, coupled = (
-            torch.where(amplitude * lever < level, 0.0, amplitude)
-            for amplitude in (self.transmission_amplitude, self.coupled_amplitude)
-        )
-        task = torch.where(self.task_amplitude < level, 0.0, self.task_amplitude)
-        return replace(self, transmission_amplitude=transmission, coupled_amplitude=coupled, task_amplitude=task)
+        sizes = {"transmission_amplitude": lever, "coupled_amplitude": lever, "task_amplitude": 1.0}
+        found = {name: (getattr(self, name), size) for name, size in sizes.items()}
+        return replace(self, **{name: torch.where(own * size < level, 0.0, own) for name, (own, size) in found.items()})
 
     def inflated(self, factor: float) -> Hyperparameters:
         """All standard deviations times a factor: the same fit (up to known covariances), larger uncertainty."""
@@ -183,11 +180,6 @@ class Hyperparameters:
         """All scales that any measurements have as one vector, without gear lines, as model files hold them."""
         return torch.cat([getattr(self, name).reshape(-1) for name in SCALES])
 
-    def with_vector(self, vector: Tensor) -> Hyperparameters:
-        """The inverse of :attr:`vector`, shaped like this object; scales that only some have are kept."""
-        parts = torch.split(vector, [getattr(self, name).numel() for name in SCALES])
-        return replace(self, **{k: v.reshape(getattr(self, k).shape) for k, v in zip(SCALES, parts, strict=True)})
-
     def amplitudes(self) -> Tensor:
         """Which entries of the vector of logarithms may shrink to zero: boolean."""
         scales = [(name in AMPLITUDES, getattr(self, name).reshape(-1)) for name in self.searched]
@@ -196,6 +188,8 @@ class Hyperparameters:
 
 DEVIATIONS_OF_SOME = "axis_errors", "other_noise"
 SCALES_OF_SOME = (*DEVIATIONS_OF_SOME, "axis_lengthscale")
+PAYLOAD_FACTORS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
+"""Candidates of :attr:`Hyperparameters.payload`."""
 FOUND = "lines", "payload", "axes", "axis_errors", "axis_lengthscale"
 """Names of what is found beside other scales, before these are searched again."""
 SCALES = tuple(one.name for one in fields(Hyperparameters) if one.name not in (*FOUND, *SCALES_OF_SOME))
@@ -266,10 +260,10 @@ class Pairs:
 
     def values(self, scales: Hyperparameters) -> tuple[KernelValues, KernelValues]:
         """K_V, diagonal (n, N, N), at all pairs of configurations, and kappa (1, N P, N P) of K_W = kappa I."""
-        own = Term(TRANSMISSION_PROFILE, scales.transmission_amplitude, scales.transmission_lengthscale)
+        term = Term(TRANSMISSION_PROFILE, scales.transmission_amplitude, scales.transmission_lengthscale)
         coupled = Term(COUPLED_PROFILE, scales.coupled_amplitude, scales.coupled_lengthscale, joined=True)
         task = Term(TASK_PROFILE, scales.task_amplitude.reshape(1), scales.task_lengthscale.reshape(1))
-        return KernelValues(self._joints, own, coupled), KernelValues(self._points[None], task)
+        return KernelValues(self._joints, term, coupled), KernelValues(self._points[None], task)
 
     def matrix(self, values: tuple[KernelValues, KernelValues]) -> Tensor:
         """(N R, N R), without a graph."""

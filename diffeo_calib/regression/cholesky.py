@@ -81,8 +81,8 @@ class Factor:
         start, M, parts = len(sooner), len(self.first), [sooner]
         for n, rows in ((start, self.first[start:]), (max(start, M), self.added[max(start - M, 0) :])):
             if len(rows):
-                known = torch.cat(parts) if len(parts) > 1 else sooner
-                right = values[: len(rows)] - rows[:, :n] @ known
+                sooner_rows = torch.cat(parts) if len(parts) > 1 else sooner
+                right = values[: len(rows)] - rows[:, :n] @ sooner_rows
                 parts.append(torch.linalg.solve_triangular(rows[:, n:], right, upper=False))
                 values = values[len(rows) :]
         return torch.cat(parts[1:])
@@ -100,6 +100,11 @@ class Factor:
         Y = torch.linalg.solve_triangular(root, V.T, upper=False)
         vars(other)["inverse"] = self.inverse.addmm(Y.T, Y, alpha=-1.0)
         return other
+
+    def with_features(self, columns: Tensor, H: Tensor) -> Factor:
+        """The factor with other features (M, k) in some of its columns (k,)."""
+        W = self.W.index_copy(1, columns, self.white(H))
+        return Factor(self.first, W, W.T @ W, self.added)
 
     @property
     def matrix(self) -> Tensor:

@@ -61,21 +61,21 @@ class Features:
         """Features of some configurations (B,)."""
         M, parts = len(self.at.sensitivity), (self.known, self.unknown, vars(self).get("mixed", self.unknown))
         known, unknown, mixed = (part.unflatten(1, (M, -1))[:, index].flatten(1) for part in parts)
-        found = Features(self.at.rows(index), known, unknown)
-        vars(found)["mixed"] = mixed
+        chosen = Features(self.at.rows(index), known, unknown)
+        vars(chosen)["mixed"] = mixed
         if "by_fields" in vars(self):
             by_fields = self.by_fields.unflatten(0, (M, -1))[index].flatten(0, 1)
-            vars(found)["by_fields"] = by_fields.unflatten(1, (M, -1))[:, index].flatten(1)
-        return found
+            vars(chosen)["by_fields"] = by_fields.unflatten(1, (M, -1))[:, index].flatten(1)
+        return chosen
 
     def followed_by(self, other: Features, cross: Tensor) -> Features:
         """Features of these configurations and others by the same process; ``cross``: :meth:`by_fields_with` them."""
-        parts = [(one.known, one.unknown, vars(one)["mixed"]) for one in (self, other)]
+        parts = [(part.known, part.unknown, vars(part)["mixed"]) for part in (self, other)]
         known, unknown, mixed = (torch.cat(both, 1) for both in zip(*parts, strict=True))
-        found = Features(Linearisation.joined([self.at, other.at]), known, unknown)
+        joined = Features(Linearisation.joined([self.at, other.at]), known, unknown)
         by_fields = torch.cat([torch.cat([self.by_fields, cross], 1), torch.cat([cross.T, other.by_fields], 1)])
-        vars(found).update(mixed=mixed, by_fields=by_fields)
-        return found
+        vars(joined).update(mixed=mixed, by_fields=by_fields)
+        return joined
 
     def blocks(self) -> Tensor:
         """Covariance of every configuration of a projected linearisation with itself: (M, r, r)."""
@@ -175,9 +175,9 @@ class Opened(Conditional):
         self.before, self.size, self.first, self.deviations = before, before.size, first, deviations
 
     def features(self, at: Linearisation) -> Features:
-        found = self.before.features(at)
+        features = self.before.features(at)
         opened = of_parameters(at, self.first + len(self.deviations))[..., self.first :] * self.deviations
-        return found.beside(found.known[:0], opened.flatten(0, 1).T)
+        return features.beside(features.known[:0], opened.flatten(0, 1).T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,6 +226,10 @@ class Process(Conditional):
         E = E / E.norm(dim=0).clamp(min=torch.finfo(E.dtype).tiny) if size is None else size * E
         return replace(self, factor=self.factor.beside(E))
 
+    def with_effects(self, unknowns: Tensor, E: Tensor) -> Process:
+        """The same rows with other effects (M, U) of some unknowns (U,) on them, in units of their prior deviations."""
+        return replace(self, factor=self.factor.with_features(unknowns, E))
+
     def features(self, at: Linearisation, sooner: Features | None = None, cross: Tensor | None = None) -> Features:
         """Features of a linearisation.
 
@@ -233,24 +237,24 @@ class Process(Conditional):
             sooner: the same by the first of these rows alone. cross: covariance of the numbers of the others with it by
                 the fields, given the first ones, see :meth:`Features.by_fields_with`; computed by default.
         """
-        found = self.before.features(at) if sooner is None else sooner
-        k, mixed = self.known.shape[1], found.unknown
+        before = self.before.features(at) if sooner is None else sooner
+        k, mixed = self.known.shape[1], before.unknown
         if sooner is not None:
             mixed = vars(sooner)["mixed"]
-        if (n := len(found.known) - k) == len(self.alpha):
-            return found
+        if (n := len(before.known) - k) == len(self.alpha):
+            return before
         if cross is None:
-            cross = self.numbers.gram(at, n).addmm_(self.known[n:], found.known[:k], alpha=-1.0)
+            cross = self.numbers.gram(at, n).addmm_(self.known[n:], before.known[:k], alpha=-1.0)
             with large_work(cross.numel()):
-                more = self.factor.further(cross, found.known[k:])
+                more = self.factor.further(cross, before.known[k:])
         else:
             more = torch.linalg.solve_triangular(self.factor.below(n), cross, upper=False)
         mixed = mixed - self.factor.W[n:].T @ more
         unknown = torch.linalg.solve_triangular(self.factor.B, mixed, upper=False)
-        new = Features(at, torch.cat([found.known, more]), unknown)
+        new = Features(at, torch.cat([before.known, more]), unknown)
         vars(new)["mixed"] = mixed  # D before the factor of the unknowns, to which later rows add theirs
-        if "by_fields" in vars(found):
-            vars(new)["by_fields"] = found.by_fields.addmm(more.T, more, alpha=-1.0)
+        if "by_fields" in vars(before):
+            vars(new)["by_fields"] = before.by_fields.addmm(more.T, more, alpha=-1.0)
         return new
 
     def mean(self, at: Features) -> Tensor:
@@ -294,8 +298,8 @@ class Process(Conditional):
 
     def _momenta(self, mu: Tensor, shift: Tensor) -> Momenta:
         """With parameters apart, since S^T mu would lose their digits; ``shift``: (K, 1) P^-1/2 u."""
-        found = self.numbers.at.fields.momenta(self.numbers.in_table(mu))
-        return replace(found, theta=self._parameters(shift))
+        momenta = self.numbers.at.fields.momenta(self.numbers.in_table(mu))
+        return replace(momenta, theta=self._parameters(shift))
 
     def _parameters(self, shift: Tensor) -> Tensor:
         variance = self.numbers.at.spec.prior_variance
@@ -322,6 +326,12 @@ class Process(Conditional):
             errors[at] = (block @ self.mu[at][:, :, None])[:, :, 0]
             covariance[at[:, :, None], at[:, None]] = block
         return errors, covariance
+
+    def rows_left_out(self, group: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """The same by row, errors (N, R) and covariances (N, R, R); group: (N,), by default each by itself."""
+        owner = self.numbers.owner
+        errors, covariance = self.left_out(owner if group is None else group[owner])
+        return self.numbers.in_table(errors), self.numbers.blocks(covariance)
 
 
 class Estimated(Conditional):
@@ -357,11 +367,11 @@ class Estimated(Conditional):
         return of_parameters(at, max(self.columns) + 1)[..., self.columns].flatten(0, 1)
 
     def features(self, at: Linearisation) -> Features:
-        found = self.before.features(at)
+        features = self.before.features(at)
         fields = self.gain @ self.reference.at.fields.gram(at.fields)
         known, unknown = (self.gain @ part.T for part in (self.reference.known, self.reference.unknown))
-        g = self._to_white @ (fields - known @ found.known + unknown @ found.unknown)
-        return found.beside(g, self.root.T @ self.slopes(at).T - g)
+        g = self._to_white @ (fields - known @ features.known + unknown @ features.unknown)
+        return features.beside(g, self.root.T @ self.slopes(at).T - g)
 
 
 def without_rigid_motions(before: Conditional, reference: Linearisation, base: Sequence[int]) -> Estimated:

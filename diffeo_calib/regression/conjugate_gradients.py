@@ -100,9 +100,9 @@ class ConjugateGradientRegression(Conditional):
         return self.linearisation.momenta(self.solve(target[:, :, None])[:, :, 0])
 
     def features(self, at: Linearisation) -> Features:
-        (W, B), found = self._apart, self.before.features(at)
+        (W, B), before = self._apart, self.before.features(at)
         known = self._white(self.linearisation.fields.gram(at.fields))
-        return Features(at, known, torch.linalg.solve_triangular(B, found.unknown - W.T @ known, upper=False))
+        return Features(at, known, torch.linalg.solve_triangular(B, before.unknown - W.T @ known, upper=False))
 
     def solve(self, values: Tensor) -> Tensor:
         """(G + R)^-1 values: (N, m, k) -> (N, m, k), all k columns together.

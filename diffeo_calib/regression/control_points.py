@@ -115,10 +115,10 @@ class ControlPointRegression(Conditional):
     def response(self, momenta: Momenta) -> Tensor:
         """A (b, p, theta): (N, m)."""
         vector = torch.nn.functional.pad(momenta.flatten(), (0, self._shifts))
-        found = vector.new_zeros(self.noise.covariance.shape[:2])
+        total = vector.new_zeros(self.noise.covariance.shape[:2])
         for rows in self._blocks(len(vector)):
-            found[rows] = (self._rows(self._linearised(rows)[1]) @ vector).view(len(rows), -1)
-        return self._ranks.total([found])[0]
+            total[rows] = (self._rows(self._linearised(rows)[1]) @ vector).view(len(rows), -1)
+        return self._ranks.total([total])[0]
 
     def weighted_residual(self) -> Tensor:
         """R^-1 (y - k1) (N, m) of the smallest residuals for which the deformation's momenta are the optimum.
@@ -131,8 +131,8 @@ class ControlPointRegression(Conditional):
         informed = (self.core @ self.core.T)[:size, :size]
         informed.diagonal().sub_(1.0)
         values, vectors = torch.linalg.eigh(informed)
-        seen = values > INFORMED_SHARE * values[-1]
-        solved = vectors[:, seen] @ ((vectors[:, seen].T @ u) / values[seen])
+        kept = values > INFORMED_SHARE * values[-1]
+        solved = vectors[:, kept] @ ((vectors[:, kept].T @ u) / values[kept])
         momenta = self._of_white(torch.nn.functional.pad(solved, (0, self._shifts))[:, None])
         return self.noise.own.solve(self.response(momenta))
 
@@ -175,8 +175,8 @@ class ControlPointRegression(Conditional):
 
     def _of_white(self, values: Tensor) -> Momenta:
         """The momenta L^-T values, without shared shifts: (size, 1)."""
-        found = self._whiten(values, transposed=True)[:, 0]
-        return self.like.unflatten(found[: len(found) - self._shifts])
+        values_of_momenta = self._whiten(values, transposed=True)[:, 0]
+        return self.like.unflatten(values_of_momenta[: len(values_of_momenta) - self._shifts])
 
     def _whiten(self, values: Tensor, *, transposed: bool = False) -> Tensor:
         """L^-1 values, or L^-T values if transposed."""

@@ -57,12 +57,12 @@ def region_scale(
     Returns:
         one if there are no errors at all, above one or below.
     """
-    seen = ~squares.isnan()
-    if not bool(seen.any()):
+    there = ~squares.isnan()
+    if not bool(there.any()):
         return 1.0
-    values = squares[seen].numpy(force=True)
-    dims = np.full(len(values), dim) if isinstance(dim, int) else dim[seen].numpy(force=True)
-    shares = np.ones(len(values)) if weights is None else weights[seen].double().numpy(force=True)
+    values = squares[there].numpy(force=True)
+    dims = np.full(len(values), dim) if isinstance(dim, int) else dim[there].numpy(force=True)
+    shares = np.ones(len(values)) if weights is None else weights[there].double().numpy(force=True)
     nu, s = FREEDOMS[:, None], SCALES  # of every pair the probability: (len(FREEDOMS), len(SCALES))
     logs = -0.5 * (np.log(nu / FREEDOM) / FREEDOM_EFOLDS) ** 2 - 0.5 * (np.log(s) / efolds) ** 2
     d2, k, count, freedoms = map(torch.from_numpy, (values, dims, shares, FREEDOMS))
@@ -77,8 +77,8 @@ def region_scale(
     order = np.argsort(ratios)  # a new one of n lies below the k-th with the probability k / (n + 1)
     effective = shares.sum() ** 2 / np.square(shares).sum()
     below = shares[order].cumsum() / shares.sum() * effective / (effective + 1.0)
-    own = float(np.interp(CONFIDENCE, below, np.log(ratios[order].clip(min=np.finfo(float).tiny))))
-    return float(np.exp((number * own + ROWS * high) / (number + ROWS)))
+    quantile = float(np.interp(CONFIDENCE, below, np.log(ratios[order].clip(min=np.finfo(float).tiny))))
+    return float(np.exp((number * quantile + ROWS * high) / (number + ROWS)))
 
 
 def smallest(holds: Callable[[float], bool], low: float, high: float) -> float:
@@ -107,9 +107,9 @@ def student_likelihood(squares: Tensor, dim: Tensor, freedoms: Tensor, shares: T
     """
     value, shares = torch.zeros_like(freedoms), torch.ones_like(squares) if shares is None else shares
     for k in dim.unique().tolist():
-        own, count, half = squares[dim == k], shares[dim == k], 0.5 * (freedoms + k)
-        parts = freedoms[:, None].split(max(1, BLOCK // len(own)))
-        distances = torch.cat([(own / nu).log1p() @ count for nu in parts])
+        some, count, half = squares[dim == k], shares[dim == k], 0.5 * (freedoms + k)
+        parts = freedoms[:, None].split(max(1, BLOCK // len(some)))
+        distances = torch.cat([(some / nu).log1p() @ count for nu in parts])
         density = torch.lgamma(half) - torch.lgamma(0.5 * freedoms) - 0.5 * k * (0.5 * freedoms).log()
         value = value + count.sum() * density - half * distances
     return value

@@ -137,8 +137,8 @@ def from_dh(
         raise RobotError.of(what, expected="one of its own", got=got, fix=fix)
     # every row is two joints: a moving one after its parent's second, and a fixed one
     after = [number for index, parent in enumerate(parents) for number in (2 * parent + 1, 2 * index)]
-    own, weighing = ({end: 2 * row + 1 for end, row in part.items()} for part in (named, loads))
-    return Tree(name, "base", joints, after, Ends(own, weighing))
+    ends_of_rows, weighing = ({end: 2 * row + 1 for end, row in part.items()} for part in (named, loads))
+    return Tree(name, "base", joints, after, Ends(ends_of_rows, weighing))
 
 
 def _tips(tips: Mapping[str, int], rows: int) -> dict[str, int]:

@@ -88,7 +88,7 @@ class DHFile:
         if len(said) > 1:
             expected = "standard or craig (modified), in one place"
             raise RobotError.of(f"'{path}' names two conventions", expected=expected)
-        own = {_what(cell): found[1].lower().replace("°", "deg") for cell in header if (found := UNIT.search(cell))}
+        own = {_what(cell): unit[1].lower().replace("°", "deg") for cell in header if (unit := UNIT.search(cell))}
         units = _units(path, rows, own)
         names = [row.get("name") or str(k + 1) for k, row in enumerate(rows)]
         names = [f"joint_{name}" if name.isdecimal() else name for name in names]
@@ -115,8 +115,8 @@ class DHFile:
             what, expected = f"--tip of '{self.path}'", f"one of {few(self.names, 20)}"
             raise RobotError.of(what, expected=expected, got=shown(str(tip)))
         count = len(self.names) if tip is None else self.names.index(tip) + 1
-        found = from_dh(self.rows[:count], way, self.names[:count], self.path.stem)
-        return Chain(found.name, found.base, tip or found.tip, found.joints)
+        chain = from_dh(self.rows[:count], way, self.names[:count], self.path.stem)
+        return Chain(chain.name, chain.base, tip or chain.tip, chain.joints)
 
 
 def _cells(path: Path, lines: Sequence[str]) -> tuple[list[str], list[list[str]], list[str]]:
@@ -126,7 +126,7 @@ def _cells(path: Path, lines: Sequence[str]) -> tuple[list[str], list[list[str]]
     top = next((k for k, header in enumerate(headers) if {"a", "alpha", "d"} <= set(map(_what, header))), None)
     if top is None:
         what, expected = f"'{path}' is no DH table", "a header with the columns a, alpha, d and theta"
-        raise RobotError.of(what, expected=expected, got=shown(lines[0] if lines else ""), fix="or pass a URDF")
+        raise RobotError.of(what, expected=expected, got=shown((lines or ["no line"])[0]), fix="or pass a URDF")
     cells = [_split(line, seps[top]) for line in lines[top + 1 :] if line[0] not in "#%/"]
     names = [name for name in map(_what, headers[top]) if name not in ("", "unread")]
     bad = next((row for row in cells if len(row) != len(headers[top])), names if len(set(names)) < len(names) else None)
@@ -163,7 +163,7 @@ def _conventions(
     header: Sequence[str], rows: Sequence[Mapping[str, str]], notes: Sequence[str]
 ) -> tuple[set[str], bool]:
     """The conventions that a file names in its header, cells and other lines; whether by words with one meaning."""
-    said = {"craig" for cell in header if (found := INDEXED.fullmatch(_bare(cell))) and (found[2] or found[3])}
+    said = {"craig" for cell in header if (index := INDEXED.fullmatch(_bare(cell))) and (index[2] or index[3])}
     cells = [row.get("convention", "") for row in rows]
     said |= {way for way, words in WORDS.items() if _mention([*cells, *notes], words) or _mention(cells, USUAL[way])}
     if said:
@@ -176,7 +176,7 @@ def _mention(lines: Sequence[str], words: str) -> bool:
     return any(re.search(f"(?<![a-z])({words})(?![a-z])", line, re.IGNORECASE) for line in lines)
 
 
-def _units(path: Path, rows: Sequence[Mapping[str, str]], own: Mapping[str, str]) -> dict[str, str]:
+def _units(path: Path, rows: Sequence[Mapping[str, str]], stated: Mapping[str, str]) -> dict[str, str]:
     """Units of all columns, by size where the header has none.
 
     No link is longer than 20 m, and most axes are at right angles. Raises RobotError: angles that may be in rad or deg;
@@ -190,7 +190,7 @@ def _units(path: Path, rows: Sequence[Mapping[str, str]], own: Mapping[str, str]
     angle = "rad" if "pi" in texts.lower() or not any(angles) or _right(angles) else ""
     angle = "deg" if "°" in texts or max(angles) > LARGEST_ANGLE_RAD else angle
     lengths = dict.fromkeys(("a", "d"), "mm" if length > LONGEST_LINK_M else "m")
-    units = lengths | dict.fromkeys(("alpha", "theta", "beta"), angle) | dict(own)
+    units = lengths | dict.fromkeys(("alpha", "theta", "beta"), angle) | dict(stated)
     if not units["alpha"] or not units["theta"]:
         what, fix = f"the unit of angles of '{path}'", "write it into the header: alpha [deg], theta [deg]"
         raise RobotError.of(what, expected="rad or deg", got="numbers that may be either", fix=fix)
@@ -198,7 +198,7 @@ def _units(path: Path, rows: Sequence[Mapping[str, str]], own: Mapping[str, str]
     for column, names in (("min", ("lower", "upper")), ("offset", ("offset",))):
         cells = [(row, name) for row in turning for name in names if "pi" not in row.get(name, "").lower()]
         sizes = [size for row, name in cells if isfinite(size := abs(_number(row, name))) and size]
-        unit = next((own[name] for name in names if name in own), "")
+        unit = next((stated[name] for name in names if name in stated), "")
         if sizes and not unit:
             unit = "deg" if max(sizes) > LARGEST_ANGLE_RAD else "rad"
             if unit == "rad" and units["theta"] == "deg" and not _right(sizes):
@@ -228,13 +228,13 @@ def _row(row: Mapping[str, str], units: Mapping[str, str], what: str) -> DHRow:
     if wrong:
         expected, got = "a revolute or prismatic joint, numbers and multiples of pi", f"{wrong[0]} {row[wrong[0]]!r}"
         raise RobotError.of(what, expected=expected, got=shown(got), fix="correct the cell, or pass a URDF")
-    own = "d" if kind == "prismatic" else "theta"
+    variable = "d" if kind == "prismatic" else "theta"
     for name in NUMBERS:
-        unit = units.get(name) or units[own]
-        if name in ("offset", "lower", "upper") and own == "d" and unit in ("rad", "deg"):
+        unit = units.get(name) or units[variable]
+        if name in ("offset", "lower", "upper") and variable == "d" and unit in ("rad", "deg"):
             unit = units["d"]  # that of the joints that turn
         value[name] *= 1.0 if "pi" in row.get(name, "").lower() else UNITS[unit]
-    value[own] += value.pop("offset")
+    value[variable] += value.pop("offset")
     value |= {name: end for name, end in (("lower", -inf), ("upper", inf)) if not row.get(name)}
     return DHRow(kind=kind, **value)
 

@@ -52,7 +52,7 @@ def real_links(x: Tensor, scale: float = 1.0, *, samples: int = 20) -> Tensor:
     Returns (N, 2, S + 1, 2) points along both links [length units]; the last one is the tip.
     """
     x1, x2 = _angles(x)
-    L1, L2 = (own + scale * (L - own) for own, L in zip(NOMINAL_LENGTHS, REAL_LENGTHS, strict=True))
+    L1, L2 = (l0 + scale * (L - l0) for l0, L in zip(NOMINAL_LENGTHS, REAL_LENGTHS, strict=True))
     W1, W2 = (scale * W for W in LOADS)
     EI1, EI2 = BENDING_STIFFNESS
     s = torch.linspace(0.0, 1.0, samples + 1, dtype=x1.dtype, device=x1.device)

@@ -142,8 +142,8 @@ class Geometry:
         moved = torch.cat([self.moved.new_ones(P, 1), self.moved], dim=1).to(device)  # the base moves all markers
         by_twist = torch.cat([by_shift, by_turn], dim=-1) * moved[..., None, None]
         by_twist = by_twist.movedim(2, 3).reshape(N, P, 3, 6 * L)
-        own = torch.eye(P, dtype=torch.float64, device=device)  # the shift of a marker moves this marker only
-        by_tool = (at.tips[:, :, :3, None, :3] * own[None, :, None, :, None]).reshape(N, P, 3, 3 * P)
+        shifts = torch.eye(P, dtype=torch.float64, device=device)  # the shift of a marker moves this marker only
+        by_tool = (at.tips[:, :, :3, None, :3] * shifts[None, :, None, :, None]).reshape(N, P, 3, 3 * P)
         return torch.cat([by_twist, by_tool], dim=-1)
 
     def with_tool(self, tool: Tensor, on: tuple[str, ...] = ()) -> Geometry:

@@ -57,7 +57,7 @@ class GravitySag:
         self.compliances = (*chain.arrays.compliances, *(_under_payload(chain, payload.link) if payload else ()))
         self._masses = Masses(*map(torch.from_numpy, Masses.of(self.compliances, chain.arrays)))
         self._numbers = self._masses.own.mT.nonzero()[:, 1]  # of the compliance of each mass
-        each = [(one.joint, one.own, one.loaded) for one in self.compliances for _ in range(one.size)]
+        each = [(c.joint, c.own, c.loaded) for c in self.compliances for _ in range(c.size)]
         columns = torch.tensor(each, dtype=torch.int64, device="cpu").view(-1, 3)
         self.size, self.joints = len(each), columns[:, 0]
         self.own, self.loaded = columns[:, 1:].bool().unbind(1)
@@ -70,9 +70,9 @@ class GravitySag:
     @property
     def parts(self) -> dict[str, Tensor]:
         """(K,) which coefficients are of which part of the sag, by name; that of a payload only with one."""
-        own, loaded = self.own, self.loaded
-        found = {"gravity on joints": own & ~loaded, "gravity on links": ~own & ~loaded}
-        return found | ({"payload": loaded} if self.payload else {})
+        by_own_weight, loaded = self.own, self.loaded
+        parts = {"gravity on joints": by_own_weight & ~loaded, "gravity on links": ~by_own_weight & ~loaded}
+        return parts | ({"payload": loaded} if self.payload else {})
 
     def features(self, q: Tensor) -> Tensor:
         """Feature values [m; 1 for forces on prismatic joints]: q (N, n) -> (N, K)."""
@@ -116,9 +116,9 @@ class GravitySag:
         unladen = [compliance for compliance in self.compliances if not compliance.loaded]
         for compliance, load in zip(self.compliances[len(unladen) :], parts[len(unladen) :], strict=True):
             alike = (compliance.joint, compliance.direction.tolist())
-            k = next(k for k, one in enumerate(unladen) if (one.joint, one.direction.tolist()) == alike)
-            own = unladen[k].places
-            at = 3 * own.index(_representative(self.chain, compliance.places[0])) if own else 0
+            k = next(k for k, c in enumerate(unladen) if (c.joint, c.direction.tolist()) == alike)
+            places = unladen[k].places
+            at = 3 * places.index(_representative(self.chain, compliance.places[0])) if places else 0
             parts[k] = torch.cat([parts[k][:at], parts[k][at : at + 3] + amount * load, parts[k][at + 3 :]])
         return torch.cat([w[:0], *parts[: len(unladen)]])
 
@@ -128,7 +128,7 @@ class GravitySag:
 
     def _loads(self, q: Tensor) -> Tensor:
         """(N or 1, compliances) the load of each in units: the payload where that is the load, else 1."""
-        loaded = torch.tensor([one.loaded for one in self.compliances], dtype=torch.bool, device=q.device)
+        loaded = torch.tensor([compliance.loaded for compliance in self.compliances], dtype=torch.bool, device=q.device)
         return torch.where(loaded, self.payload.amounts(q), q.new_ones(1, 1))
 
     def _frames(self, q: Tensor) -> Tensor:
@@ -140,9 +140,9 @@ class GravitySag:
 def _under_payload(chain: Tree, link: str) -> list[Compliance]:
     """The compliances of a robot under a load at one link, where they carry it."""
     place = chain.moving + list(chain.ends).index(link)
-    seen, moved = _representative(chain, place), chain.arrays.moved[place]
-    found = [one for one in chain.arrays.compliances if moved[one.joint] and (not one.places or seen in one.places)]
-    return [replace(one, places=(place,) if one.places else (), loaded=True) for one in found]
+    stand, moved = _representative(chain, place), chain.arrays.moved[place]
+    chosen = [c for c in chain.arrays.compliances if moved[c.joint] and (not c.places or stand in c.places)]
+    return [replace(c, places=(place,) if c.places else (), loaded=True) for c in chosen]
 
 
 def _representative(chain: Tree, place: int) -> int:

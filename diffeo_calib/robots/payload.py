@@ -173,7 +173,7 @@ def with_load(robot: Tree, name: str, place: object, on: str | None = None) -> T
     origin = torch.eye(4, dtype=torch.float64, device=HOST)
     origin[:3, 3] = as_tensor(place, "place", (3,))
     loads = {load: robot.ends[load] for load in robot.loads} | {name: len(robot.joints)}
-    ends = Ends({own: robot.ends[own] for own in robot.tips}, loads, robot.ground)
+    ends = Ends({end: robot.ends[end] for end in robot.tips}, loads, robot.ground)
     joints, parents = [*robot.joints, Joint(f"{name} (load)", "fixed", origin)], [*robot.parents, robot.ends[tip]]
     return Tree(robot.name, robot.base, joints, parents, ends, drivers=robot.drivers, source=robot.source)
 

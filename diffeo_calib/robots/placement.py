@@ -77,8 +77,8 @@ def place(poses: Tensor, points: Tensor) -> Placement:
     Args:
         poses: (N, P, 4, 4) of the markers' tips [m]. points: (N, P, 3) measured markers [m]; NaN where hidden.
     """
-    seen, eye = ~points.isnan().any(2), torch.eye(points.shape[1], dtype=points.dtype, device=points.device)
-    sightings = _Sightings(poses[seen], points[seen], eye.expand(len(points), -1, -1)[seen])
+    visible, eye = ~points.isnan().any(2), torch.eye(points.shape[1], dtype=points.dtype, device=points.device)
+    sightings = _Sightings(poses[visible], points[visible], eye.expand(len(points), -1, -1)[visible])
     base, tool = _solved(sightings, 0.0)
     left = sightings.points - sightings.predicted(tool) @ base[:3, :3].mT - base[:3, 3]
     return _solved(sightings, float(left.square().sum() / (3 * len(tool))) / PLACES.marker_m**2)
@@ -90,8 +90,8 @@ def rigid_fit(points: Tensor, targets: Tensor) -> Tensor:
     Pairs without a target (NaN) do not count.
     Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
     """
-    seen = ~targets.isnan().any(1)
-    points, targets = points[seen], targets[seen]
+    visible = ~targets.isnan().any(1)
+    points, targets = points[visible], targets[visible]
     centre, aim = points.mean(0), targets.mean(0)
     turn = nearest_rotations((targets - aim).mT @ (points - centre))
     return transforms(turn, aim - turn @ centre)
@@ -117,11 +117,11 @@ def _solved(sightings: _Sightings, weight: float) -> Placement:
     undetermined (a planar arm, a tool that never turns), the markers of smallest norm are taken and the base accounts
     for the difference.
     """
-    poses, points, own = sightings
-    S, P = own.shape
+    poses, points, weights = sightings
+    S, P = weights.shape
     centre, eye = points.mean(0), torch.eye(3 * P, dtype=points.dtype, device=points.device)
     by_turn = torch.einsum("ac,sb->sacb", eye[:3, :3], points - centre).reshape(S, 3, 9)
-    by_tool = torch.einsum("sab,sl->salb", poses[:, :3, :3], own).reshape(S, 3, 3 * P)
+    by_tool = torch.einsum("sab,sl->salb", poses[:, :3, :3], weights).reshape(S, 3, 3 * P)
     parts = (by_turn, poses[:, :3, 3:], by_tool)
     by_turn, fixed, by_tool = ((part - part.mean(dim=0)).flatten(0, 1) for part in parts)
     both = torch.cat([torch.cat([by_turn, fixed], 1), eye.new_zeros(3 * P, 10)])

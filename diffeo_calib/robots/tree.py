@@ -108,14 +108,14 @@ class Tree:
             raise RobotError.of("the parents of joints", expected="one earlier joint, or -1, each", got=self.parents)
         if not self.tips or not all(BASE <= end < count for end in (*self.ends.values(), self.ground)):
             raise RobotError.of(f"the ends of robot '{self.name}'", expected="numbers of its joints", got=self.ends)
-        self.arrays = found = nominal_chain(self.to_config())
-        self.joint_names, self.limits = found.names, torch.from_numpy(found.limits)
+        self.arrays = arrays = nominal_chain(self.to_config())
+        self.joint_names, self.limits = arrays.names, torch.from_numpy(arrays.limits)
         kinds = {joint.name: joint.kind for joint in (*moving, *self.drivers)}
         self.kinds = tuple(kinds[name] for name in self.joint_names)
-        tensors = found.axes, found.revolute, found.coupling, found.coupling_offset
+        tensors = arrays.axes, arrays.revolute, arrays.coupling, arrays.coupling_offset
         self.axes, self.revolute, self.coupling, self.coupling_offset = map(torch.from_numpy, tensors)
-        self.motion_terms, self.ancestors = torch.from_numpy(found.motions), torch.from_numpy(found.ancestors)
-        self.place_offsets, self.before = torch.from_numpy(found.offsets), tuple(found.before.tolist())
+        self.motion_terms, self.ancestors = torch.from_numpy(arrays.motions), torch.from_numpy(arrays.ancestors)
+        self.place_offsets, self.before = torch.from_numpy(arrays.offsets), tuple(arrays.before.tolist())
         self.offsets, self.tip_offsets = self.place_offsets[: len(moving)], self.place_offsets[self.tip_places]
         self.ground_place = None if self.ground == BASE else len(self.before) - 1
 
@@ -208,9 +208,9 @@ class Tree:
         ends = self.coupling[..., None] * self.limits  # (n_all, n, 2)
         ends = torch.where(self.coupling[..., None] == 0, 0.0, ends)  # no limits times no effect is not NaN
         driven = torch.stack([ends.amin(2).sum(1), ends.amax(2).sum(1)]) + self.coupling_offset
-        own = [max(abs(joint.lower), abs(joint.upper)) for joint in self.joints if joint.kind != "fixed"]
+        largest = [max(abs(joint.lower), abs(joint.upper)) for joint in self.joints if joint.kind != "fixed"]
         strokes, tips = driven.abs().amax(0), self.tip_places  # largest values within the limits [rad or m]
-        strokes = torch.where(strokes.isinf(), strokes.new_tensor(own), strokes)
+        strokes = torch.where(strokes.isinf(), strokes.new_tensor(largest), strokes)
         lengths = self.place_offsets[:, :3, 3].norm(dim=1)
         steps = lengths[: self.moving] + torch.where(self.revolute, 0.0, strokes)
         return float((torch.where(self.ancestors[tips], steps, 0.0).sum(1) + lengths[tips]).max())
@@ -255,8 +255,8 @@ class Tree:
         frames, moved = places[:, : self.moving], self.ancestors[ends]
         turning = moved.to(q.device)[..., None] & self.revolute.to(q.device)[:, None]  # (tips, n_all, 1)
         angular = self.by_active(torch.where(turning, turned_axes(frames, self.axes)[:, None], 0.0).mT)
-        found = torch.cat([self.point_slopes(frames, places[:, ends, :3, 3], moved), angular], dim=2)
-        return found if len(self.tips) > 1 else found[:, 0]
+        slopes = torch.cat([self.point_slopes(frames, places[:, ends, :3, 3], moved), angular], dim=2)
+        return slopes if len(self.tips) > 1 else slopes[:, 0]
 
     def point_slopes(self, frames: Tensor, points: Tensor, moved: Tensor) -> Tensor:
         """Derivatives of points by the active joints: (N, P, 3, n) [m/rad or m/m].
@@ -318,8 +318,8 @@ def along(
     last = {base: BASE}
     for joint, start, end, up in steps:
         before = last[start]
-        for one in backwards(joint) if up else [joint]:
-            joints.append(one)
+        for step in backwards(joint) if up else [joint]:
+            joints.append(step)
             parents.append(before)
             before = len(joints) - 1
         last[end] = before

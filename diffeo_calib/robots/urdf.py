@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MOST_NAMES, InputError, RobotError, as_written, few, sentence, warn_user
-from diffeo_calib.common.files import read_regular
+from diffeo_calib.common.files import as_path, read_regular
 from diffeo_calib.robots.joint import KINDS, Joint
 from diffeo_calib.robots.tree import BASE, Chain, Ends, Tree, along
 from diffeo_calib.robots.urdf_elements import LARGEST_FILE, URDF, JointElement, harmless_faults, joint_of
@@ -50,7 +50,7 @@ def load_urdf(path: str | PathLike[str], base: str | None = None, tip: Names | N
             joint without limits like this), <mimic> of a fixed joint, an odd XML declaration; joints on the way to the
             tip that carry other branches, whose weight is left out.
     """
-    path = Path(path)
+    path = as_path(path)
     content = read_regular(path, "URDF", LARGEST_FILE, RobotError)
     robot, urdf, steps = _read(content, path, base, tip, load)
     ignored = urdf.ignored + [fault for step in steps for fault in harmless_faults(step.joint)]
@@ -68,11 +68,11 @@ def read_urdf(content: bytes, base: str, tip: Names, path: Path, load: Names = (
 def moving_joints_below(content: bytes, links: Iterable[str]) -> list[tuple[str, str]]:
     """Names and child links of the moving joints below links of a URDF, the nearest first."""
     joints = URDF.parse(content, Path("the URDF")).joints
-    found, reached = [], set(links)
+    moving, reached = [], set(links)
     while below := [joint for joint in joints if joint.parent in reached and joint.child not in reached]:
         reached |= {joint.child for joint in below}
-        found += [(joint.name, joint.child) for joint in below if joint.kind != "fixed" and joint.driver is None]
-    return found
+        moving += [(joint.name, joint.child) for joint in below if joint.kind != "fixed" and joint.driver is None]
+    return moving
 
 
 def chains_in(path: Path) -> list[list[JointElement]]:
@@ -90,11 +90,11 @@ def chains_in(path: Path) -> list[list[JointElement]]:
 def _only_end(urdf: URDF, role: str) -> str:
     """The link before, or behind, all others."""
     inner = {joint.parent if role == "tip" else joint.child for joint in urdf.joints}
-    found = [link for link in urdf.links if link not in inner]
-    if len(found) == 1:
-        return found[0]
+    ends = [link for link in urdf.links if link not in inner]
+    if len(ends) == 1:
+        return ends[0]
     urdf.check_whole(role)
-    got, fix = few(found, MOST_NAMES) or "none", "name the one that is meant; `diffeo-calib init` proposes it"
+    got, fix = few(ends, MOST_NAMES) or "none", "name the one that is meant; `diffeo-calib init` proposes it"
     raise RobotError.of(f"`{role}` of '{urdf.path}'", expected="one link at this end", got=got, fix=fix)
 
 
@@ -192,16 +192,16 @@ def _way(urdf: URDF, above: dict[str, JointElement], base: str, end: str) -> lis
 
 def _drivers(urdf: URDF, joints: Sequence[Joint]) -> list[Joint]:
     """Joints off the paths that drive mimic joints, and those that drive these."""
-    elements, known = {joint.name: joint for joint in urdf.joints}, {joint.name for joint in joints}
-    found: list[Joint] = []
+    elements, names = {joint.name: joint for joint in urdf.joints}, {joint.name for joint in joints}
+    drivers: list[Joint] = []
     waiting = [name for joint in joints for name in joint.mimic or {}]
     while waiting:
         name = waiting.pop(0)
-        if name not in known and name in elements:
-            known.add(name)
-            found.append(joint_of(elements[name], urdf.path))
-            waiting += list(found[-1].mimic or {})
-    return found
+        if name not in names and name in elements:
+            names.add(name)
+            drivers.append(joint_of(elements[name], urdf.path))
+            waiting += list(drivers[-1].mimic or {})
+    return drivers
 
 
 def _warn_of_branches(urdf: URDF, robot: Tree, steps: Sequence[_Step]) -> None:
@@ -233,5 +233,5 @@ def _farthest(urdf: URDF, joint: JointElement) -> str:
     reached = [(1, 1, joint.child)]  # moving joints and links on the way
     for moving, links, link in reached:
         below = [(moving + (j.kind != "fixed"), links + 1, j.child) for j in urdf.joints if j.parent == link]
-        reached += [one for one in below if one not in reached]
+        reached += [child for child in below if child not in reached]
     return max(reached)[2]

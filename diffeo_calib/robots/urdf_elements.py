@@ -78,7 +78,7 @@ class URDF:
         if name in self.links:
             return
         self.check_whole(role, f" '{name}'")
-        near = get_close_matches(name, self.links, n=3)
+        near = get_close_matches(str(name), self.links, n=3)
         hint = f"did you mean {' or '.join(map(repr, near))}? " * bool(near)
         links = few(self.links, MOST_NAMES) or "(none)"
         raise RobotError.of(f"`{role}`: '{self.path}' has no link '{name}'", fix=f"{hint}its links are {links}")

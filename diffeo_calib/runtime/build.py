@@ -131,10 +131,10 @@ def calibrated_chain(
     """
     L, T, last = len(nominal.axes), len(nominal.tips), len(theta) - sum(6 * int(axis[3]) for axis in axes)
     ends = 6 + 6 * L, 6 + 6 * L + 3 * markers, last - 2 * len(waves), last
-    own, _, coefficients, by_wave, by_axis = np.split(theta, ends)
+    twist_values, _, coefficients, by_wave, by_axis = np.split(theta, ends)
     periodic = gear_waves(waves, nominal.coupling.shape[1]).times(by_wave) if waves else None
     crooked = axis_waves(axes, L).times(by_axis) if axes else None
-    twists, offsets = own.reshape(-1, 6), nominal.offsets[:L] @ joint_errors
+    twists, offsets = twist_values.reshape(-1, 6), nominal.offsets[:L] @ joint_errors
     sag, constant = None, twists[1:]
     if elastic and coefficients.any():
         sag = Masses.of(nominal.compliances, nominal).sag(coefficients)
@@ -163,8 +163,8 @@ def axis_waves(axes: Sequence[Sequence[float]], n_all: int) -> Waves:
         if not (0 <= a < n_all and -np.inf < low < high < np.inf and 0 < K <= MOST_TERMS):
             expected = f"joints below {n_all}, ranges, and 1 to {MOST_TERMS} terms"
             raise RobotError.of("errors of axes", expected=expected, got=(a, low, high, K))
-    found = [(a, k * np.pi / (high - low), low, low, high) for a, low, high, K in axes for k in range(1, int(K) + 1)]
-    return _waves(np.array(found), n_all)
+    table = [(a, k * np.pi / (high - low), low, low, high) for a, low, high, K in axes for k in range(1, int(K) + 1)]
+    return _waves(np.array(table), n_all)
 
 
 def _waves(table: Array, size: int) -> Waves:
@@ -185,9 +185,9 @@ def recorded_flow(
     steps, n = len(stages) // len(weights), stages.shape[-1]
     for config in kernel:
         term, joint = radial_term(config, stages), config["output"]
-        own: bool = joint is not None and _inputs(config, n) == ([], [joint]) and stages.shape[2] <= MOST_TABULATED
+        single: bool = joint is not None and _inputs(config, n) == ([], [joint]) and stages.shape[2] <= MOST_TABULATED
         if term.weights.any():
-            (alone.setdefault(int(joint), []) if own else rest).append(term)
+            (alone.setdefault(int(joint), []) if single else rest).append(term)
     for joint, terms in sorted(alone.items()):
         if (tables := _joint_tables(terms, stages[:, 0, :, joint], joint)) is None:
             rest += terms
@@ -200,13 +200,13 @@ def recorded_flow(
 
 def _joint_tables(terms: Sequence[RadialTerm], controls: Array, joint: int) -> list[Table] | None:
     """Tables of a joint's own function at every stage, for controls (S, C); None if it is too rough for them."""
-    found = list[Table]()
+    tables = list[Table]()
     for stage, angles in enumerate(controls):
         sums = [(term.profile, 1.0 / float(term.scales[0]), angles, term.weights[stage, :, joint]) for term in terms]
-        if (table := tabulate([PeriodicSum(*one) for one in sums])) is None:
+        if (table := tabulate([PeriodicSum(*terms_of_sum) for terms_of_sum in sums])) is None:
             return None
-        found.append(table)
-    return found
+        tables.append(table)
+    return tables
 
 
 def _inputs(config: Mapping[str, Any], n: int) -> tuple[list[int], list[int]]:

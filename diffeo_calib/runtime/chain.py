@@ -102,12 +102,12 @@ class NominalChain:
     @cached_property
     def ancestors(self) -> np.ndarray:
         """(F, n_all) whether joint l moves place f."""
-        found = np.zeros((len(self.before), len(self.axes)), dtype=bool)
+        ancestors = np.zeros((len(self.before), len(self.axes)), dtype=bool)
         for place, last in enumerate(self.before):
             if last >= 0:
-                found[place] = found[last]
-                found[place, last] = True
-        return found
+                ancestors[place] = ancestors[last]
+                ancestors[place, last] = True
+        return ancestors
 
     @cached_property
     def moved(self) -> np.ndarray:
@@ -130,16 +130,16 @@ class NominalChain:
     @cached_property
     def compliances(self) -> tuple[Compliance, ...]:
         """Every joint's own compliance and its two lateral ones (three for a slide)."""
-        moved, found = self.moved & self.distinct[:, None], []
+        moved, compliances = self.moved & self.distinct[:, None], []
         for joint, axis in enumerate(self.axes):
             beyond = tuple(place for place in np.flatnonzero(moved[:, joint]).tolist() if place != joint)
             if not self.revolute[joint]:
-                found.append(Compliance(joint, np.append(axis, np.zeros(3)), True, ()))
+                compliances.append(Compliance(joint, np.append(axis, np.zeros(3)), True, ()))
             if beyond:
                 turns = np.pad([axis, *perpendicular(axis)], ((0, 0), (3, 0)))
-                own = bool(self.revolute[joint]), False, False
-                found += [Compliance(joint, *turn, beyond) for turn in zip(turns, own, strict=True)]
-        return tuple(found)
+                flags = bool(self.revolute[joint]), False, False
+                compliances += [Compliance(joint, *turn, beyond) for turn in zip(turns, flags, strict=True)]
+        return tuple(compliances)
 
 
 def perpendicular(axis: Array) -> Array:
@@ -188,8 +188,8 @@ class Masses(NamedTuple):
         for number, compliance in enumerate(compliances):
             directions[number, compliance.joint] = compliance.direction
         axes = np.array([c.axis for c in compliances]).reshape(-1, 3)
-        own, arms, slides = np.eye(len(compliances))[:, k], units[place] - units[joint], (place == joint)[:, None]
-        return cls(joints, axes, directions.reshape(-1, 6 * len(robot.axes)), own, arms, slides.astype(float), SKEW)
+        unit, arms, slides = np.eye(len(compliances))[:, k], units[place] - units[joint], (place == joint)[:, None]
+        return cls(joints, axes, directions.reshape(-1, 6 * len(robot.axes)), unit, arms, slides.astype(float), SKEW)
 
     def sag(self, coefficients: Any) -> Sag:
         """The sag with these coefficients c (3 M,): m = sum (o_f - o_l) x c for the masses at the places f."""
@@ -256,8 +256,8 @@ class CalibratedChain:
             moved = shifts + cross(turns.swapaxes(3, 4), arms[..., None, :]).swapaxes(3, 4)
             sums = [(part * on_path[..., None]).sum(2) for part in (moved, turns)]
             by_moving = by_moving + np.concatenate(sums, axis=2)
-        found = by_moving @ robot.coupling
-        return tips, found if self.waves is None else found * (1.0 + wave_slopes(self.waves, q))[:, None, None]
+        by_active = by_moving @ robot.coupling
+        return tips, by_active if self.waves is None else by_active * (1.0 + wave_slopes(self.waves, q))[:, None, None]
 
 
 def tip_poses(chain: Any, q: Any, use: Any = NUMPY) -> Any:
@@ -316,8 +316,8 @@ def walk(start: Any, offsets: Any, motions: Any, before: Sequence[int], use: Any
 
 def nominal_frames(robot: Any, motions: Any, use: Any = NUMPY) -> Any:
     """Nominal frames of all places on the ground: (N, F, 4, 4)."""
-    found = walk(None, robot.offsets, motions, robot.before, use)
-    return use.inverse(found[:, -1:]) @ found if robot.grounded else found
+    frames = walk(None, robot.offsets, motions, robot.before, use)
+    return use.inverse(frames[:, -1:]) @ frames if robot.grounded else frames
 
 
 def error_twists(chain: Any, nominal: Any, x: Any, use: Any = NUMPY) -> Any:

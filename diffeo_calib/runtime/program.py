@@ -74,8 +74,8 @@ class Program:
         """Poses (N, 4, 4) and their derivatives (N, 6, n), linear, then angular velocity; see :meth:`poses`."""
         points, slopes = self.points_and_jacobian(q, tool_points(tool))
         poses, to_frame = nearest_poses(points), self._to(frame)
-        found = pose_slopes(points, slopes, poses[:, :3, :3])
-        return to_frame @ poses, np.kron(np.eye(2), to_frame[:3, :3]) @ found
+        velocities = pose_slopes(points, slopes, poses[:, :3, :3])
+        return to_frame @ poses, np.kron(np.eye(2), to_frame[:3, :3]) @ velocities
 
     def _to(self, frame: str) -> Array:
         """(4, 4) from the measuring frame to another one."""
@@ -123,11 +123,11 @@ def pose_slopes(points: Any, slopes: Any, R: Any, use: tuple[Any, Any, Any] = (n
 
     Returns (N, 6, n) velocity of the origin, then angular velocity, about the axes of the points' frame.
     """
-    library, marks, one = use
+    library, marks, unit = use
     centre, centred = slopes.mean(1), points - points.mean(1)[:, None]
     P = R.swapaxes(1, 2) @ (centred.swapaxes(1, 2) @ marks)
     dS = library.einsum("nkcj,kd->njcd", slopes - centre[:, None], marks)
     A = R.swapaxes(1, 2)[:, None] @ dS
     turns = A[..., 2, 1] - A[..., 1, 2], A[..., 0, 2] - A[..., 2, 0], A[..., 1, 0] - A[..., 0, 1]
-    turning = library.einsum("nkk->n", P)[:, None, None] * one - P
+    turning = library.einsum("nkk->n", P)[:, None, None] * unit - P
     return library.concatenate([centre, R @ library.linalg.solve(turning, library.stack(turns, 1))], 1)

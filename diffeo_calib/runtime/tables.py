@@ -98,9 +98,9 @@ class JointTables:
         cells = np.zeros((len(stages), 7, most))
         for stage, tables in enumerate(stages):
             knots = np.concatenate([t.knots[:-1] + shift for t, shift in zip(tables, shifts, strict=True)])
-            found = np.vstack([knots, np.concatenate([t.coefficients for t in tables], axis=1)])
+            rows = np.vstack([knots, np.concatenate([t.coefficients for t in tables], axis=1)])
             first = np.isin(knots, shifts)
-            starts[stage, : len(knots)], cells[stage, :, : len(knots)] = knots - 1.0 * first, found
+            starts[stage, : len(knots)], cells[stage, :, : len(knots)] = knots - 1.0 * first, rows
         return cls(as_index(joints), tuple(map(tuple, stages)), np.eye(size)[list(joints)], shifts, starts, cells)
 
     def velocity_and_jacobian(self, stage: int, x: Array) -> tuple[Array, Array]:

@@ -9,6 +9,7 @@ from math import cos
 import torch
 from torch import Tensor
 
+from diffeo_calib.cameras.images import projection
 from diffeo_calib.measurements.bodies import triple
 from diffeo_calib.robots.se3 import nearest_rotations, transforms
 from diffeo_calib.sensors.devices import (
@@ -102,10 +103,8 @@ class Cameras(Devices):
     def hypotheses(self, points: Tensor, device: Tensor) -> Iterator[Hypothesis]:
         """Also focal lengths, which stretch the image, and principal points, which shift it, both in focal lengths."""
         yield from super().hypotheses(points, device)
-        image, fix = (
-            self.observation(device).value(points),
-            "check the intrinsic parameters, and the size of the images",
-        )
+        image = self.observation(device).value(points)
+        fix = "check the intrinsic parameters, and the size of the images"
         for name, own in self._of_each(image[..., None], device):
             yield Hypothesis(f"the focal length of '{name}'", own, ("%", 1e-2), fix, about=VALUE)
         for axis in range(2):
@@ -128,18 +127,9 @@ class Cameras(Devices):
 
 
 def _by_projection(values: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
-    """Turn (3, 3) and shift (3,) of a camera by images (N, 2) of points (N, 3).
-
-    Direct linear transformation: (P z) x (u, v, 1) = 0, linear in P; its nearest rigid transform.
-
-    Source: R. Hartley, A. Zisserman, "Multiple view geometry in computer vision", 2003, section 7.1.
-    """
-    at = torch.cat([at, torch.ones_like(at[:, :1])], 1)
-    none = torch.zeros_like(at)
-    above = torch.cat([at, none, -values[:, :1] * at], 1)
-    matrix = torch.cat([above, torch.cat([none, at, -values[:, 1:] * at], 1)])
-    P = torch.linalg.svd(matrix, full_matrices=True).Vh[-1].view(3, 4)
-    P = P * (1.0 if float((at @ P[2]).mean()) >= 0 else -1.0)  # in front of the camera
+    """Turn (3, 3) and shift (3,) of a camera by images (N, 2) of points (N, 3): the nearest rigid transform."""
+    P = projection(values, at)
+    P = P * (1.0 if float((at @ P[2, :3] + P[2, 3]).mean()) >= 0 else -1.0)  # in front of the camera
     length = torch.linalg.svdvals(P[:, :3]).mean().clamp(min=SMALLEST_M)
     return nearest_rotations(P[:, :3]), P[:, 3] / length
 

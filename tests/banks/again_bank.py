@@ -102,11 +102,9 @@ OTHERWISE = {
 }
 """Measured in one way and then in another."""
 WORN_ROWS = {
-    "positions": Again(positions, positions),
     "payloads": Again(payloads, payloads),
     "heights": Again(height, height),
-    "mixture": Again(mixture, mixture),
-    **{name: OTHERWISE[name] for name in ("positions, then sockets", "positions, then heights")},
+    "positions, then sockets": OTHERWISE["positions, then sockets"],
 }
 """Rows that show which joint has worn; 60 rows in sockets leave 0.5 mm, and distances show a change of no joint."""
 

@@ -11,12 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
+import jsonschema
 import pytest
 
 import diffeo_calib as dc
 from diffeo_calib.cli import main as cli
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.reports.results import SCHEMA
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 PROGRAM = "import sys; sys.argv[0] = 'diffeo-calib'; from diffeo_calib.__main__ import main; main()"
@@ -27,6 +29,8 @@ FORMAT = TableFormat("mm", "deg", ";", ",")
 """That of TABLE."""
 NOTE = "arm 7 [left], spring check; serial 4711 é"
 """Of the fitted model of the site."""
+VALIDATOR = jsonschema.Draft202012Validator(SCHEMA)
+"""Judges results for programs; the schema itself is judged once, in tests/cli/test_json_results.py."""
 STAGES = ("nominal", "geometric", "calibrated")
 
 FEW_CONFIGURATIONS = 100

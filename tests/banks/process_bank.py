@@ -21,8 +21,8 @@ from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.maps.linearisation import Numbers
-from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.conditional import Process
+from diffeo_calib.regression.tails import Tails
 
 NARROW_M_RAD = 1e-3
 """Prior deviation of the places: formulas with the whole covariance keep their digits."""

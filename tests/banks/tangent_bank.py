@@ -22,7 +22,7 @@ from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.poses import mark_points
-from diffeo_calib.process.tails import Tails
+from diffeo_calib.regression.tails import Tails
 from diffeo_calib.robots import DHRow, Geometry, SimulatedArm
 from diffeo_calib.robots.tree import Tree
 

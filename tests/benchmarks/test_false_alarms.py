@@ -11,7 +11,7 @@ import false_alarms
 import pytest
 import torch
 
-TABLES = (13, 26, 108)
+TABLES = 13, *(pytest.param(number, marks=pytest.mark.slow) for number in (26, 108))
 
 
 @pytest.mark.parametrize("number", TABLES)

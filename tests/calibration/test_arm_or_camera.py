@@ -53,6 +53,7 @@ def test_a_camera_that_focuses_is_no_error_of_the_arm() -> None:
     assert arm[1]["corners"] > 2.0 * arm[0]["corners"]
 
 
+@pytest.mark.slow
 def test_a_camera_that_slips_on_its_mount_is_named() -> None:
     slipped = ARM.boards.clone()
     twist = 5e-4 * torch.tensor([[1.0, 0.0, 0.0, 3.0, 0.0, 0.0]], dtype=torch.float64)

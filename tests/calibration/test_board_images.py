@@ -78,6 +78,7 @@ def test_tables_that_cannot_be() -> None:
     )
 
 
+@pytest.mark.slow
 def test_joints_that_still_moved_are_warned_about() -> None:
     q = data().q.clone()
     q[1:] = 0.9 * data().q[1:] + 0.1 * data().q[:-1]

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from kind_bank import kind_named, marked
+from kind_bank import kind_named
 from product_bank import Case, simulated, with_usual_scales
 from table_bank import refused, warned
 from tangent_bank import normal
@@ -36,7 +36,6 @@ from diffeo_calib.robots import Geometry, Joint, SimulatedArm, from_dh
 # --- columns of one value ---------------------------------------------------------------------------------------------
 
 HELD = {
-    "positions": ("position", "z"),
     "poses": ("pose", "z"),
     "images and a tracker": ("marker", "marker 2"),
     "inclinations": ("inclination", "inclination 2"),
@@ -64,13 +63,14 @@ def stuck(data: Any, kind: str) -> Any:
     return with_attributes(data, points=points)
 
 
-@pytest.mark.parametrize("name", marked(*HELD))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", HELD)
 def test_a_stuck_column_is_named(name: str) -> None:
     """Before a calibration chooses scales and fits."""
     kind, (rows, column) = kind_named(name), HELD[name]
     data = stuck(kind.data, rows)
     placed, _ = warned(place, kind.robot, data, silent)
-    (text,) = warned(warn_of_stuck, placed.tangent_data(), stuck_columns(data))[1]
+    (text,) = warned(warn_of_stuck, placed.tangent_data(), data)[1]
     assert f"'{column}' of the {rows}s" in text
 
 

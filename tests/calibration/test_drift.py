@@ -83,6 +83,7 @@ def test_a_column_with_which_nothing_drifts_changes_nothing() -> None:
     assert torch.equal(plain.model(train.q), result.model(train.q))
 
 
+@pytest.mark.slow
 def test_readings_show_a_drift_too() -> None:
     time, still = hours(150), readings(ARM, "height", 150)
     moved = readings(ARM, "height", 150, noise=2e-5, turned=lambda q: turned(q, time, 2 * OFFSET_RAD))

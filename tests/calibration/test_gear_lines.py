@@ -28,8 +28,8 @@ from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.process.scales import DEVIATIONS, SCALES, Hyperparameters, axis_deviations
-from diffeo_calib.process.tails import Tails
+from diffeo_calib.process.scales import DEVIATIONS, SCALES, TRANSMISSION_PROFILE, Hyperparameters, axis_deviations
+from diffeo_calib.regression.tails import Tails
 from diffeo_calib.reports.analysis.predictions import FitRows
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.dh import from_dh
@@ -196,7 +196,6 @@ def test_the_prior_of_an_axis_is_that_of_functions_with_its_size() -> None:
     with_axis = data.with_position_errors(scales)
     assert_close(scales.from_logarithms(scales.logarithms()).axis_errors, errors, rtol=1e-12, atol=0)
     assert_close(scales.inflated(2.0).axis_errors, 2.0 * errors, rtol=1e-12, atol=0)
-    assert_close(scales.with_vector(setting.scales.vector).axis_lengthscale, length)
     waves = Waves(*map(torch.from_numpy, axis_waves(scales.axes, 6)))
     deviations = axis_deviations(errors[0], length[0], 10).view(10, 6)
     functions = wave_angles(waves, data.x, torch).cos() * deviations[:, 0] / deviations[0, 0]  # (N, K)
@@ -207,6 +206,11 @@ def test_the_prior_of_an_axis_is_that_of_functions_with_its_size() -> None:
     places = torch.linspace(0.0, torch.pi, 2001, dtype=torch.float64)
     values = (torch.arange(1, 11) * places[:, None]).cos()[..., None] * deviations
     assert_close(values.square().sum(1)[:-1].mean(0), errors[0].repeat_interleave(3).square(), rtol=1e-3, atol=0)
+    apart, every = torch.linspace(0.0, 0.2, 9, dtype=torch.float64), torch.arange(1, 2001)  # of a stationary process
+    variances = axis_deviations(errors[0], length[0] / 6.0, 2000)[::6].square()
+    fall = (1.0 - (torch.pi * torch.cat([apart, apart.new_ones(1)])[:, None] * every).cos()) @ variances
+    (kernel, _) = TRANSMISSION_PROFILE.derivatives((apart / (length[0] / 6.0)).square(), 1)
+    assert_close(1.0 - fall[:-1] / fall[-1], kernel, rtol=0, atol=1e-5)
 
 
 def slid(q: Tensor) -> Tensor:

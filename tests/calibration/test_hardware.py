@@ -17,9 +17,6 @@ import diffeo_calib as dc
 
 LARGEST = {"nominal": 0.80, "geometric": 0.43, "calibrated": 0.125}
 """Held-out RMS in mm with 442 poses, seed 0."""
-FEWER, LARGEST_OF_FEWER, COVERED = 60, 0.28, 0.88
-"""Poses: largest held-out RMS in mm, and smallest coverage of the 95 % regions; tests/calibration/test_outliers.py
-calibrates 150."""
 
 pytestmark = pytest.mark.slow
 

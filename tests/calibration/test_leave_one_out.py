@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from math import inf
 
 import numpy as np
@@ -12,9 +12,11 @@ import torch
 from product_bank import scales_of, usual_scales
 from scipy.stats import chi2
 from tangent_bank import Setting, built, covariance, normal, prior_covariance
+from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.choose_scales import unresolved_errors
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.scales import leave_one_out as one_out
 from diffeo_calib.calibration.scales.leave_one_out import (
@@ -27,9 +29,11 @@ from diffeo_calib.calibration.scales.leave_one_out import (
     random_folds,
     variance_ratio,
 )
+from diffeo_calib.calibration.scales.selection import Selection
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.fitting.result import silent
-from diffeo_calib.process.tails import Tails, reweight
+from diffeo_calib.regression import tails
+from diffeo_calib.regression.tails import Tails, reweight
 from diffeo_calib.robots import SimulatedArm
 
 
@@ -64,8 +68,8 @@ def test_weights_are_those_of_the_errors_under_the_posterior(name: str, monkeypa
     blocks = torch.stack([moments[m * i : m * (i + 1), m * i : m * (i + 1)] for i in range(n)])
     blocks = data.blocks_in_coordinates(blocks)
     expected = reweight(data.noise_model.squares(data.noise(scales), blocks), data.noise_model.freedom)
-    monkeypatch.setattr(one_out, "ROUNDS", 1)
-    monkeypatch.setattr(one_out, "gross_weights", lambda *_: None)
+    monkeypatch.setattr(tails, "gross_weights", lambda *_: None)
+    monkeypatch.setattr(one_out, "estimated", partial(tails.estimated, rounds=1))
     actual = one_out.weighed(data, scales).tails
     assert actual.freedom == expected.freedom < inf
     assert_close(actual.weights, expected.weights, rtol=1e-6, atol=1e-7)
@@ -160,6 +164,35 @@ def test_right_scales_are_hardly_widened(monkeypatch: pytest.MonkeyPatch) -> Non
         found.append(cross_validated_inflation(scales, scales, drawn, rows, seed=seed) or 0.0)
     assert min(found) > 0.5
     assert 0.9 < np.median(found) < 1.7, found
+
+
+UNEVEN = 3e-4, 2e-5, 2e-5
+
+
+@pytest.mark.parametrize(
+    ("along", "field", "repeats", "expected"),
+    [(UNEVEN, 1e-3, 0, 3e-4), (UNEVEN, 3e-5, 0, 3e-5), (UNEVEN, 1e-3, 10, 0.0), ((6e-5, 6e-5, 6e-5), 1e-3, 0, 0.0)],
+)
+def test_noise_of_commands_is_an_error_of_the_machine(
+    along: tuple[float, ...], field: float, repeats: int, expected: float
+) -> None:
+    """Unless a device explains it as well, or repeats show it; and of no more than the machine's other errors."""
+    x = 0.5 * torch.rand(60, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    data = place(dc.cartesian(x), dc.Measurements(x, x + 1e-4 * normal(*x.shape, seed=0)), silent).tangent_data()
+    quiet = dict.fromkeys(("transmission_amplitude", "task_amplitude"), 1e-8)
+    usual = {"coupled_lengthscale": 0.3, "coupled_amplitude": field, "sensor_noise": 5e-5}
+    scales = scales_of(3, 3, joint_noise=along, **usual, **quiet)
+    target = (torch.linalg.cholesky(covariance(data, scales)) @ normal(data.y.numel(), seed=1)).view_as(data.y)
+    drawn, found = replace(data, y=data.y + target - data.target), Selection(scales, "")
+    variances = unresolved_errors(found, scales, drawn, len(x) - repeats)
+    assert (0.0 if variances is None else float(variances.max()) ** 0.5) == pytest.approx(expected, rel=1e-3)
+
+
+def test_markers_and_repeats_of_a_row_count_as_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    shares = list[Tensor]()
+    monkeypatch.setattr(one_out, "region_scale", lambda *given: float(shares.append(given[2]) is None))
+    cross_validated_inflation(None, arm(2, 40).scales, arm(2, 40).tangent_data, torch.arange(40) // 2)
+    assert float(shares[0].sum()) == pytest.approx(20.0)
 
 
 def test_parts_of_the_space_show_errors_that_no_row_does() -> None:

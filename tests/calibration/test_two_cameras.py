@@ -100,7 +100,7 @@ def test_every_camera_is_where_it_is_and_has_its_lens() -> None:
 
 def test_every_camera_of_a_recalibrated_model_is_where_it_is(tmp_path: Path) -> None:
     own = kind_named("two cameras on the tool")
-    again: Any = dc.recalibrate(own.model, own.moved).model
+    again: Any = own.recalibrated.model
     check_hand_eyes(again, 1.5e-4)
     dc.save(again, tmp_path / "again.safetensors")
     assert len(camera_files(dc.load(tmp_path / "again.safetensors"))) == 12  # pyright: ignore
@@ -182,7 +182,7 @@ def test_each_camera_has_a_file_of_its_own(command: Command, tmp_path: Path) -> 
 
 
 def test_init_proposes_the_files_of_the_cameras(command: Command, tmp_path: Path) -> None:
-    table, _ = kind().table()
+    table, _ = kind().table("new")
     shutil.copy(table, tmp_path / "corners.csv")
     for name, camera in kind().data.cameras.items():
         (tmp_path / f"{name}.yaml").write_text(camera_text(camera))

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from diffeo_calib.cli.column_names import column
-from diffeo_calib.cli.guesses import Body, bodies_in, guess_joints, joints_without_column
-from diffeo_calib.cli.proposals import guess_deviations
+from diffeo_calib.cli.guesses import Body, bodies_in, guess_deviations, guess_joints, joints_without_column
 
 SIX = [f"joint_{k}" for k in range(1, 7)]
 SO_100 = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"]

@@ -169,7 +169,10 @@ READ: dict[str, tuple[Callable[[Path], Path], dict[str, Any], list[str]]] = {
 """What is in a table -> how it is written; entries, None for one that is missing or open; texts."""
 
 
-@pytest.mark.parametrize("what", READ)
+LONGEST = ("a degree and wrong rows", "inches", "never turned")
+
+
+@pytest.mark.parametrize("what", [pytest.param(what, marks=[pytest.mark.slow] * (what in LONGEST)) for what in READ])
 def test_init_finds_what_the_numbers_mean(what: str, tmp_path: Path, init: Any) -> None:
     write, expected, texts = READ[what]
     found, text = init(write(tmp_path / "t.csv"))
@@ -213,6 +216,8 @@ def test_places_measured_in_a_plane(tmp_path: Path, init: Any) -> None:
     measured = commanded + 1e-3 * (4 * commanded.flip(1)).sin() + 2e-5 * drawn(30, 2, seed=2)
     table = write_columns(tmp_path / "t.csv", **{"cmdx_cmdy": 1e3 * commanded, "measx_measy": 1e3 * measured})
     found, _ = init(table)
+    refused = init(write_columns(tmp_path / "um.csv", **{"cmdx_um|cmdy_um": 1e6 * commanded, "x|y": 1e3 * measured}))[1]
+    assert "cmdx_um, cmdy_um in um: expected m, mm, cm, inch; convert them" in refused
     assert found["position"] == ["measx,measy,0"]
     assert (found["robot-pose"], found["length"]) == ("cmdx,cmdy", "mm")
     machine = PoseColumns(("cmdx", "cmdy"), robot=dc.cartesian(commanded))
@@ -372,6 +377,7 @@ def test_a_slide_that_stood_still_is_corrected(tmp_path: Path, command: Command)
     assert float(added.max() - added.min()) > 0.1
 
 
+@pytest.mark.slow
 def test_a_table_with_two_slides_is_corrected_where_it_can_move(tmp_path: Path, command: Command, init: Any) -> None:
     went, measured = slides(0.0)
     table = write_columns(tmp_path / "t.csv", cmdx_cmdy=1e3 * went[:, :2], x_y_z=1e3 * measured)

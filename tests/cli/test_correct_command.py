@@ -7,11 +7,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 import pytest
 import torch
-from command_bank import Command
+from command_bank import VALIDATOR, Command
 from deformation_bank import model_of
 from product_bank import Case
 from table_bank import held
@@ -22,7 +21,6 @@ from two_arms_bank import robot as two_arms
 import diffeo_calib as dc
 from diffeo_calib.kinematics.tool import tool_transform
 from diffeo_calib.measurements.poses import angle_between, rotation_matrices, transforms
-from diffeo_calib.reports.results import SCHEMA
 
 UNITS = ["--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
 TOOL = [30.0, -20.0, 150.0, 10.0, 20.0, -30.0]  # mm, and a rotation vector in deg
@@ -220,7 +218,7 @@ def test_targets_and_commands_of_both_hands(tmp_path: Path, command: Command) ->
     done = command(*given, *targets)
     assert (done.code, done.err) == (0, "")
     results = json.loads((tmp_path / "out.json").read_text())
-    jsonschema.validate(results, SCHEMA)
+    VALIDATOR.validate(results)
     misses, empty = results["results"]["misses"], [k == 2 for k in range(6)]
     assert [miss is None for miss in misses["right"]["miss_m"]] == empty
     assert misses["left"]["angle_miss_deg"] is None

@@ -28,7 +28,7 @@ def test_sockets_are_proposed(tmp_path: Path, proposed: Proposed, init: Proposed
     arm.write_urdf(tmp_path / "arm.urdf")
     write_socket_table(table, arm, "ab", 1)
     written, text = init(table, tmp_path / "arm.urdf")
-    assert (written["socket"], written["angle"], written["length"]) == (["place", "socket"], "deg", "mm")
+    assert (written["socket"], written["angle"], written["length"]) == ("place,socket", "deg", "mm")
     assert not {"position", "distance", "distance-std"} & set(written)
     assert "# all columns are used" in text
     (tmp_path / "cell.toml").write_text(text.replace("# distance", "distance"))
@@ -40,9 +40,9 @@ def test_sockets_are_proposed(tmp_path: Path, proposed: Proposed, init: Proposed
     seen = [",".join(["", "", *map(repr, row)]) for row in both]
     table.write_text("\n".join([f"{header},x,y,z", *seen, *(f"{line},,," for line in lines)]))
     written, text = init(table, tmp_path / "arm.urdf")
-    assert (written["position"], written["socket"]) == (["x,y,z"], ["place", "socket"])
+    assert (written["position"], written["socket"]) == (["x,y,z"], "place,socket")
     assert (written["angle"], written["length"]) == ("deg", "m")
-    assert '# distance = ["a,b=0.05"]' in text
+    assert '# distance = "a,b=0.05"' in text
     assert "# distance-std = 3e-05" in text
 
 
@@ -52,9 +52,13 @@ def test_sockets_of_a_panda(ur10_folder: Path, init: Proposed) -> None:
     assert init(data / "panda_3.csv", data / "panda.urdf")[0]["angle"] == "rad"
 
 
-def test_the_ur10(ur10_folder: Path, init: Proposed) -> None:
-    assert guess_sheet(ur10_folder / "measurements_iso_cubes.csv").decimal == ","
-    _, text = init(ur10_folder / "measurements_iso_cubes.csv", ur10_folder / "ur10_robot.urdf")
+def test_the_ur10(ur10_folder: Path, tmp_path: Path, init: Proposed) -> None:
+    """Every fourth of its rows."""
+    table = tmp_path / "ur10.csv"
+    header, *lines = (ur10_folder / "measurements_iso_cubes.csv").read_text().splitlines()
+    table.write_text("\n".join([header, *lines[::4]]))
+    assert guess_sheet(table).decimal == ","
+    _, text = init(table, ur10_folder / "ur10_robot.urdf")
     for line in (
         *('length = "mm"', 'angle = "rad"', 'decimal = ","', 'sep = ";"', "measurement_x,measurement_y"),
         *('rotation = "measurement_rx,measurement_ry,measurement_rz"', 'convention = "XYZ"', 'rotation-angle = "deg"'),
@@ -140,7 +144,7 @@ def test_tips_and_cameras_are_proposed(name: str, init: Proposed) -> None:
 def test_the_camera_beside_the_table(tmp_path: Path, command: Command) -> None:
     """Another YAML file is none; its place is relative to the campaign, which runs from anywhere."""
     kind = kind_named("images of a board")
-    table, _ = kind.table()
+    table, _ = kind.table("new")
     (tmp_path / "sub").mkdir()
     shutil.copy(table, tmp_path / "corners.csv")
     (tmp_path / "launch.yaml").write_text("camera: none\n")

@@ -14,7 +14,7 @@ from kind_bank import FREE, UNITS, kind_named, marked
 import diffeo_calib as dc
 from diffeo_calib.kinematics.evaluation import place, residuals
 
-DRAWN = ("positions", "several tips", "ball in sockets", "images")
+DRAWN = ("positions", "ball in sockets", "images")
 """Kinds whose pictures differ."""
 
 

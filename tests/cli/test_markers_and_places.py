@@ -86,8 +86,8 @@ def test_init_joins_by_columns_that_name_the_same_rows(joints: str, places: str,
     """The most common texts, or those of columns of other names."""
     (tmp_path / "j.csv").write_text(joints)
     (tmp_path / "p.csv").write_text(places)
-    path, entries = with_places(tmp_path / "j.csv", Places(places=tmp_path / "p.csv"), tmp_path)
-    assert [entry.value for entry in entries] == ["p.csv", by]
+    path, common = with_places(tmp_path / "j.csv", Places(places=tmp_path / "p.csv"))
+    assert common == by
     assert [own[0] for _, own in read_cells(path, ",")[1]] == (["1.5", "0.5"] if by == "pose" else ["P3", "P1", "P2"])
 
 

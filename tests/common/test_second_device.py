@@ -32,7 +32,7 @@ ONCE, TWICE = (dc.GaussNewton(max_iterations=count) for count in (1, 2))
 FITS: dict[str, Callable[[dc.Problem], dc.Fit]] = {
     "Gauss-Newton": lambda problem: dc.fit(problem, TWICE, dc.RK4(2)),
     "chosen steps": lambda problem: dc.fit(problem, ONCE),
-    "adaptive": lambda problem: dc.fit(problem, ONCE, dc.TorchDiffEq("dopri5", rtol=1e-2, atol=1e-3)),
+    "adaptive": lambda problem: dc.fit(problem, ONCE, dc.TorchDiffEq("bosh3", rtol=1e-1, atol=1e-2)),
     "L-BFGS": lambda problem: dc.fit(problem, dc.LBFGS(max_iterations=2), dc.RK4(2)),
     "descent": lambda problem: dc.fit(problem, dc.GradientDescent(1e-6, max_iterations=2), dc.RK4(1)),
     "conjugate gradients": lambda problem: dc.fit(problem, dc.GaussNewton(linear="cg", max_iterations=1), dc.RK4(1)),

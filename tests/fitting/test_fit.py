@@ -111,6 +111,7 @@ def test_arguments_of_the_wrong_kind_are_one_sentence(call: Callable[[Problem], 
         call(rr_problem(5))
 
 
+@pytest.mark.slow
 def test_default_integrator_is_fine_enough(small: dc.Fit) -> None:
     fit = dc.fit(small.problem)
     assert fit.integrator.intervals in (1, 2, 4, 8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -113,10 +114,11 @@ def test_the_tangent_model_is_written_out_and_the_first_gauss_newton_iterate(pro
 
 def test_problem_takes_arrays_and_lists() -> None:
     x, problem = elastic_rr.grid(4), rr_problem(4)
-    for kind in (np.asarray, Tensor.tolist, lambda t: t.requires_grad_()):
-        other = Problem(
-            elastic_rr.nominal, kind(x), kind(problem.y), joint_kernel=K_V, task_kernel=K_W, noise=np.float64(0.01)
-        )
+    kernels = {"joint_kernel": K_V, "task_kernel": K_W}
+    for kind in (np.asarray, Tensor.tolist, lambda t: t.clone().requires_grad_()):
+        live = isinstance(kind(x), Tensor)
+        with pytest.warns(dc.DiffeoCalibWarning, match="back to `x`, `y`") if live else nullcontext():
+            other = Problem(elastic_rr.nominal, kind(x), kind(problem.y), noise=np.float64(0.01), **kernels)
         torch.testing.assert_close(other.x, problem.x, rtol=0, atol=0)
         torch.testing.assert_close(other.noise.covariance, problem.noise.covariance, rtol=0, atol=0)
         assert not other.x.requires_grad

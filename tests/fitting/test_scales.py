@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.func import jacrev, vmap
 
 import diffeo_calib as dc
+from diffeo_calib.fitting import scales
 from diffeo_calib.fitting.scales import SPREAD
 from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.robots import elastic_rr
@@ -86,6 +87,30 @@ def test_hidden_coordinates_stay_hidden() -> None:
     )
     torch.testing.assert_close(odd.noise.covariance, even.noise.covariance, rtol=0.02, atol=0)
     assert torch.equal(odd.noise.visible, ~gone)
+
+
+@pytest.mark.parametrize("numbers", [1500, 2 * ROWS])
+def test_gross_rows_are_named_and_hardly_followed(numbers: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Plain scales take 2 of 60 errors of 20 sigma for noise, so that no left-out error looks gross beside it.
+    monkeypatch.setattr(scales, "NUMBERS", numbers)
+    gross, new = torch.isin(torch.arange(2 * ROWS), torch.tensor([3, 40, 77])), uniform(300, 2, seed=5)
+    x = torch.cat([X, uniform(ROWS, 2, seed=6)])
+    y = elastic_rr.real(x) + SIGMA * normal(2 * ROWS, 2, seed=7) + 20 * SIGMA * gross[:, None]
+    given = arm()
+    kernels = {"joint_kernel": given.spec.joint_kernel, "task_kernel": given.spec.task_kernel, "noise": 0.03}
+    problem = dc.Problem(elastic_rr.nominal, x, y, **kernels)
+    with pytest.warns(dc.DiffeoCalibWarning, match="errors of rows 3, 40, 77 are gross"):
+        robust = dc.choose_scales(problem, robust=True)
+    plain, clean = dc.choose_scales(problem), dc.Problem(elastic_rr.nominal, x[~gross], y[~gross], **kernels)
+    clean = dc.choose_scales(clean, robust=True)  # in which no row is gross
+    wrong, right, best = (
+        float((dc.fit(own).model(new) - elastic_rr.real(new)).norm(dim=1).mean()) for own in (plain, robust, clean)
+    )
+    assert right < 0.6 * wrong
+    assert right == pytest.approx(best, rel=0.1)
+    assert float(robust.noise.covariance[gross, 0, 0].min()) > (5 * SIGMA) ** 2
+    assert robust.new_noise is not None
+    assert float(robust.new_noise[0, 0].sqrt()) == pytest.approx(SIGMA, rel=0.2)
 
 
 def test_what_is_not_chosen_stays_and_what_is_refused() -> None:

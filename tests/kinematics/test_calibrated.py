@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
 import torch
 from deformation_bank import made
@@ -9,8 +12,10 @@ from product_bank import Case, noise_blocks, simulated
 from tangent_bank import tangent_covariance
 from torch.testing import assert_close
 
+import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.registered_map import moved
 from diffeo_calib.measurements.poses import angle_between, mark_jacobian, mark_points
 
 CHI2_95 = 7.8147  # 95 % quantile, three degrees of freedom
@@ -48,6 +53,21 @@ def test_regions_of_95_percent_hold_about_as_many_points(arm: Case, pair: Case, 
         inside.append(distance < CHI2_95)
         assert 0.80 <= float(inside[-1].double().mean()) <= 0.995
     assert 0.85 <= float(torch.cat(inside).double().mean()) <= 0.99
+
+
+def test_errors_that_the_fields_do_not_resolve(arm: Case, tmp_path: Path) -> None:
+    """Regions without noise hold them, those of new measurements had them in their noise."""
+    q, variances, known = arm.test.q[:5], torch.linspace(1e-8, 6e-8, 6, dtype=torch.float64), arm.model.map
+    short, J = replace(known, unresolved=variances), known.jacobian(q)
+    found = short.predict(q, noise=False)[1]
+    assert_close(found, known.predict(q, noise=False)[1] + (J * variances) @ J.mT, rtol=5e-3, atol=2e-11)
+    assert_close(short.predict(q)[1], known.predict(q)[1], rtol=1e-9, atol=0)
+    between = short.joint_covariance(q).unflatten(0, (-1, 3)).unflatten(2, (-1, 3))
+    assert_close(torch.einsum("nanb->nab", between), found, rtol=1e-9, atol=1e-15)
+    assert moved(short, torch.eye(4, dtype=torch.float64)).unresolved is variances
+    assert_close(short.inflated(4.0).unresolved, 4.0 * variances)
+    dc.save(short, tmp_path / "model.safetensors")
+    assert dc.load(tmp_path / "model.safetensors").map.unresolved.equal(variances)
 
 
 # --- inverse --------------------------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from diffeo_calib.measurements.bodies import triple
 from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table_format import LEVER
-from diffeo_calib.robots.se3 import rotation, transforms
+from diffeo_calib.robots.se3 import rotation, transforms, twist_transform
 from diffeo_calib.sensors.coordinates import SENSORS, placed
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.height import Planes
@@ -72,7 +72,9 @@ def exact(kind: type[Devices]) -> tuple[Devices, Readings, Tensor]:
 @pytest.mark.parametrize("kind", KINDS)
 def test_exact_readings_find_both_devices(kind: type[Devices]) -> None:
     there, data, points = exact(kind)
-    found = kind.at(data, points).refined(data, points)
+    start = kind.at(data, points)
+    assert float(start.errors(data, points).abs().max()) < 1e-6  # in closed form
+    found = start.refined(data, points)
     assert float(found.errors(data, points).abs().max()) < 1e-9
     same = TOLD.get(kind, slice(None))
     assert_close(found.constants[:, same].abs(), there.constants[:, same].abs(), rtol=0, atol=1e-7)
@@ -155,6 +157,25 @@ def test_sentences_have_places_and_their_deviations(kind: type[Devices]) -> None
     assert SAID[kind](there.constants[0]) in there.sentence(0, deviations, "its frame")
 
 
+@pytest.mark.parametrize("kind", [FixedPoints, Planes])
+def test_what_rows_leave_open_of_a_device_is_that_of_least_squares(kind: type[Devices]) -> None:
+    there, data, points = exact(kind)
+    data = replace(data, values=data.values + 0.1 * normal(ROWS, 1, seed=19))
+    noise = float(there.errors(data, points).square().mean())
+    for number, deviations in enumerate(there.open_deviations(data, points)):
+        own = data.device == number
+        S = there.by_increments(points, data.device)[own, 0]
+        expected = torch.linalg.inv(S.T @ S / noise + there.deviations[number].square().reciprocal().diag())
+        assert_close(deviations, expected.diagonal().sqrt())
+
+
+def test_a_held_tool_reads_how_the_second_hand_is_off() -> None:
+    """Shift and turn along its own axes."""
+    twist, left = 1e-6 * normal(6, seed=20), frames(1, 31)[0]
+    read = HeldTools.read(KINDS[HeldTools][0], torch.stack([left, left @ HELD[0] @ twist_transform(twist)]))
+    assert_close(read, torch.cat([twist[:3], LEVER * twist[3:]]), rtol=1e-4, atol=1e-11)
+
+
 def test_sockets_are_the_middles_of_balls() -> None:
     """A single row deviates as those of others do."""
     balls = 1e-3 * normal(5, 3, seed=18)
@@ -193,6 +214,7 @@ def test_a_stated_camera_is_right_handed_and_looks_at_its_point() -> None:
     assert_close(R.mT @ t, -numbers[:, :3, None])
     line = numbers[:, 3:] - numbers[:, :3]
     assert_close(R[:, 2], line / line.norm(dim=1, keepdim=True))
+    assert triple(1e3 * numbers[0, :3]) in replace(exact(Cameras)[0], constants=Cameras.stated(numbers)).where(0)
 
 
 def test_pixels_are_metres_at_the_mean_depth_and_back() -> None:

@@ -22,7 +22,7 @@ from diffeo_calib.measurements.poses import mark_points, poses_from_marks
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.robots.se3 import rotation, transforms, twist_transform
-from diffeo_calib.sensors.set_ups import MeasuringFrames, MountedMarkers, SetUps
+from diffeo_calib.sensors.set_ups import MeasuringFrames, MountedFrames, MountedMarkers, SetUps
 
 ROWS, NAMES, STEP = 20, ("here", "there"), 1e-6
 
@@ -96,6 +96,21 @@ def test_carried_set_ups_belong_to_the_other_model(kind: type[SetUps]) -> None:
     assert_close(other.aligned(data).points, points(tips), rtol=0, atol=1e-9)
 
 
+def test_the_deviations_of_markers_are_those_of_means() -> None:
+    noise, turns = 1e-4 * normal(ROWS, 3, 3, seed=9), TIPS[:, None, :3, :3].expand(-1, 3, -1, -1)
+    data = measured(MountedMarkers)
+    own = MountedMarkers.of(points(TIPS), with_attributes(data, points=data.points + noise), lambda _: turns)
+    away = (noise @ TIPS[:, :3, :3])[SESSION == 1]
+    assert_close(own.deviations[1].view(3, 3), away.std(0, correction=0) / len(away) ** 0.5)
+
+
+def test_frames_that_are_found_in_rows_of_known_ones_lead_on_from_these() -> None:
+    first, second = (MountedFrames(NAMES, frames(2, k, 0.1).flatten(1), normal(2, 6, seed=k)) for k in (21, 23))
+    for number in range(2):
+        there = first.view(number, second.view(number, TIPS))
+        assert_close(second.after(first).view(number, TIPS), there)
+
+
 def changes(pose: Callable[[Tensor], Tensor], count: int) -> Tensor:
     """(6, count) shift and turn of a pose, along the axes of its frame, by unit steps."""
     columns = []
@@ -140,10 +155,8 @@ def test_a_mount_that_no_row_of_the_fit_tells_of_is_known_as_before() -> None:
     """Its deviations, along the axes of the model's tool, are added."""
     model, std = kind_named("two cameras on the tool").model, 1e-3 * torch.arange(1.0, 7.0).double()
     mounts, *others = sorted(model.placement, key=lambda own: own.kind != "mounted frame")
-    tool, mount = (
-        poses_from_marks(model.geometry.tool[None], model.bodies.pose_lever())[0],
-        mounts.constants[1].view(4, 4),
-    )
+    tool = poses_from_marks(model.geometry.tool[None], model.bodies.pose_lever())[0]
+    mount = mounts.constants[1].view(4, 4)
     known = []
     for deviations in (torch.zeros_like(std), std):
         alone = replace(mounts, rows=mounts.rows[:0], device=mounts.device[:0], deviations=deviations.expand(2, 6))

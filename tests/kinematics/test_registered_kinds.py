@@ -113,19 +113,6 @@ def test_a_registered_robot_carries_its_payload() -> None:
 
 
 @pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
-def test_the_middle_of_a_socket_with_one_row_is_known_as_well_as_a_row() -> None:
-    mixture = kind_named("mixture")
-    sockets = mixture.data.device_names
-    name = next(own for own in sockets if own)
-    lone = [row for row, own in enumerate(sockets) if own == name][1:]
-    rows = mixture.data.rows([row for row in range(len(sockets)) if row not in lone])
-    (placed,) = (own for own in mixture.model.registered(rows).placement if name in own.names)
-    deviations = placed.deviations.norm(dim=1)
-    others = torch.cat([deviations[: placed.names.index(name)], deviations[placed.names.index(name) + 1 :]])
-    assert float(deviations[placed.names.index(name)]) > float(others.max())
-    assert float(deviations.max()) < 1e-4
-
-
 # --- markers of new rows in another order than in the fit -----------------------------------------------------------
 
 

@@ -11,7 +11,7 @@ from bag_bank import place, standing
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.csv.joined import JoinedFile, Recording, StopLimits, joined_file, pictured, stops
+from diffeo_calib.measurements.csv.joined import HeldFile, Recording, StopLimits, joined_file, pictured, stops
 from diffeo_calib.measurements.csv.lines import read_cells
 
 JOINTS = ("pose,a,b", "p1,1,2", "p2,3,4", "p3,5,6")
@@ -20,7 +20,7 @@ PLACES = ("x,y,z,pose", "9,9,9,p3", "", "8,8,8,p1", "7,7,7,p4")
 
 def joined(
     folder: Path, joints: tuple[str, ...] = JOINTS, places: tuple[str, ...] = PLACES, by: str = "pose", **how: bool
-) -> JoinedFile:
+) -> HeldFile:
     for name, lines in (("joints", joints), ("places", places)):
         (folder / f"{name}.csv").write_text("\n".join(lines) + "\n")
     return joined_file(folder / "joints.csv", folder / "places.csv", by, **how)

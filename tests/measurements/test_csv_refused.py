@@ -118,6 +118,11 @@ POSES: list[Case] = [
     (POSE, {"rotation": [["a", "b", "c"], ["a", "b"]]}, "`rotation`: expected 3 names ... got ['a', 'b']"),
     (POSE, {"std": ["d", "q1"]}, "`std`: expected ... one per marker ... got ['d', 'q1']"),
     (POSE, {"std": ["a"]}, "distinct columns, got ['a'] twice"),
+    (
+        POSE,
+        NO_ROTATION | {"spherical": "zenith_gon", "std": ["a", "b", "c"]},
+        "`std` of a distance and two angles: expected one column for each marker, got ['a', 'b', 'c']; name one",
+    ),
     (POSE, {"rotation_std": ["d", "e"]}, "`rotation_std` ... three, or one for all three axes, got ['d', 'e']"),
     (POSE, {"rotation_std": ["d", "d", "d"]}, "distinct columns, got ['d'] twice ... the deviations of all axes alone"),
     (

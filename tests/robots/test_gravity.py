@@ -1,7 +1,10 @@
 """Gravity sag and payloads: features against moments of weights, payloads of known mass."""
 
+from dataclasses import replace
+
 import pytest
 import torch
+from product_bank import usual_scales
 from robots_bank import CHAINS, draw, every_chain
 from simulated_body import URDF_FILE
 from torch import Tensor
@@ -161,6 +164,9 @@ def test_a_map_of_payloads_at_rows_and_elsewhere() -> None:
     torch.testing.assert_close(whole.rows(some)(q[some], theta), every[some])
     usual = GeometryMap(Geometry.nominal(chain), elastic=True, payload=payload.weighing(MASSES.median()))
     torch.testing.assert_close(whole.typical(q, theta), usual(q, theta))
+    scales = usual_scales(chain)
+    one, three = (replace(scales, payload=factor).prior_variance(whole)[whole.sag] for factor in (1.0, 3.0))
+    torch.testing.assert_close(three, torch.where(whole.elasticity.loaded, 9.0, 1.0) * one)
     assert list(GravitySag(chain, payload).parts)[-1] == "payload"
 
 

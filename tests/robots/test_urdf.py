@@ -197,6 +197,8 @@ def test_files_that_are_no_files(tmp_path: Path) -> None:
     for place in ("/dev/zero", tmp_path):
         with pytest.raises(RobotError, match=f"'{place}' is no file; check the path of the URDF"):
             load_urdf(place, "a", "b")
+    with pytest.raises(InputError, match="the name of a file: expected text or a path, got 3"):
+        load_urdf(3, "a", "b")  # pyright: ignore[reportArgumentType]
     with pytest.raises(RobotError, match=r"there is no file '.*arm.urdf'; check the path"):
         load_urdf(tmp_path / "arm.urdf", "base_link", "tool")
     large = tmp_path / "large.urdf"

@@ -42,12 +42,12 @@ def test_examples_run(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """With at most 50 simulated rows, and 18 images; scales are given where the command line fits."""
+    """With at most 40 simulated rows, and 14 images; scales are given where the command line fits."""
     measure, sample, seen = SimulatedArm.measure, SimulatedArm.sample, simulated_camera.camera_arm
-    monkeypatch.setattr(SimulatedArm, "sample", lambda arm, count, seed=0: sample(arm, min(count, 50), seed))
-    monkeypatch.setattr(SimulatedArm, "measure", lambda arm, count, seed: measure(arm, min(count, 50), seed=seed))
+    monkeypatch.setattr(SimulatedArm, "sample", lambda arm, count, seed=0: sample(arm, min(count, 40), seed))
+    monkeypatch.setattr(SimulatedArm, "measure", lambda arm, count, seed: measure(arm, min(count, 40), seed=seed))
     monkeypatch.setattr(subprocess, "run", in_this_process(command))
-    monkeypatch.setattr(simulated_camera, "camera_arm", lambda rows: seen(min(rows, 18)))
+    monkeypatch.setattr(simulated_camera, "camera_arm", lambda rows: seen(min(rows, 14)))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [str(example)])
     runpy.run_path(str(example), run_name="__main__")

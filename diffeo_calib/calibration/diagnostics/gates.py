@@ -30,7 +30,7 @@ MIXED_ROWS, TWO_TOOLS_LEFT = 40, 0.45
 tools in turn: noise that is halved by its sign leaves .8."""
 PAYLOAD_ODDS, PAYLOADS_LEFT = 12.0, 0.75
 """Log odds of other payloads, beyond those by chance where every row may have any, and the part of the left-out error
-that may remain with them: of right columns 5 at most beyond chance, and .9 or more remain; none of 60 was doubted."""
+that may remain with them."""
 ROW_ODDS = 6.0
 """Log odds of a number that differs from row to row: clean images have less than zero, focal lengths that differ by
 0.1 % fourteen and more."""
@@ -68,9 +68,8 @@ OFFSETS_TOLD_APART = 4.0
 """Difference of likelihood ratios up to which the rows do not tell two offsets apart."""
 HIDDEN_SHARE = 0.3
 """Displacement by an offset that places do not reproduce, relative to the noise, up to which rows do not show it."""
-DRIFT_ODDS, DRIFT_ODDS_OF_INLIERS = 4.0, 0.5
-"""Log odds of small changes of everything: what chance exceeds in one of twenty; and where rows that do not fit the old
-model have hardly any weight, since outliers look like a change."""
+DRIFT_ODDS = 4.0
+"""Log odds of small changes of everything: what chance exceeds in one of twenty."""
 
 # --- wrong rows ---
 
@@ -154,6 +153,14 @@ LARGE_PER_REACH, LARGE_PER_USUAL, MOST_LARGE = 0.01, 20.0, 0.25
 are no errors of a calibrated robot; share of the rows from which they fail a fit."""
 LARGE_PER_EXPECTED = 2.0
 """RMS errors from this multiple of the expected ones on are warned about."""
+LARGEST_PER_REACH, LARGEST_PER_EXPECTED = 0.1, 20.0
+"""Median errors above this share of the robot's reach, or this multiple of the expected ones, are implausible."""
+LEAST_EXPLAINED, AS_GOOD = 0.5, 0.02
+"""Part of the squared error, per degree of freedom, that a motion of device or markers must explain; motions that
+explain so little less than the best one are named, too."""
+LEAST_EXCESS, MOST_LEFT = 2.0, 5.0
+"""Multiple of the expected errors below which a motion is not sought, and up to which errors may remain beside one: a
+wrong unit is no motion."""
 
 # --- what a campaign leaves open ---
 

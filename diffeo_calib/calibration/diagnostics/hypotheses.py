@@ -15,8 +15,9 @@ from diffeo_calib.common.errors import sentence
 from diffeo_calib.kinematics.nominal import rigid_motions
 from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.process.tails import FACTORS
 from diffeo_calib.regression.conditional import Process
+from diffeo_calib.regression.tails import FACTORS
+from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Hypothesis
 from diffeo_calib.sensors.set_ups import frame_slopes
 
@@ -59,8 +60,7 @@ class SampledRows(NamedTuple):
 
 def left_out_rms(process: Process) -> float:
     """RMS of the errors of rows, m, as all other rows predict them."""
-    errors, _ = process.left_out(process.numbers.owner)
-    return float((errors.square().sum() / len(process.numbers.owner.unique())).sqrt())
+    return float((process.rows_left_out()[0].square().sum() / len(process.numbers.owner.unique())).sqrt())
 
 
 def worth_it(before: Tensor, after: Tensor) -> bool:
@@ -94,20 +94,23 @@ def changes_of(data: TangentData, devices: Iterable[Hypothesis] = (), index: Ten
     places = data.places.unflatten(1, (-1, 3))
     away = (places - places.mean((0, 1))).flatten(1)[..., None]
     base, markers, away = (data.slopes @ each for each in (base, markers, away))
-    base = (
-        base * (data.noise_model.row_kinds == 0)[:, None, None]
-    )  # a ball in a socket does not show where the device of other rows stands
-    frames = [] if data.adrift else [base, base[..., :3]]
-    found = [Hypothesis(BASE, each, fix=NEW_SET_UP) for each in frames]
-    found.append(Hypothesis(MARKERS, markers, fix=NEW_SET_UP))
+    base = base * (data.noise_model.row_kinds == 0)[:, None, None]  # sockets do not show where another device stands
+    joints = data.jacobian
+    if data.adrift:  # without a device no row shows an offset of the first joint
+        base, joints = 0.0 * base, torch.cat([0.0 * joints[..., :1], joints[..., 1:]], 2)
+    found = changes_of_set_up(base, markers, joints, geometry.chain)
     found.append(Hypothesis(SCALE, away, ("ppm", 1e-6), NEW_SET_UP))
-    for joint, name in enumerate(geometry.chain.joint_names):
-        if joint > 0 or not data.adrift:  # without a device no row shows an offset of the first joint
-            unit = "mrad" if data.space.periodic[joint] else "mm"
-            found.append(Hypothesis(name, data.jacobian[..., joint, None], (unit, 1e-3), TWO_ROBOTS))
     found += [one._replace(effects=one.effects[index]) for one in devices]
-    every = (one for one in found if bool((one.effects != 0).any()))
-    return [one._replace(effects=data.motions_in_numbers(one.effects)) for one in every]
+    return [one._replace(effects=data.motions_in_numbers(one.effects)) for one in found if bool(one.effects.any())]
+
+
+def changes_of_set_up(frame: Tensor, markers: Tensor, joints: Tensor, chain: Tree) -> list[Hypothesis]:
+    """What may change of a measuring frame, of what is on the tool, and of joints, with effects (N, R, 6), ..."""
+    found = [Hypothesis(BASE, each, fix=NEW_SET_UP) for each in (frame, frame[..., :3])]
+    found.append(Hypothesis(MARKERS, markers, fix=NEW_SET_UP))
+    for name, turns, own in zip(chain.joint_names, chain.periodic, joints.split(1, 2), strict=True):
+        found.append(Hypothesis(name, own, ("mrad" if turns else "mm", 1e-3), TWO_ROBOTS))
+    return found
 
 
 # --- lengths ----------------------------------------------------------------------------------------------------------

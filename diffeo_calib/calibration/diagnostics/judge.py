@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from math import hypot, inf, log
 from types import MappingProxyType
 from typing import NamedTuple
@@ -43,7 +44,7 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import few, sentence, warn_user, with_deviation
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.process.evidence import Evidence
-from diffeo_calib.process.scales import Hyperparameters
+from diffeo_calib.process.scales import PAYLOAD_FACTORS, Hyperparameters
 from diffeo_calib.regression.conditional import Process
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import MILLIMETRE, Hypothesis
@@ -51,7 +52,9 @@ from diffeo_calib.sensors.devices import MILLIMETRE, Hypothesis
 ROUNDS = 20
 """Of the codes of a mixture."""
 MISTYPED = (10.0, 0.1, 1000.0, 0.001, 1 / 0.45359237, 0.45359237)
-"""Factors of one payload in another unit, or with a wrong digit: g, pounds."""
+"""Factors of payloads in another unit, or with a wrong digit: g, pounds."""
+ONE_SET_UP = "one set-up for all rows, in the order of their numbers"
+NOTHING = torch.zeros(0, 0, dtype=torch.float64, device=HOST)
 OPENED_M = 0.01
 """Prior RMS motion by what is opened in a model, more than what is found. Larger motions are gross, such as exchanged
 markers, and left to the weights of the rows."""
@@ -66,17 +69,18 @@ class Candidate(NamedTuple):
     """An explanation that chance does not explain, in words, and the unknowns that it opens.
 
     Args:
-        columns: (M, U) effects of the unknowns, of any size, on the numbers of the rows. most: part of the RMS left-out
-            error that may remain with them. opens: rows for which the model holds, those without effects, once they are
-            opened in it; none if not.
+        left, most: parts of the RMS left-out error that remain with them, and that may remain. opens: rows for which
+            the model holds, those without effects, once they are opened in it; none if not. columns: (M, U) their
+            effects on the numbers of the rows, of any size.
     """
 
     what: str
     expected: str
     fix: str
-    columns: Tensor
+    left: float
     most: float
     opens: str = ""
+    columns: Tensor = NOTHING
 
 
 class Finding(NamedTuple):
@@ -124,13 +128,13 @@ def judge(
 
 def best_of(found: Iterable[Candidate], rows: SampledRows) -> Finding | None:
     """That with which left-out errors fall most, relative to what may remain."""
-    shares = ((rows.left(one.columns) / one.most, one) for one in found)
-    share, best = min(shares, key=lambda own: own[0], default=(inf, None))
-    if best is None or share > 1.0:
+    best = min(found, key=lambda own: own.left / own.most, default=None)
+    if best is None or best.left > best.most:
         return None
-    left = share * best.most
-    moved = left_out_rms(rows.process) * (1.0 - left**2) ** 0.5
-    got = f"about {1e3 * moved:.2g} mm of error, and leave-one-out errors that fall to {100 * left:.0f} % beside it"
+    moved = left_out_rms(rows.process) * (1.0 - best.left**2) ** 0.5
+    got = (
+        f"about {1e3 * moved:.2g} mm of error, and leave-one-out errors that fall to {100 * best.left:.0f} % beside it"
+    )
     fix, columns = best.fix, None
     if best.opens and moved < OPENED_M:
         fix += f"; the model holds for {best.opens}"
@@ -185,10 +189,13 @@ def changed(
     process, order = rows.process, lines.argsort()
     found = [*changes(hypotheses, process, order, excess=excess)]
     best = max(found, key=lambda one: one.evidence)
-    if best.evidence < gates.CHANGE_EVIDENCE:
+    what, _, _, advice, *_ = best.hypothesis
+    sudden, clear = best.row is not None, best.evidence >= gates.CHANGE_EVIDENCE
+    once, fix = sudden * max(best.evidence, 0.0), f"check what happened then; {advice}"
+    for one in (each for each in hypotheses if each.unit is None or (clear and each.name == what)):
+        yield from changed_twice(rows, one, order, names, once, excess=excess)
+    if not clear:
         return
-    (what, E, _, advice, *_), sudden = best.hypothesis, best.row is not None
-    expected, fix = "one set-up for all rows, in the order of their numbers", f"check what happened then; {advice}"
     others = [
         one
         for one in found
@@ -200,19 +207,30 @@ def changed(
     words += " (these rows do not tell which)" * bool(others)
     words += " over the rows" if best.row is None else f" near {names[order[best.row]]}"
     kept, advice = ("the rows before it", fix) if sudden else ("the middle of the rows", SLOW)
-    yield Candidate(words, expected, advice, rows.columns(E, best.codes), gates.WORTH, opens=kept)
-    if sudden:
-        return
-    # three set-ups look like a drift: the first change is sought once more beside the second one
-    first, second = (_likeliest(*scans([E], process, order)), 0)
+    columns = rows.columns(best.hypothesis.effects, best.codes)
+    yield Candidate(words, ONE_SET_UP, advice, rows.left(columns), gates.WORTH, kept, columns)
+
+
+def changed_twice(
+    rows: SampledRows, one: Hypothesis, order: Tensor, names: Sequence[str], once: float, *, excess: float
+) -> Iterator[Candidate]:
+    """Three set-ups, which look like a drift, or what moves back, which looks like little.
+
+    Each change is sought once more beside the other one. ``once``: evidence of a single one; others as of
+    :func:`changes`.
+    """
+    (what, E, _, advice, *_), process = one, rows.process
+    first, second = _likeliest(*scans([E], process, order)), 0
     for _ in range(2):
         beside = process.opened(rows.columns(E, _from(order, first)))
         first, second = _likeliest(*scans([E], beside, order)), first
-    if abs(first - second) >= gates.CHANGE_ROWS:
+    columns = torch.cat([rows.columns(E, _from(order, row)) for row in (first, second)], 1)
+    both = Evidence.of(columns, process)
+    evidence = float(both.gain) / max(excess, float(both.excess)) - (columns.shape[1] + 2) * log(len(order))
+    if abs(first - second) >= gates.CHANGE_ROWS and evidence >= once + gates.CHANGE_EVIDENCE:
         near = " and ".join(names[order[row]] for row in sorted((first, second)))
-        columns = torch.cat([rows.columns(E, _from(order, row)) for row in (first, second)], 1)
-        words = f"{what} seems to have moved more than once, near {near}"
-        yield Candidate(words, expected, fix, columns, gates.WORTH**2, opens="the rows before them")
+        words, fix = f"{what} seems to have moved more than once, near {near}", f"check what happened then; {advice}"
+        yield Candidate(words, ONE_SET_UP, fix, rows.left(columns), gates.WORTH**2, "the rows before them", columns)
 
 
 def changes(
@@ -324,7 +342,7 @@ def two_tools(rows: SampledRows, effects: Tensor, lines: Tensor) -> Iterator[Can
         fix = "name the tool of every row in a column (`marker`; or `session` with `remounted`)"
         what += few(lines[rows.index][fewer].tolist(), 5)
         columns = rows.columns(E, fewer.to(E))
-        yield Candidate(what, "one tool", fix, columns, gates.TWO_TOOLS_LEFT, opens="the other rows")
+        yield Candidate(what, "one tool", fix, rows.left(columns), gates.TWO_TOOLS_LEFT, "the other rows", columns)
 
 
 def other_payloads(
@@ -335,44 +353,60 @@ def other_payloads(
     Args:
         rows, some: those that are judged, and their measurements. data, lines: all rows, and theirs in their file.
     """
-    load = data.nominal.load
-    masses = load.masses.to(data.x)
-    if not load.by_row or len(masses.unique()) > gates.MOST_MASSES:
+    load, sag = data.nominal.load, data.nominal.elasticity
+    if not load.by_row or sag is None:
         return
-    part, own = some.nominal.sag, masses[rows.index] / load.unit
-    loaded = torch.arange(part.start, part.stop, device=masses.device)[some.nominal.elasticity.loaded]
-    full = some.nominal.under(torch.full_like(own, load.unit))  # the sag of every row under the same mass
-    S = full.sensitivities(some.x, some.theta)[..., loaded]
+    masses, expected = load.masses.to(data.x), "every payload in the row that carried it"
+    loaded = torch.arange(data.nominal.sag.start, data.nominal.sag.stop, device=masses.device)[sag.loaded]
+    full = some.nominal.under(torch.full_like(masses[rows.index], load.unit))  # the sag of every row under one mass
     sizes = some.prior_variance(replace(scales, payload=1.0))[loaded].sqrt()
-    E = some.motions_in_numbers(S if some.slopes is None else some.slopes @ S) * sizes
-    mixed = Mixture(rows, E, masses.unique() / load.unit - own[:, None])
-    others = {words: other[rows.index] / load.unit - own for words, other in _other_columns(masses, lines)}
-    odds = {words: mixed.evidence(codes)[1] for words, codes in others.items()}
-    best, expected = max(odds, key=lambda words: odds[words]), "every payload in the row that carried it"
-    if odds[best] > gates.PAYLOAD_ODDS:
+    E = some.motions_in_numbers(some.slopes @ full.sensitivities(some.x, some.theta)[..., loaded]) * sizes
+
+    def under(codes: Tensor, factor: float) -> Process:
+        return rows.process.with_effects(loaded, factor * rows.columns(E, codes))
+
+    columns = {"": masses} | dict(_other_columns(masses, lines))
+    codes = {words: other[rows.index] / float(other.max()) for words, other in columns.items()}
+    found = {words: max((under(own, f).evidence, f) for f in PAYLOAD_FACTORS[::2]) for words, own in codes.items()}
+    best = max(found, key=lambda words: found[words])
+    if found[best][0] > found[""][0] + gates.PAYLOAD_ODDS:
         what, fix = f"the payloads seem to be {best}", "check the column: its order, unit and digits"
-        yield Candidate(what, expected, fix, rows.columns(E, others[best]), gates.WORTH)
+        left = left_out_rms(under(codes[best], found[best][1])) / left_out_rms(rows.process)
+        yield Candidate(what, expected, fix, left, gates.WORTH)
+    if len(kinds := masses.unique() / load.unit) > gates.MOST_MASSES:
         return
-    u, shuffled = rows.process.estimate[loaded] / sizes, torch.randperm(len(own), generator=seeded(0), device=HOST)
-    chance = Mixture(rows, E[shuffled.to(E.device)], mixed.codes)
-    (chosen, _, found), by_chance = (each.settled(each.decided(0 * own, u)) for each in (mixed, chance))
-    if found - by_chance[2] >= gates.PAYLOAD_ODDS:
-        wrong = chosen != 0
-        what = f"{int(wrong.sum())} of {len(own)} rows seem to have carried payloads of other rows, such as lines "
+    own, without = codes[""], rows._replace(process=under(codes[""], 0.0))
+    shuffled = torch.randperm(len(own), generator=seeded(0), device=HOST).to(E.device)
+    right, chance = (Mixture(without, each, kinds.expand(len(own), -1)) for each in (E, E[shuffled]))
+    (chosen, gain), (_, by_chance) = (
+        _likeliest_codes(each, own, sag.own[sag.loaded].to(E)) for each in (right, chance)
+    )
+    if gain - by_chance >= gates.PAYLOAD_ODDS:
+        what = f"{int((chosen != own).sum())} of {len(own)} rows seem to have carried payloads of other rows, such as "
+        what += f"lines {few(lines[rows.index][chosen != own].tolist(), 5)}"
         fix = "check that the column belongs to these rows; else leave it out"
-        what += few(lines[rows.index][wrong].tolist(), 5)
-        yield Candidate(what, expected, fix, rows.columns(E, chosen), gates.PAYLOADS_LEFT)
+        left = left_out_rms(under(chosen, 1.0)) / left_out_rms(rows.process)
+        yield Candidate(what, expected, fix, left, gates.PAYLOADS_LEFT)
+
+
+def _likeliest_codes(mixed: Mixture, own: Tensor, axes: Tensor) -> tuple[Tensor, float]:
+    """Codes (N,) beside the rows' own, and how much more they explain; joints yield about their axes, in one sense."""
+    u, odds = mixed.evidence(own)
+    found = [mixed.settled(mixed.decided(own, start)) for start in (u, axes, -axes)]
+    chosen, _, best = max(found, key=lambda one: one[2])
+    return chosen, best - odds
 
 
 def _other_columns(masses: Tensor, lines: Tensor) -> Iterator[tuple[str, Tensor]]:
-    """Payloads (N,) as they may have been meant, in words: of other lines, or one of them in another unit."""
-    order = lines.argsort()
+    """Payloads (N,) as they may have been meant, in words: of other lines, or some of them in another unit."""
+    order, kinds = lines.argsort(), masses.unique()
     for lag in range(1, gates.LARGEST_LAG + 1):
         for way, step in (("later", -lag), ("earlier", lag)):
             yield f"those {lag} line{'s' * (lag > 1)} {way}", masses[order].roll(step)[order.argsort()]
-    for mass in masses.unique().tolist():
-        for factor in MISTYPED:
-            yield f"{factor * mass:.4g} where they are {mass:g}", torch.where(masses == mass, factor * mass, masses)
+    for mass in kinds[kinds > 0].tolist() if len(kinds) <= gates.MOST_MASSES else ():
+        which = {"are": masses == mass, "are at least": masses >= mass, "are at most": masses <= mass}
+        for (words, some), factor in product(which.items(), MISTYPED):
+            yield f"{factor:.4g} times as large where they {words} {mass:g}", torch.where(some, factor * masses, masses)
 
 
 def warn_of_taken_scales(taken: LeaveOneOut, own: LeaveOneOut) -> None:

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.conventions import Convention, conventions
-from diffeo_calib.calibration.identification.registration import can_register, register, spread
+from diffeo_calib.calibration.identification.registration import can_register, registered_geometry, spread
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import (
     LONGEST_NAME,
@@ -91,7 +91,7 @@ def registered(reading: Reading) -> tuple[float, float]:
     kept = torch.ones(len(q), dtype=torch.bool, device=q.device)
     for _ in range(1 + TRIMMINGS):
         try:
-            geometry = register(reading.robot, q[kept], points[kept], reading.on).geometry
+            geometry = registered_geometry(reading.robot, q[kept], points[kept], reading.on)
         except DiffeoCalibError:
             break
         off = (geometry.points(q) - points).norm(dim=-1)

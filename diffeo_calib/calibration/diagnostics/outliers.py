@@ -234,10 +234,10 @@ def _stuck_words(stuck: Sequence[DeviceRows]) -> str:
     return f"{names} hold{'s' * (not several)} one value in all of {'their' if several else 'its'} rows"
 
 
-def warn_of_stuck(data: TangentData, stuck: Sequence[DeviceRows]) -> None:
+def warn_of_stuck(data: TangentData, table: Any) -> None:
     """Warn of columns of one value although the robot moves what they tell, by the geometric calibration."""
     size, bad = spread(data.points.unflatten(1, (-1, 3))), []
-    for one in stuck:
+    for one in stuck_columns(table):
         rows, shape = one.rows.to(data.values.device), (data.noise_model.bodies, -1)
         values, seen = data.values[rows].unflatten(1, shape), data.visible[rows].unflatten(1, shape)  # (M, P, r) m
         own = [values[:, body, flags] for body, flags in enumerate(seen.all(0)) if bool(flags.any())]
@@ -246,8 +246,8 @@ def warn_of_stuck(data: TangentData, stuck: Sequence[DeviceRows]) -> None:
         bad += [(one, least)] if least > gates.GEOMETRIC_RESIDUAL * size else []
     if bad:
         expected = f"values that change by {1e3 * min(least for _, least in bad):.3g} mm or more, as the robot moves"
-        fix = "check the sensor and the columns, or leave these rows out"
-        warn_user(sentence(_stuck_words([one for one, _ in bad]), expected=expected, fix=fix))
+        what, fix = _stuck_words([one for one, _ in bad]), "check the sensor and the columns, or leave these rows out"
+        warn_user(sentence(what, expected=expected, fix=fix))
 
 
 def warn_of_outliers(found: Sequence[Outlier], data: Any) -> None:

@@ -75,11 +75,12 @@ def check_joints(robot: Tree, data: Any) -> None:
             fix="check the base and tip links, and the joint columns",
         )
     if data.joint_names is not None and tuple(data.joint_names) != tuple(robot.joint_names):
+        fix = joint_name_fix(robot, data.joint_names)
         raise RobotError.of(
             f"the measurements' joints are not those of robot '{robot.name}'",
             expected=few(robot.joint_names, MOST_NAMES),
             got=few(data.joint_names, MOST_NAMES),
-            fix=joint_name_fix(robot, data.joint_names),
+            fix=fix,
         )
     if len(data) == 1:
         return  # the registration refuses a single row

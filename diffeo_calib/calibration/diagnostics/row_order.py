@@ -8,8 +8,7 @@ ends. Rows that look wrong and follow one another are such a run as well.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator
 from itertools import product
 from math import log
 from typing import NamedTuple
@@ -18,24 +17,20 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.outliers import Outlier, flagged
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.identification.registration import (
     CONSISTENT,
     can_register,
     largest_distances,
-    register,
+    registered_geometry,
     spread,
 )
-from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
+from diffeo_calib.common.errors import MeasurementError, sentence
 from diffeo_calib.common.quantiles import largest_known
-from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.evaluation import expected_error, motions
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import marker_tips
-from diffeo_calib.sensors.tables import Coordinates
 
 
 class Step(NamedTuple):
@@ -131,7 +126,7 @@ def check_row_order(robot: Tree, data: Measurements, registration: Identificatio
     steps = out_of_step(geometry.points(data.q), data.points, data.line_numbers, typical)
     near = largest_distances(geometry, data) <= gates.LAG_GROSS * typical
     if steps and int(near.sum()) >= gates.WINDOW_ROWS and can_register(data.points[near]):  # all that fit say more
-        geometry = register(robot, data.q[near], data.points[near], marker_tips(robot, data)).geometry
+        geometry = registered_geometry(robot, data.q[near], data.points[near], marker_tips(robot, data))
         typical = float(largest_distances(geometry, data)[near].median())
         steps = out_of_step(geometry.points(data.q), data.points, data.line_numbers, typical)
     if not steps or (steps[0].to_the_end and steps[0].first == int(data.line_numbers.min())):
@@ -148,16 +143,10 @@ def _consistent(robot: Tree, data: Measurements) -> Iterator[tuple[Geometry, flo
         own, other = _paired(data.line_numbers[rows], lag)
         q, points = data.q[rows][other], data.points[rows][own]
         if len(own) >= gates.WINDOW_ROWS and can_register(points):
-            geometry = register(robot, q, points, marker_tips(robot, data)).geometry
+            geometry = registered_geometry(robot, q, points, marker_tips(robot, data))
             typical = float(largest_known((geometry.points(q) - points).norm(dim=-1)).median())
             if typical <= limit:
                 yield geometry, typical
-
-
-def steps_of(model: CalibratedKinematics, data: Measurements) -> list[Step]:
-    """Rows whose measured values belong to the joints of other lines, judged by a model."""
-    predicted = model.at_payloads(data.payload)(data.q).detach()
-    return out_of_step(predicted, data.points, data.line_numbers, expected_error(model, data))
 
 
 def find_block(wrong: Tensor) -> tuple[int, int] | None:
@@ -173,50 +162,3 @@ def find_block(wrong: Tensor) -> tuple[int, int] | None:
     gain, loss = log(gates.BLOCK_SHARE / share), log((1 - gates.BLOCK_SHARE) / (1 - share))
     total, start, end = best_run(torch.where(wrong, gain, loss))
     return (start, end) if total > log(n / gates.BLOCK_CHANCE) else None
-
-
-def block_text(model: CalibratedKinematics, data: Measurements, wrong: Sequence[Outlier]) -> str | None:
-    """One sentence about wrong rows that follow one another, with their common cause if there is one; else None."""
-    order = data.line_numbers.argsort()
-    flags = flagged(len(data), [one.row for one in wrong])[order]
-    place = find_block(flags)
-    if place is None:
-        return None
-    start, end = place
-    block = data.rows(order[start:end])
-    lines, last = block.line_numbers.tolist(), " to the end of the table" * (end == len(data))
-    size = float((model.at_payloads(block.payload)(block.q) - block.points).norm(dim=-1).nanmedian())
-    why = ", ".join(cause.sentence for cause in motions(model, block))
-    return sentence(
-        f"{int(flags[start:end].sum())} rows look wrong that follow one another: lines {lines[0]} to {lines[-1]}{last}",
-        got=f"a median error of {1e3 * size:.3g} mm{f'; {why}' if why else ', for no common reason'}",
-        fix="check what happened there; calibrate without these lines, or measure them again",
-    )
-
-
-def common_cause(
-    model: CalibratedKinematics, data: Measurements, wrong: Sequence[Outlier], moved: str | None = None
-) -> str | None:
-    """The best explanation of several wrong rows: they are out of step, something moved, they follow one another.
-
-    Args:
-        moved: a sentence about something that moved, which explains wrong rows after it.
-    """
-    steps = steps_of(model, data) if len(wrong) >= gates.LAG_ROWS else []
-    return steps[0].sentence() if steps else moved or block_text(model, data, wrong)
-
-
-def warn_of_contradictions(
-    model: CalibratedKinematics, own: Coordinates | None, wrong: Sequence[Outlier], moved: str | None
-) -> None:
-    """Warn of the best explanation of wrong rows of a fit, see :func:`common_cause`.
-
-    Args:
-        model: the fitted model. own: its rows that tell coordinates. wrong: the outliers among all rows.
-    """
-    if own is not None:
-        place = {row: number for number, row in enumerate(own.rows.tolist())}
-        wrong = [replace(one, row=place[one.row]) for one in wrong if one.row in place]
-        moved = common_cause(model, own.table, wrong, moved)
-    if moved is not None:
-        warn_user(moved)

@@ -22,7 +22,7 @@ from diffeo_calib.common.device import seeded
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.process.tails import Tails, reweight
+from diffeo_calib.regression.tails import Tails, reweight
 from diffeo_calib.robots.cartesian import is_cartesian, turns_nowhere
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES

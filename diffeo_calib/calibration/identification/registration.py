@@ -63,6 +63,15 @@ def register(robot: Tree | Geometry, q: Tensor, points: Tensor, on: tuple[str, .
     Raises:
         MeasurementError: fewer measured coordinates than unknowns (6 + 3 P), or a marker that no row shows.
     """
+    geometry = registered_geometry(robot, q, points, on)
+    q, points = q.detach().cpu(), points.detach().cpu()
+    squares = (geometry.points(q) - points)[seen_markers(points)].square()
+    noise = sqrt(float(squares.sum()) / max(squares.numel() - 6 - 3 * points.shape[1], 1))
+    return described(Rows(geometry, (MeasuredPoints.of(q, points),)), [noise])
+
+
+def registered_geometry(robot: Tree | Geometry, q: Tensor, points: Tensor, on: tuple[str, ...] = ()) -> Geometry:
+    """Base and markers as of :func:`register`, without how well they are known, which takes as long as to find them."""
     chain = robot.chain if isinstance(robot, Geometry) else robot
     q, points = q.detach().cpu(), points.detach().cpu()
     bare = Geometry.nominal(chain, points.shape[1], on)
@@ -85,10 +94,7 @@ def register(robot: Tree | Geometry, q: Tensor, points: Tensor, on: tuple[str, .
     if turns_nowhere(chain):  # where the marker sits, or the middle of several, belongs to the base
         middle = tool.mean(0)
         base, tool = base @ transforms(torch.eye(3, dtype=tool.dtype, device=tool.device), middle), tool - middle
-    geometry = replace(bare, base=base, tool=tool)
-    squares = (geometry.points(q) - points)[seen_markers(points)].square()
-    noise = sqrt(float(squares.sum()) / max(squares.numel() - unknowns, 1))
-    return described(Rows(geometry, (MeasuredPoints.of(q, points),)), [noise])
+    return replace(bare, base=base, tool=tool)
 
 
 def can_register(points: Tensor) -> bool:
@@ -301,7 +307,7 @@ def _inliers(robot: Tree, data: Measurements, on: tuple[str, ...]) -> Tensor:
     A least-squares fit of all rows is drawn towards gross outliers if there are many; a few random rows may be free
     of them.
     """
-    start = largest_distances(register(robot, data.q, data.points, on).geometry, data)
+    start = largest_distances(registered_geometry(robot, data.q, data.points, on), data)
     every = torch.ones_like(start, dtype=torch.bool)
     gross = GROSS_DISTANCES
     if float(start.max()) <= gross * float(start.median()) <= gross * CONSISTENT * spread(data.points):
@@ -314,7 +320,7 @@ def _inliers(robot: Tree, data: Measurements, on: tuple[str, ...]) -> Tensor:
         rows = torch.randperm(len(data), generator=generator, device=HOST)[:drawn]
         if not can_register(data.points[rows]):
             continue
-        largest = largest_distances(register(robot, data.q[rows], data.points[rows], on).geometry, data)
+        largest = largest_distances(registered_geometry(robot, data.q[rows], data.points[rows], on), data)
         best = largest if float(largest.median()) < float(best.median()) else best
     near = best <= gross * float(best.median())
     if float(best.median()) > 0.5 * float(start.median()) or not can_register(data.points[near]):

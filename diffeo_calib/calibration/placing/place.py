@@ -55,7 +55,7 @@ from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.observation import Part, Stacked
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.process.tails import Tails
+from diffeo_calib.regression.tails import Tails
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
@@ -352,15 +352,14 @@ def _by_readings(robot: Tree, data: Any, readings: list[OtherReadings], progress
     tip = () if tables[0].on is None else (tables[0].on,)
     registration = register_ball(robot, tables, tip)
     rows = Rows(registration.geometry, tuple(map(ReadRows, tables, registration.devices)))
-    found = estimated(rows, held_parameters(rows.geometry, adrift=True), prior_of(tables))
+    held, prior = held_parameters(rows.geometry, adrift=True), prior_of(tables)
+    found = estimated(rows, held, prior)
     warn_of_wrong_names(tables, found.geometry)
     LOG.info("registration RMS %.4f mm, geometry %.4f mm", 1e3 * registration.rms, 1e3 * found.rms)
     if any(free := [devices.freed() for devices in registration.devices]):  # what was said to be known is tested
         each = zip(tables, registration.devices, free, strict=True)
         parts = tuple(ReadRows(data, opened or own) for data, own, opened in each)
-        again = estimated(
-            Rows(registration.geometry, parts), held_parameters(registration.geometry, adrift=True), prior_of(tables)
-        )
+        again = estimated(replace(rows, parts=parts), held, prior)
         for devices in again.devices:
             devices.check_freed(found.noise, again.noise)
     return Placed(data, None, Placement(reading_sets(readings, found.devices)), registration, found)

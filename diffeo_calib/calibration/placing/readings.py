@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import inf
 from operator import itemgetter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -28,11 +28,13 @@ from diffeo_calib.calibration.identification.identification import (
     solve,
 )
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherRows, Seen, Settled
+from diffeo_calib.cameras.images import projection
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices, Hypothesis, check_devices
 from diffeo_calib.sensors.kinds import kind_of
 
@@ -49,6 +51,10 @@ CHECK += "and which device each row names; or measure more rows with each device
 LARGEST_SHARE, DOUBTED_SHARE, FAR_BETTER = 0.02, 0.002, 0.2
 """Median residuals, relative to the robot's reach, that belong to a robot, and from which the other unit is tried; the
 part that the right unit leaves."""
+BALL_SEARCH = {"maxfev": 150, "initial_simplex": [[0.0] * 3, [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]]}
+"""Of the ball on the tool by images of unknown cameras, m."""
+FEWEST_IMAGES = 8
+"""Rows of a camera from which a projection, 11 numbers, can be contradicted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +168,34 @@ def rough_error(bare: Geometry, tables: Sequence[Readings]) -> float:
     return float(torch.cat([own.flatten() for own in found[0].errors]).square().mean().sqrt()) if found else inf
 
 
+def images_error(robot: Tree, data: Readings) -> float:
+    """Median distance of images from projections of the tool, as a share of their spread.
+
+    The ball on the tool is sought; lens and place of each camera are those of the best projection P, linear in its 12
+    numbers: P z ~ (u, v, 1). Infinite for too few rows of a camera.
+    """
+    from scipy.optimize import minimize  # noqa: PLC0415  # slow to import
+
+    poses = robot(data.q)
+    rows = [data.device == device for device in range(len(data.names))]
+    if min(int(own.sum()) for own in rows) < FEWEST_IMAGES:
+        return inf
+
+    def share(ball: Any) -> float:
+        at = poses[:, :3, :3] @ poses.new_tensor(ball) + poses[:, :3, 3]
+        return max(_projection_error(at[own], data.reported[own]) for own in rows)
+
+    return float(minimize(share, [0.0] * 3, method="Nelder-Mead", options=BALL_SEARCH).fun)
+
+
+def _projection_error(points: Tensor, image: Tensor) -> float:
+    """Median distance of images (N, 2) from the best projection of points (N, 3), as a share of their spread."""
+    at, seen = (points - points.mean(0)) / points.std(), (image - image.mean(0)) / image.std()
+    P = projection(seen, at)
+    shown = at @ P[:, :3].mT + P[:, 3]
+    return float((shown[:, :2] / shown[:, 2:] - seen).norm(dim=1).median() / seen.norm(dim=1).median())
+
+
 class RoughFit(NamedTuple):
     """Ball and devices from one start, with errors (N, 1, r) of all readings, m.
 
@@ -205,9 +239,8 @@ def _rough_fit(bare: Geometry, tables: Sequence[Readings], ball: Tensor, how: Ma
         for data, errors in zip(tables, fit.errors, strict=True)
         for number, name in enumerate(data.names)
     )
-    moved = (
-        one for own, some in zip(rows.parts, fit.shifts.split(rows.freedom), strict=True) for one in own.devices(some)
-    )
+    each = zip(rows.parts, fit.shifts.split(rows.freedom), strict=True)
+    moved = [one for own, some in each for one in own.devices(some)]
     return RoughFit(worst, Rows(geometry.absorb(fit.theta), tuple(map(ReadRows, tables, moved))), fit.errors)
 
 

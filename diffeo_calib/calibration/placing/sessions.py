@@ -25,7 +25,7 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.plausibility import refuse_mistakes
 from diffeo_calib.calibration.identification.identification import identify
-from diffeo_calib.calibration.identification.registration import register, register_inliers, spread
+from diffeo_calib.calibration.identification.registration import register_inliers, registered_geometry, spread
 from diffeo_calib.calibration.placing.placement import DeviceSet, OtherLabel, OtherRows, Seen, Settled
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
 from diffeo_calib.fitting.result import Progress
@@ -67,7 +67,7 @@ class Sessions(DeviceSet):
         """The sessions of rows, and these as those of one; none for one session.
 
         Raises:
-            MeasurementError: a session with too few rows, rows that do not fit the robot, or sessions without a device.
+            MeasurementError: a session with too few rows, or rows that do not fit the robot.
         """
         table = own.table
         if len(table.present_sessions) < 2:
@@ -99,7 +99,7 @@ class Sessions(DeviceSet):
         for _ in range(ROUNDS):  # a better geometry gives better places
             found = cls.around(data, kind, geometry, geometry.points(data.q))
             together = found.devices.aligned(data)
-            start = register(robot, data.q, together.points, marker_tips(robot, data)).geometry
+            start = registered_geometry(robot, data.q, together.points, marker_tips(robot, data))
             geometry = identify(start, data.q, together.points).geometry
         away = (geometry.points(data.q) - together.points).norm(dim=2)
         median, rows, name = max(
@@ -226,9 +226,8 @@ class Drift(DeviceSet):
 
     def settled(self, found: Settled) -> Drift:
         own = found.shifts.new_tensor([FRAME_M_RAD] * 6 + [GROWTH] + [OFFSET_RAD_M] * len(self.devices.joints))
-        shifts, deviations = (
-            own * each.view(len(self.names), -1) for each in (found.shifts, found.covariance.diagonal().sqrt())
-        )
+        shifts = own * found.shifts.view(len(self.names), -1)
+        deviations = own * found.covariance.diagonal().sqrt().view(len(self.names), -1)
         constants = torch.cat([self.devices.constants[:, :2], found.centre.expand(len(shifts), 3), shifts], 1)
         known = replace(self.devices, constants=constants, deviations=deviations)
         return replace(self, devices=known, centre=found.centre)

@@ -40,9 +40,9 @@ from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.cholesky import lower_root
 from diffeo_calib.regression.conditional import BeforeData, Conditional, Opened, diagonal_blocks
+from diffeo_calib.regression.tails import Tails
 from diffeo_calib.robots.cartesian import is_cartesian
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.hypotheses import BASE, MARKERS, NEW_SET_UP, SampledRows
+from diffeo_calib.calibration.diagnostics.hypotheses import SampledRows, changes_of_set_up
 from diffeo_calib.calibration.diagnostics.judge import best_of, changed, two_tools
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows, NewSetUp, UsualNoise
 from diffeo_calib.common.checks import check_number
@@ -27,7 +27,6 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few, sentence, warn_user
 from diffeo_calib.common.quantiles import known
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kinematics.evaluation import LARGEST_ERROR_PER_REACH
 from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.registered_map import (
     HARDLY,
@@ -41,11 +40,11 @@ from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_points, tool_transform
 from diffeo_calib.measurements.bodies import Bodies
 from diffeo_calib.measurements.poses import kind_of_points, own_blocks, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.process.tails import Tails
+from diffeo_calib.regression.tails import Tails
 from diffeo_calib.robots.placement import PLACES, place, rigid_fit
-from diffeo_calib.robots.se3 import skew
+from diffeo_calib.robots.se3 import twist_at
 from diffeo_calib.sensors.coordinates import check_joint_order
-from diffeo_calib.sensors.devices import CHANGE, Hypothesis
+from diffeo_calib.sensors.devices import CHANGE
 from diffeo_calib.sensors.tables import Coordinates
 
 FREE = ("both", "base", "marker")
@@ -133,7 +132,7 @@ def find_place(
         outliers += kept[worst].tolist()
         stay = kept.new_tensor([row for row in range(len(kept)) if row not in worst])
         kept, found = kept[stay], {name: rows.kept(stay).settled() for name, rows in found.items()}
-    most = max(LARGEST_ERROR_PER_REACH * chain.reach, gates.REGISTERED_RESIDUAL * spread)
+    most = max(gates.LARGEST_PER_REACH * chain.reach, gates.REGISTERED_RESIDUAL * spread)
     _refuse_others(best.given.shown(best.given.residual).unflatten(1, (-1, 3)), most)
     if opens and (beside := opened(best, some.rows(kept))) is not best:
         best = beside.settled()
@@ -224,7 +223,7 @@ class Search:
             return found
         size = len(found) if self.known else 6
         to = torch.eye(size, dtype=found.dtype, device=found.device)
-        to[:3, 3:6] = -skew(centre - before.centre)
+        to[:6, :6] = twist_at(centre - before.centre)
         found[:size, :size] = to @ before.covariance[:size, :size] @ to.mT
         return found
 
@@ -328,13 +327,8 @@ def opened(rows: NewRows, data: Any) -> NewRows:
         return rows
     shown, chain, mine = rows.visible[..., None], rows.nominal.geometry.chain, rows.placement
     frame, markers = (rows.by_places * shown).tensor_split([6], 2)
-    found = [Hypothesis(BASE, own, fix=NEW_SET_UP) for own in (frame, frame[..., :3])]
-    found.append(Hypothesis(MARKERS, markers, fix=NEW_SET_UP))
-    for joint, (name, turns) in enumerate(zip(chain.joint_names, chain.periodic, strict=True)):
-        effects = rows.at.joint_to_start[:, :, joint, None] * shown
-        found.append(Hypothesis(name, effects, ("mrad" if turns else "mm", 1e-3)))
-    found = [own for own in (*found, *mine.hypotheses(rows, CHANGE)) if bool((own.effects != 0).any())]
-    named = [own._replace(name=mine.bodies.get(own.name, own.name)) for own in found]
+    found = changes_of_set_up(frame, markers, rows.at.joint_to_start * shown, chain) + mine.hypotheses(rows, CHANGE)
+    named = [own._replace(name=mine.bodies.get(own.name, own.name)) for own in found if bool(own.effects.any())]
     told = SampledRows(torch.arange(len(rows), device=shown.device), rows.process, None)
     found = changed(told, named, data.line_numbers, data.row_names)
     causes = [one for one in found if one.what.split(" seems")[0] not in chain.joint_names]  # see find_changes.py

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import inf
 from typing import Any, NamedTuple
 
 import torch
@@ -33,10 +32,10 @@ from diffeo_calib.maps.observation import Stacked
 from diffeo_calib.measurements.poses import block_diagonal, own_blocks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.evidence import Evidence
-from diffeo_calib.process.tails import Tails, gross_weights, reweight
 from diffeo_calib.regression.conditional import Process
 from diffeo_calib.regression.linear_rows import LinearRows
 from diffeo_calib.regression.regions import OTHER_DATE, region_factor, region_scale
+from diffeo_calib.regression.tails import Tails, estimated, gross_weights
 from diffeo_calib.robots.se3 import rotation, transforms
 from diffeo_calib.sensors.coordinates import errors_of_kinds, fitting_devices
 from diffeo_calib.sensors.errors import Evaluations
@@ -306,8 +305,7 @@ class NewRows:
 
     def evidence(self, root: Tensor) -> Evidence:
         """Evidence of unknowns with these effects (M, R, c)."""
-        E = root.flatten(0, 1)
-        return Evidence(E.T @ self.given.solved.flatten(), E.T @ self.given.factor.solve(E))
+        return Evidence.of(root.flatten(0, 1), self.process)
 
     @property
     def old_markers(self) -> Tensor:
@@ -375,6 +373,8 @@ class NewRows:
         """Change the noise or the prior; what does not change is computed once."""
         other = replace(self, **changes)
         vars(other).update({name: getattr(self, name) for name in LINEARISED})
+        if changes.keys() <= {"noise", "tails"}:
+            vars(other)["given"] = replace(self.given, noise=other.weighted_noise)
         return other
 
     def kept(self, index: Tensor) -> NewRows:
@@ -395,22 +395,19 @@ class NewRows:
     def with_weights(self) -> NewRows:
         """Weigh the rows by Student's t, by expectation maximisation, or as good and gross ones."""
         rows = self
-        for _ in range(ROUNDS):
+
+        def squares(tails: Tails, *, left_out: bool) -> Tensor:
+            nonlocal rows
+            rows = rows if rows.tails is tails else self.changed(tails=tails)
+            if left_out:
+                return rows._left_out_squares(rows.noise)
             noise, given = rows.weighted_noise, rows.given
             error = noise @ given.solved[..., None]
-            moments = error @ error.mT + noise - noise @ given.precisions @ noise  # expected, of the noise
-            tails = reweight(rows.noise_model.squares(rows.noise, moments), rows.noise_model.freedom)
-            before, rows = rows.tails, rows.changed(tails=tails)
-            if tails.settled(before):
-                break
-        for _ in range(ROUNDS):
-            weights = gross_weights(rows._left_out_squares(rows.noise), rows.noise_model.freedom)
-            if weights is None:
-                break
-            before, rows = rows.tails, rows.changed(tails=Tails(inf, weights, gross=True))
-            if rows.tails.settled(before):
-                break
-        return rows
+            moments = error @ error.mT + noise - noise @ given.precisions @ noise
+            return rows.noise_model.squares(rows.noise, moments)
+
+        tails = estimated(self.tails, self.noise_model.freedom, squares, ROUNDS)
+        return rows if rows.tails is tails else self.changed(tails=tails)
 
     def moved(self, step: Tensor) -> NewRows:
         """The rows of coordinates around other places, after a step (6 + 3 P,) of frame and markers, m and rad."""

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.placing.sockets import ball_of
-from diffeo_calib.calibration.recalibration.find_changes import parts_of
+from diffeo_calib.calibration.recalibration.drift import parts_of
 from diffeo_calib.calibration.recalibration.find_place import (
     MARKER_DEVIATIONS,
     UNMOVED_LOG_ODDS,
@@ -235,7 +235,7 @@ def with_ball(fitted: FittedMap, ball: Tensor, tip: str, deviation: float) -> Fi
     slopes = torch.nn.functional.pad(fitted.functionals, (0, 3))
     new_noise = torch.block_diag(fitted.new_noise, own_blocks(fitted.new_noise[None], markers)[0].mean(0))
     parts = fitted.noise, fitted.data, new_noise, fitted.workspace
-    return FittedMap(deformation, *parts, slopes=slopes, y=fitted.measured())
+    return FittedMap(deformation, *parts, slopes=slopes, y=fitted.measured(), unresolved=fitted.unresolved)
 
 
 Marker = Literal["evidence", "same", "moved", "other"]

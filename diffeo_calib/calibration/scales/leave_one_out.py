@@ -1,7 +1,7 @@
 """Errors of the tangent model that decide about outliers and about the size of regions.
 
-Weights by heavy tails (process/tails.py) need the errors of the measurements, not the residuals of the fit, which are
-smaller. The second moments of the errors under the posterior are exact:
+Weights by heavy tails (regression/tails.py) need the errors of the measurements, not the residuals of the fit, which
+are smaller. The second moments of the errors under the posterior are exact:
 
     E[r r^T] = R mu mu^T R + R - R [(G + R)^-1]_ii R.
 
@@ -28,7 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import inf, nan
+from math import nan
 
 import torch
 from torch import Tensor
@@ -39,13 +39,11 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.quantiles import chi2_median
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.process.tails import Tails, gross_weights, reweight
 from diffeo_calib.regression.regions import region_factor, region_scale
+from diffeo_calib.regression.tails import Tails, estimated
 
 BLOCK_COORDINATES = KEPT_COORDINATES
 """Measured coordinates of one block: a few hundred poses predict another pose nearly as well as thousands do."""
-ROUNDS = 8
-"""Largest number of steps of expectation maximisation."""
 SMALLEST_FREEDOM = 8.0
 """Lower bound of the degrees of freedom with which the data determine the scale of all variances."""
 
@@ -79,9 +77,11 @@ def weighed(data: TangentData, scales: Hyperparameters, seed: int = 0) -> Tangen
 
     Memory does not grow with the number of blocks. An outlier anywhere counts: no sample could stand for all rows.
     """
-    tails = data.tails
-    for _ in range(ROUNDS):
-        squares = torch.empty_like(tails.weights)
+
+    def squares(tails: Tails, *, left_out: bool) -> Tensor:
+        if left_out:
+            return leave_one_out(data.with_tails(tails), scales, seed).squares
+        found = torch.empty_like(tails.weights)
         for rows, part in _parts(data, seed):
             part.expected(scales)  # the same for all weights
             now = part.with_tails(tails.rows(rows))
@@ -89,18 +89,10 @@ def weighed(data: TangentData, scales: Hyperparameters, seed: int = 0) -> Tangen
             inverse = now.blocks_in_coordinates(process.numbers.blocks(process.inverse))
             residual = noise @ now.in_coordinates(process.numbers.in_table(process.mu)[:, :, None])
             moments = residual @ residual.mT + noise - noise @ inverse @ noise
-            squares[rows] = now.noise_model.squares(now.noise(scales), moments)
-        before, tails = tails, reweight(squares, data.noise_model.freedom)
-        if tails.settled(before):
-            break
-    for _ in range(ROUNDS):  # beside gross rows, if left-out errors show any
-        weights = gross_weights(leave_one_out(data.with_tails(tails), scales, seed).squares, data.noise_model.freedom)
-        if weights is None:
-            break
-        before, tails = tails, Tails(inf, weights, gross=True)
-        if tails.settled(before):
-            break
-    return data.with_tails(tails)
+            found[rows] = now.noise_model.squares(now.noise(scales), moments)
+        return found
+
+    return data.with_tails(estimated(data.tails, data.noise_model.freedom, squares))
 
 
 def leave_one_out(data: TangentData, scales: Hyperparameters, seed: int = 0) -> LeaveOneOut:
@@ -141,9 +133,9 @@ def left_out_rows(data: TangentData, scales: Hyperparameters, part: Tensor, new:
         new: (N, m, m) noise of a new measurement like each row, whose predicted covariance is the unit of squares.
     """
     process, own = data.process(scales), data.weighted_noise(scales)
-    errors, covariance = process.left_out(part[process.numbers.owner])
-    errors = data.in_coordinates(process.numbers.in_table(errors)[:, :, None])[:, :, 0]
-    predicted = data.blocks_in_coordinates(process.numbers.blocks(covariance)) - own + new
+    errors, covariance = process.rows_left_out(part)
+    errors = data.in_coordinates(errors[:, :, None])[:, :, 0]
+    predicted = data.blocks_in_coordinates(covariance) - own + new
     predicted = torch.where(part[:, None, None] < 0, own, predicted)
     return errors, data.noise_model.squares(predicted, errors[:, :, None] * errors[:, None])
 

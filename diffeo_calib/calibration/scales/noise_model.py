@@ -47,8 +47,8 @@ from diffeo_calib.measurements.poses import block_diagonal, inverse_poses, own_b
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.scales import Hyperparameters
-from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.regions import CONFIDENCE, region_factor, smallest
+from diffeo_calib.regression.tails import Tails
 
 SMALLEST_NOISE_M = 1e-7
 """Independent noise that is always present: with less, exact data would make G + R singular in float64."""

@@ -101,11 +101,12 @@ def _ambiguous(falls: dict[int, Tensor], after: dict[int, Tensor], joint: int, f
     Args:
         falls, after: T of every joint without and with the line. joint, frequency: of the line.
     """
-    least = float(falls[joint].max()) - CLEARANCE
+    least, q = float(falls[joint].max()) - CLEARANCE, scan.q[:, joint]
+    width = 4.0 * pi / max(float(q.max() - q.min()), 1e-9)  # of side lobes, which predict the same in the joint's range
     for other, before in falls.items():
         rivals = (before > least) & (after[other] < 0.5 * before)
         if other == joint:
-            rivals &= (scan.frequencies - frequency).abs() > scan.width(joint)
+            rivals &= (scan.frequencies - frequency).abs() > width
         if bool(rivals.any()):
             return True
     return False
@@ -183,11 +184,6 @@ class _Scan:
         numbers = self.process.numbers
         effects = numbers.at.joint_to_start[:, :, joint, None] * waves[:, None]
         return _Scan(self.process.opened(numbers.of_table(effects)))
-
-    def width(self, joint: int) -> float:
-        """Distance from a peak within which its side lobes lie, which predict the same in the joint's range."""
-        q = self.q[:, joint]
-        return 4.0 * pi / max(float(q.max() - q.min()), 1e-9)
 
     def threshold(self, joints: list[int]) -> float:
         """The T that the largest of these joints exceeds by chance with the probability :data:`FALSE_ALARMS`."""

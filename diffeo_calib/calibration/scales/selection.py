@@ -67,7 +67,6 @@ class Selection:
     scales: Hyperparameters  # the scales
     status: str  # a sentence about the choice
     interrupted: bool = False  # whether Ctrl-C ended the search
-    likelihood: float | None = None  # log marginal likelihood of the subset that was used; None if nothing was selected
 
 
 def select(
@@ -110,7 +109,7 @@ def select(
     except KeyboardInterrupt:
         return Selection(search.best, "search interrupted, the best so far are kept", interrupted=True)
     status = f"log marginal likelihood {search.best_likelihood:.1f} on {len(subset.x)} poses"
-    return Selection(search.best, status, likelihood=search.best_likelihood)
+    return Selection(search.best, status)
 
 
 class LogPosterior(NamedTuple):
@@ -242,7 +241,8 @@ def defaults(data: TangentData, noise: float, prior: Prior) -> Hyperparameters:
     unit = torch.where(
         torch.tensor(data.space.periodic, dtype=torch.bool, device=x.device), torch.ones_like(half_range), half_range
     )
-    size = _size(data.points.reshape(-1, 3))
+    points = data.points.reshape(-1, 3)
+    size = max(float(points.std(0).norm()) if len(points) > 1 else 1.0, SMALLEST_SPREAD_M)  # m
     own, lateral = _load_effects(data)
     others = data.noise_model.kind_count - 1
     return Hyperparameters(
@@ -262,12 +262,6 @@ def defaults(data: TangentData, noise: float, prior: Prior) -> Hyperparameters:
         gravity=x.new_ones(3),
         other_noise=x.new_full((others,), SENSOR_SHARE * noise) if others else None,
     )
-
-
-def _size(points: Tensor) -> float:
-    """Spread of points (N P, 3), m; one metre for a single point."""
-    spread = float(points.std(0).norm()) if len(points) > 1 else 1.0
-    return max(spread, SMALLEST_SPREAD_M)
 
 
 def _load_effects(data: TangentData) -> tuple[Tensor, Tensor]:

@@ -26,9 +26,9 @@ from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.maps.observation import Observation
 from diffeo_calib.measurements.poses import block_diagonal
 from diffeo_calib.process.scales import Hyperparameters, Pairs
-from diffeo_calib.process.tails import Tails
 from diffeo_calib.regression.conditional import BeforeData, Features, Process
 from diffeo_calib.regression.regions import region_factor
+from diffeo_calib.regression.tails import Tails
 from diffeo_calib.robots.placement import PLACES
 
 T = TypeVar("T")

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import sys
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from itertools import chain
-from pathlib import Path
 from queue import Empty
 from threading import Thread
 from typing import Any
@@ -29,6 +27,7 @@ from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.files import read_joints
+from diffeo_calib.measurements.csv.joined import HeldFile
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.csv.sensors import columns_of
 from diffeo_calib.measurements.table_format import ZERO
@@ -303,18 +302,9 @@ class Live:
 
     def _read(self, lines: Sequence[bytes], header: bytes = b"", first: int = 0) -> Any:
         """Lines as a table, in their order; ``first`` is the number of the first one, for messages."""
-        try:
-            with tempfile.TemporaryDirectory() as folder:
-                path = Path(folder) / self.source.csv.name
-                path.write_bytes((header or self.table.header) + b"\n" * first + b"".join(lines))
-                try:
-                    data = replace(self.source, csv=path, growing=True).read(self.campaign.robot, self.tips)
-                except DiffeoCalibError as error:
-                    raise type(error)(str(error).replace(str(path), str(self.source.csv))) from error
-        except OSError as error:  # of no line: none counts as read
-            what = f"lines of {self.source.csv} cannot be written to a temporary table ({error.strerror})"
-            fix = "free some space, or name a folder on another disk by TMPDIR"
-            raise DiffeoCalibError.of(what, fix=fix) from error
+        held = HeldFile(self.source.csv)
+        held.content = (header or self.table.header) + b"\n" * first + b"".join(lines)
+        data = replace(self.source, csv=held, growing=True).read(self.campaign.robot, self.tips)
         return data.rows(data.line_numbers.argsort(stable=True))
 
 

@@ -12,8 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics.judged_rows import evaluate, expected_rms, judge
 from diffeo_calib.calibration.diagnostics.outliers import outlier_lines
-from diffeo_calib.calibration.expected_errors import accuracy, expected_rms, judge
+from diffeo_calib.calibration.expected_errors import accuracy
 from diffeo_calib.cli import models, printed
 from diffeo_calib.cli.console import out, plain, progress_bar, say
 from diffeo_calib.cli.declarations import EvaluateOptions, PredictOptions
@@ -28,7 +29,6 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.device_readings import PredictedReadings
 from diffeo_calib.kinematics.evaluation import (
     check_rows,
-    evaluate,
     place,
     placement_sentences,
     positions_of,

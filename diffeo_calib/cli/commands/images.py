@@ -16,8 +16,8 @@ from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import shown
 from diffeo_calib.common.files import write_together, write_whole
 from diffeo_calib.measurements.bags import read_bag, read_images
+from diffeo_calib.measurements.csv.cells import csv_text
 from diffeo_calib.measurements.csv.joined import PLACE, TURN, StopLimits, pictured, rows_of, stops
-from diffeo_calib.measurements.csv.lines import csv_text
 from diffeo_calib.measurements.csv.sensors import CAMERA, IMAGE, PIXEL, POINT
 from diffeo_calib.measurements.image_folders import page, read_folders
 from diffeo_calib.measurements.table_format import TableFormat, options_of
@@ -37,7 +37,7 @@ def run(given: ImagesOptions) -> None:
         contents[cameras[one.name]] = camera_text(one.camera(BoardPrior(scale=given.board_std))).encode()
         own = {f"{one.name}/{image.name}" if several else image.name: image.refused for image in one.images}
         refused |= {name: reason for name, reason in own.items() if reason}
-    contents[output] = csv_text(lines, table.sep)
+    contents[output] = csv_text(lines, table.sep, "\r\n").encode()
     if given.report is not None:
         contents[given.report] = page(found).encode()
     write_together(contents)
@@ -68,7 +68,7 @@ def run_record(given: RecordOptions) -> None:
     if seen.values.shape[1]:
         found, offset = stops(joints, seen, limits, offset)
         table = rows_of(names, found)
-        write_whole(output, csv_text([list(table[0]), *(row.values() for row in table)], ",", "\n"))
+        write_whole(output, csv_text([list(table[0]), *(row.values() for row in table)]).encode())
         say(f"{len(found)} stops written to {shown(output)}; {offset:.3f} s were added to the times of {given.seen}")
         if seen.values.shape[1] > len(PLACE) and TURN[0] not in table[0]:
             say(f"without rotations: those of {given.seen} never change, as of a device that measures none")
@@ -82,7 +82,7 @@ def run_record(given: RecordOptions) -> None:
             files[time] = f"{times.index(time):05d}{suffix}"
             write_whole(output.parent / files[time], content)
         rows = [{IMAGE: files[time], **dict(zip(names, q.tolist(), strict=True))} for q, time in found]
-        write_whole(output, csv_text([list(rows[0]), *(row.values() for row in rows)], ",", "\n"))
+        write_whole(output, csv_text([list(rows[0]), *(row.values() for row in rows)]).encode())
         left = f"; {without} stops without an image were left out" * bool(without)
         say(f"{len(found)} images of stops written beside {shown(output)}{left}")
         say(f"images {shown(output.parent)} {shown(output)} --board ... --length m -o corners.csv")

@@ -2,33 +2,21 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
-from os.path import relpath
 from pathlib import Path
 from statistics import median
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.cli import commanded_poses
 from diffeo_calib.cli.column_names import Column, column
+from diffeo_calib.cli.commanded_poses import commanded
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.declarations import InitOptions
-from diffeo_calib.cli.guesses import (
-    NAMED,
-    Choice,
-    JointColumns,
-    Sheet,
-    entries,
-    guess_sheet,
-    joints_without_column,
-    rows_in,
-    with_places,
-)
+from diffeo_calib.cli.guesses import JointColumns, Sheet, guess_sheet, joints_without_column, rows_in, with_places
 from diffeo_calib.cli.models import is_urdf, load_robot
-from diffeo_calib.cli.options import CORNERS, Links
+from diffeo_calib.cli.options import Links
 from diffeo_calib.cli.proposals import (
     CLEAR_RATIO,
     LARGEST_RESIDUAL,
@@ -36,6 +24,7 @@ from diffeo_calib.cli.proposals import (
     is_clear,
     percent,
     ranked,
+    source_of,
     with_deviations,
     with_distances,
     with_joint_columns,
@@ -47,8 +36,6 @@ from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.checks import quiet
 from diffeo_calib.measurements.csv.lines import read_cells
-from diffeo_calib.measurements.csv.sensors import CAMERA, IMAGE, PIXEL, POINT
-from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.dh_file import DHFile
 from diffeo_calib.robots.urdf import chains_in
 from diffeo_calib.robots.urdf_elements import JointElement
@@ -57,7 +44,6 @@ NOT_RAISED = 1.01
 """Ratio of residuals without and with a joint up to which the markers do not follow it."""
 FLANGES = ("flange", "tool0")
 """Ends of the names of links to which tools are screwed."""
-COLUMNS = ("joints", "position", "marker", "socket", "rotation", "std", "reading", "by", *NAMED)
 
 
 def run(given: InitOptions) -> None:
@@ -65,37 +51,24 @@ def run(given: InitOptions) -> None:
     output = given.output
     if given.csv.is_dir():
         read_cells(given.csv, ",")  # says why not
-    csv, joined = with_places(given.csv, given, output.parent)
+    csv, by = with_places(given.csv, given)
     sheet = guess_sheet(csv)
     try:
-        source = _commanded(given.robot, sheet) or _of_robot(given.robot or Path(), output.parent, sheet)
+        source = _commanded(given.robot, sheet) or _of_robot(given.robot or Path(), sheet)
     except InputError as error:
         raise type(error)(f"{error} {sheet.odd}".strip()) from error
     with quiet():
         copies = len(source.data.copies())
-    choices = [
-        Choice("csv", relpath(given.csv, output.parent), "; ".join(["the table", *sheet.notes])),
-        *joined,
-        *source.rows.entries(output.parent, source.table.spherical),
-        *source.said,
-        Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it"),
-        Choice("decimal", sheet.decimal, "the same"),
-        *[Choice("duplicates", "drop", f"{copies} line(s) repeat others exactly; real repeats differ")] * bool(copies),
-        Choice("output", csv.with_suffix(".safetensors").name, "the model"),
-        Choice("report", csv.with_suffix(".html").name, "the report"),
-    ]
-    columns = [choice.value for choice in choices if choice.name in COLUMNS]
-    columns += [str(choice.value).partition("=")[0] for choice in choices if choice.name == "robot-pose"]
-    texts = [str(text) for value in columns for text in (value if isinstance(value, list) else [value])]
-    used = {IMAGE, *POINT, *PIXEL, CAMERA} if any(text.startswith(CORNERS) for text in texts) else set[str]()
-    for name in (name for text in texts for name in text.rpartition("=")[2].split(",")):
-        used |= {*(re.findall(r"\{([^{}]+)\}", name) or [name])}
-    unused = [name for name in sheet.header if name not in used]
+    why = {"by": getattr(csv, "sentence", "")}
+    source = source.into(why, csv=given.csv, places=given.places, by=by or None)
+    if copies:
+        exactly = f"{copies} line(s) repeat others exactly; real repeats differ"
+        source = source.into({"duplicates": exactly}, duplicates="drop")
+    unused = few([name for name in sheet.header if name not in source.columns], 20)
+    unused = f"columns that are not used: {unused}" if unused else "all columns are used"
     lines = [
         "# Options of `diffeo-calib fit`, proposed by `diffeo-calib init`: check every line.",
-        *(choice.line() for choice in choices),
-        f"# columns that are not used: {few(unused, 20)}" if unused else "# all columns are used",
-        *([f"# {sheet.odd}"] if sheet.odd else []),
+        *source.remarking(unused, *filter(None, [sheet.odd])).lines(output.parent),
     ]
     content = ("\n".join(lines) + "\n").encode()
     if output.is_file() and not given.force and output.read_bytes() != content:
@@ -110,19 +83,19 @@ def run(given: InitOptions) -> None:
 def _commanded(robot: Path | None, sheet: Sheet) -> Source | None:
     """The table as poses of the machine; None where a robot is named whose joints the table has."""
     if robot is None:
-        return commanded_poses.source_of(sheet)
+        return commanded(sheet)
     try:
         _arms(robot, sheet)
     except InputError as error:
         try:
-            source = commanded_poses.source_of(sheet)
+            source = commanded(sheet)
         except DiffeoCalibError:
             raise error from None
-        return source.saying(Choice("", "", f"{robot}: not used, no column is named after its joints"))
+        return source.remarking(f"{robot}: not used, no column is named after its joints")
     return None
 
 
-def _of_robot(robot: Path, folder: Path, sheet: Sheet) -> Source:
+def _of_robot(robot: Path, sheet: Sheet) -> Source:
     """The table as joint values of a robot: of the joints, or in the convention, that explain the rows.
 
     Raises:
@@ -149,29 +122,23 @@ def _of_robot(robot: Path, folder: Path, sheet: Sheet) -> Source:
         raise InputError.of(f"the joints of '{robot}'", expected=expected, got=got, fix=fix)
     if others := best.other_units():
         remark = f"{few(others)}: the names say another unit than the robot finds in the numbers: check it"
-        best = best.saying(Choice("", "", remark))
-    for socket in best.rows.sockets[-1:]:
-        best = with_distances(best, socket)
-    if best.rows.markers and best.table.rotation is None:
+        best = best.remarking(remark)
+    best = with_distances(best)
+    if best.bodies and not best.options.rotation:
         best = with_deviations(with_rotation(best))
-    about = "a URDF" if is_urdf(robot) else f"a DH table, {DHFile.read(robot).units}"
-    return replace(best, said=(Choice("robot", relpath(robot, folder), about), *best.said))
+    return best.into({"robot": "a URDF" if is_urdf(robot) else f"a DH table, {DHFile.read(robot).units}"})
 
 
 def _read(robot: Path, sheet: Sheet, arm: Arm) -> Source:
     """The table as values of these joints; InputError if the robot does not explain the rows."""
     rows = rows_in(sheet, arm.columns.names)
-    tips = _tips_named(chains_in(robot) if is_urdf(robot) else [], [column(triple[0]) for triple in rows.markers])
+    tips = _tips_named(chains_in(robot) if is_urdf(robot) else [], [column(own.place[0]) for own in rows.bodies])
     chain = load_robot(robot, replace(arm.links, tip=tips or arm.links.tip))
-    source = Source(sheet, chain, arm.columns.names, rows, TableFormat("mm", "deg", sheet.sep, sheet.decimal), tips)
+    options = {"robot": robot, **vars(arm.links), "tip": tips or None, "length": "mm", "angle": "deg"}
+    source = source_of(sheet, chain, rows, **options)
     guessed = sheet.joint_columns(chain.joint_names) or [arm.columns]
     source = with_units(with_measured(with_joint_columns(source, guessed)))
-    about = [Choice("base", arm.links.base or "", "root of the URDF")] if is_urdf(robot) else []
-    about += entries([arm.links], dh_convention="the convention with which it explains the rows")
-    source = replace(source, said=(*about, *source.said))
-    if source.tips:
-        return source.saying(Choice("tip", list(source.tips), "leaves after which the columns are named"))
-    return _with_tip(robot, source, arm)
+    return source if tips else _with_tip(robot, source, arm)
 
 
 def _tips_named(paths: Sequence[list[JointElement]], markers: Sequence[Column]) -> list[str]:
@@ -194,26 +161,24 @@ def _with_tip(robot: Path, source: Source, arm: Arm) -> Source:
     """Drop joints at the end that no marker follows, and say why the tip is there."""
     left_out = list[str]()
     moved = (source.data.q.amax(0) - source.data.q.amin(0)).tolist()
-    while len(arm.joints) > 1 and source.value("joints"):
+    while len(arm.joints) > 1 and "joints" not in source.asked:
         count = len(arm.joints) - 1
         shorter, last = arm.first(count), arm.joints[count]
-        without = replace(source, robot=load_robot(robot, shorter.links), joints=source.joints[:count])
+        without = replace(source, robot=load_robot(robot, shorter.links)).into(joints=",".join(source.joints[:count]))
         if moved[count] < gates.FIXED_RANGE:
             left_out.append(f"{last} hardly moves in the table")
         else:
             # its axis may run through the marker, and a pose shows that it turns where a place does not
-            an_arm_s = moved[count] > median(moved) / 2 or any(own.turn for own in source.rows.bodies)
+            an_arm_s = moved[count] > median(moved) / 2 or any(own.turn for own in source.bodies)
             raised = 1 / CLEAR_RATIO if an_arm_s else NOT_RAISED
             if source.left > LARGEST_RESIDUAL or without.left > raised * source.left:
                 break
             words = f"with {last} the nominal robot leaves {percent(source.left)} of what the rows vary"
             left_out.append(f"{words}, without it {percent(without.left)}")
         arm, source = shorter, without
-    if left_out:
-        joints = next(choice for choice in source.said if choice.name == "joints")
-        source = with_units(source).saying(joints._replace(value=",".join(source.joints)))
+    source = with_units(source) if left_out else source
     why = "; ".join([f"behind {arm.joints[-1]}, the last joint that moves the markers", *left_out])
-    return source.saying(*(Choice("tip", tip, why) for tip in arm.links.tip or ()))
+    return source.into({"tip": why}, tip=arm.links.tip)
 
 
 @dataclass(frozen=True)
@@ -256,7 +221,7 @@ def _arms(robot: Path, sheet: Sheet) -> list[Arm]:
                 break
     if not arms:
         longest = sorted((joints for _, joints, _ in whole), key=len)[:-4:-1]
-        expected = " or ".join(few(joints, 20) for joints in longest if joints) or "a robot with joints"
+        expected = " or ".join(dict.fromkeys(few(joints, 20) for joints in longest if joints)) or "a robot with joints"
         missing = few(joints_without_column(sheet.numbers, longest[0]), 20) if longest else "a joint"
         fix = f"no column is named after {missing}" if missing else "numbered columns are more than the joints"
         fix += ": name the columns as the joints, or q1, q2, ... in their order"

@@ -111,9 +111,9 @@ def evaluate(
     i, j = (rows, columns) if name == "fused" and accuracy is None else _centred(rows, columns)
     if accuracy is not None and name != "dense" and not followed:
         finite = (at.features.sum() + columns.features.sum()).isfinite()  # a flow that diverges has no extent
-        found = fourier.sums(formula, profile, i, j, accuracy) if bool(finite) else None
-        if found is not None:
-            return found
+        sums = fourier.sums(formula, profile, i, j, accuracy) if bool(finite) else None
+        if sums is not None:
+            return sums
     return BACKENDS[name].reduce(formula, profile, i, j) or Tiled().reduce(formula, profile, *_centred(i, j))
 
 

@@ -35,10 +35,10 @@ def _kept_folder(base: str, name: str) -> Path | None:
             part.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder = folder.resolve()
         if hasattr(os, "getuid"):  # not on Windows, where the home folders are private
-            me, own = os.getuid(), folder.stat()
-            for found in (*map(os.stat, folder.parents), own):
-                sticky = found.st_mode & stat.S_ISVTX and found is not own  # only its owner renames what lies there
-                if found.st_uid not in {0, me} or (found.st_mode & 0o022 and not sticky):
+            me, ours = os.getuid(), folder.stat()
+            for status in (*map(os.stat, folder.parents), ours):
+                sticky = status.st_mode & stat.S_ISVTX and status is not ours  # only its owner renames what lies there
+                if status.st_uid not in {0, me} or (status.st_mode & 0o022 and not sticky):
                     return None
             for entry in folder.rglob("*"):
                 with contextlib.suppress(FileNotFoundError):  # another process has finished with it

@@ -79,9 +79,9 @@ class Ranks:
         Raises:
             LostRankError: they differ, or another rank has ended or hangs.
         """
-        found = [torch.empty_like(numbers) for _ in range(self.count)]
-        self._exchange(messages.all_gather, found, numbers)
-        every = torch.stack(found)
+        received = [torch.empty_like(numbers) for _ in range(self.count)]
+        self._exchange(messages.all_gather, received, numbers)
+        every = torch.stack(received)
         apart = (every - every[0]).abs() > AGREEMENT * every.abs().amax(0)
         if bool(apart.any()):
             others = ", ".join(str(k) for k in apart.any(1).nonzero()[:, 0].tolist())

@@ -72,11 +72,11 @@ class Formula:
     _expanded: list[list[Summand]] = field(init=False)  # the summands of every weight, without repetitions
 
     def __post_init__(self) -> None:
-        found: dict[int, dict[Summand, None]] = {}
+        parts: dict[int, dict[Summand, None]] = {}
         for term in chain.from_iterable(self.results):
             keys = [(term.vector, term.apart)] if term.apart else []
-            found.setdefault(term.weight, {}).update(dict.fromkeys([*keys, (term.vector, None)]))
-        object.__setattr__(self, "_expanded", [list(found[weight]) for weight in sorted(found)])
+            parts.setdefault(term.weight, {}).update(dict.fromkeys([*keys, (term.vector, None)]))
+        object.__setattr__(self, "_expanded", [list(parts[weight]) for weight in sorted(parts)])
 
     def summands(self, j: Points) -> list[Tensor]:
         """Factors of every weight: (N, k) each, the vectors b_j and products b_j e_j^T of all its terms."""

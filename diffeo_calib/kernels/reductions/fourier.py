@@ -147,8 +147,8 @@ class Lattice:
             return rest.mH @ (first.conj()[:, :, None] * b[rows][:, None]).flatten(1)  # (P / P1, P1 k)
 
         total = b.new_zeros(self.size // count, count * k, dtype=torch.complex(b[:1], b[:1]).dtype)
-        for found in in_parallel(part, self._chunks(len(at))):
-            total += found
+        for chunk in in_parallel(part, self._chunks(len(at))):
+            total += chunk
         return total.view(-1, count, k).transpose(0, 1).reshape(-1, k)
 
     def values(self, at: Tensor, grid: Tensor) -> Tensor:
@@ -168,10 +168,10 @@ class Lattice:
 
     def error(self, profile: Profile, apart: Tensor) -> float:
         """Largest error of kernel and gradient for differences (K, D) of points."""
-        origin, one = torch.zeros_like(apart[:1]), torch.ones_like(apart[:1, :1])
-        found, slopes = _with_slopes(self, apart, self.coefficients(origin, one))
+        origin, unit = torch.zeros_like(apart[:1]), torch.ones_like(apart[:1, :1])
+        values, slopes = _with_slopes(self, apart, self.coefficients(origin, unit))
         kappa = profile.derivatives(apart.square().sum(-1, keepdim=True), 1)
-        return float(torch.cat([found - kappa[0], slopes[:, 0] - 2.0 * kappa[1] * apart], 1).abs().max())
+        return float(torch.cat([values - kappa[0], slopes[:, 0] - 2.0 * kappa[1] * apart], 1).abs().max())
 
     def _waves(self, at: Tensor) -> tuple[Tensor, Tensor]:
         """exp(i w . E) along the first dimension, and along all others together: (M, P1), (M, P / P1)."""
@@ -198,9 +198,9 @@ def _hessian_product(waves: Lattice, i: Points, j: Points) -> tuple[Tensor, ...]
     grids = waves.coefficients(j.features, torch.cat([j.momenta, j.d_momenta, moved], 1))
     grid, changed, moved_grid = grids.split([r, r, r * d], 1)
     d_grid = changed - 1j * (moved_grid.view(-1, r, d) * waves.frequencies[:, None]).sum(-1)
-    found, slopes = _with_slopes(waves, i.features, torch.cat([d_grid, waves.slopes(grid).flatten(1)], 1))
-    slope, bent = found[:, r:].unflatten(1, (r, d)), slopes[:, r:].unflatten(1, (r, d))
-    dv = found[:, :r] + torch.einsum("mrd,md->mr", slope, i.d_features)
+    values, slopes = _with_slopes(waves, i.features, torch.cat([d_grid, waves.slopes(grid).flatten(1)], 1))
+    slope, bent = values[:, r:].unflatten(1, (r, d)), slopes[:, r:].unflatten(1, (r, d))
+    dv = values[:, :r] + torch.einsum("mrd,md->mr", slope, i.d_features)
     d_slope = slopes[:, :r] + torch.einsum("mrde,me->mrd", bent, i.d_features)
     dg = torch.einsum("mr,mrd->md", i.d_momenta, slope) + torch.einsum("mr,mrd->md", i.momenta, d_slope)
     return dv, dg, torch.einsum("mr,mrd->md", i.momenta, slope)
@@ -208,8 +208,8 @@ def _hessian_product(waves: Lattice, i: Points, j: Points) -> tuple[Tensor, ...]
 
 def _with_slopes(waves: Lattice, at: Tensor, grid: Tensor) -> tuple[Tensor, Tensor]:
     r = grid.shape[1]
-    found = waves.values(at, torch.cat([grid, waves.slopes(grid).flatten(1)], 1))
-    return found[:, :r], found[:, r:].unflatten(1, (r, at.shape[1]))
+    columns = waves.values(at, torch.cat([grid, waves.slopes(grid).flatten(1)], 1))
+    return columns[:, :r], columns[:, r:].unflatten(1, (r, at.shape[1]))
 
 
 RESULTS: dict[Formula, Callable[[Lattice, Points, Points], tuple[Tensor, ...]]] = {

@@ -59,9 +59,9 @@ class Machine:
             llvm.initialize()
         llvm.initialize_native_target()
         llvm.initialize_native_asmprinter()
-        found = llvm.get_host_cpu_features()
-        name, features = llvm.get_host_cpu_name(), found.flatten()
-        self.vector_bytes = 64 if found.get("avx512f") else 32 if found.get("avx2") else 16
+        flags = llvm.get_host_cpu_features()
+        name, features = llvm.get_host_cpu_name(), flags.flatten()
+        self.vector_bytes = 64 if flags.get("avx512f") else 32 if flags.get("avx2") else 16
         self.mark = f"{name} {features} {llvmlite.__version__}"
         # ELF on Windows too, whose own format the loader of objects handles badly
         triple = llvm.get_process_triple() + ("-elf" if sys.platform == "win32" else "")
@@ -189,17 +189,17 @@ class Compiled(NamedTuple):
 
     def results(self, totals: Tensor, rows: int) -> tuple[Tensor, ...]:
         """The results of the formula at M rows, from all sums."""
-        found, first = [], 0
+        results, first = [], 0
         for size, factor, (term, *_) in zip(
             self.program.outputs, self.factors, self.program.formula.results, strict=True
         ):
             total = totals[first : first + size, :rows]
             result = (total if factor == 1.0 else total * factor).T
-            found.append(
+            results.append(
                 result.unflatten(1, (self.program.sizes["momenta"], -1)) if term.vector and term.apart else result
             )
             first += size
-        return tuple(found)
+        return tuple(results)
 
 
 class Fused(SumBackend):

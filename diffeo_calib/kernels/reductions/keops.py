@@ -67,10 +67,10 @@ def _lazy(weights: Weights, keops: ModuleType, i: Points, j: Points) -> list[Any
         left, right = factors(name, i, j)
         return keops.Vi(left.contiguous()) | keops.Vj(right.contiguous())
 
-    found: dict[int | None, Any] = {None: None}
+    lazy: dict[int | None, Any] = {None: None}
     for k, (name, operands, number) in weights.steps():
-        found[k] = leaf(name) if name in LEAVES else OPERATIONS[name](*(found[o] for o in operands), number)
-    return [found[node] for node, _ in weights.results]
+        lazy[k] = leaf(name) if name in LEAVES else OPERATIONS[name](*(lazy[o] for o in operands), number)
+    return [lazy[node] for node, _ in weights.results]
 
 
 class Keops(SumBackend):
@@ -98,11 +98,11 @@ class Keops(SumBackend):
                     sums = iter(torch.split(total, [b.shape[1] for _, b in some], dim=1))
             except Exception as error:  # the compiler chain may raise anything
                 return self.failed(f"KeOps could not compile or run a kernel sum ({error}).")
-            found = [
+            reduced = [
                 scale * (b.sum(0).expand(len(rows.features), -1) if w is None else next(sums))
                 for w, b, (_, scale) in zip(lazy, summands, weights.results, strict=True)
             ]
-        return formula.finish(found, rows)
+        return formula.finish(reduced, rows)
 
 
 @cache

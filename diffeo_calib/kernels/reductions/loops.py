@@ -194,18 +194,18 @@ class _Lowering:
 
     def __init__(self, code: Code, weights: Weights, i: Points, j: Points) -> None:
         self.code, self.i, self.j = code, i, j
-        known: dict[int, str] = {}
+        nodes: dict[int, str] = {}
         for k, (name, operands, number) in weights.steps():
-            values = [known[o] for o in operands]
+            values = [nodes[o] for o in operands]
             if name in LEAVES:
-                known[k] = self._leaf(name)
+                nodes[k] = self._leaf(name)
             elif name == "exp":
-                known[k] = code.exp(*values, number, weights.positive[operands[0]])
+                nodes[k] = code.exp(*values, number, weights.positive[operands[0]])
             elif name == "relu" and weights.nodes[operands[0]].name == "r2":
-                known[k] = values[0]  # a sum of squares here
+                nodes[k] = values[0]  # a sum of squares here
             else:
-                known[k] = OPERATIONS[name](code, *values, number)
-        self.results = [(None if node is None else known[node], scale) for node, scale in weights.results]
+                nodes[k] = OPERATIONS[name](code, *values, number)
+        self.results = [(None if node is None else nodes[node], scale) for node, scale in weights.results]
 
     def weight(self, number: int, factor: float) -> str:
         """A weight times a number."""
@@ -233,8 +233,8 @@ class _Lowering:
 
     def _dot(self, a: list[str], b: list[str]) -> str:
         total = self.code.call("fmul", a[0], b[0])
-        for one, other in zip(a[1:], b[1:], strict=True):
-            total = self.code.fused(one, other, total)
+        for left, other in zip(a[1:], b[1:], strict=True):
+            total = self.code.fused(left, other, total)
         return total
 
 
@@ -310,21 +310,21 @@ class _Block:
         )
 
     def _results(self) -> list[_Result]:
-        found, place, scales = [], 0, [scale for _, scale in self.program.weights.results]
+        results, place, scales = [], 0, [scale for _, scale in self.program.weights.results]
         for terms, size in zip(self.program.formula.results, self.program.outputs, strict=True):
             present = [t for t in terms if scales[t.weight] != 0.0]
             factor = scales[present[0].weight] * present[0].factor if present else 0.0
-            found.append(_Result(range(place, place + size), factor, present, terms[0].apart is not None))
+            results.append(_Result(range(place, place + size), factor, present, terms[0].apart is not None))
             place += size
-        return found
+        return results
 
     def _points(self, load: Callable[[int], str]) -> Points:
         """Points whose inputs are loaded one by one."""
-        found, place = {}, 0
+        points, place = {}, 0
         for name, size in self.program.inputs:
-            found[name] = [load(place + k) for k in range(size)]
+            points[name] = [load(place + k) for k in range(size)]
             place += size
-        return Points(**found)
+        return Points(**points)
 
     def _address(self, code: Code, k: int, array: str, length: str, point: str) -> str:
         """Address of the number at a point in the k-th line of an array whose lines have a length."""

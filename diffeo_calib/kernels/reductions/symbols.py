@@ -49,14 +49,14 @@ class Weights:
     @cached_property
     def uses(self) -> list[int]:
         """How often every node is read, by results and by nodes that are read themselves."""
-        found = [0] * len(self.nodes)
+        counts = [0] * len(self.nodes)
         for node, _ in self.results:
             if node is not None:
-                found[node] += 1
-        for k in reversed(range(len(found))):
-            for operand in self.nodes[k].operands if found[k] else ():
-                found[operand] += 1
-        return found
+                counts[node] += 1
+        for k in reversed(range(len(counts))):
+            for operand in self.nodes[k].operands if counts[k] else ():
+                counts[operand] += 1
+        return counts
 
     def steps(self) -> Iterator[tuple[int, Node]]:
         """The nodes that are read, with their numbers."""
@@ -65,13 +65,13 @@ class Weights:
     @cached_property
     def positive(self) -> list[bool]:
         """Whether the value of every node is known not to be negative, but for rounding."""
-        found: list[bool] = []
+        signs: list[bool] = []
         for name, operands, number in self.nodes:
             square = name == "product" and operands[0] == operands[1]
             inherits = name in ("product", "ratio", "sum", "shift", "inverse") and number >= 0.0
-            kept = inherits and all(found[k] for k in operands)
-            found.append(name in ("r2", "exp", "sqrt", "relu") or square or kept)
-        return found
+            kept = inherits and all(signs[k] for k in operands)
+            signs.append(name in ("r2", "exp", "sqrt", "relu") or square or kept)
+        return signs
 
 
 class Symbol:
@@ -131,10 +131,10 @@ class Symbol:
         whole = int(power)
         if whole != power or not 0 < abs(whole) <= MOST_FACTORS:
             raise TypeError(f"a power of a profile: expected a whole number up to {MOST_FACTORS}, got {power}")
-        found = self
+        product = self
         for _ in range(abs(whole) - 1):
-            found = found * self
-        return found if whole > 0 else 1.0 / found
+            product = product * self
+        return product if whole > 0 else 1.0 / product
 
     def exp(self) -> Symbol:
         """Elementwise."""

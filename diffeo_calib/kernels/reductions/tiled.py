@@ -99,8 +99,8 @@ class Tiled(SumBackend):
             in_parallel(lambda i: _rectangular(weigh, at.rows(i), columns, summands, elements), slices),
             strict=True,
         ):
-            for total, own in zip(totals, sums, strict=True):
-                total[i] = own
+            for total, part in zip(totals, sums, strict=True):
+                total[i] = part
         return totals
 
     def _elements(self, points: Points) -> int:
@@ -145,10 +145,10 @@ def _symmetric(
 
 def dealt(tile_rows: list[int], parts: int) -> list[list[int]]:
     """Rows of a triangle of tiles in parts of about equal area: dealt there and back, since later rows are shorter."""
-    found: list[list[int]] = [[] for _ in range(parts)]
+    hands: list[list[int]] = [[] for _ in range(parts)]
     for k, row in enumerate(tile_rows):
-        found[min(k % (2 * parts), 2 * parts - 1 - k % (2 * parts))].append(row)
-    return [part for part in found if part]
+        hands[min(k % (2 * parts), 2 * parts - 1 - k % (2 * parts))].append(row)
+    return [part for part in hands if part]
 
 
 def _rectangular(weigh: Weighing, rows: Points, columns: Points, summands: list[Tensor], elements: int) -> list[Tensor]:
@@ -165,8 +165,8 @@ def _rectangular(weigh: Weighing, rows: Points, columns: Points, summands: list[
 
 def _sums(weights: tuple[list[Tensor], list[float]], summands: list[Tensor]) -> list[Tensor]:
     """Sums over one tile: (k, M) each."""
-    found, scales = weighted_sums(weights[0], summands), weights[1]
-    return [s if scale == 1.0 else s * scale for s, scale in zip(found, scales, strict=True)]
+    results, scales = weighted_sums(weights[0], summands), weights[1]
+    return [s if scale == 1.0 else s * scale for s, scale in zip(results, scales, strict=True)]
 
 
 def _slices(count: int, size: int) -> list[slice]:
@@ -234,14 +234,14 @@ def _recycled(weights: Weights, elements: int, i: Points, j: Points) -> tuple[li
         free.extend(held.pop(o) for o in over[1:])
         OPERATIONS[name](*values, number, view(buffer))
         held[k] = buffer
-    found = []
+    buffers = []
     for place, (node, _) in enumerate(weights.results):
         key = -1 - place if node is None else node
         if key not in held:
             held[key] = taken() if node is None else dots(node)
-        found.append(view(held[key]).fill_(1.0) if node is None else view(held[key]))
+        buffers.append(view(held[key]).fill_(1.0) if node is None else view(held[key]))
     BUFFERS.lent += [(free, buffer) for buffer in held.values()]
-    return found, [scale for _, scale in weights.results]
+    return buffers, [scale for _, scale in weights.results]
 
 
 def _exp(a: Tensor, c: float, out: Tensor) -> None:

@@ -90,8 +90,8 @@ class Compensation:
     @property
     def counts(self) -> dict[str, int]:
         """How many rows ended in each status; statuses without rows are left out."""
-        found = Counter(self.status)
-        return {str(status): found[status] for status in Status if found[status]}
+        counts = Counter(self.status)
+        return {str(status): counts[status] for status in Status if counts[status]}
 
     def __len__(self) -> int:
         return len(self.status)
@@ -198,14 +198,14 @@ def compensate(
         return _result(*follow(problem, begin[0] if len(begin) else motion))
     if pace is None:
         return _result(problem, problem.solve())
-    found, jumps = solve_path(problem, pace)
+    solution, jumps = solve_path(problem, pace)
     if len(jumps):
         rows = (
             f"the corrections of the path jump after {few(jumps.tolist())} rows, and were spread over the rows around"
         )
         fix = "look at their statuses: the path may pass a singularity or change its branch there"
         warn_user(sentence(rows, fix=fix))
-    return _result(problem, found, jumps)
+    return _result(problem, solution, jumps)
 
 
 def _pace(robot: Tree, problem: CompensationProblem, rate: object, time: object, *, path: bool) -> Pace | None:
@@ -239,8 +239,8 @@ def _tools(model: CalibratedKinematics, tool: object, goals: Targets) -> dict[st
     if not goals.of_tips:
         return {checked_tip(model.robot, model.tool_tip): model.tool if tool is None else tool_transform(tool)}
     if tool is None:
-        own = model.tool_tip or tips[0]
-        return {tip: model.tool if tip == own else tool_transform(None) for tip in tips}
+        usual = model.tool_tip or tips[0]
+        return {tip: model.tool if tip == usual else tool_transform(None) for tip in tips}
     given = real_tensor(tool, "tool")
     if given.shape not in ((len(tips), 4, 4), (len(tips), 3)):
         expected, fix = f"({len(tips)}, 4, 4) or ({len(tips)}, 3)", "pass one tool for every tip"
@@ -248,15 +248,15 @@ def _tools(model: CalibratedKinematics, tool: object, goals: Targets) -> dict[st
     return {tip: tool_transform(each) for tip, each in zip(tips, given, strict=True)}
 
 
-def _result(problem: CompensationProblem, found: Solution, jumps: Sequence[int] | Array = ()) -> Compensation:
-    goals, status = problem.targets, tuple(MEMBERS[code] for code in found.codes.tolist())
-    (miss, angle), poses = goals.misses(found.poses), found.poses
+def _result(problem: CompensationProblem, solution: Solution, jumps: Sequence[int] | Array = ()) -> Compensation:
+    goals, status = problem.targets, tuple(MEMBERS[code] for code in solution.codes.tolist())
+    (miss, angle), poses = goals.misses(solution.poses), solution.poses
     miss, angle = np.where(goals.free, np.nan, miss), None if angle is None else np.where(goals.free, np.nan, angle)
     if not goals.of_tips:
         poses, miss, angle = poses[:, 0], miss[:, 0], None if angle is None else angle[:, 0]
-    q, start, seen, away = (torch.from_numpy(part) for part in (found.q, problem.start.copy(), poses, miss))
+    q, start, arrived, away = (torch.from_numpy(part) for part in (solution.q, problem.start.copy(), poses, miss))
     turned = None if angle is None else torch.from_numpy(angle)
-    return Compensation(q, start, status, seen, away, turned, tuple(int(row) for row in jumps))
+    return Compensation(q, start, status, arrived, away, turned, tuple(int(row) for row in jumps))
 
 
 ROUNDS = 3
@@ -302,11 +302,11 @@ def _lowest(values: Array, steps: Array) -> Array:
 
 def solve_path(problem: CompensationProblem, pace: Pace) -> tuple[Solution, Array]:
     """Commands of a path, and the rows at which the corrections of the rows on their own jump."""
-    found = problem.solve()
+    solution = problem.solve()
     start = problem.start
-    jumps = pace.jumps(found.q - start)
-    firm = found.codes == CODE[Status.reached]
-    q, held = found.q.copy(), np.zeros(found.q.shape, dtype=bool)
+    jumps = pace.jumps(solution.q - start)
+    firm = solution.codes == CODE[Status.reached]
+    q, held = solution.q.copy(), np.zeros(solution.q.shape, dtype=bool)
     for _ in range(ROUNDS):
         slow = start + pace.limited(q - start, firm)
         held |= np.abs(slow - q) > SAME_CORRECTION_TOLERANCE
@@ -321,7 +321,7 @@ def solve_path(problem: CompensationProblem, pace: Pace) -> tuple[Solution, Arra
     slow = start + pace.limited(q - start, firm)
     q = np.where(np.abs(slow - q) > ROUNDING, slow, q)
     box = problem.box()
-    return problem.keep_mimics(_judged(problem, found, np.clip(q, box.low, box.high))), jumps
+    return problem.keep_mimics(_judged(problem, solution, np.clip(q, box.low, box.high))), jumps
 
 
 def _judged(problem: CompensationProblem, before: Solution, q: Array) -> Solution:

@@ -146,24 +146,24 @@ class CompensationProblem:
         """The nearest command of every row on its own; none where a start is farther beyond a limit than the bound."""
         count, n = self.start.shape
         poses = np.full((count, self.targets.tools, 4, 4), np.nan)
-        found = Solution(np.full((count, n), np.nan), poses, np.full(count, CODE[Status.limit]))
+        solution = Solution(np.full((count, n), np.nan), poses, np.full(count, CODE[Status.limit]))
         box = self.box()
         possible = np.flatnonzero(np.all(box.low <= box.high, axis=1))
         for first in range(0, len(possible), ROWS_AT_ONCE):
             rows = possible[first : first + ROWS_AT_ONCE]
-            own, (q, seen, done) = self.started(rows, self.start[rows]), self._search(rows)
-            solved = own.keep_mimics(Solution(q, seen, own._codes(q, seen, done)))
-            for whole, part in zip(found, solved, strict=True):
+            begin, (q, reached, done) = self.started(rows, self.start[rows]), self._search(rows)
+            solved = begin.keep_mimics(Solution(q, reached, begin._codes(q, reached, done)))
+            for whole, part in zip(solution, solved, strict=True):
                 whole[rows] = part
-        return found
+        return solution
 
-    def keep_mimics(self, found: Solution) -> Solution:
+    def keep_mimics(self, solution: Solution) -> Solution:
         """Shorten corrections that would take mimic joints of several joints beyond their limits."""
         if not len(self.limits.matrix):
-            return found
-        q = self.limits.within(self.start, found.q)
-        changed = np.flatnonzero((q != found.q).any(1))
-        poses, codes = found.poses.copy(), found.codes.copy()
+            return solution
+        q = self.limits.within(self.start, solution.q)
+        changed = np.flatnonzero((q != solution.q).any(1))
+        poses, codes = solution.poses.copy(), solution.codes.copy()
         codes[changed] = CODE[Status.limit]
         possible = changed[np.isfinite(q[changed]).all(1)]
         poses[changed] = np.nan
@@ -194,10 +194,10 @@ class CompensationProblem:
         start, targets = self.start[rows], self.targets.take(rows)
         near, open_ = self._blames(targets, start, self.tool.poses(start), start)
         near_here, open_here = self._blames(targets, q, poses, start)
-        found = (near & open_) | (near_here & open_here)
-        doubtful = np.flatnonzero((near | near_here) & ~found)
-        found[doubtful] = self._search(rows[doubtful], scale=SECOND_SEARCH_BOUND_FACTOR)[2]
-        return found
+        singular = (near & open_) | (near_here & open_here)
+        doubtful = np.flatnonzero((near | near_here) & ~singular)
+        singular[doubtful] = self._search(rows[doubtful], scale=SECOND_SEARCH_BOUND_FACTOR)[2]
+        return singular
 
     def _blames(self, targets: Targets, q: Array, poses: Array, start: Array) -> tuple[Array, Array]:
         """(R,) whether weak directions at ``q`` (R, n) alone keep the bound from sufficing; whether they lead there.

@@ -105,8 +105,8 @@ class Search:
         at, slope = self.q[rows], self.gradient[rows]
         step = _step_in_box(damped, slope, box.low - at, box.high - at)
         moved = np.clip(at + step, box.low, box.high)
-        seen = self.tool.poses(moved)
-        cost = self._cost(rows, moved, seen)
+        poses = self.tool.poses(moved)
+        cost = self._cost(rows, moved, poses)
         goal, before = self.targets.take(rows), self.cost[rows]
         missed = goal.cost(self.poses[rows])
         noise = ROUNDING * before
@@ -114,16 +114,16 @@ class Search:
         gain = (before - cost + noise) / (np.abs(promised) + noise + 1e-300)
         good = gain > 1e-4
         taken = rows[good]
-        self.q[taken], self.poses[taken], self.cost[taken] = moved[good], seen[good], cost[good]
+        self.q[taken], self.poses[taken], self.cost[taken] = moved[good], poses[good], cost[good]
         damping, growth = self.damping[rows], self.growth[rows]  # by Nielsen's rule
         factor = np.maximum(1.0 / 3.0, 1.0 - (2.0 * np.minimum(gain, 1.0) - 1.0) ** 3)
         self.damping[rows] = np.maximum(np.where(good, damping * factor, damping * growth), LEAST_DAMPING)
         self.growth[rows] = np.where(good, 2.0, 2.0 * growth)
         still = np.abs(step).max(1, initial=0.0) <= SETTLED_STEP
         still |= np.abs(promised) <= np.maximum(SMALLEST_GAIN, noise)
-        still |= good & reached(goal, seen)
+        still |= good & reached(goal, poses)
         if not self.exact:
-            still |= goal.cost(seen) > SLOWEST_CONTRACTION * missed
+            still |= goal.cost(poses) > SLOWEST_CONTRACTION * missed
         self._linearise(rows[good & ~still])
         self.todo = rows[~still]
 
@@ -154,19 +154,19 @@ class Search:
         rows = np.flatnonzero(near & ~reached(self.targets, self.poses))
         if not len(rows):
             return
-        goal, box, q, seen = self.targets.take(rows), self.box.take(rows), self.q[rows], self.poses[rows]
+        goal, box, q, poses = self.targets.take(rows), self.box.take(rows), self.q[rows], self.poses[rows]
         jacobian, ease = (
             self.tool.jacobian if self.exact else self.tool.rough,
             np.sqrt(box.mobility) * ((q > box.low) & (q < box.high)),
         )
         for _ in range(LAST_STEPS):
             inverse = ease[:, :, None] * np.linalg.pinv(goal.slopes(jacobian(q)) * ease[:, None])
-            q = np.clip(q + (inverse @ goal.errors(seen)[:, :, None])[:, :, 0], box.low, box.high)
-            seen = self.tool.poses(q)
-            there = reached(goal, seen)
+            q = np.clip(q + (inverse @ goal.errors(poses)[:, :, None])[:, :, 0], box.low, box.high)
+            poses = self.tool.poses(q)
+            there = reached(goal, poses)
             if there.all():
                 break
-        self.q[rows[there]], self.poses[rows[there]] = q[there], seen[there]
+        self.q[rows[there]], self.poses[rows[there]] = q[there], poses[there]
 
 
 def _convex(hessian: Array, blocked: Array) -> Array:

@@ -30,7 +30,7 @@ from diffeo_calib.common.checks import as_tensor, real_tensor
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.tool import ToolKinematics
-from diffeo_calib.measurements.poses import rigid_poses
+from diffeo_calib.robots.se3 import rigid_poses
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.build import calibrated_chain
 
@@ -176,17 +176,17 @@ def checked_targets(targets: Tensor, robot: Tree, rows: int, *, axis: object, to
         finite_rows(targets, "targets", (rows, 4, 4) if targets.ndim == 3 else (rows, 3), fix)
         parts = _parts(targets[:, None], axis, tool_axis, "row {}".format)
         return Targets(**parts, lever=lever, free=np.zeros((rows, 1), dtype=bool), of_tips=False)
-    tips, one = targets.shape[1], targets.shape[2:]
+    tips, shape = targets.shape[1], targets.shape[2:]
     if tips != len(robot.tips):
         fix = "pass one for every tip, NaN where a tip may be anywhere; or (N, 4, 4) or (N, 3) for the tip of the tool"
         raise InputError.of(f"`targets` of robot '{robot.name}'", expected=f"{len(robot.tips)} tips", got=tips, fix=fix)
-    free = targets[..., :3, :].isnan().flatten(2).all(2) if len(one) == 2 else targets.isnan().all(2)
+    free = targets[..., :3, :].isnan().flatten(2).all(2) if len(shape) == 2 else targets.isnan().all(2)
     idle = free.all(1).nonzero()[:, 0].tolist()
     if idle:
         raise InputError.of(f"`targets`, row {idle[0]}: no tip has a target", fix="leave this row out")
-    anywhere = torch.eye(4, dtype=targets.dtype, device=targets.device) if len(one) == 2 else targets.new_zeros(3)
-    filled = torch.where(free.reshape(*free.shape, *[1] * len(one)), anywhere, targets)
-    finite_rows(filled, "targets", (rows, tips, *one), f"{fix} and every tip, NaN for a free tip")
+    anywhere = torch.eye(4, dtype=targets.dtype, device=targets.device) if len(shape) == 2 else targets.new_zeros(3)
+    filled = torch.where(free.reshape(*free.shape, *[1] * len(shape)), anywhere, targets)
+    finite_rows(filled, "targets", (rows, tips, *shape), f"{fix} and every tip, NaN for a free tip")
     if axis is not None:
         given = real_tensor(axis, "axis")
         if given.shape != (rows, tips, 3):
@@ -204,8 +204,8 @@ def _parts(targets: Tensor, axis: object, tool_axis: str, place: Any) -> dict[st
     if targets.ndim == 4:
         if axis is not None:
             raise InputError.of("`axis` beside target poses, which say how all axes point", fix="leave it out")
-        found = rigid_poses(flat, lambda k: f"`targets`, {place(k)}") if len(flat) else flat
-        poses = found.detach().cpu().numpy().astype(np.float64).reshape(*shape, 4, 4)
+        rigid = rigid_poses(flat, lambda k: f"`targets`, {place(k)}") if len(flat) else flat
+        poses = rigid.detach().cpu().numpy().astype(np.float64).reshape(*shape, 4, 4)
         return {"position": poses[..., :3, 3], "axes": poses[..., :3, :3], "tool_axes": np.eye(3)}
     if not isinstance(tool_axis, str) or tool_axis not in AXES:
         raise InputError.of("`tool_axis`", expected="'x', 'y' or 'z'", got=as_written(tool_axis))
@@ -253,12 +253,12 @@ _ready: WeakKeyDictionary[CalibratedKinematics, dict[object, ToolFunctions]] = W
 
 def tool_functions(model: CalibratedKinematics, tools: Mapping[str, Tensor], frame: str) -> ToolFunctions:
     """Kinematics of tools (4, 4) on these tips in a frame, "base" or "measuring"; kept for later calls."""
-    known = _ready.setdefault(model, {})
+    cache = _ready.setdefault(model, {})
     key = frame, *((tip, tool.numpy().tobytes()) for tip, tool in tools.items())
-    if key in known:
-        return known[key]
-    if len(known) >= MOST_TOOLS:
-        known.clear()
+    if key in cache:
+        return cache[key]
+    if len(cache) >= MOST_TOOLS:
+        cache.clear()
     robot, geometry, device = model.robot, model.geometry, model.configurations.device
     each = [ToolKinematics(model.map, model.nominal, tool, frame, tip) for tip, tool in tools.items()]
 
@@ -273,6 +273,6 @@ def tool_functions(model: CalibratedKinematics, tools: Mapping[str, Tensor], fra
     chain = replace(chain, tips=ends)
     poses, jacobian = (partial(by_tool, of) for of in (ToolKinematics.poses, ToolKinematics.jacobian))
     serial, length = robot.moving == robot.n, 0.25 * robot.reach if isfinite(robot.reach) else SOME_LENGTH
-    return known.setdefault(
+    return cache.setdefault(
         key, ToolFunctions(poses, jacobian, lambda q: chain.poses_and_jacobian(q)[1][:, numbers], serial, length)
     )

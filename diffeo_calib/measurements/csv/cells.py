@@ -6,11 +6,13 @@ anything.
 
 from __future__ import annotations
 
+import csv
 import difflib
+import io
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -34,6 +36,13 @@ LARGEST_NUMBER = 1e12
 """Larger numbers, in any unit, are no measurements: marks of missing readings, or damage."""
 _PLAIN = re.compile(r"[0-9+\-.eE]*", re.ASCII)
 """Characters of numbers: of these, ``float`` reads what _NUMBER matches, only faster."""
+
+
+def csv_text(rows: Iterable[Iterable[object]], sep: str = ",", end: str = "\n") -> str:
+    """Rows of cells as CSV; numbers are read back to the last bit."""
+    text = io.StringIO(newline="")
+    csv.writer(text, delimiter=sep, lineterminator=end).writerows(rows)
+    return text.getvalue()
 
 
 def repeated(names: Sequence[str]) -> list[str]:

@@ -27,8 +27,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from diffeo_calib.common.errors import MeasurementError, few, shown
-from diffeo_calib.measurements.csv.cells import find_columns, number
-from diffeo_calib.measurements.csv.lines import TextTable, csv_text, read_cells
+from diffeo_calib.measurements.csv.cells import csv_text, find_columns, number
+from diffeo_calib.measurements.csv.lines import TextTable, read_cells
 
 SEPARATORS = (",", ";", "\t", "|", " ")
 MOVED = 1e-3
@@ -39,11 +39,12 @@ Pairs = list[tuple[int, int]]
 """Numbers of lines with the same joint values: of the joints and of the places."""
 
 
-class JoinedFile(pathlib.WindowsPath if os.name == "nt" else pathlib.PosixPath):  # no subclass of Path before 3.12
-    """Joined lines, read as a file of places with this name would be; messages name the files that were joined.
+class HeldFile(pathlib.WindowsPath if os.name == "nt" else pathlib.PosixPath):  # no subclass of Path before 3.12
+    """Lines that are read as those of a file of this name would be.
 
     Attributes:
-        words: these files. sentence: how many lines are joined, and which have no partner. content: the lines.
+        content: the lines. words: files that were joined, for messages. sentence: how many lines are joined, and which
+            have no partner.
     """
 
     words = sentence = ""
@@ -57,7 +58,7 @@ class JoinedFile(pathlib.WindowsPath if os.name == "nt" else pathlib.PosixPath):
         return True
 
     def open(self, *_: Any, **__: Any) -> Any:
-        """The joined lines, as a file of bytes."""
+        """The lines, as a file of bytes."""
         return BytesIO(self.content)
 
 
@@ -88,7 +89,7 @@ class _Table(NamedTuple):
 
 def joined_file(
     joints: Path, places: Path, by: str, sep: str = ",", decimal: str = ".", *, several: bool = False
-) -> JoinedFile:
+) -> HeldFile:
     """A file with the columns of the tables of joints and of places, joined by a common column.
 
     ``by`` is the common column, or "A=B" where the places have it under another name B. Another usual separator of one
@@ -122,7 +123,7 @@ def joined_file(
         expected, got = "values that both files have", " and ".join(without)
         raise MeasurementError.of(f"--by {shown(by)}", expected=expected, got=got, fix=fix)
     _refuse_several(tables, pairs, several=several)
-    found = JoinedFile(places)
+    found = HeldFile(places)
     found.content = _written(tables, pairs, sep)
     found.words = f"{places}, joined with {joints}"
     found.sentence = f"{len(pairs)} lines of {places.name} are joined with lines of {joints.name} {how}"
@@ -189,7 +190,7 @@ def _written(tables: Sequence[_Table], pairs: Pairs, sep: str) -> bytes:
     for row, place in pairs:
         line, cells = measured.rows[place]
         lines[line] = [" ".join(cell.split()) for cell in (*table.rows[row][1], *cells)]
-    return csv_text((lines.get(line, []) for line in range(1, max(lines) + 1)), sep, "\n")
+    return csv_text((lines.get(line, []) for line in range(1, max(lines) + 1)), sep).encode()
 
 
 # --- stops

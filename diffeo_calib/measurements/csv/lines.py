@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import codecs
 import csv
+import hashlib
 import io
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from itertools import combinations, islice, takewhile, zip_longest
 from math import isfinite, isnan, prod
 from os import PathLike
@@ -19,7 +21,7 @@ from typing import NamedTuple
 
 from diffeo_calib.common.errors import MeasurementError, few, listed
 from diffeo_calib.common.files import WholeFile
-from diffeo_calib.measurements.csv.cells import number, repeated
+from diffeo_calib.measurements.csv.cells import csv_text, number, repeated
 from diffeo_calib.measurements.csv.sheets import MARKS, as_text, names_of
 from diffeo_calib.measurements.table_format import ZERO, TableFormat
 
@@ -42,8 +44,11 @@ WIDE = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 COMMENTS = "#", "%", "//"
 DAMAGED = re.compile(r"#[A-Z/0]+[!?]")
 """Cells such as #VALUE! and #DIV/0!, with which spreadsheets say that a formula failed: no comments."""
-LENGTHS = {"m": "m", "mm": "mm", "cm": "cm", "um": "um", "µm": "um", "in": "inch", "inch": "inch"}
-ANGLES = {"rad": "rad", "radians": "rad", "mrad": "mrad", "deg": "deg", "degrees": "deg", "°": "deg", "gon": "gon"}
+LENGTHS = {name: name for name in ("m", "mm", "cm", "um", "inch")}
+LENGTHS |= {"µm": "um", "in": "inch", "毫米": "mm", "厘米": "cm", "米": "m"}
+ANGLES = {name: name for name in ("rad", "mrad", "deg", "gon")}
+ANGLES |= {"radians": "rad", "弧度": "rad", "°": "deg", "degree": "deg", "degrees": "deg", "度": "deg"}
+UNITS = LENGTHS | ANGLES
 """Units as they are written, and their names."""
 LIST = re.compile(r"(?:[\w.]+\((?:'\w', *)?)?([\[(].*[\])])(?:, *dtype=[\w.]+)?\)?", re.DOTALL)
 """A list in one cell, as Python, NumPy and ROS write it: [0.1, 0.2], (0.1, 0.2), [0.1 0.2], array('d', [0.1, 0.2])."""
@@ -69,6 +74,7 @@ class CsvLines:
         header: the names of the columns; by position, "1", "2", ..., where no line names them.
         units: by name of column, of a row of units below the header.
         notes: what was decided, in words; after :meth:`rows` also which lines between them were skipped.
+        sha256: of the file; None of what can be read only once, a pipe.
 
     Raises:
         MeasurementError: a file that cannot be read, is empty, no text or no valid CSV.
@@ -79,7 +85,7 @@ class CsvLines:
         self.header, self.units, self.notes = list[str](), dict[str, str](), list[str]()
         self._aligned, self._commented = False, True
         self._last, self._extra = 0, 0  # line before the rows, and empty cells at the end of rows
-        self._text, notes = _text(path, sep)
+        self._text, notes, self.sha256 = _text(path, sep)
         if sep != " " and re.search(r"[\[(][-+\d.]", self._text[:AT_ONCE]) and '"' not in self._text:
             self._text = re.sub(UNQUOTED.format(re.escape(sep)), r'\1"\2"', self._text)
         self._lists = dict[int, tuple[int, ...]]()  # shapes of the lists that columns hold
@@ -193,8 +199,8 @@ class CsvLines:
         self.header, self._extra = header, max(width - len(header), 0)
 
 
-def _text(path: Path, sep: str) -> tuple[str, list[str]]:
-    """The text of a file, and what was decided about it; MeasurementError if it cannot be read or is no table."""
+def _text(path: Path, sep: str) -> tuple[str, list[str], str | None]:
+    """The text of a file, what was decided about it, its SHA-256; MeasurementError if it is none, or no table."""
     try:
         with path.open("rb") as file:
             data = file.read(AT_ONCE)  # tells a device without an end
@@ -213,18 +219,19 @@ def _text(path: Path, sep: str) -> tuple[str, list[str]]:
     if path.suffix.lower() in NO_TABLES:
         what, fix = f"'{path}' is no table", "write one: a line with the names of the columns, then a line for each row"
         raise MeasurementError.of(what, expected="CSV, a spreadsheet or arrays", got=path.suffix, fix=fix)
+    sha256 = hashlib.sha256(data).hexdigest() if path.is_file() else None
     if data.startswith(WIDE):
-        return data.decode("utf-16", "replace"), ["text in utf-16, not UTF-8"]
+        return data.decode("utf-16", "replace"), ["text in utf-16, not UTF-8"], sha256
     if (sheet := as_text(path, data, sep)) is not None:
-        return sheet
+        return *sheet, sha256
     if b"\0" in data:
         what, fix = f"file '{path}' is no text but binary", "export the table as CSV"
         raise MeasurementError.of(what, expected="a CSV file", fix=fix)
     try:
-        return data.decode("utf-8-sig"), []
+        return data.decode("utf-8-sig"), [], sha256
     except UnicodeDecodeError:
         page = _code_page(data)
-        return data.decode(page, "replace"), [f"text in {page}, not UTF-8"]
+        return data.decode(page, "replace"), [f"text in {page}, not UTF-8"], sha256
 
 
 def _code_page(data: bytes) -> str:
@@ -343,13 +350,13 @@ def _parts(cell: str, shape: tuple[int, ...] | None) -> list[str]:
 def unit_of(text: str) -> str:
     """The unit that a text is, in small letters without brackets; empty if it is none."""
     bare = text.lower().replace("\u03bc", "µ").strip("[](){}<> ")
-    return bare if bare in LENGTHS | ANGLES or OTHERS.fullmatch(bare) else ""
+    return bare if bare in UNITS or OTHERS.fullmatch(bare) else ""
 
 
 def stated_unit(column: str, units: Mapping[str, str]) -> str | None:
     """The unit of length or angle in brackets after the name of a column, or in a row of units; None without any."""
     bracket = re.search(r"[\[(][^\[(]*[\])]$", column)
-    return (LENGTHS | ANGLES).get(units.get(column) or (unit_of(bracket[0]) if bracket else ""))
+    return UNITS.get(units.get(column) or (unit_of(bracket[0]) if bracket else ""))
 
 
 def _is_units(cells: Sequence[str]) -> bool:
@@ -367,6 +374,7 @@ def _uncommented(cells: list[str], width: int) -> list[str]:
     return cells[1:] if not first and len(cells) > width > 0 else [first or cells[0], *cells[1:]]
 
 
+@lru_cache(maxsize=1 << 14)  # `init` reads a table in many units
 def _value(text: str) -> bool:
     """Whether a text is a number, with any decimal mark."""
     values = (number(text, decimal) for decimal in ".,")
@@ -398,16 +406,9 @@ def write_rows(path: str | PathLike[str], names: Sequence[str], blocks: Iterable
         return repr(value).replace(".", table.decimal) if isfinite(value) else ""
 
     with WholeFile(path) as file:
-        file.write(csv_text([names], table.sep))
+        file.write(csv_text([names], table.sep, "\r\n").encode())
         for block in blocks:
-            file.write(csv_text((map(cell, row) for row in block), table.sep))
-
-
-def csv_text(rows: Iterable[Iterable[object]], sep: str, end: str = "\r\n") -> bytes:
-    """Rows of cells as CSV."""
-    text = io.StringIO(newline="")
-    csv.writer(text, delimiter=sep, lineterminator=end).writerows(rows)
-    return text.getvalue().encode()
+            file.write(csv_text((map(cell, row) for row in block), table.sep, "\r\n").encode())
 
 
 def write_columns(path: Path, sheet: TextTable, cells: Mapping[str, Column], table: TableFormat) -> None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError, as_written, few, shown, warn_user
+from diffeo_calib.common.errors import MeasurementError, as_written, few, listed, shown, warn_user
 from diffeo_calib.measurements.checks import of_measurements, unlikely_units
 from diffeo_calib.measurements.csv.cells import bad_cells
 from diffeo_calib.measurements.csv.columns import DEVIATION, Body, Check, Column, Columns
@@ -102,6 +102,10 @@ class PositionColumns(SensorColumns):
         if std is not None:
             expected = "names of columns: one, one per marker or three per marker"
             std = column_names("std", std, expected, (1, count, 3 * count))
+        if form.spherical and std and len(std) == 3 * count:  # deviations are along x, y and z
+            fix = "name one for all directions, in the unit of `length`, or leave them out: the noise is estimated"
+            what = "`std` of a distance and two angles"
+            raise MeasurementError.of(what, expected="one column for each marker", got=listed(std), fix=fix)
 
         def own(names: Sequence[str], k: int) -> Sequence[str]:
             each = len(names) // count

@@ -8,14 +8,13 @@ sheets are one table if one column of both has the same texts.
 
 from __future__ import annotations
 
-import csv
 import math
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
-from io import BytesIO, StringIO
+from io import BytesIO
 from itertools import compress, product, zip_longest
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -23,6 +22,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from diffeo_calib.common.errors import MeasurementError, few
+from diffeo_calib.measurements.csv.cells import csv_text
 
 MARKS = ZIP, OLD_SHEET, NUMPY, MATLAB = b"PK\3\4", b"\xd0\xcf\x11\xe0", b"\x93NUMPY", b"MATLAB "
 """First bytes of files that are no text."""
@@ -40,9 +40,7 @@ def as_text(path: Path, data: bytes, sep: str) -> tuple[str, list[str]] | None:
     if not variables and not data.startswith((ZIP, OLD_SHEET, NUMPY)):
         return None
     rows, notes = _table(path, data)
-    text = StringIO()
-    csv.writer(text, delimiter=sep, lineterminator="\n").writerows(rows)
-    return text.getvalue(), notes
+    return csv_text(rows, sep), notes
 
 
 Rows = Sequence[Sequence[object]]

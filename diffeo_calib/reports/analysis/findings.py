@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics.judged_rows import common_cause, judge
 from diffeo_calib.calibration.diagnostics.outliers import Outlier
-from diffeo_calib.calibration.diagnostics.row_order import common_cause
-from diffeo_calib.calibration.expected_errors import Accuracy, accuracy, expected_errors, judge
+from diffeo_calib.calibration.expected_errors import Accuracy, accuracy, expected_errors
 from diffeo_calib.calibration.result import Part, parts
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
@@ -27,7 +27,6 @@ from diffeo_calib.kinematics.evaluation import (
     unseen,
 )
 from diffeo_calib.measurements.csv.tables import TableOrigin
-from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.predictions import FitRows, Predictions, forecast
 from diffeo_calib.reports.analysis.stages import Deviations, Kinematics, Repeats, repeats_of, stages_of
@@ -45,16 +44,17 @@ COLUMN_WORDS = ("temp", "time", "stamp", "date", "hour")
 
 
 class RowsOfKind(NamedTuple):
-    """N rows of one kind: their errors by stage, the model last, joint values (N, n) and lines (N,)."""
+    """N rows of one kind: their errors by stage, the model last, and joint values (N, n)."""
 
     stages: Mapping[str, Evaluation]
     q: Tensor
-    lines: Tensor
 
     @property
     def errors(self) -> Evaluation:
         """Errors of the model."""
         return list(self.stages.values())[-1]
+
+    lines = property(lambda self: self.errors.line_numbers)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -108,7 +108,7 @@ class Findings:
     @property
     def count(self) -> int:
         """Number of rows shown."""
-        return sum(len(one.lines) for one in self.kinds.values())
+        return sum(len(one.q) for one in self.kinds.values())
 
     @property
     def judged(self) -> Accuracy:
@@ -147,9 +147,6 @@ def find(
     """Compute everything that a report shows; arguments and errors as of :func:`write_report`."""
     if not isinstance(model, CalibratedKinematics):
         raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
-    if not (data is None or isinstance(data, RowGroups)):
-        expected = "dc.Measurements, dc.Readings or Observations"
-        raise InputError.of("`data`", expected=expected, got=type(data).__name__)
     if data is not None:
         check_rows(model, data)
     own = Places() if data is None else place(model, data) if places is None else list(places.values())[-1]
@@ -162,9 +159,9 @@ def find(
     kinematics = stages_of(model, rows) if stages is None else stages
     progress("analysis", 1, STEPS)
     if data is not None and (bool((new := _new_rows(model, data, rows)).any()) or not rows.of_positions):
-        aligned = measured if rows.of_positions and measured is not None and len(measured) == len(data) else None
-        errors = _by_stage(data, aligned, kinematics, own, places)
-        shown = _of_table(model, data, new, measured, own, errors=errors)
+        shown = _of_table(
+            model, data, new, measured, own, stages=kinematics, places=places, of_positions=rows.of_positions
+        )
     else:
         shown = _left_out(model, rows, kinematics) if rows.of_positions else NOTHING
     progress("analysis", 2, STEPS)
@@ -207,30 +204,10 @@ def _new_rows(model: CalibratedKinematics, data: Any, rows: FitRows) -> Tensor:
     return new
 
 
-def _by_stage(
-    data: Any, measured: Measurements | None, stages: Mapping[str, Kinematics], own: Places, places: Any
-) -> dict[str, Evaluations]:
-    """Errors of all rows by stage, devices in their ``own`` places beside the model, in ``places`` beside every stage.
-
-    ``measured``: the rows in the frame of the model, without its drift, if all are measured positions; they are placed.
-    """
-    *before, last = stages
-    found = dict[str, Evaluations]()
-    for name in before:
-        rows = data if measured is None else measured
-        at = place(stages[name], rows) if measured is not None or places is None else places[name]
-        at = at if measured is not None else replace(at, devices={**own.devices, **at.devices}, ball=own.ball)
-        found[name] = residuals(stages[name], at, rows)
-    return found | {last: residuals(stages[last], own, data)}
-
-
-def _by_kind(errors: Mapping[str, Evaluations], q: Tensor, lines: Tensor) -> dict[str, RowsOfKind]:
-    """Errors by stage, of rows with these joint values (N, n) and lines (N,), by kind."""
-    index = next(iter(errors.values())).index
-    return {
-        kind: RowsOfKind({name: found[kind] for name, found in errors.items()}, q[rows.cpu()], lines[rows.cpu()])
-        for kind, rows in index.items()
-    }
+def _by_kind(errors: Mapping[str, Evaluations], q: Tensor) -> dict[str, RowsOfKind]:
+    """Errors by stage, of rows with these joint values (N, n), by kind."""
+    each = next(iter(errors.values())).index.items()
+    return {kind: RowsOfKind({name: own[kind] for name, own in errors.items()}, q[rows.cpu()]) for kind, rows in each}
 
 
 def _of_table(
@@ -240,22 +217,30 @@ def _of_table(
     measured: Measurements | None,
     own: Places,
     *,
-    errors: Mapping[str, Evaluations],
+    of_positions: bool,
+    stages: Mapping[str, Kinematics],
+    places: Mapping[str, Places] | None,
 ) -> dict[str, Any]:
     """Rows that the model has not seen, of a ``mask`` (N,); if there are none, all as fitted.
 
-    ``measured``: positions of all in the frame of the model. ``errors``: of all by stage.
+    ``measured``: positions of all in the frame of the model, without its drift. If there are no other rows, they are
+    placed beside every stage; else devices are in their ``own`` places, or in ``places`` beside that stage.
     """
-    new = bool(mask.any())
+    new, (*before, last), errors = bool(mask.any()), stages, dict[str, Evaluations]()
     LOG.info("judged by %d rows it has not seen, %d were used before", int(mask.sum()), int((~mask).sum()))
     mask = mask if new else ~mask
-    errors = {name: found.rows(mask) for name, found in errors.items()}
-    shown = NOTHING | {"kinds": _by_kind(errors, data.q[mask], data.line_numbers[mask])}
-    shown |= {"new": new, "devices": own.found}
+    alone = of_positions and measured is not None and len(measured) == len(data)
+    for name in before:
+        rows = measured if alone else data
+        at = place(stages[name], rows) if alone or places is None else places[name]
+        at = at if alone else replace(at, devices={**own.devices, **at.devices}, ball=own.ball)
+        errors[name] = residuals(stages[name], at, rows).rows(mask)
+    errors[last] = residuals(stages[last], own, data).rows(mask)
+    shown = NOTHING | {"kinds": _by_kind(errors, data.q[mask]), "new": new, "devices": own.found}
     raw = measured_positions(data)  # as read: those of `measured` are moved by a drift that the model knows
     if measured is None or raw is None or not new or not bool((seen := unseen(model, raw.q)).any()):
         return shown
-    judged = judge(model, own, data.rows(mask), list(errors.values())[-1])
+    judged = judge(model, own, data.rows(mask), errors[last])
     moved = judged.causes if judged.refusal is None else [judged.refusal]
     predictions = Predictions.of(model, measured.rows(seen))
     return shown | {"predictions": predictions, "outliers": predictions.outliers(model), "moved": moved}
@@ -275,7 +260,7 @@ def _left_out(model: CalibratedKinematics, rows: FitRows, stages: Mapping[str, K
     errors[own] = Evaluations.of([(found.errors, torch.arange(len(found), device=HOST))])
     outliers = found.outliers(model)
     cause = common_cause(model, data, outliers) if model.registration is None else None  # else they are elsewhere
-    kinds, moved = _by_kind(errors, data.q, data.line_numbers), [cause] if cause else []
+    kinds, moved = _by_kind(errors, data.q), [cause] if cause else []
     return {"kinds": kinds, "new": False, "predictions": found, "outliers": outliers, "moved": moved}
 
 

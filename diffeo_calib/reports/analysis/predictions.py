@@ -129,9 +129,8 @@ class FitRows:
         noise, seen = self.map.noise, self.map.noise.visible
         errors, covariance = torch.empty_like(self.target), torch.empty_like(noise.covariance)
         for rows, regression in self.blocks:
-            numbers = regression.numbers
-            error, own = regression.about(self.target[rows]).left_out(numbers.owner)
-            errors[rows], covariance[rows] = numbers.in_table(error), numbers.blocks(own) - noise.covariance[rows]
+            errors[rows], own = regression.about(self.target[rows]).rows_left_out()
+            covariance[rows] = own - noise.covariance[rows]
         both = seen[:, :, None] & seen[:, None, :]
         return errors.masked_fill(~seen, nan), torch.where(both, covariance, 0.0) + self.map.new_noise
 

@@ -70,7 +70,7 @@ class Picture:
         for variable in VARIABLES:
             svg = re.sub(getattr(style, variable.upper()), f"var(--{variable})", svg, flags=re.IGNORECASE)
         svg = re.sub(r"font: ([0-9.]+)px [^;\"]*", r"font-size: \1px", svg)
-        svg = re.sub(r'\b(?:d|x|y|transform)="[^"]*"', lambda found: re.sub(r"(\.\d{2})\d+", r"\1", found[0]), svg)
+        svg = re.sub(r'\b(?:d|x|y|transform)="[^"]*"', lambda match: re.sub(r"(\.\d{2})\d+", r"\1", match[0]), svg)
         return re.sub(r"\s*\n\s*", "\n", svg)
 
 

@@ -59,14 +59,14 @@ def draw_transmission(axes: Axes, model: CalibratedKinematics, rows: FitRows, jo
     finish(axes, x=joint_label(robot, joint), y=f"transmission error [{joint_unit(robot, joint, 'mrad')}]")
 
 
-def draw_parts(axes: Axes, found: Sequence[Part]) -> None:
+def draw_parts(axes: Axes, parts: Sequence[Part]) -> None:
     """Bars of the parts of a model, in mm."""
-    lengths = [1e3 * part.displacement for part in found]
-    places = np.arange(len(found))[::-1]
+    lengths = [1e3 * part.displacement for part in parts]
+    places = np.arange(len(parts))[::-1]
     axes.barh(places, lengths, color=BLUE, height=0.62)
     for place, length in zip(places, lengths, strict=True):
         axes.text(length, place, f" {length:.3f}", va="center", fontsize=8, color=INK)
-    names = [literal(short(part.name)) for part in found]
+    names = [literal(short(part.name)) for part in parts]
     axes.set_yticks(places, names)
     axes.set_xlim(0, 1.15 * max([*lengths, 1e-9]))
     ticks = list(axes.get_yticks())
@@ -75,13 +75,13 @@ def draw_parts(axes: Axes, found: Sequence[Part]) -> None:
     axes.grid(visible=False, axis="y")
 
 
-def draw_expected(axes: Axes, robot: Tree, joint: int, found: Deviations, *, key: bool = True) -> None:
+def draw_expected(axes: Axes, robot: Tree, joint: int, deviations: Deviations, *, key: bool = True) -> None:
     """Deviations that a model claims against one joint: anywhere in its ranges, and where it was measured.
 
     ``key``: whether the lines are named.
     """
-    values, lengths = joint_values(robot, joint, found.q[:, joint]), 1e3 * found.deviation
-    near, short = joint_values(robot, joint, found.measured[:, joint]), 1e3 * found.measured_deviation
+    values, lengths = joint_values(robot, joint, deviations.q[:, joint]), 1e3 * deviations.deviation
+    near, short = joint_values(robot, joint, deviations.measured[:, joint]), 1e3 * deviations.measured_deviation
     dots(axes, values, lengths, colour=GREY, size=2.2)
     dots(axes, near, short, colour=BLUE, size=2.2)
     anywhere = values, lengths, LOOKS[1], "anywhere in the ranges"
@@ -109,8 +109,8 @@ def in_bins(values: Tensor, lengths: Tensor) -> Iterator[tuple[float, float, Ten
 
 def rms_in_bins(values: Tensor, lengths: Tensor) -> tuple[list[float], list[float]]:
     """Middles of intervals of values, and the RMS of the lengths there."""
-    found = [((low + high) / 2, float(group.square().mean().sqrt())) for low, high, group in in_bins(values, lengths)]
-    return [middle for middle, _ in found], [rms for _, rms in found]
+    bins = [((low + high) / 2, float(group.square().mean().sqrt())) for low, high, group in in_bins(values, lengths)]
+    return [middle for middle, _ in bins], [rms for _, rms in bins]
 
 
 def short(name: str) -> str:
@@ -144,17 +144,17 @@ def draw_distributions(
     axes: Axes, evaluations: Mapping[str, Evaluation], *, repeatability: float | None = None
 ) -> None:
     """Share of measurements whose error is at most a value, one curve for each stage."""
-    one = next(iter(evaluations.values()))
-    unit, per_unit = one.shown
-    for (name, found), look in zip(evaluations.items(), LOOKS, strict=False):
-        errors = np.sort(_sizes(found))
+    first = next(iter(evaluations.values()))
+    unit, per_unit = first.shown
+    for (name, sizes), look in zip(evaluations.items(), LOOKS, strict=False):
+        errors = np.sort(_sizes(sizes))
         share = np.arange(1, len(errors) + 1) / len(errors)
-        label = f"{name}: {per_unit * found.rms:.3g} {unit} RMS"
+        label = f"{name}: {per_unit * sizes.rms:.3g} {unit} RMS"
         axes.step(errors, 100 * share, where="post", color=look.colour, ls=look.line, lw=look.width, label=label)
     if repeatability is not None:
         axes.axvline(1e3 * repeatability, color=INK, lw=0.8, label=f"repeatability: {1e3 * repeatability:.3g} mm RMS")
     axes.set_ylim(0, 101)
-    finish(axes, x=f"{one.label} [{unit}]", y="measurements [%]", logarithmic="x")
+    finish(axes, x=f"{first.label} [{unit}]", y="measurements [%]", logarithmic="x")
     legend(axes, loc="lower left", bbox_to_anchor=(0.0, 1.0))
 
 
@@ -191,8 +191,8 @@ def draw_coverage(axes: Axes, predictions: Predictions) -> None:
     low, high = (100 / count * binom.ppf(p, count, SHARES.numpy()) for p in (0.025, 0.975))
     axes.fill_between(claimed, low, high, color=GREY, alpha=0.3, lw=0, label="chance (rows independent)")
     axes.plot([0, 100], [0, 100], color=GREY, lw=1)
-    found = [100 * predictions.coverage(share) for share in SHARES.tolist()]
-    axes.plot(claimed, found, "-o", color=BLUE, ms=3.5, lw=1.8, label="found")
+    inside = [100 * predictions.coverage(share) for share in SHARES.tolist()]
+    axes.plot(claimed, inside, "-o", color=BLUE, ms=3.5, lw=1.8, label="found")
     note(axes, 0.03, 0.7, "cautious", va="top")
     note(axes, 0.97, 0.25, "overconfident", ha="right")
     axes.set(xlim=(0, 100), ylim=(0, 101))

@@ -16,6 +16,7 @@ its errors. There the weights are P(good) + P(gross) / c, never more than one.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import inf, log
 
@@ -80,8 +81,8 @@ def reweight(squares: Tensor, dim: int | Tensor) -> Tails:
 
 def _seen(squares: Tensor, dim: int | Tensor) -> tuple[Tensor, Tensor]:
     """Squares and numbers of coordinates of the errors that are not hidden: (n,) each."""
-    seen = ~squares.isnan()
-    return squares[seen], torch.as_tensor(dim, dtype=squares.dtype, device=squares.device).expand_as(squares)[seen]
+    there = ~squares.isnan()
+    return squares[there], torch.as_tensor(dim, dtype=squares.dtype, device=squares.device).expand_as(squares)[there]
 
 
 FACTORS = tuple(25.0 * 4e4 ** (i / 34) for i in range(35))
@@ -100,7 +101,7 @@ def gross_weights(squares: Tensor, dim: int | Tensor) -> Tensor | None:
     """
     d2, k = _seen(squares, dim)
     shares, factors = squares.new_tensor(SHARES)[:, None, None], squares.new_tensor(FACTORS)[:, None]
-    freedoms, best, found, student = squares.new_tensor(FREEDOMS), -inf, (0.0, 1.0, 1.0), -inf
+    freedoms, best, likeliest, student = squares.new_tensor(FREEDOMS), -inf, (0.0, 1.0, 1.0), -inf
     for s in VARIANCES:
         scale = 0.5 * float(k.sum()) * log(s)
         student = max(student, float(student_likelihood(d2 / s, k, freedoms).max()) - scale)
@@ -108,12 +109,34 @@ def gross_weights(squares: Tensor, dim: int | Tensor) -> Tensor | None:
         value = torch.logaddexp((1.0 - shares).log() + good, shares.log() + gross).sum(2) - scale
         if float(value.max()) > best:
             share, factor = divmod(int(value.argmax()), len(FACTORS))
-            best, found = float(value.max()), (SHARES[share], FACTORS[factor], s)
+            best, likeliest = float(value.max()), (SHARES[share], FACTORS[factor], s)
     if best < student + EVIDENCE:
         return None
-    share, c, s = found
+    share, c, s = likeliest
     odds = log((1.0 - share) / share) + 0.5 * dim * log(c) - 0.5 * squares / s * (1.0 - 1.0 / c)
     good = torch.sigmoid(odds)
     if float(good.nanmean()) < 0.5:  # noise that is said to be far too small is not gross
         return None
     return (good + (1.0 - good) / c).nan_to_num(1.0)
+
+
+def estimated(tails: Tails, freedom: Tensor, squares: Callable[..., Tensor], rounds: int = 8) -> Tails:
+    """Tails by expectation maximisation, then beside gross measurements, if left-out errors show any.
+
+    Args:
+        tails: to begin with. freedom: (N, P) coordinates of each error. rounds: most of either.
+        squares: of errors beside some tails, as of :func:`reweight`: of rows that are ``left_out``, or as they are
+            expected under the posterior.
+    """
+    for _ in range(rounds):
+        before, tails = tails, reweight(squares(tails, left_out=False), freedom)
+        if tails.settled(before):
+            break
+    for _ in range(rounds):
+        weights = gross_weights(squares(tails, left_out=True), freedom)
+        if weights is None:
+            break
+        before, tails = tails, Tails(inf, weights, gross=True)
+        if tails.settled(before):
+            break
+    return tails

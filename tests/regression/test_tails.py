@@ -10,7 +10,7 @@ from scipy import stats
 from torch import Tensor
 from torch.testing import assert_close
 
-from diffeo_calib.process.tails import (
+from diffeo_calib.regression.tails import (
     FREEDOM_CENTRE,
     FREEDOM_EFOLDS,
     GAUSSIAN_FREEDOM,
