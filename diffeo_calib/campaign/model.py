@@ -341,7 +341,7 @@ class CampaignModel:
             some, change = [*(verdicts[row] for row in window[last][:-1]), verdict], None
             if not cause:
                 flags = _flags([one.accepted for one in some]), _flags([not one.cause for one in some])
-                how: Any = {"single": found, "typical": typical, "coordinates": data.y.shape[1]}
+                how: Any = {"typical": typical, "coordinates": data.y.shape[1]}
                 change = find_change(given(last.start, last.stop), window[last], changes(last), flags, **how)
             if number > before and change is not None:
                 break

@@ -7,7 +7,7 @@ A row is judged by d^2 = e^T S^-1 e, chi-squared if it is right. Two kinds of ca
 * from a row k on: a device has moved, a marker has slipped, a joint has another offset. By chance such a hypothesis
   gains chi-squared (regression/conditional.py) from the errors of the last rows. Rows that were taken in one by one
   count again here: small changes show in several rows only. A single wrong row, which six unknowns of a device explain
-  as well, is no change.
+  as well, is no change, whichever of them it is: it may have been taken in, and rows near it seem to be wrong.
 """
 
 from __future__ import annotations
@@ -142,6 +142,16 @@ class Seen(NamedTuple):
         expected = float(self.covariance.diagonal().mean().clamp(min=0).sqrt())
         return Measure(square, freedom, float(self.error.square().mean().sqrt()), expected)
 
+    def one_wrong(self, used: Tensor, typical: float, count: int) -> float:
+        """The most that one wrong row explains of some numbers (R,), less the price of its own among so many."""
+        some, owner, scores = self.some(used), self.numbers.owner[used], []
+        precision = torch.linalg.inv(some.covariance)
+        for row in owner.unique():
+            own, solved = owner == row, precision[owner == row] @ some.error
+            gain = float(solved @ torch.linalg.solve(precision[own][:, own], solved))
+            scores.append(gain / typical - len(solved) * log(count))
+        return max(scores)
+
     def in_order(self, accepted: Tensor) -> tuple[Tensor, Callable[[int, int], Seen]]:
         """One row after the other, each as those before it predict it that are accepted, (N,) boolean.
 
@@ -170,7 +180,6 @@ def find_change(
     hypotheses: Sequence[Hypothesis],
     flags: tuple[Tensor, Tensor],
     *,
-    single: Measure,
     typical: float,
     coordinates: int,
 ) -> Change | None:
@@ -179,7 +188,7 @@ def find_change(
     Args:
         seen: N rows as earlier ones predict them. numbers: theirs. hypotheses: effects (N, R, U) on what they tell, m.
         flags: (N,) boolean: the rows that were accepted, and those that a change may explain.
-        single: the distance of the last row. typical: see :meth:`Measure.fits`. coordinates: of the points of a row.
+        typical: see :meth:`Measure.fits`. coordinates: of the points of a row.
     """
     if not hypotheses:
         return None
@@ -212,7 +221,7 @@ def find_change(
     if best is None or chi2_probability(best[1], len(best[5])) > gates.JUMP_CHANCE:
         return None
     score, _, first, what, moved, u, count = best
-    if score < single.square / typical - single.freedom * log(count) + gates.CHANGES_TOLD_APART:
+    if score < seen.one_wrong(used[first], typical, count) + gates.CHANGES_TOLD_APART:
         return None
     others = {one[3].name for one in found if one[0] > score - gates.CHANGES_TOLD_APART} - {what.name}
     unit, size = what.unit or ("mm", 1e-3)

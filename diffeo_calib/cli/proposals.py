@@ -125,9 +125,8 @@ class Source:
         """Names that its options hold, of columns and others."""
         used = {IMAGE, *POINT, *PIXEL, CAMERA} if self.options.images else set[str]()
         values = [getattr(self.options, name) for name in COLUMNS] + [[*own] for own in self.asked.values()]
-        for text in (str(one) for value in values if value for one in (value if isinstance(value, list) else [value])):
-            used |= {name for part in re.split("[=,]", text) for name in re.findall(r"\{([^{}]+)\}", part) or [part]}
-        return used
+        texts = (text for value in values for text in (value if isinstance(value, list) else [value or ""]))
+        return used.union(*(re.split("[=,{}]", text) for text in texts))
 
     @cached_property
     def data(self) -> Any:

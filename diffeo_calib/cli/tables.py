@@ -219,10 +219,10 @@ class MeasuredTable:
     def rows(self, robot: Tree, tips: Sequence[str] = ()) -> Any:
         """The rows of a robot, under the names of its own joints, as of :func:`read_observations`.
 
-        ``tips`` are those of every marker, for a robot with several.
+        ``tips`` are those of every marker, for a robot with several; none where a model knows them.
         """
         given, triples = self.table, self.table.position
-        several = max(len(tips), len(robot.tips)) > 1 and given.sockets is None and not given.readings
+        several = bool(tips) and max(len(tips), len(robot.tips)) > 1 and given.sockets is None and not given.readings
         if several and triples is not None and len(tips) != len(triples):
             expected, fix = f"{len(triples)}, one for each --position", "repeat a tip that carries several markers"
             raise InputError.of("--tip", expected=expected, got=len(tips), fix=fix)

@@ -63,8 +63,8 @@ class TableFormat:
         rotation_angle: unit of Euler angles, rotation vectors and `rotation_std`.
         lever: distance from a pose's origin to the three points that represent the pose: it weighs orientation against
             position. 0.1 m by default. On the command line it is in the unit of `length`. In Python it is in m.
-        std: columns with standard deviations of the positions, in the unit of `length`: one for all, one per marker or
-            three per marker.
+        std: columns with standard deviations of the positions, in the unit of `length`: one for all, one per marker or,
+            of x, y and z, three per marker.
         rotation_std: columns with standard deviations of the rotation about the measuring frame's axes, which are not
             the axes of Euler angles: one for all, or one or three for each frame.
         joint_length: unit of prismatic joints, if not that of `length`.

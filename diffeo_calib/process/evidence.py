@@ -60,3 +60,10 @@ class Evidence(NamedTuple):
         scaled = variances[:, None] * h.clamp(min=0.0)  # (S, U)
         gains = torch.einsum("su,...u->s...", variances[:, None] / (1.0 + scaled), (self.g @ V).square())
         return 0.5 * (gains - scaled.log1p().sum(1).view(-1, *[1] * (gains.ndim - 1)))
+
+    def log_odds_of(self, variances: Tensor) -> Tensor:
+        """(S,) the same of one g (U,) with priors of different variances (S, U)."""
+        root, eye = variances.sqrt(), torch.eye(len(self.g), dtype=self.g.dtype, device=self.g.device)
+        low = torch.linalg.cholesky(eye + root[:, :, None] * self.H * root[:, None])
+        white = torch.linalg.solve_triangular(low, (root * self.g)[..., None], upper=False)
+        return 0.5 * white.square().sum((1, 2)) - low.diagonal(dim1=1, dim2=2).log().sum(1)

@@ -77,27 +77,27 @@ def served(address: str, decisions: Inbox) -> Iterator[Page]:
         thread.join()
 
 
-def state_of(campaign: Campaign, words: tuple[str, str], found: Next | None) -> dict[str, Any]:
+def state_of(campaign: Campaign, words: tuple[str, str], proposal: Next | None) -> dict[str, Any]:
     """Data of the page: lengths in mm, places in m in the robot's base.
 
     Args:
-        words: the expected error, and the next poses. found: these.
+        words: the expected error, and the next poses. proposal: these.
     """
-    robot, count, known = campaign.robot, len(campaign), campaign.expected_error
-    seen = [(one.row + 1, 1e3 * one.expected_error) for one in campaign.verdicts if one.expected_error is not None]
-    next_q, expected = (campaign.candidates[:0], ()) if found is None else (found.q[:1], found.expected)
+    robot, count, error = campaign.robot, len(campaign), campaign.expected_error
+    said = [(row.row + 1, 1e3 * row.expected_error) for row in campaign.verdicts if row.expected_error is not None]
+    next_q, expected = (campaign.candidates[:0], ()) if proposal is None else (proposal.q[:1], proposal.expected)
     verdicts = [
-        {"line": one.line, "text": str(one), "accepted": one.accepted, "fits": one.fits}
-        for one in campaign.verdicts[: -SHOWN_ROWS - 1 : -1]
+        {"line": row.line, "text": str(row), "accepted": row.accepted, "fits": row.fits}
+        for row in campaign.verdicts[: -SHOWN_ROWS - 1 : -1]
     ]
     done_q = next_q[:0] if campaign.table is None else campaign.table.q[-SHOWN_POSES:]
     next_tips, done = (robot.tip_poses(q)[:, 0, :3, 3].tolist() for q in (next_q, done_q))
     return {
-        "error": None if known is None else 1e3 * known,
+        "error": None if error is None else 1e3 * error,
         "state": f"{len(campaign.accepted)} of {count} rows accepted; {words[0]}",
         "pose": words[1],
         "goal": None if campaign.goal is None else 1e3 * campaign.goal,
-        "curve": seen[:: max(1, len(seen) // SHOWN_POSES)],
+        "curve": said[:: max(1, len(said) // SHOWN_POSES)],
         "forecast": [(count + step, 1e3 * value) for step, value in enumerate(expected)],
         "verdicts": verdicts,
         "done": done,

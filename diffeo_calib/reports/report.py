@@ -75,7 +75,7 @@ def write_report(
     date = "" if made is None else f", fitted {made.date[:10]}"
     note = "" if made is None or not made.note else f". Note: {printable(made.note)}"
     fit, rows = f"{robot.n} joints, {len(model.configurations)} rows in the fit{date}{note}", sentences.rows_of(found)
-    known = (summary.warnings or "").splitlines() if summary else []
+    warned = (summary.warnings or "").splitlines() if summary else []
     sha256 = None if data is None or not found.new else data.sha256
     parts = [*sections.sections(found), sections.record(model, sha256)]
     drawn, drawings = [picture for section in parts for picture in section.pictures], dict[str, str]()
@@ -86,7 +86,7 @@ def write_report(
         title=printable(title or f"Robot {robot.name}, {robot.base} to {robot.tip}"),
         subtitle=f"{fit}. Errors: {rows}.",
         verdict=sentences.verdict(found, tolerance),
-        warnings=known if warnings is None else warnings,
+        warnings=warned if warnings is None else warnings,
         advice=list(sentences.advice(found)),
         figures=dict(sentences.figures(found)),
         sections=parts,
@@ -105,5 +105,5 @@ def pictures(model: CalibratedKinematics, data: Any = None, **how: Any) -> dict[
     Args:
         model, data: as there. how: ``stages``, ``places`` and ``against`` as there.
     """
-    found = find(model, data, **how)
-    return {one.name: one.figure() for section in sections.sections(found) for one in section.pictures}
+    findings = find(model, data, **how)
+    return {picture.name: picture.figure() for section in sections.sections(findings) for picture in section.pictures}

@@ -223,7 +223,7 @@ def test_a_change_of_everything_is_followed_named_or_not(arm: Case, size: float,
     found, (still, _) = dc.recalibrate(arm.model, new), warned(dc.recalibrate, arm.model, new, drift="none")
     assert ("geometry" in [change.part for change in found.changes.found]) == named
     error = dc.evaluate(found.model, test).rms
-    assert error < min(0.12e-3, 0.95 * dc.evaluate(still.model, test).rms)
+    assert error < min(0.14e-3, 0.95 * dc.evaluate(still.model, test).rms)
     assert 0.9 < covered(found.model, test) <= 1.0
 
 
@@ -233,7 +233,8 @@ def test_another_tool_of_a_worn_robot_is_found() -> None:
     found = dc.recalibrate(old(), measured(worn, 12))
     assert found.marker == "other"
     assert "shoulder_joint has changed by 2." in found.status
-    assert rms(found.model, worn) < 3e-3
+    assert rms(found.model, worn) < 1e-3
+    assert covered(found.model, measured(worn, 100, 6)) > 0.8  # though the joint errs by 25 times what it did
 
 
 @few_rows

@@ -182,7 +182,7 @@ def test_each_camera_has_a_file_of_its_own(command: Command, tmp_path: Path) -> 
 
 
 def test_init_proposes_the_files_of_the_cameras(command: Command, tmp_path: Path) -> None:
-    table, _ = kind().table()
+    table, _ = kind().table("new")
     shutil.copy(table, tmp_path / "corners.csv")
     for name, camera in kind().data.cameras.items():
         (tmp_path / f"{name}.yaml").write_text(camera_text(camera))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import os
 import re
+import shlex
+from dataclasses import replace
 from math import degrees, pi
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,8 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.cli.main import expanded
+from diffeo_calib.cli.options import Rows
+from diffeo_calib.cli.tables import as_at_the_fit, described
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.poses import rotation_numbers, to_spherical
 from diffeo_calib.measurements.table_format import TableFormat
@@ -357,28 +361,24 @@ def test_signs_and_a_zero_are_proposed_and_read(tmp_path: Path, command: Command
     assert ["uncomment one" in line for line in lines] == [True, True]
 
 
-@pytest.mark.parametrize(
-    "written", [(",", ".", "mm", "deg"), (";", ",", "m", "rad"), ("\t", ".", "mm", "rad"), ("|", ",", "m", "deg")]
-)
-def test_a_proposal_is_that_of_the_table(written: tuple[str, str, str, str], tmp_path: Path, command: Command) -> None:
-    sep, decimal, length, angle = written
+@pytest.mark.parametrize("table", [TableFormat("m", "rad", ";", ","), TableFormat("mm", "deg", "\t")])
+def test_a_proposal_is_that_of_the_table(table: TableFormat, tmp_path: Path, command: Command) -> None:
+    """Of two markers, for a campaign in another folder."""
     arm = SimulatedArm(seed=3, markers=2)
     arm.write_urdf(tmp_path / "arm.urdf")
     data = dc.Measurements(*arm.measure(60, seed=0), NAMES)
-    positions = [("left x", "left y", "left z"), ("right x", "right y", "right z")]
-    write_measurements(tmp_path / "t.csv", data, TableFormat(length, angle, sep, decimal), position=positions)
+    positions = [["left x", "left y", "left z"], ["right x", "right y", "right z"]]
+    write_measurements(tmp_path / "t.csv", data, table, position=positions)
     out = tmp_path / "sub" / "cell.toml"
     out.parent.mkdir()
     done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", out)
     assert (done.code, done.err) == (0, "")
     assert "the nominal robot leaves, of what the rows vary" in done.out
     words = expanded(["fit", str(out)])
-    options = dict(zip(words[2::2], words[3::2], strict=True))
     assert os.path.realpath(words[1]) == os.path.realpath(tmp_path / "t.csv")
-    assert (options["--length"], options["--angle"], options["--decimal"]) == (length, angle, decimal)
-    assert options["--sep"] == ("tab" if sep == "\t" else sep)
-    assert [words[k + 1] for k, word in enumerate(words) if word == "--position"] == [",".join(p) for p in positions]
-    assert (options["--joints"], options["--base"], options["--tip"]) == (",".join(NAMES), "base_link", "flange")
+    read = described(as_at_the_fit(shlex.join(words), Rows()))
+    assert read == replace(table, position=positions, joints=NAMES)
+    assert [words[words.index(name) + 1] for name in ("--base", "--tip")] == ["base_link", "flange"]
 
 
 def test_cells_that_are_no_numbers_are_named(tmp_path: Path, init: Proposed, proposed: Proposed) -> None:

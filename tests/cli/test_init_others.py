@@ -144,7 +144,7 @@ def test_tips_and_cameras_are_proposed(name: str, init: Proposed) -> None:
 def test_the_camera_beside_the_table(tmp_path: Path, command: Command) -> None:
     """Another YAML file is none; its place is relative to the campaign, which runs from anywhere."""
     kind = kind_named("images of a board")
-    table, _ = kind.table()
+    table, _ = kind.table("new")
     (tmp_path / "sub").mkdir()
     shutil.copy(table, tmp_path / "corners.csv")
     (tmp_path / "launch.yaml").write_text("camera: none\n")

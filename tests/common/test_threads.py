@@ -99,19 +99,12 @@ def test_a_forked_process_has_workers_of_its_own() -> None:
             process.kill()
 
 
-def test_a_fit_runs_on_one_thread_whatever_the_setting() -> None:
-    seen: set[int] = set()
-    with torch_threads(3):
-        dc.fit(section_5(0.01), integrator=dc.RK4(2), progress=lambda *_: seen.add(torch.get_num_threads()))
-        assert torch.get_num_threads() == 3
-    assert seen == {1}
-
-
-def test_fits_in_the_thread_pool_of_another_program_agree() -> None:
-    problem = section_5(0.01)
+def test_fits_run_on_one_thread_whatever_the_setting_and_agree_in_the_thread_pool_of_another_program() -> None:
+    problem, seen = section_5(0.01), set[int]()
     with torch_threads(2):
-        alone = dc.fit(problem, integrator=dc.RK4(2)).energy
+        alone = dc.fit(problem, integrator=dc.RK4(2), progress=lambda *_: seen.add(torch.get_num_threads())).energy
         with ThreadPoolExecutor(3) as pool:
             energies = list(pool.map(lambda _: dc.fit(problem, integrator=dc.RK4(2)).energy, range(3)))
         assert torch.get_num_threads() == 2
     assert energies == [alone] * 3
+    assert seen == {1}

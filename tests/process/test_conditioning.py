@@ -228,6 +228,9 @@ def test_evidence_of_unknowns_is_that_of_their_covariance(case: Case) -> None:
             )
             expected = float(after.log_prob(target) - before.log_prob(target))
             assert float(odds[row, column]) == pytest.approx(expected, rel=1e-6, abs=1e-6)
+    ratio, both = variances.sqrt(), torch.tensor([[1.0, 1.0], [0.5, 30.0]], dtype=torch.float64)
+    scaled = Evidence(ratio * found.g, ratio[:, None] * found.H * ratio).log_odds(both[0, :1])
+    assert_close(found.log_odds_of(both), torch.cat([odds.new_tensor([float(found.log_odds(both[0, :1]))]), scaled]))
 
 
 def test_rows_without_noise_that_are_there_twice_are_refused() -> None:

@@ -68,9 +68,8 @@ OFFSETS_TOLD_APART = 4.0
 """Difference of likelihood ratios up to which the rows do not tell two offsets apart."""
 HIDDEN_SHARE = 0.3
 """Displacement by an offset that places do not reproduce, relative to the noise, up to which rows do not show it."""
-DRIFT_ODDS, DRIFT_ODDS_OF_INLIERS = 4.0, 0.5
-"""Log odds of small changes of everything: what chance exceeds in one of twenty; and where rows that do not fit the old
-model have hardly any weight, since outliers look like a change."""
+DRIFT_ODDS = 4.0
+"""Log odds of small changes of everything: what chance exceeds in one of twenty."""
 
 # --- wrong rows ---
 

@@ -115,7 +115,7 @@ def judge(
     for step in steps_of(model, some) if usual else ():
         return Judgement(step.sentence())
     moved = [sentence(motion.sentence, fix=fix) for motion in motions(model, some)]
-    causes = moved or [text for text in [implausible(model, some, errors)] if text is not None]
+    causes = moved or [*filter(None, [implausible(model, some, errors)])]
     if errors.median > impossible and causes:
         if usual and not moved:
             refuse_mistakes(model.robot, some)
@@ -123,8 +123,10 @@ def judge(
     if causes or not usual:
         return Judgement(None, causes)
     wrong = contradicted(model, some)
-    block, claimed = block_text(model, some, wrong), expected_rms(model, seen, errors.errors.shape[1])
-    causes = [block] if block is not None else []
+    causes, claimed = (
+        [*filter(None, [block_text(model, some, wrong)])],
+        expected_rms(model, seen, errors.errors.shape[1]),
+    )
     if not causes and not wrong and errors.rms >= gates.LARGE_PER_EXPECTED * claimed:
         what = f"the errors are {errors.rms / claimed:.1f} times as large as the model expects: "
         fix = "something has changed since the fit, or these poses are unlike those of the fit: compare, or recalibrate"

@@ -15,11 +15,8 @@ extrapolation, not change.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from math import degrees, inf
-from operator import itemgetter
 from typing import NamedTuple
 
 import torch
@@ -27,18 +24,21 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.row_order import find_block
+from diffeo_calib.calibration.recalibration.drift import (
+    NEGLIGIBLE_EIGENVALUE_SHARE,
+    OFFSET_DEVIATION_RAD_M,
+    ChangedPart,
+    Drift,
+    offsets_of,
+    parts_of,
+)
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows, NewSetUp
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import sentence, warn_user, with_deviation
 from diffeo_calib.common.quantiles import chi2_above
-from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kernels.radial import RadialKernel
-from diffeo_calib.kinematics.registered_map import robot_map
-from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.regression.conditional import roots
-from diffeo_calib.regression.tails import Tails
 from diffeo_calib.robots.tree import Tree
 
 LEVEL = 0.01
@@ -142,71 +142,6 @@ class Changes:
             rows = f", {self.rows} rows" * bool(self.rows)
             return f"no change was found but {places} (tested at {100 * self.level:g} %{rows})"
         return "; ".join(map(str, self.found))
-
-
-SMALLEST_AMPLITUDE_SHARE = 0.5
-"""A small transmission error counts with this share of the largest joint's amplitude: it may have grown."""
-OFFSET_DEVIATION_RAD_M = 3e-4
-"""Of a joint offset, to which the sizes of changes are relative: they span 0.05 to 5 mrad."""
-NEGLIGIBLE_EIGENVALUE_SHARE = 1e-5
-"""Eigenvalues of a part's covariance below this share of the largest are left out."""
-
-
-@dataclass(frozen=True, eq=False)
-class ChangedPart:
-    """A part of a model that may have changed, by columns whose products are the prior covariance of the change."""
-
-    name: str  # of the joint, or "gravity" or "geometry"
-    columns: Callable[[Linearisation], Tensor]  # (M, m, c) at M configurations, m; of a joint's errors (M, c), rad or m
-    joint: int | None = None  # whose errors they are; None for parameters of the nominal map
-    offset: bool = False  # whether it is the offset of the joint, which all readings lack since then
-    variance: float = 1.0  # of the change, relative to the old variance of the part
-
-    def shapes(self, at: Linearisation) -> Tensor:
-        """The columns, with the variance of the change."""
-        return self.variance**0.5 * self.columns(at)
-
-    def root(self, at: Linearisation) -> Tensor:
-        """(M, m, c) the columns at M configurations, m."""
-        own = self.shapes(at)
-        return own if self.joint is None else at.joint_to_start[:, :, self.joint, None] * own[:, None]
-
-
-def offsets_of(fitted: FittedMap) -> list[ChangedPart]:
-    """The offsets of all joints, which are tested beside the parts: the geometry has them, among much else."""
-
-    def same(at: Linearisation) -> Tensor:
-        return torch.full_like(at.joint[0].points[:, :1], OFFSET_DEVIATION_RAD_M)
-
-    names = robot_map(fitted).geometry.chain.joint_names
-    return [ChangedPart(f"the offset of {name}", same, joint, offset=True) for joint, name in enumerate(names)]
-
-
-def parts_of(fitted: FittedMap) -> list[ChangedPart]:
-    """The parts of a robot's map: every joint with a transmission term, gravity, geometry."""
-    spec, nominal = fitted.geodesic.spec, robot_map(fitted)
-    names = nominal.geometry.chain.joint_names
-    own = {t.output: t for t in spec.joint_kernel.terms if isinstance(t, RadialKernel) and t.output is not None}
-    least = SMALLEST_AMPLITUDE_SHARE**2 * max((float(term.variance) for term in own.values()), default=0.0)
-
-    def of_joint(kernel: RadialKernel, joint: int, at: Linearisation) -> Tensor:
-        points = at.joint[0].points
-        one = points.new_zeros(len(points), 1, points.shape[1])
-        one[:, 0, joint] = 1.0
-        values, vectors = torch.linalg.eigh(kernel.gram(points, one, points, one))
-        kept = values > NEGLIGIBLE_EIGENVALUE_SHARE * values[-1]
-        return vectors[:, kept] * values[kept].sqrt()
-
-    def of_parameters(some: slice, at: Linearisation) -> Tensor:
-        return at.sensitivity[..., some] * spec.prior_variance[some].sqrt()
-
-    found: list[ChangedPart] = []
-    for joint, term in own.items() if least > 0 else ():
-        kernel = RadialKernel.from_config(term.to_config() | {"variance": max(float(term.variance), least)})
-        found.append(ChangedPart(names[joint], partial(of_joint, kernel, joint), joint))
-    parameters = {"gravity": nominal.sag, "geometry": nominal.geometry.slices["joints"]}
-    there = {name: some for name, some in parameters.items() if bool(spec.prior_variance[some].any())}
-    return found + [ChangedPart(name, partial(of_parameters, some)) for name, some in there.items()]
 
 
 SIMULATED_DRAWS = 2000
@@ -342,12 +277,15 @@ def _changes_of(rows: NewRows, *, level: float, seed: int) -> tuple[Changes, lis
         return Changes(rows=len(rows), level=level), []
     parts = {part.name: part for part in (*parts_of(rows.fitted), *offsets_of(rows.fitted))}
     roots = {name: part.root(rows.at) for name, part in parts.items()}
-    rows = rows.changed(tails=rows.drifting(list(roots.values())).with_weights().tails)
+    drift = Drift(rows.with_weights())
+    few_fit = (drift.rows.tails.weights < OUTLIER_WEIGHT).any(1).double().mean() > MOST_OUTLIERS and drift.explains
+    rows = drift.doubted
     drifts, found, first, noise = list[ChangedPart](), list[tuple[float, tuple[str, ...]]](), dict[str, float](), 1.0
     while roots:
         ratios, factor = likelihood_ratios(rows, roots, seed)
         # A few outliers look like a change, and a change looks like outliers: it must stand out with either weights.
-        doubted = not first or min(one.probability for one in ratios.values()) <= level
+        # Where hardly a row fits the old model these are no outliers.
+        doubted = not few_fit and (not first or min(one.probability for one in ratios.values()) <= level)
         strict = likelihood_ratios(rows.with_weights(), roots, seed)[0] if doubted else ratios
         for name, (value, probability, variance) in ratios.items():
             other = strict[name]
@@ -392,47 +330,6 @@ def _change(rows: NewRows, part: ChangedPart, probability: float, others: tuple[
             deviation = float(shapes[0, 0]) * max(1.0 - float(evidence.H), 0.0) ** 0.5
     angle = part.joint is not None and kinds[part.joint] != "prismatic"
     return Change(part.name, size, angle, displacement, probability, deviation, others)
-
-
-USUAL_LOG, EFOLDS = -6.0, 2.5
-"""Log-normal prior of s^2: the logarithm of its centre, and the standard deviation of its logarithm."""
-MOST_DRIFT = 0.5
-"""The s^2 up to which a robot may differ from the old one although only a minority of the rows fits that."""
-LOG_SIZES = torch.linspace(-12.0, 4.0, 65, dtype=torch.float64, device="cpu")
-"""Logarithms of the s^2 that are tried."""
-
-
-def with_usual_drift(rows: NewRows, named: Sequence[ChangedPart]) -> list[ChangedPart]:
-    """What differs between the dates: what a test named, and all else: temperature, wear and screws change everything.
-
-    Errors of geometry, load and transmissions may differ from the old ones by s^2 times their old prior variance; s^2
-    maximises the evidence of the new rows with a wide prior below one percent. It has to be clear unless gravity or
-    the geometry are named: one worn joint changes nothing else. A change of everything looks like one of a part: what
-    was named stays only where the rows are likelier so.
-
-    Args:
-        rows: the new rows as the old model sees them. named: parts that have changed.
-    """
-    if not (parts := parts_of(rows.fitted)):
-        return [*named]
-    root, sizes = torch.cat([part.root(rows.at) for part in parts], 2), LOG_SIZES.exp().to(rows.y)
-    prior = -0.5 * ((sizes.log() - USUAL_LOG) / EFOLDS).square()
-
-    def likeliest(tails: Tails, kept: Sequence[ChangedPart]) -> tuple[float, float, float]:
-        """Log evidence, that relative to no such drift, and s^2 beside some of the named parts."""
-        own = rows.changed(tails=tails).drifting([each.root(rows.at) for each in kept])
-        odds = own.evidence(root).log_odds(sizes) + prior
-        return own.given.log_evidence() + float(odds.max()), float(odds.max()), float(sizes[odds.argmax()])
-
-    doubted = rows.drifting([*(each.root(rows.at) for each in named), root]).with_weights().tails
-    found = [(likeliest(doubted, kept), kept) for kept in ([named, []] if named else [[]])]
-    (_, odds, size), kept = max(found, key=itemgetter(0))
-    if odds < gates.DRIFT_ODDS and all(each.joint is not None for each in named):
-        return [*named]
-    most = size > MOST_DRIFT or (rows.tails.weights >= OUTLIER_WEIGHT).all(1).double().mean() > MOST_OUTLIERS
-    if not named and most and likeliest(rows.tails, [])[1] < gates.DRIFT_ODDS_OF_INLIERS:  # a minority says nothing
-        return []
-    return [*kept, *(replace(part, variance=size) for part in parts)]
 
 
 RANK_TOLERANCE = 1e-9

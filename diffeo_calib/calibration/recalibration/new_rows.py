@@ -375,6 +375,8 @@ class NewRows:
         """Change the noise or the prior; what does not change is computed once."""
         other = replace(self, **changes)
         vars(other).update({name: getattr(self, name) for name in LINEARISED})
+        if changes.keys() <= {"noise", "tails"}:
+            vars(other)["given"] = replace(self.given, noise=other.weighted_noise)
         return other
 
     def kept(self, index: Tensor) -> NewRows:

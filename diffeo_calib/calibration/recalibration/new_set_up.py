@@ -17,7 +17,7 @@ from torch import Tensor
 from diffeo_calib.calibration.placing.readings import ball_of
 from diffeo_calib.calibration.placing.sessions import Sessions
 from diffeo_calib.calibration.placing.sockets import ball_in_sockets
-from diffeo_calib.calibration.recalibration.find_changes import parts_of
+from diffeo_calib.calibration.recalibration.drift import parts_of
 from diffeo_calib.calibration.recalibration.find_place import (
     MARKER_DEVIATIONS,
     UNMOVED_LOG_ODDS,

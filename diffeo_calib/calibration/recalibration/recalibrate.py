@@ -23,6 +23,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import RESIDUAL_TOLERANCE
 from diffeo_calib.calibration.placing.placement import Placement
+from diffeo_calib.calibration.recalibration.drift import Drift
 from diffeo_calib.calibration.recalibration.find_changes import (
     FEWEST_ROWS,
     LEVEL,
@@ -30,9 +31,8 @@ from diffeo_calib.calibration.recalibration.find_changes import (
     Offset,
     find_changes,
     hidden_offsets,
-    with_usual_drift,
 )
-from diffeo_calib.calibration.recalibration.find_place import find_place, warn_about
+from diffeo_calib.calibration.recalibration.find_place import OTHER_MARKER, find_place, warn_about
 from diffeo_calib.calibration.recalibration.new_rows import OUTLIER_WEIGHT, NewRows, NewSetUp
 from diffeo_calib.calibration.recalibration.new_set_up import (
     Marker,
@@ -67,6 +67,10 @@ from diffeo_calib.sensors.errors import Evaluations
 LOG = logging.getLogger(__name__)
 CERTIFICATES = "coupling_residual", "end_residual", "energy", "status"
 """Of a fit that the summary of a model has, too."""
+LARGEST_OUTLIER_PART = 0.5
+"""Part of the rows that may hardly count: with more of them it is not clear which rows are wrong."""
+LARGEST_EXCESS = 10.0
+"""Residuals by this factor above the expected ones are not those of a worn joint."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -182,12 +186,17 @@ def recalibrate(
         warn_user(sentence(what, fix="check what happened between them, and recalibrate with the rows since then"))
     warn_about(before.registration, outliers=False, excess=not drifts, marker=marker, among=rows.changed_among)
     if drift == "tested":
-        drifts = with_usual_drift(rows, drifts)
+        drifts = Drift(rows, drifts).parts
     if drifts:
         rows = rows.drifting([each.root(rows.at) for each in drifts]).with_weights()
     excess = float((rows.given.left_out_squares / rows.visible.sum(1)).median().sqrt())  # of the better half
-    warn_of_contradictions(rows, excess if before.registration is None else before.registration.excess)
-    problem, start = both_dates(rows, rows.inflation, [each.root for each in drifts])
+    excess = excess if before.registration is None else before.registration.excess
+    bad = int((rows.tails.weights < OUTLIER_WEIGHT).any(1).sum())
+    if bad >= LARGEST_OUTLIER_PART * len(rows) and excess > LARGEST_EXCESS:
+        what = f"{bad} of {len(rows)} new rows contradict the old model"
+        fix = "check that the table belongs to this robot; if it was damaged or rebuilt, calibrate it afresh"
+        warn_user(sentence(what, expected="rows of the same robot, most of them right", fix=fix))
+    problem, start = both_dates(rows, rows.inflation, drifts)
     solver, integrator = GaussNewton(tolerance=RESIDUAL_TOLERANCE), rows.fitted.geodesic.integrator
     fitted = fit(problem, solver, integrator, start=start, progress=progress)
     if fitted.solution.interrupted:
@@ -244,21 +253,6 @@ def _result(
         shift=None if found is None else away * place.seen_before[:, None],
         hidden=hidden_offsets(model.robot, place, changes),
     )
-
-
-LARGEST_OUTLIER_PART = 0.5
-"""Part of the rows that may hardly count: with more of them it is not clear which rows are wrong."""
-LARGEST_EXCESS = 10.0
-"""Residuals by this factor above the expected ones are not those of a worn joint."""
-
-
-def warn_of_contradictions(rows: NewRows, excess: float) -> None:
-    """Warn if half of the rows hardly count, and errors are larger than those of worn joints."""
-    bad = int((rows.tails.weights < OUTLIER_WEIGHT).any(1).sum())
-    if bad >= LARGEST_OUTLIER_PART * len(rows) and excess > LARGEST_EXCESS:
-        what = f"{bad} of {len(rows)} new rows contradict the old model"
-        fix = "check that the table belongs to this robot; if it was damaged or rebuilt, calibrate it afresh"
-        warn_user(sentence(what, expected="rows of the same robot, most of them right", fix=fix))
 
 
 # --- comparison ---
@@ -403,7 +397,7 @@ def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) ->
         return Measurements.of_points(q, points.detach(), None, model.lever).with_load(own.nominal.load)
 
     fitted = other.map.unregistered
-    found = find_place(fitted, other.lever, measured(other, there, model(q)))[1]
+    found = find_place(fitted, other.lever, measured(other, there, model(q)), marker_std=OTHER_MARKER)[1]
     placed = RegisteredMap(moved(fitted, found.transform), found)
     new = measured(model, q, placed(there).unflatten(1, (-1, 3)))
     rows = weighed(place_again(model, new, "other", opens=False), "other")

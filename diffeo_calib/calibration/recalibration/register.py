@@ -9,7 +9,7 @@ from the old momenta (:meth:`FittedMap.measured`), from which the search starts.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from diffeo_calib.calibration.recalibration.drift import ChangedPart, grown
 from diffeo_calib.calibration.recalibration.find_place import find_place, warn_about
 from diffeo_calib.calibration.recalibration.new_rows import NewRows
 from diffeo_calib.common.device import HOST
@@ -36,7 +37,6 @@ from diffeo_calib.kinematics.registered_map import (
     robot_map,
 )
 from diffeo_calib.maps.deformation import Momenta
-from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.maps.observation import LinearFunctionals, Observation, Part, Stacked
 from diffeo_calib.measurements.rows import RowGroups
@@ -119,21 +119,19 @@ def _placed(
     return learnt, replace(registration, markers=markers, shift=markers - new.old_markers)
 
 
-def both_dates(
-    new: NewRows, factor: float, drifts: Sequence[Callable[[Linearisation], Tensor]] = ()
-) -> tuple[Problem, Momenta]:
+def both_dates(new: NewRows, factor: float, drifts: Sequence[ChangedPart] = ()) -> tuple[Problem, Momenta]:
     """The problem of old and new rows, and the old momenta as its start.
 
     Args:
         new: the rows. factor: on all variances, which changes the uncertainty, but not the optimum.
-        drifts: columns (N, r, c) of what old rows share besides places, m, from their linearisation.
+        drifts: what has changed besides places.
     """
     old, count = new.fitted, len(new)
     spec, (b, p, theta), x = old.geodesic.spec, old.deformation.momenta.tensors, old.deformation.x
     nominal = robot_map(old).typical
     geometry = nominal.geometry
     newest = nominal.with_geometry(geometry.with_tool(new.marks.points - theta[geometry.slices["tool"]].view(-1, 3)))
-    prior = spec.prior_variance.clone()
+    joint_kernel, prior = grown(spec, drifts)
     if bool(new.deviations[:6].any()):  # a device says where the base is
         prior[geometry.slices["base"]] = prior[geometry.slices["base"]].clamp(min=PLACES.found_m_rad**2)
     y, noise, observe = _together(new)
@@ -144,7 +142,7 @@ def both_dates(
         newest,
         torch.cat([old.x, new.q]),
         y,
-        joint_kernel=spec.joint_kernel.scaled(factor),
+        joint_kernel=joint_kernel.scaled(factor),
         task_kernel=spec.task_kernel.scaled(factor),
         noise=Noise(factor * noise, factor**0.5 * torch.cat([before, since])),
         markers=geometry.markers,
@@ -155,6 +153,9 @@ def both_dates(
     problem = problem.with_nominal_of_rows(_sessions(geometry.tool, new, newest))
     if old.data is not None or problem.y.numel() > MAX_DENSE:
         problem = problem.with_controls(torch.cat([x, new.q]))
+    one = torch.eye(x.shape[1], dtype=x.dtype, device=x.device)[None]
+    grew = [kernel.own_blocks(x[:1], one).diagonal(dim1=1, dim2=2) for kernel in (spec.joint_kernel, joint_kernel)]
+    b = b * (grew[0] / grew[1]).nan_to_num(1.0)  # fields start as they were
     b, p = pad(b, (0, 0, 0, count)) / factor, pad(p, (0, 0, 0, count * geometry.markers)) / factor
     return problem, Momenta(b, p, theta)
 
@@ -179,7 +180,7 @@ def _together(new: NewRows) -> tuple[Tensor, Tensor, Observation | None]:
     return numbers, without_hidden(torch.cat(noise), seen), Stacked(N + M, size, m, parts)
 
 
-def _shared(new: NewRows, drifts: Sequence[Callable[[Linearisation], Tensor]]) -> Tensor:
+def _shared(new: NewRows, drifts: Sequence[ChangedPart]) -> Tensor:
     """(N, r, c) shifts of the old rows: those they shared already, device and markers since, what has drifted since."""
     old, tool = new.fitted, new.nominal.geometry.slices["tool"]
     A, at = old.functionals, old.geodesic.linearise(None if old.data is None else old.x)
@@ -188,7 +189,7 @@ def _shared(new: NewRows, drifts: Sequence[Callable[[Linearisation], Tensor]]) -
     by_frame = frame_slopes(places.unflatten(1, (-1, 3)), new.centre)
     moved = A @ torch.cat([by_frame, at.sensitivity[..., tool]], 2) * new.deviations
     at = at.projected(A)
-    return torch.cat([old.noise.shared, moved[..., new.free], *(columns(at) for columns in drifts)], 2)
+    return torch.cat([old.noise.shared, moved[..., new.free], *(part.before(at) for part in drifts)], 2)
 
 
 def _sessions(tool: Tensor, new: NewRows, newest: GeometryMap) -> SessionMarkers:

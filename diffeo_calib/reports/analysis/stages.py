@@ -78,11 +78,16 @@ class Deviations:
     @classmethod
     def of(cls, model: CalibratedKinematics) -> Deviations:
         """The deviations of a model at random configurations."""
+
+        def claimed(q: Tensor) -> Tensor:
+            found = model.bodies.predicted(model, q.to(model.configurations.device), noise=False)
+            return found.claimed.square().mean(1).sqrt().to(HOST)
+
         fitted = model.configurations.to(HOST)
         low, high = (torch.clamp(end, *model.robot.limits.unbind(1)) for end in (fitted.amin(0), fitted.amax(0)))
         draws = torch.rand(CONFIGURATIONS, len(low), generator=seeded(0), dtype=low.dtype, device=HOST)
         q, fitted = low + draws * (high - low), fitted[:: -(-len(fitted) // MEASURED)]
-        found = cls(q, claimed(model, q), fitted, claimed(model, fitted), ExpectedError.of(model))
+        found = cls(q, claimed(q), fitted, claimed(fitted), ExpectedError.of(model))
         try:
             somewhere = [sensor for sensor in sensor_of(model) if sensor.reached(model.geometry.base)]
         except InputError:  # a file of an early version
@@ -93,12 +98,6 @@ class Deviations:
         except InputError:  # such as of a camera, which cannot see everywhere
             options.append(model.configurations.to(HOST))
         return replace(found, next=plan(model, torch.cat(options), NEXT, target=q[:TARGETS]))
-
-
-def claimed(model: CalibratedKinematics, q: Tensor) -> Tensor:
-    """(M,) RMS distance of the markers, or of the measured frame's origin, that the model claims at q (M, n), m."""
-    q = q.to(model.configurations.device)
-    return model.bodies.predicted(model, q, noise=False).claimed.square().mean(1).sqrt().to(HOST)
 
 
 FEWEST_REPEATS = 5

@@ -55,7 +55,7 @@ def stage_pictures(stages: Mapping[str, Evaluation], suffix: str, repeatability:
     yield Picture(f"distributions{suffix}", label, panels.draw_distributions, stages, **how)
     label = f"Every row: {some.label} of the calibrated model against that of the stage before it."
     yield Picture(f"before-after{suffix}", label, panels.draw_before_after, stages, frame=UNDER_LEGEND)
-    turned = {name: one.orientation for name, one in stages.items() if one.orientation is not None}
+    turned = {name: stage.orientation for name, stage in stages.items() if stage.orientation is not None}
     if turned:
         label = "Share of rows whose orientation error is at most a value."
         yield Picture(f"angles{suffix}", label, panels.draw_distributions, turned, frame=UNDER_LEGEND)
@@ -64,66 +64,66 @@ def stage_pictures(stages: Mapping[str, Evaluation], suffix: str, repeatability:
 def stage_table(stages: Mapping[str, Evaluation]) -> Table:
     """Errors of one kind of rows by stage, and orientation errors in degrees if there are any."""
     some = next(iter(stages.values()))
-    units = [one.shown[0] for one in some.each]
+    units = [errors.shown[0] for errors in some.each]
     header = ["stage", *(name for unit in units for name in (f"{SIZES[0]} [{unit}]", *SIZES[1:]))]
     rows = [
-        [name, *(f"{size:.{3 + number}f}" for number, one in enumerate(own.each) for size in one.sizes)]
-        for name, own in stages.items()
+        [name, *(f"{size:.{3 + number}f}" for number, errors in enumerate(stage.each) for size in errors.sizes)]
+        for name, stage in stages.items()
     ]
     return Table(f"{some.title} by stage", header, rows)
 
 
-def sections(found: Findings) -> Iterator[Section]:
+def sections(findings: Findings) -> Iterator[Section]:
     """Contents of the page before its record."""
-    yield from (section(found) for section in (how_good, where, why, trust, repeatability))
-    if found.devices:
+    yield from (section(findings) for section in (how_good, where, why, trust, repeatability))
+    if findings.devices:
         see = "Where devices and sockets stand, and what was found from the rows shown as the model did not know it."
-        yield Section("devices", "Devices", see, text=[printable(line) for line in found.devices])
+        yield Section("devices", "Devices", see, text=[printable(line) for line in findings.devices])
 
 
-def how_good(found: Findings) -> Section:
+def how_good(findings: Findings) -> Section:
     """Errors of every kind of rows by stage."""
-    limit = None if found.repeats is None else found.repeats.deviation
+    limit = None if findings.repeats is None else findings.repeats.deviation
     pictures = list[Picture]()
-    for number, one in enumerate(found.kinds.values()):
-        pictures += stage_pictures(one.stages, f"-{number}", limit if one.errors.what == ERRORS else None)
-    see = f"Errors on {sentences.rows_of(found)}: each stage should lie well to the left of the one before it."
-    see += " Each kind has its own unit; units are never mixed." * (len(found.kinds) > 1)
-    see = see if found.kinds else "No rows were passed: pass some to see errors of each kind in its own unit."
+    for number, kind in enumerate(findings.kinds.values()):
+        pictures += stage_pictures(kind.stages, f"-{number}", limit if kind.errors.what == ERRORS else None)
+    see = f"Errors on {sentences.rows_of(findings)}: each stage should lie well to the left of the one before it."
+    see += " Each kind has its own unit; units are never mixed." * (len(findings.kinds) > 1)
+    see = see if findings.kinds else "No rows were passed: pass some to see errors of each kind in its own unit."
     notes = [
         "Nominal: the robot's description, placed where it fits best. Geometric: joint axes and links corrected, the "
         "classical calibration. Calibrated: gravity sag, transmission errors and remaining errors as well."
     ]
-    present = {one.errors.what for one in found.kinds.values()}
+    present = {kind.errors.what for kind in findings.kinds.values()}
     notes += [text for what, text in FLATTERING.items() if what in present]
-    if found.kinds and not found.new:
+    if findings.kinds and not findings.new:
         notes.append(
             "Nominal and geometric kinematics were fitted to these poses too, with so few parameters that it hardly "
             "matters. Measurements of new poses are the stronger proof."
         )
-    tables = [stage_table(one.stages) for one in found.kinds.values()]
+    tables = [stage_table(kind.stages) for kind in findings.kinds.values()]
     return Section("errors", "How good", see, tables, None, pictures, notes)
 
 
-def where(found: Findings) -> Section:
+def where(findings: Findings) -> Section:
     """What the model expects of its positions, by stage and against every joint; the poses to measure next."""
-    robot, error, plan = found.model.robot, found.deviations.error, found.deviations.next
+    robot, error, plan = findings.model.robot, findings.deviations.error, findings.deviations.next
     pictures, solid = list[Picture](), "dashed anywhere in the measured ranges, solid where it was measured."
     for k, name in enumerate(robot.joint_names):
         label, what = f"Error that the model itself expects against {printable(name)}: {solid}", (robot, k)
-        pictures.append(Picture(f"expected-{k}", label, panels.draw_expected, *what, found.deviations, key=k == 0))
-    scene = None if found.predictions is None else _scene(found.stages, found.predictions)
+        pictures.append(Picture(f"expected-{k}", label, panels.draw_expected, *what, findings.deviations, key=k == 0))
+    scene = None if findings.predictions is None else _scene(findings.stages, findings.predictions)
     arrows = "Arrows point from the predicted to the measured place, with one scale in all views. Below: "
     see = arrows * (scene is not None) + (
         "The error that the model itself expects, without the noise of a measurement: "
         f"{rough(error.measured)} mm RMS at the measured configurations; anywhere in the measured joint "
         f"ranges {printable(error.sentence)}"
     )
-    if found.model.own_frame:
+    if findings.model.own_frame:
         see += ", after a rigid fit, because no device says where the robot stands"
-    rows = [[name, mm(value)] for name, value in found.expected.items()]
+    rows = [[name, mm(value)] for name, value in findings.expected.items()]
     tables = [Table("Expected error of positions by stage", ["stage", "RMS [mm]"], rows)]
-    notes = [*sentences.unlike_poses(found), *sentences.worst_range(found)]
+    notes = [*sentences.unlike_poses(findings), *sentences.worst_range(findings)]
     if plan is not None:
         q, then = plan.q[plan.rank.argsort()], rough(float(plan.expected_rms[-1]))
         caption = f"Where to measure next: {len(q)} poses that would lower the expected error most"
@@ -134,39 +134,39 @@ def where(found: Findings) -> Section:
     return Section("where", "Where", f"{see}.", tables, scene, pictures, notes)
 
 
-def _scene(stages: Mapping[str, Kinematics], seen: Predictions) -> dict[str, Any]:
-    there = ~seen.measured.isnan().any(2)  # of the sightings
+def _scene(stages: Mapping[str, Kinematics], rows: Predictions) -> dict[str, Any]:
+    there = ~rows.measured.isnan().any(2)  # of the sightings
     step, errors = -(-int(there.sum()) // MOST_POINTS), dict[str, list[list[float]]]()
 
     def listed(values: Tensor, digits: int) -> list[list[float]]:
         return [[round(value, digits) for value in row] for row in values[there][::step].tolist()]
 
     for number, (name, kinematics) in enumerate(stages.items(), 1):
-        own = seen.predicted  # of the model, which has not seen the rows
+        origins = rows.predicted  # of the model, which has not seen the rows
         if number < len(stages):
-            own = seen.data.bodies.origins(at_payloads(kinematics, seen.data)(seen.data.q).detach())
-        errors[name] = listed(seen.measured - own, SCENE_DECIMALS + 2)
-    return {"points": listed(seen.measured, SCENE_DECIMALS), "errors": errors}
+            origins = rows.data.bodies.origins(at_payloads(kinematics, rows.data)(rows.data.q).detach())
+        errors[name] = listed(rows.measured - origins, SCENE_DECIMALS + 2)
+    return {"points": listed(rows.measured, SCENE_DECIMALS), "errors": errors}
 
 
-def why(found: Findings) -> Section:
+def why(findings: Findings) -> Section:
     """What each part of the model explains: sag, waves of its gears, and corrections of the geometry."""
-    parts = found.parts
+    parts = findings.parts
     left = 0.3 + PER_LETTER * max(len(panels.short(part.name)) for part in parts)
     frame = Frame((panels.PART_WIDTH, 0.9 + 0.24 * len(parts)), left=left)
     label = "What each part of the model explains (parts may cancel)."
     pictures = [Picture("parts", label, panels.draw_parts, parts, frame=frame)]
     label = "motion beyond its reading, with its 95 % band; below, where the joint was measured."
-    for joint, name in enumerate(found.model.robot.joint_names):
-        what = panels.draw_transmission, found.model, found.rows, joint
+    for joint, name in enumerate(findings.model.robot.joint_names):
+        what = panels.draw_transmission, findings.model, findings.rows, joint
         pictures.append(Picture(f"transmission-{joint}", f"{printable(name)}: {label}", *what))
     see, tables = "A wide band means that the joint was measured too little there.", list[Table]()
     notes = ["Coupled joint errors depend on several joints, task space on the place of the marker."]
-    if not is_cartesian(found.model.robot):  # whose joints have no links, gears and weight
+    if not is_cartesian(findings.model.robot):  # whose joints have no links, gears and weight
         waves = "A wave of one period per turn is eccentricity of a gear or an encoder, of two its ovality"
-        see, tables = f"{waves}, faster ones are meshing. {see}", [_corrections(found.model, found.rows)]
-        notes.insert(0, f"Gravity sag is elastic: {payload_sentence(found.model.nominal.load)}.")
-        notes += [f"{line.sentence}, not in the pictures above." for line in gear_lines(found.model)]
+        see, tables = f"{waves}, faster ones are meshing. {see}", [_corrections(findings.model, findings.rows)]
+        notes.insert(0, f"Gravity sag is elastic: {payload_sentence(findings.model.nominal.load)}.")
+        notes += [f"{line.sentence}, not in the pictures above." for line in gear_lines(findings.model)]
         notes.append(
             "Corrections are open where the rows do not tell them; those of parallel axes stand for one another."
         )
@@ -186,8 +186,8 @@ def _corrections(model: CalibratedKinematics, fit_rows: FitRows) -> Table:
     rows = [[name] for name in model.robot.moving_names]
     entries = zip(*(each.tolist() for each in (nominal.split(theta)[0][which], claimed, prior)), strict=True)
     for number, (value, deviation, before) in enumerate(entries):
-        known = deviation <= OPEN_SHARE * before or abs(value) >= deviation
-        rows[number // 6].append(f"{1e3 * value:.3f} \u00b1 {1e3 * deviation:.3f}" if known else "open")
+        sure = deviation <= OPEN_SHARE * before or abs(value) >= deviation
+        rows[number // 6].append(f"{1e3 * value:.3f} \u00b1 {1e3 * deviation:.3f}" if sure else "open")
     header = ["before joint", *(f"{axis} [mm]" for axis in "xyz"), *(f"r{axis} [mrad]" for axis in "xyz")]
     return Table("Geometry corrections with their standard deviations", header, rows)
 
@@ -198,40 +198,40 @@ MOST_REPEATS = 12
 """Repeated poses that are listed."""
 
 
-def trust(found: Findings) -> Section:
+def trust(findings: Findings) -> Section:
     """Claimed against found errors, residuals, outliers, learning curve."""
-    registered, seen = found.model.registration, found.predictions
-    tables = [_largest(found, own) for own in found.kinds.values()]
-    notes = list(found.moved)
+    registered, rows = findings.model.registration, findings.predictions
+    tables = [_largest(findings, kind) for kind in findings.kinds.values()]
+    notes = list(findings.moved)
     if registered is not None:
         each = f"each predicted by the others {mm(registered.left_out_rms)} mm"
         after = f"{registered.rows} rows, RMS {mm(registered.rms_after)} mm"
         notes.append(f"The model was registered anew with {after}; {each}.")
-    elif not notes and seen is not None:
+    elif not notes and rows is not None:
         notes.append("No device or marker moved, and no block of rows is wrong.")
-    if not found.outliers and not found.moved and seen is not None:
+    if not findings.outliers and not findings.moved and rows is not None:
         none = "No row looks wrong: none is further from its prediction than chance allows in a table of this size"
         notes.append(f"{none} (1 %), by the model's own deviations.")
     pictures = list[Picture]()
-    if seen is not None:
+    if rows is not None:
         label = "Found against claimed shares of errors; on the diagonal the claims are true."
-        pictures.append(Picture("coverage", label, panels.draw_coverage, seen))
-    if found.learning_curve:
+        pictures.append(Picture("coverage", label, panels.draw_coverage, rows))
+    if findings.learning_curve:
         label = "Error of rows of the fit when a model knows fewer of them, each row left out in turn."
-        what = found.learning_curve, found.forecast, found.limit if found.repeats else None
+        what = findings.learning_curve, findings.forecast, findings.limit if findings.repeats else None
         pictures.append(Picture("learning", label, panels.draw_learning_curve, *what))
-    pictures += _residuals(found)
-    wrong = list(outlier_lines(found.outliers, 0 if seen is None else len(seen), "rows"))
-    return Section("trust", "Can I trust it", sentences.judged(found), tables, None, pictures, notes, wrong)
+    pictures += _residuals(findings)
+    wrong = list(outlier_lines(findings.outliers, 0 if rows is None else len(rows), "rows"))
+    return Section("trust", "Can I trust it", sentences.judged(findings), tables, None, pictures, notes, wrong)
 
 
-def _residuals(found: Findings) -> Iterator[Picture]:
+def _residuals(findings: Findings) -> Iterator[Picture]:
     """Errors of every kind against the row, time and temperature, and every joint."""
-    robot = found.model.robot
-    for place, one in enumerate(found.kinds.values()):
-        errors, q = one.errors, one.q
-        what = errors.title if len(found.kinds) > 1 else "Errors"
-        columns = {"row": one.lines.double(), **(found.columns if errors.what == ERRORS else {})}
+    robot = findings.model.robot
+    for place, kind in enumerate(findings.kinds.values()):
+        errors, q = kind.errors, kind.q
+        what = errors.title if len(findings.kinds) > 1 else "Errors"
+        columns = {"row": kind.lines.double(), **(findings.columns if errors.what == ERRORS else {})}
         for number, (name, values) in enumerate(columns.items()):
             label = f"{what} against {printable(name)}, their RMS dashed: a trend is a drift."
             missing = int((~values.isfinite()).sum())
@@ -244,26 +244,26 @@ def _residuals(found: Findings) -> Iterator[Picture]:
             yield Picture(f"residuals-{place}-joint-{joint}", label, panels.draw_residuals, *given, key=False)
 
 
-def _largest(found: Findings, own: RowsOfKind) -> Table:
+def _largest(findings: Findings, kind: RowsOfKind) -> Table:
     """The rows of one kind with the largest errors, of positions beside what the model expects there."""
-    (unit, per_unit), seen = own.errors.shown, found.predictions
-    errors, body = own.errors.errors.nan_to_num(0.0).max(1)  # hidden markers have no error
+    (unit, per_unit), rows = kind.errors.shown, findings.predictions
+    errors, body = kind.errors.errors.nan_to_num(0.0).max(1)  # hidden markers have no error
     order = errors.argsort(descending=True)[:LISTED_ROWS].tolist()
     lines = [[f"error [{unit}]", *(f"{per_unit * float(errors[row]):.3f}" for row in order)]]
-    what = f"Largest: {own.errors.label}" if len(found.kinds) > 1 else "Largest errors"
-    if seen is not None and own.errors.what == ERRORS and len(seen) == len(own.lines):
+    what = f"Largest: {kind.errors.label}" if len(findings.kinds) > 1 else "Largest errors"
+    if rows is not None and kind.errors.what == ERRORS and len(rows) == len(kind.lines):
         what += ", and what the model expects of a measurement there"
-        lines.append(["expected RMS [mm]", *(mm(float(seen.claimed[row, body[row]])) for row in order)])
-    lines += joint_values_by_row(found.model.robot, own.q[order])
-    if own.errors.errors.shape[1] > 1:
-        on = [f" on {printable(tip)}" * (len({*found.model.on}) > 1) for tip in found.model.on]
+        lines.append(["expected RMS [mm]", *(mm(float(rows.claimed[row, body[row]])) for row in order)])
+    lines += joint_values_by_row(findings.model.robot, kind.q[order])
+    if kind.errors.errors.shape[1] > 1:
+        on = [f" on {printable(tip)}" * (len({*findings.model.on}) > 1) for tip in findings.model.on]
         lines.insert(0, ["marker", *(f"{number}{on[number]}" for number in body[order].tolist())])
-    return Table(what, ["row", *(str(int(own.lines[row])) for row in order)], lines)
+    return Table(what, ["row", *(str(int(kind.lines[row])) for row in order)], lines)
 
 
-def repeatability(found: Findings) -> Section:
+def repeatability(findings: Findings) -> Section:
     """Figures of ISO 9283, where poses were repeated."""
-    repeats = found.repeats
+    repeats = findings.repeats
     if repeats is None:
         see = "No pose was measured twice: pose accuracy and repeatability (ISO 9283) cannot be told from these rows."
         note = "Repeat five poses, 30 times each, and pass the table."
@@ -271,9 +271,9 @@ def repeatability(found: Findings) -> Section:
     header = ["pose", "measured", "RP [mm]", *(f"AP {name} [mm]" for name in repeats.accuracy)]
     values = torch.stack([repeats.repeatability, *repeats.accuracy.values()], 1)  # (G, 1 + stages) m
     some = zip(repeats.lines.tolist(), repeats.counts.tolist(), values, strict=True)
-    named = [(f"row {line}", str(count), own) for line, count, own in some][:MOST_REPEATS]
+    named = [(f"row {line}", str(count), spread) for line, count, spread in some][:MOST_REPEATS]
     named += [("worst", "", values.amax(0)), ("mean", "", values.mean(0))]
-    rows = [[pose, count, *map(mm, own.tolist())] for pose, count, own in named]
+    rows = [[pose, count, *map(mm, spread.tolist())] for pose, count, spread in named]
     poses, away = f"{len(values)} poses were measured several times", f"{mm(repeats.deviation)} mm RMS away"
     see = f"{poses}: single measurements are {away} from their mean, which limits the RMS error of any model."
     few = f", from fewer than its {STANDARD_REPEATS} attainments" * (int(repeats.counts.min()) < STANDARD_REPEATS)
