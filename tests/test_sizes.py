@@ -65,19 +65,25 @@ def may_have_many(function: Function, owner: str) -> bool:
     return bool(public) or command
 
 
+def functions(node: ast.AST, owner: str = "") -> Iterator[tuple[Function, str]]:
+    """Every function, and the class that it is a method of; expressions, which hold none, are not looked at."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, Function):
+            yield child, owner
+        if isinstance(child, (ast.stmt, ast.excepthandler, ast.match_case)):
+            yield from functions(child, child.name if isinstance(child, ast.ClassDef) else "")
+
+
 def too_big(path: Path, source: str) -> Iterator[str]:
     """What is too long in a file, and which functions have too many parameters."""
     if source.count("\n") > MOST_LINES:
         yield f"{path}: {source.count(chr(10))} lines: split the file by subject"
-    tree = ast.parse(source)
-    owners = {child: node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef) for child in node.body}
-    for node in ast.walk(tree):
-        if isinstance(node, Function):
-            place = f"{path}, line {node.lineno}"
-            if code_lines(node, source) > MOST_CODE_LINES:
-                yield f"{place}: {code_lines(node, source)} lines of code: split {node.name}"
-            if parameters(node) > MOST_PARAMETERS and not may_have_many(node, owners.get(node, "")):
-                yield f"{place}: group the parameters of {node.name}"
+    for node, owner in functions(ast.parse(source)):
+        place = f"{path}, line {node.lineno}"
+        if code_lines(node, source) > MOST_CODE_LINES:
+            yield f"{place}: {code_lines(node, source)} lines of code: split {node.name}"
+        if parameters(node) > MOST_PARAMETERS and not may_have_many(node, owner):
+            yield f"{place}: group the parameters of {node.name}"
 
 
 def test_small_pieces() -> None:

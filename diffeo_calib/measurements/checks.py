@@ -13,7 +13,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from math import isnan
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -133,17 +132,6 @@ def check_size(values: Tensor, name: str) -> None:
         what = f"`{name}` has {len(bad)} value(s) that cannot be measured, the first at index {where}"
         expected, got = f"less than {LARGEST_SI:g} m or rad", f"{float(values[tuple(where)]):g}"
         raise MeasurementError.of(what, expected=expected, got=got, fix="remove or repair these rows")
-
-
-def file_sha256(path: Path) -> str | None:
-    """SHA-256 of a file; None for what can be read only once, such as a pipe."""
-    if not path.is_file():
-        return None
-    sha = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            sha.update(block)
-    return sha.hexdigest()
 
 
 def arrays_sha256(arrays: Mapping[str, Tensor | None], others: Mapping[str, bytes] | None = None) -> str:

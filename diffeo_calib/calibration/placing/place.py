@@ -362,14 +362,13 @@ def _by_readings(robot: Tree, data: Any, readings: list[OtherReadings], progress
     tip = () if tables[0].on is None else (tables[0].on,)
     registration = register_readings(Geometry.nominal(robot, 1, tip), tables)
     rows = Rows(registration.geometry, tuple(map(ReadRows, tables, registration.devices)))
-    found = estimated(rows, held_parameters(rows.geometry, adrift=True), Prior())
+    held = held_parameters(rows.geometry, adrift=True)
+    found = estimated(rows, held, Prior())
     LOG.info("registration RMS %.4f mm, geometry %.4f mm", 1e3 * registration.rms, 1e3 * found.rms)
     if any(free := [devices.freed() for devices in registration.devices]):  # what was said to be known is tested
         each = zip(tables, registration.devices, free, strict=True)
         parts = tuple(ReadRows(data, opened or own) for data, own, opened in each)
-        again = estimated(
-            Rows(registration.geometry, parts), held_parameters(registration.geometry, adrift=True), Prior()
-        )
+        again = estimated(replace(rows, parts=parts), held, Prior())
         for devices in again.devices:
             devices.check_freed(found.noise, again.noise)
     return Placed(data, None, Placement(reading_sets(readings, found.devices)), registration, found)

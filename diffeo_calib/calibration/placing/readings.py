@@ -228,9 +228,8 @@ def _rough_fit(bare: Geometry, tables: Sequence[Readings], ball: Tensor, how: Ma
         for data, errors in zip(tables, fit.errors, strict=True)
         for number, name in enumerate(data.names)
     )
-    moved = (
-        one for own, some in zip(rows.parts, fit.shifts.split(rows.freedom), strict=True) for one in own.devices(some)
-    )
+    each = zip(rows.parts, fit.shifts.split(rows.freedom), strict=True)
+    moved = [one for own, some in each for one in own.devices(some)]
     return RoughFit(worst, Rows(geometry.absorb(fit.theta), tuple(map(ReadRows, tables, moved))), fit.errors)
 
 

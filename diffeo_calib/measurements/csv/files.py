@@ -20,7 +20,7 @@ from torch import Tensor
 from diffeo_calib.common.device import outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few, listed, shown, warn_user
 from diffeo_calib.common.files import as_path
-from diffeo_calib.measurements.checks import file_sha256, quiet
+from diffeo_calib.measurements.checks import quiet
 from diffeo_calib.measurements.csv.cells import repeated
 from diffeo_calib.measurements.csv.columns import Columns, check_count
 from diffeo_calib.measurements.csv.joints import PoseColumns
@@ -74,12 +74,13 @@ def read_observations(
         found, own = sensor.table(here)
         found = found.with_line_numbers(own.lines).with_payload(own.beside.get("payload"))
         tables.append(found.with_covariates(**{name: own.beside.get(name) for name in ("time", "temperature")}))
-    data, sha256 = tables[0] if alone else joined_tables(tables), file_sha256(file)
-    data = (data if alone else data.rows(data.line_numbers.argsort(stable=True))).with_columns(file_sha256=sha256)
+    data = tables[0] if alone else joined_tables(tables)
+    data = data if alone else data.rows(data.line_numbers.argsort(stable=True))
+    data = data.with_columns(file_sha256=rows.sha256)
     if alone and table.position is not None:
         marker = table.marker and f"{table.marker.partition('=')[0]}={','.join(data.marker_names)}"
         columns = replace(columns, table=replace(table, marker=marker))
-        data = data.with_columns(origin=TableOrigin(file, columns, sha256))
+        data = data.with_columns(origin=TableOrigin(file, columns, rows.sha256))
     LOG.info("read %d rows of %s", len(data), shown(path))
     return data if duplicates == "keep" else _without_copies(file, data, drop=duplicates == "drop")
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import codecs
 import csv
+import hashlib
 import io
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -73,6 +74,7 @@ class CsvLines:
         header: the names of the columns; by position, "1", "2", ..., where no line names them.
         units: by name of column, of a row of units below the header.
         notes: what was decided, in words; after :meth:`rows` also which lines between them were skipped.
+        sha256: of the file; None of what can be read only once, a pipe.
 
     Raises:
         MeasurementError: a file that cannot be read, is empty, no text or no valid CSV.
@@ -83,7 +85,7 @@ class CsvLines:
         self.header, self.units, self.notes = list[str](), dict[str, str](), list[str]()
         self._aligned, self._commented = False, True
         self._last, self._extra = 0, 0  # line before the rows, and empty cells at the end of rows
-        self._text, notes = _text(path, sep)
+        self._text, notes, self.sha256 = _text(path, sep)
         if sep != " " and re.search(r"[\[(][-+\d.]", self._text[:AT_ONCE]) and '"' not in self._text:
             self._text = re.sub(UNQUOTED.format(re.escape(sep)), r'\1"\2"', self._text)
         self._lists = dict[int, tuple[int, ...]]()  # shapes of the lists that columns hold
@@ -197,8 +199,8 @@ class CsvLines:
         self.header, self._extra = header, max(width - len(header), 0)
 
 
-def _text(path: Path, sep: str) -> tuple[str, list[str]]:
-    """The text of a file, and what was decided about it; MeasurementError if it cannot be read or is no table."""
+def _text(path: Path, sep: str) -> tuple[str, list[str], str | None]:
+    """The text of a file, what was decided about it, its SHA-256; MeasurementError if it is none, or no table."""
     try:
         with path.open("rb") as file:
             data = file.read(AT_ONCE)  # tells a device without an end
@@ -217,18 +219,19 @@ def _text(path: Path, sep: str) -> tuple[str, list[str]]:
     if path.suffix.lower() in NO_TABLES:
         what, fix = f"'{path}' is no table", "write one: a line with the names of the columns, then a line for each row"
         raise MeasurementError.of(what, expected="CSV, a spreadsheet or arrays", got=path.suffix, fix=fix)
+    sha256 = hashlib.sha256(data).hexdigest() if path.is_file() else None
     if data.startswith(WIDE):
-        return data.decode("utf-16", "replace"), ["text in utf-16, not UTF-8"]
+        return data.decode("utf-16", "replace"), ["text in utf-16, not UTF-8"], sha256
     if (sheet := as_text(path, data, sep)) is not None:
-        return sheet
+        return *sheet, sha256
     if b"\0" in data:
         what, fix = f"file '{path}' is no text but binary", "export the table as CSV"
         raise MeasurementError.of(what, expected="a CSV file", fix=fix)
     try:
-        return data.decode("utf-8-sig"), []
+        return data.decode("utf-8-sig"), [], sha256
     except UnicodeDecodeError:
         page = _code_page(data)
-        return data.decode(page, "replace"), [f"text in {page}, not UTF-8"]
+        return data.decode(page, "replace"), [f"text in {page}, not UTF-8"], sha256
 
 
 def _code_page(data: bytes) -> str:

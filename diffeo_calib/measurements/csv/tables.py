@@ -16,11 +16,10 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
-from diffeo_calib.measurements.checks import file_sha256
 from diffeo_calib.measurements.csv.cells import LARGEST_NUMBER, bad_cells, find_columns, number_hint, numbers_in
 from diffeo_calib.measurements.csv.columns import Body, Columns
 from diffeo_calib.measurements.csv.joints import PoseColumns
-from diffeo_calib.measurements.csv.lines import ANGLES, CsvLines, Lines, read_cells, stated_unit
+from diffeo_calib.measurements.csv.lines import ANGLES, CsvLines, Lines, stated_unit
 from diffeo_calib.measurements.poses import (
     POINTS,
     inverse_poses,
@@ -62,15 +61,15 @@ class TableOrigin:
 
     def texts(self, line_numbers: Tensor) -> dict[str, list[str]]:
         """The cells of all columns in these lines (N,); empty if the file has changed since, or is gone."""
-        try:
-            if self.sha256 is None or file_sha256(self.path) != self.sha256:
-                return {}
-            sheet = read_cells(self.path, self.columns.table.sep, self.columns.names)
-            known = dict(sheet.rows)
-            wanted = [known[line] for line in line_numbers.tolist()]
-        except (OSError, MeasurementError, KeyError):
+        if self.sha256 is None or not self.path.is_file():
             return {}
-        return dict(zip(sheet.header, map(list, zip(*wanted, strict=True)), strict=True))
+        try:
+            file = CsvLines(self.path, self.columns.table.sep, self.columns.names)
+            known = dict(file.rows()) if file.sha256 == self.sha256 else {}
+            wanted = [known[line] for line in line_numbers.tolist()]
+        except (MeasurementError, KeyError):
+            return {}
+        return dict(zip(file.header, map(list, zip(*wanted, strict=True)), strict=True))
 
 
 FEW_ROWS = 2000
@@ -87,6 +86,7 @@ class FileRows(NamedTuple):
     raw: Tensor  # (N, c) numbers in these, in its units
     texts: Mapping[str, Sequence[str]]  # its columns of texts
     lines: Sequence[int]  # their numbers in the file
+    sha256: str | None  # of the file, as of :class:`CsvLines`
 
     def of(self, rows: Tensor) -> FileRows:
         """The rows with these numbers (M,), or those that a mask (N,) chooses."""
@@ -176,7 +176,7 @@ def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
     markers = columns.hideable[: len(columns.table.triples)]
     for own in markers if zeros else ():
         _hide_marks(path, columns, numbers, lines, own)
-    whole = FileRows(path, columns, numbers, dict(zip(named, words, strict=True)), lines)
+    whole = FileRows(path, columns, numbers, dict(zip(named, words, strict=True)), lines, file.sha256)
     if not markers or columns.all_hidden:
         return whole
     seen = ~torch.stack([numbers[:, columns.places(own.values)].isnan().all(1) for own in markers]).all(0)
