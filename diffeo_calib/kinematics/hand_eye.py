@@ -24,7 +24,7 @@ from diffeo_calib.measurements.bodies import transform_words, triple
 from diffeo_calib.measurements.images import ONLY_CAMERA
 from diffeo_calib.measurements.poses import inverse_poses, pose_directions, poses_from_marks
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.se3 import skew
+from diffeo_calib.robots.se3 import twist_at
 from diffeo_calib.sensors.set_ups import NUMBERS_OF_A_FRAME, SESSION, TRANSFORMS, frame_slopes, own_slopes
 
 
@@ -93,20 +93,20 @@ class HandEye:
         geometry, lever = geometry or model.geometry, model.bodies.pose_lever()
         set_up, tool = SetUp.of(model, camera), poses_from_marks(geometry.tool[None], lever)
         carried = (tool @ set_up.mount)[0]
-        from_tool = _at(carried[:3, 3] - tool[0, :3, 3])
+        from_tool = twist_at(carried[:3, 3] - tool[0, :3, 3])
         own = from_tool @ torch.block_diag(*[tool[0, :3, :3]] * 2)  # by a shift and a turn along the axes of the tool
         by_tool = from_tool @ pose_directions(tool, lever)[0]
         known = _covariance(model.map, geometry.slices["tool"], by_tool, set_up.columns, own @ set_up.of_mount)
         known = known + own @ torch.diag(set_up.mount_std.square()) @ own.mT
         # base T(e) for an error twist e: what stands moves by -e, at its place, seen from the base
         standing = inverse_poses((set_up.transform @ geometry.base)[None])[0]
-        by_base, back = -_at(standing[:3, 3]), geometry.base[:3, :3].mT
-        of_base = torch.block_diag(back, back) @ _at(geometry.base[:3, 3]) @ set_up.of_frame
+        by_base, back = -twist_at(standing[:3, 3]), geometry.base[:3, :3].mT
+        of_base = torch.block_diag(back, back) @ twist_at(geometry.base[:3, 3]) @ set_up.of_frame
         found = _covariance(model.map, geometry.slices["base"], by_base, set_up.columns, by_base @ of_base)
         tip, base = geometry.on[0], model.robot.base
-        carried_there = KnownPose(carried, known, tip, f"in the frame of '{tip}'", "in_tip")
-        standing_there = KnownPose(standing, found, base, "in the robot's base", "in_base")
-        return cls(*((carried_there, standing_there) if camera_on_tool else (standing_there, carried_there)))
+        there = KnownPose(carried, known, tip, f"in the frame of '{tip}'", "in_tip")
+        poses = there, KnownPose(standing, found, base, "in the robot's base", "in_base")
+        return cls(*(poses if camera_on_tool else reversed(poses)))
 
     @classmethod
     def of_each(
@@ -192,13 +192,6 @@ class SetUp(NamedTuple):
         """(M, 9, k) what its shifts do to points (M, 9) of the model's tool, m."""
         own = points.unflatten(1, (-1, 3))
         return frame_slopes(own, points.new_zeros(3)) @ self.of_frame + own_slopes(own) @ self.of_mount
-
-
-def _at(place: Tensor) -> Tensor:
-    """(6, 6) from the shift of a body at the origin, and its turn, to those at a place (3,), m."""
-    there = torch.eye(6, dtype=place.dtype, device=place.device)
-    there[:3, 3:] = -skew(place)
-    return there
 
 
 def _covariance(fitted: FittedMap, part: slice, slopes: Tensor, columns: Tensor, effects: Tensor) -> Tensor:

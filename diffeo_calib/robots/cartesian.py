@@ -18,7 +18,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.robots.joint import Joint
-from diffeo_calib.robots.se3 import nearest_rotations, transforms
+from diffeo_calib.robots.se3 import nearest_rotations, rigid_poses, transforms
 from diffeo_calib.robots.tree import Chain, Tree
 
 SLIDES, TURNS = ("pose_x", "pose_y", "pose_z"), ("pose_a", "pose_b", "pose_c")
@@ -31,8 +31,6 @@ FLAT, STEEPEST = 0.8, 0.97
 """Sine of the largest b about the mean of the poses, and about any middle."""
 DIRECTIONS, GOLDEN_ANGLE_RAD = 500, pi * (3.0 - 5.0**0.5)
 """Of the z-axis of M that are tried."""
-TOLERANCE = 1e-3
-"""Files have few digits."""
 
 
 def cartesian(poses: object) -> Chain:
@@ -112,15 +110,7 @@ def _checked(poses: object) -> Tensor:
     """Poses (N, 4, 4) with exact rotations, or places."""
     also = [("N", 1), ("N", 2), ("N", 3)]
     given = as_tensor(poses, "poses", ("N", 4, 4), also=also, fix="pass one transform, or one place, per row")
-    if given.ndim == 2:
-        return given
-    R, eye = given[:, :3, :3], torch.eye(4, dtype=given.dtype, device=given.device)
-    away = torch.maximum((R.mT @ R - eye[:3, :3]).abs().amax((1, 2)), (given[:, 3] - eye[3]).abs().amax(1))
-    bad = (away > TOLERANCE) | (torch.linalg.det(R) < 0)
-    if bool(bad.any()):
-        fix = "pass [[R, t], [0, 0, 0, 1]] in m"
-        raise InputError.of(f"`poses`, row {int(bad.nonzero()[0])}", expected="a rigid transform", fix=fix)
-    return transforms(nearest_rotations(R), given[:, :3, 3])
+    return given if given.ndim == 2 else rigid_poses(given)
 
 
 def _chain(inputs: Tensor, middle: Tensor | None = None) -> Chain:

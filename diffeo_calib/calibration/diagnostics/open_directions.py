@@ -21,7 +21,7 @@ from diffeo_calib.kinematics.registered_map import undetermined
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.robots.se3 import skew
+from diffeo_calib.robots.se3 import twist_at
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices
 
@@ -75,7 +75,7 @@ def undetermined_places(robot: Tree, data: Measurements, registration: Identific
     R, middle = geometry.base[:3, :3], geometry.points(q).mean((0, 1))
     arm = R.mT @ (middle - geometry.base[:3, 3])  # of the middle, in the robot's base
     to = torch.eye(len(places), dtype=q.dtype, device=q.device)
-    to[:3, :3], to[3:6, 3:6], to[:3, 3:6] = R, R, -R @ skew(arm)
+    to[:6, :6] = torch.block_diag(R, R) @ twist_at(arm)
     to = to @ (unit[:, None] * (some_poses.mT @ some_poses) / unit)
     covariance = to @ registration.covariance[places[:, None], places] @ to.mT
     rigid = data.lever is not None

@@ -42,7 +42,7 @@ from diffeo_calib.measurements.poses import kind_of_points, own_blocks, poses_fr
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.tails import Tails
 from diffeo_calib.robots.placement import PLACES, place, rigid_fit
-from diffeo_calib.robots.se3 import skew
+from diffeo_calib.robots.se3 import twist_at
 from diffeo_calib.sensors.coordinates import check_joint_order
 from diffeo_calib.sensors.devices import CHANGE
 from diffeo_calib.sensors.tables import Coordinates
@@ -223,7 +223,7 @@ class Search:
             return found
         size = len(found) if self.known else 6
         to = torch.eye(size, dtype=found.dtype, device=found.device)
-        to[:3, 3:6] = -skew(centre - before.centre)
+        to[:6, :6] = twist_at(centre - before.centre)
         found[:size, :size] = to @ before.covariance[:size, :size] @ to.mT
         return found
 
