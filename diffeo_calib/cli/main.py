@@ -162,15 +162,15 @@ Json = Annotated[
 
 def _declare(name: str, options: type[Command]) -> None:
     """Declare a command by the class of its options; every command has --json."""
-    own = sorted(options.all(), key=lambda one: bool(one.names))  # arguments first, in messages too
+    fields = sorted(options.all(), key=lambda one: bool(one.names))  # arguments first, in messages too
     parameters = list[inspect.Parameter]()
-    named = {one: option.hint for option in own for one in option.names or (option.shown,)} | {"--json": Path}
+    named = {one: option.hint for option in fields for one in option.names or (option.shown,)} | {"--json": Path}
     DECLARED[name] = {one.removeprefix("--").lower(): hint for one, hint in named.items()}
 
     def run(_json: Any, **given: Any) -> None:
         written, read, appended = dict[str, Path](), dict[str, Path](), dict[str, Path]()
         files = {"write": written, "source": written, "read": read, "later": appended}
-        for one in own:
+        for one in fields:
             value = given[one.field]
             for path in value if isinstance(value, list) else [value]:
                 if one.kind in files and isinstance(path, Path):
@@ -182,7 +182,7 @@ def _declare(name: str, options: type[Command]) -> None:
         module = import_module(f"diffeo_calib.cli.commands.{IN_FILE_OF.get(name, name)}")
         getattr(module, f"run_{name}" if name in IN_FILE_OF else "run")(options(**given))
 
-    for one in own:
+    for one in fields:
         typed = typer.Option(*one.names, **one.how) if one.names else typer.Argument(**one.how)
         default = inspect.Parameter.empty if one.default is MISSING else one.default
         kind, annotation = inspect.Parameter.KEYWORD_ONLY, Annotated[one.hint, typed]
@@ -272,7 +272,7 @@ def _words(path: Path, name: str, value: object, hint: Any) -> list[str]:
     values = value if isinstance(value, list) else [value]
     if isinstance(value, list) and (name in JOINED or not has(hint, list)):
         values = [",".join(map(str, value))]
-    return [word for one in values for word in (f"--{name}", _text(path, name, one, hint))]
+    return [word for element in values for word in (f"--{name}", _text(path, name, element, hint))]
 
 
 def _text(path: Path, name: str, value: object, hint: Any) -> str:

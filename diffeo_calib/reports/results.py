@@ -36,9 +36,9 @@ def schema(kind: Any, text: str = "", **more: Any) -> dict[str, Any]:
 
 def entries(own: dict[str, Any], text: str = "", *may_lack: str, **more: Any) -> dict[str, Any]:
     """An object with these entries, by name, and no others."""
-    found = {"type": "object", "required": [name for name in own if name not in may_lack]}
-    known = {"additionalProperties": False, "properties": {name: schema(kind) for name, kind in own.items()}}
-    return schema(found | known | more, text)
+    head = {"type": "object", "required": [name for name in own if name not in may_lack]}
+    body = {"additionalProperties": False, "properties": {name: schema(kind) for name, kind in own.items()}}
+    return schema(head | body | more, text)
 
 
 def tree(kind: Any, depth: int) -> dict[str, Any]:

@@ -69,10 +69,10 @@ def run(given: FitOptions) -> None:
     _show_findings(result, len(train))
     wrong = list[Outlier]()
     if test is not None:
-        seen = positions_of(result.model, result.places(), test)
+        measured = positions_of(result.model, result.places(), test)
         wrong += contradicted_in_sockets(result.model, test)
-        wrong += [] if seen is None else contradicted(result.model, seen)
-        say(*outlier_lines(sorted(wrong, key=lambda one: -one.distance), len(test), "held-out rows"))
+        wrong += [] if measured is None else contradicted(result.model, measured)
+        say(*outlier_lines(sorted(wrong, key=lambda outlier: -outlier.distance), len(test), "held-out rows"))
     say(*_lines_about_places(result, data, held_out, hand_eye))
     say(*_advice(judged, wrong=bool(wrong), partial=result.partial), f"model: {given.output}")
     if given.report is not None:
@@ -103,8 +103,8 @@ def _end(result: CalibrationResult, in_train: Errors, judged: Errors) -> None:
     """Exit with the code of the fit, or with errors of ``judged`` rows that no calibrated robot has."""
     if result.interrupted or interrupts.asked:
         raise typer.Exit(EXIT_INTERRUPTED)
-    for one, fitted in zip(_of_positions(judged), _of_positions(in_train), strict=False):
-        check_errors(result.model, one[CALIBRATED], fitted[GEOMETRIC].median)
+    for stages, fitted in zip(_of_positions(judged), _of_positions(in_train), strict=False):
+        check_errors(result.model, stages[CALIBRATED], fitted[GEOMETRIC].median)
     if not result.fit.converged:
         raise typer.Exit(EXIT_UNCONVERGED)
 
@@ -121,10 +121,10 @@ def _lines_about_places(
         yield from printed.socket_lines(one[CALIBRATED], "held out")
     own, _ = divided(data)
     if own is not None:
-        seen = own.table
-        hidden = zip(seen.body_names, (~seen.seen_bodies).sum(0).tolist(), strict=True)
+        measured = own.table
+        hidden = zip(measured.body_names, (~measured.seen_bodies).sum(0).tolist(), strict=True)
         if counts := [f"{name} in {count}" for name, count in hidden if count]:
-            yield f"hidden in some of {len(seen)} rows: {few(counts)} of them"
+            yield f"hidden in some of {len(measured)} rows: {few(counts)} of them"
     yield from (*result.placement.sentences(), *map(str, result.lengths[:1]))
     if _of_positions(held_out):  # else they are the verdict
         yield printed.stage_line(result.model, result.stages, result.expected)
@@ -165,9 +165,9 @@ def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors |
     """Print the errors of every stage on the training rows and on the held-out rows, if any, kind by kind."""
     fitted = "was held out: these are errors on rows that were fitted"
     none = [f"no row {fitted}, those of new rows are larger (leave-one-out RMS: {result.left_out.rms_text})"]
-    for kind, one in in_train.items():
+    for kind, stages in in_train.items():
         other, rows = (held_out or {}).get(kind), dict[tuple[str, ...], Evaluation]()
-        for name, errors in one.items():
+        for name, errors in stages.items():
             rows[name, f"{errors.count} training"] = errors
             if other is not None:
                 rows[name, f"{other[name].count} held out"] = other[name]
@@ -194,7 +194,7 @@ def _show_findings(result: CalibrationResult, rows: int) -> None:
     """Print the rows that look wrong and how the fit ended; with --verbose also what each part explains."""
     detailed = logging.getLogger(PACKAGE).isEnabledFor(logging.INFO)
     if detailed:
-        sizes = ((plain(own.name), own.displacement, own.angle) for own in result.parts)
+        sizes = ((plain(part.name), part.displacement, part.angle) for part in result.parts)
         cells = [
             [name, f"{1e3 * shift:.4f}", "" if turn is None else f"{1e3 * turn:.4f}"] for name, shift, turn in sizes
         ]
