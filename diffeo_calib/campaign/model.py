@@ -113,13 +113,13 @@ class Around:
 
         MeasurementError for devices that have no place.
         """
-        known = self.placed.data
-        unknown = set(others.device_names) - set(known.device_names)
+        old = self.placed.data
+        unknown = set(others.device_names) - set(old.device_names)
         if unknown:
             fix = "they are judged once a model holds some of them"
-            expected, got = few(sorted(set(known.device_names))), few(sorted(unknown))
+            expected, got = few(sorted(set(old.device_names))), few(sorted(unknown))
             raise MeasurementError.of("the set-ups and devices of rows", expected=expected, got=got, fix=fix)
-        anchors = known.rows([int(part.rows[0]) for part in rows_of_one_kind(known)])
+        anchors = old.rows([int(part.rows[0]) for part in rows_of_one_kind(old)])
         whole = joined_tables([anchors, others])
         placed, data = self.placed.beside(whole, self.data)
         index = torch.arange(len(anchors), len(whole), device=HOST)
@@ -150,7 +150,7 @@ class Around:
     def _sees(self, row: int, q: Tensor) -> Tensor:
         """(M,) boolean: configurations in which a row can be measured."""
         every = torch.ones(len(q), dtype=torch.bool, device=q.device)
-        return torch.stack([every, *(own.there for own in self.placed.elsewhere(row, q))]).all(0)
+        return torch.stack([every, *(moved.there for moved in self.placed.elsewhere(row, q))]).all(0)
 
     @cached_property
     def open(self) -> Tensor:
@@ -160,7 +160,7 @@ class Around:
     def with_open_candidates(self, count: int, seed: int) -> Around:
         """Draw ``count`` candidates that can be measured where some of the present ones cannot."""
         elsewhere = self.placed.elsewhere(self.like, self.candidates)
-        geometry, places = self.placed.identification.geometry, [own.places for own in elsewhere]
+        geometry, places = self.placed.identification.geometry, [moved.places for moved in elsewhere]
         chain, base = geometry.chain, geometry.base
         how: Any = {"ranges": ranges_around(chain, self.placed.data.q), "keep": partial(self._sees, self.like)}
         if any(map(len, places)):
@@ -175,8 +175,8 @@ class Around:
         """What the candidates would tell, and its noise (M, r, r), m^2."""
         copies = self.placed.data.rows([self.like] * len(self.candidates))
         copies: Any = with_attributes(copies.parts[0], q=self.candidates)
-        for own in self.placed.elsewhere(self.like, self.candidates):
-            copies = own.changed(copies)
+        for moved in self.placed.elsewhere(self.like, self.candidates):
+            copies = moved.changed(copies)
         numbers, noise = self.told(self.rows(copies)[0])
         return numbers.at, noise
 

@@ -256,13 +256,13 @@ class Live:
 
     def answer(self, number: int) -> Entry:
         """Outcome of a line."""
-        known, answer = self.campaign.verdicts, {"line": number + 2}
+        every, answer = self.campaign.verdicts, {"line": number + 2}
         if number in self.unreadable:
             return answer | {"error": f"line {number + 2} left out: {self.unreadable[number]}"}
-        of_line = [verdict for verdict in known if verdict.line == number + 2]
+        of_line = [verdict for verdict in every if verdict.line == number + 2]
         answer = of_line[0].entry() | answer | {"text": "\n".join(map(str, of_line))}
         revised, self.late, self.revised = dict.fromkeys([*self.late, *self.revised]), [], []
-        return answer | {"revised": [{"line": known[row].line, "accepted": known[row].accepted} for row in revised]}
+        return answer | {"revised": [{"line": every[row].line, "accepted": every[row].accepted} for row in revised]}
 
     def _say(self, answer: Entry) -> None:
         """Print an answer."""

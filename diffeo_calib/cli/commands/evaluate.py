@@ -99,11 +99,11 @@ def run(options: EvaluateOptions) -> None:
         printed.accept(accuracy(model, new.values(), limit.unit, which=which), limit)
 
 
-def _show(model: CalibratedKinematics, found: Evaluations, used: Tensor, seen: Measurements | None, name: str) -> None:
+def _show(model: CalibratedKinematics, kinds: Evaluations, used: Tensor, seen: Measurements | None, name: str) -> None:
     """Print and record errors of all rows, of the rows of the fit, of the others, and of set-ups and devices."""
     named = dict[str, dict[str, Any]]()
-    for kind, errors in found.items():
-        fitted, positions = used[found.index[kind]], errors is found.positions
+    for kind, errors in kinds.items():
+        fitted, positions = used[kinds.index[kind]], errors is kinds.positions
         of_rows = {"in all": errors}
         if fitted.any() and not fitted.all():
             of_rows |= {"used in the fit": errors.rows(fitted), "not used in the fit": errors.rows(~fitted)}
@@ -262,8 +262,8 @@ class _Readings:
     @property
     def names(self) -> list[str]:
         """KIND_DEVICE and std_KIND_DEVICE, of several numbers with _1, _2."""
-        counts = [(own, range(1, 1 + own.mean.shape[1])) for own in self.devices]
-        ends = [(f"{own.kind}_{own.device}", [f"_{k}" if len(ks) > 1 else "" for k in ks]) for own, ks in counts]
+        counts = [(part, range(1, 1 + part.mean.shape[1])) for part in self.devices]
+        ends = [(f"{part.kind}_{part.device}", [f"_{k}" if len(ks) > 1 else "" for k in ks]) for part, ks in counts]
         return [f"{std}{name}{end}" for name, each in ends for std in ("", "std_") for end in each]
 
     def cells(self, model: CalibratedKinematics, q: Tensor) -> Tensor:

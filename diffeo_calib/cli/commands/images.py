@@ -35,8 +35,8 @@ def run(given: ImagesOptions) -> None:
         lines += [[*cells, *[one.name] * several] for cells in one.rows(table.per_metre, table.decimal)]
         cameras[one.name] = output.with_name(f"{one.name}.yaml") if several else output.with_suffix(".yaml")
         contents[cameras[one.name]] = camera_text(one.camera(BoardPrior(scale=given.board_std))).encode()
-        reasons = {f"{one.name}/{image.name}" if several else image.name: image.refused for image in one.images}
-        refused |= {name: reason for name, reason in reasons.items() if reason}
+        why = {f"{one.name}/{image.name}" if several else image.name: image.refused for image in one.images}
+        refused |= {name: reason for name, reason in why.items() if reason}
     contents[output] = csv_text(lines, table.sep, "\r\n").encode()
     if given.report is not None:
         contents[given.report] = page(found).encode()

@@ -117,7 +117,7 @@ def _compare(given: RecalibrateOptions) -> None:
         say(*provenance_lines(model), *another_date_lines(model))
         rows = source.read(model.robot)
     compared = compare(model, rows, marker=MARKERS[given.free], seed=given.seed)
-    kinds = {kind: {"found": one, "expected": compared.expectations[kind]} for kind, one in compared.errors.items()}
+    kinds = {kind: {"found": error, "expected": compared.expectations[kind]} for kind, error in compared.errors.items()}
     moved = {} if compared.moved is None else {"transform": compared.moved.transform}
     record.add(**change_entries(compared.changes, compared.hidden), **moved, **entries_by_kind(kinds))
     record.add(rows_can_tell=compared.telling and compared.changes.tested)

@@ -197,10 +197,10 @@ def _new_rows(model: CalibratedKinematics, data: Any, rows: FitRows) -> Tensor:
     new = unseen(model, data.q)
     if rows.of_positions and model.registration is None:
         other = torch.ones_like(new)
-        own = divided(data)[0]
-        measured = None if own is None else measured_rows(own.table)
-        if own is not None and measured is not None:
-            other[own.rows[measured.rows].to(HOST)] = False
+        positions = divided(data)[0]
+        measured = None if positions is None else measured_rows(positions.table)
+        if positions is not None and measured is not None:
+            other[positions.rows[measured.rows].to(HOST)] = False
         new |= other
     return new
 

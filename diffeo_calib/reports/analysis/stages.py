@@ -139,7 +139,7 @@ def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: floa
         return None
     data = data.rows(repeated)
     at_rows = {name: at_payloads(kinematics, data)(data.q).detach() for name, kinematics in stages.items()}
-    predicted = {name: data.bodies.origins(found) for name, found in at_rows.items()}  # (N, B, 3) m
+    predicted = {name: data.bodies.origins(at) for name, at in at_rows.items()}  # (N, B, 3) m
     *_, best = predicted.values()
     points, labels, squares, freedom = data.origins, data.groups(), 0.0, 0
     first, counts, repeatability = list[int](), list[int](), list[Tensor]()
@@ -148,13 +148,13 @@ def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: floa
         rows = (labels == label).nonzero()[:, 0]
         middle = points[rows].nanmean(0)
         distances = (points[rows] - middle).norm(dim=-1)  # (n, B), NaN for hidden markers
-        seen = (~distances.isnan()).sum(0)
-        if int(seen.max()) < 2 or float((best[rows] - best[rows[:1]]).norm(dim=-1).max()) >= noise:
+        attained = (~distances.isnan()).sum(0)
+        if int(attained.max()) < 2 or float((best[rows] - best[rows[:1]]).norm(dim=-1).max()) >= noise:
             continue
-        variances = (distances - distances.nanmean(0)).square().nansum(0) / (seen - 1).clamp(min=1)
-        repeatability.append((distances.nanmean(0) + 3.0 * variances.sqrt())[seen > 1].max())
+        variances = (distances - distances.nanmean(0)).square().nansum(0) / (attained - 1).clamp(min=1)
+        repeatability.append((distances.nanmean(0) + 3.0 * variances.sqrt())[attained > 1].max())
         squares += float(distances.square().nansum())
-        freedom += int((seen - 1).clamp(min=0).sum())
+        freedom += int((attained - 1).clamp(min=0).sum())
         first.append(int(rows[0]))
         counts.append(len(rows))
         for name, places in predicted.items():
