@@ -323,7 +323,7 @@ class CampaignModel:
         data, changes = self.around.rows(table.rows(window))
         numbers, noise = self.around.told(data)
         new = self.process.features(numbers.rows(_numbers(before, len(window))).at)
-        near, far = (one.by_fields_with(new) for one in (self._at, self._target))
+        near, far = (part.by_fields_with(new) for part in (self._at, self._target))
         at, cross = self._at.followed_by(new, near), torch.cat([self._cross, far.T])
         accepted = [verdicts[row].accepted for row in self.window] + [True] * (len(window) - before)
         root, given = Seen.of(self.process, numbers, noise, at).in_order(_flags(accepted))
@@ -340,7 +340,7 @@ class CampaignModel:
             last = slice(max(0, number - gates.WINDOW), number + 1)
             some, change = [*(verdicts[row] for row in window[last][:-1]), verdict], None
             if not cause:
-                flags = _flags([one.accepted for one in some]), _flags([not one.cause for one in some])
+                flags = _flags([judged.accepted for judged in some]), _flags([not judged.cause for judged in some])
                 how: Any = {"typical": typical, "coordinates": data.y.shape[1]}
                 change = find_change(given(last.start, last.stop), window[last], changes(last), flags, **how)
             if number > before and change is not None:

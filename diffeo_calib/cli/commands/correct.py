@@ -205,8 +205,8 @@ def _summarise(robot: Tree, solution: Compensation, tools: list[ToolOnTip], line
             after, before = (tool.nominal(robot, q[allowed])[:, :3, 3] for q in (solution.q, solution.start))
             label = "tool" if tool.place is None else f"tool on {tool.tip}"
             sizes[f"{label}, mm"] = 1e3 * (after - before).norm(dim=1)
-        for name, turns, own in zip(robot.joint_names, robot.periodic, change.mT, strict=True):
-            sizes[f"{name}, {'deg' if turns else 'mm'}"] = own.rad2deg() if turns else 1e3 * own
+        for name, turns, moved in zip(robot.joint_names, robot.periodic, change.mT, strict=True):
+            sizes[f"{name}, {'deg' if turns else 'mm'}"] = moved.rad2deg() if turns else 1e3 * moved
         rows = [[plain(what), f"{float(own.median()):.4f}", f"{float(own.max()):.4f}"] for what, own in sizes.items()]
         out.print(text_table("Corrections", ["", "median", "max"], rows))
     say(f"{len(solution)} rows: " + ", ".join(f"{count} {name}" for name, count in solution.counts.items()))

@@ -78,11 +78,11 @@ def doubt(changes: Changes, where: str) -> str:
 
 def change_entries(changes: Changes, hidden: Sequence[Offset] = ()) -> dict[str, list[dict[str, object]]]:
     """For programs: changes, what offsets the rows would show (None where places hide it), and those they may hide."""
-    smallest = [(one.joint, one.size if isfinite(one.size) else None) for one in changes.smallest]
+    smallest = [(offset.joint, offset.size if isfinite(offset.size) else None) for offset in changes.smallest]
     return {
         "changes": [
-            {"part": one.part, "size_rad_or_m": one.size, "probability": one.probability, "sentence": str(one)}
-            for one in changes.found
+            {"part": part.part, "size_rad_or_m": part.size, "probability": part.probability, "sentence": str(part)}
+            for part in changes.found
         ],
         "smallest_offsets": [{"joint": joint, "size_rad_or_m": size} for joint, size in smallest],
         "possible_offsets": [

@@ -80,24 +80,24 @@ class Deviations:
         """The deviations of a model at random configurations."""
 
         def claimed(q: Tensor) -> Tensor:
-            found = model.bodies.predicted(model, q.to(model.configurations.device), noise=False)
-            return found.claimed.square().mean(1).sqrt().to(HOST)
+            predicted = model.bodies.predicted(model, q.to(model.configurations.device), noise=False)
+            return predicted.claimed.square().mean(1).sqrt().to(HOST)
 
         fitted = model.configurations.to(HOST)
         low, high = (torch.clamp(end, *model.robot.limits.unbind(1)) for end in (fitted.amin(0), fitted.amax(0)))
         draws = torch.rand(CONFIGURATIONS, len(low), generator=seeded(0), dtype=low.dtype, device=HOST)
         q, fitted = low + draws * (high - low), fitted[:: -(-len(fitted) // MEASURED)]
-        found = cls(q, claimed(q), fitted, claimed(fitted), ExpectedError.of(model))
+        deviations = cls(q, claimed(q), fitted, claimed(fitted), ExpectedError.of(model))
         try:
             somewhere = [sensor for sensor in sensor_of(model) if sensor.reached(model.geometry.base)]
         except InputError:  # a file of an early version
-            return found
+            return deviations
         options = [q]
         try:
             options += [drawn(model, somewhere, CONFIGURATIONS, model.geometry.tool)] if somewhere else []
         except InputError:  # such as of a camera, which cannot see everywhere
             options.append(model.configurations.to(HOST))
-        return replace(found, next=plan(model, torch.cat(options), NEXT, target=q[:TARGETS]))
+        return replace(deviations, next=plan(model, torch.cat(options), NEXT, target=q[:TARGETS]))
 
 
 FEWEST_REPEATS = 5
