@@ -113,13 +113,13 @@ class Around:
 
         MeasurementError for devices that have no place.
         """
-        known = self.placed.data
-        unknown = set(others.device_names) - set(known.device_names)
+        old = self.placed.data
+        unknown = set(others.device_names) - set(old.device_names)
         if unknown:
             fix = "they are judged once a model holds some of them"
-            expected, got = few(sorted(set(known.device_names))), few(sorted(unknown))
+            expected, got = few(sorted(set(old.device_names))), few(sorted(unknown))
             raise MeasurementError.of("the set-ups and devices of rows", expected=expected, got=got, fix=fix)
-        anchors = known.rows([int(part.rows[0]) for part in rows_of_one_kind(known)])
+        anchors = old.rows([int(part.rows[0]) for part in rows_of_one_kind(old)])
         whole = joined_tables([anchors, others])
         placed, data = self.placed.beside(whole, self.data)
         index = torch.arange(len(anchors), len(whole), device=HOST)
@@ -150,7 +150,7 @@ class Around:
     def _sees(self, row: int, q: Tensor) -> Tensor:
         """(M,) boolean: configurations in which a row can be measured."""
         every = torch.ones(len(q), dtype=torch.bool, device=q.device)
-        return torch.stack([every, *(own.there for own in self.placed.elsewhere(row, q))]).all(0)
+        return torch.stack([every, *(moved.there for moved in self.placed.elsewhere(row, q))]).all(0)
 
     @cached_property
     def open(self) -> Tensor:
@@ -160,7 +160,7 @@ class Around:
     def with_open_candidates(self, count: int, seed: int) -> Around:
         """Draw ``count`` candidates that can be measured where some of the present ones cannot."""
         elsewhere = self.placed.elsewhere(self.like, self.candidates)
-        geometry, places = self.placed.identification.geometry, [own.places for own in elsewhere]
+        geometry, places = self.placed.identification.geometry, [moved.places for moved in elsewhere]
         chain, base = geometry.chain, geometry.base
         how: Any = {"ranges": ranges_around(chain, self.placed.data.q), "keep": partial(self._sees, self.like)}
         if any(map(len, places)):
@@ -175,8 +175,8 @@ class Around:
         """What the candidates would tell, and its noise (M, r, r), m^2."""
         copies = self.placed.data.rows([self.like] * len(self.candidates))
         copies: Any = with_attributes(copies.parts[0], q=self.candidates)
-        for own in self.placed.elsewhere(self.like, self.candidates):
-            copies = own.changed(copies)
+        for moved in self.placed.elsewhere(self.like, self.candidates):
+            copies = moved.changed(copies)
         numbers, noise = self.told(self.rows(copies)[0])
         return numbers.at, noise
 
@@ -323,7 +323,7 @@ class CampaignModel:
         data, changes = self.around.rows(table.rows(window))
         numbers, noise = self.around.told(data)
         new = self.process.features(numbers.rows(_numbers(before, len(window))).at)
-        near, far = (one.by_fields_with(new) for one in (self._at, self._target))
+        near, far = (part.by_fields_with(new) for part in (self._at, self._target))
         at, cross = self._at.followed_by(new, near), torch.cat([self._cross, far.T])
         accepted = [verdicts[row].accepted for row in self.window] + [True] * (len(window) - before)
         root, given = Seen.of(self.process, numbers, noise, at).in_order(_flags(accepted))
@@ -340,7 +340,7 @@ class CampaignModel:
             last = slice(max(0, number - gates.WINDOW), number + 1)
             some, change = [*(verdicts[row] for row in window[last][:-1]), verdict], None
             if not cause:
-                flags = _flags([one.accepted for one in some]), _flags([not one.cause for one in some])
+                flags = _flags([judged.accepted for judged in some]), _flags([not judged.cause for judged in some])
                 how: Any = {"typical": typical, "coordinates": data.y.shape[1]}
                 change = find_change(given(last.start, last.stop), window[last], changes(last), flags, **how)
             if number > before and change is not None:

@@ -196,7 +196,7 @@ def find_change(
     later = view.numbers.owner >= torch.arange(len(numbers) - gates.ROWS_AFTER_CHANGE + 1, device=HOST)[:, None]
     after = later & doubted  # (F, M) numbers, for each first row of a change
     used = after | (~later & accepted)
-    effects = [view.numbers.of_table(one.effects) for one in hypotheses]
+    effects = [view.numbers.of_table(hypothesis.effects) for hypothesis in hypotheses]
     right = torch.cat([(view.error * used)[:, :, None], torch.cat(effects, 1) * after[:, :, None]], 2)
     masks, which = used.unique(dim=0, return_inverse=True)
     for number, mask in enumerate(masks):
@@ -208,7 +208,7 @@ def find_change(
     white, W = right[:, :, 0], right[:, :, 1:]
     counts, total = after.sum(1).tolist(), (white.square().sum(1) / typical).tolist()
     g, H, candidates, start = (W.mT @ white[:, :, None])[..., 0], W.mT @ W, [], 0
-    for one, E in zip(hypotheses, effects, strict=True):
+    for hypothesis, E in zip(hypotheses, effects, strict=True):
         size, part = E.shape[1], slice(start, start + E.shape[1])
         start += size
         u = Evidence(g[:, part], H[:, part, part]).size
@@ -216,14 +216,14 @@ def find_change(
             rows, spare = counts[first], counts[first] - size
             if spare >= gates.SPARE_NUMBERS and total[first] - gain <= chi2_above(gates.LEFT_CHANCE, spare):
                 moved = E[after[first]] @ u[first]
-                candidates.append((gain - size * log(rows), gain, first, one, moved, u[first], rows))
-    best = max(candidates, key=lambda one: one[0], default=None)
+                candidates.append((gain - size * log(rows), gain, first, hypothesis, moved, u[first], rows))
+    best = max(candidates, key=lambda choice: choice[0], default=None)
     if best is None or chi2_probability(best[1], len(best[5])) > gates.JUMP_CHANCE:
         return None
     score, _, first, what, moved, u, count = best
     if score < view.one_wrong(used[first], typical, count) + gates.CHANGES_TOLD_APART:
         return None
-    others = {one[3].name for one in candidates if one[0] > score - gates.CHANGES_TOLD_APART} - {what.name}
+    others = {choice[3].name for choice in candidates if choice[0] > score - gates.CHANGES_TOLD_APART} - {what.name}
     unit, size = what.unit or ("mm", 1e-3)
     points = 3.0 * view.numbers.shape[1] / coordinates  # numbers of a point
     change = float(u.abs().max()) if what.unit else float((points * moved.square().mean()).sqrt())

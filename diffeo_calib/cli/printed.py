@@ -159,12 +159,12 @@ def parsed_length(text: str | None) -> float | None:
     return None if limit is None else limit.value
 
 
-def accept(found: Accuracy, limit: Limit) -> None:
+def accept(error: Accuracy, limit: Limit) -> None:
     """Say whether errors are within the limit; exit with a code of its own if they are not."""
-    good = found.value <= limit.value
-    record.add(**{f"rms_{found.unit}": found.value, f"limit_{found.unit}": limit.value}, accepted=good)
-    unit, per_unit = shown_unit(found.unit)
+    good = error.value <= limit.value
+    record.add(**{f"rms_{error.unit}": error.value, f"limit_{error.unit}": limit.value}, accepted=good)
+    unit, per_unit = shown_unit(error.unit)
     within = "within" if good else "above"
-    say(f"RMS {per_unit * found.value:.4f} {unit} {found.of}: {within} the limit of {per_unit * limit.value:g} {unit}")
+    say(f"RMS {per_unit * error.value:.4f} {unit} {error.of}: {within} the limit of {per_unit * limit.value:g} {unit}")
     if not good:
         raise typer.Exit(EXIT_ABOVE)

@@ -31,7 +31,7 @@ def schema(kind: Any, text: str = "", **more: Any) -> dict[str, Any]:
     if isinstance(kind, tuple):
         return {"enum": list(kind)} | more
     each = get_args(kind) or (kind,)
-    return {"type": SIMPLE[each[0]] if len(each) == 1 else [SIMPLE[one] for one in each]} | more
+    return {"type": SIMPLE[each[0]] if len(each) == 1 else [SIMPLE[word] for word in each]} | more
 
 
 def entries(own: dict[str, Any], text: str = "", *may_lack: str, **more: Any) -> dict[str, Any]:

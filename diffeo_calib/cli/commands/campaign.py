@@ -73,7 +73,7 @@ class Live:
 
     def resume(self) -> None:
         """Go on after the lines that the journal knows."""
-        entries = [one for one in self.journal.entries if "line" in one]
+        entries = [stored for stored in self.journal.entries if "line" in stored]
         lines = self.table.new_lines()
         places = [name for name in self.missing if name in self.columns.joints.columns and name.isdecimal()]
         if self.table.header and places:  # columns are named by their places, and the first line is a row
@@ -85,7 +85,7 @@ class Live:
                 fix = f"undo the change, or remove '{self.journal.path.name}' to judge all rows anew"
                 raise InputError.of(f"line {number + 2} of {self.source.csv} was changed after it was judged", fix=fix)
         now = self._begun()
-        begun = next((one[BEGUN] for one in self.journal.entries if BEGUN in one), now)
+        begun = next((stored[BEGUN] for stored in self.journal.entries if BEGUN in stored), now)
         if names := [name for name in begun | now if begun.get(name) != now.get(name)]:
             then, got = (", ".join(f"{name} {each.get(name, 'none')}" for name in names) for each in (begun, now))
             fix = f"go on as it was begun, or remove '{self.journal.path.name}' to judge all rows anew"
@@ -94,7 +94,7 @@ class Live:
         for line in lines[: len(entries)]:
             self._keep(line)
         self.unreadable = {n: entry["unreadable"] for n, entry in enumerate(entries) if "unreadable" in entry}
-        verdicts = [one for entry in entries for one in entry.get("rows", [])]
+        verdicts = [kept for entry in entries for kept in entry.get("rows", [])]
         for entry in self.journal.entries:
             if "row" in entry:
                 verdicts[entry["row"]] |= {name: entry[name] for name in KEPT if name in entry}
@@ -102,9 +102,9 @@ class Live:
         if verdicts:
             if len(table := self._read(readable)) != len(verdicts):
                 raise self.journal.damaged(f"{len(verdicts)} verdicts of {len(table)} rows")
-            self.campaign.resume(table, [Verdict(row, **one) for row, one in enumerate(verdicts)])
+            self.campaign.resume(table, [Verdict(row, **kept) for row, kept in enumerate(verdicts)])
             self.say(f"going on after {len(entries)} lines{expected(self.campaign)}", self.state())
-        self.said = [(one.accepted, one.again) for one in self.campaign.verdicts]
+        self.said = [(verdict.accepted, verdict.again) for verdict in self.campaign.verdicts]
         self.waiting = lines[len(entries) :]
 
     @property
@@ -248,7 +248,7 @@ class Live:
 
     def _revised(self) -> Iterator[Entry]:
         """Entries of rows that are accepted now and were not, or the other way round; of those to be repeated, too."""
-        now = [(one.accepted, one.again) for one in self.campaign.verdicts]
+        now = [(verdict.accepted, verdict.again) for verdict in self.campaign.verdicts]
         self.revised = [row for row, (one, other) in enumerate(zip(self.said, now, strict=False)) if one != other]
         self.said = now
         for row in self.revised:
@@ -256,13 +256,13 @@ class Live:
 
     def answer(self, number: int) -> Entry:
         """Outcome of a line."""
-        known, answer = self.campaign.verdicts, {"line": number + 2}
+        every, answer = self.campaign.verdicts, {"line": number + 2}
         if number in self.unreadable:
             return answer | {"error": f"line {number + 2} left out: {self.unreadable[number]}"}
-        of_line = [verdict for verdict in known if verdict.line == number + 2]
+        of_line = [verdict for verdict in every if verdict.line == number + 2]
         answer = of_line[0].entry() | answer | {"text": "\n".join(map(str, of_line))}
         revised, self.late, self.revised = dict.fromkeys([*self.late, *self.revised]), [], []
-        return answer | {"revised": [{"line": known[row].line, "accepted": known[row].accepted} for row in revised]}
+        return answer | {"revised": [{"line": every[row].line, "accepted": every[row].accepted} for row in revised]}
 
     def _say(self, answer: Entry) -> None:
         """Print an answer."""

@@ -122,27 +122,27 @@ def run(options: CorrectOptions) -> None:
         targets = torch.stack([tool.nominal(robot, start) for tool in tools], dim=1)
         if is_cartesian(robot) and robot.n < AXES_OF_A_POSE:  # commanded places
             targets = targets[..., :3, 3]
-    bound, rate = (None if one is None else radians(one) for one in (options.limit, options.rate))
+    bound, rate = (None if angle is None else radians(angle) for angle in (options.limit, options.rate))
     how = {"frame": options.frame, "bound": bound, "path": rate is not None, "rate": rate}
     with progress_bar() as progress:
         progress("commands", 0, 1)
-        found = compensate(model, _goals(robot, tools, targets), start, tool=_places(robot, tools), **how)
-    allowed = found.q.isfinite().all(1)
+        program = compensate(model, _goals(robot, tools, targets), start, tool=_places(robot, tools), **how)
+    allowed = program.q.isfinite().all(1)
     some = bool(allowed.any())
-    regions = [tool.known(model, found.q[allowed], options.frame) if some else None for tool in tools]
+    regions = [tool.known(model, program.q[allowed], options.frame) if some else None for tool in tools]
     added = dict[str, Column]()
-    for tool, own in zip(tools, regions, strict=True):
-        added |= tool.added(robot, found, own, table)
+    for tool, pair in zip(tools, regions, strict=True):
+        added |= tool.added(robot, program, pair, table)
     place = {"command": 0, "status": 1, "miss": 2, "angle": 2, "std": 3}
     added = {name: added[name] for name in sorted(added, key=lambda name: place[name.split("_")[0]])}
-    write_columns(options.output, sheet, columns.cells(found.q, {}) | added, table)
-    misses = {tool.tip: {"miss_m": tool.own(found.miss), "angle_miss_deg": _degrees(found, tool)} for tool in tools}
-    record.add(rows=len(found), statuses=found.counts, misses=misses, files={"program": options.output})
-    _summarise(robot, found, tools, [line for line, _ in sheet.rows])
+    write_columns(options.output, sheet, columns.cells(program.q, {}) | added, table)
+    misses = {tool.tip: {"miss_m": tool.own(program.miss), "angle_miss_deg": _degrees(program, tool)} for tool in tools}
+    record.add(rows=len(program), statuses=program.counts, misses=misses, files={"program": options.output})
+    _summarise(robot, program, tools, [line for line, _ in sheet.rows])
     where = "robot's base" if options.frame == "base" else "measuring frame"
-    say(*(_how_well_known(tool, *own, where) for tool, own in zip(tools, regions, strict=True) if own is not None))
+    say(*(_how_well_known(tool, *pair, where) for tool, pair in zip(tools, regions, strict=True) if pair is not None))
     frames = ", ".join(f"of the tool on {tool.tip}, in the frame of {robot.base}" for tool in tools)
-    corrected = f"{len(found)} rows written to {options.output}: corrected {', '.join(columns.names)}"
+    corrected = f"{len(program)} rows written to {options.output}: corrected {', '.join(columns.names)}"
     say(f"{corrected}, the pose to command ({frames}), status, miss and standard deviation")
 
 
@@ -205,8 +205,8 @@ def _summarise(robot: Tree, solution: Compensation, tools: list[ToolOnTip], line
             after, before = (tool.nominal(robot, q[allowed])[:, :3, 3] for q in (solution.q, solution.start))
             label = "tool" if tool.place is None else f"tool on {tool.tip}"
             sizes[f"{label}, mm"] = 1e3 * (after - before).norm(dim=1)
-        for name, turns, own in zip(robot.joint_names, robot.periodic, change.mT, strict=True):
-            sizes[f"{name}, {'deg' if turns else 'mm'}"] = own.rad2deg() if turns else 1e3 * own
+        for name, turns, moved in zip(robot.joint_names, robot.periodic, change.mT, strict=True):
+            sizes[f"{name}, {'deg' if turns else 'mm'}"] = moved.rad2deg() if turns else 1e3 * moved
         rows = [[plain(what), f"{float(own.median()):.4f}", f"{float(own.max()):.4f}"] for what, own in sizes.items()]
         out.print(text_table("Corrections", ["", "median", "max"], rows))
     say(f"{len(solution)} rows: " + ", ".join(f"{count} {name}" for name, count in solution.counts.items()))

@@ -99,11 +99,11 @@ def run(options: EvaluateOptions) -> None:
         printed.accept(accuracy(model, new.values(), limit.unit, which=which), limit)
 
 
-def _show(model: CalibratedKinematics, found: Evaluations, used: Tensor, seen: Measurements | None, name: str) -> None:
+def _show(model: CalibratedKinematics, kinds: Evaluations, used: Tensor, data: Measurements | None, name: str) -> None:
     """Print and record errors of all rows, of the rows of the fit, of the others, and of set-ups and devices."""
     named = dict[str, dict[str, Any]]()
-    for kind, errors in found.items():
-        fitted, positions = used[found.index[kind]], errors is found.positions
+    for kind, errors in kinds.items():
+        fitted, positions = used[kinds.index[kind]], errors is kinds.positions
         of_rows = {"in all": errors}
         if fitted.any() and not fitted.all():
             of_rows |= {"used in the fit": errors.rows(fitted), "not used in the fit": errors.rows(~fitted)}
@@ -113,7 +113,7 @@ def _show(model: CalibratedKinematics, found: Evaluations, used: Tensor, seen: M
             for sensor in present:  # sockets have no errors of their own
                 mask = torch.tensor([device == sensor for device in errors.devices], dtype=torch.bool, device=HOST)
                 of_devices[sensor] = errors.rows(mask)
-        expected = expected_rms(model, seen, errors.errors.shape[1]) if positions and seen is not None else None
+        expected = expected_rms(model, data, errors.errors.shape[1]) if positions and data is not None else None
         labels = of_rows | {f"of {what} '{plain(device)}'": some for device, some in of_devices.items()}
         rows = {(f"{some.count} {label}",): some for label, some in labels.items()}
         out.print(printed.ErrorTable(rows, f"of {plain(name)}", "rows", expected=expected))
@@ -201,8 +201,8 @@ def run_predict(given: PredictOptions) -> None:
     units = {name: getattr(given, name) for name in Units.names()}
     typed = Rows(**units, convention=given.convention, rotation_angle=given.rotation_angle, payload=given.payload)
     read = models.as_fitted(kinematics, typed)
-    own = typed if given.length and given.angle else read  # the predictions are by default written as the rows were
-    rows = Rows(convention=own.convention, rotation_angle=own.rotation_angle, payload=own.payload)
+    layout = typed if given.length and given.angle else read  # the predictions are by default written as the rows were
+    rows = Rows(convention=layout.convention, rotation_angle=layout.rotation_angle, payload=layout.payload)
     table = of_robot(with_rows(table_format(read), rows), kinematics.robot)
     with_poses = kinematics.lever is not None
     if not with_poses and (table.convention or table.rotation_angle):
@@ -226,11 +226,11 @@ def run_predict(given: PredictOptions) -> None:
     def blocks() -> Iterator[Predictions]:
         for first in range(0, len(q), ROWS_AT_ONCE):
             progress("rows", first, len(q))
-            own = slice(first, first + ROWS_AT_ONCE)
-            model = kinematics if masses is None else kinematics.at_payloads(masses[own])
-            mean, covariance = model.bodies.written(model, q[own])
+            block = slice(first, first + ROWS_AT_ONCE)
+            model = kinematics if masses is None else kinematics.at_payloads(masses[block])
+            mean, covariance = model.bodies.written(model, q[block])
             deviations = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-            yield q[own], mean, deviations, readings.cells(model, q[own])
+            yield q[block], mean, deviations, readings.cells(model, q[block])
 
     with progress_bar() as progress:
         write_predictions(output, blocks(), written, prefixes=prefixes, more=readings.names, poses=with_poses)
@@ -242,9 +242,9 @@ def run_predict(given: PredictOptions) -> None:
     say(*readings.sentences())
     if with_poses:
         turned = table.for_writing(rotation_std=False, prefixes=prefixes)
-        own = replace(turned, joints=(), position=[[prefix + axis for axis in "xyz"] for prefix in prefixes])
-        own = replace(own, rotation_std=None, **dict.fromkeys(BESIDE))
-        say(f"`evaluate` and `fit` read these poses with {shlex.join(options_of(own))}")
+        layout = replace(turned, joints=(), position=[[prefix + axis for axis in "xyz"] for prefix in prefixes])
+        layout = replace(layout, rotation_std=None, **dict.fromkeys(BESIDE))
+        say(f"`evaluate` and `fit` read these poses with {shlex.join(options_of(layout))}")
 
 
 @dataclass(frozen=True)
@@ -262,8 +262,8 @@ class _Readings:
     @property
     def names(self) -> list[str]:
         """KIND_DEVICE and std_KIND_DEVICE, of several numbers with _1, _2."""
-        counts = [(own, range(1, 1 + own.mean.shape[1])) for own in self.devices]
-        ends = [(f"{own.kind}_{own.device}", [f"_{k}" if len(ks) > 1 else "" for k in ks]) for own, ks in counts]
+        counts = [(part, range(1, 1 + part.mean.shape[1])) for part in self.devices]
+        ends = [(f"{part.kind}_{part.device}", [f"_{k}" if len(ks) > 1 else "" for k in ks]) for part, ks in counts]
         return [f"{std}{name}{end}" for name, each in ends for std in ("", "std_") for end in each]
 
     def cells(self, model: CalibratedKinematics, q: Tensor) -> Tensor:

@@ -211,7 +211,7 @@ def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> N
         left_out = rigid.validated.get(rigid.how)
         lines.append((plain(name), [rigid.rms, rigid.largest, left_out, hypot(left_out or rigid.rms, about)]))
     lines.append(("(the model itself)", [None, None, None, about]))
-    cells = [[name, *("" if one is None else f"{1e3 * one:.4f}" for one in numbers)] for name, numbers in lines]
+    cells = [[name, *("" if rms is None else f"{1e3 * rms:.4f}" for rms in numbers)] for name, numbers in lines]
     out.print(text_table(title, ["export", "RMS", "max", "cross-validated", new], cells))
     if summary is not None and summary.geometry_rms is not None and summary.diffeomorphic_rms is not None:
         left = f"geometric calibration {1e3 * summary.geometry_rms:.4f}, model {1e3 * summary.diffeomorphic_rms:.4f}"

@@ -55,12 +55,12 @@ def run(given: FitOptions) -> None:
         how = {"controls": given.controls or "auto", "seed": given.seed, "note": given.note, "scales_of": others}
         result = calibrate(chain, train, **how, progress=interrupts.watching(progress, err.print))
         result = replace(result, model=made_by_command(result.model))
-    own, commanded = result.placed.coordinates, is_cartesian(chain) and not turns_nowhere(chain)
-    on_tool = None if own is None else own.table.sees_board_from_tool(commanded=commanded)
+    positions, commanded = result.placed.coordinates, is_cartesian(chain) and not turns_nowhere(chain)
+    on_tool = None if positions is None else positions.table.sees_board_from_tool(commanded=commanded)
     hand_eye = {} if on_tool is None else HandEye.of_each(result.model, camera_on_tool=on_tool)
     save(result.model, given.output)  # before anything is printed: output may be cut off
     in_train, held_out = result.errors(train), {} if test is None else result.errors(test)
-    each = {name: own.entry() for name, own in hand_eye.items()}
+    each = {name: solved.entry() for name, solved in hand_eye.items()}
     record.add(**({"hand_eyes": each} if len(each) > 1 else dict(zip(("hand_eye",), each.values(), strict=False))))
     _record(result, in_train, held_out, given)
     judged = _of_positions(held_out)
@@ -117,11 +117,11 @@ def _lines_about_places(
     placement = list(hand_eye_sentences(hand_eye)) or list(
         placement_lines(result.model.geometry, poses=placed.lever is not None, ball=placed.ball)
     )
-    for one in held_out.values():
-        yield from printed.socket_lines(one[CALIBRATED], "held out")
-    own, _ = divided(data)
-    if own is not None:
-        measured = own.table
+    for stages in held_out.values():
+        yield from printed.socket_lines(stages[CALIBRATED], "held out")
+    positions, _ = divided(data)
+    if positions is not None:
+        measured = positions.table
         hidden = zip(measured.body_names, (~measured.seen_bodies).sum(0).tolist(), strict=True)
         if counts := [f"{name} in {count}" for name, count in hidden if count]:
             yield f"hidden in some of {len(measured)} rows: {few(counts)} of them"
@@ -129,7 +129,7 @@ def _lines_about_places(
     if _of_positions(held_out):  # else they are the verdict
         yield printed.stage_line(result.model, result.stages, result.expected)
     yield from printed.expectation_lines(result.model, data, result.expected)
-    advice = next(filter(None, (one.size_advice() for one in result.placement)), None)
+    advice = next(filter(None, (device.size_advice() for device in result.placement)), None)
     share, whole = result.expected.size_share, 1e3 * result.expected.workspace
     if advice is not None and share > LARGE_SHARE:
         yield f"  {share * whole:.3f} mm of it is the robot's size: {advice}"
@@ -139,19 +139,19 @@ def _lines_about_places(
 def _record(result: CalibrationResult, in_train: Errors, held_out: Errors, given: FitOptions) -> None:
     """Add the results for programs."""
     both = {"training": in_train, "held_out": held_out}
-    kinds = {kind: {rows: one[kind] for rows, one in both.items() if kind in one} for kind in in_train}
+    kinds = {kind: {rows: errors[kind] for rows, errors in both.items() if kind in errors} for kind in in_train}
     files = {"model": given.output, "report": given.report}
     record.add(
         **result.placement.entry(),
         **entries_by_kind(kinds),
-        lengths={one.cause.name: [one.value, one.deviation] for one in result.lengths},
-        leave_one_out={kind: kind_entry(one) for kind, one in result.left_out.items()},
+        lengths={length.cause.name: [length.value, length.deviation] for length in result.lengths},
+        leave_one_out={kind: kind_entry(left) for kind, left in result.left_out.items()},
         leave_one_out_rms_m=result.left_out.positions_rms,
         parts=[{"name": p.name, "displacement_m": p.displacement, "angle_rad_or_m": p.angle} for p in result.parts],
         outliers=[
-            {"row": one.number, "marker": one.marker, "reason": one.reason}
-            | dict(zip(("distance", "unit"), one.shown, strict=True))
-            for one in result.outliers
+            {"row": row.number, "marker": row.marker, "reason": row.reason}
+            | dict(zip(("distance", "unit"), row.shown, strict=True))
+            for row in result.outliers
         ],
         base=result.model.geometry.base,
         markers_m=result.model.geometry.tool,

@@ -31,25 +31,25 @@ def run(given: ImagesOptions) -> None:
     several = len(found) > 1
     lines = [[IMAGE, *found[0].header, *POINT, *PIXEL, *[CAMERA] * several]]
     cameras, contents, refused = dict[str, Path](), dict[Path, bytes](), dict[str, str]()
-    for one in found:
-        lines += [[*cells, *[one.name] * several] for cells in one.rows(table.per_metre, table.decimal)]
-        cameras[one.name] = output.with_name(f"{one.name}.yaml") if several else output.with_suffix(".yaml")
-        contents[cameras[one.name]] = camera_text(one.camera(BoardPrior(scale=given.board_std))).encode()
-        reasons = {f"{one.name}/{image.name}" if several else image.name: image.refused for image in one.images}
-        refused |= {name: reason for name, reason in reasons.items() if reason}
+    for folder in found:
+        lines += [[*cells, *[folder.name] * several] for cells in folder.rows(table.per_metre, table.decimal)]
+        cameras[folder.name] = output.with_name(f"{folder.name}.yaml") if several else output.with_suffix(".yaml")
+        contents[cameras[folder.name]] = camera_text(folder.camera(BoardPrior(scale=given.board_std))).encode()
+        why = {f"{folder.name}/{image.name}" if several else image.name: image.refused for image in folder.images}
+        refused |= {name: reason for name, reason in why.items() if reason}
     contents[output] = csv_text(lines, table.sep, "\r\n").encode()
     if given.report is not None:
         contents[given.report] = page(found).encode()
     write_together(contents)
     for name, reason in refused.items():
         say(f"{name}: {reason}: left out")
-    for one in found:
-        width, height = one.size
-        used = f"{len(one.used)} of {len(one.images)} images of {width} x {height} pixels"
-        if one.paired:
-            say(f"{f'{one.name}: ' * several}{one.paired}")
-        corners = sum(len(image.numbers) for image in one.used)
-        say(f"{f'{one.name}: ' * several}{used}, {corners} corners: {shown(output)}")
+    for folder in found:
+        width, height = folder.size
+        used = f"{len(folder.used)} of {len(folder.images)} images of {width} x {height} pixels"
+        if folder.paired:
+            say(f"{f'{folder.name}: ' * several}{folder.paired}")
+        corners = sum(len(image.numbers) for image in folder.used)
+        say(f"{f'{folder.name}: ' * several}{used}, {corners} corners: {shown(output)}")
     options = " ".join(f"--reading corners={shown(path)}" for path in cameras.values())
     say(f"fit {shown(output)} ... {options}" + ", with --camera-on-tool if the camera is on the tool" * (not several))
     rows, files = sum(len(one.used) for one in found), {"camera": cameras[found[0].name]} if not several else cameras

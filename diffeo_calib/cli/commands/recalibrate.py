@@ -78,11 +78,11 @@ def doubt(changes: Changes, where: str) -> str:
 
 def change_entries(changes: Changes, hidden: Sequence[Offset] = ()) -> dict[str, list[dict[str, object]]]:
     """For programs: changes, what offsets the rows would show (None where places hide it), and those they may hide."""
-    smallest = [(one.joint, one.size if isfinite(one.size) else None) for one in changes.smallest]
+    smallest = [(offset.joint, offset.size if isfinite(offset.size) else None) for offset in changes.smallest]
     return {
         "changes": [
-            {"part": one.part, "size_rad_or_m": one.size, "probability": one.probability, "sentence": str(one)}
-            for one in changes.found
+            {"part": part.part, "size_rad_or_m": part.size, "probability": part.probability, "sentence": str(part)}
+            for part in changes.found
         ],
         "smallest_offsets": [{"joint": joint, "size_rad_or_m": size} for joint, size in smallest],
         "possible_offsets": [
@@ -117,7 +117,7 @@ def _compare(given: RecalibrateOptions) -> None:
         say(*provenance_lines(model), *another_date_lines(model))
         rows = source.read(model.robot)
     compared = compare(model, rows, marker=MARKERS[given.free], seed=given.seed)
-    kinds = {kind: {"found": one, "expected": compared.expectations[kind]} for kind, one in compared.errors.items()}
+    kinds = {kind: {"found": error, "expected": compared.expectations[kind]} for kind, error in compared.errors.items()}
     moved = {} if compared.moved is None else {"transform": compared.moved.transform}
     record.add(**change_entries(compared.changes, compared.hidden), **moved, **entries_by_kind(kinds))
     record.add(rows_can_tell=compared.telling and compared.changes.tested)

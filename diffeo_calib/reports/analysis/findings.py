@@ -197,9 +197,9 @@ def _new_rows(model: CalibratedKinematics, data: Any, rows: FitRows) -> Tensor:
     new = unseen(model, data.q)
     if rows.of_positions and model.registration is None:
         other = torch.ones_like(new)
-        own = divided(data)[0]
-        if own is not None:
-            other[own.rows.to(HOST)] = False
+        positions = divided(data)[0]
+        if positions is not None:
+            other[positions.rows.to(HOST)] = False
         new |= other
     return new
 

@@ -236,9 +236,9 @@ class Predictions:
         """Rows of a fit, each predicted by all others."""
         data, (errors, covariance) = rows.measurements, rows.left_out
         points = rows.points - errors.unflatten(1, (-1, 3))
-        found = _errors(points, data)
+        evaluated = _errors(points, data)
         predicted, covariance = data.bodies.claimed(points, covariance, rows.linearised[0].unflatten(1, (-1, 3)))
-        return cls(data, data.origins, predicted, covariance, found)
+        return cls(data, data.origins, predicted, covariance, evaluated)
 
     def __len__(self) -> int:
         return len(self.measured)
