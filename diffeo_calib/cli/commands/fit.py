@@ -69,8 +69,8 @@ def run(given: FitOptions) -> None:
     _show_findings(result, len(train))
     wrong = list[Outlier]()
     if test is not None:
-        measured, (positions, _) = positions_of(result.model, result.places(), test), divided(test)
-        wrong += [] if positions is None else contradicted_in_sockets(result.model, positions.table)
+        measured = positions_of(result.model, result.places(), test)
+        wrong += contradicted_in_sockets(result.model, test)
         wrong += [] if measured is None else contradicted(result.model, measured)
         say(*outlier_lines(sorted(wrong, key=lambda outlier: -outlier.distance), len(test), "held-out rows"))
     say(*_lines_about_places(result, data, held_out, hand_eye))
@@ -120,8 +120,8 @@ def _lines_about_places(
     for stages in held_out.values():
         yield from printed.socket_lines(stages[CALIBRATED], "held out")
     positions, _ = divided(data)
-    if positions is not None and not placed.free:
-        measured = positions.table.device_rows()
+    if positions is not None:
+        measured = positions.table
         hidden = zip(measured.body_names, (~measured.seen_bodies).sum(0).tolist(), strict=True)
         if counts := [f"{name} in {count}" for name, count in hidden if count]:
             yield f"hidden in some of {len(measured)} rows: {few(counts)} of them"

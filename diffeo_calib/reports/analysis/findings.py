@@ -32,7 +32,7 @@ from diffeo_calib.reports.analysis.predictions import FitRows, Predictions, fore
 from diffeo_calib.reports.analysis.stages import Deviations, Kinematics, Repeats, repeats_of, stages_of
 from diffeo_calib.sensors.coordinates import Places
 from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
-from diffeo_calib.sensors.tables import divided, measured_positions, measured_rows
+from diffeo_calib.sensors.tables import divided, measured_positions
 
 LOG = logging.getLogger(__name__)
 STEPS = 4
@@ -198,9 +198,8 @@ def _new_rows(model: CalibratedKinematics, data: Any, rows: FitRows) -> Tensor:
     if rows.of_positions and model.registration is None:
         other = torch.ones_like(new)
         positions = divided(data)[0]
-        measured = None if positions is None else measured_rows(positions.table)
-        if positions is not None and measured is not None:
-            other[positions.rows[measured.rows].to(HOST)] = False
+        if positions is not None:
+            other[positions.rows.to(HOST)] = False
         new |= other
     return new
 
