@@ -210,7 +210,8 @@ def marker_slopes(deformation: GeodesicDeformation, points: FlangePoints, at: Li
         deformation: k1. points: its nominal map. at: its linearisation at N configurations.
     """
     shifts = points.shifts(at.xi, deformation.momenta.theta)  # (N, 3 P, 3 P)
-    return (at.by_task_points @ shifts.view(len(at.by_task_points), 3, -1)).view(shifts.shape)
+    by_points = at.task[0].effect  # Dpsi (N P, 3, 3)
+    return (by_points @ shifts.view(len(by_points), 3, -1)).view(shifts.shape)
 
 
 def place_slopes(deformation: GeodesicDeformation, at: Linearisation, places: Tensor, centre: Tensor) -> Tensor:

@@ -18,9 +18,9 @@ from torch.nn.functional import pad
 from diffeo_calib.calibration.placing.lens import CameraErrors
 from diffeo_calib.calibration.placing.place import Told, stacked
 from diffeo_calib.calibration.placing.placement import DeviceSet, Placement
-from diffeo_calib.calibration.placing.readings import ReadingDevices, reading_sets
+from diffeo_calib.calibration.placing.readings import ReadingDevices
 from diffeo_calib.calibration.placing.sessions import Sessions
-from diffeo_calib.calibration.placing.sockets import SocketDevices
+from diffeo_calib.calibration.placing.sockets import reading_sets
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.fitted_map import FittedMap
@@ -169,15 +169,13 @@ class NewSetUp:
     def _coordinates(
         self, own: Coordinates, T: Tensor, seen: Tensor, usual: UsualNoise
     ) -> tuple[Told, Tensor, list[DeviceSet]]:
-        """Rows that tell coordinates, in the model's frame; their noise, sockets, and errors of cameras."""
+        """Rows that tell coordinates, in the model's frame; their noise, and errors of cameras."""
         new, rows = own
         table = new.in_frames(torch.linalg.inv(T).expand(len(new), -1, -1))
         noise = noise_of_rows(self.fitted, new, table, T, usual)
-        sets = SocketDevices.around_model(table, rows, seen)
-        table = Placement(sets).at_places(table)
         y, sensor = table.points.flatten(1), NoiseModel.of(table, 0.0).without_known
         y, noise = torch.where(y.isnan(), seen[rows], y), without_hidden(noise, sensor.visible)
-        return Told(rows, y, sensor), noise, [*sets, *CameraErrors.around(table, rows)]
+        return Told(rows, y, sensor), noise, [*CameraErrors.around(table, rows)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,9 +14,8 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.placing.readings import ball_of
 from diffeo_calib.calibration.placing.sessions import Sessions
-from diffeo_calib.calibration.placing.sockets import ball_in_sockets
+from diffeo_calib.calibration.placing.sockets import ball_of
 from diffeo_calib.calibration.recalibration.drift import parts_of
 from diffeo_calib.calibration.recalibration.find_place import (
     MARKER_DEVIATIONS,
@@ -46,7 +45,6 @@ from diffeo_calib.sensors.tables import (
     ball_tip,
     check_markers,
     divided,
-    measured_rows,
     rows_of_one_kind,
     with_markers,
 )
@@ -80,28 +78,24 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
     old = model.map.unregistered.to(HOST)
     nominal = robot_map(old)
     geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])  # without deformation
-    ball, tip = None if own is None else ball_in_sockets(own.table, geometry), nominal.geometry.on[-1]
-    if ball is None:
-        found = ball_of([one.table for one in readings], geometry, ball_tip(own, readings, tip))
-        ball = None if found is None else found.tool[0]
+    tip = ball_tip(readings, nominal.geometry.on[-1])
+    found = ball_of([one.table for one in readings], geometry, tip)
+    ball = None if found is None else found.tool[0]
     new_ball = ball is not None and not knows_ball(model)
     if ball is not None and new_ball:
-        old = with_ball(old, ball, ball_tip(own, readings, tip), PLACES.found_m_rad)
+        old = with_ball(old, ball, tip, PLACES.found_m_rad)
         nominal = robot_map(old)
     set_up = NewSetUp(old, new, own, readings, ball=ball, new_ball=new_ball)
     if own is None:
         return set_up
     table = with_markers(own.table, nominal.geometry.markers, model.lever)
     own = own._replace(table=mounted_of(model).in_any_frame(table))
-    device = measured_rows(own.table)
-    if device is None:
-        return replace(set_up, coordinates=own)
     # the rows judge "same", too
     stated = MARKER_DEVIATIONS[marker][0] if marker in ("moved", "other") else None
-    rows, found, seen = _place_of_device(old, model.lever, device.table, stated, opens=opens)
+    rows, found, seen = _place_of_device(old, model.lever, own.table, stated, opens=opens)
     geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])
     geometry = replace(geometry, base=found.transform @ geometry.base)
-    sessions, own = Sessions.beside(own, device, geometry, seen)
+    sessions, own = Sessions.beside(own, geometry, seen)
     return replace(set_up, coordinates=own, sessions=sessions, registration=found, registered=rows)
 
 
@@ -166,7 +160,7 @@ def _levelled(rows: NewRows) -> NewRows:
         return rows
     drifting = rows.drifting([part.root(rows.at) for part in parts_of(rows.fitted)])  # no noise
     kinds, noise = rows.noise_model.kinds, rows.noise
-    for kind in range(int(rows.fitted.slopes is None), int(kinds.max()) + 1):
+    for kind in range(int(rows.fitted.shows_points), int(kinds.max()) + 1):
         own = (kinds == kind).repeat_interleave(rows.y.shape[1] // kinds.shape[1], 1) & rows.visible
         levels = []
         for factor in NOISE_LEVELS.tolist():

@@ -101,7 +101,8 @@ def _placed(
     learn = learn and (model.registration is None or registration.free == "both")  # what is held must be known
     N, m = len(fit.x), fit.m  # more new rows than leave a dense matrix dense cannot join, nor rows of no coordinates
     dense = fit.data is not None or not N * m <= MAX_DENSE < (N + len(new)) * m
-    if not (learn and dense and new.of_coordinates):
+    shown = new.observe is None and (fit.shows_points or not fit.stands_free)
+    if not (learn and dense and shown):
         placed = moved(fit, registration.transform).inflated(new.inflation)
         return RegisteredMap(placed, registration), registration
     open_, marks = new.deviations.clone(), new.marks
