@@ -34,10 +34,10 @@ def schema(kind: Any, text: str = "", **more: Any) -> dict[str, Any]:
     return {"type": SIMPLE[each[0]] if len(each) == 1 else [SIMPLE[word] for word in each]} | more
 
 
-def entries(own: dict[str, Any], text: str = "", *may_lack: str, **more: Any) -> dict[str, Any]:
+def entries(fields: dict[str, Any], text: str = "", *may_lack: str, **more: Any) -> dict[str, Any]:
     """An object with these entries, by name, and no others."""
-    head = {"type": "object", "required": [name for name in own if name not in may_lack]}
-    body = {"additionalProperties": False, "properties": {name: schema(kind) for name, kind in own.items()}}
+    head = {"type": "object", "required": [name for name in fields if name not in may_lack]}
+    body = {"additionalProperties": False, "properties": {name: schema(kind) for name, kind in fields.items()}}
     return schema(head | body | more, text)
 
 

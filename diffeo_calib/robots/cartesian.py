@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
+from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.se3 import nearest_rotations, rigid_poses, transforms
@@ -29,7 +30,7 @@ BEYOND, LEAST_BEYOND, LEAST_BEYOND_RAD = 0.25, 0.01, 0.35
 one that stood still can be corrected; of turns at least by so much."""
 FLAT, STEEPEST = 0.8, 0.97
 """Sine of the largest b about the mean of the poses, and about any middle."""
-DIRECTIONS, GOLDEN_ANGLE_RAD = 500, pi * (3.0 - 5.0**0.5)
+DIRECTIONS = 2000
 """Of the z-axis of M that are tried."""
 
 
@@ -96,10 +97,8 @@ def _middle(R: Tensor) -> Tensor:
     mean, x = nearest_rotations(R.mean(0)), R[:, :, 0]
     if float((x @ mean[:, 2]).abs().max()) < FLAT:
         return mean
-    k = torch.arange(DIRECTIONS, dtype=R.dtype, device=R.device) + 0.5
-    height, turn = 1.0 - k / DIRECTIONS, GOLDEN_ANGLE_RAD * k  # half a sphere
-    radius = (1.0 - height.square()).sqrt()
-    ways = torch.stack([radius * turn.cos(), radius * turn.sin(), height], 1)
+    draws = torch.randn(DIRECTIONS, 3, generator=seeded(0), dtype=torch.float64, device=HOST)
+    ways = torch.nn.functional.normalize(draws, dim=1).to(R)
     z = ways[(x @ ways.mT).abs().amax(0).argmin()]
     side = torch.linalg.cross(z, mean[:, (mean.mT @ z).abs().argmin()], dim=0)
     side = side / side.norm()

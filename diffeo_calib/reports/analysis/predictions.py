@@ -113,9 +113,9 @@ class FitRows:
     def blocks(self) -> list[tuple[Tensor, Process]]:
         """Row numbers (B,) of each block, and the model conditioned on them: on all rows the map is that at hand."""
         n, m, _ = self.map.noise.covariance.shape
-        known = self.map.by_data if self.map.data is None and n * m <= WHOLE_COORDINATES else None
-        if isinstance(known, Process):
-            return [(torch.arange(n, device=HOST), known)]
+        by_data = self.map.by_data if self.map.data is None and n * m <= WHOLE_COORDINATES else None
+        if isinstance(by_data, Process):
+            return [(torch.arange(n, device=HOST), by_data)]
         order = torch.randperm(n, generator=seeded(0), device=HOST)
         parts = [part.sort().values for part in order.tensor_split(ceil(n * m / BLOCK_COORDINATES))]
         return [(rows, Process.of_rows(self.linearised[1].rows(rows), self.map.noise.rows(rows))) for rows in parts]
