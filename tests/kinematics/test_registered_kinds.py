@@ -112,7 +112,6 @@ def test_a_registered_robot_carries_its_payload() -> None:
     assert kind.model.with_payload(3.0).registered(kind.moved).payload == 3.0
 
 
-@pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 # --- markers of new rows in another order than in the fit -----------------------------------------------------------
 
 
