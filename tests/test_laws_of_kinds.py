@@ -188,13 +188,13 @@ def test_a_recalibration_with_rows_of_one_set_up_knows_where_all_of_them_are(nam
 
 def lone_rows(rows: Any) -> Any:
     """The first row of every socket, and all rows of other kinds."""
-    names = rows.row_sockets
+    names = rows.device_names
     return rows.rows([number for number, name in enumerate(names) if name not in names[:number] or not name])
 
 
 def test_a_row_alone_in_its_socket_shows_no_error() -> None:
     kind = kind_named("ball in sockets")
-    names = kind.new.row_sockets
+    names = kind.new.device_names
     rows = kind.new.rows([number for number, name in enumerate(names) if name == names[0]] + [names.index("4/1")])
     found: Any = dc.evaluate(kind.model, rows)
     assert found.count == len(rows) - 1

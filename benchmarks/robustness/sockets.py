@@ -58,10 +58,7 @@ Points = Callable[[Tensor], Tensor]
 
 def authors(start: Geometry, data: dc.Measurements) -> Geometry:
     """Minimise, over twists of joints and the ball, the sum over places of variance, distortion and regularisation."""
-    data = data.with_sockets_of_rows()
-    assert data.socket is not None
-    assert data.sockets is not None
-    socket, places, free = data.socket, data.sockets.place, slice(6, start.size)
+    socket, places, free = data.device, data.sockets.place, slice(6, start.size)
     own = torch.nn.functional.one_hot(socket).double()
     mean = own / own.sum(0)  # (N, S)
     per_row = torch.bincount(places[socket]).double()[places[socket]].rsqrt()
@@ -77,13 +74,13 @@ def authors(start: Geometry, data: dc.Measurements) -> Geometry:
     def residual(u: np.ndarray) -> np.ndarray:
         points, _, middle, _ = parts(u)
         away = per_row[:, None] * (points - middle[socket])
-        far = [float((middle[a] - middle[b]).norm()) - d for a, b, d in data.sockets.distances]  # pyright: ignore
+        far = [float((middle[a] - middle[b]).norm()) - d for a, b, d in data.sockets.distances]
         return np.concatenate([away.flatten().numpy(), np.array(far), (regular * torch.from_numpy(u)).numpy()])
 
     def jacobian(u: np.ndarray) -> np.ndarray:
         _, slopes, middle, moved = parts(u)
         rows = [(per_row[:, None, None] * (slopes - moved[socket])).flatten(0, 1)]
-        for a, b, _ in data.sockets.distances:  # pyright: ignore
+        for a, b, _ in data.sockets.distances:
             along = middle[a] - middle[b]
             rows.append((along / along.norm() @ (moved[a] - moved[b]))[None])
         return torch.cat([*rows, regular.diag()]).numpy()
@@ -114,9 +111,7 @@ def read(name: str, folder: Path) -> tuple[dc.Tree, dc.Measurements]:
 def real(name: str, folder: Path) -> Iterator[Record]:
     """Every place of a robot left out."""
     robot, data = read(name, folder)
-    assert data.socket is not None
-    assert data.sockets is not None
-    place, totals = data.sockets.place[data.socket], dict[str, list[tuple[int, float, float]]]()
+    place, totals = data.places, dict[str, list[tuple[int, float, float]]]()
     for number, left_out in enumerate(data.sockets.place_names):
         result, methods = calibrated(robot, data.rows(place != number))
         test = data.rows(place == number)

@@ -29,7 +29,7 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import worth_it
 from diffeo_calib.calibration.diagnostics.judge import Finding, judge, lengths, warn_of_lengths, warn_of_taken_scales
 from diffeo_calib.calibration.diagnostics.judged_rows import warn_of_contradictions
-from diffeo_calib.calibration.diagnostics.open_directions import warn_of_what_is_open
+from diffeo_calib.calibration.diagnostics.open_directions import warn_of_single_joints, warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.outliers import (
     outliers,
     warn_of_outliers,
@@ -167,6 +167,7 @@ def calibrate(
     with kept_warnings() as warned:
         placed = place(robot, measurements, progress)
         check_limits(robot, measurements)
+        warn_of_single_joints(robot, measurements)
         data = placed.tangent_data()
         warn_of_no_errors(robot, data, placed.registration, placed.identification)
         warn_of_stuck(data, measurements)
@@ -222,8 +223,7 @@ def _result(
 ) -> CalibrationResult:
     """Findings about model and rows, and everything together."""
     data, scales, fitted_map = chosen.data, chosen.selection.scales, fitted.model
-    if placed.coordinates is not None:
-        fitted_map = with_open_directions(fitted_map, placed.coordinates.table, placed.registration)
+    fitted_map = with_open_directions(fitted_map, placed.data.q, placed.registration, rigid=placed.lever is not None)
     fitted_map = fitted_map.without_rigid_motions() if placed.free else fitted_map
     placed = placed.settled(fitted, fitted_map, chosen)
     model = CalibratedKinematics(robot, fitted_map, lever=placed.lever, ball=placed.ball)

@@ -34,7 +34,6 @@ from diffeo_calib.common.errors import InputError, printable
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import diagonal_blocks, roots
 from diffeo_calib.robots.placement import PLACES, rigid_fit
 from diffeo_calib.sensors.errors import ERRORS, Evaluation
@@ -267,16 +266,16 @@ BASE_PER_DEVIATION = 3.0
 """The base moves along with an undetermined marker and must not hold it."""
 
 
-def with_open_directions(fitted: FittedMap, measurements: Measurements, registration: Identification) -> FittedMap:
+def with_open_directions(fitted: FittedMap, q: Tensor, registration: Identification, *, rigid: bool) -> FittedMap:
     """A map whose covariances hold in directions that the rows leave open; the map itself if there are none.
 
     No prior variance of theta is smaller than before.
 
     Args:
-        fitted: the fitted model of a robot. measurements: what it was fitted to.
-        registration: base and markers by themselves, with deviations.
+        fitted: the fitted model of a robot. q: (N, n) joint values of its rows.
+        registration: base and markers by themselves, with deviations. rigid: whether markers are points of poses.
     """
-    nominal, before, q = fitted.geodesic.spec.nominal, fitted.geodesic.spec.prior_variance, measurements.q
+    nominal, before = fitted.geodesic.spec.nominal, fitted.geodesic.spec.prior_variance
     if not isinstance(nominal, GeometryMap):
         return fitted
     parts, chain, prior = nominal.geometry.slices, nominal.geometry.chain, Prior()
@@ -286,7 +285,7 @@ def with_open_directions(fitted: FittedMap, measurements: Measurements, registra
     least[parts["tool"]] = deviations[parts["tool"]]
     still = (q.amax(0) - q.amin(0)) < STILL_RANGE
     unseen = ~((chain.coupling.to(before) != 0) & ~still).any(1)  # (n_all,)
-    if undetermined_places(chain, measurements, registration):
+    if undetermined_places(chain, q, registration, rigid=rigid):
         unseen = torch.ones_like(unseen)
     twist = before.new_tensor([prior.translation] * 3 + [prior.rotation] * 3)
     least[parts["joints"]] = (unseen[:, None] * twist).flatten()

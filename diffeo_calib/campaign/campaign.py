@@ -120,14 +120,14 @@ class Campaign:
         return len(self.verdicts)
 
     def __repr__(self) -> str:
-        known = self.expected_error
-        words = "" if known is None else f", {1e3 * known:.3g} mm expected"
+        error = self.expected_error
+        words = "" if error is None else f", {1e3 * error:.3g} mm expected"
         return f"Campaign({len(self.accepted)} of {len(self)} rows accepted{words})"
 
     @property
     def accepted(self) -> list[int]:
         """Numbers of the accepted rows."""
-        return [one.row for one in self.verdicts if one.accepted]
+        return [verdict.row for verdict in self.verdicts if verdict.accepted]
 
     @property
     def expected_error(self) -> float | None:
@@ -182,7 +182,7 @@ class Campaign:
         if len(self) or len(table) != len(verdicts):
             raise InputError.of("`verdicts`", expected=f"{len(table)}, of a new campaign", got=str(len(verdicts)))
         self.table, self._lines = self._numbered(table)
-        self.verdicts = [replace(one, line=line) for one, line in zip(verdicts, self._lines, strict=True)]
+        self.verdicts = [replace(verdict, line=line) for verdict, line in zip(verdicts, self._lines, strict=True)]
         self._renew()
 
     def accept(self, row: int) -> None:
@@ -219,16 +219,16 @@ class Campaign:
         """
         if goal is None and self.goal is not None and self._model is not None:
             goal = self.goal * self._model.expected_error / (self.error_limit or self._model.expected_error)
-        again = [one.row for one in self.verdicts if one.again][:count]
-        found = Next(self.candidates[:0], [], [], None)
+        again = [verdict.row for verdict in self.verdicts if verdict.again][:count]
+        proposal = Next(self.candidates[:0], [], [], None)
         if self._model is not None:
             rows, expected = self._model.next(count if goal is None else max(count, MOST_STEPS))
             needed = None if goal is None else _needed(expected, goal, self._model.count)
-            found = Next(self._model.around.candidates[rows[:count]], rows[:count], expected, needed)
+            proposal = Next(self._model.around.candidates[rows[:count]], rows[:count], expected, needed)
         if not again:
-            return None if self._model is None else found
-        q = torch.cat([self.table.q[again], found.q])[:count]
-        return replace(found, q=q, rows=found.rows[: count - len(again)], again=again)
+            return None if self._model is None else proposal
+        q = torch.cat([self.table.q[again], proposal.q])[:count]
+        return replace(proposal, q=q, rows=proposal.rows[: count - len(again)], again=again)
 
     def wait(self) -> None:
         """Wait for a model that is made in the background."""
@@ -249,10 +249,10 @@ class Campaign:
         self._renew()
         why = {"cause": self._obstacle} if self._model is None else {}
         self.verdicts[-1] = replace(self.verdicts[-1], expected_error=self.expected_error, **why)
-        for one in [one for one in self.verdicts if one.again]:
-            after = self.table.q[max(row, one.row + 1) :]
-            if bool(((after - self.table.q[one.row]).abs().amax(1) < SAME_POSE).any()):
-                self.verdicts[one.row] = replace(one, again=False)
+        for verdict in [verdict for verdict in self.verdicts if verdict.again]:
+            after = self.table.q[max(row, verdict.row + 1) :]
+            if bool(((after - self.table.q[verdict.row]).abs().amax(1) < SAME_POSE).any()):
+                self.verdicts[verdict.row] = replace(verdict, again=False)
 
     def _numbered(self, table: Any) -> tuple[Any, list[int]]:
         """New rows, numbered in the campaign, and their lines, which go on after those before."""
@@ -269,8 +269,8 @@ class Campaign:
         if before.accepted != accepted:
             self.wait()
             if self._model is not None:
-                names, known = self.table.device_names, self._model.around.placed.data.device_names
-                some = sum(names[row] in known for row in self.accepted) > 1  # which a model holds at least
+                names, placed = self.table.device_names, self._model.around.placed.data.device_names
+                some = sum(names[row] in placed for row in self.accepted) > 1  # which a model holds at least
                 self._model = self._model.rebuilt(self.table, self.verdicts) if some else None
 
     def _renew(self) -> None:
@@ -306,7 +306,7 @@ class Campaign:
     @small_work()
     def _make(self, table: Any, verdicts: Sequence[Verdict]) -> None:
         """A new model from accepted rows; without one if they do not allow it yet."""
-        numbers, old = [one.row for one in verdicts if one.accepted], self._model
+        numbers, old = [verdict.row for verdict in verdicts if verdict.accepted], self._model
         first = len(numbers) < FIRST_SCALES
         same = None if old is None or len(numbers) >= self._next_scales(old) else old
         asked = self.candidates, self.target[:: -(-len(self.target) // TARGETS)]
@@ -343,14 +343,14 @@ class Campaign:
 
     def _caught_up(self, made: CampaignModel) -> CampaignModel:
         """A new model with the rows that came since its last one: those that no model has judged are judged by it."""
-        late = next((one.row for one in self.verdicts[made.seen :] if one.fits is None), None)
+        late = next((verdict.row for verdict in self.verdicts[made.seen :] if verdict.fits is None), None)
         if late is not None:
             made = made.rebuilt(self.table.rows(slice(0, late)), self.verdicts[:late])
             before, self.verdicts = self.verdicts, self.verdicts[:late]
             for old in before[late:]:
                 self._judge(made, self.table.rows(slice(0, old.row + 1)))
-                own = {"accepted": old.accepted, "decided": True, "again": old.again} if old.decided else {}
-                self.verdicts[old.row] = replace(self.verdicts[old.row], expected_error=old.expected_error, **own)
+                kept = {"accepted": old.accepted, "decided": True, "again": old.again} if old.decided else {}
+                self.verdicts[old.row] = replace(self.verdicts[old.row], expected_error=old.expected_error, **kept)
         return made if made.seen == len(self) else made.rebuilt(self.table, self.verdicts)
 
     def _judge(self, model: CampaignModel, table: Any) -> None:
@@ -370,9 +370,9 @@ def _joints(robot: Tree, values: object) -> Tensor:
 
 def _needed(expected: list[float], goal: float, count: int) -> int | None:
     """Rows until the expected error is below a goal, extrapolated by the last half of the steps."""
-    found = next((step for step, value in enumerate(expected) if value <= goal), None)
-    if found is not None or len(expected) < 3 or expected[-1] <= 0:
-        return found
+    first = next((step for step, value in enumerate(expected) if value <= goal), None)
+    if first is not None or len(expected) < 3 or expected[-1] <= 0:
+        return first
     half, last = len(expected) // 2, len(expected) - 1
     power = log(expected[half] / expected[last]) / log((count + last) / (count + half))
     if power <= 0:

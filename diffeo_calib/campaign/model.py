@@ -95,10 +95,10 @@ class Around:
             check_joints(robot, rows)
             placed = place(robot, rows, silent)
             data, stages = placed.tangent_data(), (placed.registration, placed.identification)
-            known = None if same is None else same.scales
-            if known is None and first:
-                known = defaults(data, noise_of_few(data, len(rows), *stages), placed.identification.prior)
-            scales = None if known is None else replace(known, lines=())
+            initial = None if same is None else same.scales
+            if initial is None and first:
+                initial = defaults(data, noise_of_few(data, len(rows), *stages), placed.identification.prior)
+            scales = None if initial is None else replace(initial, lines=())
             chosen = choose_scales(data, rows, *stages, given=scales, seed=seed)
         ratio = variance_ratio(chosen.data, chosen.left_out) if first else 0.0
         if ratio > VARIANCE_RATIO:  # around wrong places all later rows would be wrong
@@ -113,13 +113,13 @@ class Around:
 
         MeasurementError for devices that have no place.
         """
-        known = self.placed.data
-        unknown = set(others.device_names) - set(known.device_names)
+        old = self.placed.data
+        unknown = set(others.device_names) - set(old.device_names)
         if unknown:
             fix = "they are judged once a model holds some of them"
-            expected, got = few(sorted(set(known.device_names))), few(sorted(unknown))
+            expected, got = few(sorted(set(old.device_names))), few(sorted(unknown))
             raise MeasurementError.of("the set-ups and devices of rows", expected=expected, got=got, fix=fix)
-        anchors = known.rows([int(part.rows[0]) for part in rows_of_one_kind(known)])
+        anchors = old.rows([int(part.rows[0]) for part in rows_of_one_kind(old)])
         whole = joined_tables([anchors, others])
         placed, data = self.placed.beside(whole, self.data)
         index = torch.arange(len(anchors), len(whole), device=HOST)
@@ -135,11 +135,11 @@ class Around:
         place_of = {row: number for number, row in enumerate(self.placed.data.line_numbers.tolist())}
         mine = [place_of[row] for row in accepted if row in place_of]
         later = [row for row in accepted if row not in place_of]
-        found: Any = self.data.prior(self.scales)
+        process: Any = self.data.prior(self.scales)
         if mine:
-            own = self.data.rows(torch.tensor(mine, dtype=torch.int64, device=HOST))
-            found = own.sample(len(mine), MOST_COORDINATES, 0)[1].process(self.scales)
-        return found.given(*self.told(self.rows(table.rows(later))[0])) if later else found
+            rows = self.data.rows(torch.tensor(mine, dtype=torch.int64, device=HOST))
+            process = rows.sample(len(mine), MOST_COORDINATES, 0)[1].process(self.scales)
+        return process.given(*self.told(self.rows(table.rows(later))[0])) if later else process
 
     @cached_property
     def like(self) -> int:
@@ -150,7 +150,7 @@ class Around:
     def _sees(self, row: int, q: Tensor) -> Tensor:
         """(M,) boolean: configurations in which a row can be measured."""
         every = torch.ones(len(q), dtype=torch.bool, device=q.device)
-        return torch.stack([every, *(own.there for own in self.placed.elsewhere(row, q))]).all(0)
+        return torch.stack([every, *(moved.there for moved in self.placed.elsewhere(row, q))]).all(0)
 
     @cached_property
     def open(self) -> Tensor:
@@ -160,7 +160,7 @@ class Around:
     def with_open_candidates(self, count: int, seed: int) -> Around:
         """Draw ``count`` candidates that can be measured where some of the present ones cannot."""
         elsewhere = self.placed.elsewhere(self.like, self.candidates)
-        geometry, places = self.placed.identification.geometry, [own.places for own in elsewhere]
+        geometry, places = self.placed.identification.geometry, [moved.places for moved in elsewhere]
         chain, base = geometry.chain, geometry.base
         how: Any = {"ranges": ranges_around(chain, self.placed.data.q), "keep": partial(self._sees, self.like)}
         if any(map(len, places)):
@@ -175,8 +175,8 @@ class Around:
         """What the candidates would tell, and its noise (M, r, r), m^2."""
         copies = self.placed.data.rows([self.like] * len(self.candidates))
         copies: Any = with_attributes(copies.parts[0], q=self.candidates)
-        for own in self.placed.elsewhere(self.like, self.candidates):
-            copies = own.changed(copies)
+        for moved in self.placed.elsewhere(self.like, self.candidates):
+            copies = moved.changed(copies)
         numbers, noise = self.told(self.rows(copies)[0])
         return numbers.at, noise
 
@@ -245,10 +245,10 @@ class CampaignModel:
     def __init__(self, around: Around, table: Any, verdicts: Sequence[Verdict], ratios: Sequence[float]) -> None:
         self.around, self.seen, self.ratios = around, len(table), list(ratios)
         placed, names = set(around.placed.data.device_names), table.device_names
-        judged = [one for one in verdicts if names[one.row] in placed]
-        accepted = [one.row for one in judged if one.accepted]
+        judged = [verdict for verdict in verdicts if names[verdict.row] in placed]
+        accepted = [verdict.row for verdict in judged if verdict.accepted]
         first = accepted[(len(accepted) + 1) // 2]  # the others hold what is known
-        self.window = [one.row for one in judged[-gates.WINDOW :] if one.row >= first]
+        self.window = [verdict.row for verdict in judged[-gates.WINDOW :] if verdict.row >= first]
         self.process = around.process(table, [row for row in accepted if row not in self.window])
         self.numbers, self.noise = around.told(around.rows(table.rows(self.window))[0])
         ats = self.numbers.at, around.errors[0], around.options[0]
@@ -297,11 +297,11 @@ class CampaignModel:
         """Candidates that lower the variance over the target most, and the expected error before and after each, m."""
         (at, noise), (_, compared), open_ = self.around.options, self.around.errors, self.around.open
         self._options = self.process.features(at, self._options)
-        options, target = (self.now.features(one.at, one) for one in (self._options, self._target))
+        options, target = (self.now.features(part.at, part) for part in (self._options, self._target))
         K, (M, r), place = options.between(), noise.shape[:2], torch.arange(len(noise), device=HOST)
-        cross, own = compared @ target.between(options), diagonal_blocks(K, M) + noise
+        cross, blocks = compared @ target.between(options), diagonal_blocks(K, M) + noise
         how: Any = {"place": place, "open_": open_, "count": min(count, int(open_.sum()))}
-        order, by = greedy(cross, own, lambda row: K.view(M, r, -1)[row], **how)
+        order, by = greedy(cross, blocks, lambda row: K.view(M, r, -1)[row], **how)
         variance = self.covariance.diagonal().mean()[None]
         lowered = torch.cat([variance, -by.square().sum((1, 2)) / len(cross)]).cumsum(0)
         return order, (3 * lowered).clamp(min=0).sqrt().tolist()
@@ -323,30 +323,30 @@ class CampaignModel:
         data, changes = self.around.rows(table.rows(window))
         numbers, noise = self.around.told(data)
         new = self.process.features(numbers.rows(_numbers(before, len(window))).at)
-        near, far = (one.by_fields_with(new) for one in (self._at, self._target))
+        near, far = (part.by_fields_with(new) for part in (self._at, self._target))
         at, cross = self._at.followed_by(new, near), torch.cat([self._cross, far.T])
         accepted = [verdicts[row].accepted for row in self.window] + [True] * (len(window) - before)
         root, given = Seen.of(self.process, numbers, noise, at).in_order(_flags(accepted))
         expected = self._expected_errors(numbers, root, cross + at.unknown.T @ self._target.unknown)
         for number in range(before, len(window)):
             row, single, typical = window[number], given(number, number + 1), self.typical
-            own = data.rows(_numbers(number, number + 1))
-            found = single.measure(_freedom(own))
-            fits = found.fits(typical)
+            readings = data.rows(_numbers(number, number + 1))
+            measure = single.measure(_freedom(readings))
+            fits = measure.fits(typical)
             if number > before and not fits:
                 break
-            cause = "" if fits else self._cause(table.rows(slice(0, row + 1)), own, single)
-            verdict = Verdict(row, fits, fits, found.error, found.expected, cause, line=lines[row])
+            cause = "" if fits else self._cause(table.rows(slice(0, row + 1)), readings, single)
+            verdict = Verdict(row, fits, fits, measure.error, measure.expected, cause, line=lines[row])
             last = slice(max(0, number - gates.WINDOW), number + 1)
             some, change = [*(verdicts[row] for row in window[last][:-1]), verdict], None
             if not cause:
-                flags = _flags([one.accepted for one in some]), _flags([not one.cause for one in some])
+                flags = _flags([judged.accepted for judged in some]), _flags([not judged.cause for judged in some])
                 how: Any = {"typical": typical, "coordinates": data.y.shape[1]}
                 change = find_change(given(last.start, last.stop), window[last], changes(last), flags, **how)
             if number > before and change is not None:
                 break
             if fits:
-                self.ratios.append(found.square / chi2_above(1.0 - gates.TYPICAL_SHARE, found.freedom))
+                self.ratios.append(measure.square / chi2_above(1.0 - gates.TYPICAL_SHARE, measure.freedom))
             shown = self.around.placed.shown(table.rows([row]).parts[0])
             verdicts.append(replace(verdict, shown=shown, expected_error=expected[number]))
             if change is not None:
@@ -380,7 +380,7 @@ class CampaignModel:
             oldest, before = self.numbers.rows(rows), self.process.size
             self.process = self.process.given(oldest, self.noise[rows], self._at.rows(rows))
             blocks = (self._at, self._at.by_fields[at]), (self._target, self._cross[at])
-            self._at, self._target = (self.process.features(one.at, one, oldest.there(own)) for one, own in blocks)
+            self._at, self._target = (self.process.features(part.at, part, oldest.there(own)) for part, own in blocks)
             self._cross = self._cross - self._at.known[before:].T @ self._target.known[before:]
         self.window, self.numbers, self.noise = self.window[count:], self.numbers.rows(kept), self.noise[kept]
         self._at, self._cross = self._at.rows(kept), self._cross[count * size : (count + len(kept)) * size]
@@ -393,30 +393,30 @@ class CampaignModel:
         target = self.now.features(self._target.at, self._target, self.numbers.there(self._cross))
         self.covariance = self.around.covariance(target)
 
-    def _cause(self, table: Any, own: TangentData, seen: Seen) -> str:
+    def _cause(self, table: Any, data: TangentData, view: Seen) -> str:
         """Why the last row is wrong, in words; empty if nothing that is undone makes it fit."""
-        bodies, freedom = own.noise_model.bodies, _freedom(own)
+        bodies, freedom = data.noise_model.bodies, _freedom(data)
 
         def fits(other: Seen, freedom: int) -> bool:
             return other.measure(freedom).fits(self.typical, gates.UNDONE_CHANCE)
 
-        for words, other in self._undone(table, own, seen):
+        for words, other in self._undone(table, data, view):
             if fits(other, freedom):
                 return words
-        body = seen.numbers.cells * bodies // seen.numbers.shape[1]
-        good = [b for b in range(bodies) if fits(seen.some(body != b), freedom * (bodies - 1) // bodies)]
+        body = view.numbers.cells * bodies // view.numbers.shape[1]
+        good = [b for b in range(bodies) if fits(view.some(body != b), freedom * (bodies - 1) // bodies)]
         return f"marker {good[0]} seems to be wrong" if len(good) == 1 < bodies else ""
 
-    def _undone(self, table: Any, own: TangentData, seen: Seen) -> Iterator[tuple[str, Seen]]:
+    def _undone(self, table: Any, data: TangentData, view: Seen) -> Iterator[tuple[str, Seen]]:
         """The last row with a mistake undone, in words: in its values, and in its joint values."""
-        values = [(f"its values seem to be {words}", factor * own.y) for factor, words in UNITS]
-        each = own.y.unflatten(1, (own.noise_model.bodies, -1))
+        values = [(f"its values seem to be {words}", factor * data.y) for factor, words in UNITS]
+        each = data.y.unflatten(1, (data.noise_model.bodies, -1))
         for a, b in combinations(range(each.shape[1]), 2):
             order = [{a: b, b: a}.get(k, k) for k in range(each.shape[1])]
             values.append((f"markers {a} and {b} seem to be exchanged", each[:, order].flatten(1)))
         for words, other in values:
-            away = seen.numbers.of_table(own.in_numbers((other - own.y)[..., None]))[:, 0]
-            yield words, seen._replace(error=seen.error + away)
+            away = view.numbers.of_table(data.in_numbers((other - data.y)[..., None]))[:, 0]
+            yield words, view._replace(error=view.error + away)
         q, chain = table.q[-1], self.around.placed.registration.geometry.chain
         turning = torch.tensor(chain.periodic, dtype=torch.bool, device=HOST)
         joints = {
@@ -441,15 +441,15 @@ def _numbers(first: int, last: int) -> Tensor:
 
 def _change(verdicts: list[Verdict], window: Sequence[int], change: Change, lines: Sequence[int]) -> None:
     """Take rows out that came after a change, and those before it in again that an earlier one had taken out."""
-    known = verdicts[window[0]].change
-    if known is not None and change.row == window[0]:  # it is older than these rows
-        change = replace(change, row=known.row)
+    earlier = verdicts[window[0]].change
+    if earlier is not None and change.row == window[0]:  # it is older than these rows
+        change = replace(change, row=earlier.row)
     change = replace(change, line=lines[change.row])
     for number in window:
-        one, before = verdicts[number], number < change.row
-        if one.change is not None or not (before or one.cause or one.decided):
-            accepted = before and bool(one.fits)
-            verdicts[number] = replace(one, accepted=accepted, change=None if before else change)
+        verdict, before = verdicts[number], number < change.row
+        if verdict.change is not None or not (before or verdict.cause or verdict.decided):
+            accepted = before and bool(verdict.fits)
+            verdicts[number] = replace(verdict, accepted=accepted, change=None if before else change)
 
 
 def _freedom(data: TangentData) -> int:

@@ -147,8 +147,8 @@ class Seen(NamedTuple):
         some, owner, scores = self.some(used), self.numbers.owner[used], []
         precision = torch.linalg.inv(some.covariance)
         for row in owner.unique():
-            own, solved = owner == row, precision[owner == row] @ some.error
-            gain = float(solved @ torch.linalg.solve(precision[own][:, own], solved))
+            mask, solved = owner == row, precision[owner == row] @ some.error
+            gain = float(solved @ torch.linalg.solve(precision[mask][:, mask], solved))
             scores.append(gain / typical - len(solved) * log(count))
         return max(scores)
 
@@ -166,16 +166,16 @@ class Seen(NamedTuple):
 
         def rows(first: int, last: int) -> Seen:
             start, end = (int((owner < row).sum()) for row in (first, last))
-            own, before = slice(start, end), root[start:end, :start]
+            part, before = slice(start, end), root[start:end, :start]
             numbers = self.numbers.rows(torch.arange(first, last, device=owner.device))
-            error = self.error[own] - before @ white[:start]
-            return Seen(numbers, error, self.covariance[own, own] - before @ before.T)
+            error = self.error[part] - before @ white[:start]
+            return Seen(numbers, error, self.covariance[part, part] - before @ before.T)
 
         return root, rows
 
 
 def find_change(
-    seen: Seen,
+    view: Seen,
     numbers: list[int],
     hypotheses: Sequence[Hypothesis],
     flags: tuple[Tensor, Tensor],
@@ -186,45 +186,45 @@ def find_change(
     """Change found among rows in order, the last one included; None if chance explains everything.
 
     Args:
-        seen: N rows as earlier ones predict them. numbers: theirs. hypotheses: effects (N, R, U) on what they tell, m.
+        view: N rows as earlier ones predict them. numbers: theirs. hypotheses: effects (N, R, U) on what they tell, m.
         flags: (N,) boolean: the rows that were accepted, and those that a change may explain.
         typical: see :meth:`Measure.fits`. coordinates: of the points of a row.
     """
     if not hypotheses:
         return None
-    known, doubted = (flag[seen.numbers.owner] for flag in flags)
-    later = seen.numbers.owner >= torch.arange(len(numbers) - gates.ROWS_AFTER_CHANGE + 1, device=HOST)[:, None]
+    accepted, doubted = (flag[view.numbers.owner] for flag in flags)
+    later = view.numbers.owner >= torch.arange(len(numbers) - gates.ROWS_AFTER_CHANGE + 1, device=HOST)[:, None]
     after = later & doubted  # (F, M) numbers, for each first row of a change
-    used = after | (~later & known)
-    effects = [seen.numbers.of_table(one.effects) for one in hypotheses]
-    right = torch.cat([(seen.error * used)[:, :, None], torch.cat(effects, 1) * after[:, :, None]], 2)
+    used = after | (~later & accepted)
+    effects = [view.numbers.of_table(hypothesis.effects) for hypothesis in hypotheses]
+    right = torch.cat([(view.error * used)[:, :, None], torch.cat(effects, 1) * after[:, :, None]], 2)
     masks, which = used.unique(dim=0, return_inverse=True)
     for number, mask in enumerate(masks):
-        own = which == number
-        root = torch.linalg.cholesky(torch.where(mask[:, None] & mask, seen.covariance, torch.diag(~mask)))
-        columns = torch.linalg.solve_triangular(root, right[own].transpose(0, 1).flatten(1), upper=False)
-        right[own] = columns.unflatten(1, (-1, right.shape[2])).transpose(0, 1)
+        part = which == number
+        root = torch.linalg.cholesky(torch.where(mask[:, None] & mask, view.covariance, torch.diag(~mask)))
+        columns = torch.linalg.solve_triangular(root, right[part].transpose(0, 1).flatten(1), upper=False)
+        right[part] = columns.unflatten(1, (-1, right.shape[2])).transpose(0, 1)
     right *= after[:, :, None]  # given the rows before, which come first
     white, W = right[:, :, 0], right[:, :, 1:]
     counts, total = after.sum(1).tolist(), (white.square().sum(1) / typical).tolist()
-    g, H, found, start = (W.mT @ white[:, :, None])[..., 0], W.mT @ W, [], 0
-    for one, E in zip(hypotheses, effects, strict=True):
-        size, own = E.shape[1], slice(start, start + E.shape[1])
+    g, H, candidates, start = (W.mT @ white[:, :, None])[..., 0], W.mT @ W, [], 0
+    for hypothesis, E in zip(hypotheses, effects, strict=True):
+        size, part = E.shape[1], slice(start, start + E.shape[1])
         start += size
-        u = Evidence(g[:, own], H[:, own, own]).size
-        for first, gain in enumerate(((g[:, own] * u).sum(1) / typical).tolist()):
+        u = Evidence(g[:, part], H[:, part, part]).size
+        for first, gain in enumerate(((g[:, part] * u).sum(1) / typical).tolist()):
             rows, spare = counts[first], counts[first] - size
             if spare >= gates.SPARE_NUMBERS and total[first] - gain <= chi2_above(gates.LEFT_CHANCE, spare):
                 moved = E[after[first]] @ u[first]
-                found.append((gain - size * log(rows), gain, first, one, moved, u[first], rows))
-    best = max(found, key=lambda one: one[0], default=None)
+                candidates.append((gain - size * log(rows), gain, first, hypothesis, moved, u[first], rows))
+    best = max(candidates, key=lambda choice: choice[0], default=None)
     if best is None or chi2_probability(best[1], len(best[5])) > gates.JUMP_CHANCE:
         return None
     score, _, first, what, moved, u, count = best
-    if score < seen.one_wrong(used[first], typical, count) + gates.CHANGES_TOLD_APART:
+    if score < view.one_wrong(used[first], typical, count) + gates.CHANGES_TOLD_APART:
         return None
-    others = {one[3].name for one in found if one[0] > score - gates.CHANGES_TOLD_APART} - {what.name}
+    others = {choice[3].name for choice in candidates if choice[0] > score - gates.CHANGES_TOLD_APART} - {what.name}
     unit, size = what.unit or ("mm", 1e-3)
-    points = 3.0 * seen.numbers.shape[1] / coordinates  # numbers of a point
+    points = 3.0 * view.numbers.shape[1] / coordinates  # numbers of a point
     change = float(u.abs().max()) if what.unit else float((points * moved.square().mean()).sqrt())
     return Change(numbers[first], what.name, change / size, unit, tuple(sorted(others)), what.fix)

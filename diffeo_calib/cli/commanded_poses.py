@@ -16,7 +16,7 @@ from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.identification.registration import spread
 from diffeo_calib.cli.column_names import WORDS, Group, column, whole
 from diffeo_calib.cli.guesses import Body, RowColumns, Sheet, bodies_in, matrices_in, rows_in
-from diffeo_calib.cli.options import Units
+from diffeo_calib.cli.options import Rows, Units
 from diffeo_calib.cli.proposals import LARGEST_RESIDUAL, Source, percent, ranked, reason, source_of
 from diffeo_calib.cli.tables import table_format
 from diffeo_calib.common.device import HOST
@@ -174,7 +174,7 @@ def _ways(sheet: Sheet, machine: Body, rows: RowColumns, *, lengths: tuple[str, 
         metres = [values / UNITS_PER_METRE[unit] for values, unit in ((commanded_at, length), (seen_at, other))]
         ways = _alike((metres[0], own), (metres[1], seen))
     else:
-        ways = list(product(own or [Reading()], seen or [Reading()], (False, True)[: 1 + rows.of_boards]))
+        ways = list(product(own or [Reading()], seen or [Reading()], (False, True)[: 1 + Rows(**rows.options).images]))
     units = {"length": other, "joint_length": None if length == other else length}
     for commanded, measured, camera in ways[:FEW_WAYS] if any(lengths) else ways:
         pose = PoseColumns((*machine.place, *machine.turn), commanded.convention).text

@@ -79,8 +79,8 @@ def progress_bar(clock: Callable[[], float] = monotonic) -> Iterator[Progress]:
     """
     times = TimeElapsedColumn(), TimeRemainingColumn()
     columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=30), *times
-    seen = err.is_terminal or err.is_jupyter
-    with Bar(*columns, console=err, transient=True, get_time=clock, disable=not seen) as bar:
+    visible = err.is_terminal or err.is_jupyter
+    with Bar(*columns, console=err, transient=True, get_time=clock, disable=not visible) as bar:
         line, current, last = bar.add_task("starting", total=None), "", 0
 
         def update(task: str, done: int, total: int) -> None:
@@ -125,8 +125,8 @@ KEYWORDS += " std rotation_std controls tip payload"
 def _as_options(text: str) -> str:
     """Keywords of Python as options: ``sep=';'`` -> ``--sep ';'``, `rotation_angle` -> --rotation-angle."""
     names = KEYWORDS.replace(" ", "|")
-    text = re.sub(rf"\b({names})=('[^']*')", lambda found: f"--{found[1].replace('_', '-')} {found[2]}", text)
-    return re.sub(f"(?<!in Python )`({names})`", lambda found: f"--{found[1].replace('_', '-')}", text)
+    text = re.sub(rf"\b({names})=('[^']*')", lambda match: f"--{match[1].replace('_', '-')} {match[2]}", text)
+    return re.sub(f"(?<!in Python )`({names})`", lambda match: f"--{match[1].replace('_', '-')}", text)
 
 
 INTERRUPTED = "interrupted before there was a result to keep"

@@ -345,11 +345,6 @@ class RowColumns(NamedTuple):
     why: dict[str, str]  # their reasons
     left: list[str]  # columns that are not used, and why
 
-    @property
-    def of_boards(self) -> bool:
-        """Whether the rows are corners of a board in images."""
-        return any(text.startswith(CORNERS) for text in self.options["reading"] or ())
-
 
 def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
     """The probable contents of a table beside its joints."""

@@ -162,34 +162,34 @@ Json = Annotated[
 
 def _declare(name: str, options: type[Command]) -> None:
     """Declare a command by the class of its options; every command has --json."""
-    own = sorted(options.all(), key=lambda one: bool(one.names))  # arguments first, in messages too
+    declared = sorted(options.all(), key=lambda option: bool(option.names))  # arguments first, in messages too
     parameters = list[inspect.Parameter]()
-    named = {one: option.hint for option in own for one in option.names or (option.shown,)} | {"--json": Path}
-    DECLARED[name] = {one.removeprefix("--").lower(): hint for one, hint in named.items()}
+    named = {word: option.hint for option in declared for word in option.names or (option.shown,)} | {"--json": Path}
+    DECLARED[name] = {word.removeprefix("--").lower(): hint for word, hint in named.items()}
 
     def run(_json: Any, **given: Any) -> None:
         written, read, appended = dict[str, Path](), dict[str, Path](), dict[str, Path]()
         files = {"write": written, "source": written, "read": read, "later": appended}
-        for one in own:
-            value = given[one.field]
+        for option in declared:
+            value = given[option.field]
             for path in value if isinstance(value, list) else [value]:
-                if one.kind in files and isinstance(path, Path):
-                    files[one.kind][one.shown + f" {path}" * isinstance(value, list)] = path
-                    if one.kind == "source":
-                        written[f"{one.shown} (its header)"] = path.with_suffix(".h")
+                if option.kind in files and isinstance(path, Path):
+                    files[option.kind][option.shown + f" {path}" * isinstance(value, list)] = path
+                    if option.kind == "source":
+                        written[f"{option.shown} (its header)"] = path.with_suffix(".h")
         check_outputs(written, read | appended, may_come=appended)
         options.check_together(given)
         module = import_module(f"diffeo_calib.cli.commands.{IN_FILE_OF.get(name, name)}")
         getattr(module, f"run_{name}" if name in IN_FILE_OF else "run")(options(**given))
 
-    for one in own:
-        typed = typer.Option(*one.names, **one.how) if one.names else typer.Argument(**one.how)
-        default = inspect.Parameter.empty if one.default is MISSING else one.default
-        kind, annotation = inspect.Parameter.KEYWORD_ONLY, Annotated[one.hint, typed]
-        parameters.append(inspect.Parameter(one.field, kind, default=default, annotation=annotation))
+    for option in declared:
+        typed = typer.Option(*option.names, **option.how) if option.names else typer.Argument(**option.how)
+        default = inspect.Parameter.empty if option.default is MISSING else option.default
+        kind, annotation = inspect.Parameter.KEYWORD_ONLY, Annotated[option.hint, typed]
+        parameters.append(inspect.Parameter(option.field, kind, default=default, annotation=annotation))
     parameters.append(inspect.Parameter("_json", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Json))
     run.__name__, run.__doc__ = f"{name}_command", options.__doc__
-    run.__annotations__ = {one.name: one.annotation for one in parameters}
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     vars(run)["__signature__"] = inspect.Signature(parameters)
     app.command(name)(run)
 
@@ -272,7 +272,7 @@ def _words(path: Path, name: str, value: object, hint: Any) -> list[str]:
     values = value if isinstance(value, list) else [value]
     if isinstance(value, list) and (name in JOINED or not has(hint, list)):
         values = [",".join(map(str, value))]
-    return [word for one in values for word in (f"--{name}", _text(path, name, one, hint))]
+    return [word for element in values for word in (f"--{name}", _text(path, name, element, hint))]
 
 
 def _text(path: Path, name: str, value: object, hint: Any) -> str:

@@ -172,9 +172,9 @@ def tool_in_tip(model: CalibratedKinematics, text: str | None, table: TableForma
         return tool
     tip = model.tool_tip or model.robot.tips[0]
     frames = [] if model.lever is None else list(by_frame(model.measured_frame[None])[0])
-    own = [frame for frame, name in zip(frames, model.on[::POINTS], strict=False) if name == tip]
-    if len(own) != 1:
-        found = f"{len(own)} frames were measured on '{tip}'"
-        found = "this model was calibrated with points, which have no measured frame" if not frames else found
-        raise InputError.of(f"--tool {text}: {found}", fix="give the tool in the frame of the tip (--tool X,Y,Z)")
-    return own[0] @ tool
+    on_tip = [frame for frame, name in zip(frames, model.on[::POINTS], strict=False) if name == tip]
+    if len(on_tip) != 1:
+        problem = f"{len(on_tip)} frames were measured on '{tip}'"
+        problem = "this model was calibrated with points, which have no measured frame" if not frames else problem
+        raise InputError.of(f"--tool {text}: {problem}", fix="give the tool in the frame of the tip (--tool X,Y,Z)")
+    return on_tip[0] @ tool

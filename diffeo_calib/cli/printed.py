@@ -49,15 +49,15 @@ class ErrorTable:
         last = [self.expected] if self.expected is not None and errors else []
         header = [*self.columns, *SIZES * errors, *[f"{size} deg" for size in SIZES] * angles]
         lines = list[list[str]]()
-        for labels, own in self.rows.items():
-            each = own.each[not errors : 1 + angles]
-            numbers = [*(size for one in each for size in one.sizes), *(own.shown[1] * value for value in last)]
+        for labels, row in self.rows.items():
+            each = row.each[not errors : 1 + angles]
+            numbers = [*(size for part in each for size in part.sizes), *(row.shown[1] * value for value in last)]
             lines.append([*labels, *("-" if isnan(value) else f"{value:.4f}" for value in numbers)])
         return text_table(title, [*header, *["expected RMS"] * len(last)], lines, len(self.columns))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:
-        one = next(iter(self.rows.values()))
-        title, turned = f"{one.title} in {one.shown[0]} {self.of}", one.orientation is not None
+        first = next(iter(self.rows.values()))
+        title, turned = f"{first.title} in {first.shown[0]} {self.of}", first.orientation is not None
         whole = self._table(title + ", orientation errors in deg" * turned, angles=turned)
         wide = options.update(max_width=WIDEST)
         if not turned or console.measure(whole, options=wide).maximum <= options.max_width:
@@ -69,55 +69,55 @@ class ErrorTable:
 
 def registration_lines(model: CalibratedKinematics) -> Iterator[str]:
     """Where measuring frame and markers were found, how well, and from how many rows."""
-    found = model.registration
-    if found is None:
+    motion = model.registration
+    if motion is None:
         return
-    yield from motion_lines(found, model.on, doubt=": what else has changed is in them" * found.doubtful)
-    fitted = f"RMS {1e3 * found.rms_after:.4f} mm on these rows, to which device and markers were fitted"
-    left_out = f"{1e3 * found.left_out_rms:.4f} mm with each row left out in turn"
-    yield f"{found.rows} rows took part: {fitted}; {left_out}"
+    yield from motion_lines(motion, model.on, doubt=": what else has changed is in them" * motion.doubtful)
+    fitted = f"RMS {1e3 * motion.rms_after:.4f} mm on these rows, to which device and markers were fitted"
+    left_out = f"{1e3 * motion.left_out_rms:.4f} mm with each row left out in turn"
+    yield f"{motion.rows} rows took part: {fitted}; {left_out}"
 
 
-def motion_lines(found: Registration, tips: Sequence[str], *, doubt: str = "") -> Iterator[str]:
+def motion_lines(motion: Registration, tips: Sequence[str], *, doubt: str = "") -> Iterator[str]:
     """Where measuring frame and markers are now, and how far from where they were, as if the robot had not changed.
 
     With ``doubt``, what its change does to these places, no probability is stated: it would hold without one alone.
     """
-    if found.free != "marker":
-        yield from frame_lines(found)
-    if found.free != "base":
-        tips = tips if len(tips) == len(found.markers) else [tips[0]] * len(found.markers)
-        rigid = found.lever is not None
-        yield from marker_lines(found.markers, tips, poses=rigid, known=None if rigid else found.marker_deviations)
-        if found.shift is not None:
-            largest = 1e3 * float(found.shift.norm(dim=1).max())
-            sure = f" (unmoved with probability {found.same_place:.2f})" if found.same_place is not None else ""
+    if motion.free != "marker":
+        yield from frame_lines(motion)
+    if motion.free != "base":
+        tips = tips if len(tips) == len(motion.markers) else [tips[0]] * len(motion.markers)
+        rigid = motion.lever is not None
+        yield from marker_lines(motion.markers, tips, poses=rigid, known=None if rigid else motion.marker_deviations)
+        if motion.shift is not None:
+            largest = 1e3 * float(motion.shift.norm(dim=1).max())
+            sure = f" (unmoved with probability {motion.same_place:.2f})" if motion.same_place is not None else ""
             yield f"  that is {largest:.3f} mm from where it was{sure * (not doubt)}"
     if doubt:
         yield f"  these places were found as if the robot had not changed{doubt}"
 
 
-def frame_lines(found: Registration) -> Iterator[str]:
+def frame_lines(motion: Registration) -> Iterator[str]:
     """Where the measuring frame is now."""
-    yield f"the measuring frame of the model, seen from the new one: {transform_words(found.transform)}"
-    shift, turn = 1e3 * found.frame_deviations[:3], torch.rad2deg(found.frame_deviations[3:])
+    yield f"the measuring frame of the model, seen from the new one: {transform_words(motion.transform)}"
+    shift, turn = 1e3 * motion.frame_deviations[:3], torch.rad2deg(motion.frame_deviations[3:])
     yield f"  known to {triple(shift, '.2g')} mm at the middle of the rows, and to {triple(turn, '.2g')} deg"
 
 
 def socket_lines(errors: Evaluation, rows: str) -> Iterator[str]:
     """Known distances and those found, for some rows."""
-    for one in errors.distances:
-        between = f"distance of '{one.first}' and '{one.second}' ({rows})"
-        yield f"{between}: {1e3 * one.found:.3f} mm, known {1e3 * one.known:.3f}, error {1e3 * one.error:+.3f}"
+    for pair in errors.distances:
+        between = f"distance of '{pair.first}' and '{pair.second}' ({rows})"
+        yield f"{between}: {1e3 * pair.found:.3f} mm, known {1e3 * pair.known:.3f}, error {1e3 * pair.error:+.3f}"
 
 
 def stage_line(
     model: CalibratedKinematics, stages: Mapping[str, Callable[[Tensor], Tensor]], expected: ExpectedError
 ) -> str:
     """The absolute errors that a model expects of every stage; they go into the record too."""
-    found = expected_errors(model, stages, expected)
-    record.add(expected_error_by_stage_m=found)
-    listed = ", ".join(f"{name} {1e3 * value:.3f}" for name, value in found.items())
+    by_stage = expected_errors(model, stages, expected)
+    record.add(expected_error_by_stage_m=by_stage)
+    listed = ", ".join(f"{name} {1e3 * value:.3f}" for name, value in by_stage.items())
     return f"expected absolute error by stage, in mm: {listed}"
 
 
@@ -159,12 +159,12 @@ def parsed_length(text: str | None) -> float | None:
     return None if limit is None else limit.value
 
 
-def accept(found: Accuracy, limit: Limit) -> None:
+def accept(error: Accuracy, limit: Limit) -> None:
     """Say whether errors are within the limit; exit with a code of its own if they are not."""
-    good = found.value <= limit.value
-    record.add(**{f"rms_{found.unit}": found.value, f"limit_{found.unit}": limit.value}, accepted=good)
-    unit, per_unit = shown_unit(found.unit)
+    good = error.value <= limit.value
+    record.add(**{f"rms_{error.unit}": error.value, f"limit_{error.unit}": limit.value}, accepted=good)
+    unit, per_unit = shown_unit(error.unit)
     within = "within" if good else "above"
-    say(f"RMS {per_unit * found.value:.4f} {unit} {found.of}: {within} the limit of {per_unit * limit.value:g} {unit}")
+    say(f"RMS {per_unit * error.value:.4f} {unit} {error.of}: {within} the limit of {per_unit * limit.value:g} {unit}")
     if not good:
         raise typer.Exit(EXIT_ABOVE)

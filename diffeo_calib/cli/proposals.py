@@ -25,6 +25,7 @@ from diffeo_calib.calibration.diagnostics import gates, likely_mistakes
 from diffeo_calib.calibration.diagnostics.plausibility import marker_column, unmeasured_markers
 from diffeo_calib.calibration.identification.registration import register_sockets, registered_geometry, spread
 from diffeo_calib.calibration.placing.readings import images_error, rough_error
+from diffeo_calib.calibration.placing.sockets import resting_rows
 from diffeo_calib.cli.column_names import column
 from diffeo_calib.cli.declarations import FitOptions
 from diffeo_calib.cli.guesses import (
@@ -49,7 +50,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, BESIDE, UNITS_PER_METRE, numbers_of
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.tables import check_poses, divided, measured_positions
+from diffeo_calib.sensors.tables import check_poses, measured_positions
 
 CLEAR_RATIO = 5.0
 """A way is clear if every other one leaves more by this factor."""
@@ -126,7 +127,7 @@ class Source:
         used = {IMAGE, *POINT, *PIXEL, CAMERA} if self.options.images else set[str]()
         values = [getattr(self.options, name) for name in COLUMNS] + [[*own] for own in self.asked.values()]
         texts = (text for value in values for text in (value if isinstance(value, list) else [value or ""]))
-        return used.union(*(re.split("[=,{}]", text) for text in texts))
+        return used.union(*(re.split("[=,{}]", str(text)) for text in texts))
 
     @cached_property
     def data(self) -> Any:
@@ -158,15 +159,12 @@ class Source:
                 what, expected = f"{len(own)} row(s) of '{self.sheet.path}'", "enough for base and markers"
                 raise MeasurementError.of(what, expected=expected, fix="measure more rows, at several places")
             return left / max(spread(own.points), SMALLEST_SPREAD_M)
-        own, readings = divided(self.data)
-        if own is not None:
-            if own.table.socket is None:
-                return inf
-            rests = register_sockets(self.robot, own.table.q, own.table.socket)
-            ball = rests.positions[own.table.socket]
+        tables = self.data.parts
+        if (resting := resting_rows(tables)) is not None:
+            rests = register_sockets(self.robot, resting.q, resting.device)
+            ball = rests.positions[resting.device]
             around = float((ball - ball.mean(0)).norm(dim=1).median())
             return float(rests.distances.median()) / around if around > 0.0 else inf
-        tables = [one.table for one in readings]
         lengths = [one for one in tables if one.kind != "image"]
         if not lengths:
             return max(images_error(self.robot, one) for one in tables)

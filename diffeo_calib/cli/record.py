@@ -117,25 +117,25 @@ def kind_entry(errors: Evaluation, *, metres: bool = False) -> dict[str, object]
     return entry | {f"angle_{name}_deg": getattr(errors.orientation, name, None) for name in SIZES}
 
 
-def entries_by_kind(found: Mapping[str, Any]) -> dict[str, Any]:
+def entries_by_kind(errors: Mapping[str, Any]) -> dict[str, Any]:
     """Errors of every kind of rows as ``kinds``; those of measured positions once more as ``errors``, in m.
 
     Args:
-        found: kind -> errors, or errors by rows and by stage.
+        errors: kind -> errors, or errors by rows and by stage.
     """
-    entries: dict[str, Any] = {"kinds": _each(found, kind_entry), "errors": {}}
-    for own in found.values():
-        one: Any = own
-        while isinstance(one, Mapping):
-            one = next(iter(one.values()))
-        if one.what == ERRORS:
-            entries["errors"] = _each(own, partial(kind_entry, metres=True))
+    entries: dict[str, Any] = {"kinds": _each(errors, kind_entry), "errors": {}}
+    for stages in errors.values():
+        leaf: Any = stages
+        while isinstance(leaf, Mapping):
+            leaf = next(iter(leaf.values()))
+        if leaf.what == ERRORS:
+            entries["errors"] = _each(stages, partial(kind_entry, metres=True))
     return entries
 
 
-def _each(found: Any, entry: Callable[[Evaluation], dict[str, Any]]) -> Any:
+def _each(errors: Any, entry: Callable[[Evaluation], dict[str, Any]]) -> Any:
     """The entry of every evaluation of a tree."""
-    return {name: _each(one, entry) for name, one in found.items()} if isinstance(found, Mapping) else entry(found)
+    return {name: _each(part, entry) for name, part in errors.items()} if isinstance(errors, Mapping) else entry(errors)
 
 
 def _plain(value: Any) -> Any:

@@ -21,7 +21,7 @@ from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.main import add_to_command_line
 from diffeo_calib.cli.options import CORNERS, Rows, Targets, Units, has
-from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
+from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, shown, warn_user
 from diffeo_calib.common.files import PROGRAM
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.files import read_observations
@@ -132,7 +132,7 @@ def as_at_the_fit(command: str, given: Given) -> Given:
         known = _stated(stored, wanted)
     except (ValueError, IndexError) as error:  # of a file that was edited
         fix = "name the columns (--position, --socket, --reading), --length and --angle"
-        raise InputError.of("the options that the model was fitted with", got=str(error), fix=fix) from error
+        raise InputError.of("the options that the model was fitted with", got=shown(str(error)), fix=fix) from error
     pose = given.robot_pose
     program = _stated(shlex.split(command), {"robot_pose"}).get("robot_pose", ("", []))[0] if PROGRAM in command else ""
     if PROGRAM in program and pose in (None, program.partition("=")[0]):  # of other names: places

@@ -122,6 +122,12 @@ class FittedMap:
             return self.slopes
         return torch.eye(self.m, dtype=self.x.dtype, device=self.x.device).expand(len(self.x), -1, -1)
 
+    @property
+    def shows_points(self) -> bool:
+        """Whether every row tells all coordinates, each by itself, but for places that rows share."""
+        A = self.functionals
+        return A.shape[1] == self.m and bool((torch.eye(self.m, dtype=A.dtype, device=A.device) == A).all())
+
     def with_nominal(self, nominal: NominalMap) -> FittedMap:
         """The same map around another nominal map with the same parameters, with what it knows of its covariances."""
         other = copy(self)

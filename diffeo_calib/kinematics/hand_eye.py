@@ -24,7 +24,7 @@ from diffeo_calib.measurements.bodies import transform_words, triple
 from diffeo_calib.measurements.images import ONLY_CAMERA
 from diffeo_calib.measurements.poses import inverse_poses, pose_directions, poses_from_marks
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.se3 import skew
+from diffeo_calib.robots.se3 import twist_at
 from diffeo_calib.sensors.set_ups import NUMBERS_OF_A_FRAME, SESSION, TRANSFORMS, frame_slopes, own_slopes
 
 
@@ -93,55 +93,55 @@ class HandEye:
         geometry, lever = geometry or model.geometry, model.bodies.pose_lever()
         set_up, tool = SetUp.of(model, camera), poses_from_marks(geometry.tool[None], lever)
         carried = (tool @ set_up.mount)[0]
-        from_tool = _at(carried[:3, 3] - tool[0, :3, 3])
-        own = from_tool @ torch.block_diag(*[tool[0, :3, :3]] * 2)  # by a shift and a turn along the axes of the tool
+        from_tool = twist_at(carried[:3, 3] - tool[0, :3, 3])
+        arm = from_tool @ torch.block_diag(*[tool[0, :3, :3]] * 2)  # by a shift and a turn along the axes of the tool
         by_tool = from_tool @ pose_directions(tool, lever)[0]
-        known = _covariance(model.map, geometry.slices["tool"], by_tool, set_up.columns, own @ set_up.of_mount)
-        known = known + own @ torch.diag(set_up.mount_std.square()) @ own.mT
+        in_tip = _covariance(model.map, geometry.slices["tool"], by_tool, set_up.columns, arm @ set_up.of_mount)
+        in_tip = in_tip + arm @ torch.diag(set_up.mount_std.square()) @ arm.mT
         # base T(e) for an error twist e: what stands moves by -e, at its place, seen from the base
         standing = inverse_poses((set_up.transform @ geometry.base)[None])[0]
-        by_base, back = -_at(standing[:3, 3]), geometry.base[:3, :3].mT
-        of_base = torch.block_diag(back, back) @ _at(geometry.base[:3, 3]) @ set_up.of_frame
-        found = _covariance(model.map, geometry.slices["base"], by_base, set_up.columns, by_base @ of_base)
+        by_base, back = -twist_at(standing[:3, 3]), geometry.base[:3, :3].mT
+        of_base = torch.block_diag(back, back) @ twist_at(geometry.base[:3, 3]) @ set_up.of_frame
+        in_base = _covariance(model.map, geometry.slices["base"], by_base, set_up.columns, by_base @ of_base)
         tip, base = geometry.on[0], model.robot.base
-        carried_there = KnownPose(carried, known, tip, f"in the frame of '{tip}'", "in_tip")
-        standing_there = KnownPose(standing, found, base, "in the robot's base", "in_base")
-        return cls(*((carried_there, standing_there) if camera_on_tool else (standing_there, carried_there)))
+        there = KnownPose(carried, in_tip, tip, f"in the frame of '{tip}'", "in_tip")
+        poses = there, KnownPose(standing, in_base, base, "in the robot's base", "in_base")
+        return cls(*(poses if camera_on_tool else reversed(poses)))
 
     @classmethod
     def of_each(
         cls, model: CalibratedKinematics, *, camera_on_tool: bool, geometry: Geometry | None = None
     ) -> dict[str, HandEye]:
         """Result for every camera, of several fixed ones every session's, by name; arguments as of :meth:`of`."""
-        cameras = [name for own in model.placement for name in own.cameras] or [ONLY_CAMERA]
-        known = {"camera_on_tool": camera_on_tool, "geometry": geometry}
+        cameras = [name for devices in model.placement for name in devices.cameras] or [ONLY_CAMERA]
+        options = {"camera_on_tool": camera_on_tool, "geometry": geometry}
         if len(cameras) == 1:
-            return {cameras[0]: cls.of(model, **known)}
-        sessions = [name for own in model.placement if own.kind in TRANSFORMS for name in own.names]
-        return {name: cls.of(model, camera=name, **known) for name in sessions}
+            return {cameras[0]: cls.of(model, **options)}
+        sessions = [name for devices in model.placement if devices.kind in TRANSFORMS for name in devices.names]
+        return {name: cls.of(model, camera=name, **options) for name in sessions}
 
     @classmethod
     def of_fit(cls, model: CalibratedKinematics) -> dict[str, HandEye]:
         """Result where the model's images, or the command that made it, say where the camera is; else nothing."""
-        made, seen = model.provenance, [one for own in model.placement for one in own.cameras.values()]
+        made, cameras = model.provenance, [camera for devices in model.placement for camera in devices.cameras.values()]
         words = shlex.split(made.command or "") if made is not None else []
-        on_tool = seen[0].on_tool if seen else "--camera-on-tool" in words
-        seen_board = bool(model.lever) and (bool(seen) or on_tool or "--robot-pose" in words)
+        on_tool = cameras[0].on_tool if cameras else "--camera-on-tool" in words
+        seen_board = bool(model.lever) and (bool(cameras) or on_tool or "--robot-pose" in words)
         if not seen_board or model.registration:
             return {}
         return cls.of_each(model, camera_on_tool=on_tool)
 
     def entry(self) -> dict[str, object]:
         """Both poses for programs."""
-        return {f"{name}_{own.key}": own.entry() for name, own in vars(self).items()}
+        return {f"{name}_{pose.key}": pose.entry() for name, pose in vars(self).items()}
 
 
-def hand_eye_sentences(found: Mapping[str, HandEye]) -> Iterator[str]:
+def hand_eye_sentences(results: Mapping[str, HandEye]) -> Iterator[str]:
     """Every camera and the board with their deviations."""
-    for name, own in found.items():
-        which = "camera" if len(found) == 1 else f"camera '{name}'"
-        yield from own.camera.sentences(f"{which} {own.camera.where} (hand-eye transform)")
-    yield from (line for own in [*found.values()][:1] for line in own.board.sentences(f"board {own.board.where}"))
+    for name, eye in results.items():
+        which = "camera" if len(results) == 1 else f"camera '{name}'"
+        yield from eye.camera.sentences(f"{which} {eye.camera.where} (hand-eye transform)")
+    yield from (line for eye in [*results.values()][:1] for line in eye.board.sentences(f"board {eye.board.where}"))
 
 
 class SetUp(NamedTuple):
@@ -190,15 +190,8 @@ class SetUp(NamedTuple):
 
     def shifted(self, points: Tensor) -> Tensor:
         """(M, 9, k) what its shifts do to points (M, 9) of the model's tool, m."""
-        own = points.unflatten(1, (-1, 3))
-        return frame_slopes(own, points.new_zeros(3)) @ self.of_frame + own_slopes(own) @ self.of_mount
-
-
-def _at(place: Tensor) -> Tensor:
-    """(6, 6) from the shift of a body at the origin, and its turn, to those at a place (3,), m."""
-    there = torch.eye(6, dtype=place.dtype, device=place.device)
-    there[:3, 3:] = -skew(place)
-    return there
+        places = points.unflatten(1, (-1, 3))
+        return frame_slopes(places, points.new_zeros(3)) @ self.of_frame + own_slopes(places) @ self.of_mount
 
 
 def _covariance(fitted: FittedMap, part: slice, slopes: Tensor, columns: Tensor, effects: Tensor) -> Tensor:

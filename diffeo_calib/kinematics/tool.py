@@ -28,7 +28,8 @@ from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
 from diffeo_calib.kinematics.registered_map import marker_slopes
 from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.maps.geodesic import GeodesicDeformation
-from diffeo_calib.measurements.poses import mark_points, marks, pose_directions, poses_from_marks, rigid_poses
+from diffeo_calib.measurements.poses import mark_points, marks, pose_directions, poses_from_marks
+from diffeo_calib.robots.se3 import rigid_poses
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime import program
 from diffeo_calib.runtime.arrays import Array

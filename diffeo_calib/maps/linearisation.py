@@ -97,11 +97,6 @@ class Linearisation:
         return self.joint[-1].points
 
     @property
-    def by_task_points(self) -> Tensor:
-        """Dpsi at every marker point (M P, d, d)."""
-        return self.task[0].effect
-
-    @property
     def fields(self) -> Linearisation:
         """The effect of the fields alone, without parameters."""
         spec = replace(self.spec, prior_variance=self.spec.prior_variance[:0])

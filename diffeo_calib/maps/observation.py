@@ -48,6 +48,10 @@ class Observation(ABC):
     def slope(self, points: Tensor) -> Tensor:
         """A = Dh: points (N, m) -> (N, r, m)."""
 
+    def places(self, points: Tensor) -> Tensor:
+        """Points (N, m), those that a place holds there."""
+        return points
+
     def __len__(self) -> int:
         return len(getattr(self, self.constants[0]))
 
@@ -111,6 +115,18 @@ class LinearFunctionals(Observation):
 
     def slope(self, points: Tensor) -> Tensor:
         return self.axes
+
+
+class FromPlaces(LinearFunctionals):
+    """Points minus the places (N, m) that hold them, m."""
+
+    def __init__(self, places: Tensor) -> None:
+        m = self.size = self.dim = places.shape[1]
+        eye = torch.eye(m, dtype=places.dtype, device=places.device)
+        self.axes, self.offsets = eye.expand(len(places), m, m), places
+
+    def places(self, points: Tensor) -> Tensor:
+        return self.offsets
 
 
 @dataclass(frozen=True)
@@ -177,6 +193,12 @@ class Stacked(Observation):
         for part in self.parts:
             values[part.rows[:, None], part.numbers] = part.observe.value(part.seen(points))
         return values
+
+    def places(self, points: Tensor) -> Tensor:
+        found = points.clone()
+        for part in self.parts:
+            found[part.rows[:, None], part.points] = part.observe.places(part.seen(points))
+        return found
 
     def slope(self, points: Tensor) -> Tensor:
         slopes = points.new_zeros(len(points), self.size, self.dim)

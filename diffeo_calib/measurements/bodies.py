@@ -16,8 +16,9 @@ from torch import Tensor
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements import poses as pose_math
 from diffeo_calib.measurements.rows import with_attributes
-from diffeo_calib.measurements.sockets import BALL
 
+BALL = "ball"
+"""Name of the last marker, if the other ones have names."""
 NUMBERS = ("x", "y", "z", "rx", "ry", "rz")
 
 

@@ -15,8 +15,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, listed, sentence, warn_user
 from diffeo_calib.measurements import checks
 from diffeo_calib.measurements.poses import of_frames, points_of_frames, pose_jacobian
-from diffeo_calib.measurements.rows import with_attributes
-from diffeo_calib.measurements.sockets import ONE_SESSION, SocketTable
+from diffeo_calib.measurements.rows import RowGroups, with_attributes
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -34,8 +33,32 @@ ONLY_CAMERA = "camera"
 OF_POSES = ("pose_covariance", "pose_shared", "pose_larger")
 
 
-class ImageTable(SocketTable):
-    """Columns of tables of images beside poses."""
+ONE_SESSION: dict[str, object] = {"session": None, "session_names": (), "remounted": False}
+
+
+class ImageTable(RowGroups):
+    """Columns of tables of positions and poses, and of images beside poses."""
+
+    without_device = False
+    ball_tip = None
+
+    points: Tensor
+    frames: Any
+    poses: Tensor | None = None
+    lever: float | None = None
+    board: Tensor | None = None
+    std: Tensor | None = None
+    rotation_std: Tensor | None = None
+    marker_names: tuple[str, ...] | None = None
+    on: tuple[str, ...] | None = None
+    session: Tensor | None = None
+    session_names: tuple[str, ...] = ()
+    remounted: bool = False
+
+    @property
+    def markers(self) -> int:
+        """Number of markers P; 3 for every pose of a row, because three points represent a pose."""
+        return self.points.shape[1]
 
     BY_IMAGE = ("corners", "seen_by", *OF_POSES)
     corners: Tensor | None = None  # (N, K, 5), see :meth:`from_images`; None without images

@@ -1,6 +1,6 @@
 """Rows of several kinds in one table: positions, poses, a ball in sockets, and readings of other devices.
 
-The ball is one target: that of the rows in sockets, of the readings, and the last marker of mixtures.
+The ball is one target: that of the rows in sockets and of the readings.
 """
 
 from __future__ import annotations
@@ -15,12 +15,10 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.measurements.checks import arrays_sha256, chosen_rows, numbers_of
-from diffeo_calib.measurements.rows import NO_SOCKET, RowGroups, check_alike, common, set_attributes
+from diffeo_calib.measurements.rows import RowGroups, check_alike, common, set_attributes
 
-WITH_POSITION = ("position", "pose", "mixture")
+WITH_POSITION = ("position", "pose")
 """Kinds of rows of which a device measures positions."""
-ONE_TABLE = {"position", "socket", "mixture"}, {"pose"}
-"""Kinds of rows that one table of measurements can hold."""
 
 
 @methods_outside_inference_mode
@@ -29,8 +27,8 @@ class Observations(RowGroups):
     """N rows of several kinds, made by :meth:`joined`.
 
     Args:
-        parts: tables of one kind each: :class:`Measurements` of positions, of poses or of a ball in sockets, and
-            :class:`Readings`, in the order of their first rows. Positions and rows in sockets are parts of their own.
+        parts: tables of one kind each: :class:`Measurements` of positions or of poses, and :class:`Readings`, in the
+            order of their first rows.
         index: (N_i,) int64 for each part, its row numbers here.
 
     Other attributes are those that all parts have, see :class:`Measurements`; q, line_numbers, payload and covariates
@@ -153,7 +151,7 @@ class Observations(RowGroups):
 
 
 class Rows(NamedTuple):
-    """A table of one kind, or a mixture of positions and sockets, and its row numbers (M,) in the whole."""
+    """A table of one kind, and its row numbers (M,) in the whole."""
 
     table: Any
     rows: Tensor
@@ -181,28 +179,14 @@ def joined_tables(tables: Sequence[Any], *, apart: bool = False) -> Any:
     Rows of the same kind are one part.
     """
     pieces = _pieces(tables)
-    kinds = {piece.table.kind for piece in pieces}
-    if not apart and any(kinds <= one for one in ONE_TABLE):
-        whole = type(pieces[0].table).in_one([piece.table for piece in pieces])
-        return whole.rows(torch.cat([piece.rows for piece in pieces]).argsort())
     groups: dict[object, list[Rows]] = {}
-    whole = [Rows(*pure) for piece in pieces for pure in unmixed(*piece)]
-    if any("corners" in piece.table.columns for piece in whole):
-        whole = [Rows(own, piece.rows[here]) for piece in whole for own, here in piece.table.beside_images()]
-    for pure in whole:
-        groups.setdefault(pure.table.column_kind, []).append(pure)
+    if any("corners" in piece.table.columns for piece in pieces):
+        pieces = [Rows(own, piece.rows[here]) for piece in pieces for own, here in piece.table.beside_images()]
+    for piece in pieces:
+        groups.setdefault(piece.table.column_kind, []).append(piece)
     parts = [type(group[0].table).in_one([piece.table for piece in group]) for group in groups.values()]
     rows = [torch.cat([piece.rows for piece in group]) for group in groups.values()]
     return Observations(parts, rows) if apart or len(parts) > 1 else parts[0].rows(rows[0].argsort())
-
-
-def unmixed(table: Any, rows: Tensor) -> list[tuple[Any, Tensor]]:
-    """A mixture with the row numbers (M,) as its positions and its rows in sockets, where there are some."""
-    if table.kind != "mixture":
-        return [(table, rows)]
-    resting = table.socket != NO_SOCKET
-    some = (table.device_rows, ~resting), (table.socket_rows, resting)
-    return [(own(), rows[here]) for own, here in some if bool(here.any())]
 
 
 def _check_joinable(tables: Sequence[Any]) -> None:

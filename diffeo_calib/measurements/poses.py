@@ -8,7 +8,7 @@ the pose back. One frame is measured or one on each of several tips: (N, T, 4, 4
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from math import pi
 
 import torch
@@ -18,24 +18,14 @@ from diffeo_calib.common.checks import as_tensor, check_number, real_tensor, wra
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.checks import quiet
 from diffeo_calib.measurements.table_format import numbers_of
-from diffeo_calib.robots import se3
-from diffeo_calib.robots.se3 import skew, transforms
+from diffeo_calib.robots.se3 import ONE_POSE, TOLERANCE, Place, checked_rotations, rigid_poses, skew, transforms
 
-TOLERANCE = 1e-3
-"""Quaternions and matrices may be off by this, because files have few digits; the nearest rotation is used."""
 MARKS = ((1.0, 0.0, 0.0), (-0.5, 0.75**0.5, 0.0), (-0.5, -(0.75**0.5), 0.0))
 """Directions u_k from the frame's origin to its three points, one per row: their sum is zero."""
 POINTS = 3
 """Points that represent a frame."""
-ROUNDING = 2e-15
-"""Entries of R^T R - 1 that are rounding alone: such matrices are rotations already."""
 FLATTEST_TRIANGLE_LEVERS = 1e-3
 """Points whose triangle is thinner than this, in levers, have no orientation."""
-
-ONE_POSE = "pass one rigid transform per row, (N, 4, 4), or one for each of T tips, (N, T, 4, 4)"
-
-Place = Callable[[int], str]
-"""Names a row in messages."""
 
 
 def marks(device: torch.device) -> Tensor:
@@ -62,7 +52,7 @@ def rotation_matrices(values: object, convention: str, *, angle: str = "rad", pl
     fix = f"pass the {count} numbers of {convention!r} in every row"
     table = as_tensor(values, "rotations", ("N", count), fix=fix).detach()
     if count == 9:
-        return nearest_rotations(table.unflatten(1, (3, 3)), place)
+        return checked_rotations(table.unflatten(1, (3, 3)), place)
     off = (table.norm(dim=1) - 1).abs() > TOLERANCE
     if count == 4 and off.any():
         row = int(off.nonzero()[0])
@@ -94,7 +84,7 @@ def rotation_numbers(matrices: Tensor, convention: str, *, angle: str = "rad") -
         raise InputError.of("`rotations` has the wrong shape", expected="(N, 3, 3)", got=tuple(given.shape))
     seen = ~given.isnan().flatten(-2).any(-1)
     found = given.new_full((*seen.shape, count), torch.nan)
-    exact = nearest_rotations(given[seen])
+    exact = checked_rotations(given[seen])
     if count == 9 or not len(exact):
         found[seen] = exact.flatten(1)[:, :count]
         return found
@@ -112,41 +102,6 @@ def rotation_numbers(matrices: Tensor, convention: str, *, angle: str = "rad") -
             numbers = rotation.as_euler(convention, degrees=degrees)
     found[seen] = torch.as_tensor(numbers.copy(), dtype=torch.float64, device=exact.device)
     return found
-
-
-def nearest_rotations(matrices: Tensor, place: Place = "row {}".format) -> Tensor:
-    """The rotations nearest to matrices that are rotations up to rounding: (N, 3, 3) -> (N, 3, 3).
-
-    Raises:
-        InputError: a matrix that is off by more than 0.001 (row named).
-    """
-    away = (matrices.mT @ matrices - torch.eye(3, dtype=matrices.dtype, device=matrices.device)).abs().amax((1, 2))
-    bad = ~(away <= TOLERANCE) | (torch.linalg.det(matrices) < 0)
-    if bad.any():
-        row = int(bad.nonzero()[0])
-        mirrored = float(away[row]) <= TOLERANCE
-        got = "a determinant of -1, a mirrored frame" if mirrored else f"R^T R - 1 of up to {float(away[row]):.2g}"
-        expected = f"a rotation matrix, orthonormal to {TOLERANCE:g}"
-        fix = "check that the entries come row by row and without a scale"
-        raise InputError.of(place(row), expected=expected, got=got, fix=fix)
-    exact = len(away) > 0 and float(away.max()) <= ROUNDING
-    return matrices if exact else se3.nearest_rotations(matrices)
-
-
-def rigid_poses(poses: object, place: Place = "`poses`, row {}".format) -> Tensor:
-    """The rigid poses nearest to poses [[R, t], [0, 0, 0, 1]]: (N, 4, 4) -> (N, 4, 4).
-
-    Raises:
-        InputError: wrong shape, values that are not finite, a last row other than [0, 0, 0, 1], or an R that is not a
-            rotation.
-    """
-    frames = as_tensor(poses, "poses", ("N", 4, 4), fix=ONE_POSE).detach()
-    bad = ((frames[:, 3] - frames.new_tensor([0.0, 0.0, 0.0, 1.0])).abs() > TOLERANCE).any(1)
-    if bad.any():
-        row = int(bad.nonzero()[0])
-        what, fix = f"{place(row)}: the last row of the transform", "pass [[R, t], [0, 0, 0, 1]], not its transpose"
-        raise InputError.of(what, expected=[0, 0, 0, 1], got=frames[row, 3].tolist(), fix=fix)
-    return transforms(nearest_rotations(frames[:, :3, :3], place), frames[:, :3, 3])
 
 
 def mark_points(poses: Tensor, lever: float) -> Tensor:

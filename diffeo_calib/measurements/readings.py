@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST, methods_outside_inference_mode
-from diffeo_calib.common.errors import MeasurementError, as_written, sentence, warn_user
+from diffeo_calib.common.errors import MeasurementError, as_written
 from diffeo_calib.measurements import checks
 from diffeo_calib.measurements.observations import joined_tables
 from diffeo_calib.measurements.rows import RowGroups, set_attributes, with_attributes
@@ -54,6 +54,8 @@ class Readings(RowGroups):
     ALIKE = ("kind", "n", "joint_names", "offset_std", "intrinsics", "payload_at", "covariate_names", "on", "unit")
     NUMBERED = "device", "names"
     flattery = FLATTERY
+    blocks = ()
+    """Known distances between devices, see :attr:`Sockets.blocks`."""
 
     kind: str
     q: Tensor
@@ -234,9 +236,14 @@ class Readings(RowGroups):
         return self.unit[0], (self.unit[1],) * (r := self.values.shape[1]), (0.0,) * r
 
     @property
+    def stated(self) -> object:
+        """What is said of the devices."""
+        return self.names, self.offset_std
+
+    @property
     def sha256(self) -> str:
         """SHA-256 of the file that the rows were read from, or of the arrays if they come from Python."""
-        names = {"kind": self.kind.encode(), "names": repr((self.names, self.offset_std)).encode()}
+        names = {"kind": self.kind.encode(), "names": repr(self.stated).encode()}
         arrays = {"q": self.q, "values": self.values, "device": self.device, "std": self.std, "payload": self.payload}
         return self.file_sha256 or checks.arrays_sha256(arrays, names)
 
@@ -290,25 +297,21 @@ MARKER, CONTACT = "marker", "contact"
 """Kinds of readings of points of a tool whose poses are measured."""
 
 
-def as_readings(table: Any) -> list[tuple[Readings, Tensor]]:
-    """Positions of markers, or a ball in sockets, as readings, see sensors/tool_frames.py, with their rows (M,).
+def read_of_tool(own: Any, kind: str, values: Tensor, names: Sequence[str], std: Tensor | None = None) -> Readings:
+    """Rows of a table as readings (N, 3) of points of a tool whose poses are measured, see sensors/tool_frames.py."""
+    read = Readings.of(kind, own.q, values, names, own.joint_names, std=std, doubt=False, numbers=3)
+    alike = ("payload", "payload_at", "covariates", "covariate_names", "line_numbers", "file_sha256", "origin")
+    return with_attributes(read, **{name: getattr(own, name) for name in alike})
 
-    Every marker of every set-up is that of a device of its own, as is every socket; distances of sockets are not used.
-    """
-    resting = table.sockets is not None
-    if resting and table.sockets.distances:
-        fix = "calibrate without the images to use them"
-        warn_user(sentence("known distances between sockets are not used beside images of a board", fix=fix))
+
+def as_readings(table: Any) -> list[tuple[Readings, Tensor]]:
+    """Positions of markers as readings with their rows (M,): every marker of every set-up has a device of its own."""
     found = []
     for marker, name in enumerate(table.marker_names or range(1, table.markers + 1)):
-        rows = torch.arange(len(table), device=HOST) if resting else table.visible[:, marker].nonzero()[:, 0].cpu()
+        rows = table.visible[:, marker].nonzero()[:, 0].cpu()
         own = table.rows(rows)
         of_marker = f" {name}" if table.markers > 1 else ""
-        names = own.row_sockets if resting else [f"{device or 'tracker'}{of_marker}" for device in own.device_names]
-        values = torch.zeros_like(own.points[:, marker]) if resting else own.points[:, marker]
+        names = [f"{device or 'tracker'}{of_marker}" for device in own.device_names]
         std = None if own.std is None else own.std[:, marker]
-        kind = CONTACT if resting else MARKER
-        read = Readings.of(kind, own.q, values, names, own.joint_names, std=std, doubt=False, numbers=3)
-        alike = ("payload", "payload_at", "covariates", "covariate_names", "line_numbers", "file_sha256", "origin")
-        found.append((with_attributes(read, **{name: getattr(own, name) for name in alike}), rows))
+        found.append((read_of_tool(own, MARKER, own.points[:, marker], names, std), rows))
     return found

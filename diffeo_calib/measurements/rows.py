@@ -38,7 +38,7 @@ def set_attributes(data: object, **attributes: object) -> None:
         object.__setattr__(data, name, value)
 
 
-ON_HOST = ("line_numbers", "session", "socket", "device", "seen_by")
+ON_HOST = ("line_numbers", "session", "device", "seen_by")
 """Columns of numbers that stay on the host."""
 NO_SOCKET = -1
 """Number of the socket of rows whose positions a device measured."""
@@ -343,7 +343,8 @@ class RowGroups:
         held, labels, kind = self._divided
         units, names, test = labels.numpy(), np.full(len(self), "", dtype=object), np.zeros(len(self), dtype=bool)
         for part, rows in zip(self.parts, self.index, strict=True):  # devices of other kinds are others
-            names[rows.numpy()] = [name and f"{part.kind} {name}" for name in part.device_names]
+            each = zip(part.device_names, (part.places != NO_SOCKET).tolist(), strict=True)
+            names[rows.numpy()] = ["" if rests else name and f"{part.kind} {name}" for name, rests in each]
         test[held] = out = ~in_train(labels, fraction, seed, kind)
         for name in np.unique(names[test]):
             own = (names == name) & (name != "")

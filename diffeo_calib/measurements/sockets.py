@@ -1,4 +1,4 @@
-"""Rows without a measuring device: a ball on the tool rests in a socket, whose place is not known.
+"""Readings without a measuring device: a ball on the tool rests in a socket, whose place is not known.
 
 All rows of a socket have their ball at the same unknown point. Sockets in one rigid block stand at one place; distances
 between some of them may be known, such as 50 mm in a printed block.
@@ -6,7 +6,7 @@ between some of them may be known, such as 50 mm in a printed block.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
 from typing import TYPE_CHECKING, Any
@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import number_of
-from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError, as_written, few, listed
-from diffeo_calib.measurements.checks import numbers_of, texts_of
-from diffeo_calib.measurements.rows import NO_SOCKET, RowGroups, with_attributes
+from diffeo_calib.common.device import methods_outside_inference_mode
+from diffeo_calib.common.errors import MeasurementError, as_written, few, listed, sentence, warn_user
+from diffeo_calib.measurements.checks import numbers_of
+from diffeo_calib.measurements.readings import CONTACT, Readings, read_of_tool
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -26,9 +26,7 @@ if TYPE_CHECKING:
 SEPARATOR = "/"
 """Between the name of a place and that of a socket: "front/0"."""
 Distances = Mapping[tuple[str, str], float]
-ONE_SESSION: dict[str, object] = {"session": None, "session_names": (), "remounted": False}
-BALL = "ball"
-"""Name of the last marker, if the other ones have names."""
+KIND = "socket"
 FLATTERY = (
     "the spread within sockets is smaller than the true error: it contains neither errors that all rows of a socket "
     "share nor the robot's size, so that absolute errors are 2 to 6 times as large; do not compare models by it"
@@ -100,153 +98,78 @@ class Sockets:
         return numbers_of([_place(name) for name in self.names], self.place_names)
 
 
-class SocketTable(RowGroups):
-    """Rows of markers whose last one may be a ball that rested in sockets.
+@methods_outside_inference_mode
+@dataclass(frozen=True, eq=False, repr=False)
+class SocketReadings(Readings):
+    """N joint configurations in which the ball rested in sockets: a row reads that it is there, three zeros.
 
-    In a table of both kinds of rows the ball is hidden where a device measured, and the other markers where it rested.
+    Made by :meth:`Measurements.from_sockets`.
 
-    Attributes:
-        socket: (N,) int64, where the ball rested, -1 if a device measured. sockets: names and distances.
+    Args:
+        distances: known distances [m] of two sockets by their names, also of sockets that no row shows.
+        distance_std: see :class:`Sockets`. Other arguments are those of :class:`Readings`; devices are sockets.
     """
 
+    ALIKE = (*Readings.ALIKE, "distances", "distance_std")
     flattery = FLATTERY
 
-    points: Tensor
-    frames: Any
-    poses: Tensor | None = None
-    lever: float | None = None
-    board: Tensor | None = None
-    std: Tensor | None = None
-    rotation_std: Tensor | None = None
-    marker_names: tuple[str, ...] | None = None
-    on: tuple[str, ...] | None = None
-    session: Tensor | None = None
-    session_names: tuple[str, ...] = ()
-    remounted: bool = False
-    socket: Tensor | None = None
-    sockets: Sockets | None = None
+    distances: tuple[tuple[str, str, float], ...] = ()
+    distance_std: float | None = None
 
     @property
-    def markers(self) -> int:
-        """Number of markers P; 3 for every pose of a row, because three points represent a pose."""
-        return self.points.shape[1]
+    def sockets(self) -> Sockets:
+        """The sockets of these rows, and known distances between them."""
+        number = {name: number for number, name in enumerate(self.names)}
+        known = ((number[a], number[b], away) for a, b, away in self.distances if {a, b} <= number.keys())
+        return Sockets(self.names, tuple(known), self.distance_std)
 
     @property
-    def without_device(self) -> bool:
-        """Whether no position was measured: the ball of every row rested in a socket."""
-        return self.socket is not None and bool((self.socket != NO_SOCKET).all())
-
-    @property
-    def ball_tip(self) -> str | None:
-        """Name of the tip that carries the ball in sockets; None without one."""
-        return None if self.sockets is None or self.on is None else self.on[-1]
+    def blocks(self) -> list[tuple[tuple[int, int, float], ...]]:
+        """See :class:`Sockets`."""
+        return self.sockets.blocks
 
     @property
     def socket_numbers(self) -> Tensor:
-        """(N,) int64, number of each row's socket, -1 for other rows."""
-        return super().socket_numbers if self.socket is None else self.socket
+        """(N,) int64, number of each row's socket."""
+        return self.device
 
     @property
     def places(self) -> Tensor:
-        """(N,) int64, number of the place of each row's socket, -1 where a device measured."""
-        if self.socket is None or self.sockets is None:
-            return self.socket_numbers
-        return torch.where(self.socket == NO_SOCKET, NO_SOCKET, self.sockets.place[self.socket])
+        """(N,) int64, number of the place of each row's socket."""
+        return self.sockets.place[self.device]
 
     @property
-    def row_sockets(self) -> list[str]:
-        """(N,) name of the socket of each row, "" where a device measured."""
-        return texts_of(self.socket, () if self.sockets is None else self.sockets.names, len(self))
+    def points(self) -> Tensor:
+        """(N, 1, 3) NaN: no position was measured."""
+        return torch.full_like(self.values, torch.nan)[:, None]
 
     @property
-    def known_sockets(self) -> Sockets:
-        """The sockets; MeasurementError for rows without any."""
-        if self.sockets is None:
-            raise MeasurementError.of("the rows have no sockets", fix="pass Measurements.from_sockets(...)")
-        return self.sockets
+    def stated(self) -> object:
+        """See :class:`Readings`."""
+        return super().stated, self.distances, self.distance_std
 
-    def other_socket(self, row: int, predicted: Tensor, near: float) -> str | None:
-        """Why a row in a socket is far from its place, in words; None for rows in no socket.
+    def __repr__(self) -> str:
+        return f"SocketReadings({len(self)} rows in {len(self.names)} socket{'s' * (len(self.names) != 1)})"
 
-        ``predicted`` (N, P, 3), m, ``points`` being the places of the sockets, of which another fits if ``near``, m.
-        """
-        if int(self.socket_numbers[row]) == NO_SOCKET:
-            return None
-        away = (predicted[row, -1] - self.points[:, -1]).norm(dim=-1).nan_to_num(torch.inf)
-        nearest = int(away.argmin())
-        if float(away[nearest]) > near:
-            return "far from where the other rows of its socket predict it"
-        return f"fits socket '{self.row_sockets[nearest]}': named after a wrong one?"
+    def measured(self) -> dict[str, Any]:
+        """The names of the sockets."""
+        return {"socket": self.device_names}
 
-    def device_rows(self) -> Self:
-        """The rows whose positions a device measured, without the ball; the table itself if it has no sockets."""
-        if self.socket is None:
-            return self
-        rows = self.rows(self.socket == NO_SOCKET)
-        names = {name: own and own[:-1] for name, own in (("marker_names", rows.marker_names), ("on", rows.on))}
-        std = None if rows.std is None else rows.std[:, :-1]
-        return with_attributes(rows, socket=None, sockets=None, points=rows.points[:, :-1], std=std, **names)
+    def with_sessions(self, names: object, **_: object) -> Self:
+        """Raise MeasurementError: sockets of another set-up are other sockets."""
+        fix = "give the sockets of each session names of their own, and leave the sessions out"
+        raise MeasurementError.of("rows with sockets", expected="no sessions", got=as_written(names), fix=fix)
 
-    def socket_rows(self) -> Self:
-        """The rows whose ball rested in sockets, with the ball alone; MeasurementError if there are none."""
-        if len(self.known_sockets.names) and self.without_device and self.markers == 1:
-            return self
-        rows = self.rows(self.socket_numbers != NO_SOCKET)
-        changes = {"points": rows.points[:, -1:], "marker_names": None, "on": None, "std": None}
-        return with_attributes(rows, **changes, session=None, session_names=())
+    def explained(self) -> tuple[Tensor, Tensor, str | None]:
+        """See :meth:`Measurements.explained`: every socket is at one place."""
+        return *self.index, torch.nn.functional.one_hot(self.device).to(self.values), self.on
 
-    def with_sockets_of_rows(self) -> Self:
-        """The same rows without the sockets that hold the ball in none of them, and without distances to these."""
-        if self.socket is None or self.sockets is None:
-            return self
-        rest = self.socket != NO_SOCKET
-        used, inverse = self.socket[rest].unique(return_inverse=True)
-        numbers = torch.full_like(self.socket, NO_SOCKET).masked_scatter(rest, inverse)
-        new = {old: number for number, old in enumerate(used.tolist())}
-        names = tuple(self.sockets.names[old] for old in new)
-        distances = tuple((new[a], new[b], d) for a, b, d in self.sockets.distances if a in new and b in new)
-        return with_attributes(self, socket=numbers, sockets=Sockets(names, distances, self.sockets.distance_std))
-
-    def with_markers(self, count: int) -> Self:
-        """The rows with this many markers, the ball last: those that rows of one kind do not show are hidden."""
-        if self.sockets is not None:
-            lacking = count - 1 if self.markers == 1 else 0
-            changes: dict[str, object] = {"marker_names": None, "on": None} if lacking else {}
-            return with_attributes(self, points=_padded(self.points, lacking, 0), **changes)
-        if self.markers != count - 1:
-            return self
-        names = self.marker_names and (*self.marker_names, BALL)
-        changes = {"marker_names": names, "on": self.on and (*self.on, self.on[-1])}
-        std = None if self.std is None else _padded(self.std, 0, 1)
-        return with_attributes(self, points=_padded(self.points, 0, 1), std=std, **changes)
-
-    @classmethod
-    def of_one_layout(cls, tables: Sequence[Self]) -> Sequence[Self]:
-        """Positions and rows in sockets with the same markers, the ball as the last one."""
-        device = [table for table in tables if table.sockets is None]
-        known = [table for table in tables if table.sockets is not None]
-        if not known or (not device and len({table.markers for table in tables}) == 1):
-            return super().of_one_layout(tables)
-        most = max(known, key=lambda table: table.markers)
-        both = device[0].with_markers(device[0].markers + 1) if device else most
-        found = []
-        for table in tables:
-            none = torch.full((len(table),), NO_SOCKET, dtype=torch.int64, device=HOST)
-            shown = table.with_markers(both.markers if table.sockets is not None else table.markers + 1)
-            changes: dict[str, object] = {}
-            if table.sockets is None:
-                changes = {"socket": none, "sockets": known[0].sockets}
-            elif table.markers == 1:
-                changes = {"marker_names": both.marker_names, "on": both.on, "remounted": both.remounted}
-                changes |= {} if both.std is None else {"std": torch.full_like(shown.points, torch.nan)}
-                changes |= {} if both.session is None else {"session": none, "session_names": both.session_names}
-            found.append(with_attributes(shown, **changes))
-        return super().of_one_layout(found)
-
-
-def _padded(values: Tensor, before: int, after: int) -> Tensor:
-    """Values (N, P, 3) with hidden markers before and after."""
-    return torch.nn.functional.pad(values, (0, 0, before, after), value=torch.nan)
+    def beside_images(self) -> list[tuple[Any, Tensor]]:
+        """See :class:`RowGroups`: contacts of a point of the tool; distances of sockets are not used."""
+        if self.distances:
+            fix = "calibrate without the images to use them"
+            warn_user(sentence("known distances between sockets are not used beside images of a board", fix=fix))
+        return [(read_of_tool(self, CONTACT, self.values, self.device_names), *self.index)]
 
 
 def _place(name: str) -> str:

@@ -18,12 +18,12 @@ from diffeo_calib.common.device import HOST, methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements import checks
 from diffeo_calib.measurements import poses as pose_math
-from diffeo_calib.measurements.bodies import Bodies
-from diffeo_calib.measurements.images import ImageTable
+from diffeo_calib.measurements.bodies import BALL, Bodies
+from diffeo_calib.measurements.images import ONE_SESSION, ImageTable
 from diffeo_calib.measurements.observations import Observations, joined_tables
 from diffeo_calib.measurements.readings import Readings, as_readings
-from diffeo_calib.measurements.rows import NO_SOCKET, set_attributes, with_attributes
-from diffeo_calib.measurements.sockets import ONE_SESSION, Distances, Sockets
+from diffeo_calib.measurements.rows import set_attributes, with_attributes
+from diffeo_calib.measurements.sockets import KIND, Distances, SocketReadings, Sockets
 from diffeo_calib.measurements.table_format import LEVER
 
 XYZ, TURNS = ("x", "y", "z"), ("rx", "ry", "rz")
@@ -56,7 +56,6 @@ class Measurements(ImageTable):
         session_names: their names. remounted: whether the device stayed, and markers were mounted anew between them.
         payload: (N,) known masses that the robot carried, in any unit; None where they are not known.
         payload_at: name of the link that carried them; None for the robot's tip.
-        socket: (N,) int64, where the ball, the last marker, rested, -1 if a device measured. sockets: names, distances.
         line_numbers: (N,) int64, where every row comes from: its line in the file, or its row number in the original
             table. Subsets keep the line numbers of their rows.
         file_sha256: SHA-256 of the file that the rows were read from; None for arrays.
@@ -75,9 +74,9 @@ class Measurements(ImageTable):
             Nothing is dropped.
     """
 
-    BY_ROW = ("q", "points", "poses", "board", "std", "rotation_std", "line_numbers", "session", "payload", "socket")
+    BY_ROW = ("q", "points", "poses", "board", "std", "rotation_std", "line_numbers", "session", "payload")
     BY_ROW = (*BY_ROW, "covariates", *ImageTable.BY_IMAGE)
-    ALIKE = ("joint_names", "marker_names", "on", "lever", "session_names", "payload_at", "sockets", "n", "markers")
+    ALIKE = ("joint_names", "marker_names", "on", "lever", "session_names", "payload_at", "n", "markers")
     ALIKE = (*ALIKE, "covariate_names", "cameras", "remounted")
     NUMBERED = "session", "session_names"
 
@@ -168,9 +167,8 @@ class Measurements(ImageTable):
         tips = None if on is None else on[:: pose_math.POINTS]
         return cls.from_poses(q, poses, on=tips, lever=lever, doubt=False)
 
-    @classmethod
+    @staticmethod
     def from_sockets(
-        cls,
         q: object,
         sockets: Sequence[str],
         joint_names: Sequence[str] | None = None,
@@ -178,7 +176,7 @@ class Measurements(ImageTable):
         distances: Distances | None = None,
         distance_std: float | None = None,
         doubt: bool = True,
-    ) -> Measurements:
+    ) -> SocketReadings:
         """N joint configurations in which a ball on the tool rested in sockets. No position was measured.
 
         Args:
@@ -190,7 +188,7 @@ class Measurements(ImageTable):
             distance_std: standard deviation of the known distances, m.
 
         Returns:
-            measurements whose ``points`` are NaN, and whose ``socket`` (N,) holds numbers of ``sockets.names``.
+            readings, whose ``device`` (N,) holds numbers of the sockets ``names``.
 
         Raises:
             MeasurementError: not one name per row; a distance that is not positive, or between unknown sockets; a
@@ -199,17 +197,17 @@ class Measurements(ImageTable):
         angles, joints = checks.joint_table(q, joint_names)
         numbers, names = checks.numbered(sockets, len(angles), "`sockets`")
         known = Sockets.of(names, distances, distance_std)
-        nowhere = torch.zeros(len(angles), 1, 3, dtype=torch.float64, device=angles.device)
-        data = cls(angles, nowhere, joints, doubt=doubt)
-        return with_attributes(data, points=torch.full_like(nowhere, torch.nan), socket=numbers, sockets=known)
+        apart = tuple((names[a], names[b], length) for a, b, length in known.distances)
+        zeros = torch.zeros(len(angles), 3, dtype=torch.float64, device=angles.device)
+        how: Any = {"joint_names": joints, "distances": apart, "distance_std": known.distance_std}
+        return SocketReadings(KIND, angles, zeros, numbers.to(HOST), names, **how).doubted(doubt)
 
     @classmethod
     def joined(cls, parts: Sequence[Measurements | Readings | Observations]) -> Any:
         """The rows of several tables, in order: :class:`Measurements` if one table can hold them.
 
-        These are rows with the same columns, and measured positions beside rows in sockets, of one tool, whose ball is
-        then the last marker. Rows of other kinds become :class:`Observations`. Beside images of a board positions
-        and rows in sockets become readings of points of the same tool, see sensors/tool_frames.py.
+        These are rows with the same columns; rows of several kinds become :class:`Observations`. Beside images of a
+        board positions and rows in sockets become readings of points of the same tool, see sensors/tool_frames.py.
 
         Raises:
             MeasurementError: tables that differ in joints, payloads, markers or known deviations.
@@ -245,15 +243,11 @@ class Measurements(ImageTable):
     def sha256(self) -> str:
         """SHA-256 of the file that the rows were read from, or of the arrays if they come from Python."""
         measured = {"points": self.points} if self.poses is None else {"poses": self.poses}
-        arrays = {"q": self.q, **({} if self.without_device else measured), "std": self.std}
+        arrays = {"q": self.q, **measured, "std": self.std}
         arrays |= {"rotation_std": self.rotation_std, "corners": self.corners}
         arrays |= {"seen_by": self.seen_by if len(self.cameras) > 1 else None}
         arrays |= {"payload": self.payload, "board": self.board}
-        sockets = None
-        if self.sockets is not None:
-            known = self.sockets.distances, self.sockets.distance_std
-            sockets = {"sockets": repr((self.row_sockets, known)).encode()}
-        return self.file_sha256 or checks.arrays_sha256(arrays, sockets)
+        return self.file_sha256 or checks.arrays_sha256(arrays)
 
     @property
     def frames(self) -> Tensor | None:
@@ -263,10 +257,7 @@ class Measurements(ImageTable):
     @property
     def visible(self) -> Tensor:
         """(N, P) boolean: which markers were seen in which rows."""
-        seen = checks.seen_markers(self.points)
-        if self.socket is not None:  # the ball
-            seen[:, -1] = self.socket.to(seen.device) != NO_SOCKET
-        return seen
+        return checks.seen_markers(self.points)
 
     @property
     def bodies(self) -> Bodies:
@@ -284,15 +275,6 @@ class Measurements(ImageTable):
         return self.visible[:, :: self.bodies.points]
 
     @property
-    def body_kinds(self) -> Tensor | None:
-        """(N, B) int64, 1 for the ball in sockets beside bodies that a device saw, 0; None if all are of one kind."""
-        if self.sockets is None or self.without_device:
-            return None
-        found = torch.zeros(self.seen_bodies.shape, dtype=torch.int64, device=self.q.device)
-        found[:, -1] = 1
-        return found
-
-    @property
     def body_names(self) -> list[str]:
         """Names of markers or frames in messages, such as "marker 0", "the frame on 'hand'"."""
         if self.lever is None:
@@ -303,9 +285,7 @@ class Measurements(ImageTable):
 
     @property
     def kind(self) -> str:
-        """Kind of the rows: "position", "pose" or "socket"; "mixture" for positions and sockets."""
-        if self.sockets is not None:
-            return "socket" if self.without_device and self.markers == 1 else "mixture"
+        """Kind of the rows: "position" or "pose"."""
         return "position" if self.poses is None else "pose"
 
     @property
@@ -317,10 +297,6 @@ class Measurements(ImageTable):
         counts = (len(self), "row"), (self.n, "joint"), (self.markers, "marker")
         parts = [f"{count} {thing}" + "s" * (count != 1) for count, thing in counts]
         hidden = int((~self.seen_bodies).sum())
-        if self.sockets is not None:
-            named, resting = f"{len(self.sockets.names)} sockets", int((self.socket_numbers != NO_SOCKET).sum())
-            words = [f"the last one in {named} in {resting} of the rows"]
-            parts, hidden = [*parts[:2], named] if self.without_device else parts + words, 0
         if self.frames is not None:
             parts[2] = pose_math.kind_of_points(self.markers, self.lever)
         parts += [f"{hidden} of {self.seen_bodies.numel()} sightings hidden"] * bool(hidden)
@@ -328,21 +304,20 @@ class Measurements(ImageTable):
 
     @property
     def prefixes(self) -> list[str]:
-        """Beginnings of the columns of each marker or frame: none for a single one, else NAME_, TIP_; not of a ball."""
+        """Beginnings of the columns of each marker or frame: none for a single one, else NAME_, TIP_."""
         if self.frames is not None:
             frames = self.frames.shape[1]
             return [""] if frames == 1 else [f"{tip}_" for tip in pose_math.frame_tips(self.on, frames)]
-        seen = self.markers - (self.sockets is not None)
-        plain = [""] if seen == 1 else [f"marker{k + 1}_" for k in range(seen)]
-        return plain if self.marker_names is None else [f"{name}_" for name in self.marker_names[:seen]]
+        plain = [""] if self.markers == 1 else [f"marker{k + 1}_" for k in range(self.markers)]
+        return plain if self.marker_names is None else [f"{name}_" for name in self.marker_names]
 
     def measured(self) -> dict[str, Any]:
-        """Sockets, positions and rotation vectors rx, ry, rz, known standard deviations as std_x, ..., and sessions.
+        """Positions and rotation vectors rx, ry, rz, known standard deviations as std_x, ..., and sessions.
 
         Poses seen by a camera on the tool are those of the camera in the board's frame, with the deviations along the
         camera's axes.
         """
-        columns: dict[str, Any] = {} if self.sockets is None else {"socket": self.row_sockets}
+        columns = dict[str, Any]()
         names, turns = ([f"{prefix}{name}" for prefix in self.prefixes for name in own] for own in (XYZ, TURNS))
         columns |= zip(names, self.origins.flatten(1).T, strict=False)
         if self.frames is not None:
@@ -356,6 +331,28 @@ class Measurements(ImageTable):
         """Return the same measurements with markers or poses on these tips, a name for each, else MeasurementError."""
         points = 1 if self.poses is None else pose_math.POINTS
         return with_attributes(self, on=checks.tip_names(on, self.markers // points, points))
+
+    def with_markers(self, count: int) -> Measurements:
+        """The rows with this many markers, the last one a ball that none of them shows if it is one more."""
+        if self.markers != count - 1:
+            return self
+
+        def padded(values: Tensor) -> Tensor:
+            return torch.nn.functional.pad(values, (0, 0, 0, 1), value=torch.nan)
+
+        names, tips = self.marker_names and (*self.marker_names, BALL), self.on and (*self.on, self.on[-1])
+        std = None if self.std is None else padded(self.std)
+        return with_attributes(self, points=padded(self.points), std=std, marker_names=names, on=tips)
+
+    def explained(self) -> tuple[Tensor, Tensor, str | None]:
+        """Rows (M,), columns (M, c) that explain each coordinate of a point of the robot there by a sum, and its tip.
+
+        They do wherever the device stands: the marker that most rows show is an affine function of its positions.
+        """
+        marker = int(self.visible.sum(0).argmax())
+        rows = self.visible[:, marker].nonzero()[:, 0]
+        at = self.points[rows, marker]
+        return rows, torch.nn.functional.pad(at - at.mean(0), (1, 0), value=1.0), self.on and self.on[marker]
 
     def with_sessions(self, names: Sequence[str] | None, *, remounted: bool = False) -> Measurements:
         """Return the same measurements in several set-ups of the measuring device, a name for each row (N,).

@@ -24,7 +24,7 @@ from urllib.parse import parse_qs
 
 from diffeo_calib.campaign.campaign import Campaign, Next
 from diffeo_calib.campaign.feeds import DECISIONS, Inbox
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, shown
 
 LOCAL = ("127.0.0.1", "localhost")
 PATHS = tuple(f"/{name}" for name in DECISIONS)
@@ -64,7 +64,7 @@ def served(address: str, decisions: Inbox) -> Iterator[Page]:
         page = Page((host or LOCAL[0], int(port)), decisions)
     except (OSError, ValueError, OverflowError) as error:
         expected = "a free port, or HOST:PORT"
-        raise InputError.of(f"the page at {address}", expected=expected, got=str(error)) from error
+        raise InputError.of(f"the page at {shown(address)}", expected=expected, got=shown(str(error))) from error
     thread = Thread(target=page.serve_forever, daemon=True)
     thread.start()
     try:

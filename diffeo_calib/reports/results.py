@@ -31,14 +31,14 @@ def schema(kind: Any, text: str = "", **more: Any) -> dict[str, Any]:
     if isinstance(kind, tuple):
         return {"enum": list(kind)} | more
     each = get_args(kind) or (kind,)
-    return {"type": SIMPLE[each[0]] if len(each) == 1 else [SIMPLE[one] for one in each]} | more
+    return {"type": SIMPLE[each[0]] if len(each) == 1 else [SIMPLE[word] for word in each]} | more
 
 
-def entries(own: dict[str, Any], text: str = "", *may_lack: str, **more: Any) -> dict[str, Any]:
+def entries(fields: dict[str, Any], text: str = "", *may_lack: str, **more: Any) -> dict[str, Any]:
     """An object with these entries, by name, and no others."""
-    found = {"type": "object", "required": [name for name in own if name not in may_lack]}
-    known = {"additionalProperties": False, "properties": {name: schema(kind) for name, kind in own.items()}}
-    return schema(found | known | more, text)
+    head = {"type": "object", "required": [name for name in fields if name not in may_lack]}
+    body = {"additionalProperties": False, "properties": {name: schema(kind) for name, kind in fields.items()}}
+    return schema(head | body | more, text)
 
 
 def tree(kind: Any, depth: int) -> dict[str, Any]:

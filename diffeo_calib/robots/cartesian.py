@@ -16,9 +16,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
+from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.robots.joint import Joint
-from diffeo_calib.robots.se3 import nearest_rotations, transforms
+from diffeo_calib.robots.se3 import nearest_rotations, rigid_poses, transforms
 from diffeo_calib.robots.tree import Chain, Tree
 
 SLIDES, TURNS = ("pose_x", "pose_y", "pose_z"), ("pose_a", "pose_b", "pose_c")
@@ -29,10 +30,8 @@ BEYOND, LEAST_BEYOND, LEAST_BEYOND_RAD = 0.25, 0.01, 0.35
 one that stood still can be corrected; of turns at least by so much."""
 FLAT, STEEPEST = 0.8, 0.97
 """Sine of the largest b about the mean of the poses, and about any middle."""
-DIRECTIONS, GOLDEN_ANGLE_RAD = 500, pi * (3.0 - 5.0**0.5)
+DIRECTIONS = 2000
 """Of the z-axis of M that are tried."""
-TOLERANCE = 1e-3
-"""Files have few digits."""
 
 
 def cartesian(poses: object) -> Chain:
@@ -98,10 +97,8 @@ def _middle(R: Tensor) -> Tensor:
     mean, x = nearest_rotations(R.mean(0)), R[:, :, 0]
     if float((x @ mean[:, 2]).abs().max()) < FLAT:
         return mean
-    k = torch.arange(DIRECTIONS, dtype=R.dtype, device=R.device) + 0.5
-    height, turn = 1.0 - k / DIRECTIONS, GOLDEN_ANGLE_RAD * k  # half a sphere
-    radius = (1.0 - height.square()).sqrt()
-    ways = torch.stack([radius * turn.cos(), radius * turn.sin(), height], 1)
+    draws = torch.randn(DIRECTIONS, 3, generator=seeded(0), dtype=torch.float64, device=HOST)
+    ways = torch.nn.functional.normalize(draws, dim=1).to(R)
     z = ways[(x @ ways.mT).abs().amax(0).argmin()]
     side = torch.linalg.cross(z, mean[:, (mean.mT @ z).abs().argmin()], dim=0)
     side = side / side.norm()
@@ -112,15 +109,7 @@ def _checked(poses: object) -> Tensor:
     """Poses (N, 4, 4) with exact rotations, or places."""
     also = [("N", 1), ("N", 2), ("N", 3)]
     given = as_tensor(poses, "poses", ("N", 4, 4), also=also, fix="pass one transform, or one place, per row")
-    if given.ndim == 2:
-        return given
-    R, eye = given[:, :3, :3], torch.eye(4, dtype=given.dtype, device=given.device)
-    away = torch.maximum((R.mT @ R - eye[:3, :3]).abs().amax((1, 2)), (given[:, 3] - eye[3]).abs().amax(1))
-    bad = (away > TOLERANCE) | (torch.linalg.det(R) < 0)
-    if bool(bad.any()):
-        fix = "pass [[R, t], [0, 0, 0, 1]] in m"
-        raise InputError.of(f"`poses`, row {int(bad.nonzero()[0])}", expected="a rigid transform", fix=fix)
-    return transforms(nearest_rotations(R), given[:, :3, 3])
+    return given if given.ndim == 2 else rigid_poses(given)
 
 
 def _chain(inputs: Tensor, middle: Tensor | None = None) -> Chain:

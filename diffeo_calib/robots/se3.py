@@ -8,17 +8,26 @@ robotics", 2018.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import atan2, cos, pi, sin
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, wrapped
-from diffeo_calib.common.errors import RobotError
+from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.runtime.chain import smooth
 
 RIGID_TOLERANCE = 1e-6
 """Largest accepted entry of |R^T R - 1|: text files carry six digits or more."""
+TOLERANCE = 1e-3
+"""Measured quaternions and matrices may be off by this, because files have few digits; the nearest rotation is used."""
+ROUNDING = 2e-15
+"""Entries of R^T R - 1 that are rounding alone: such matrices are rotations already."""
+ONE_POSE = "pass one rigid transform per row, (N, 4, 4), or one for each of T tips, (N, T, 4, 4)"
+
+Place = Callable[[int], str]
+"""Names a row in messages."""
 
 
 def skew(vectors: Tensor) -> Tensor:
@@ -81,6 +90,13 @@ def twist_transform(twists: Tensor) -> Tensor:
     return transforms(rotation(twists[..., 3:]), twists[..., :3])
 
 
+def twist_at(place: Tensor) -> Tensor:
+    """(6, 6) from the shift of a body at the origin, and its turn, to those at a place (3,), m."""
+    there = torch.eye(6, dtype=place.dtype, device=place.device)
+    there[:3, 3:] = -skew(place)
+    return there
+
+
 def nearest_rotations(matrices: Tensor) -> Tensor:
     """The proper rotations nearest in the Frobenius norm: any matrices (..., 3, 3) -> (..., 3, 3).
 
@@ -91,6 +107,41 @@ def nearest_rotations(matrices: Tensor) -> Tensor:
     signs = torch.ones_like(matrices[..., 0])
     signs[..., 2] = torch.linalg.det(U @ Vt).sign()
     return (U * signs[..., None, :]) @ Vt
+
+
+def checked_rotations(matrices: Tensor, place: Place = "row {}".format) -> Tensor:
+    """The rotations nearest to matrices that are rotations up to rounding: (N, 3, 3) -> (N, 3, 3).
+
+    Raises:
+        InputError: a matrix that is off by more than 0.001 (row named).
+    """
+    away = (matrices.mT @ matrices - torch.eye(3, dtype=matrices.dtype, device=matrices.device)).abs().amax((1, 2))
+    bad = ~(away <= TOLERANCE) | (torch.linalg.det(matrices) < 0)
+    if bad.any():
+        row = int(bad.nonzero()[0])
+        mirrored = float(away[row]) <= TOLERANCE
+        got = "a determinant of -1, a mirrored frame" if mirrored else f"R^T R - 1 of up to {float(away[row]):.2g}"
+        expected = f"a rotation matrix, orthonormal to {TOLERANCE:g}"
+        fix = "check that the entries come row by row and without a scale"
+        raise InputError.of(place(row), expected=expected, got=got, fix=fix)
+    exact = len(away) > 0 and float(away.max()) <= ROUNDING
+    return matrices if exact else nearest_rotations(matrices)
+
+
+def rigid_poses(poses: object, place: Place = "`poses`, row {}".format) -> Tensor:
+    """The rigid poses nearest to poses [[R, t], [0, 0, 0, 1]]: (N, 4, 4) -> (N, 4, 4).
+
+    Raises:
+        InputError: wrong shape, values that are not finite, a last row other than [0, 0, 0, 1], or an R that is not a
+            rotation.
+    """
+    frames = as_tensor(poses, "poses", ("N", 4, 4), fix=ONE_POSE).detach()
+    bad = ((frames[:, 3] - frames.new_tensor([0.0, 0.0, 0.0, 1.0])).abs() > TOLERANCE).any(1)
+    if bad.any():
+        row = int(bad.nonzero()[0])
+        what, fix = f"{place(row)}: the last row of the transform", "pass [[R, t], [0, 0, 0, 1]], not its transpose"
+        raise InputError.of(what, expected=[0, 0, 0, 1], got=frames[row, 3].tolist(), fix=fix)
+    return transforms(checked_rotations(frames[:, :3, :3], place), frames[:, :3, 3])
 
 
 def rigid(value: object, name: str) -> Tensor:

@@ -206,14 +206,16 @@ def _drivers(urdf: URDF, joints: Sequence[Joint]) -> list[Joint]:
 
 def _warn_of_branches(urdf: URDF, robot: Tree, steps: Sequence[_Step]) -> None:
     """Warn if joints hang on moving links before the tips and are left out: their weight bends the robot."""
-    above, passed = _parents(urdf), {step.joint.name for step in steps}
+    above, passed, bodies = _parents(urdf), {step.joint.name for step in steps}, dict[str, str]()
 
     def body(link: str) -> str:
         """The topmost link that is fixed to a link."""
-        for _ in above:  # links may make a loop
-            if link in above and above[link].kind == "fixed":
-                link = above[link].parent
-        return link
+        way = list[str]()  # links may make a loop
+        while link not in bodies and link in above and above[link].kind == "fixed" and len(way) < len(above):
+            way.append(link)
+            link = above[link].parent
+        bodies.update(dict.fromkeys((*way, link), bodies.get(link, link)))
+        return bodies[link]
 
     top = [step.end for step in steps if step.up][-1:]
     carried = {body(step.end) for step in steps} - {body(link) for link in (robot.base, *robot.ends, *top)}

@@ -19,14 +19,14 @@ from diffeo_calib.common.errors import InputError, MeasurementError, few, listed
 from diffeo_calib.measurements.checks import ANGLE_MISTAKES, rare_names
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
+from diffeo_calib.measurements.sockets import KIND, SocketReadings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices, Extrinsics, check_devices
-from diffeo_calib.sensors.errors import ERRORS, READINGS, SPREAD, Evaluation, Evaluations, socket_errors
+from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, Evaluations, socket_errors
 from diffeo_calib.sensors.kinds import kind_of
 from diffeo_calib.sensors.set_ups import ROWS, SetUps, Turns, check_same_markers, mounted_kind, set_up_kind
 from diffeo_calib.sensors.tables import Coordinates
-from diffeo_calib.sensors.tool_frames import SocketPlaces
 
 KNOWN_DEVIATION = 1e-8
 """Prior deviations of increments below this, m or rad, are those of numbers that are known."""
@@ -231,56 +231,6 @@ class Poses(Positions):
         return replace(whole, errors=away.norm(dim=-1), angles=angles, away=away, turns=turns)
 
 
-class Contacts(Sensor):
-    """A ball in sockets, perhaps beside measured positions."""
-
-    def check(self, data: Measurements, model: Any) -> None:
-        check_ball(model, "rows with a ball in sockets", "rows", "rows in sockets")
-        check_tips(data, model.on[-data.markers :])
-
-    def rare(self, data: Measurements) -> list[str]:
-        return rare_names(data.row_sockets, data.line_numbers.tolist(), 2)
-
-    def check_angles(self, data: Measurements, model: Any) -> None:
-        """By the spread within sockets, relative to the motion of the tip, with which it shrinks."""
-        if not model.ball:
-            return
-        turning = torch.tensor(model.robot.periodic, dtype=torch.bool, device=data.q.device)
-
-        def share(q: Tensor) -> float:
-            tips = model.robot.tip_poses(q)[..., 0, :3, 3]
-            motion = float((tips - tips.mean(0)).square().sum(1).mean().sqrt())
-            resting = data.socket_numbers.to(q.device), data.known_sockets
-            away = socket_errors(model(q).detach()[:, -1], *resting)[0].norm(dim=1)
-            return float(away.nanmedian()) / max(motion, SMALLEST_MOTION_M)
-
-        own = share(data.q)
-        for factor, fix in ANGLE_MISTAKES:
-            other = share(torch.where(turning, factor * data.q, data.q))
-            if other < REMAINING_SPREAD * own:
-                expected = f"a spread within sockets of {1e2 * other:.2g} % of the tip's motion, as in the other unit"
-                raise MeasurementError.of("the joint values", expected=expected, got=f"{1e2 * own:.2g} %", fix=fix)
-
-    def place(self, data: Measurements, beside: Beside) -> Places:
-        """The middles of the sockets, which :meth:`errors` finds."""
-        count, lone = len(set(data.row_sockets) - {""}), self.rare(data)
-        found = [f"the middles of {count} sockets were found from these rows"]
-        if lone:
-            what = f"{len(lone)} of {len(data)} rows show no error: they are alone in their socket, so its middle"
-            found.append(f"{what}: {few(lone)}")
-        return Places(found=tuple(found), numbers=NUMBERS_OF_A_SOCKET * count)
-
-    def errors(self, data: Measurements, points: Tensor, places: Places) -> Evaluation:
-        """Spread within sockets, and errors of known distances."""
-        resting = data.socket_numbers.to(points.device), data.known_sockets
-        away, distances = socket_errors(points[:, -1], *resting)
-        size, lines, names = away.norm(dim=1, keepdim=True), data.line_numbers, data.row_sockets
-        return Evaluation(size, None, away[:, None], lines, distances, what=SPREAD, kind="socket", devices=names)
-
-    def settled(self, data: Measurements, points: Tensor, turns: Turns) -> tuple[Extrinsics, ...]:
-        return (SocketPlaces.around(points[:, -1], data),)
-
-
 class OtherDevices(Sensor):
     """Readings of the ball, or of a frame of the tool, by other devices."""
 
@@ -311,10 +261,14 @@ class OtherDevices(Sensor):
         if devices is None:
             fix = "pass rows of the devices of the calibration"
             raise MeasurementError.of("`data`", expected="readings of the calibration", got=f"{data.kind}s", fix=fix)
-        return self.in_unit(data, devices, devices.errors(data, devices.points_of(points)))
+        return self.in_unit(data, devices, self.away(data, points, places))
 
-    @staticmethod
-    def in_unit(data: Readings, devices: Devices, errors: Tensor) -> Evaluation:
+    def away(self, data: Readings, points: Tensor, places: Places) -> Tensor:
+        """Measured minus predicted readings (N, r), m."""
+        devices = places.devices[data.kind]
+        return devices.errors(data, devices.points_of(points))
+
+    def in_unit(self, data: Readings, devices: Devices, errors: Tensor) -> Evaluation:
         """Errors (N, r), m, in the unit of the device."""
         unit, per_unit = ("m", 1e-3) if data.unit[0] == "mm" else (data.unit[0], 1.0)
         away = per_unit * devices.in_unit(data, errors)
@@ -323,7 +277,7 @@ class OtherDevices(Sensor):
 
     def settled(self, data: Readings, points: Tensor, turns: Turns) -> tuple[Extrinsics, ...]:
         """The devices, with the standard deviations of their increments."""
-        found = placed(data, points)
+        found = self.around(data, points)
         seen = found.points_of(points)
         median = float(found.errors(data, seen).norm(dim=1).median())
         if median > LARGEST_MEDIAN_M:
@@ -334,13 +288,76 @@ class OtherDevices(Sensor):
             )
         return (replace(found, deviations=found.open_deviations(data, seen)),)
 
+    def around(self, data: Any, points: Tensor) -> Devices:
+        """The devices where rows put them, that tell enough, see :func:`placed`."""
+        return placed(data, points)
+
+
+class Contacts(OtherDevices):
+    """A ball in sockets, whose middles are found from any rows."""
+
+    def check(self, data: SocketReadings, model: Any) -> None:
+        check_ball(model, "rows with a ball in sockets", "rows", "rows in sockets")
+        if data.on is not None and data.on != model.on[-1]:
+            fix = "name the tip of the model's ball (`with_tips`)"
+            raise MeasurementError.of("the ball's tip", expected=f"'{model.on[-1]}'", got=f"'{data.on}'", fix=fix)
+
+    def rare(self, data: SocketReadings) -> list[str]:
+        return rare_names(data.device_names, data.line_numbers.tolist(), 2)
+
+    def check_angles(self, data: SocketReadings, model: Any) -> None:
+        """By the spread within sockets, relative to the motion of the tip, with which it shrinks."""
+        if not model.ball:
+            return
+        turning = torch.tensor(model.robot.periodic, dtype=torch.bool, device=data.q.device)
+
+        def share(q: Tensor) -> float:
+            tips = model.robot.tip_poses(q)[..., 0, :3, 3]
+            motion = float((tips - tips.mean(0)).square().sum(1).mean().sqrt())
+            away = socket_errors(model(q).detach()[:, -1], data.device.to(q.device), data.sockets)[0].norm(dim=1)
+            return float(away.nanmedian()) / max(motion, SMALLEST_MOTION_M)
+
+        own = share(data.q)
+        for factor, fix in ANGLE_MISTAKES:
+            other = share(torch.where(turning, factor * data.q, data.q))
+            if other < REMAINING_SPREAD * own:
+                expected = f"a spread within sockets of {1e2 * other:.2g} % of the tip's motion, as in the other unit"
+                raise MeasurementError.of("the joint values", expected=expected, got=f"{1e2 * own:.2g} %", fix=fix)
+
+    def place(self, data: SocketReadings, beside: Beside) -> Places:
+        """The middles of the sockets, which :meth:`errors` finds."""
+        count, lone = len(data.names), self.rare(data)
+        found = [f"the middles of {count} sockets were found from these rows"]
+        if lone:
+            what = f"{len(lone)} of {len(data)} rows show no error: they are alone in their socket, so its middle"
+            found.append(f"{what}: {few(lone)}")
+        return Places(found=tuple(found), numbers=NUMBERS_OF_A_SOCKET * count)
+
+    def errors(self, data: SocketReadings, points: Tensor, places: Places) -> Evaluation:
+        """Spread within sockets, and errors of known distances."""
+        away, distances = socket_errors(points[:, -1], data.device.to(points.device), data.sockets)
+        return replace(self._spread(data, away), distances=distances)
+
+    def away(self, data: SocketReadings, points: Tensor, places: Places) -> Tensor:
+        return socket_errors(points[:, -1], data.device.to(points.device), data.sockets)[0]
+
+    def in_unit(self, data: SocketReadings, devices: Devices, errors: Tensor) -> Evaluation:
+        return self._spread(data, errors.masked_fill(alone(data.device).to(errors.device)[:, None], torch.nan))
+
+    def _spread(self, data: SocketReadings, away: Tensor) -> Evaluation:
+        size, lines = away.norm(dim=1, keepdim=True), data.line_numbers
+        return Evaluation(size, None, away[:, None], lines, what=SPREAD, kind=data.kind, devices=data.device_names)
+
+    def around(self, data: SocketReadings, points: Tensor) -> Devices:
+        return fitting_devices(data, points)
+
 
 def of_devices(data: Any, names: Collection[str]) -> Any:
     """The rows of a table of the devices or set-ups of these names."""
     return data.rows([number for number, name in enumerate(data.device_names) if name in names])
 
 
-SENSORS: dict[str, Sensor] = {"position": Positions(), "pose": Poses(), "socket": Contacts()}
+SENSORS: dict[str, Sensor] = {"position": Positions(), "pose": Poses(), KIND: Contacts()}
 
 
 def errors_of_kinds(errors: Tensor, own: Coordinates | None, readings: Sequence[Any]) -> Evaluations:
@@ -353,17 +370,11 @@ def errors_of_kinds(errors: Tensor, own: Coordinates | None, readings: Sequence[
     """
     found = list[tuple[Evaluation, Tensor]]()
     if own is not None:
-        resting = own.table.socket_numbers != NO_SOCKET
-        for what, rows in ((ERRORS, ~resting), (SPREAD, resting)):
-            if bool(rows.any()):
-                sizes, lines = errors[own.rows[rows]].unflatten(1, (-1, 3)).norm(dim=2), own.table.line_numbers[rows]
-                if what == SPREAD:
-                    sizes = sizes.masked_fill(alone(own.table.socket_numbers[rows])[:, None], torch.nan)
-                kind = "socket" if what == SPREAD else own.table.device_rows().kind
-                found.append((Evaluation(sizes, line_numbers=lines, what=what, kind=kind), own.rows[rows]))
+        sizes, table = errors[own.rows].unflatten(1, (-1, 3)).norm(dim=2), own.table
+        found.append((Evaluation(sizes, line_numbers=table.line_numbers, kind=table.kind), own.rows))
     for one in readings:
         numbers = errors[one.rows[:, None], one.numbers]
-        found.append((OtherDevices.in_unit(one.data, one.devices, numbers), one.rows))
+        found.append((sensor_of(one.data).in_unit(one.data, one.devices, numbers), one.rows))
     return Evaluations.of(found)
 
 
@@ -381,7 +392,7 @@ def check_shown(data: Any) -> None:
         raise MeasurementError.of("`data`", expected="rows that show an error", got=got, fix=fix)
 
 
-def sensor_of(data: Any) -> Sensor:
+def sensor_of(data: Any) -> Any:
     """The kind of a table of one kind of rows."""
     return SENSORS.get(data.kind, OtherDevices())
 

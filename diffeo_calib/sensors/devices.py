@@ -237,9 +237,14 @@ class Devices(Extrinsics):
         by_own = vmap(jacrev(self._read_metres))(own, points)  # (N, r, c)
         return by_own @ vmap(jacrev(self.changed, argnums=1))(self.constants, none)[device]
 
+    @property
+    def root(self) -> Tensor:
+        """Square root (D k, D k) of the covariance of all increments before the rows, m or rad."""
+        return torch.diag(self.deviations.flatten())
+
     def shifted(self, shifts: Tensor) -> Devices:
-        """The devices after shifts (D k,), increments in units of their deviations."""
-        increments = shifts.view_as(self.deviations) * self.deviations
+        """The devices after shifts (D k,), increments in units of what is known of them."""
+        increments = (self.root @ shifts).view_as(self.deviations)
         return replace(self, constants=vmap(self.changed)(self.constants, increments))
 
     @classmethod
@@ -356,9 +361,9 @@ class Devices(Extrinsics):
 
     def shared(self, points: Tensor, device: Tensor) -> Tensor:
         """Uncertainty of the devices, as effects of unit variance that rows share: (N, r, D k)."""
-        own = self.by_increments(points, device) * self.deviations[device][:, None]  # (N, r, k)
+        own = self.by_increments(points, device)  # (N, r, k)
         whose = torch.nn.functional.one_hot(device, len(self.constants)).to(own)
-        return (whose[:, None, :, None] * own[:, :, None]).flatten(2)
+        return (whose[:, None, :, None] * own[:, :, None]).flatten(2) @ self.root
 
     def refined(self, data: Readings, points: Tensor) -> Devices:
         """The places that fit readings of known points (N, 3 k), m, best, by reweighted least squares."""
@@ -380,8 +385,8 @@ class Devices(Extrinsics):
         errors, slopes = self.errors(data, points), self.shared(points, self.numbers(data)).flatten(0, 1)
         level = errors.square().mean().sqrt().clamp(min=SMALLEST_MEDIAN_M)
         eye = torch.eye(slopes.shape[1], dtype=slopes.dtype, device=slopes.device)
-        covariance = torch.linalg.inv(slopes.mT @ slopes / level**2 + eye)
-        return covariance.diagonal().clamp(min=0).sqrt().view(len(self.names), -1) * self.deviations
+        covariance = self.root @ torch.linalg.inv(slopes.mT @ slopes / level**2 + eye) @ self.root.mT
+        return covariance.diagonal().clamp(min=0).sqrt().view(len(self.names), -1)
 
 
 def check_devices(data: Readings) -> None:

@@ -13,7 +13,6 @@ from diffeo_calib.common.data_frames import data_frame, table_html
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, listed
 from diffeo_calib.common.quantiles import known, quantile
-from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.sockets import Sockets
 
 NAMES = ("rms", "median", "p95", "max")
@@ -59,21 +58,19 @@ def socket_errors(predicted: Tensor, socket: Tensor, sockets: Sockets) -> tuple[
     """Compare predicted positions (N, 3), m, of rows in sockets (N,) with one another: the middle is their mean.
 
     Returns:
-        (N, 3) from the predicted position of each row to the middle of its socket, m; NaN without one, and of a row
-        that is alone in its socket, whose middle it is. Known distances between sockets that both have rows.
+        (N, 3) from the predicted position of each row to the middle of its socket, m; NaN of a row that is alone in its
+        socket, whose middle it is. Known distances between sockets that both have rows.
     """
-    inside = socket != NO_SOCKET
-    own = socket[inside]
-    count = torch.bincount(own, minlength=len(sockets.names)).to(predicted)
-    middles = predicted.new_zeros(len(sockets.names), 3).index_add(0, own, predicted[inside]) / count[:, None]
+    count = torch.bincount(socket, minlength=len(sockets.names)).to(predicted)
+    middles = predicted.new_zeros(len(sockets.names), 3).index_add(0, socket, predicted) / count[:, None]
     seen = (count > 0).tolist()
     distances = tuple(
         DistanceError(sockets.names[a], sockets.names[b], known, float((middles[a] - middles[b]).norm()))
         for a, b, known in sockets.distances
         if seen[a] and seen[b]
     )
-    judged = inside & (count > 1)[socket]
-    return (middles[socket] - predicted).masked_fill(~judged[:, None], torch.nan), distances
+    alone = (count == 1)[socket]
+    return (middles[socket] - predicted).masked_fill(alone[:, None], torch.nan), distances
 
 
 @dataclass(frozen=True, repr=False)

@@ -29,10 +29,10 @@ from diffeo_calib.sensors.set_ups import MeasuringFrames, MountedFrames, Mounted
 from diffeo_calib.sensors.tool_frames import Contacts, HeldTools, SocketPlaces, Trackers
 
 KINDS: dict[str, type[Devices]] = {
-    kind.kind: kind for kind in (FixedPoints, Planes, Cameras, HeldTools, Trackers, Contacts)
+    kind.kind: kind for kind in (FixedPoints, Planes, Cameras, HeldTools, Trackers, Contacts, SocketPlaces)
 }
 WITHOUT_READINGS: dict[str, type[Extrinsics]] = {
-    kind.kind: kind for kind in (MeasuringFrames, MountedMarkers, MountedFrames, SocketPlaces, BoardCameras, KnownDrift)
+    kind.kind: kind for kind in (MeasuringFrames, MountedMarkers, MountedFrames, BoardCameras, KnownDrift)
 }
 
 

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import torch
-
 from diffeo_calib.common.errors import InputError, MeasurementError, few
-from diffeo_calib.measurements.observations import Observations, Rows, unmixed
+from diffeo_calib.measurements.observations import Observations, Rows
 from diffeo_calib.measurements.poses import POINTS, kind_of_points, points_of_frames
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.kinds import kind_of
 
@@ -19,43 +17,30 @@ ORDER = {"position": 0, "pose": 0, "socket": 1}
 
 
 Coordinates = OtherReadings = Rows
-"""Rows that tell coordinates, of positions, poses and a ball in sockets; readings of one kind."""
+"""Rows that tell coordinates, of positions and poses; readings of one kind."""
 
 
 def rows_of_one_kind(data: Any) -> list[Rows]:
     """The rows of any table by kind: measured positions or poses, then a ball in sockets, then readings."""
-    parts = [Rows(*own) for table, rows in zip(data.parts, data.index, strict=True) for own in unmixed(table, rows)]
+    parts = map(Rows, data.parts, data.index)
     return sorted(parts, key=lambda part: ORDER.get(part.table.kind, len(ORDER)))
 
 
 def divided(data: Any) -> tuple[Coordinates | None, list[OtherReadings]]:
     """The rows of any table that tell coordinates, as one table, and its readings by kind."""
     parts = list(zip(data.parts, data.index, strict=True))
-    own = [(table, rows) for table, rows in parts if isinstance(table, Measurements)]
-    readings = [OtherReadings(table, rows) for table, rows in parts if isinstance(table, Readings)]
-    if len(own) < 2:
-        return (Coordinates(*own[0]) if own else None), readings
-    rows = torch.cat([numbers for _, numbers in own])
-    order = rows.argsort()
-    return Coordinates(Measurements.joined([table for table, _ in own]).rows(order), rows[order]), readings
+    own = [Coordinates(table, rows) for table, rows in parts if isinstance(table, Measurements)]
+    return next(iter(own), None), [OtherReadings(table, rows) for table, rows in parts if isinstance(table, Readings)]
 
 
 def with_markers(table: Measurements, markers: int, lever: float | None = None) -> Measurements:
-    """Rows that tell coordinates, with this many markers, the ball last: rows of one kind hide those of the other.
+    """Rows that tell coordinates, with this many markers, the last one a ball that they hide.
 
     Poses are then represented by points at the distance ``lever``, m, if it is given.
     """
     if table.frames is not None and lever is not None:
         table = with_attributes(table, points=points_of_frames(table.frames, lever), lever=lever)
-    return table.with_sockets_of_rows().with_markers(markers)
-
-
-def measured_rows(table: Measurements) -> Coordinates | None:
-    """The rows of a table that a device measured, with all of its markers, by their numbers there; None without any."""
-    rows = (table.socket_numbers == NO_SOCKET).nonzero()[:, 0]
-    if not len(rows):
-        return None
-    return Coordinates(with_attributes(table.rows(rows), socket=None, sockets=None), rows)
+    return table.with_markers(markers)
 
 
 def check_markers(model: Any, own: Coordinates | None, readings: Sequence[OtherReadings], other: str) -> None:
@@ -66,22 +51,21 @@ def check_markers(model: Any, own: Coordinates | None, readings: Sequence[OtherR
     if lever is None and frames:
         raise InputError.of(f"{frames[0]}s", expected="a model of poses", got="one of markers", fix=other)
     balls = len(frames) < len(readings)
-    if lever is not None and (balls or (table is not None and table.sockets is not None)):
+    if lever is not None and balls:
         fix = "measure poses again, or calibrate again with all rows"
         raise InputError.of("the new rows", expected="poses", got="rows that show a ball", fix=fix)
-    if table is None or table.without_device:
+    if table is None:
         return
-    seen = table.markers - (table.sockets is not None)
     same = (table.lever is None) == (lever is None)
-    if not same or seen not in {markers, markers - ball}:
-        kinds = [kind_of_points(*one) for one in ((markers, lever), (seen, table.lever))]
+    if not same or table.markers not in {markers, markers - ball}:
+        kinds = [kind_of_points(*one) for one in ((markers, lever), (table.markers, table.lever))]
         raise InputError.of("the new rows", expected=kinds[0], got=kinds[1], fix=other)
 
 
 def measured_positions(data: Any) -> Measurements | None:
-    """The rows of any table whose positions or poses a device measured, without the ball; None without any."""
+    """The rows of any table whose positions or poses a device measured; None without any."""
     own = divided(data)[0]
-    return None if own is None or own.table.without_device else own.table.device_rows()
+    return None if own is None else own.table
 
 
 def with_points(data: Measurements, model: Any) -> Measurements:
@@ -100,10 +84,9 @@ def device_coordinates(coordinates: int, *, ball: bool, free: bool) -> int:
     return coordinates - 3 if ball and not free and coordinates > 3 else coordinates
 
 
-def ball_tip(own: Coordinates | None, readings: Sequence[OtherReadings], usual: str) -> str:
+def ball_tip(readings: Sequence[OtherReadings], usual: str) -> str:
     """Name of the tip that carries the ball; the usual one where no table names it."""
-    tables = [one.table for one in readings] + ([] if own is None else [own.table])
-    return next((tip for table in tables if (tip := table.ball_tip) is not None), usual)
+    return next((tip for table, _ in readings if (tip := table.ball_tip) is not None), usual)
 
 
 SMALLEST_LEVER_M, LARGEST_LEVER_M = 0.01, 3.0
@@ -139,10 +122,3 @@ def check_poses(data: Any) -> None:
         got = " and ".join(f"{kind}s" for kind in kinds)
         fix = "give the positions of the poses alone (leave their rotation out)"
         raise MeasurementError.of("poses in a table of several kinds", expected="positions", got=got, fix=fix)
-
-
-def check_sessions(own: Coordinates | None) -> None:
-    """Raise MeasurementError for sessions without a device."""
-    if own is not None and own.table.without_device and len(names := own.table.present_sessions) > 1:
-        fix = "give the sockets of each session names of their own, and leave the sessions out"
-        raise MeasurementError.of("rows with sockets", expected="no sessions", got=few(names), fix=fix)

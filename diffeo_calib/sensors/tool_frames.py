@@ -14,19 +14,24 @@ whose shift and turn, times the lever of measured poses, are readings of value z
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from diffeo_calib.maps.observation import FromPlaces, Observation
 from diffeo_calib.measurements.bodies import triple
 from diffeo_calib.measurements.poses import POINTS
-from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.sockets import KIND
 from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.robots.placement import PLACES, place
 from diffeo_calib.robots.se3 import nearest_rotations
 from diffeo_calib.sensors.devices import Devices, Extrinsics, least_squares, moved_pose
 
+ALIKE = 0.05
+"""Deviation of a block's distance from one place to another, relative to that of the distance itself."""
 IN_SOCKET_M = 0.02
 """Largest distance of the ball from the place of a socket, stated roughly, at which it counts as resting there."""
 
@@ -62,11 +67,34 @@ class Trackers(Devices):
 
 @dataclass(frozen=True, eq=False)
 class SocketPlaces(Devices):
-    """Sockets, in which a ball shows nothing but that it is there: constants are their places (3), m."""
+    """Sockets, in which a ball shows nothing but that it is there: constants are their places (3), m.
 
-    kind, reads, stated_as = "socket", False, "X,Y,Z"
+    Args:
+        before: square root (3 D, 3 D) of the covariance of the places before the rows, m, where it is not diagonal.
+    """
+
+    kind, reads, stated_as = KIND, False, "X,Y,Z"
     size_fix = "pass a known distance between two sockets"
     numbers_each, increments_each = 3, 3
+    before: tuple[Tensor, ...] = ()
+
+    @classmethod
+    def of(cls, data: Any, constants: Tensor) -> SocketPlaces:
+        """Around places (D, 3), m, where the known distances, linearised there, make them most probable."""
+        D, std = len(constants), PLACES.found_m_rad
+        one_hot, wide = (torch.eye(k, dtype=constants.dtype, device=constants.device) for k in (D, 3 * D))
+        equations = [torch.nn.functional.pad(wide / std, (0, 1))]
+        for block in data.blocks:
+            first, second, lengths = (list(each) for each in zip(*block, strict=True))
+            away = constants[second] - constants[first]
+            U = (one_hot[second] - one_hot[first])[:, :, None] * torch.nn.functional.normalize(away)[:, None]
+            own = torch.cat([U.flatten(1), (away.new_tensor(lengths) - away.norm(dim=1))[:, None]], 1)
+            noise = (1.0 + ALIKE**2 * own.new_ones(len(own)).diag()) * data.distance_std**2
+            equations.append(torch.linalg.solve_triangular(torch.linalg.cholesky(noise), own, upper=False))
+        R = torch.linalg.qr(torch.cat(equations), mode="r").R[: 3 * D]
+        root = torch.linalg.inv(R[:, :-1])
+        places = constants + (root @ R[:, -1]).view(-1, 3)
+        return cls(data.names, places, torch.full_like(places, std), before=(root,))
 
     @classmethod
     def start(cls, values: Tensor, bodies: Tensor) -> Tensor:
@@ -75,6 +103,24 @@ class SocketPlaces(Devices):
     @staticmethod
     def read(constants: Tensor, body: Tensor) -> Tensor:
         return body - constants
+
+    @classmethod
+    def columns(cls) -> Mapping[str, Sequence[str]]:
+        """None: the names of sockets are no readings."""
+        return {}
+
+    @property
+    def root(self) -> Tensor:
+        return self.before[0] if self.before else super().root
+
+    def by_increments(self, points: Tensor, device: Tensor) -> Tensor:
+        return -torch.eye(3, dtype=points.dtype, device=points.device).expand(len(points), 3, 3)
+
+    def only(self, names: Collection[str]) -> SocketPlaces:
+        return replace(super().only(names), before=())
+
+    def observation(self, device: Tensor) -> Observation:
+        return FromPlaces(self.constants[device])
 
     @classmethod
     def stated(cls, numbers: Tensor) -> Tensor:
@@ -86,18 +132,6 @@ class SocketPlaces(Devices):
 
     def sees(self, points: Tensor, device: Tensor) -> Tensor:
         return (points - self.constants[device]).norm(dim=1) < IN_SOCKET_M
-
-    @classmethod
-    def around(cls, ball: Tensor, data: Measurements) -> SocketPlaces:
-        """The middles of balls (N, 3), m; a single row deviates as those of others do."""
-        socket, known = data.socket_numbers.to(ball.device), data.known_sockets
-        numbers = socket.unique()
-        own = [ball[socket == number] for number in numbers]
-        middles = torch.stack([rows.mean(0) for rows in own])
-        spreads = [rows.var(0) for rows in own if len(rows) > 1]
-        single = torch.stack(spreads).mean(0).sqrt() if spreads else torch.full_like(middles[0], PLACES.found_m_rad)
-        each = [rows.std(0) / len(rows) ** 0.5 if len(rows) > 1 else single for rows in own]
-        return cls(tuple(known.names[number] for number in numbers.tolist()), middles, torch.stack(each))
 
     def same_set(self, other: Extrinsics) -> bool:
         """Sockets are all of one set."""

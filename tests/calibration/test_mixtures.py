@@ -25,10 +25,8 @@ from diffeo_calib.calibration.identification.identification import (
 )
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.placing.place import place
-from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.rows import with_attributes
-from diffeo_calib.measurements.sockets import Sockets
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.sensors.coordinates import fitting_devices
@@ -85,7 +83,7 @@ def test_several_set_ups_of_the_device(
 ) -> None:
     """Rows in sockets belong to no set-up, and the places of the robot to all."""
     T = twist_transform(torch.tensor([0.1, -0.05, 0.02, 0.0, 0.2, 0.1], dtype=torch.float64))
-    device, resting = mixture.device_rows(), mixture.socket_rows()
+    device, resting = mixture.parts
     second = torch.arange(TRACKED) % 3 == 1
     points = torch.where(second[:, None, None], device.points @ T[:3, :3].mT + T[:3, 3], device.points)
     moved = with_attributes(device, points=points).with_sessions(["ab"[int(flag)] for flag in second])
@@ -96,30 +94,11 @@ def test_several_set_ups_of_the_device(
     assert rms(found.model(q) - arm.true_points(q).flip(1)) < 1.5 * rms(result.model(q) - arm.true_points(q).flip(1))
 
 
-# --- tables of both ---------------------------------------------------------------------------------------------------
-
-
-def test_rows_in_sockets_join_a_mixture(mixture: dc.Measurements, resting: dc.Measurements) -> None:
-    """The same as if they had been joined at once, in any order; rows in other sockets are named."""
-    some = resting.rows(slice(10))
-    for parts, places in (([mixture, some], slice(-10, None)), ([some, mixture], slice(10))):
-        both = dc.Measurements.joined(parts)
-        assert both.visible[places].tolist() == [[False, True]] * 10
-        assert torch.equal(both.socket[places], some.socket)  # pyright: ignore[reportArgumentType]
-        assert len(both.device_rows()) == TRACKED
-    marked = dc.Measurements.joined([mixture.device_rows().with_sessions(["day"] * TRACKED), resting])
-    whole = dc.Measurements.joined([marked, some])
-    assert whole.session[-10:].tolist() == [-1] * 10
-    other = dc.Measurements.from_sockets(some.q, ["x/0"] * 10, some.joint_names)
-    with pytest.raises(MeasurementError, match="the tables differ in sockets;"):
-        dc.Measurements.joined([mixture, other])
-
-
 @pytest.mark.filterwarnings("ignore:the place of marker 1 on 'flange'")
 def test_rows_of_another_robot(arm: SimulatedArm, tracked: dc.Measurements, resting: dc.Measurements) -> None:
     bend = torch.zeros(6, dtype=torch.float64)
     bend[4] = 0.05
-    other = with_attributes(resting, q=resting.q + bend, sockets=Sockets(resting.sockets.names))
+    other = with_attributes(resting, q=resting.q + bend, distances=())
     with pytest.warns(dc.DiffeoCalibWarning, match="do not fit the robot whose positions were measured"):
         place(arm.nominal, dc.Measurements.joined([tracked, other]), silent)
 

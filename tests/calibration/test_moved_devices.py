@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from copy import copy
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -95,8 +94,7 @@ def test_the_result_tells_which_scales_pass_without_a_warning(share: float, noti
 def test_sockets_without_a_known_distance_show_no_size() -> None:
     """Neither another one nor a change: what the ball differs within a socket is no motion."""
     kind = kind_named("ball in sockets")
-    table = kind.data
-    table = with_attributes(table, sockets=replace(table.sockets, distances=(), distance_std=None))
+    table = with_attributes(kind.data, distances=(), distance_std=None)
     result, (text,) = warned(dc.calibrate, kind.robot, table, hyperparameters=kind.scales)
     assert "no distance between sockets is known" in text
     size = result.lengths[0]

@@ -277,7 +277,7 @@ RENAMED: dict[str, Callable[[Any, list[str]], Any]] = {
 
 def with_a_lone_name(kind: str, data: Any) -> tuple[Any, str]:
     """Rows of which one carries a name of its own, and what must be said of it."""
-    names = list(data.row_sockets if kind == "ball in sockets" else data.device_names)
+    names = list(data.device_names)
     usual, names[5] = names[5], f"{names[5]}x"
     return RENAMED[kind](data, names), rf"'{usual}x' in 1 row \(5\), perhaps meant as '{usual}'"
 
@@ -347,7 +347,7 @@ def test_a_row_in_a_socket_is_judged_as_all_others_predict_it(result: Any) -> No
     """By the conditional mean and covariance of its error given theirs, with dense matrices."""
     new, model = moved(in_their_sockets(7, 1), [7]), result.model.map
     (found,) = contradicted_in_sockets(result.model, new)
-    rests = new.socket_numbers[:, None] == new.socket_numbers
+    rests = new.device[:, None] == new.device
     eye, seen = torch.eye(3, dtype=torch.float64), model(new.q).detach()
     middles = rests.double() @ seen / rests.sum(1, keepdim=True)
     K = model.joint_covariance(new.q) + PLACES.found_m_rad**2 * torch.kron(rests.double(), eye)

@@ -22,14 +22,16 @@ from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import Placed, place
-from diffeo_calib.calibration.placing.sockets import SocketDevices
+from diffeo_calib.calibration.placing.sockets import SocketDevices, other_socket
 from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places, leave_one_out
 from diffeo_calib.calibration.scales.selection import Selection, defaults
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
+from diffeo_calib.measurements.sockets import SocketReadings
 from diffeo_calib.regression.regions import region_factor
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
+from diffeo_calib.sensors.tool_frames import SocketPlaces
 
 DISTANCES = {("0", "1"): 0.05}
 
@@ -45,13 +47,13 @@ def rows(arm: SimulatedArm) -> SocketRows:
 
 
 @pytest.fixture(scope="module")
-def data(arm: SimulatedArm, rows: SocketRows) -> dc.Measurements:
+def data(arm: SimulatedArm, rows: SocketRows) -> SocketReadings:
     names = arm.nominal.joint_names
     return dc.Measurements.from_sockets(rows.q, rows.names, names, distances=DISTANCES, distance_std=1e-5)
 
 
 @pytest.fixture(scope="module")
-def result(arm: SimulatedArm, data: dc.Measurements) -> Any:
+def result(arm: SimulatedArm, data: SocketReadings) -> Any:
     return with_usual_scales(arm.nominal, data)
 
 
@@ -72,11 +74,11 @@ def test_the_sockets_are_where_they_are(result: Any, rows: SocketRows) -> None:
 
 
 @pytest.fixture(scope="module")
-def placed(arm: SimulatedArm, data: dc.Measurements) -> Placed:
+def placed(arm: SimulatedArm, data: SocketReadings) -> Placed:
     return place(arm.nominal, data, silent)
 
 
-def test_places_left_out_by_leaving_them_out(data: dc.Measurements, placed: Placed) -> None:
+def test_places_left_out_by_leaving_them_out(data: SocketReadings, placed: Placed) -> None:
     """Closed form against a regression without the rows of the place."""
     tangent, devices = placed.tangent_data(), placed.placement.one(SocketDevices)
     scales = defaults(tangent, placed.identification.noise, placed.identification.prior)
@@ -85,7 +87,9 @@ def test_places_left_out_by_leaving_them_out(data: dc.Measurements, placed: Plac
     rest, gone = (flags.nonzero()[:, 0] for flags in (~own, own))
     mu = tangent.rows(rest).process(scales).mu.view(-1, 3)
     gram = tangent.linearisation(scales).gram().view(len(data), 3, len(data), 3)
-    predicted = torch.einsum("iajb,jb->ia", gram[gone][:, :, rest], mu) + tangent.y[gone] - tangent.target[gone]
+    predicted = (
+        torch.einsum("iajb,jb->ia", gram[gone][:, :, rest], mu) + devices.positions[socket[gone]] - tangent.target[gone]
+    )
     middles = {int(s): predicted[socket[gone] == s].mean(0) for s in socket[gone].unique()}
     spread = torch.stack([p - middles[int(s)] for p, s in zip(predicted, socket[gone], strict=True)])
     found = devices._left_out(chosen)[2]
@@ -94,7 +98,7 @@ def test_places_left_out_by_leaving_them_out(data: dc.Measurements, placed: Plac
     assert found.distance_errors[0] == pytest.approx(float((first - second).norm()) - 0.05, abs=1e-9)
 
 
-def test_deviations_grow_where_places_contradict_each_other(data: dc.Measurements, placed: Placed) -> None:
+def test_deviations_grow_where_places_contradict_each_other(data: SocketReadings, placed: Placed) -> None:
     """The ratio of squared errors of left-out places, by conditioning on the rows of the others."""
     tangent, found = placed.tangent_data(), placed.identification
     scales = defaults(tangent, 0.3 * found.noise, found.prior)
@@ -107,10 +111,10 @@ def test_deviations_grow_where_places_contradict_each_other(data: dc.Measurement
     ratio = total / (3 * len(data) - 3 * 12)
     assert ratio > 1.5, "scales that are too small"
     groups = data.groups()
-    factor = inflation_by_places(tangent, scales, data.places, data.socket, groups)
+    factor = inflation_by_places(tangent, scales, data.places, data.device, groups)
     assert factor == pytest.approx(ratio * region_factor(6, 3), rel=1e-5)
     wide = defaults(tangent, 10 * found.noise, found.prior)
-    assert inflation_by_places(tangent, wide, data.places, data.socket, groups) == region_factor(6, 3)
+    assert inflation_by_places(tangent, wide, data.places, data.device, groups) == region_factor(6, 3)
 
 
 def test_distances_of_a_block_have_one_error() -> None:
@@ -126,7 +130,7 @@ def test_distances_of_a_block_have_one_error() -> None:
         ({(f"{p}/0", f"{p}/1"): 0.05 + 1e-9 * k for k, p in enumerate("abcdef")}, 1e-4 / 6**0.5),
     ):
         data = dc.Measurements.from_sockets(q, names, distances=distances, distance_std=1e-4, doubt=False)
-        places = SocketDevices.around(data, at)
+        places = SocketPlaces.of(data, at)
         assert float((mean.flatten() @ places.root).norm()) == pytest.approx(deviation, rel=0.01)
 
 
@@ -156,7 +160,7 @@ def some(plain: SimulatedArm) -> SocketRows:
     return rest_in_sockets(plain, seed=2, places=3, rows=6)
 
 
-def table(rows: SocketRows, names: tuple[str, ...] | None = None, **options: object) -> dc.Measurements:
+def table(rows: SocketRows, names: tuple[str, ...] | None = None, **options: object) -> SocketReadings:
     given = {"distances": DISTANCES, "distance_std": 3e-5} | options
     return dc.Measurements.from_sockets(rows.q, names or rows.names, **given)  # pyright: ignore[reportArgumentType]
 
@@ -164,7 +168,7 @@ def table(rows: SocketRows, names: tuple[str, ...] | None = None, **options: obj
 def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows) -> None:
     bare: Any = {"distances": None, "distance_std": None}
 
-    def staged(data: dc.Measurements) -> Callable[[], object]:
+    def staged(data: SocketReadings) -> Callable[[], object]:
         return lambda: place(plain.nominal, data, silent)
 
     refused(
@@ -172,7 +176,7 @@ def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows
         ("sockets: expected at least 9, got 6", staged(table(some, **bare).rows([0, 1, 6, 7, 12, 13]))),
         (r"expected about (49|50)\..* mm, by the robot, got 5e\+04 mm", staged(table(some, distances={PAIR: 50.0}))),
         ("check the unit of `distances`", staged(table(some, distances={PAIR: 5e-5}))),
-        ("rows with sockets: expected no sessions", staged(table(some).with_sessions(["a"] * 18 + ["b"] * 18))),
+        ("rows with sockets: expected no sessions", lambda: table(some).with_sessions(["a"] * 18 + ["b"] * 18)),
         ("rows with sockets: expected no payloads", staged(table(some).with_payload(2.0))),
         *(
             ("calibrated with measured positions", lambda verb=verb: verb(kind_named("positions").model, table(some)))
@@ -187,6 +191,13 @@ def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows
             place(plain.nominal, table(some, **options), silent)
 
 
+def test_a_row_in_a_socket_says_why_it_is_far() -> None:
+    places = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+    seen = torch.tensor([[1.0, 1e-3, 0.0], [0.0, 0.4, 0.0]], dtype=torch.float64)
+    assert "'b/0'" in other_socket(seen[0], places, ("a/0", "b/0"), 0.01)
+    assert "its socket" in other_socket(seen[1], places, ("a/0", "b/0"), 0.01)
+
+
 def test_rows_in_a_wrong_socket_are_named(plain: SimulatedArm, some: SocketRows) -> None:
     names = list(some.names)
     names[3], names[20] = "0/1", "0/0"
@@ -196,8 +207,8 @@ def test_rows_in_a_wrong_socket_are_named(plain: SimulatedArm, some: SocketRows)
 
 def test_a_known_distance_is_judged_by_how_well_its_own_rows_fit(plain: SimulatedArm, some: SocketRows) -> None:
     """Bent links leave its sockets apart from the others."""
-    data, found = table(some), register_sockets(plain.nominal, some.q, table(some).socket_numbers)
-    positions, own = found.positions.clone(), data.socket_numbers < 2
+    data, found = table(some), register_sockets(plain.nominal, some.q, table(some).device)
+    positions, own = found.positions.clone(), data.device < 2
     positions[1] += positions[1] - positions[0]
     spread = found.distances.masked_fill(own, 0.02)
     for distances, doubted in ((found.distances, True), (spread, False)):
@@ -225,7 +236,7 @@ def test_a_tool_that_never_turns_or_tilts(plain: SimulatedArm, some: SocketRows)
                            (upright, pytest.warns(dc.DiffeoCalibWarning, match="never tilted"))):  # fmt: skip
         data = dc.Measurements.from_sockets(change(some.q[:1].repeat(12, 1)), ["a"] * 12)
         with expect:
-            check_socket_registration(plain.nominal, data, register_sockets(plain.nominal, data.q, data.socket))
+            check_socket_registration(plain.nominal, data, register_sockets(plain.nominal, data.q, data.device))
 
 
 def test_tables_that_cannot_be_made(some: SocketRows) -> None:
@@ -254,8 +265,7 @@ def test_splits_hold_out_whole_places(some: SocketRows) -> None:
     data = table(some)
     train, test = data.split(0.7, seed=1)
     assert (len(train), len(test)) == (24, 12)
-    names = {data.sockets.names[k].split("/")[0] for k in test.socket.tolist()}  # pyright: ignore
-    assert len(names) == 1
+    assert len({name.split("/")[0] for name in test.names}) == 1
     assert sorted(len(held) for _, held in data.folds(3)) == [12, 12, 12]
     with pytest.raises(MeasurementError, match="expected at least 4 places with sockets, got 3"):
         data.folds(4)

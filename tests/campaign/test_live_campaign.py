@@ -306,7 +306,7 @@ def test_a_goal_is_reached_once_the_limit_is_below_it(running: dc.Campaign, meas
 def test_next_poses_of_a_ball_are_in_sockets() -> None:
     kind = kind_named("ball in sockets")
     rows, q = kind.source.rows, kind.q(30)
-    ball, own = kind.model(rows.q).detach()[:, -1], rows.socket_numbers
+    ball, own = kind.model(rows.q).detach()[:, -1], rows.device
     sockets = torch.stack([ball[own == number].mean(0) for number in own.unique()])
     drawn, given = begun(rows, kind.robot, target=q), begun(rows, kind.robot, candidates=q, target=q)
     found: Any = drawn.next(5)

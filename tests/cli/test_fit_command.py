@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from command_bank import FORMAT, STAGES, Command, Outcome, Site
+from command_bank import STAGES, Command, Outcome, Site
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.outliers import Outlier, outlier_lines
@@ -80,36 +80,6 @@ def test_fit_with_the_scales_of_another_robot(
     ratios = (found.scales / model.scales)[model.scales > 0]
     assert torch.unique(ratios.round(decimals=6)).numel() == 2  # length scales and factors; deviations
     assert float(ratios.min()) == pytest.approx(1.0) or float(ratios.max()) == pytest.approx(1.0)
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("given_scales")
-def test_outliers_are_named_by_their_lines_in_the_file(site: Site, command: Command, tmp_path: Path) -> None:
-    """Two training rows are wrong, far from the top of the file; nothing is dropped and the exit code is 0."""
-    train, _ = site.data.split(0.7, seed=0)
-    first, second = (int(train.line_numbers[k]) for k in (5, 20))  # from 0: the header is line 1, row 0 is line 2
-    points = site.data.points.clone()
-    points[first] += torch.tensor([0.03, 0.04, 0.0], dtype=torch.float64)
-    points[second] = points[first - 1]
-    data = dc.Measurements(site.data.q, points, site.data.joint_names, doubt=False)
-    position = ["mx", "my", "mz"]
-    write_measurements(tmp_path / "t.csv", data, FORMAT, position=position)
-    done = command(*site.fit(tmp_path / "t.csv", tmp_path / "model"))
-    assert done.code == 0
-    assert "2 of 28 training rows look wrong (numbers are lines of the file); none was dropped:" in done.out
-    lines = [line for line in done.out.splitlines() if line.startswith("  row ")]
-    assert [line.split(":")[0] for line in lines] == [f"  row {second + 2}", f"  row {first + 2}"]
-    assert "a wrong pairing?" in lines[0] or "far from where the other rows predict it" in lines[0]
-    assert "marker" not in "".join(lines)  # there is only one
-    far = re.search(r"row \d+: (\S+) mm off, weight (\S+); far from where", lines[1])
-    assert far is not None
-    assert float(far[1]) == pytest.approx(50, abs=1.0)
-    assert float(far[2]) < 1e-3
-    loaded = dc.load(tmp_path / "model")
-    assert isinstance(loaded, dc.CalibratedKinematics)
-    assert (loaded.report["outliers"], loaded.report["rows"]) == (2, 28)
-    rms = done.numbers(STAGES[2], "12 held out")[0]
-    assert rms < done.numbers(STAGES[1], "12 held out")[0]
 
 
 def test_many_outliers_are_cut_short() -> None:

@@ -21,7 +21,6 @@ from diffeo_calib.kinematics.evaluation import rows_used_in_fit
 from diffeo_calib.kinematics.joint_ranges import joints_outside_range, refuse_other_angles, warn_outside_range
 from diffeo_calib.measurements.poses import mark_points, rotation_matrices, transforms
 from diffeo_calib.measurements.rows import with_attributes
-from diffeo_calib.measurements.sockets import Sockets
 
 
 @pytest.mark.parametrize(("rows", "markers"), [(1, 1), (7, 3), (200, 2)])
@@ -191,6 +190,6 @@ MISTAKES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
 @pytest.mark.filterwarnings("ignore:no distance between sockets", "ignore:shoulder_joint. hardly moved")
 def test_rows_in_sockets_with_wrong_joint_values_are_refused(words: str) -> None:
     kind = kind_named("ball in sockets")
-    data = with_attributes(kind.data, sockets=Sockets(kind.data.sockets.names))
+    data = with_attributes(kind.data, distances=())
     with pytest.raises(MeasurementError, match=words):
         dc.calibrate(kind.robot, with_attributes(data, q=MISTAKES[words](data.q)), hyperparameters=kind.scales)

@@ -23,7 +23,7 @@ from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table_format import LEVER
 from diffeo_calib.robots.se3 import rotation, transforms, twist_transform
-from diffeo_calib.sensors.coordinates import placed
+from diffeo_calib.sensors.coordinates import SENSORS, placed
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.height import Planes
 from diffeo_calib.sensors.image import Cameras
@@ -178,12 +178,12 @@ def test_a_held_tool_reads_how_the_second_hand_is_off() -> None:
 
 def test_sockets_are_the_middles_of_balls() -> None:
     """A single row deviates as those of others do."""
-    balls = normal(5, 3, seed=18)
-    rows = dc.Measurements.from_sockets(normal(5, 2), list("aaaab"))
-    found = SocketPlaces.around(balls, rows)
+    balls = 1e-3 * normal(5, 3, seed=18)
+    rows: Any = dc.Measurements.from_sockets(normal(5, 2), list("aaaab"))
+    (found,) = SENSORS["socket"].settled(rows, balls[:, None], lambda q: q)
     assert found.names == ("a", "b")
-    assert_close(found.constants, torch.stack([balls[:4].mean(0), balls[4]]))
-    assert_close(found.deviations, balls[:4].std(0) * torch.tensor([[0.5], [1.0]], dtype=torch.float64))
+    assert_close(found.constants, torch.stack([balls[:4].mean(0), balls[4]]), rtol=0, atol=1e-3)
+    assert_close(2.0 * found.deviations[0], found.deviations[1], rtol=1e-3, atol=0)
 
 
 @pytest.mark.parametrize("kind", KINDS)

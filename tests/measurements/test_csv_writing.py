@@ -130,7 +130,6 @@ def assert_same(found: Any, wanted: Any) -> None:
         for name in ("on", "lever", "payload_at", "offset_std", "intrinsics"):
             assert getattr(own, name, None) == getattr(other, name, None), name
         if getattr(other, "sockets", None) is not None:
-            assert own.row_sockets == other.row_sockets
             known = [[one.distance_std, *(d for *_, d in one.distances)] for one in (own.sockets, other.sockets)]
             assert known[0] == pytest.approx(known[1])
 
@@ -300,7 +299,7 @@ def test_a_line_with_two_kinds_is_two_rows(tmp_path: Path) -> None:
     data = read_measurements(tmp_path / "t.csv", NAMES, length="m", angle="rad", readings=(wire,), **sockets)
     assert data.kinds == ("position", "distance", "position", "distance", "position", "socket")
     assert data.line_numbers.tolist() == [2, 3, 4, 4, 5, 5]
-    assert data.device_names == ["", "A", "", "B", "", ""]
+    assert data.device_names == ["", "A", "", "B", "", "s0"]
     assert held(data.parts[1].std).tolist() == [[0.1], [0.1]]
 
 
@@ -338,7 +337,7 @@ def test_a_socket_that_is_not_a_number_is_none(tmp_path: Path) -> None:
     """As a program writes a table of numbers and names."""
     (tmp_path / "t.csv").write_text("a,b,x,y,z,s\n0,1,1,2,3,nan\n1,2,nan,nan,nan,p\n2,2,NaN,NaN,NaN,p\n")
     known: dict[str, Any] = {"length": "m", "angle": "rad", "socket": "s"}
-    assert read_measurements(tmp_path / "t.csv", NAMES, POSITION, **known).row_sockets == ["", "p", "p"]
+    assert read_measurements(tmp_path / "t.csv", NAMES, POSITION, **known).device_names == ["", "p", "p"]
     (tmp_path / "t.csv").write_text("a,b,s\n0,1,p\n1,2,nan\n2,2,p\n")
     with pytest.raises(MeasurementError, match=r"line 3, column 's'.*name"):
         read_measurements(tmp_path / "t.csv", NAMES, **known)

@@ -15,7 +15,6 @@ import diffeo_calib as dc
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.rows import with_attributes
 
 NAMES = ("a", "b")
 Tables = dict[str, Any]
@@ -47,8 +46,8 @@ def test_parts_and_rows_in_order(whole: Observations) -> None:
     assert_close(whole.q, torch.cat([table.q for table in parts.values()]))
     assert (whole.n, whole.joint_names, whole.payload) == (2, NAMES, None)
     assert whole.device_names[15:22] == ["A", "A", "B", "B", "A", "top", "top"]
-    assert whole.session_names == ("A", "B", "top", "device")
-    assert held(whole.session).tolist()[14:21] == [-1, 0, 0, 1, 1, 0, 2]
+    assert whole.session_names == ("f/0", "f/1", "g/0", "g/1", "A", "B", "top", "device")
+    assert held(whole.session).tolist()[14:21] == [0, 4, 4, 5, 5, 4, 6]
     assert whole.places.tolist() == [*[-1] * 10, 0, 0, 1, 1, 0, *[-1] * 14]
 
 
@@ -92,16 +91,14 @@ def test_copies_are_those_of_one_kind() -> None:
     assert Observations.joined([far, near, near.rows([3]), far.rows([0])]).copies() == [(8, 10), (0, 11)]
 
 
-def test_mixtures_become_parts_and_back() -> None:
+def test_rows_in_sockets_beside_positions() -> None:
     parts = tables()
-    mixture = dc.Measurements.joined([parts["position"], parts["socket"]])
-    assert (type(mixture), mixture.kind) == (dc.Measurements, "mixture")
-    shuffled = mixture.rows([7, 0, 5, 1])
-    found = dc.Measurements.joined([shuffled, parts["height"]])
-    assert found.kinds == ("socket", "position", "socket", "position", *["height"] * 5)
-    assert [part.markers for part in found.parts[:2]] == [1, 1]
-    assert_close(found.q[:4], shuffled.q)
-    assert Observations.joined([shuffled.rows([0, 2])]).kinds == ("socket", "socket")
+    both = dc.Measurements.joined([parts["position"], parts["socket"]])
+    assert both.rows([7, 0, 5, 1]).kinds == ("socket", "position", "socket", "position")
+    assert both.rows([7, 0, 5, 1]).places.tolist() == [1, -1, 0, -1]
+    some = parts["socket"].rows(slice(2))
+    again = dc.Measurements.joined([some, both, parts["socket"].rows([4])])
+    assert again.parts[0].device_names == [*some.device_names, *parts["socket"].device_names, "f/0"]
 
 
 def test_the_simplest_table_that_holds_the_rows() -> None:
@@ -164,7 +161,7 @@ def test_as_text_html_and_data_frame(whole: Observations) -> None:
         (lambda t: [t["pose"].with_payload(1.0, "x"), t["height"].with_payload(1.0)], "differ in payload_at"),
         (lambda t: [Readings.heights(values(3, 3)), t["image"]], "the tables differ in n, joint_names"),
         (lambda t: [t["height"].with_tips(["l"]), t["distance"].with_tips(["r"])], "expected one tip, got l, r"),
-        (lambda t: [t["socket"], dc.Measurements.from_sockets(values(1, 2), ["x"], NAMES), t["height"]], "in sockets"),
+        (lambda t: [replace(t["socket"], distances=(("f/0", "f/1", own),)) for own in (1.0, 2.0)], "in distances"),
         (lambda t: [t["position"], dc.Measurements(values(1, 2), values(1, 2, 3), NAMES), t["height"]], "in markers"),
     ],
 )
@@ -210,17 +207,6 @@ def test_readings_that_look_wrong_are_doubted() -> None:
     with pytest.warns(dc.DiffeoCalibWarning, match="degrees"):
         Readings.distances(100 * q, 1.0)
     assert len(Readings.distances(100 * q, 1.0, doubt=False)) == 3
-
-
-def test_a_row_in_a_socket_says_why_it_is_far() -> None:
-    rows = dc.Measurements.from_sockets(values(7, 2), ["a/0"] * 3 + ["b/0"] * 4, doubt=False)
-    places = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)[rows.places][:, None]
-    predicted = places.clone()
-    predicted[0], predicted[1] = torch.tensor([1.0, 1e-3, 0.0]), torch.tensor([0.0, 0.4, 0.0])
-    found = [with_attributes(rows, points=places).other_socket(row, predicted, 0.01) or "" for row in (0, 1)]
-    assert "'b/0'" in found[0]
-    assert "its socket" in found[1]
-    assert tables()["position"].other_socket(0, values(5, 1, 3), 0.01) is None
 
 
 def test_positions_beside_images_are_readings_with_their_deviations() -> None:

@@ -27,13 +27,12 @@ from diffeo_calib.measurements.poses import (
     points_of_frames,
     pose_jacobian,
     poses_from_marks,
-    rigid_poses,
     rotation_matrices,
     rotation_numbers,
     transforms,
 )
 from diffeo_calib.measurements.table_format import TableFormat, numbers_of
-from diffeo_calib.robots.se3 import rotation
+from diffeo_calib.robots.se3 import rigid_poses, rotation
 
 EYE = torch.eye(3, dtype=torch.float64)
 

@@ -205,7 +205,7 @@ def test_measured_positions_decide_about_a_tolerance() -> None:
     kind = kind_named("mixture")
     own = divided(kind.new)[0]
     assert own is not None
-    tracked = own.table.device_rows()  # without those within sockets
+    tracked = own.table
     wrong = with_attributes(tracked, points=tracked.points + 0.003 * torch.sin(97.0 * tracked.points))
     found = find(kind.model, wrong)
     assert found.deviations.error.whole < 1e-3 < found.judged.value

@@ -63,7 +63,7 @@ def test_places(axes: int) -> None:
 def test_bad_poses() -> None:
     robot, commanded = dc.cartesian(poses()), poses()
     commanded[3, :3, :3] *= 1.1
-    with pytest.raises(dc.DiffeoCalibError, match="`poses`, row 3: expected a rigid transform"):
+    with pytest.raises(dc.DiffeoCalibError, match="`poses`, row 3: expected a rotation matrix"):
         dc.cartesian(commanded)
     with pytest.raises(dc.DiffeoCalibError, match=r"`poses`: expected \(N, 4, 4\), got \(30, 3\)"):
         dc.pose_inputs(robot, poses()[:, :3, 3])

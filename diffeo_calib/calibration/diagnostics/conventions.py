@@ -106,18 +106,16 @@ def conventions(
     Returns:
         none if nothing explains the rows far better; several if the rows do not tell them apart.
     """
-    marker, socket, free = int(data.visible.sum(0).argmax()), data.socket_numbers, data.without_device
-    rows = (socket >= 0 if free else data.visible[:, marker]).nonzero()[:, 0]
+    rows, columns, tip = data.explained()
     limit = min(gates.RIGHT_READING, gates.OTHER_READING_LEFT * left(data.q))
     if min(len(rows), ROWS) < 2 * (2 + robot.n) or limit < SMALLEST_LIMIT:
         return []
-    rows = rows[torch.randperm(len(rows), generator=seeded(0), device=HOST)[:ROWS]]
-    at, own = data.points[rows, marker], socket[rows]
-    affine = torch.cat([torch.ones_like(at[:, :1]), at - at.mean(0)], 1)
-    columns = (own[:, None] == own.unique()).to(at) if free else affine
+    some = torch.randperm(len(rows), generator=seeded(0), device=HOST)[:ROWS]
+    rows, columns = rows[some], columns[some]
+    columns = columns[:, (columns != 0).any(0)]
     Q = torch.linalg.qr(columns / columns.norm(dim=0).clamp(min=1e-12)).Q
     projector = torch.eye(len(Q), dtype=Q.dtype, device=Q.device) - Q @ Q.mT
-    search = _Search(robot, robot.tips.index(data.on[marker]) if data.on else 0, data.q[rows], projector, per_rad)
+    search = _Search(robot, robot.tips.index(tip) if tip else 0, data.q[rows], projector, per_rad)
 
     def judged(matrix: Tensor, offset: Tensor) -> Convention:
         return Convention(robot, matrix, offset, left(data.q @ matrix.mT + offset))

@@ -101,9 +101,8 @@ def judge(
     """
     impossible = gates.LARGEST_PER_REACH * model.robot.reach
     for table, _ in divided(data)[1]:
-        devices = places.devices[table.kind]
-        away = devices.errors(table, devices.points_of(predicted_at(model, table))).norm(dim=1)
-        if (median := float(away.median())) > impossible:
+        away = sensor_of(table).away(table, predicted_at(model, table), places).norm(dim=1)
+        if (median := float(away.nanmedian())) > impossible:
             fix = "check the unit of the readings (--length), their columns (--reading), and the device of every row"
             fix += " (`device`, --session)"
             got = f"a median of {1e3 * median:.4g} mm at the ball"

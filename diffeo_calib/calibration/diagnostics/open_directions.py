@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import inf
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,7 +22,7 @@ from diffeo_calib.kinematics.registered_map import undetermined
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.robots.se3 import skew
+from diffeo_calib.robots.se3 import twist_at
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices
 
@@ -31,19 +32,18 @@ STEPS, REACHED_M, LARGEST_STEP_RAD = 30, 1e-4, 0.3
 
 
 def warn_of_open_directions(robot: Tree, data: Measurements, registration: Identification) -> None:
-    """Warn of what the measurements leave open: places, a path that the robot could leave, joints one at a time.
+    """Warn of what the measurements leave open: places, and a path that the robot could leave.
 
     Args:
         robot: the nominal chain. data: the measurements. registration: base and markers.
     """
-    for text in undetermined_places(robot, data, registration):
+    for text in undetermined_places(robot, data.q, registration, rigid=data.lever is not None):
         warn_user(f"{text}.")
-    measured = data.q[data.places.to(data.q.device) < 0]  # sockets on one table need not leave anything open
-    if len(measured) >= gates.PATH_POSES:  # three points always lie in a plane
-        geometry, reached = registration.geometry, _reached(robot, data, registration)
-        middles = geometry.points(measured).mean(1)
+    if len(data) >= gates.PATH_POSES:  # three points always lie in a plane
+        geometry, reached = registration.geometry, _reached(robot, data.q, registration)
+        middles = geometry.points(data.q).mean(1)
         _, s, axes = torch.linalg.svd(middles - middles.mean(0), full_matrices=False)
-        spreads, speeds = s / len(measured) ** 0.5, geometry.jacobian(measured).mean(1)  # (N, 3, n)
+        spreads, speeds = s / len(data) ** 0.5, geometry.jacobian(data.q).mean(1)  # (N, 3, n)
         leaving = torch.einsum("ac,ncl->nal", axes, speeds).square().mean(0).sqrt().amax(1)  # along each axis
         flat = (spreads < gates.FLAT * reached) & (leaving > gates.LEAVES * reached)
         if count := int(flat.sum()):
@@ -51,6 +51,10 @@ def warn_of_open_directions(robot: Tree, data: Measurements, registration: Ident
             what = f"the measured positions lie near {('a plane', 'a line', 'one point')[count - 1]}"
             fix = "predictions elsewhere are extrapolated; spread the poses over the workspace that you will use"
             warn_user(sentence(what, got=f"{away:.2g} mm RMS away from it", fix=fix))
+
+
+def warn_of_single_joints(robot: Tree, data: Any) -> None:
+    """Warn of joints that moved one at a time in most rows of any kinds."""
     moved = (data.q - data.q.median(0).values).abs() > gates.MOVED_RAD_M
     single, joints = int((moved.sum(1) <= 1).sum()), moved.any(0)
     if single >= gates.SINGLE_SHARE * len(data) and int(joints.sum()) >= gates.SINGLE_JOINTS:
@@ -60,9 +64,9 @@ def warn_of_open_directions(robot: Tree, data: Measurements, registration: Ident
         warn_user(sentence(what, fix=fix))
 
 
-def undetermined_places(robot: Tree, data: Measurements, registration: Identification) -> tuple[str, ...]:
-    """Sentences about the directions of base and markers that the measurements hardly determine; arguments as above."""
-    geometry, reached, q = registration.geometry, _reached(robot, data, registration), data.q
+def undetermined_places(robot: Tree, q: Tensor, registration: Identification, *, rigid: bool) -> tuple[str, ...]:
+    """Sentences about the directions of base and markers that rows (N, n) hardly determine; ``rigid``: of poses."""
+    geometry, reached = registration.geometry, _reached(robot, q, registration)
     every, parts = torch.arange(geometry.size, device=HOST), geometry.slices
     places = torch.cat([every[parts["base"]], every[parts["tool"]]])
     # Whatever a SCARA robot does, the height of its marker and that of its base cannot be told apart, and need not be.
@@ -75,16 +79,15 @@ def undetermined_places(robot: Tree, data: Measurements, registration: Identific
     R, middle = geometry.base[:3, :3], geometry.points(q).mean((0, 1))
     arm = R.mT @ (middle - geometry.base[:3, 3])  # of the middle, in the robot's base
     to = torch.eye(len(places), dtype=q.dtype, device=q.device)
-    to[:3, :3], to[3:6, 3:6], to[:3, 3:6] = R, R, -R @ skew(arm)
+    to[:6, :6] = torch.block_diag(R, R) @ twist_at(arm)
     to = to @ (unit[:, None] * (some_poses.mT @ some_poses) / unit)
     covariance = to @ registration.covariance[places[:, None], places] @ to.mT
-    rigid = data.lever is not None
     return undetermined(covariance, geometry.tool, reached, registration.noise, geometry.on, rigid=rigid)
 
 
-def _reached(robot: Tree, data: Measurements, registration: Identification) -> float:
+def _reached(robot: Tree, q: Tensor, registration: Identification) -> float:
     """Largest distance of the tip from the base, m."""
-    return max(float(robot.tip_poses(data.q)[..., :3, 3].norm(dim=-1).max()), registration.noise)
+    return max(float(robot.tip_poses(q)[..., :3, 3].norm(dim=-1).max()), registration.noise)
 
 
 def sampled_configurations(chain: Tree) -> Tensor:

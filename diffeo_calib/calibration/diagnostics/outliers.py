@@ -128,11 +128,14 @@ def outliers(
         sizes = each[one.rows, 0].nan_to_num(0.0).norm(dim=1)
         shown = errors_of_kinds(left_out.errors, None, [one]).main
         unit, per_unit = shown.shown
-        for number in bad[one.rows, 0].nonzero()[:, 0].tolist():
+        wrong = bad[one.rows, 0].nonzero()[:, 0].tolist()
+        balls = model.at_payloads(one.data.payload)(one.data.q).detach()[:, -1] if wrong else ()
+        for number in wrong:
             row, line = int(one.rows[number]), int(one.data.line_numbers[number])
             reading, size = (per_unit * float(shown.errors[number, 0]), unit), float(sizes[number])
             name, weight = one.data.row_names[number], float(weights[row, 0])
-            found.append(Outlier(row, None, line, name, size, weight, FAR, reading=reading))
+            reason = one.reason(balls[number], gates.REMAINING_ERROR * size)
+            found.append(Outlier(row, None, line, name, size, weight, reason, reading=reading))
     return sorted(found, key=lambda outlier: -outlier.distance)
 
 
@@ -180,8 +183,6 @@ def _reason(row: int, body: int, data: Measurements, predicted: Tensor, bad: Ten
     others = [k for k in range(bad.shape[1]) if k != body and bool(data.seen_bodies[row, k])]
     if others and not bool(bad[row, others].any()):
         return f"{data.body_names[body]} alone is off, the other {data.bodies.many} of this row fit"
-    if (in_socket := data.other_socket(row, predicted, small)) is not None:
-        return in_socket
     elsewhere = largest_known((predicted - data.points[row]).norm(dim=-1))
     elsewhere[row] = torch.inf
     nearest = int(elsewhere.argmin())
@@ -206,9 +207,9 @@ class DeviceRows(NamedTuple):
 
 
 def _device_rows(data: Any) -> Iterator[DeviceRows]:
-    """The rows of any table by kind and device."""
+    """The rows of any table by kind and device; those in sockets, of few rows each, together."""
     for part, numbers in zip(data.parts, data.index, strict=True):
-        names = part.device_names
+        names = [name * (place < 0) for name, place in zip(part.device_names, part.places.tolist(), strict=True)]
         for name in dict.fromkeys(names):
             own = [row for row, other in enumerate(names) if other == name]
             yield DeviceRows(f"{part.kind}s" + f" of '{name}'" * bool(name), numbers[own], part.rows(own))

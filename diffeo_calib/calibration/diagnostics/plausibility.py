@@ -55,7 +55,7 @@ from diffeo_calib.common.quantiles import chi2_median, known
 from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD, in_other_unit, rare_names
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.rows import NO_SOCKET
+from diffeo_calib.measurements.sockets import SocketReadings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import check_unladen
@@ -123,23 +123,20 @@ def check_readings(robot: Tree, tables: Sequence[Readings], *, alone: bool) -> N
         check_devices(table)
 
 
-def check_sockets(robot: Tree, data: Measurements) -> None:
+def check_sockets(robot: Tree, data: SocketReadings) -> None:
     """Refuse rows in sockets that are too few, or measured in a way that does not go with them."""
-    socket, sockets = data.socket_numbers, data.known_sockets
     if len(robot.tips) > 1:
         raise MeasurementError.of("sockets", expected="a robot with one tip", got=few(robot.tips), fix="pass one `tip`")
     check_unladen(data.payload, "rows with sockets", fix="leave the masses out; measure all rows with the same load")
-    resting = socket[socket != NO_SOCKET]
-    counts = torch.bincount(resting, minlength=len(sockets.names))
-    single = rare_names(data.row_sockets, data.line_numbers.tolist(), gates.SOCKET_ROWS)
+    single = rare_names(data.device_names, data.line_numbers.tolist(), gates.SOCKET_ROWS)
     if single:
         expected = f"at least {gates.SOCKET_ROWS} rows in every socket, better 10 or more"
         fix = "check the name, measure more rows there, with the tool turned and tilted otherwise, or leave it out"
         raise MeasurementError.of("rows with sockets", expected=expected, got=few(single), fix=fix)
-    needed = len(counts) + gates.SOCKET_SURPLUS
-    if len(resting) < needed:
+    needed = len(data.names) + gates.SOCKET_SURPLUS
+    if len(data) < needed:
         fix = "measure more rows in each socket: its place is three unknowns, and that of the ball three more"
-        raise MeasurementError.of("rows with sockets", expected=f"at least {needed}", got=len(resting), fix=fix)
+        raise MeasurementError.of("rows with sockets", expected=f"at least {needed}", got=len(data), fix=fix)
 
 
 def check_limits(robot: Tree, data: Any) -> None:
@@ -399,7 +396,7 @@ def check_markers(robot: Tree, data: Measurements) -> None:
 
 
 def check_socket_registration(
-    robot: Tree, data: Measurements, found: SocketRegistration, around: Geometry | None = None
+    robot: Tree, data: SocketReadings, found: SocketRegistration, around: Geometry | None = None
 ) -> None:
     """Refuse rows that fit with one mistake undone, or that do not determine where the ball is.
 
@@ -407,9 +404,9 @@ def check_socket_registration(
         DiffeoCalibWarning: a ball in no socket, a tool that never tilted, a known distance that is not the robot's.
 
     Args:
-        robot: n joints. data: rows in sockets alone. found: their registration. around: the robot as a device saw it.
+        robot: n joints. data: the rows. found: their registration. around: the robot as a device saw it.
     """
-    median, socket = float(found.distances.median()), data.socket_numbers
+    median, socket = float(found.distances.median()), data.device
     far = median > gates.SOCKET_FAR * robot.reach
 
     def left(reading: Reading) -> tuple[float, float]:
@@ -452,13 +449,13 @@ def warn_of_other_robot(robot: Tree, device: Measurements, start: Identification
         warn_user(sentence(what, expected=expected, got=got, fix=fix))
 
 
-def warn_of_wrong_sockets(data: Measurements, points: Tensor) -> None:
+def warn_of_wrong_sockets(data: SocketReadings, points: Tensor) -> None:
     """Warn of rows that fit another socket than their own; refuse them if they are many.
 
     Args:
-        data: rows in sockets alone. points: (N, 3) places of the ball by a geometric calibration, m.
+        data: the rows. points: (N, 3) places of the ball by a geometric calibration, m.
     """
-    socket, sockets = data.socket_numbers, data.known_sockets
+    socket = data.device
     middles = socket_means(points, socket)
     away = (points[:, None] - middles).norm(dim=-1)  # (N, S)
     own = away.gather(1, socket[:, None])[:, 0]
@@ -467,19 +464,19 @@ def warn_of_wrong_sockets(data: Measurements, points: Tensor) -> None:
     rows = wrong.nonzero()[:, 0].tolist()
     if not rows:
         return
-    named = [f"row {int(data.line_numbers[row])} fits '{sockets.names[int(where[row])]}'" for row in rows]
+    named = [f"row {int(data.line_numbers[row])} fits '{data.names[int(where[row])]}'" for row in rows]
     what = f"{len(rows)} of {len(data)} rows seem to be in another socket than they say: {few(named)}"
     if len(rows) > gates.WRONG_SOCKETS * len(data):
         raise MeasurementError.of(what, fix="check the columns that name the place and the socket")
     warn_user(sentence(what, fix="check their sockets; they hardly count"))
 
 
-def _check_distances(data: Measurements, found: SocketRegistration) -> None:
+def _check_distances(data: SocketReadings, found: SocketRegistration) -> None:
     """Refuse known distances that are those of the robot in another unit, and warn of other ones."""
-    sockets = data.known_sockets
+    sockets = data.sockets
     for first, second, length in sockets.distances:
         seen = float((found.positions[first] - found.positions[second]).norm())
-        there = (data.socket_numbers == first) | (data.socket_numbers == second)
+        there = (data.device == first) | (data.device == second)
         off = max(float(own.median()) for own in (found.distances, found.distances[there]))  # as bent links leave it
         if abs(seen - length) <= max(gates.DISTANCE_SHARE * length, gates.DISTANCE_MEDIANS * off):
             continue

@@ -4,7 +4,7 @@
 
 e_ib the errors of body b of row i, such as of a marker, whose rows are of kind k with noise sigma_k, s_j the standard
 deviation of the Gaussian prior of parameter j. The prior makes the problem regular whatever the poses are. What rows of
-a kind share has the prior c ~ N(0, 1): effects Z_i c of the places of sockets, or increments of devices of readings.
+a kind share has the prior c ~ N(0, 1): increments of devices of readings.
 """
 
 from __future__ import annotations
@@ -120,30 +120,28 @@ def held_parameters(geometry: Geometry, *, adrift: bool = False) -> tuple[int, .
 
 
 class MeasuredPoints(NamedTuple):
-    """Measured markers (N, P, 3), m, NaN where hidden, the first of a geometry, with effects (N, P, 3, c) of shifts."""
+    """Measured markers (N, P, 3), m, NaN where hidden, the first of a geometry."""
 
     q: Tensor
     points: Tensor
-    effects: Tensor
 
     @classmethod
-    def of(cls, q: Tensor, points: Tensor, shared: Tensor | None = None) -> MeasuredPoints:
-        """Markers without shifts by default."""
-        q, points = q.detach().cpu(), points.detach().cpu()
-        return cls(q, points, points.new_zeros(*points.shape, 0) if shared is None else shared)
+    def of(cls, q: Tensor, points: Tensor) -> MeasuredPoints:
+        """On the CPU."""
+        return cls(q.detach().cpu(), points.detach().cpu())
 
     @property
     def freedom(self) -> int:
-        """Number c of shifts of unit variance."""
-        return self.effects.shape[3]
+        """Number c of shifts of unit variance: none."""
+        return 0
 
     def errors(self, points: Tensor, shifts: Tensor) -> Tensor:
         """Predicted minus measured numbers (N, B, d) of B bodies, m, for points (N, P', 3) and shifts (c,)."""
-        return points[:, : self.points.shape[1]] - self.points - self.effects @ shifts
+        return points[:, : self.points.shape[1]] - self.points
 
     def slopes(self, points: Tensor, by_errors: Tensor, shifts: Tensor) -> Tensor:
         """Their derivatives (N, B, d, f + c) by f errors that move points by (N, P', 3, f), then by the shifts."""
-        return torch.cat([by_errors[:, : self.points.shape[1]], -self.effects], 3)
+        return by_errors[:, : self.points.shape[1]]
 
     def sample(self) -> MeasuredPoints:
         """Random rows that stand for all of them, if there are many."""

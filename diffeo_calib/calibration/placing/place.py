@@ -1,7 +1,7 @@
 """Where devices and markers are, for rows of any kinds: registration and geometric calibration, and what follows.
 
-Rows that tell coordinates find the robot first: in the frame of their device, or in the robot's base if a ball rested
-in sockets. Readings find it by themselves only where there are no such rows; else their devices are placed around it.
+Rows that tell coordinates find the robot first, in the frame of their device. Readings find it by themselves only where
+there are no such rows; else their devices are placed around it.
 """
 
 from __future__ import annotations
@@ -21,11 +21,10 @@ from diffeo_calib.calibration.diagnostics.hypotheses import variation
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_open_directions
 from diffeo_calib.calibration.diagnostics.outliers import Outlier
-from diffeo_calib.calibration.diagnostics.plausibility import check_identification, check_readings
+from diffeo_calib.calibration.diagnostics.plausibility import check_identification, registered
 from diffeo_calib.calibration.identification.identification import (
     Identification,
     MeasuredPoints,
-    Prior,
     ReadRows,
     Rows,
     described,
@@ -36,14 +35,17 @@ from diffeo_calib.calibration.identification.identification import (
 )
 from diffeo_calib.calibration.placing.lens import LensAndBoard
 from diffeo_calib.calibration.placing.placement import Elsewhere, OtherLabel, OtherRows, Placement
-from diffeo_calib.calibration.placing.readings import (
-    ReadingDevices,
-    ball_of,
-    reading_sets,
-    register_readings,
-)
+from diffeo_calib.calibration.placing.readings import ReadingDevices
 from diffeo_calib.calibration.placing.sessions import Drift, Sessions
-from diffeo_calib.calibration.placing.sockets import SocketDevices, register_coordinates
+from diffeo_calib.calibration.placing.sockets import (
+    ball_of,
+    check_beside,
+    check_rows,
+    prior_of,
+    reading_sets,
+    register_ball,
+    warn_of_wrong_names,
+)
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import few, sentence
@@ -55,7 +57,6 @@ from diffeo_calib.maps.observation import Part, Stacked
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.regression.tails import Tails
 from diffeo_calib.robots.cartesian import is_cartesian
-from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import Places, errors_of_kinds, fitting_devices
@@ -66,7 +67,6 @@ from diffeo_calib.sensors.tables import (
     OtherReadings,
     ball_tip,
     check_poses,
-    check_sessions,
     divided,
     sees_frame,
     with_markers,
@@ -128,7 +128,7 @@ class Placed:
     """Rows of any kinds beside a geometric calibration, everything in the frame of the model."""
 
     data: Any  # the table
-    coordinates: Coordinates | None  # its rows that tell coordinates, in that frame, sockets at their places
+    coordinates: Coordinates | None  # its rows that tell coordinates, in that frame
     placement: Placement  # the devices
     registration: Identification  # base and markers, or ball and devices
     # the geometric calibration. Both have the devices of readings as they were then, in the order of their sets
@@ -142,7 +142,7 @@ class Placed:
     @property
     def free(self) -> bool:
         """Whether no device says where the robot stands."""
-        return self.coordinates is None or self.coordinates.table.without_device
+        return self.coordinates is None
 
     @property
     def lever(self) -> float | None:
@@ -152,8 +152,7 @@ class Placed:
     @property
     def ball(self) -> bool:
         """Whether no device measures positions of the last marker."""
-        balls = self.lever is None and bool(self.readings)
-        return self.free or balls or self.placement.one(SocketDevices) is not None
+        return self.free or (self.lever is None and bool(self.readings))
 
     def by_kind(self, errors: Tensor) -> Evaluations:
         """Errors (N, R) of the numbers of the rows, m, NaN where nothing was measured, in the unit of each kind."""
@@ -181,8 +180,7 @@ class Placed:
         placement = self.placement.settled(fitted, fitted_map, chosen.data, here, chosen=chosen)
         own = self.coordinates
         if own is not None:
-            table = with_markers(own.table, self.registration.geometry.markers)
-            own = own._replace(table=placement.at_places(table))
+            own = own._replace(table=with_markers(own.table, self.registration.geometry.markers))
         return replace(self, placement=placement, coordinates=own)
 
     def stage_rms(self, model: Callable[[Tensor], Tensor]) -> list[float | None]:
@@ -255,8 +253,7 @@ class Placed:
         """
         (coordinates, readings), aligned = divided(data), None
         if coordinates is not None:
-            table = self.placement.at_places(self.placement.aligned(coordinates.table))
-            aligned = coordinates._replace(table=table)
+            aligned = coordinates._replace(table=self.placement.aligned(coordinates.table))
         centre = like.points.unflatten(1, (-1, 3)).mean((0, 1))
         other = OtherRows(data, coordinates, aligned, readings, centre)
         placement = Placement(one.with_rows(other) for one in self.placement)
@@ -308,8 +305,7 @@ def place(robot: Tree, data: Any, progress: Progress) -> Placed:
     """
     check_poses(data)
     coordinates, readings = divided(data)
-    check_sessions(coordinates)
-    check_readings(robot, [one.table for one in readings], alone=coordinates is None)
+    check_rows(robot, [one.table for one in readings], alone=coordinates is None)
     if coordinates is None:
         return _by_readings(robot, data, readings, progress)
     return _by_coordinates(robot, data, coordinates, readings, progress)
@@ -323,34 +319,28 @@ def _by_coordinates(
     sessions, table = Sessions.of_table(robot, own, progress)
     LOG.info("calibrating %s with %r", robot.name, table)
     progress("registration", 0, 1)
-    registration, places = register_coordinates(robot, table)
-    table = Placement(places).at_places(table)
+    registration, tables = registered(robot, table), [one.table for one in readings]
+    check_beside(robot, table, registration, tables)
     warn_of_joints_below_tip(robot, table)
     warn_of_open_directions(robot, table, registration)
-    tables, adrift = [one.table for one in readings], table.without_device
     geometry, ball = registration.geometry, None
-    if not places and not all(map(sees_frame, tables)):
+    if not all(map(sees_frame, tables)):
         known = identify(geometry, table.q, table.points).geometry  # a nominal robot may miss its ball by centimetres
-        ball = ball_of(tables, known, ball_tip(None, readings, geometry.on[-1]))
+        ball = ball_of(tables, known, ball_tip(readings, geometry.on[-1]))
         geometry = geometry if ball is None else with_ball(geometry, ball)
     devices = tuple(fitting_devices(one, geometry.points(one.q)) for one in tables)
-    shared = [one.shared(len(table), 3 * table.markers).unflatten(1, (-1, 3)) for one in places]
-    rows = Rows(geometry, (MeasuredPoints.of(table.q, table.points, *shared), *map(ReadRows, tables, devices)))
+    rows = Rows(geometry, (MeasuredPoints.of(table.q, table.points), *map(ReadRows, tables, devices)))
     if ball is not None:
         registration = described(rows, [registration.noise])
     registration = replace(registration, devices=devices)
     progress("geometry", 0, 1)
-    found = estimated(rows, held_parameters(geometry, adrift=adrift))
-    places = [one.found(table, found) for one in places]
+    found = estimated(rows, held_parameters(geometry))
+    warn_of_wrong_names(tables, found.geometry)
     LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", 1e3 * registration.rms, 1e3 * found.rms)
-    table = Placement(places).at_places(table)
-    if not adrift:
-        device, seen = table.device_rows(), found.geometry  # without a ball, which a device does not see
-        seen = seen.with_tool(seen.tool[: device.markers], seen.on[: device.markers])
-        check_identification(device, replace(found, geometry=seen))
+    seen, count = found.geometry, table.markers  # without a ball, which a device does not see
+    check_identification(table, replace(found, geometry=seen.with_tool(seen.tool[:count], seen.on[:count])))
     cameras = LensAndBoard.of_table(table, own.rows, registration, sessions)
-    sets = reading_sets(readings, found.devices, "the robot's base" if adrift else "the measuring frame")
-    placement = Placement((*sessions, *(one.of_rows(own.rows) for one in places), *cameras, *sets))
+    placement = Placement((*sessions, *cameras, *reading_sets(readings, found.devices, "the measuring frame")))
     return Placed(data, own._replace(table=table), placement, registration, found)
 
 
@@ -360,15 +350,16 @@ def _by_readings(robot: Tree, data: Any, readings: list[OtherReadings], progress
     LOG.info("calibrating %s with %r", robot.name, data)
     tables = [one.table for one in readings]
     tip = () if tables[0].on is None else (tables[0].on,)
-    registration = register_readings(Geometry.nominal(robot, 1, tip), tables)
+    registration = register_ball(robot, tables, tip)
     rows = Rows(registration.geometry, tuple(map(ReadRows, tables, registration.devices)))
-    held = held_parameters(rows.geometry, adrift=True)
-    found = estimated(rows, held, Prior())
+    held, prior = held_parameters(rows.geometry, adrift=True), prior_of(tables)
+    found = estimated(rows, held, prior)
+    warn_of_wrong_names(tables, found.geometry)
     LOG.info("registration RMS %.4f mm, geometry %.4f mm", 1e3 * registration.rms, 1e3 * found.rms)
     if any(free := [devices.freed() for devices in registration.devices]):  # what was said to be known is tested
         each = zip(tables, registration.devices, free, strict=True)
         parts = tuple(ReadRows(data, opened or own) for data, own, opened in each)
-        again = estimated(replace(rows, parts=parts), held, Prior())
+        again = estimated(replace(rows, parts=parts), held, prior)
         for devices in again.devices:
             devices.check_freed(found.noise, again.noise)
     return Placed(data, None, Placement(reading_sets(readings, found.devices)), registration, found)

@@ -51,7 +51,7 @@ class OtherRows(NamedTuple):
 
     data: Any  # all of them
     coordinates: Coordinates | None  # those that tell coordinates
-    aligned: Coordinates | None  # the same in the frame of the model, a ball in sockets at its places
+    aligned: Coordinates | None  # the same in the frame of the model
     readings: list[OtherReadings]  # the others, by kind
     centre: Tensor  # (3,) the middle of the rows with which the devices were found, m
 
@@ -117,10 +117,6 @@ class DeviceSet(ABC):
     @abstractmethod
     def with_rows(self: S, other: OtherRows) -> S:
         """Replace the rows of the devices; MeasurementError for other devices."""
-
-    def at_places(self, table: T) -> T:
-        """Rows that tell coordinates where these devices put them."""
-        return table
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:  # noqa: B027
         """Warn (DiffeoCalibWarning) of what these devices leave open in a model, and of what would show it."""
@@ -195,12 +191,6 @@ class Placement(tuple[DeviceSet, ...]):
         """Measured positions in the frame of the model; unchanged where one set-up measured all."""
         for own in self:
             data = own.devices.aligned(data)
-        return data
-
-    def at_places(self, data: T) -> T:
-        """Rows that tell coordinates, a ball in sockets at its places."""
-        for own in self:
-            data = own.at_places(data)
         return data
 
     def sentences(self) -> list[str]:

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.outliers import FAR
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import (
     Identification,
@@ -36,8 +37,9 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices, Hypothesis, check_devices
 from diffeo_calib.sensors.kinds import kind_of
-from diffeo_calib.sensors.tables import OtherReadings
 
+ROBOT_BASE = "the robot's base"
+"""Measuring frame of rows without a device."""
 ROUGH_M = 2e-3
 """Errors of a robot before its calibration, to compare starts."""
 STARTS_STEPS, COMPARED = 200, 1e-3  # most steps; change of the cost by which those end that are only compared
@@ -67,6 +69,15 @@ class ReadingDevices(DeviceSet):
     data: Readings
     frame: str
 
+    @classmethod
+    def found(cls, devices: Devices, data: Readings, frame: str) -> ReadingDevices:
+        """Where a geometric calibration found them, with what is known of them before the fit."""
+        return cls(devices, data, frame)
+
+    def reason(self, seen: Tensor, small: float) -> str:
+        """Probable cause of a row whose readings are wrong: ``seen`` (3,) its ball, ``small`` an error that fits, m."""
+        return FAR
+
     @property
     def numbers(self) -> Tensor:
         """(r,) where their r numbers stand in these rows."""
@@ -90,9 +101,9 @@ class ReadingDevices(DeviceSet):
             yield one._replace(effects=self._of_all_rows(one.effects, data))
 
     def settled(self, found: Settled) -> ReadingDevices:
-        known = found.covariance.diagonal().clamp(min=0).sqrt().view_as(self.devices.deviations)
-        moved = self.devices.shifted(found.shifts)
-        return replace(self, devices=replace(moved, deviations=known * moved.deviations))
+        root, moved = self.devices.root, self.devices.shifted(found.shifts)
+        known = (root @ found.covariance @ root.mT).diagonal().clamp(min=0).sqrt()
+        return replace(self, devices=replace(moved, deviations=known.view_as(moved.deviations)))
 
     def with_rows(self, other: OtherRows) -> ReadingDevices:
         own = next(one for one in other.readings if one.table.column_kind == self.data.column_kind)
@@ -233,7 +244,7 @@ def _rough_fit(bare: Geometry, tables: Sequence[Readings], ball: Tensor, how: Ma
     return RoughFit(worst, Rows(geometry.absorb(fit.theta), tuple(map(ReadRows, tables, moved))), fit.errors)
 
 
-def ball_of(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Geometry | None:
+def ball_of_readings(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Geometry | None:
     """A known robot with the ball of readings on a tip as its only marker; None without readings of a ball."""
     for one in readings:
         check_devices(one)
@@ -241,11 +252,3 @@ def ball_of(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Geome
     if not readings:
         return None
     return register_readings(geometry.with_tool(geometry.tool[-1:], (tip,)), readings).geometry
-
-
-def reading_sets(
-    readings: Sequence[OtherReadings], devices: Sequence[Devices], frame: str = "the robot's base"
-) -> tuple[ReadingDevices, ...]:
-    """Sets of devices and the rows that they measured; ``frame``: that of the devices, in words."""
-    each = zip(readings, devices, strict=True)
-    return tuple(ReadingDevices(own, table, frame).measuring(rows, own.numbers(table)) for (table, rows), own in each)

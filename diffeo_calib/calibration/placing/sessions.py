@@ -46,7 +46,7 @@ from diffeo_calib.sensors.set_ups import (
     sessions_of,
     set_up_kind,
 )
-from diffeo_calib.sensors.tables import Coordinates, measured_rows
+from diffeo_calib.sensors.tables import Coordinates
 
 ROUNDS = 3
 TOLD_APART = 0.5
@@ -73,21 +73,20 @@ class Sessions(DeviceSet):
         if len(table.present_sessions) < 2:
             return [], table
         progress("sessions", 0, 1)
-        rows = table.device_rows()
-        found, median = cls.find(robot, rows, set_up_kind(rows))
+        found, median = cls.find(robot, table, set_up_kind(table))
         with suppress(MeasurementError):
-            other = MeasuringFrames if rows.remounted else MountedMarkers
-            ratio = cls.find(robot, rows, other)[1] / median if rows.lever is None else 1.0
+            other = MeasuringFrames if table.remounted else MountedMarkers
+            ratio = cls.find(robot, table, other)[1] / median if table.lever is None else 1.0
             if ratio < TOLD_APART:
                 moved = ("markers were mounted anew", "device"), ("device was moved", "markers")
-                what, stayed = moved[rows.remounted]
+                what, stayed = moved[table.remounted]
                 words = (
                     f"the sessions fit {1 / ratio:.2g} times better if the {what} between them and the {stayed} stayed"
                 )
-                option = "leave out" if rows.remounted else "add"
+                option = "leave out" if table.remounted else "add"
                 fix = f"{option} --remounted (in Python `remounted=True` of `with_sessions`) if that is so"
                 warn_user(sentence(words, fix=fix))
-        return [found.of_rows(own.rows[table.socket_numbers < 0])], found.devices.aligned(table)
+        return [found.of_rows(own.rows)], found.devices.aligned(table)
 
     @classmethod
     def find(cls, robot: Tree, data: Measurements, kind: type[SetUps]) -> tuple[Sessions, float]:
@@ -124,19 +123,17 @@ class Sessions(DeviceSet):
         return cls(found.with_reference(reference), reference, data.markers).measuring(rows, session[rows])
 
     @staticmethod
-    def beside(
-        own: Coordinates, device: Coordinates, geometry: Geometry, seen: Tensor
-    ) -> tuple[list[Sessions], Coordinates]:
+    def beside(own: Coordinates, geometry: Geometry, seen: Tensor) -> tuple[list[Sessions], Coordinates]:
         """The sessions of new rows, and these as of the largest one; none for one session.
 
         Args:
-            own: rows of a table. device: those of them that a device measured.
+            own: rows of a table.
             geometry: of the robot in the frame of the largest session. seen: (M, P, 3) their points there, m.
         """
-        if len(device.table.present_sessions) < 2:
+        if len(own.table.present_sessions) < 2:
             return [], own
-        found = Sessions.around(device.table, set_up_kind(device.table), geometry, seen)
-        return [found.of_rows(own.rows[device.rows])], own._replace(table=found.devices.aligned(own.table))
+        found = Sessions.around(own.table, set_up_kind(own.table), geometry, seen)
+        return [found.of_rows(own.rows)], own._replace(table=found.devices.aligned(own.table))
 
     @property
     def transforms(self) -> Tensor:
@@ -186,11 +183,10 @@ class Sessions(DeviceSet):
         return {self.devices.key: self.devices.entry()}
 
     def with_rows(self, other: OtherRows) -> Sessions:
-        device = None if other.coordinates is None else measured_rows(other.coordinates.table)
         rows = number = self.rows[:0]
-        if other.coordinates is not None and device is not None:
-            number = self.devices.numbers(device.table)
-            rows, number = other.coordinates.rows[device.rows][number != NO_SOCKET], number[number != NO_SOCKET]
+        if other.coordinates is not None:
+            number = self.devices.numbers(other.coordinates.table)
+            rows, number = other.coordinates.rows[number != NO_SOCKET], number[number != NO_SOCKET]
         return replace(self, centre=other.centre).measuring(rows, number)
 
 

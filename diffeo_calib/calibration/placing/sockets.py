@@ -1,61 +1,52 @@
-"""Sockets: where they are before the exact fit, and what it says about them.
+"""Sockets: how a ball in them shows a robot by itself or beside a device, and what a fit says about their places.
 
-Ball and sockets are found in the measuring frame: the robot's base, or that of the device that measured other rows. The
-rows of a socket then have its place as their measured position, and what is not known about it is an error that they
-share, with a wide prior; known distances between sockets, linearised where these are, narrow it. Places are found again
-with the geometric errors.
-
-Without a device no row says where the robot's base is: base and error twist of the first joint are held.
+Ball and sockets are found in closed form, in the measuring frame: the robot's base, or that of the device that measured
+other rows. Known distances between sockets, linearised where these are, belong to what is known of their places before
+the rows; places are found again with the geometric errors.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
+from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_flat_places
-from diffeo_calib.calibration.diagnostics.outliers import Outlier, excluded, found_outliers
+from diffeo_calib.calibration.diagnostics.outliers import Outlier, excluded
 from diffeo_calib.calibration.diagnostics.plausibility import (
+    check_readings,
     check_socket_registration,
     check_sockets,
-    registered,
     warn_of_other_robot,
     warn_of_wrong_sockets,
 )
 from diffeo_calib.calibration.expected_errors import workspace_deviation
-from diffeo_calib.calibration.identification.identification import (
-    Identification,
-    MeasuredPoints,
-    Rows,
-    described,
-    with_ball,
-)
-from diffeo_calib.calibration.identification.registration import (
-    register_sockets,
-    socket_means,
-)
-from diffeo_calib.calibration.placing.placement import DeviceSet, Elsewhere, OtherRows, Placement, Seen, Settled
-from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
+from diffeo_calib.calibration.identification.identification import Identification, Prior, ReadRows, Rows, described
+from diffeo_calib.calibration.identification.registration import register_sockets, socket_means
+from diffeo_calib.calibration.placing.placement import Elsewhere, Placement, Seen, Settled
+from diffeo_calib.calibration.placing.readings import ROBOT_BASE, ReadingDevices, ball_of_readings, register_readings
+from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.measurements.checks import numbers_of
+from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
-from diffeo_calib.measurements.sockets import SEPARATOR, Sockets
+from diffeo_calib.measurements.sockets import KIND, SEPARATOR, SocketReadings, Sockets
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.linear_rows import LinearRows
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.devices import VALUE, Hypothesis
+from diffeo_calib.sensors.coordinates import fitting_devices
+from diffeo_calib.sensors.devices import VALUE, Devices, Hypothesis
 from diffeo_calib.sensors.errors import socket_errors
 from diffeo_calib.sensors.set_ups import frame_slopes
+from diffeo_calib.sensors.tables import OtherReadings
 from diffeo_calib.sensors.tool_frames import IN_SOCKET_M, SocketPlaces
 
-ALIKE = 0.05
-"""Deviation of a block's distance from one place to another, relative to that of the distance itself."""
 FEWEST_BESIDE = 2
 """Rows of a socket besides one that are needed to judge it."""
 
@@ -71,80 +62,36 @@ class PlaceErrors:
 
 
 @dataclass(frozen=True, eq=False)
-class SocketDevices(DeviceSet):
+class SocketDevices(ReadingDevices):
     """The sockets of a calibration, in the measuring frame: that of the device, or the robot's base without one."""
 
     devices: SocketPlaces
-    sockets: Sockets  # their names and known distances
-    root: Tensor  # (3 S, 3 S) square root of the covariance of their places before the fit, m
-    by_device: bool  # whether a device measured other rows
-    # (3 S, 3 S) of the positions, m^2; after a fit without a device without rigid motions of all of them
-    covariance: Tensor
+    data: SocketReadings
     left_out: tuple[PlaceErrors, ...] = ()  # every place, predicted by all other rows
 
-    @classmethod
-    def around(cls, data: Measurements, positions: Tensor) -> SocketDevices:
-        """The sockets of a table, wide around positions (S, 3), and with the known distances linearised there [m]."""
-        sockets, S = data.known_sockets, len(positions)
-        wide, one_hot = (torch.eye(size, dtype=positions.dtype, device=positions.device) for size in (3 * S, S))
-        equations = [torch.nn.functional.pad(wide / PLACES.found_m_rad, (0, 1))]
-        for known in sockets.blocks:
-            first, second, lengths = (list(each) for each in zip(*known, strict=True))
-            away = positions[second] - positions[first]
-            U = (one_hot[second] - one_hot[first])[:, :, None] * torch.nn.functional.normalize(away)[:, None]
-            own = torch.cat([U.flatten(1), (away.new_tensor(lengths) - away.norm(dim=1))[:, None]], 1)
-            noise = (1.0 + ALIKE**2 * own.new_ones(len(own)).diag()) * (sockets.distance_std or 1.0) ** 2
-            equations.append(torch.linalg.solve_triangular(torch.linalg.cholesky(noise), own, upper=False))
-        R = torch.linalg.qr(torch.cat(equations), mode="r").R[: 3 * S]
-        root = torch.linalg.solve_triangular(R[:, :-1], wide, upper=True)
-        places, rows = positions + (root @ R[:, -1]).view(-1, 3), (data.socket_numbers != NO_SOCKET).nonzero()[:, 0]
-        covariance = root @ root.mT
-        devices = SocketPlaces(sockets.names, places, _deviations(covariance), rows, data.socket_numbers[rows])
-        return cls(devices, sockets, root, not data.without_device, covariance)
-
-    @classmethod
-    def around_model(cls, table: Measurements, rows: Tensor, seen: Tensor) -> list[SocketDevices]:
-        """The sockets around a model that is known; nothing without sockets.
-
-        Args:
-            table: M rows. rows: (M,) their numbers in a table of N. seen: (N, 3 P) points of the model, m.
-        """
-        if table.sockets is None:
-            return []
-        socket = table.socket_numbers
-        resting = socket != NO_SOCKET
-        return [cls.around(table, socket_means(seen[rows][resting, -3:], socket[resting])).of_rows(rows)]
+    @property
+    def sockets(self) -> Sockets:
+        """Their names and known distances."""
+        return with_attributes(self.data, names=self.names).sockets
 
     @property
     def positions(self) -> Tensor:
         """(S, 3) most probable places, m."""
         return self.devices.constants
 
-    def shared(self, count: int, coordinates: int) -> Tensor:
-        """Uncertainty of the places, as errors of the last marker that ``count`` rows share: (N, 3 P, 3 S), m."""
-        own = self.root.view(len(self.positions), 3, -1)
-        effects = own.new_zeros(count, coordinates, own.shape[2])
-        effects[self.rows, -3:] = own[self.device]
-        return effects
+    @classmethod
+    def found(cls, devices: Devices, data: Any, frame: str) -> ReadingDevices:
+        """Known distances are linearised anew there."""
+        return cls(SocketPlaces.of(data, devices.constants), data, frame)
 
-    def found(self, data: Measurements, stage: Identification) -> SocketDevices:
-        """Move the sockets to the places that a geometric calibration found; its first shifts are theirs."""
-        resting = data.socket_rows()
-        warn_of_wrong_sockets(resting, stage.geometry.points(resting.q)[:, -1])
-        return SocketDevices.around(data, self.positions + (self.root @ stage.shifts[0]).view(-1, 3))
-
-    def at_places(self, table: Measurements) -> Measurements:
-        """The places of their sockets as measured positions of the ball."""
-        table = self.named(table)
-        rows, points = table.socket_numbers != NO_SOCKET, table.points.clone()
-        points[rows, -1] = self.positions[table.socket_numbers[rows]]
-        return with_attributes(table, points=points)
+    def reason(self, seen: Tensor, small: float) -> str:
+        return other_socket(seen, self.positions, self.names, small)
 
     def elsewhere(self, row: int, points: Tensor, devices: Placement) -> Elsewhere:
         if not bool((self.rows == row).any()):
             return super().elsewhere(row, points, devices)
         away, nearest = torch.cdist(points[:, -1], self.positions.to(points)).min(1)
-        there = {"socket": nearest, "sockets": self.sockets}
+        there = {"device": nearest, "names": self.names}
         return Elsewhere(away < IN_SOCKET_M, self.positions, lambda copies: with_attributes(copies, **there))
 
     def hypotheses(self, data: Seen) -> Iterator[Hypothesis]:
@@ -162,32 +109,15 @@ class SocketDevices(DeviceSet):
             name = f"the distance of '{pair[0]}' and '{pair[1]}' ({1e3 * length:.2f} mm)"
             yield Hypothesis(name, data.slopes @ effects, ("mm", 1e-3), fix, about=VALUE)
 
-    def effects(self, data: Seen) -> Tensor:
-        return data.slopes @ self.shared(*data.points.shape)
-
     def settled(self, found: Settled) -> SocketDevices:
-        root, positions = self.root, self.positions - (self.root @ found.shifts).view(-1, 3)
-        if found.fitted.workspace is not None:
-            B = frame_slopes(positions[None], positions.mean(0))[0]  # (3 S, 6)
+        root, moved = self.devices.root, self.devices.shifted(found.shifts)
+        if found.fitted.workspace is not None:  # no device tells where all of them are
+            B = frame_slopes(moved.constants[None], moved.constants.mean(0))[0]  # (3 S, 6)
             root = root - B @ (torch.linalg.pinv(B) @ root)
-        covariance = root @ found.covariance @ root.mT
-        devices = replace(self.devices, constants=positions, deviations=_deviations(covariance))
+        std = (root @ found.covariance @ root.mT).diagonal().clamp(min=0).sqrt().view(-1, 3)
         left_out = () if found.chosen is None else self._left_out(found.chosen)
-        return replace(self, devices=devices, covariance=covariance, left_out=left_out)
-
-    def with_rows(self, other: OtherRows) -> SocketDevices:
-        rows = socket = self.rows[:0]
-        if other.coordinates is not None:
-            socket = self.named(other.coordinates.table).socket_numbers
-            rows, socket = other.coordinates.rows[socket != NO_SOCKET], socket[socket != NO_SOCKET]
-        return self.measuring(rows, socket)
-
-    def named(self, table: Measurements) -> Measurements:
-        """The rows of a table with these sockets; MeasurementError for others."""
-        unknown = sorted(set(table.row_sockets) - {*self.names, ""})
-        if unknown:
-            raise MeasurementError.of("rows in sockets", expected=few(self.names), got=few(unknown))
-        return with_attributes(table, socket=numbers_of(table.row_sockets, self.names), sockets=self.sockets)
+        devices = replace(moved, deviations=std, before=())
+        return replace(self, devices=devices, left_out=left_out)
 
     def _left_out(self, chosen: ChosenScales) -> tuple[PlaceErrors, ...]:
         """Every place as predicted by all other rows: with A its block of (G + R)^-1, its errors are A^-1 mu.
@@ -199,14 +129,13 @@ class SocketDevices(DeviceSet):
         numbers, shared = process.numbers, process.numbers.of_table(data.shared)
         socket = self.by_row(len(data.y))
         place = torch.where(socket == NO_SOCKET, NO_SOCKET, sockets.place[socket])
-        ball = numbers.cells % numbers.shape[1] >= numbers.shape[1] - 3
         for number, name in enumerate(sockets.place_names):
-            index = (ball & (place[numbers.owner] == number)).nonzero()[:, 0]
+            index = (place[numbers.owner] == number).nonzero()[:, 0]
             rows = (place == number).nonzero()[:, 0]
             errors = process.left_out(place.new_full(numbers.cells.shape, -1).index_fill(0, index, 0))[0][index]
             others = process.mu - process.inverse[:, index] @ errors  # K^-1 y without the place
             errors = errors + shared[index] @ (shared.T @ others)
-            predicted = data.y[rows, -3:] - errors.view(-1, 3)
+            predicted = self.positions[socket[rows]] - errors.view(-1, 3)
             away, distances = socket_errors(predicted, socket[rows], sockets)
             spread = float(away.square().sum(1).mean().sqrt())
             found.append(PlaceErrors(name, len(rows), spread, tuple(one.error for one in distances)))
@@ -231,11 +160,10 @@ class SocketDevices(DeviceSet):
 
     def sentences(self) -> list[str]:
         """Places of the sockets, how well they are predicted, and what that does not show."""
-        frame = "the measuring frame" if self.by_device else "the robot's base"
-        among = "" if self.by_device else "among the sockets "
+        among = "among the sockets " * (self.frame == ROBOT_BASE)
         each = zip(self.names, 1e3 * self.positions, 1e3 * self.devices.deviations, strict=True)
         lines = [
-            f"socket '{name}': {_listed(place)} mm in {frame}, deviations {among}{_listed(deviation)} mm"
+            f"socket '{name}': {_listed(place)} mm in {self.frame}, deviations {among}{_listed(deviation)} mm"
             for name, place, deviation in each
         ]
         for one in self.left_out:
@@ -245,56 +173,93 @@ class SocketDevices(DeviceSet):
         return [*lines, f"spread within sockets, each place left out: {1e3 * self.left_out_spread:.4f} mm"]
 
 
-def _deviations(covariance: Tensor) -> Tensor:
-    return covariance.diagonal().clamp(min=0).sqrt().view(-1, 3)
-
-
 def _listed(values: Tensor) -> str:
     return ", ".join(f"{value:.3f}" for value in values.tolist())
 
 
-def register_coordinates(robot: Tree, data: Measurements) -> tuple[Identification, list[SocketDevices]]:
-    """Base and markers of rows that tell coordinates in one measuring frame, and the sockets.
+def other_socket(seen: Tensor, positions: Tensor, names: Sequence[str], small: float) -> str:
+    """Why a ball (3,) is far from its socket: it may be in another one of places (S, 3), at most ``small`` m away."""
+    away = (seen - positions).norm(dim=1)
+    nearest = int(away.argmin())
+    if float(away[nearest]) > small:
+        return "far from where the other rows of its socket predict it"
+    return f"fits socket '{names[nearest]}': named after a wrong one?"
+
+
+SETS: Mapping[str, type[ReadingDevices]] = {KIND: SocketDevices}
+"""Sets of devices of readings but :class:`ReadingDevices`."""
+
+
+def reading_sets(
+    readings: Sequence[OtherReadings], devices: Sequence[Devices], frame: str = ROBOT_BASE
+) -> tuple[ReadingDevices, ...]:
+    """Sets of devices and the rows that they measured; ``frame``: that of the devices, in words."""
+    each = zip(readings, devices, strict=True)
+    sets = ((SETS.get(table.kind, ReadingDevices).found(own, table, frame), table, rows) for (table, rows), own in each)
+    return tuple(one.measuring(rows, one.devices.numbers(table)) for one, table, rows in sets)
+
+
+def resting_rows(tables: Sequence[Any]) -> SocketReadings | None:
+    """The rows in sockets among tables of one kind each; None without any."""
+    return next((own for own in tables if own.kind == KIND), None)
+
+
+def ball_of(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Geometry | None:
+    """A known robot with the ball of readings on a tip as its only marker; None without readings of a ball."""
+    if (resting := resting_rows(readings)) is None:
+        return ball_of_readings(readings, geometry, tip)
+    bare = geometry.with_tool(geometry.tool[-1:], (tip,))
+    return register_sockets(bare, resting.q, resting.device).geometry
+
+
+def check_rows(robot: Tree, tables: Sequence[Readings], *, alone: bool) -> None:
+    """Refuse readings on another tip than the robot has, and too few; ``alone``: no other rows tell of the robot."""
+    check_readings(robot, [own for own in tables if own.kind != KIND], alone=alone and resting_rows(tables) is None)
+    if (resting := resting_rows(tables)) is not None:
+        check_sockets(robot, resting)
+
+
+def register_ball(robot: Tree, tables: Sequence[Readings], tip: tuple[str, ...]) -> Identification:
+    """Ball and devices by readings alone, with errors of joints zero: in closed form where the ball rested in sockets.
 
     Raises:
-        MeasurementError: rows that cannot belong to this robot, too few, or known distances that are not those of the
-            robot.
+        MeasurementError: rows that cannot belong to this robot, or known distances that are not its own.
 
     Warns:
-        DiffeoCalibWarning: a tool that never tilts, no known distance, rows in sockets that are not of the robot that a
-            device measured.
+        DiffeoCalibWarning: a tool that never tilts, no known distance, readings that no places explain.
     """
-    if data.sockets is None:
-        return registered(robot, data), []
-    data = data.with_sockets_of_rows()
-    check_sockets(robot, data)
-    start = None if data.without_device else registered(robot, data.device_rows())
-    if start is None and not data.known_sockets.distances:
+    bare, resting = Geometry.nominal(robot, 1, tip), resting_rows(tables)
+    if resting is None:
+        return register_readings(bare, tables)
+    if not resting.sockets.distances:
         what = "no distance between sockets is known: the size of the robot rests on its description"
         warn_user(sentence(what, fix="pass one: a printed block with two sockets and a caliper are enough"))
-    around, resting = None if start is None else start.geometry, data.socket_rows()
-    found = register_sockets(around or robot, resting.q, resting.socket_numbers)
-    check_socket_registration(robot, resting, found, around)
-    places = SocketDevices.around(data, found.positions)
-    placed, shared = places.at_places(data), places.shared(len(data), 3 * data.markers).unflatten(1, (-1, 3))
-    ball = MeasuredPoints.of(*(values[places.rows] for values in (placed.q, placed.points, shared)))
-    if start is None:
-        return described(Rows(found.geometry, (ball,)), adrift=True), [places]
-    device = data.device_rows()
-    warn_of_other_robot(robot, device, start, found)
-    rows = Rows(with_ball(start.geometry, found.geometry), (MeasuredPoints.of(device.q, device.points), ball))
-    return described(rows, [start.noise]), [places]
+    found = register_sockets(robot, resting.q, resting.device)
+    check_socket_registration(robot, resting, found)
+    devices = [fitting_devices(one, found.geometry.points(one.q)) for one in tables]
+    return described(Rows(found.geometry, tuple(map(ReadRows, tables, devices))), adrift=True)
 
 
-def ball_in_sockets(data: Measurements, geometry: Geometry) -> Tensor | None:
-    """(3,) the ball of rows in sockets in the frame of its tip of a known robot, m; None without such rows."""
-    if data.sockets is None:
-        return None
-    resting = data.with_sockets_of_rows().socket_rows()
-    return register_sockets(geometry, resting.q, resting.socket_numbers).geometry.tool[0]
+def prior_of(tables: Sequence[Readings]) -> Prior | None:
+    """Of the joints' errors by readings alone; None to estimate it, as rows in sockets allow."""
+    return Prior() if resting_rows(tables) is None else None
 
 
-def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> list[Outlier]:
+def check_beside(robot: Tree, device: Measurements, start: Identification, tables: Sequence[Readings]) -> None:
+    """Check rows in sockets beside measured positions; ``start``: the registration of these."""
+    if (resting := resting_rows(tables)) is not None:
+        found = register_sockets(start.geometry, resting.q, resting.device)
+        check_socket_registration(robot, resting, found, start.geometry)
+        warn_of_other_robot(robot, device, start, found)
+
+
+def warn_of_wrong_names(tables: Sequence[Readings], geometry: Geometry) -> None:
+    """Warn of rows that fit another socket than their own by a geometric calibration; refuse them if they are many."""
+    if (resting := resting_rows(tables)) is not None:
+        warn_of_wrong_sockets(resting, geometry.points(resting.q)[:, -1])
+
+
+def contradicted_in_sockets(model: CalibratedKinematics, data: Any) -> list[Outlier]:
     """Rows whose ball the model excludes from the middle of their socket, the worst first.
 
     Each is judged as the model and the other rows of its socket predict it: where the socket is, is an error with a
@@ -302,14 +267,15 @@ def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> 
     hold for errors elsewhere, and the rows of a socket share most of these.
 
     Args:
-        model: of rows in sockets. data: rows in sockets that took no part in its fit; rows of other kinds are left out.
+        model: of rows in sockets. data: rows of any kinds that took no part in its fit; those of other kinds are left
+            out.
     """
-    if not bool((data.places >= 0).any()):
+    resting = resting_rows(data.parts)
+    if resting is None:
         return []
-    resting = data.socket_rows().with_sockets_of_rows()
-    seen, socket, N = model.map, resting.socket_numbers.to(resting.q.device), len(resting)
+    seen, socket, N = model.map, resting.device.to(resting.q.device), len(resting)
     predicted = seen(resting.q).detach()[:, -3:]
-    middles, eye = socket_means(predicted, socket)[socket], torch.eye(3, dtype=predicted.dtype, device=predicted.device)
+    middles, eye = socket_means(predicted, socket), torch.eye(3, dtype=predicted.dtype, device=predicted.device)
     rests = torch.nn.functional.one_hot(socket).to(predicted)
     judged = rests.sum(0)[socket] > FEWEST_BESIDE
     if not bool(judged.any()):
@@ -319,10 +285,12 @@ def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> 
     places = torch.kron(PLACES.found_m_rad * rests, eye).view(N, 3, -1)
     wide = torch.eye(places.shape[2], dtype=places.dtype, device=places.device)
     noise, every = seen.new_noise[-3:, -3:].expand(N, -1, -1), torch.ones_like(predicted, dtype=torch.bool)
-    rows = LinearRows(middles - predicted, places, own, noise, every, wide, wide[0] * 0.0, wide * 0.0)
+    rows = LinearRows(middles[socket] - predicted, places, own, noise, every, wide, wide[0] * 0.0, wide * 0.0)
     squares = rows.left_out_squares.masked_fill(~judged, torch.nan)
-    bad = torch.zeros(N, model.markers, dtype=torch.bool, device=own.device)
-    bad[:, -1] = excluded(squares, torch.full_like(squares, 3.0), least=0.0)
-    distances = rows.left_out.norm(dim=1)[:, None].expand(-1, model.markers)
-    placed = with_attributes(resting, points=middles[:, None])
-    return found_outliers(model, placed.with_markers(model.markers), bad, distances)
+    bad = excluded(squares, torch.full_like(squares, 3.0), least=0.0)
+    found, sizes, names = list[Outlier](), rows.left_out.norm(dim=1), resting.row_names
+    for row in bad.nonzero()[:, 0].tolist():
+        small = gates.REMAINING_ERROR * float((predicted[row] - middles[socket[row]]).norm())
+        reason = other_socket(predicted[row], middles, resting.names, small)
+        found.append(Outlier(row, None, int(resting.line_numbers[row]), names[row], float(sizes[row]), None, reason))
+    return sorted(found, key=lambda outlier: -outlier.distance)

@@ -94,8 +94,7 @@ class NoiseModel:
             finest = finest[finest > SMALLEST_NOISE_M**2]
         # that size would drown what images of a board tell across the line of sight: a tenth of that along it
         slack = min(SLACK_SHARE * residual, FINEST_SHARE * (float(finest.median()) ** 0.5 if len(finest) else residual))
-        kinds = plain.kinds if data.body_kinds is None else data.body_kinds
-        return cls(visible, kinds, known, plain.modes if modes is None else modes, slack)
+        return cls(visible, plain.kinds, known, plain.modes if modes is None else modes, slack)
 
     def rows(self, index: Tensor) -> NoiseModel:
         """Noise of some configurations."""

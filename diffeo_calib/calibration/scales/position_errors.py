@@ -187,17 +187,14 @@ class _Scan:
 
     def threshold(self, joints: list[int]) -> float:
         """The T that the largest of these joints exceeds by chance with the probability :data:`FALSE_ALARMS`."""
-        spans = [(HIGHEST - LOWEST) * self._spread(joint) for joint in joints]
+        q, weights = self.q.T[joints], self.pairs.diagonal(dim1=1, dim2=2)[joints]  # by what the rows tell of them
+        weights = weights / weights.sum(1, keepdim=True)
+        variances = (weights * (q - (weights * q).sum(1, keepdim=True)).square()).sum(1)
+        spans = [(HIGHEST - LOWEST) * variance**0.5 for variance in variances.tolist()]
         level = 10.0
         for _ in range(50):  # a contraction
             level = 2.0 * log(sum(1.0 + span * (level / (2.0 * pi)) ** 0.5 for span in spans) / FALSE_ALARMS)
         return level
-
-    def _spread(self, joint: int) -> float:
-        """Standard deviation of the joint's values, weighted by what the rows tell of it, rad."""
-        q, weights = self.q[:, joint], self.pairs[joint].diagonal()
-        mean = (weights * q).sum() / weights.sum()
-        return float((weights * (q - mean).square()).sum() / weights.sum()) ** 0.5
 
 
 def _fall(s: Tensor, both: Tensor, unlike: Tensor) -> Tensor:

@@ -82,11 +82,7 @@ class TangentData:
         A socket is one place, with one effect of the size on all of its rows. Of k0 the differences within it are the
         negative residuals, which would look like another size.
         """
-        kinds = self.noise_model.row_kinds
-        if self.observe is not None:
-            return self.points
-        resting = self.visible & ((kinds > 0) | self.adrift)[:, None]
-        return torch.where(resting, self.y, self.points)
+        return self.points if self.observe is None else self.observe.places(self.points)
 
     @cached_property
     def slopes(self) -> Tensor:

@@ -73,39 +73,39 @@ class Live:
 
     def resume(self) -> None:
         """Go on after the lines that the journal knows."""
-        known = [one for one in self.journal.entries if "line" in one]
+        entries = [stored for stored in self.journal.entries if "line" in stored]
         lines = self.table.new_lines()
         places = [name for name in self.missing if name in self.columns.joints.columns and name.isdecimal()]
         if self.table.header and places:  # columns are named by their places, and the first line is a row
             what = f"{self.source.csv} has no column {few(places)}: a table that grows needs a header line"
             got = f"the first line {few(sorted(self.table.cells(self.table.header)))}"
             raise InputError.of(what, got=got, fix="name the columns in its first line")
-        for number, entry in enumerate(known):
+        for number, entry in enumerate(entries):
             if number >= len(lines) or digest(lines[number]) != entry["sha"]:
                 fix = f"undo the change, or remove '{self.journal.path.name}' to judge all rows anew"
                 raise InputError.of(f"line {number + 2} of {self.source.csv} was changed after it was judged", fix=fix)
         now = self._begun()
-        begun = next((one[BEGUN] for one in self.journal.entries if BEGUN in one), now)
+        begun = next((stored[BEGUN] for stored in self.journal.entries if BEGUN in stored), now)
         if names := [name for name in begun | now if begun.get(name) != now.get(name)]:
             then, got = (", ".join(f"{name} {each.get(name, 'none')}" for name in names) for each in (begun, now))
             fix = f"go on as it was begun, or remove '{self.journal.path.name}' to judge all rows anew"
             what = f"{self.source.csv} was judged with another {' and '.join(names)} than it is read with now"
             raise InputError.of(what, expected=then, got=got, fix=fix)
-        for line in lines[: len(known)]:
+        for line in lines[: len(entries)]:
             self._keep(line)
-        self.unreadable = {n: entry["unreadable"] for n, entry in enumerate(known) if "unreadable" in entry}
-        verdicts = [one for entry in known for one in entry.get("rows", [])]
+        self.unreadable = {n: entry["unreadable"] for n, entry in enumerate(entries) if "unreadable" in entry}
+        verdicts = [kept for entry in entries for kept in entry.get("rows", [])]
         for entry in self.journal.entries:
             if "row" in entry:
                 verdicts[entry["row"]] |= {name: entry[name] for name in KEPT if name in entry}
-        readable = [line if "rows" in entry else b"\n" for line, entry in zip(lines, known, strict=False)]
+        readable = [line if "rows" in entry else b"\n" for line, entry in zip(lines, entries, strict=False)]
         if verdicts:
             if len(table := self._read(readable)) != len(verdicts):
                 raise self.journal.damaged(f"{len(verdicts)} verdicts of {len(table)} rows")
-            self.campaign.resume(table, [Verdict(row, **one) for row, one in enumerate(verdicts)])
-            self.say(f"going on after {len(known)} lines{expected(self.campaign)}", self.state())
-        self.said = [(one.accepted, one.again) for one in self.campaign.verdicts]
-        self.waiting = lines[len(known) :]
+            self.campaign.resume(table, [Verdict(row, **kept) for row, kept in enumerate(verdicts)])
+            self.say(f"going on after {len(entries)} lines{expected(self.campaign)}", self.state())
+        self.said = [(verdict.accepted, verdict.again) for verdict in self.campaign.verdicts]
+        self.waiting = lines[len(entries) :]
 
     @property
     def missing(self) -> list[str]:
@@ -120,17 +120,17 @@ class Live:
         robot, source = self.campaign.robot, self.source
         parts = robot.place_offsets, robot.axes, robot.coupling, robot.coupling_offset
         numbers = [(part.round(decimals=9) + 0.0).tolist() for part in parts]  # without -0.0
-        found = {"robot": (robot.revolute.tolist(), robot.before, numbers), "tip": self.tips}
-        found |= vars(source.table) | {"header": self.table.header.decode("latin-1").strip()}
-        found["position"] = [",".join(triple) for triple in source.table.position or ()]
-        found["joints"] = self.columns.table.joints
-        texts = {name: str(value) for name, value in found.items() if value}
+        setup = {"robot": (robot.revolute.tolist(), robot.before, numbers), "tip": self.tips}
+        setup |= vars(source.table) | {"header": self.table.header.decode("latin-1").strip()}
+        setup["position"] = [",".join(triple) for triple in source.table.position or ()]
+        setup["joints"] = self.columns.table.joints
+        texts = {name: str(value) for name, value in setup.items() if value}
         return {name: text if len(text) < LONGEST else digest(text.encode()) for name, text in texts.items()}
 
     def new_lines(self) -> list[bytes]:
         """Lines that have not been judged."""
-        found, self.waiting = [*self.waiting, *self.table.new_lines()], []
-        return found
+        lines, self.waiting = [*self.waiting, *self.table.new_lines()], []
+        return lines
 
     def judge(self, lines: Sequence[bytes]) -> None:
         """Judge lines, and say what became of them; after the last what comes next."""
@@ -158,22 +158,22 @@ class Live:
 
     def take(self, entry: Entry | DiffeoCalibError) -> None:
         """Do what was sent, and answer it: judge a row, decide about one, or say how the campaign is."""
-        told: Entry = {}
+        answer: Entry = {}
         try:
             if isinstance(entry, DiffeoCalibError):
                 raise entry
             check_cells(entry)
-            told |= {ID: entry[ID]} if ID in entry else {}
+            answer |= {ID: entry[ID]} if ID in entry else {}
             if "do" in entry:
                 self.decide(entry.get("line"), entry["do"])
             elif entry:
                 number = self.known(entry)
-                told = self.answer(self._append(entry) if number is None else number) | told
+                answer = self.answer(self._append(entry) if number is None else number) | answer
             self.poll()
-            told |= self.state()
+            answer |= self.state()
         except InputError as error:
-            told["error"] = str(error)
-        self._say(told)
+            answer["error"] = str(error)
+        self._say(answer)
 
     def known(self, row: Entry) -> int | None:
         """Number of the line that a row repeats; InputError for other values under its id."""
@@ -191,7 +191,7 @@ class Live:
         """Do what a user decided about the rows of a line; InputError for no such line or decision."""
         if what not in DECISIONS:
             raise InputError.of("a decision about a row", expected=f"one of {few(DECISIONS)}", got=str(what))
-        rows = [one.row for one in self.campaign.verdicts if one.line == line]
+        rows = [verdict.row for verdict in self.campaign.verdicts if verdict.line == line]
         if not rows:
             numbers = f", 2 to {len(self.lines) + 1}" if self.lines else "; there is none yet"
             expected = f"a line of {self.source.csv} with a row{numbers}"
@@ -209,11 +209,11 @@ class Live:
         if torn:
             self.journal.add([{"removed": torn}])
             self.say(f"half a line was removed from the end of {self.source.csv}: {torn}", {"removed": torn})
-        *others, own = self.new_lines()
+        *others, last = self.new_lines()
         while others:  # also those after the target was reached
             self.judge(others)
             others, self.waiting = self.waiting, []
-        self._add([own])
+        self._add([last])
         return len(self.lines) - 1
 
     def _add(self, lines: Sequence[bytes], waiting: int = 0) -> None:
@@ -235,8 +235,8 @@ class Live:
                 return
             entries[0]["unreadable"] = self.unreadable[first] = str(error)
         for entry, line in zip(entries, lines, strict=True):
-            if own := [one for one in verdicts if one.line == entry["line"]]:
-                entry["rows"] = [{name: getattr(one, name) for name in KEPT} for one in own]
+            if of_line := [verdict for verdict in verdicts if verdict.line == entry["line"]]:
+                entry["rows"] = [{name: getattr(verdict, name) for name in KEPT} for verdict in of_line]
             self._keep(line)
         self.journal.add([*begun, *entries, *self._revised()])
 
@@ -248,7 +248,7 @@ class Live:
 
     def _revised(self) -> Iterator[Entry]:
         """Entries of rows that are accepted now and were not, or the other way round; of those to be repeated, too."""
-        now = [(one.accepted, one.again) for one in self.campaign.verdicts]
+        now = [(verdict.accepted, verdict.again) for verdict in self.campaign.verdicts]
         self.revised = [row for row, (one, other) in enumerate(zip(self.said, now, strict=False)) if one != other]
         self.said = now
         for row in self.revised:
@@ -256,37 +256,37 @@ class Live:
 
     def answer(self, number: int) -> Entry:
         """Outcome of a line."""
-        known, found = self.campaign.verdicts, {"line": number + 2}
+        every, answer = self.campaign.verdicts, {"line": number + 2}
         if number in self.unreadable:
-            return found | {"error": f"line {number + 2} left out: {self.unreadable[number]}"}
-        own = [one for one in known if one.line == number + 2]
-        found = own[0].entry() | found | {"text": "\n".join(map(str, own))}
+            return answer | {"error": f"line {number + 2} left out: {self.unreadable[number]}"}
+        of_line = [verdict for verdict in every if verdict.line == number + 2]
+        answer = of_line[0].entry() | answer | {"text": "\n".join(map(str, of_line))}
         revised, self.late, self.revised = dict.fromkeys([*self.late, *self.revised]), [], []
-        return found | {"revised": [{"line": known[row].line, "accepted": known[row].accepted} for row in revised]}
+        return answer | {"revised": [{"line": every[row].line, "accepted": every[row].accepted} for row in revised]}
 
-    def _say(self, told: Entry) -> None:
+    def _say(self, answer: Entry) -> None:
         """Print an answer."""
-        words = ["left out: " + told["error"]] if "error" in told else [told["text"]] if "text" in told else []
-        if "next" in told:
+        words = ["left out: " + answer["error"]] if "error" in answer else [answer["text"]] if "text" in answer else []
+        if "next" in answer:
             words.append(f"  {'; '.join(filter(None, self.words))}")
-        self.say("\n".join(words), told)
+        self.say("\n".join(words), answer)
 
     def state(self) -> Entry:
         """The campaign in numbers, with what to measure next: joint values in the unit of the table."""
-        known, found = self.campaign.expected_error, self.found
+        error, proposal = self.campaign.expected_error, self.found
         entry: Entry = {"rows": len(self.campaign), "accepted_rows": len(self.campaign.accepted)}
-        entry["expected_error_mm"] = None if known is None else 1e3 * known
+        entry["expected_error_mm"] = None if error is None else 1e3 * error
         if self.campaign.goal is not None:
-            limit, more = self.campaign.error_limit, None if found is None else found.needed
+            limit, more = self.campaign.error_limit, None if proposal is None else proposal.needed
             entry["error_limit_mm"] = None if limit is None else 1e3 * limit
             entry |= {"more_rows": more, "target_reached": self.campaign.reached}
-        poses = [] if found is None else self.columns.joints_from_si(found.q[: self.given.count]).tolist()
+        poses = [] if proposal is None else self.columns.joints_from_si(proposal.q[: self.given.count]).tolist()
         return entry | {"next": [dict(zip(self.columns.joints.columns, q, strict=True)) for q in poses]}
 
     @property
     def found(self) -> Next | None:
         """The next poses, and the forecast."""
-        now = self.campaign.models, [(one.accepted, one.again) for one in self.campaign.verdicts]
+        now = self.campaign.models, [(verdict.accepted, verdict.again) for verdict in self.campaign.verdicts]
         if self._found is None or self._found[0] != now:
             self._found = now, self.campaign.next(max(self.given.count, 1))
         return self._found[1]
@@ -294,11 +294,11 @@ class Live:
     @property
     def words(self) -> tuple[str, str]:
         """The expected error with the rows to the goal, and the next poses."""
-        state, known = self.state(), expected(self.campaign)
+        state, error = self.state(), expected(self.campaign)
         more = "?" if state.get("more_rows", "") is None else state.get("more_rows", "")
         needed = "" if more == "" else f", {more} more rows to the target"
         poses = (", ".join(f"{value:.6g}" for value in pose.values()) for pose in state["next"])
-        return f"{known[2:]}{needed}" if known else "no model yet", "; ".join(f"next: {pose}" for pose in poses)
+        return f"{error[2:]}{needed}" if error else "no model yet", "; ".join(f"next: {pose}" for pose in poses)
 
     def _read(self, lines: Sequence[bytes], header: bytes = b"", first: int = 0) -> Any:
         """Lines as a table, in their order; ``first`` is the number of the first one, for messages."""
@@ -310,9 +310,9 @@ class Live:
 
 def expected(campaign: Campaign) -> str:
     """The expected error in words, after a comma; empty without one."""
-    known, limit = campaign.expected_error, campaign.error_limit
+    error, limit = campaign.expected_error, campaign.error_limit
     below = "" if limit is None else f" (95 %: below {1e3 * limit:.4g} mm)"
-    return "" if known is None else f", {1e3 * known:.4g} mm expected{below}"
+    return "" if error is None else f", {1e3 * error:.4g} mm expected{below}"
 
 
 def run(given: CampaignOptions) -> None:

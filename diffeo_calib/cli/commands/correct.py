@@ -75,21 +75,21 @@ class ToolOnTip:
         return [self.name("command", name) for name in ("x", "y", "z", *flat_names(table.rotation))]
 
     def added(
-        self, robot: Tree, found: Compensation, known: tuple[Tensor, Tensor] | None, table: TableFormat
+        self, robot: Tree, solution: Compensation, region: tuple[Tensor, Tensor] | None, table: TableFormat
     ) -> dict[str, Column]:
         """Its pose, misses and standard deviation, NaN where there is no command or no target."""
-        allowed, names = found.q.isfinite().all(1), self.pose_names(table)
-        numbers = found.q.new_full((len(found), len(names) + 1), torch.nan)
-        if known is not None:
-            poses, unit = self.nominal(robot, found.q[allowed]), table.rotation_angle or "rad"
+        allowed, names = solution.q.isfinite().all(1), self.pose_names(table)
+        numbers = solution.q.new_full((len(solution), len(names) + 1), torch.nan)
+        if region is not None:
+            poses, unit = self.nominal(robot, solution.q[allowed]), table.rotation_angle or "rad"
             turned = rotation_numbers(poses[:, :3, :3], table.convention or "rotvec", angle=unit)
-            parts = poses[:, :3, 3] * table.per_metre, turned, known[0][:, :1] * table.per_metre
+            parts = poses[:, :3, 3] * table.per_metre, turned, region[0][:, :1] * table.per_metre
             numbers[allowed] = torch.cat(parts, dim=1)
         *pose, deviation = numbers.mT.tolist()
         added = dict[str, Column](zip(names, pose, strict=True))
-        added["status"] = list(map(str, found.status))
-        added[self.name("miss", table.length)] = (self.own(found.miss) * table.per_metre).tolist()
-        angle = self.own(found.angle_miss)
+        added["status"] = list(map(str, solution.status))
+        added[self.name("miss", table.length)] = (self.own(solution.miss) * table.per_metre).tolist()
+        angle = self.own(solution.angle_miss)
         if angle is not None:
             turned = angle.rad2deg() if table.angle == "deg" else angle
             added[self.name("angle_miss", table.angle)] = turned.tolist()
@@ -122,27 +122,27 @@ def run(options: CorrectOptions) -> None:
         targets = torch.stack([tool.nominal(robot, start) for tool in tools], dim=1)
         if is_cartesian(robot) and robot.n < AXES_OF_A_POSE:  # commanded places
             targets = targets[..., :3, 3]
-    bound, rate = (None if one is None else radians(one) for one in (options.limit, options.rate))
+    bound, rate = (None if angle is None else radians(angle) for angle in (options.limit, options.rate))
     how = {"frame": options.frame, "bound": bound, "path": rate is not None, "rate": rate}
     with progress_bar() as progress:
         progress("commands", 0, 1)
-        found = compensate(model, _goals(robot, tools, targets), start, tool=_places(robot, tools), **how)
-    allowed = found.q.isfinite().all(1)
+        program = compensate(model, _goals(robot, tools, targets), start, tool=_places(robot, tools), **how)
+    allowed = program.q.isfinite().all(1)
     some = bool(allowed.any())
-    known = [tool.known(model, found.q[allowed], options.frame) if some else None for tool in tools]
+    regions = [tool.known(model, program.q[allowed], options.frame) if some else None for tool in tools]
     added = dict[str, Column]()
-    for tool, own in zip(tools, known, strict=True):
-        added |= tool.added(robot, found, own, table)
+    for tool, pair in zip(tools, regions, strict=True):
+        added |= tool.added(robot, program, pair, table)
     place = {"command": 0, "status": 1, "miss": 2, "angle": 2, "std": 3}
     added = {name: added[name] for name in sorted(added, key=lambda name: place[name.split("_")[0]])}
-    write_columns(options.output, sheet, columns.cells(found.q, {}) | added, table)
-    misses = {tool.tip: {"miss_m": tool.own(found.miss), "angle_miss_deg": _degrees(found, tool)} for tool in tools}
-    record.add(rows=len(found), statuses=found.counts, misses=misses, files={"program": options.output})
-    _summarise(robot, found, tools, [line for line, _ in sheet.rows])
+    write_columns(options.output, sheet, columns.cells(program.q, {}) | added, table)
+    misses = {tool.tip: {"miss_m": tool.own(program.miss), "angle_miss_deg": _degrees(program, tool)} for tool in tools}
+    record.add(rows=len(program), statuses=program.counts, misses=misses, files={"program": options.output})
+    _summarise(robot, program, tools, [line for line, _ in sheet.rows])
     where = "robot's base" if options.frame == "base" else "measuring frame"
-    say(*(_how_well_known(tool, *own, where) for tool, own in zip(tools, known, strict=True) if own is not None))
+    say(*(_how_well_known(tool, *pair, where) for tool, pair in zip(tools, regions, strict=True) if pair is not None))
     frames = ", ".join(f"of the tool on {tool.tip}, in the frame of {robot.base}" for tool in tools)
-    corrected = f"{len(found)} rows written to {options.output}: corrected {', '.join(columns.names)}"
+    corrected = f"{len(program)} rows written to {options.output}: corrected {', '.join(columns.names)}"
     say(f"{corrected}, the pose to command ({frames}), status, miss and standard deviation")
 
 
@@ -165,14 +165,14 @@ def _tools(model: CalibratedKinematics, named: CorrectOptions, table: TableForma
     if len(tips) < 2:
         tip = checked_tip(robot, model.tool_tip)
         return [ToolOnTip(tip, tool_in_tip(model, numbers[0], table))]
-    found = []
+    placed = []
     for k, (tip, text) in enumerate(zip(tips, numbers, strict=True)):
         if tip in tips[:k]:
             raise InputError.of(f"--tip {tip} is named twice", fix="name every tip once")
-        own = model.tool if checked_tip(robot, tip) == model.tool_tip else None
-        tool = tool_in_tip(model.with_tool(own, tip), text, table)
-        found.append(ToolOnTip(tip, tool, robot.tips.index(tip)))
-    return found
+        mounted = model.tool if checked_tip(robot, tip) == model.tool_tip else None
+        tool = tool_in_tip(model.with_tool(mounted, tip), text, table)
+        placed.append(ToolOnTip(tip, tool, robot.tips.index(tip)))
+    return placed
 
 
 def _goals(robot: Tree, tools: list[ToolOnTip], targets: Tensor) -> Tensor:
@@ -191,32 +191,32 @@ def _places(robot: Tree, tools: list[ToolOnTip]) -> Tensor:
     return tools[0].tool if only else torch.stack([by_tip.get(tip, tool_transform(None)) for tip in robot.tips])
 
 
-def _degrees(found: Compensation, tool: ToolOnTip) -> Tensor | None:
+def _degrees(solution: Compensation, tool: ToolOnTip) -> Tensor | None:
     """Angles (N,) of the tool from its targets, NaN where it has none; None for targets without orientation."""
-    return None if found.angle_miss is None else tool.own(found.angle_miss).rad2deg()
+    return None if solution.angle_miss is None else tool.own(solution.angle_miss).rad2deg()
 
 
-def _summarise(robot: Tree, found: Compensation, tools: list[ToolOnTip], lines: list[int]) -> None:
+def _summarise(robot: Tree, solution: Compensation, tools: list[ToolOnTip], lines: list[int]) -> None:
     """Print sizes of corrections, counts of statuses, and the first rows that are not reached."""
-    allowed = found.q.isfinite().all(1)
+    allowed = solution.q.isfinite().all(1)
     if bool(allowed.any()):
-        sizes, change = dict[str, Tensor](), found.correction[allowed].abs()
+        sizes, change = dict[str, Tensor](), solution.correction[allowed].abs()
         for tool in tools:
-            after, before = (tool.nominal(robot, q[allowed])[:, :3, 3] for q in (found.q, found.start))
+            after, before = (tool.nominal(robot, q[allowed])[:, :3, 3] for q in (solution.q, solution.start))
             label = "tool" if tool.place is None else f"tool on {tool.tip}"
             sizes[f"{label}, mm"] = 1e3 * (after - before).norm(dim=1)
-        for name, turns, own in zip(robot.joint_names, robot.periodic, change.mT, strict=True):
-            sizes[f"{name}, {'deg' if turns else 'mm'}"] = own.rad2deg() if turns else 1e3 * own
+        for name, turns, moved in zip(robot.joint_names, robot.periodic, change.mT, strict=True):
+            sizes[f"{name}, {'deg' if turns else 'mm'}"] = moved.rad2deg() if turns else 1e3 * moved
         rows = [[plain(what), f"{float(own.median()):.4f}", f"{float(own.max()):.4f}"] for what, own in sizes.items()]
         out.print(text_table("Corrections", ["", "median", "max"], rows))
-    say(f"{len(found)} rows: " + ", ".join(f"{count} {name}" for name, count in found.counts.items()))
-    say(*_missed_lines(found, tools, lines))
-    few_joints = robot.n < AXES_OF_A_POSE * len(tools) and found.angle_miss is not None
-    if few_joints and 2 * int(found.reached.sum()) < len(found):
+    say(f"{len(solution)} rows: " + ", ".join(f"{count} {name}" for name, count in solution.counts.items()))
+    say(*_missed_lines(solution, tools, lines))
+    few_joints = robot.n < AXES_OF_A_POSE * len(tools) and solution.angle_miss is not None
+    if few_joints and 2 * int(solution.reached.sum()) < len(solution):
         of_tools = "" if len(tools) == 1 else f" of {len(tools)} tools"
         what = f"a robot with {robot.n} joints cannot hold every orientation{of_tools}"
         warn_user(sentence(what, fix="name target positions instead (--position)"))
-    elif 2 * found.counts.get("unreachable", 0) > len(found):
+    elif 2 * solution.counts.get("unreachable", 0) > len(solution):
         what = "most targets are farther from their commands than the largest correction allows"
         warn_user(sentence(what, fix="check the frame, the unit and the columns of the targets, and --tool"))
 
@@ -244,18 +244,18 @@ def _sizes(deviations: Tensor) -> tuple[str, str]:
     return f"{1e3 * shift:.3f} mm", f"{degrees(turn):.4f} deg"
 
 
-def _missed_lines(found: Compensation, tools: list[ToolOnTip], lines: list[int]) -> Iterator[str]:
+def _missed_lines(solution: Compensation, tools: list[ToolOnTip], lines: list[int]) -> Iterator[str]:
     """Sentences about the first rows that are not reached."""
-    missed = (~found.reached).nonzero().flatten().tolist()
+    missed = (~solution.reached).nonzero().flatten().tolist()
     for row in missed[:MOST_MISSED]:
-        status, misses = str(found.status[row]), list[str]()
+        status, misses = str(solution.status[row]), list[str]()
         for tool in tools:
-            distance, angle = float(tool.own(found.miss)[row]), _degrees(found, tool)
+            distance, angle = float(tool.own(solution.miss)[row]), _degrees(solution, tool)
             turned = "" if angle is None else f" and {float(angle[row]):.4f} deg"
             who = "" if tool.place is None else f"{tool.tip} "
             misses += [] if isnan(distance) else [f"{who}misses by {1e3 * distance:.4f} mm{turned}"]
         words = f"{REASONS.get(status, status)}, {', '.join(misses)}"
-        if not bool(found.q[row].isfinite().all()):
+        if not bool(solution.q[row].isfinite().all()):
             words = f"{status}, no command is allowed: it starts beyond a joint's limit"
         yield f"  line {lines[row]}: {words}"
     if len(missed) > MOST_MISSED:

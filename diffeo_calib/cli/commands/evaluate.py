@@ -71,11 +71,11 @@ def run(options: EvaluateOptions) -> None:
         return _registered(model, data, options)
     check_rows(model, data)
     places = place(model, data, every_session=source.table.session is not None)
-    found, used = residuals(model, places, data), rows_used_in_fit(model, data.q)
-    judged = judge(model, places, data, found)
-    _show(model, found, used, positions_of(model, places, data), options.model.name)
+    by_kind, used = residuals(model, places, data), rows_used_in_fit(model, data.q)
+    judged = judge(model, places, data, by_kind)
+    _show(model, by_kind, used, positions_of(model, places, data), options.model.name)
     if options.output is not None:
-        write_rows(options.output, COLUMNS, [list(_residuals(found, used, source))], source.table)
+        write_rows(options.output, COLUMNS, [list(_residuals(by_kind, used, source))], source.table)
         record.add(files={"residuals": options.output})
         say(f"residuals: {options.output}")
     if SESSION in places.devices:
@@ -83,37 +83,37 @@ def run(options: EvaluateOptions) -> None:
     if places.numbers:
         record.add(found_from_rows={"numbers": places.numbers, "sentences": list(places.found)})
     say(*map(plain, places.found))
-    say(*(line for errors in found.values() for line in printed.socket_lines(errors, "all rows")))
+    say(*(line for errors in by_kind.values() for line in printed.socket_lines(errors, "all rows")))
     say(*printed.expectation_lines(model, data))
     warn_outside_range(model, data.q)
     source.warn_of_other_frames(rows_of_other_frames(model, data.q))
     if judged.refusal is not None:
         raise MeasurementError(judged.refusal)
-    positions = 0 if found.positions is None else len(found.positions.errors)
+    positions = 0 if by_kind.positions is None else len(by_kind.positions.errors)
     which = "rows" if judged.rows == positions else f"rows, evenly chosen of {positions},"
     say(*outlier_lines(judged.outliers, judged.rows, which))
     for text in judged.causes:
         warn_user(text)
     if limit is not None:
-        new, which = (found, "") if bool(used.all()) else (found.rows(~used), " not used in the fit")
+        new, which = (by_kind, "") if bool(used.all()) else (by_kind.rows(~used), " not used in the fit")
         printed.accept(accuracy(model, new.values(), limit.unit, which=which), limit)
 
 
-def _show(model: CalibratedKinematics, found: Evaluations, used: Tensor, seen: Measurements | None, name: str) -> None:
+def _show(model: CalibratedKinematics, kinds: Evaluations, used: Tensor, data: Measurements | None, name: str) -> None:
     """Print and record errors of all rows, of the rows of the fit, of the others, and of set-ups and devices."""
     named = dict[str, dict[str, Any]]()
-    for kind, errors in found.items():
-        own, positions = used[found.index[kind]], errors is found.positions
+    for kind, errors in kinds.items():
+        fitted, positions = used[kinds.index[kind]], errors is kinds.positions
         of_rows = {"in all": errors}
-        if own.any() and not own.all():
-            of_rows |= {"used in the fit": errors.rows(own), "not used in the fit": errors.rows(~own)}
+        if fitted.any() and not fitted.all():
+            of_rows |= {"used in the fit": errors.rows(fitted), "not used in the fit": errors.rows(~fitted)}
         of_devices, what = dict[str, Evaluation](), "session" if positions else "device"
-        present = [one for one in dict.fromkeys(errors.devices) if one and errors.what != SPREAD]
+        present = [sensor for sensor in dict.fromkeys(errors.devices) if sensor and errors.what != SPREAD]
         if errors.what != READINGS or len(present) > 1:
-            for one in present:  # sockets have no errors of their own
-                mask = torch.tensor([device == one for device in errors.devices], dtype=torch.bool, device=HOST)
-                of_devices[one] = errors.rows(mask)
-        expected = expected_rms(model, seen, errors.errors.shape[1]) if positions and seen is not None else None
+            for sensor in present:  # sockets have no errors of their own
+                mask = torch.tensor([device == sensor for device in errors.devices], dtype=torch.bool, device=HOST)
+                of_devices[sensor] = errors.rows(mask)
+        expected = expected_rms(model, data, errors.errors.shape[1]) if positions and data is not None else None
         labels = of_rows | {f"of {what} '{plain(device)}'": some for device, some in of_devices.items()}
         rows = {(f"{some.count} {label}",): some for label, some in labels.items()}
         out.print(printed.ErrorTable(rows, f"of {plain(name)}", "rows", expected=expected))
@@ -122,9 +122,9 @@ def _show(model: CalibratedKinematics, found: Evaluations, used: Tensor, seen: M
     record.add(files={}, **entries_by_kind(named))
 
 
-def _residuals(found: Evaluations, used: Tensor, source: MeasuredTable) -> Iterator[list[float | str]]:
+def _residuals(by_kind: Evaluations, used: Tensor, source: MeasuredTable) -> Iterator[list[float | str]]:
     """Rows of the table of residuals: lengths in the unit of the table, pixels, degrees."""
-    for entry in found.lines():
+    for entry in by_kind.lines():
         metres = entry["unit"] == "mm"
         values = [entry[name] * (source.table.per_metre / 1e3 if metres else 1.0) for name in COLUMNS[5:9]]
         cells = entry["line"], int(used[entry["row"]]), entry["kind"], entry["device"], entry["marker"]
@@ -136,20 +136,20 @@ def _registered(model: CalibratedKinematics, data: Any, options: EvaluateOptions
     output = options.output
     warn_outside_range(model, data.q)
     say(*models.another_date_lines(model))
-    found = model.registered(data, free=options.free or "both", learn=False)
+    registered = model.registered(data, free=options.free or "both", learn=False)
     if output is not None:
-        save(found, output)  # before anything is printed: output may be cut off
-    errors = evaluate(found, data)
+        save(registered, output)  # before anything is printed: output may be cut off
+    errors = evaluate(registered, data)
     kinds = errors if isinstance(errors, Evaluations) else {errors.kind: errors}
     record.add(files={} if output is None else {"model": output})
     record.add(**entries_by_kind({kind: {"after": after} for kind, after in kinds.items()}))
-    known = found.registration is not None and found.registration.rms_before is not None
-    before = residuals(model, place(model, data), data) if known else None
+    has_before = registered.registration is not None and registered.registration.rms_before is not None
+    before = residuals(model, place(model, data), data) if has_before else None
     for kind, after in kinds.items():
         rows = {} if before is None else {(f"{after.count} with the places of the fit",): before[kind]}
         rows |= {(f"{after.count} with places found anew",): after}
         out.print(printed.ErrorTable(rows, f"of {plain(options.model.name)}", "rows"))
-    say(*map(plain, (*printed.registration_lines(found), *placement_sentences(found))))
+    say(*map(plain, (*printed.registration_lines(registered), *placement_sentences(registered))))
     if output is not None:
         say(f"registered model: {output}")
 
@@ -167,18 +167,18 @@ def _reported(model: CalibratedKinematics, page: Path, options: EvaluateOptions)
         raise InputError.of("rows to hold against --tolerance", expected=expected, got=f"{len(data)} that did", fix=fix)
     with progress_bar() as progress:
         against = options.against or []
-        found = write_report(model, page, data, against=against, tolerance=tolerance, progress=progress)
+        findings = write_report(model, page, data, against=against, tolerance=tolerance, progress=progress)
     say(*models.provenance_lines(model))
-    words, stages = verdict(found, tolerance), dict(found.expected)
-    kinds = {kind: one.stages for kind, one in found.kinds.items()}
-    record.add(**entries_by_kind(kinds), expected_error_by_stage_m=stages, left_out=not found.new)
-    record.add(verdict=words, advice=list(advice(found)), files={"report": page})
-    if found.predictions is not None:
-        record.add(coverage_95=found.predictions.coverage())
-    if data is not None and not found.new:
-        each = "as fitted" if not found.errors else "each predicted by all others"
+    words, stages = verdict(findings, tolerance), dict(findings.expected)
+    kinds = {kind: rows.stages for kind, rows in findings.kinds.items()}
+    record.add(**entries_by_kind(kinds), expected_error_by_stage_m=stages, left_out=not findings.new)
+    record.add(verdict=words, advice=list(advice(findings)), files={"report": page})
+    if findings.predictions is not None:
+        record.add(coverage_95=findings.predictions.coverage())
+    if data is not None and not findings.new:
+        each = "as fitted" if not findings.errors else "each predicted by all others"
         say(f"all rows of the table were used before: the rows of the fit are shown, {each}")
-    say(words, *printed.expectation_lines(model, None, found.deviations.error), f"report: {page}")
+    say(words, *printed.expectation_lines(model, None, findings.deviations.error), f"report: {page}")
 
 
 # --- predictions
@@ -201,8 +201,8 @@ def run_predict(given: PredictOptions) -> None:
     units = {name: getattr(given, name) for name in Units.names()}
     typed = Rows(**units, convention=given.convention, rotation_angle=given.rotation_angle, payload=given.payload)
     read = models.as_fitted(kinematics, typed)
-    own = typed if given.length and given.angle else read  # the predictions are by default written as the rows were
-    rows = Rows(convention=own.convention, rotation_angle=own.rotation_angle, payload=own.payload)
+    layout = typed if given.length and given.angle else read  # the predictions are by default written as the rows were
+    rows = Rows(convention=layout.convention, rotation_angle=layout.rotation_angle, payload=layout.payload)
     table = of_robot(with_rows(table_format(read), rows), kinematics.robot)
     with_poses = kinematics.lever is not None
     if not with_poses and (table.convention or table.rotation_angle):
@@ -226,11 +226,11 @@ def run_predict(given: PredictOptions) -> None:
     def blocks() -> Iterator[Predictions]:
         for first in range(0, len(q), ROWS_AT_ONCE):
             progress("rows", first, len(q))
-            own = slice(first, first + ROWS_AT_ONCE)
-            model = kinematics if masses is None else kinematics.at_payloads(masses[own])
-            mean, covariance = model.bodies.written(model, q[own])
+            block = slice(first, first + ROWS_AT_ONCE)
+            model = kinematics if masses is None else kinematics.at_payloads(masses[block])
+            mean, covariance = model.bodies.written(model, q[block])
             deviations = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-            yield q[own], mean, deviations, readings.cells(model, q[own])
+            yield q[block], mean, deviations, readings.cells(model, q[block])
 
     with progress_bar() as progress:
         write_predictions(output, blocks(), written, prefixes=prefixes, more=readings.names, poses=with_poses)
@@ -242,9 +242,9 @@ def run_predict(given: PredictOptions) -> None:
     say(*readings.sentences())
     if with_poses:
         turned = table.for_writing(rotation_std=False, prefixes=prefixes)
-        own = replace(turned, joints=(), position=[[prefix + axis for axis in "xyz"] for prefix in prefixes])
-        own = replace(own, rotation_std=None, **dict.fromkeys(BESIDE))
-        say(f"`evaluate` and `fit` read these poses with {shlex.join(options_of(own))}")
+        layout = replace(turned, joints=(), position=[[prefix + axis for axis in "xyz"] for prefix in prefixes])
+        layout = replace(layout, rotation_std=None, **dict.fromkeys(BESIDE))
+        say(f"`evaluate` and `fit` read these poses with {shlex.join(options_of(layout))}")
 
 
 @dataclass(frozen=True)
@@ -262,21 +262,21 @@ class _Readings:
     @property
     def names(self) -> list[str]:
         """KIND_DEVICE and std_KIND_DEVICE, of several numbers with _1, _2."""
-        counts = [(own, range(1, 1 + own.mean.shape[1])) for own in self.devices]
-        ends = [(f"{own.kind}_{own.device}", [f"_{k}" if len(ks) > 1 else "" for k in ks]) for own, ks in counts]
+        counts = [(part, range(1, 1 + part.mean.shape[1])) for part in self.devices]
+        ends = [(f"{part.kind}_{part.device}", [f"_{k}" if len(ks) > 1 else "" for k in ks]) for part, ks in counts]
         return [f"{std}{name}{end}" for name, each in ends for std in ("", "std_") for end in each]
 
     def cells(self, model: CalibratedKinematics, q: Tensor) -> Tensor:
         """(B, k) means and standard deviations of every device."""
         parts = [q[:, :0]]
-        for own in model.predict_readings(q) if self.devices else ():
-            parts += [self._unit(own.unit)[1] * values for values in (own.mean, own.deviations)]
+        for reading in model.predict_readings(q) if self.devices else ():
+            parts += [self._unit(reading.unit)[1] * values for values in (reading.mean, reading.deviations)]
         return torch.cat(parts, 1)
 
     def sentences(self) -> Iterator[str]:
         """Meaning of the columns, and the width of 95 % regions."""
-        for own in self.devices:
-            numbers = own.mean.shape[1]
+        for part in self.devices:
+            numbers = part.mean.shape[1]
             widths = f"within {chi2_above(0.05, numbers) ** 0.5:.2f} standard deviations"
-            unit = self._unit(own.unit)[0]
-            yield f"{own.kind}_{own.device}: what this device will read, in {unit}; 95 % of new readings are {widths}"
+            unit = self._unit(part.unit)[0]
+            yield f"{part.kind}_{part.device}: what this device will read, in {unit}; 95 % of new readings are {widths}"

@@ -84,20 +84,20 @@ class _Export:
         if new is not None and new.is_file() and new.read_bytes() == urdf:
             fix = "name another file: later fits need the robot as it is now"
             raise InputError.of(f"--urdf {new} is the robot's own URDF", fix=fix)
-        found = rigid_kinematics(self.model, transmission=tables)
-        self.geometry, name = found.geometry, ", ".join(options)
-        alone = {f"{name} alone": with_errors(self.model, found.geometry.joint_errors, found.how)} if tables else {}
-        self.rows |= {f"{name} and --correction-tables" if tables else name: found} | alone
+        rigid = rigid_kinematics(self.model, transmission=tables)
+        self.geometry, name = rigid.geometry, ", ".join(options)
+        alone = {f"{name} alone": with_errors(self.model, rigid.geometry.joint_errors, rigid.how)} if tables else {}
+        self.rows |= {f"{name} and --correction-tables" if tables else name: rigid} | alone
         self.lines += [TOGETHER] * tables
-        said = ", ".join(f"{name} {1e3 * rms:.4f} mm" for name, rms in found.validated.items())
-        self.lines.append(f"rigid kinematics from the {found.how} (cross-validated: {said})")
+        said = ", ".join(f"{name} {1e3 * rms:.4f} mm" for name, rms in rigid.validated.items())
+        self.lines.append(f"rigid kinematics from the {rigid.how} (cross-validated: {said})")
         self.lines.append("rigid kinematics hold no gravity sag, no transmission errors and no other deformations")
         frame = "that of the model" if stands_free(self.model) else "the measuring frame"
-        placed = placement_lines(found.geometry, poses=self.model.lever is not None, frame=frame)
+        placed = placement_lines(rigid.geometry, poses=self.model.lever is not None, frame=frame)
         self.lines += [f"  their {line}" for line in placed]
         self.lines.append("  (they belong to these files: plan with them or send commands of `correct`, never both)")
         for option in options:
-            self.files[option] = self._text(option, found.geometry, urdf).encode("utf-8", "surrogateescape")
+            self.files[option] = self._text(option, rigid.geometry, urdf).encode("utf-8", "surrogateescape")
 
     def _text(self, option: str, geometry: Geometry, urdf: bytes) -> str:
         if option == "--dh":
@@ -108,19 +108,19 @@ class _Export:
             return mjcf_text(geometry)
         if option == "--urdf":
             return corrected_urdf(geometry, urdf).decode("utf-8", "surrogateescape")
-        before, known = self.given.ur_kinematics, None
+        before, match = self.given.ur_kinematics, None
         if before is not None and before.is_file():
-            known = HASH.search(before.read_bytes().decode(errors="replace"))
-        self.lines += [UR_HASH] * (known is None)
-        return ur_text(ur_transforms(geometry, urdf), known and known[1])
+            match = HASH.search(before.read_bytes().decode(errors="replace"))
+        self.lines += [UR_HASH] * (match is None)
+        return ur_text(ur_transforms(geometry, urdf), match and match[1])
 
     def tables(self, wanted: Mapping[str, Path]) -> None:
         """Joint offsets alone, correction tables for the nominal robot, corrections on a grid."""
         length, angle = self.given.length, self.given.angle
         if "--joint-offsets" in wanted:
-            found = best_joint_offsets(self.model)
-            self.rows["--joint-offsets"] = found.rigid
-            self.files["--joint-offsets"] = offsets_text(found, self.model.robot, length, angle).encode()
+            offsets = best_joint_offsets(self.model)
+            self.rows["--joint-offsets"] = offsets.rigid
+            self.files["--joint-offsets"] = offsets_text(offsets, self.model.robot, length, angle).encode()
             self.lines.append(OFFSETS)
         if "--correction-tables" in wanted:
             tables = correction_tables(self.model)
@@ -149,8 +149,8 @@ def run(given: ExportOptions) -> None:
     if not wanted:
         raise typer.BadParameter(f"name at least one file to write: {', '.join(files)}")
     model = load_laden(given.model, given.payload)
-    own = tool_in_tip(model, given.tool, TableFormat(given.length, given.angle))
-    tool = None if given.tool is None else own
+    in_tip = tool_in_tip(model, given.tool, TableFormat(given.length, given.angle))
+    tool = None if given.tool is None else in_tip
     source = given.c and write_c(model, given.c, tool, given.frame or "base", tip=given.tip, write=False)
     export, rigid = _Export(model, given), [option for option in wanted if option in RIGID]
     if rigid:
@@ -201,8 +201,8 @@ def _limits(model: CalibratedKinematics, rigid: Sequence[str]) -> Iterator[str]:
 
 def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> None:
     """Print how far each export is from the model, and about how far from new measurements."""
-    known = model.summary
-    about, new = (None if known is None else known.leave_one_out_rms), "new measurements, about"
+    summary = model.summary
+    about, new = (None if summary is None else summary.leave_one_out_rms), "new measurements, about"
     if about is None or stands_free(model):  # no position was measured
         about, new = ExpectedError.of(model).whole, "true positions, about"
     title = f"Distance from the model over {Compared.of(model).where}, mm"
@@ -211,10 +211,10 @@ def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> N
         left_out = rigid.validated.get(rigid.how)
         lines.append((plain(name), [rigid.rms, rigid.largest, left_out, hypot(left_out or rigid.rms, about)]))
     lines.append(("(the model itself)", [None, None, None, about]))
-    cells = [[name, *("" if one is None else f"{1e3 * one:.4f}" for one in numbers)] for name, numbers in lines]
+    cells = [[name, *("" if rms is None else f"{1e3 * rms:.4f}" for rms in numbers)] for name, numbers in lines]
     out.print(text_table(title, ["export", "RMS", "max", "cross-validated", new], cells))
-    if known is not None and known.geometry_rms is not None and known.diffeomorphic_rms is not None:
-        left = f"geometric calibration {1e3 * known.geometry_rms:.4f}, model {1e3 * known.diffeomorphic_rms:.4f}"
+    if summary is not None and summary.geometry_rms is not None and summary.diffeomorphic_rms is not None:
+        left = f"geometric calibration {1e3 * summary.geometry_rms:.4f}, model {1e3 * summary.diffeomorphic_rms:.4f}"
         say(f"RMS distance from the measured positions of the fit, mm: {left}")
 
 
@@ -222,7 +222,7 @@ def _dh_lines(table: DHTable, given: ExportOptions) -> Iterator[str]:
     """Base and tool of a Denavit-Hartenberg table, and the joints with Hayati's parameter."""
     for name, transform in (("base", table.base), ("tool", table.tool)):
         numbers = zip(origin_numbers(transform), (given.length, given.angle), strict=True)
-        words = [f"{' '.join(f'{value:.6g}' for value in in_unit(own, unit))} {unit}" for own, unit in numbers]
+        words = [f"{' '.join(f'{value:.6g}' for value in in_unit(values, unit))} {unit}" for values, unit in numbers]
         yield f"DH {name} (x y z, roll pitch yaw): {', '.join(words)}"
     parallel = [name for name, row in zip(table.names, table.rows, strict=True) if row.beta]
     if parallel:

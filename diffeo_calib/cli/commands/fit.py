@@ -55,12 +55,12 @@ def run(given: FitOptions) -> None:
         how = {"controls": given.controls or "auto", "seed": given.seed, "note": given.note, "scales_of": others}
         result = calibrate(chain, train, **how, progress=interrupts.watching(progress, err.print))
         result = replace(result, model=made_by_command(result.model))
-    own, commanded = result.placed.coordinates, is_cartesian(chain) and not turns_nowhere(chain)
-    on_tool = None if own is None else own.table.sees_board_from_tool(commanded=commanded)
+    positions, commanded = result.placed.coordinates, is_cartesian(chain) and not turns_nowhere(chain)
+    on_tool = None if positions is None else positions.table.sees_board_from_tool(commanded=commanded)
     hand_eye = {} if on_tool is None else HandEye.of_each(result.model, camera_on_tool=on_tool)
     save(result.model, given.output)  # before anything is printed: output may be cut off
     in_train, held_out = result.errors(train), {} if test is None else result.errors(test)
-    each = {name: own.entry() for name, own in hand_eye.items()}
+    each = {name: solved.entry() for name, solved in hand_eye.items()}
     record.add(**({"hand_eyes": each} if len(each) > 1 else dict(zip(("hand_eye",), each.values(), strict=False))))
     _record(result, in_train, held_out, given)
     judged = _of_positions(held_out)
@@ -69,10 +69,10 @@ def run(given: FitOptions) -> None:
     _show_findings(result, len(train))
     wrong = list[Outlier]()
     if test is not None:
-        seen, (own, _) = positions_of(result.model, result.places(), test), divided(test)
-        wrong += [] if own is None else contradicted_in_sockets(result.model, own.table)
-        wrong += [] if seen is None else contradicted(result.model, seen)
-        say(*outlier_lines(sorted(wrong, key=lambda one: -one.distance), len(test), "held-out rows"))
+        measured = positions_of(result.model, result.places(), test)
+        wrong += contradicted_in_sockets(result.model, test)
+        wrong += [] if measured is None else contradicted(result.model, measured)
+        say(*outlier_lines(sorted(wrong, key=lambda outlier: -outlier.distance), len(test), "held-out rows"))
     say(*_lines_about_places(result, data, held_out, hand_eye))
     say(*_advice(judged, wrong=bool(wrong), partial=result.partial), f"model: {given.output}")
     if given.report is not None:
@@ -103,8 +103,8 @@ def _end(result: CalibrationResult, in_train: Errors, judged: Errors) -> None:
     """Exit with the code of the fit, or with errors of ``judged`` rows that no calibrated robot has."""
     if result.interrupted or interrupts.asked:
         raise typer.Exit(EXIT_INTERRUPTED)
-    for one, fitted in zip(_of_positions(judged), _of_positions(in_train), strict=False):
-        check_errors(result.model, one[CALIBRATED], fitted[GEOMETRIC].median)
+    for stages, fitted in zip(_of_positions(judged), _of_positions(in_train), strict=False):
+        check_errors(result.model, stages[CALIBRATED], fitted[GEOMETRIC].median)
     if not result.fit.converged:
         raise typer.Exit(EXIT_UNCONVERGED)
 
@@ -117,19 +117,19 @@ def _lines_about_places(
     placement = list(hand_eye_sentences(hand_eye)) or list(
         placement_lines(result.model.geometry, poses=placed.lever is not None, ball=placed.ball)
     )
-    for one in held_out.values():
-        yield from printed.socket_lines(one[CALIBRATED], "held out")
-    own, _ = divided(data)
-    if own is not None and not placed.free:
-        seen = own.table.device_rows()
-        hidden = zip(seen.body_names, (~seen.seen_bodies).sum(0).tolist(), strict=True)
+    for stages in held_out.values():
+        yield from printed.socket_lines(stages[CALIBRATED], "held out")
+    positions, _ = divided(data)
+    if positions is not None:
+        measured = positions.table
+        hidden = zip(measured.body_names, (~measured.seen_bodies).sum(0).tolist(), strict=True)
         if counts := [f"{name} in {count}" for name, count in hidden if count]:
-            yield f"hidden in some of {len(seen)} rows: {few(counts)} of them"
+            yield f"hidden in some of {len(measured)} rows: {few(counts)} of them"
     yield from (*result.placement.sentences(), *map(str, result.lengths[:1]))
     if _of_positions(held_out):  # else they are the verdict
         yield printed.stage_line(result.model, result.stages, result.expected)
     yield from printed.expectation_lines(result.model, data, result.expected)
-    advice = next(filter(None, (one.size_advice() for one in result.placement)), None)
+    advice = next(filter(None, (device.size_advice() for device in result.placement)), None)
     share, whole = result.expected.size_share, 1e3 * result.expected.workspace
     if advice is not None and share > LARGE_SHARE:
         yield f"  {share * whole:.3f} mm of it is the robot's size: {advice}"
@@ -139,19 +139,19 @@ def _lines_about_places(
 def _record(result: CalibrationResult, in_train: Errors, held_out: Errors, given: FitOptions) -> None:
     """Add the results for programs."""
     both = {"training": in_train, "held_out": held_out}
-    kinds = {kind: {rows: one[kind] for rows, one in both.items() if kind in one} for kind in in_train}
+    kinds = {kind: {rows: errors[kind] for rows, errors in both.items() if kind in errors} for kind in in_train}
     files = {"model": given.output, "report": given.report}
     record.add(
         **result.placement.entry(),
         **entries_by_kind(kinds),
-        lengths={one.cause.name: [one.value, one.deviation] for one in result.lengths},
-        leave_one_out={kind: kind_entry(one) for kind, one in result.left_out.items()},
+        lengths={length.cause.name: [length.value, length.deviation] for length in result.lengths},
+        leave_one_out={kind: kind_entry(left) for kind, left in result.left_out.items()},
         leave_one_out_rms_m=result.left_out.positions_rms,
         parts=[{"name": p.name, "displacement_m": p.displacement, "angle_rad_or_m": p.angle} for p in result.parts],
         outliers=[
-            {"row": one.number, "marker": one.marker, "reason": one.reason}
-            | dict(zip(("distance", "unit"), one.shown, strict=True))
-            for one in result.outliers
+            {"row": row.number, "marker": row.marker, "reason": row.reason}
+            | dict(zip(("distance", "unit"), row.shown, strict=True))
+            for row in result.outliers
         ],
         base=result.model.geometry.base,
         markers_m=result.model.geometry.tool,
@@ -165,9 +165,9 @@ def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors |
     """Print the errors of every stage on the training rows and on the held-out rows, if any, kind by kind."""
     fitted = "was held out: these are errors on rows that were fitted"
     none = [f"no row {fitted}, those of new rows are larger (leave-one-out RMS: {result.left_out.rms_text})"]
-    for kind, one in in_train.items():
+    for kind, stages in in_train.items():
         other, rows = (held_out or {}).get(kind), dict[tuple[str, ...], Evaluation]()
-        for name, errors in one.items():
+        for name, errors in stages.items():
             rows[name, f"{errors.count} training"] = errors
             if other is not None:
                 rows[name, f"{other[name].count} held out"] = other[name]
@@ -194,7 +194,7 @@ def _show_findings(result: CalibrationResult, rows: int) -> None:
     """Print the rows that look wrong and how the fit ended; with --verbose also what each part explains."""
     detailed = logging.getLogger(PACKAGE).isEnabledFor(logging.INFO)
     if detailed:
-        sizes = ((plain(own.name), own.displacement, own.angle) for own in result.parts)
+        sizes = ((plain(part.name), part.displacement, part.angle) for part in result.parts)
         cells = [
             [name, f"{1e3 * shift:.4f}", "" if turn is None else f"{1e3 * turn:.4f}"] for name, shift, turn in sizes
         ]

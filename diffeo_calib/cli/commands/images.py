@@ -31,25 +31,25 @@ def run(given: ImagesOptions) -> None:
     several = len(found) > 1
     lines = [[IMAGE, *found[0].header, *POINT, *PIXEL, *[CAMERA] * several]]
     cameras, contents, refused = dict[str, Path](), dict[Path, bytes](), dict[str, str]()
-    for one in found:
-        lines += [[*cells, *[one.name] * several] for cells in one.rows(table.per_metre, table.decimal)]
-        cameras[one.name] = output.with_name(f"{one.name}.yaml") if several else output.with_suffix(".yaml")
-        contents[cameras[one.name]] = camera_text(one.camera(BoardPrior(scale=given.board_std))).encode()
-        own = {f"{one.name}/{image.name}" if several else image.name: image.refused for image in one.images}
-        refused |= {name: reason for name, reason in own.items() if reason}
+    for folder in found:
+        lines += [[*cells, *[folder.name] * several] for cells in folder.rows(table.per_metre, table.decimal)]
+        cameras[folder.name] = output.with_name(f"{folder.name}.yaml") if several else output.with_suffix(".yaml")
+        contents[cameras[folder.name]] = camera_text(folder.camera(BoardPrior(scale=given.board_std))).encode()
+        why = {f"{folder.name}/{image.name}" if several else image.name: image.refused for image in folder.images}
+        refused |= {name: reason for name, reason in why.items() if reason}
     contents[output] = csv_text(lines, table.sep, "\r\n").encode()
     if given.report is not None:
         contents[given.report] = page(found).encode()
     write_together(contents)
     for name, reason in refused.items():
         say(f"{name}: {reason}: left out")
-    for one in found:
-        width, height = one.size
-        used = f"{len(one.used)} of {len(one.images)} images of {width} x {height} pixels"
-        if one.paired:
-            say(f"{f'{one.name}: ' * several}{one.paired}")
-        corners = sum(len(image.numbers) for image in one.used)
-        say(f"{f'{one.name}: ' * several}{used}, {corners} corners: {shown(output)}")
+    for folder in found:
+        width, height = folder.size
+        used = f"{len(folder.used)} of {len(folder.images)} images of {width} x {height} pixels"
+        if folder.paired:
+            say(f"{f'{folder.name}: ' * several}{folder.paired}")
+        corners = sum(len(image.numbers) for image in folder.used)
+        say(f"{f'{folder.name}: ' * several}{used}, {corners} corners: {shown(output)}")
     options = " ".join(f"--reading corners={shown(path)}" for path in cameras.values())
     say(f"fit {shown(output)} ... {options}" + ", with --camera-on-tool if the camera is on the tool" * (not several))
     rows, files = sum(len(one.used) for one in found), {"camera": cameras[found[0].name]} if not several else cameras
@@ -64,26 +64,26 @@ def run_record(given: RecordOptions) -> None:
         check_number(value, "--still", above=0.0)
     check_number(offset or 0.0, "--offset", above=-1e12, below=1e12)
     limits = StopLimits(**dict(zip(("joints", "shortest"), values, strict=False)))
-    joints, names, seen = read_bag(given.bag, given.joints, given.seen)
-    if seen.values.shape[1]:
-        found, offset = stops(joints, seen, limits, offset)
-        table = rows_of(names, found)
+    joints, names, readings = read_bag(given.bag, given.joints, given.seen)
+    if readings.values.shape[1]:
+        at_stops, offset = stops(joints, readings, limits, offset)
+        table = rows_of(names, at_stops)
         write_whole(output, csv_text([list(table[0]), *(row.values() for row in table)]).encode())
-        say(f"{len(found)} stops written to {shown(output)}; {offset:.3f} s were added to the times of {given.seen}")
-        if seen.values.shape[1] > len(PLACE) and TURN[0] not in table[0]:
+        say(f"{len(at_stops)} stops written to {shown(output)}; {offset:.3f} s were added to the times of {given.seen}")
+        if readings.values.shape[1] > len(PLACE) and TURN[0] not in table[0]:
             say(f"without rotations: those of {given.seen} never change, as of a device that measures none")
         turned = {"rotation": [TURN], "convention": "quat_xyzw"} if TURN[0] in table[0] else {}
         say(f"fit {shown(output)} {shlex.join(options_of(TableFormat('m', 'rad', position=PLACE, **turned)))} ...")
     else:
         offset = offset or 0.0
-        found, without = pictured(joints, seen.times, limits, offset)
-        times, files = [time for _, time in found], dict[float, str]()
+        at_stops, without = pictured(joints, readings.times, limits, offset)
+        times, files = [time for _, time in at_stops], dict[float, str]()
         for time, suffix, content in read_images(given.bag, given.seen, times):
             files[time] = f"{times.index(time):05d}{suffix}"
             write_whole(output.parent / files[time], content)
-        rows = [{IMAGE: files[time], **dict(zip(names, q.tolist(), strict=True))} for q, time in found]
+        rows = [{IMAGE: files[time], **dict(zip(names, q.tolist(), strict=True))} for q, time in at_stops]
         write_whole(output, csv_text([list(rows[0]), *(row.values() for row in rows)]).encode())
         left = f"; {without} stops without an image were left out" * bool(without)
-        say(f"{len(found)} images of stops written beside {shown(output)}{left}")
+        say(f"{len(at_stops)} images of stops written beside {shown(output)}{left}")
         say(f"images {shown(output.parent)} {shown(output)} --board ... --length m -o corners.csv")
-    record.add(rows=len(found), clock_offset_s=offset, files={"table": output})
+    record.add(rows=len(at_stops), clock_offset_s=offset, files={"table": output})

@@ -101,22 +101,22 @@ def _of_robot(robot: Path, sheet: Sheet) -> Source:
     Raises:
         InputError: none do, or several.
     """
-    found, refused = dict[tuple[str | None, ...], Source](), list[InputError]()
+    sources, refused = dict[tuple[str | None, ...], Source](), list[InputError]()
     for arm in (arms := _arms(robot, sheet)):
         try:
             with quiet():  # `fit` warns of the right reading
-                one = _read(robot, sheet, arm)
-                found.setdefault((arm.links.dh_convention, *one.robot.joint_names), one)
+                source = _read(robot, sheet, arm)
+                sources.setdefault((arm.links.dh_convention, *source.robot.joint_names), source)
         except InputError as error:
             refused.append(error)
-    if not found:
+    if not sources:
         lacking = next((arm.lacking for arm in arms if arm.lacking), ())
         more = f" No column is named after {few(lacking, 20)}." if lacking else ""
         raise type(refused[0])(f"{refused[0]}{more}")
-    best, *_ = several = ranked(found.values())
+    best, *_ = several = ranked(sources.values())
     if len(several) > 1 and not is_clear(several):
-        got = "; ".join(f"{key[0] or few(key[1:], 9)}: {percent(one.left)}" for key, one in found.items())
-        convention = any(key[0] for key in found)
+        got = "; ".join(f"{key[0] or few(key[1:], 9)}: {percent(source.left)}" for key, source in sources.items())
+        convention = any(key[0] for key in sources)
         fix = "say the convention in the file, by a line such as `# craig`" if convention else ""
         fix, expected = fix or "name the columns after the joints of the arm", "some that explain the rows far better"
         raise InputError.of(f"the joints of '{robot}'", expected=expected, got=got, fix=fix)
@@ -132,7 +132,7 @@ def _of_robot(robot: Path, sheet: Sheet) -> Source:
 def _read(robot: Path, sheet: Sheet, arm: Arm) -> Source:
     """The table as values of these joints; InputError if the robot does not explain the rows."""
     rows = rows_in(sheet, arm.columns.names)
-    tips = _tips_named(chains_in(robot) if is_urdf(robot) else [], [column(own.place[0]) for own in rows.bodies])
+    tips = _tips_named(chains_in(robot) if is_urdf(robot) else [], [column(body.place[0]) for body in rows.bodies])
     chain = load_robot(robot, replace(arm.links, tip=tips or arm.links.tip))
     options = {"robot": robot, **vars(arm.links), "tip": tips or None, "length": "mm", "angle": "deg"}
     source = source_of(sheet, chain, rows, **options)
@@ -147,7 +147,7 @@ def _tips_named(paths: Sequence[list[JointElement]], markers: Sequence[Column]) 
     Fingers of a gripper are no arms: each has a joint or none of its own.
     """
     words = {path[-1].child: {*column(path[-1].child).words} for path in paths}
-    counts = Counter(word for own in words.values() for word in own)
+    counts = Counter(word for group in words.values() for word in group)
     uses = Counter(joint.name for path in paths for joint in path if joint.kind != "fixed")
     arms = [path[-1].child for path in paths if sum(uses[joint.name] == 1 for joint in path) > 1]
     tips = list[str]()
@@ -169,7 +169,7 @@ def _with_tip(robot: Path, source: Source, arm: Arm) -> Source:
             left_out.append(f"{last} hardly moves in the table")
         else:
             # its axis may run through the marker, and a pose shows that it turns where a place does not
-            an_arm_s = moved[count] > median(moved) / 2 or any(own.turn for own in source.bodies)
+            an_arm_s = moved[count] > median(moved) / 2 or any(body.turn for body in source.bodies)
             raised = 1 / CLEAR_RATIO if an_arm_s else NOT_RAISED
             if source.left > LARGEST_RESIDUAL or without.left > raised * source.left:
                 break
@@ -235,10 +235,10 @@ def _arms(robot: Path, sheet: Sheet) -> list[Arm]:
 def _end_behind(path: list[JointElement], joint: JointElement, paths: list[list[JointElement]]) -> str:
     """The flange, by usual names, or the link of a joint; behind joints that follow this or earlier ones."""
     place = path.index(joint)
-    above = {one.name for one in path[: place + 1]}
-    behind = [joint, *takewhile(lambda one: one.kind == "fixed" or one.driver in above, path[place + 1 :])]
-    links = [[one.child for one in behind if one.kind != "fixed"][-1]]
-    fixed = {one.child: one.parent for path in paths for one in path if one.kind == "fixed"}
+    above = {element.name for element in path[: place + 1]}
+    behind = [joint, *takewhile(lambda element: element.kind == "fixed" or element.driver in above, path[place + 1 :])]
+    links = [[element.child for element in behind if element.kind != "fixed"][-1]]
+    fixed = {element.child: element.parent for path in paths for element in path if element.kind == "fixed"}
     for link in links:
         links += [child for child, parent in fixed.items() if parent == link]
     return next((link for word in FLANGES for link in links if link.lower().endswith(word)), links[0])

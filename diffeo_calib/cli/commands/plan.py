@@ -44,18 +44,18 @@ TRACKERS = {"tracker": Sensor.positions, "poses": Sensor.poses}
 def sensors_of(words: list[str] | None, table: TableFormat) -> list[Sensor]:
     """The sensors of --sensor; none if it was not given."""
     numbers: dict[str, list[list[float]]] = {}
-    found = []
+    sensors = []
     for text in words or ():
         kind, _, values = text.partition("=")
         if text in TRACKERS:
-            found.append(TRACKERS[text]())
+            sensors.append(TRACKERS[text]())
         elif kind in SENSORS and values:
             each = stated_numbers("--sensor", values, (3, 4, 6))
             numbers.setdefault(kind, []).append([x / table.per_metre for x in each])
         else:
             expected = f"{', '.join(TRACKERS)}, or {', '.join(f'{kind}=NUMBERS' for kind in SENSORS)}"
             raise InputError.of(f"--sensor {text}", expected=expected)
-    return [*found, *(SENSORS[kind](places) for kind, places in numbers.items())]
+    return [*sensors, *(SENSORS[kind](places) for kind, places in numbers.items())]
 
 
 def run(given: PlanOptions) -> None:
@@ -85,14 +85,14 @@ def run(given: PlanOptions) -> None:
             q = drawn(source, sensors, max(given.draw or DRAWN, count), markers, **_cell(given, robot, table))
         progress("candidates", 1, 1)
         progress("plan", 0, 1)
-        framed = model is not None or any(one.of_frames for one in sensors)
+        framed = model is not None or any(sensor.of_frames for sensor in sensors)
         target, measured = configurations(given.target_poses), configurations(given.measured)
         how: dict[str, Any] = {"marker": None if framed else markers, "free": given.free, "sensor": sensors}
-        found = plan(source, q, count, target=target, measured=measured, **how)
-    found.write(output, as_written(table))
-    entries = {"expected_rms_m": found.expected_rms, "noise_rms_m": found.noise_rms, "assumed": found.assumed}
+        proposal = plan(source, q, count, target=target, measured=measured, **how)
+    proposal.write(output, as_written(table))
+    entries = {"expected_rms_m": proposal.expected_rms, "noise_rms_m": proposal.noise_rms, "assumed": proposal.assumed}
     record.add(rows=count, **entries, files={"poses": output})
-    _show(found, of_positions=all(one.of_positions for one in sensors), free=MOVED.get(given.free or ""))
+    _show(proposal, of_positions=all(sensor.of_positions for sensor in sensors), free=MOVED.get(given.free or ""))
     if isinstance(source, CalibratedKinematics):
         say("the table averages over the poses that were drawn or given; they may lie beyond those of the fit")
         say(*expectation_lines(source, None))
@@ -100,41 +100,41 @@ def run(given: PlanOptions) -> None:
         say("poses are drawn around those of the fit: pass --candidates where the machine, or the view, is smaller")
     say(f"{count} of {len(q)} configurations written to {output}, in an order of short moves")
     say("its column `rank`: the poses of ranks 1 to k are the plan for k poses")
-    if found.devices:
+    if proposal.devices:
         say("its column `device`: what measures the pose")
-        say(*(line for one in sensors for line in one.sentences()))
+        say(*(line for sensor in sensors for line in sensor.sentences()))
 
 
 def _cell(cell: Candidates, robot: Tree, table: TableFormat) -> dict[str, Any]:
     """What random configurations have to respect, in m and rad: arguments of :func:`drawn`."""
     scale = table.per_metre
-    found: dict[str, Any] = {"ranges": _ranges(cell, robot, table), "seed": cell.seed}
+    options: dict[str, Any] = {"ranges": _ranges(cell, robot, table), "seed": cell.seed}
     if cell.tracker is not None:
-        x, y, z, *seen = stated_numbers("--tracker", cell.tracker, (3, 6, 7))
-        looks = (seen[:3], *map(radians, seen[3:])) if seen else ()
+        x, y, z, *view = stated_numbers("--tracker", cell.tracker, (3, 6, 7))
+        looks = (view[:3], *map(radians, view[3:])) if view else ()
         how: dict[str, Any] = dict(zip(("direction", "half_angle"), looks, strict=False))
-        found["tracker"] = Tracker((x / scale, y / scale, z / scale), **how)
+        options["tracker"] = Tracker((x / scale, y / scale, z / scale), **how)
     if cell.column is not None:
-        found["column"] = [x / scale for x in stated_numbers("--column", cell.column, (3, 4))]
+        options["column"] = [x / scale for x in stated_numbers("--column", cell.column, (3, 4))]
     if cell.floor is not None:
-        found["floor"] = cell.floor / scale
+        options["floor"] = cell.floor / scale
     if cell.collisions:
-        found["keep"] = collision_free(robot)
-    return found
+        options["keep"] = collision_free(robot)
+    return options
 
 
 def _ranges(cell: Candidates, robot: Tree, table: TableFormat) -> dict[str, list[float]]:
     """Name of a joint -> its range, rad or m."""
     turns = dict(zip(robot.joint_names, robot.periodic, strict=True))
-    found = {}
+    ranges = {}
     for text in cell.range or ():
         name, _, ends = text.rpartition("=")
         if not name or ends.count(":") != 1:
             raise InputError.of(f"--range {text}", expected="JOINT=A:B, such as joint_1=-90:90")
         numbers = stated_numbers("--range", ends.replace(":", ","), (2,))
         unit = 1 / table.joints_per_metre if not turns.get(name, True) else 1.0
-        found[name] = [x * (pi / 180 if turns.get(name) and table.angle == "deg" else unit) for x in numbers]
-    return found
+        ranges[name] = [x * (pi / 180 if turns.get(name) and table.angle == "deg" else unit) for x in numbers]
+    return ranges
 
 
 MOVED = {"base": "the measuring device is", "marker": "the markers are", "both": "device and markers are"}
@@ -143,17 +143,17 @@ OPEN_M = 0.01
 """Expected error from which it is the place of what has moved."""
 
 
-def _show(found: Plan, *, of_positions: bool, free: str | None) -> None:
+def _show(proposal: Plan, *, of_positions: bool, free: str | None) -> None:
     """Print the expected errors by number of poses, also as held-out errors of positions.
 
     ``free`` has moved since the fit: without poses only its place would be expected to be wrong.
     """
-    more = "" if found.assumed else " more"
+    more = "" if proposal.assumed else " more"
     title = f"Expected RMS error in mm by number of{more} poses"
-    fewest, rows = 0 if free is None else int((found.expected_rms > OPEN_M).sum()), list[list[str]]()
-    for count in (*[0] * (not found.assumed and not fewest), *found.counts):
-        rms = 1e3 * float(found.expected_rms[count])
-        with_noise = (rms**2 + (1e3 * found.noise_rms) ** 2) ** 0.5
+    fewest, rows = 0 if free is None else int((proposal.expected_rms > OPEN_M).sum()), list[list[str]]()
+    for count in (*[0] * (not proposal.assumed and not fewest), *proposal.counts):
+        rms = 1e3 * float(proposal.expected_rms[count])
+        with_noise = (rms**2 + (1e3 * proposal.noise_rms) ** 2) ** 0.5
         rows.append([str(count), f"{rms:.3f}", *[f"{with_noise:.3f}"] * of_positions])
     header = [f"{more} poses".strip(), "model", *["held out"] * of_positions]
     out.print(text_table(title, header, rows, labels=0, min_width=len(title)))
@@ -163,5 +163,5 @@ def _show(found: Plan, *, of_positions: bool, free: str | None) -> None:
         say(f"fewer than {fewest} poses do not show where {free} now")
     if free is not None:
         say("these errors are expected if nothing else has changed since the fit: test that by `recalibrate`")
-    if found.assumed:
-        say(f"{found.caution}: measure the first 20 poses, fit them, and plan the next with the model")
+    if proposal.assumed:
+        say(f"{proposal.caution}: measure the first 20 poses, fit them, and plan the next with the model")

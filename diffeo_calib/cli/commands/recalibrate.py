@@ -40,11 +40,11 @@ def run(given: RecalibrateOptions) -> None:
         result = recalibrate(model, data, progress=progress, **how)
     save(made_by_command(result.model), given.output)  # before anything is printed: output may be cut off
     after, left_out = result.after, result.left_out
-    kinds = {k: {"before": one, "after": after[k], "left_out": left_out[k]} for k, one in result.before.items()}
-    found = {} if result.moved is None else {"transform": result.moved.transform}
-    found |= {"rows_can_tell": result.changes.tested, "markers": result.marker, "files": {"model": given.output}}
-    found |= {"converged": result.fit.converged, "status": result.status}
-    record.add(**change_entries(result.changes, result.hidden), **found, **entries_by_kind(kinds))
+    kinds = {k: {"before": errors, "after": after[k], "left_out": left_out[k]} for k, errors in result.before.items()}
+    entries = {} if result.moved is None else {"transform": result.moved.transform}
+    entries |= {"rows_can_tell": result.changes.tested, "markers": result.marker, "files": {"model": given.output}}
+    entries |= {"converged": result.fit.converged, "status": result.status}
+    record.add(**change_entries(result.changes, result.hidden), **entries, **entries_by_kind(kinds))
     frame = () if result.moved is None else frame_lines(result.moved)
     places = placement_lines(result.model.geometry, poses=result.model.lever is not None)
     say(*frame, *_found(result), *places, *change_lines(result.changes), *map(str, result.hidden))
@@ -55,13 +55,13 @@ def run(given: RecalibrateOptions) -> None:
 
 def _found(result: Recalibration) -> Iterator[str]:
     """Errors of the new rows, and those that hardly count."""
-    moved, known = "have moved", ""
+    moved, precision = "have moved", ""
     if result.moved is not None and result.shift is not None:
         moved = f"are {1e3 * float(result.shift.norm(dim=1).max()):.2g} mm from where they were"
-        known = f" (these rows show that to {1e3 * result.moved.known_m:.2g} mm)" * result.changes.tested
-    moved += known + doubt(result.changes, "in this")
-    if not any("markers" in one.instead for one in result.hidden):
-        words = {"same": f"are taken to be where they were{known}", "moved": moved}
+        precision = f" (these rows show that to {1e3 * result.moved.known_m:.2g} mm)" * result.changes.tested
+    moved += precision + doubt(result.changes, "in this")
+    if not any("markers" in offset.instead for offset in result.hidden):
+        words = {"same": f"are taken to be where they were{precision}", "moved": moved}
         yield f"the markers {words.get(result.marker, f'{moved}, or are other ones')}"
     yield f"new rows, RMS from the old model, device and markers found anew: {result.before.rms_text}"
     yield f"new rows, RMS if each is predicted by the old rows and the other new ones: {result.left_out.rms_text}"
@@ -78,11 +78,11 @@ def doubt(changes: Changes, where: str) -> str:
 
 def change_entries(changes: Changes, hidden: Sequence[Offset] = ()) -> dict[str, list[dict[str, object]]]:
     """For programs: changes, what offsets the rows would show (None where places hide it), and those they may hide."""
-    smallest = [(one.joint, one.size if isfinite(one.size) else None) for one in changes.smallest]
+    smallest = [(offset.joint, offset.size if isfinite(offset.size) else None) for offset in changes.smallest]
     return {
         "changes": [
-            {"part": one.part, "size_rad_or_m": one.size, "probability": one.probability, "sentence": str(one)}
-            for one in changes.found
+            {"part": part.part, "size_rad_or_m": part.size, "probability": part.probability, "sentence": str(part)}
+            for part in changes.found
         ],
         "smallest_offsets": [{"joint": joint, "size_rad_or_m": size} for joint, size in smallest],
         "possible_offsets": [
@@ -116,12 +116,12 @@ def _compare(given: RecalibrateOptions) -> None:
         source = table_of(model, other, given)
         say(*provenance_lines(model), *another_date_lines(model))
         rows = source.read(model.robot)
-    found = compare(model, rows, marker=MARKERS[given.free], seed=given.seed)
-    kinds = {kind: {"found": one, "expected": found.expectations[kind]} for kind, one in found.errors.items()}
-    moved = {} if found.moved is None else {"transform": found.moved.transform}
-    record.add(**change_entries(found.changes, found.hidden), **moved, **entries_by_kind(kinds))
-    record.add(rows_can_tell=found.telling and found.changes.tested)
-    if found.moved is not None:
-        say(*motion_lines(found.moved, model.on, doubt=doubt(found.changes, "in them")))
-    say(f"RMS from the model, device and markers found anew: {found.errors.rms_text}")
-    say(f"expected of it: {found.expectations.rms_text}", *change_lines(found.changes, found))
+    compared = compare(model, rows, marker=MARKERS[given.free], seed=given.seed)
+    kinds = {kind: {"found": error, "expected": compared.expectations[kind]} for kind, error in compared.errors.items()}
+    moved = {} if compared.moved is None else {"transform": compared.moved.transform}
+    record.add(**change_entries(compared.changes, compared.hidden), **moved, **entries_by_kind(kinds))
+    record.add(rows_can_tell=compared.telling and compared.changes.tested)
+    if compared.moved is not None:
+        say(*motion_lines(compared.moved, model.on, doubt=doubt(compared.changes, "in them")))
+    say(f"RMS from the model, device and markers found anew: {compared.errors.rms_text}")
+    say(f"expected of it: {compared.expectations.rms_text}", *change_lines(compared.changes, compared))

@@ -30,7 +30,7 @@ from diffeo_calib.common.checks import as_tensor, real_tensor
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.tool import ToolKinematics
-from diffeo_calib.measurements.poses import rigid_poses
+from diffeo_calib.robots.se3 import rigid_poses
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.build import calibrated_chain
 

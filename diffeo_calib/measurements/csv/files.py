@@ -332,7 +332,8 @@ def _sheet(whole: Observations, table: TableFormat) -> tuple[TableFormat, list[A
     if len(measured) > 1:
         fix = "write them to two files"
         raise MeasurementError.of("a table with rows of positions and of poses", expected="one of them", fix=fix)
-    device, names = measured[0] if measured else None, set(whole.device_names) - {""}
+    device = measured[0] if measured else None
+    names = {name for part in whole.parts if part.kind != "socket" for name in part.device_names} - {""}
     board = None if device is None else device.board
     if table.camera_on_tool != (board is not None):
         got = "poses seen by a camera on the tool" if board is not None else "measurements without such a camera"
@@ -374,7 +375,7 @@ def _others(whole: Observations, session: str | None) -> list[Any]:
         if "corners" in part.columns:
             found.append(ImageColumns.of(part, session))
         elif part.kind == "socket":
-            sockets = part.with_sockets_of_rows().sockets  # a reader finds these alone
+            sockets = part.sockets  # a reader finds these alone
             distances = {(sockets.names[a], sockets.names[b]): length for a, b, length in sockets.distances}
             found.append(SocketColumns((SOCKET,), distances or None, sockets.distance_std, part.ball_tip))
         elif part.kind in ("position", "pose"):

@@ -28,7 +28,7 @@ from diffeo_calib.measurements.poses import (
     transforms_of_frames,
 )
 from diffeo_calib.measurements.readings import MILLIMETRES, Readings
-from diffeo_calib.measurements.sockets import SEPARATOR, Distances
+from diffeo_calib.measurements.sockets import SEPARATOR, Distances, SocketReadings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import ZERO, TableFormat, column_names, flat_names, numbers_of
 
@@ -248,7 +248,7 @@ class SocketColumns(SensorColumns):
     def filled(self, rows: FileRows) -> Tensor:
         return torch.stack([rows.filled(name) for name in self.names]).any(0)
 
-    def table(self, rows: FileRows) -> tuple[Measurements, FileRows]:
+    def table(self, rows: FileRows) -> tuple[SocketReadings, FileRows]:
         fix = "fill it in; lines without a socket hold a measured position, whose columns must be named (`position`)"
         parts = [rows.named(name, "the name of a place or socket", fix) for name in self.names]
         names = [SEPARATOR.join(row) for row in zip(*parts, strict=True)]
@@ -257,7 +257,7 @@ class SocketColumns(SensorColumns):
         return data.with_tips(None if self.on is None else [self.on]), rows
 
     def written(self, part: Any, table: TableFormat) -> Written:
-        return {}, {self.names[0]: part.row_sockets}, *part.index
+        return {}, {self.names[0]: part.device_names}, *part.index
 
 
 @dataclass(frozen=True)

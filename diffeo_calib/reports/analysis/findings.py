@@ -32,7 +32,7 @@ from diffeo_calib.reports.analysis.predictions import FitRows, Predictions, fore
 from diffeo_calib.reports.analysis.stages import Deviations, Kinematics, Repeats, repeats_of, stages_of
 from diffeo_calib.sensors.coordinates import Places
 from diffeo_calib.sensors.errors import ERRORS, Evaluation, Evaluations
-from diffeo_calib.sensors.tables import divided, measured_positions, measured_rows
+from diffeo_calib.sensors.tables import divided, measured_positions
 
 LOG = logging.getLogger(__name__)
 STEPS = 4
@@ -88,7 +88,7 @@ class Findings:
     def errors(self) -> Mapping[str, Evaluation]:
         """Errors of measured positions by stage, of a model that has not seen them; empty without any."""
         kinds = [] if self.predictions is None else self.kinds.values()
-        return next((one.stages for one in kinds if one.errors.what == ERRORS), {})
+        return next((rows.stages for rows in kinds if rows.errors.what == ERRORS), {})
 
     @property
     def calibrated(self) -> Evaluation | None:
@@ -98,7 +98,7 @@ class Findings:
     @property
     def rms(self) -> Mapping[str, float]:
         """RMS error of positions by stage, m: measured, or the expected one where none were."""
-        return {name: one.rms for name, one in self.errors.items()} or self.expected
+        return {name: errors.rms for name, errors in self.errors.items()} or self.expected
 
     @property
     def unlike(self) -> bool:
@@ -108,14 +108,14 @@ class Findings:
     @property
     def count(self) -> int:
         """Number of rows shown."""
-        return sum(len(one.q) for one in self.kinds.values())
+        return sum(len(rows.q) for rows in self.kinds.values())
 
     @property
     def judged(self) -> Accuracy:
         """The RMS error that is compared with a tolerance."""
         fitted = not self.new and self.predictions is None
-        own = [] if fitted else [one.errors for one in self.kinds.values()]
-        return accuracy(self.model, own, "m", self.deviations.error)
+        errors = [] if fitted else [rows.errors for rows in self.kinds.values()]
+        return accuracy(self.model, errors, "m", self.deviations.error)
 
     @property
     def forecast(self) -> tuple[int, float] | None:
@@ -149,8 +149,8 @@ def find(
         raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
     if data is not None:
         check_rows(model, data)
-    own = Places() if data is None else place(model, data) if places is None else list(places.values())[-1]
-    measured = None if data is None else positions_of(model, own, data)
+    placed = Places() if data is None else place(model, data) if places is None else list(places.values())[-1]
+    measured = None if data is None else positions_of(model, placed, data)
     if measured is not None and measured.markers != model.markers:
         fix = "pass the markers that the model predicts, in the same order"
         raise InputError.of("the markers of `data`", expected=model.markers, got=measured.markers, fix=fix)
@@ -160,7 +160,7 @@ def find(
     progress("analysis", 1, STEPS)
     if data is not None and (bool((new := _new_rows(model, data, rows)).any()) or not rows.of_positions):
         shown = _of_table(
-            model, data, new, measured, own, stages=kinematics, places=places, of_positions=rows.of_positions
+            model, data, new, measured, placed, stages=kinematics, places=places, of_positions=rows.of_positions
         )
     else:
         shown = _left_out(model, rows, kinematics) if rows.of_positions else NOTHING
@@ -169,8 +169,8 @@ def find(
     repeats = None if measured is None else repeats_of(measured, kinematics, noise)
     if repeats is None and model.registration is None and rows.known:
         repeats = repeats_of(rows.measurements, kinematics, noise)
-    seen: Predictions | None = shown["predictions"]
-    columns = _columns(None if seen is None else seen.data, against)
+    predicted: Predictions | None = shown["predictions"]
+    columns = _columns(None if predicted is None else predicted.data, against)
     progress("analysis", 3, STEPS)
     deviations = Deviations.of(model)
     progress("analysis", STEPS, STEPS)
@@ -197,10 +197,9 @@ def _new_rows(model: CalibratedKinematics, data: Any, rows: FitRows) -> Tensor:
     new = unseen(model, data.q)
     if rows.of_positions and model.registration is None:
         other = torch.ones_like(new)
-        own = divided(data)[0]
-        seen = None if own is None else measured_rows(own.table)
-        if own is not None and seen is not None:
-            other[own.rows[seen.rows].to(HOST)] = False
+        positions = divided(data)[0]
+        if positions is not None:
+            other[positions.rows.to(HOST)] = False
         new |= other
     return new
 
@@ -216,7 +215,7 @@ def _of_table(
     data: Any,
     mask: Tensor,
     measured: Measurements | None,
-    own: Places,
+    placed: Places,
     *,
     of_positions: bool,
     stages: Mapping[str, Kinematics],
@@ -225,7 +224,7 @@ def _of_table(
     """Rows that the model has not seen, of a ``mask`` (N,); if there are none, all as fitted.
 
     ``measured``: positions of all in the frame of the model, without its drift. If there are no other rows, they are
-    placed beside every stage; else devices are in their ``own`` places, or in ``places`` beside that stage.
+    placed beside every stage; else devices are where ``placed`` has them, or in ``places`` beside that stage.
     """
     new, (*before, last), errors = bool(mask.any()), stages, dict[str, Evaluations]()
     LOG.info("judged by %d rows it has not seen, %d were used before", int(mask.sum()), int((~mask).sum()))
@@ -234,16 +233,16 @@ def _of_table(
     for name in before:
         rows = measured if alone else data
         at = place(stages[name], rows) if alone or places is None else places[name]
-        at = at if alone else replace(at, devices={**own.devices, **at.devices}, ball=own.ball)
+        at = at if alone else replace(at, devices={**placed.devices, **at.devices}, ball=placed.ball)
         errors[name] = residuals(stages[name], at, rows).rows(mask)
-    errors[last] = residuals(stages[last], own, data).rows(mask)
-    shown = NOTHING | {"kinds": _by_kind(errors, data.q[mask]), "new": new, "devices": own.found}
+    errors[last] = residuals(stages[last], placed, data).rows(mask)
+    shown = NOTHING | {"kinds": _by_kind(errors, data.q[mask]), "new": new, "devices": placed.found}
     raw = measured_positions(data)  # as read: those of `measured` are moved by a drift that the model knows
-    if measured is None or raw is None or not new or not bool((seen := unseen(model, raw.q)).any()):
+    if measured is None or raw is None or not new or not bool((fresh := unseen(model, raw.q)).any()):
         return shown
-    judged = judge(model, own, data.rows(mask), errors[last])
+    judged = judge(model, placed, data.rows(mask), errors[last])
     moved = judged.causes if judged.refusal is None else [judged.refusal]
-    predictions = Predictions.of(model, measured.rows(seen))
+    predictions = Predictions.of(model, measured.rows(fresh))
     return shown | {"predictions": predictions, "outliers": predictions.outliers(model), "moved": moved}
 
 
@@ -254,28 +253,28 @@ def _left_out(model: CalibratedKinematics, rows: FitRows, stages: Mapping[str, K
         got = f"a model registered with {model.markers} marker(s), fitted with {fitted}"
         fix = "pass rows that it has not seen, neither in the fit nor in the registration"
         raise InputError.of("a report of the rows of the fit", expected="the markers of the fit", got=got, fix=fix)
-    found = Predictions.of_fit(rows)
-    LOG.info("judged by the %d rows of the fit, each predicted by all others", len(found))
-    data, (*before, own) = found.data, stages
+    predicted = Predictions.of_fit(rows)
+    LOG.info("judged by the %d rows of the fit, each predicted by all others", len(predicted))
+    data, (*before, last) = predicted.data, stages
     errors = {name: residuals(stages[name], place(stages[name], data), data) for name in before}
-    errors[own] = Evaluations.of([(found.errors, torch.arange(len(found), device=HOST))])
-    outliers = found.outliers(model)
+    errors[last] = Evaluations.of([(predicted.errors, torch.arange(len(predicted), device=HOST))])
+    outliers = predicted.outliers(model)
     cause = common_cause(model, data, outliers) if model.registration is None else None  # else they are elsewhere
     kinds, moved = _by_kind(errors, data.q), [cause] if cause else []
-    return {"kinds": kinds, "new": False, "predictions": found, "outliers": outliers, "moved": moved}
+    return {"kinds": kinds, "new": False, "predictions": predicted, "outliers": outliers, "moved": moved}
 
 
 def _columns(data: Measurements | None, against: Sequence[str]) -> dict[str, Tensor]:
     """Columns of the table that were asked for, and those whose names speak of time or temperature."""
-    known = dict[str, Tensor]()
+    columns = dict[str, Tensor]()
     if data is not None and isinstance(data.origin, TableOrigin):
-        known = data.origin.numeric_columns(data.line_numbers, gaps=True)
-    missing = [name for name in against if name not in known]
+        columns = data.origin.numeric_columns(data.line_numbers, gaps=True)
+    missing = [name for name in against if name not in columns]
     if missing:
         alone = "a table of positions or poses alone, read from a file"
-        expected = f"columns of numbers: {', '.join(known)}" if known else alone
+        expected = f"columns of numbers: {', '.join(columns)}" if columns else alone
         raise InputError.of("`against`", expected=expected, got=", ".join(missing))
-    words = [name for name in known if any(word in name.lower() for word in COLUMN_WORDS) and name not in against]
+    words = [name for name in columns if any(word in name.lower() for word in COLUMN_WORDS) and name not in against]
     chosen = [*against, *words]
-    there = {name: known[name][known[name].isfinite()] for name in chosen}  # NaN where a cell has no number
-    return {name: known[name] for name, own in there.items() if not bool(torch.isclose(own, own[:1]).all())}
+    there = {name: columns[name][columns[name].isfinite()] for name in chosen}  # NaN where a cell has no number
+    return {name: columns[name] for name, cells in there.items() if not bool(torch.isclose(cells, cells[:1]).all())}

@@ -113,9 +113,9 @@ class FitRows:
     def blocks(self) -> list[tuple[Tensor, Process]]:
         """Row numbers (B,) of each block, and the model conditioned on them: on all rows the map is that at hand."""
         n, m, _ = self.map.noise.covariance.shape
-        known = self.map.by_data if self.map.data is None and n * m <= WHOLE_COORDINATES else None
-        if isinstance(known, Process):
-            return [(torch.arange(n, device=HOST), known)]
+        by_data = self.map.by_data if self.map.data is None and n * m <= WHOLE_COORDINATES else None
+        if isinstance(by_data, Process):
+            return [(torch.arange(n, device=HOST), by_data)]
         order = torch.randperm(n, generator=seeded(0), device=HOST)
         parts = [part.sort().values for part in order.tensor_split(ceil(n * m / BLOCK_COORDINATES))]
         return [(rows, Process.of_rows(self.linearised[1].rows(rows), self.map.noise.rows(rows))) for rows in parts]
@@ -126,13 +126,13 @@ class FitRows:
 
         Where markers were hidden the errors are NaN, and the covariance is that of noise alone.
         """
-        noise, seen = self.map.noise, self.map.noise.visible
+        noise, visible = self.map.noise, self.map.noise.visible
         errors, covariance = torch.empty_like(self.target), torch.empty_like(noise.covariance)
         for rows, regression in self.blocks:
-            errors[rows], own = regression.about(self.target[rows]).rows_left_out()
-            covariance[rows] = own - noise.covariance[rows]
-        both = seen[:, :, None] & seen[:, None, :]
-        return errors.masked_fill(~seen, nan), torch.where(both, covariance, 0.0) + self.map.new_noise
+            errors[rows], block = regression.about(self.target[rows]).rows_left_out()
+            covariance[rows] = block - noise.covariance[rows]
+        both = visible[:, :, None] & visible[:, None, :]
+        return errors.masked_fill(~visible, nan), torch.where(both, covariance, 0.0) + self.map.new_noise
 
     def learning_curve(self) -> list[tuple[int, float]]:
         """Number of rows -> RMS distance of other rows from their prediction with the scales of the whole fit, m.
@@ -154,10 +154,10 @@ class FitRows:
             # The factor of the first rows is the first part of that of all: one serves every size.
             factor = torch.linalg.cholesky(noise.add_to(self.linearised[1].rows(rows).gram()))
             white = torch.linalg.solve_triangular(factor, target.reshape(-1, 1), upper=False)
-            for size, found in squares.items():
+            for size, parts in squares.items():
                 predicted = (factor[size * m :, : size * m] @ white[: size * m]).view(-1, m)
                 error = (target[size:] - predicted).masked_fill(unseen[size:], nan)
-                found.append(error.reshape(-1, 3).square().sum(-1))
+                parts.append(error.reshape(-1, 3).square().sum(-1))
         curve = [(size, float(torch.cat(values).nanmean().sqrt())) for size, values in squares.items()]
         left_out = self.left_out[0][block][inliers[block]].reshape(-1, 3)
         return [*curve, (len(block), float(left_out.square().sum(-1).nanmean().sqrt()))]
@@ -168,7 +168,7 @@ class FitRows:
         The mean of the error over the values is left out.
         """
         terms = self.map.geodesic.spec.joint_kernel.terms
-        own = [t for t in terms if isinstance(t, RadialKernel) and t.columns == (joint,) and t.output == joint]
+        kernels = [t for t in terms if isinstance(t, RadialKernel) and t.columns == (joint,) and t.output == joint]
         regression = self.blocks[0][1]
         data, q = regression.numbers.at, self.q.mean(0).repeat(len(values), 1)
         q[:, joint] = values
@@ -176,7 +176,7 @@ class FitRows:
         along[:, :, joint] = 1.0
         centred = torch.eye(len(values), dtype=q.dtype, device=q.device) - 1.0 / len(values)
         total, cross = q.new_zeros(len(values), len(values)), q.new_zeros(*data.sensitivity.shape[:2], len(values))
-        for kernel in own:
+        for kernel in kernels:
             for node in data.joint:
                 total += kernel.gram(q, node.weight * along, q, along)
                 cross += kernel.gram(node.points, node.weight * node.effect, q, along).view_as(cross)
@@ -228,17 +228,17 @@ class Predictions:
     @classmethod
     def of(cls, model: CalibratedKinematics, data: Measurements) -> Predictions:
         """Predictions of rows that took no part in the fit."""
-        seen = data.bodies.predicted(model.at_payloads(data.payload), data.q)
-        return cls(data, data.origins, seen.origins, seen.places, _errors(seen.points, data))
+        predicted = data.bodies.predicted(model.at_payloads(data.payload), data.q)
+        return cls(data, data.origins, predicted.origins, predicted.places, _errors(predicted.points, data))
 
     @classmethod
     def of_fit(cls, rows: FitRows) -> Predictions:
         """Rows of a fit, each predicted by all others."""
         data, (errors, covariance) = rows.measurements, rows.left_out
         points = rows.points - errors.unflatten(1, (-1, 3))
-        found = _errors(points, data)
+        evaluated = _errors(points, data)
         predicted, covariance = data.bodies.claimed(points, covariance, rows.linearised[0].unflatten(1, (-1, 3)))
-        return cls(data, data.origins, predicted, covariance, found)
+        return cls(data, data.origins, predicted, covariance, evaluated)
 
     def __len__(self) -> int:
         return len(self.measured)

@@ -80,24 +80,24 @@ class Deviations:
         """The deviations of a model at random configurations."""
 
         def claimed(q: Tensor) -> Tensor:
-            found = model.bodies.predicted(model, q.to(model.configurations.device), noise=False)
-            return found.claimed.square().mean(1).sqrt().to(HOST)
+            predicted = model.bodies.predicted(model, q.to(model.configurations.device), noise=False)
+            return predicted.claimed.square().mean(1).sqrt().to(HOST)
 
         fitted = model.configurations.to(HOST)
         low, high = (torch.clamp(end, *model.robot.limits.unbind(1)) for end in (fitted.amin(0), fitted.amax(0)))
         draws = torch.rand(CONFIGURATIONS, len(low), generator=seeded(0), dtype=low.dtype, device=HOST)
         q, fitted = low + draws * (high - low), fitted[:: -(-len(fitted) // MEASURED)]
-        found = cls(q, claimed(q), fitted, claimed(fitted), ExpectedError.of(model))
+        deviations = cls(q, claimed(q), fitted, claimed(fitted), ExpectedError.of(model))
         try:
             somewhere = [sensor for sensor in sensor_of(model) if sensor.reached(model.geometry.base)]
         except InputError:  # a file of an early version
-            return found
+            return deviations
         options = [q]
         try:
             options += [drawn(model, somewhere, CONFIGURATIONS, model.geometry.tool)] if somewhere else []
         except InputError:  # such as of a camera, which cannot see everywhere
             options.append(model.configurations.to(HOST))
-        return replace(found, next=plan(model, torch.cat(options), NEXT, target=q[:TARGETS]))
+        return replace(deviations, next=plan(model, torch.cat(options), NEXT, target=q[:TARGETS]))
 
 
 FEWEST_REPEATS = 5
@@ -139,7 +139,7 @@ def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: floa
         return None
     data = data.rows(repeated)
     at_rows = {name: at_payloads(kinematics, data)(data.q).detach() for name, kinematics in stages.items()}
-    predicted = {name: data.bodies.origins(found) for name, found in at_rows.items()}  # (N, B, 3) m
+    predicted = {name: data.bodies.origins(at) for name, at in at_rows.items()}  # (N, B, 3) m
     *_, best = predicted.values()
     points, labels, squares, freedom = data.origins, data.groups(), 0.0, 0
     first, counts, repeatability = list[int](), list[int](), list[Tensor]()
@@ -148,13 +148,13 @@ def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: floa
         rows = (labels == label).nonzero()[:, 0]
         middle = points[rows].nanmean(0)
         distances = (points[rows] - middle).norm(dim=-1)  # (n, B), NaN for hidden markers
-        seen = (~distances.isnan()).sum(0)
-        if int(seen.max()) < 2 or float((best[rows] - best[rows[:1]]).norm(dim=-1).max()) >= noise:
+        attained = (~distances.isnan()).sum(0)
+        if int(attained.max()) < 2 or float((best[rows] - best[rows[:1]]).norm(dim=-1).max()) >= noise:
             continue
-        variances = (distances - distances.nanmean(0)).square().nansum(0) / (seen - 1).clamp(min=1)
-        repeatability.append((distances.nanmean(0) + 3.0 * variances.sqrt())[seen > 1].max())
+        variances = (distances - distances.nanmean(0)).square().nansum(0) / (attained - 1).clamp(min=1)
+        repeatability.append((distances.nanmean(0) + 3.0 * variances.sqrt())[attained > 1].max())
         squares += float(distances.square().nansum())
-        freedom += int((seen - 1).clamp(min=0).sum())
+        freedom += int((attained - 1).clamp(min=0).sum())
         first.append(int(rows[0]))
         counts.append(len(rows))
         for name, places in predicted.items():
