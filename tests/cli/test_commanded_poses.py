@@ -139,6 +139,17 @@ def of_two_markers(path: Path) -> Path:
     return write_columns(path, cmdx_cmdy_cmdz=own, **markers)
 
 
+def in_sockets(path: Path) -> Path:
+    """A ball near the flange: quaternions in the wrong order leave little too."""
+    commanded, ball = flange(), torch.tensor([0.03, -0.02, 0.02], dtype=torch.float64)
+    commanded[:, :3, 3] = places(3).repeat(len(commanded) // 3, 1) - commanded[:, :3, :3] @ ball
+    quaternions = rotation_numbers(commanded[:, :3, :3], "quat_xyzw")
+    header, *rows = cells(write_columns(path, X_Y_Z=1e3 * commanded[:, :3, 3], qx_qy_qz_qw=quaternions))
+    lines = [[*header, "socket"], *([*row, "abc"[k % 3]] for k, row in enumerate(rows))]
+    path.write_text("\n".join(map(",".join, lines)), encoding="utf-8")
+    return path
+
+
 TOOL = {"rotation": "qx,qy,qz,qw", "convention": "quat_xyzw", "length": "mm", "camera-on-tool": True}
 FIXED = {**TOOL, "camera-on-tool": None}
 QUATERNIONS = {**FIXED, "robot-pose": "X,Y,Z,q0,q1,q2,q3=quat_wxyz"}
@@ -162,6 +173,8 @@ READ: dict[str, tuple[Callable[[Path], Path], dict[str, Any], list[str]]] = {
     "a degree and wrong rows": (partial(noisy, noise=0.017, wrong=(5, 6)), OPENCV, []),
     "flipped boards": (partial(noisy, flipped=(4, 13)), OPENCV, []),
     "two markers": (of_two_markers, TWO, []),
+    "no errors": (partial(write_columns, cmdx_cmdy_cmdz=places(), x_y_z=places()), {"length": "m"}, []),
+    "sockets": (in_sockets, {"robot-pose": "X,Y,Z,qx,qy,qz,qw=quat_xyzw", "socket": "socket"}, []),
     "5 mm, or 5 m": (partial(of_places, size=5.0), {"length": None}, ['# length = "m"', '# length = "mm"']),
     "metres": (partial(of_places, size=15.0, measured=1e3), {"joint-length": "m", "length": "mm"}, []),
     "15 inches": (partial(of_places, size=0.381, per_metre=1000 / 25.4, measured=1e3), IN_INCHES, []),
@@ -217,6 +230,8 @@ def test_places_measured_in_a_plane(tmp_path: Path, init: Any) -> None:
     table = write_columns(tmp_path / "t.csv", **{"cmdx_cmdy": 1e3 * commanded, "measx_measy": 1e3 * measured})
     found, _ = init(table)
     refused = init(write_columns(tmp_path / "um.csv", **{"cmdx_um|cmdy_um": 1e6 * commanded, "x|y": 1e3 * measured}))[1]
+    alone = write_columns(tmp_path / "alone.csv", cmdx_cmdy=commanded)
+    assert "got no other columns; if they are in another file" in init(alone)[1]
     assert "cmdx_um, cmdy_um in um: expected m, mm, cm, inch; convert them" in refused
     assert found["position"] == ["measx,measy,0"]
     assert (found["robot-pose"], found["length"]) == ("cmdx,cmdy", "mm")
