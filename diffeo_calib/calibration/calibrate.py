@@ -172,7 +172,7 @@ def calibrate(
         warn_of_no_errors(robot, data, placed.registration, placed.identification)
         warn_of_stuck(data, measurements)
         if placed.coordinates is None:
-            warn_of_what_is_open(data, [own.devices for own in placed.readings])
+            warn_of_what_is_open(data, [kind.devices for kind in placed.readings])
         stages = placed.registration, placed.identification
         scales_for = partial(choose_scales, given=hyperparameters, models=scales_of, seed=seed, progress=progress)
         chosen = scales_for(data, measurements, *stages)
@@ -230,18 +230,18 @@ def _result(
     for devices in placed.placement:
         devices.warn_of_weakness(model)
     least = gates.UNCHOSEN_FACTOR if len(data.x) < FEWEST_POSES else 1.0
-    explained, found = parts(model), outliers(model, placed, data, chosen.judged, least)
-    LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
-    warn_of_outliers(found, placed.data)
-    said, mislabelled = best and best.text, placed.mislabelled(model, found)
+    explained, outlying = parts(model), outliers(model, placed, data, chosen.judged, least)
+    LOG.info("rows that look wrong and hardly count: %s", few([outlier.number for outlier in outlying], 20) or "none")
+    warn_of_outliers(outlying, placed.data)
+    said, mislabelled = best and best.text, placed.mislabelled(model, outlying)
     said = said if best and best.columns is None else mislabelled or said  # a wrong column explains its wrong rows
-    warn_of_contradictions(model, placed.coordinates, found, said)
+    warn_of_contradictions(model, placed.coordinates, outlying, said)
     warn_of_rounding(robot, placed.data, data, chosen.left_out)
     found_lengths = lengths(data, scales, placed.placement.hypotheses(data, VALUE))
     summary = Summary(
         **dict(zip(OF_POSITIONS, placed.stage_rms(model), strict=False)),
         leave_one_out_rms=placed.by_kind(chosen.left_out.errors).positions_rms,
-        outliers=len(found),
+        outliers=len(outlying),
         noise_degrees_of_freedom=data.tails.freedom,
         **{name: getattr(fitted, name) for name in ("coupling_residual", "end_residual", "energy", "status")},
         scales=chosen.selection.status,
@@ -268,7 +268,7 @@ def _result(
         tails=data.tails,
         leave_one_out=chosen.left_out,
         parts=explained,
-        outliers=found,
+        outliers=outlying,
         fit=fitted,
         lengths=found_lengths,
         partial=best is not None and best.columns is not None,

@@ -127,7 +127,7 @@ class Source:
         used = {IMAGE, *POINT, *PIXEL, CAMERA} if self.options.images else set[str]()
         values = [getattr(self.options, name) for name in COLUMNS] + [[*choices] for choices in self.asked.values()]
         texts = (text for value in values for text in (value if isinstance(value, list) else [value or ""]))
-        return used.union(*(re.split("[=,{}]", text) for text in texts))
+        return used.union(*(re.split("[=,{}]", str(text)) for text in texts))
 
     @cached_property
     def data(self) -> Any:
