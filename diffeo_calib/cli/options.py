@@ -77,14 +77,14 @@ class Option(NamedTuple):
     how: dict[str, Any]  # its help and limits
 
     @classmethod
-    def of(cls, own: Field[Any], hint: Any) -> Option:
+    def of(cls, entry: Field[Any], hint: Any) -> Option:
         """The option of a field."""
-        kind, how = own.metadata["kind"], dict(own.metadata["how"])
+        kind, how = entry.metadata["kind"], dict(entry.metadata["how"])
         if not how["help"]:
-            how["help"] = described().get(own.name, "") + " Repeatable." * has(hint, list)
-        long = f"--{own.name.replace('_', '-')}"
-        names = tuple(filter(None, (SHORT.get(own.name), long))) if own.metadata["named"] else ()
-        return cls(own.name, hint, own.default, names, (*names, how["metavar"])[0], kind, how)
+            how["help"] = described().get(entry.name, "") + " Repeatable." * has(hint, list)
+        long = f"--{entry.name.replace('_', '-')}"
+        names = tuple(filter(None, (SHORT.get(entry.name), long))) if entry.metadata["named"] else ()
+        return cls(entry.name, hint, entry.default, names, (*names, how["metavar"])[0], kind, how)
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
@@ -103,12 +103,12 @@ class Options:
     def all(cls) -> tuple[Option, ...]:
         """Its options."""
         hints = get_type_hints(cls)
-        return tuple(Option.of(own, hints[own.name]) for own in fields(cls))
+        return tuple(Option.of(entry, hints[entry.name]) for entry in fields(cls))
 
     @classmethod
     def names(cls) -> set[str]:
         """Names of its fields."""
-        return {own.name for own in fields(cls)}
+        return {entry.name for entry in fields(cls)}
 
     @classmethod
     def check_together(cls, given: Mapping[str, Any]) -> None:
@@ -127,7 +127,7 @@ class Options:
 
 def has(hint: Any, part: Any) -> bool:
     """Whether a type, or a part of it, is this one."""
-    return part in {hint, get_origin(hint)} or any(has(one, part) for one in get_args(hint))
+    return part in {hint, get_origin(hint)} or any(has(inner, part) for inner in get_args(hint))
 
 
 # --- groups of several commands -----------------------------------------------------------------------------------
@@ -219,8 +219,8 @@ class Rows(Places, Units):
 
     def left_open(self) -> set[str]:
         """Columns too, unless some are named; not the file of the places of the fit."""
-        own = {"places", "by"} if self.places is None else {"places"}
-        return super().left_open() | (set() if self.named else Rows.names() - Units.names() - own)
+        joining = {"places", "by"} if self.places is None else {"places"}
+        return super().left_open() | (set() if self.named else Rows.names() - Units.names() - joining)
 
     @property
     def images(self) -> bool:

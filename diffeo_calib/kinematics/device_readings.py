@@ -78,9 +78,9 @@ class FittedDevice(NamedTuple):
     noise: Tensor | None = None  # (r, r) of a reading by its rows of the fit, m^2; None without any
 
     @classmethod
-    def of(cls, fitted: FittedMap, own: Extrinsics, number: int) -> FittedDevice:
+    def of(cls, fitted: FittedMap, group: Extrinsics, number: int) -> FittedDevice:
         """A device of a set of those of readings."""
-        devices: Any = own.only(own.names[number : number + 1])
+        devices: Any = group.only(group.names[number : number + 1])
         deviations = devices.deviations[0]
         placed, rows = cls(devices, torch.diag(deviations)), devices.rows
         if not len(rows):
@@ -89,16 +89,16 @@ class FittedDevice(NamedTuple):
         placed = placed._replace(noise=fitted.noise.covariance[rows][:, numbers][:, :, numbers].median(0).values)
         slopes = placed.by_increments(fitted.fitted_points[rows, -3 * devices.seen_points :])
         columns, root = own_shifts(shared[:, numbers], slopes)
-        known = fitted.registration is None and bool(columns.any())
-        return placed._replace(columns=columns, root=root) if known else placed
+        moves = fitted.registration is None and bool(columns.any())
+        return placed._replace(columns=columns, root=root) if moves else placed
 
     def by_increments(self, points: Tensor) -> Tensor:
         """(N, r, k) derivatives of readings of points (N, 3 P'), which it sees, by its unknowns, m."""
         return self.devices.by_increments(points, torch.zeros(len(points), dtype=torch.int64, device=HOST))
 
-    def readings(self, fitted: FittedMap, seen: tuple[Tensor, Linearisation], *, noise: bool) -> tuple[Tensor, Tensor]:
+    def readings(self, fitted: FittedMap, rows: tuple[Tensor, Linearisation], *, noise: bool) -> tuple[Tensor, Tensor]:
         """Mean (N, r) and covariance (N, r, r) of its readings, m, of points and their linearisation."""
-        whole, at = seen
+        whole, at = rows
         points = whole[:, -3 * self.devices.seen_points :]
         observation = self.devices.observation(torch.zeros(len(points), dtype=torch.int64, device=HOST))
         A = torch.nn.functional.pad(observation.slope(points), (whole.shape[1] - points.shape[1], 0))
@@ -115,30 +115,30 @@ class FittedDevice(NamedTuple):
 def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[PredictedReadings]:
     """Predicted readings at q (N, n) of every device that a model knows, see :meth:`predict_readings`."""
     fitted: FittedMap = model.map
-    sets = [own for own in model.placement if own.reads and len(q)]
-    markers = [own for own in model.placement if own.kind == MountedMarkers.kind]
-    found = [one for own in markers for one in _mounted(model, own, q, noise=noise)]
+    sets = [devices for devices in model.placement if devices.reads and len(q)]
+    markers = [devices for devices in model.placement if devices.kind == MountedMarkers.kind]
+    readings = [reading for devices in markers for reading in _mounted(model, devices, q, noise=noise)]
     each = (slice(first, first + PREDICT_ROWS) for first in range(0, len(q) if sets else 0, PREDICT_ROWS))
-    seen = [fitted.linearised_value(q[some], fitted.geodesic.at_rows(some)) for some in each]
-    for own in sets:
-        unit, scale, zero = own.shown or ("", (1.0,), (0.0,))  # files of old versions: as reported, lengths in m
-        for number, name in enumerate(own.names):
-            device = FittedDevice.of(fitted, own, number)
-            means, blocks = zip(*(device.readings(fitted, rows, noise=noise) for rows in seen), strict=True)
-            factor = q.new_tensor(scale) / own.metres[number]
+    parts = [fitted.linearised_value(q[some], fitted.geodesic.at_rows(some)) for some in each]
+    for devices in sets:
+        unit, scale, zero = devices.shown or ("", (1.0,), (0.0,))  # files of old versions: as reported, lengths in m
+        for number, name in enumerate(devices.names):
+            device = FittedDevice.of(fitted, devices, number)
+            means, blocks = zip(*(device.readings(fitted, rows, noise=noise) for rows in parts), strict=True)
+            factor = q.new_tensor(scale) / devices.metres[number]
             mean = torch.cat(means) * factor + q.new_tensor(zero)
             covariance = torch.cat(blocks) * factor[:, None] * factor
-            found.append(PredictedReadings(own.kind, name, unit, mean, covariance))
-    return found
+            readings.append(PredictedReadings(devices.kind, name, unit, mean, covariance))
+    return readings
 
 
-def _mounted(model: Any, own: Extrinsics, q: Tensor, *, noise: bool) -> Iterator[PredictedReadings]:
+def _mounted(model: Any, devices: Extrinsics, q: Tensor, *, noise: bool) -> Iterator[PredictedReadings]:
     """Positions of the markers as they were mounted in other sessions than that of the model."""
     mean, covariance = model.predict(q, noise=noise)
-    shifts, deviations = (each.unflatten(1, (-1, 3)) for each in (own.constants, own.deviations))
+    shifts, deviations = (each.unflatten(1, (-1, 3)) for each in (devices.constants, devices.deviations))
     P = shifts.shape[1]
     turns = model.turns(q)[:, :P]
-    for name, shift, std in zip(own.names, shifts, deviations, strict=True):
+    for name, shift, std in zip(devices.names, shifts, deviations, strict=True):
         if bool(shift.any()):
             places = 1e3 * (mean[:, :P] + (turns @ shift[..., None])[..., 0])
             places = places.masked_fill(~seen_mounted(std)[:, None], torch.nan)

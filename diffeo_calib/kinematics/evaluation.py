@@ -33,11 +33,11 @@ def residuals(kinematics: Callable[[Tensor], Tensor], places: Places, data: Any)
 
     Kinematics and errors as of :func:`evaluate`; places of the devices as :func:`place` finds them.
     """
-    found = [
+    errors = [
         (sensor_of(table).errors(table, predicted_at(kinematics, table), places), rows)
         for table, rows in rows_of_one_kind(data)
     ]
-    return Evaluations.of(found, places.found, places.numbers)
+    return Evaluations.of(errors, places.found, places.numbers)
 
 
 def check_rows(kinematics: Callable[[Tensor], Tensor], data: Any) -> None:
@@ -63,22 +63,22 @@ def place(kinematics: Callable[[Tensor], Tensor], data: Any, *, every_session: b
     """
     check_rows(kinematics, data)
     model = kinematics if isinstance(kinematics, CalibratedKinematics) else None
-    known = {"unplaced": model is not None and model.own_frame, "every_session": every_session}
+    flags = {"unplaced": model is not None and model.own_frame, "every_session": every_session}
     turns, parts = None if model is None else model.turns, rows_of_one_kind(data)
-    beside = Beside(partial(predicted_at, kinematics), known_devices(kinematics), turns, **known)
-    found = Places(ball=len(parts) > 1 if model is None else model.ball)
+    beside = Beside(partial(predicted_at, kinematics), known_devices(kinematics), turns, **flags)
+    places = Places(ball=len(parts) > 1 if model is None else model.ball)
     for table, _ in parts:
-        found = found.beside(sensor_of(table).place(table, beside))
+        places = places.beside(sensor_of(table).place(table, beside))
     drift = KnownDrift.of(kinematics)
-    sentences = [f"{found.numbers} numbers in all were found from the rows that are judged"] * (found.numbers > 0)
+    sentences = [f"{places.numbers} numbers in all were found from the rows that are judged"] * (places.numbers > 0)
     sentences += [] if drift is None else drift.in_rows(data)
-    return replace(found, found=(*found.found, *sentences))
+    return replace(places, found=(*places.found, *sentences))
 
 
 def placement_sentences(model: object) -> list[str]:
     """Where the devices are that a model knows, with deviations; none for other kinematics."""
     drift = KnownDrift.of(model)
-    lines = [line for own in getattr(model, "placement", None) or () for line in own.sentences()]
+    lines = [line for devices in getattr(model, "placement", None) or () for line in devices.sentences()]
     return lines if drift is None else [*lines, *drift.of_joints()]
 
 
@@ -89,8 +89,8 @@ def at_payloads(kinematics: Callable[[Tensor], Tensor], data: Any) -> Callable[[
 
 def predicted_at(kinematics: Callable[[Tensor], Tensor], data: Any) -> Tensor:
     """(N, P, 3) markers of kinematics under the payloads of the rows, and where a drift moved them, m."""
-    own, drift = at_payloads(kinematics, data), KnownDrift.of(kinematics)
-    return own(data.q).detach() if drift is None else drift.points(own, data)
+    loaded, drift = at_payloads(kinematics, data), KnownDrift.of(kinematics)
+    return loaded(data.q).detach() if drift is None else drift.points(loaded, data)
 
 
 def rows_used_in_fit(model: CalibratedKinematics, q: object) -> Tensor:
@@ -119,7 +119,7 @@ def rows_of_other_frames(model: CalibratedKinematics, q: Tensor) -> int:
     """
     if model.registration is not None:
         return 0
-    rows = [own.rows[own.elsewhere.to(HOST)[own.device]].to(q.device) for own in model.placement]
+    rows = [devices.rows[devices.elsewhere.to(HOST)[devices.device]].to(q.device) for devices in model.placement]
     elsewhere = model.configurations[torch.cat(rows)] if rows else model.configurations[:0]
     return int((torch.cdist(q.to(elsewhere), elsewhere, p=torch.inf) < SAME_CONFIGURATION).any(1).sum())
 
@@ -129,8 +129,8 @@ def positions_of(model: CalibratedKinematics, places: Places, data: Any) -> Meas
 
     A drift that the model knows is undone.
     """
-    own, drift = measured_positions(data), KnownDrift.of(model)
-    if own is None:
+    positions, drift = measured_positions(data), KnownDrift.of(model)
+    if positions is None:
         return None
-    own = places.aligned(own)
-    return with_points(own if drift is None else drift.undone(own), model)
+    positions = places.aligned(positions)
+    return with_points(positions if drift is None else drift.undone(positions), model)

@@ -94,18 +94,18 @@ class HandEye:
         set_up, tool = SetUp.of(model, camera), poses_from_marks(geometry.tool[None], lever)
         carried = (tool @ set_up.mount)[0]
         from_tool = twist_at(carried[:3, 3] - tool[0, :3, 3])
-        own = from_tool @ torch.block_diag(*[tool[0, :3, :3]] * 2)  # by a shift and a turn along the axes of the tool
+        arm = from_tool @ torch.block_diag(*[tool[0, :3, :3]] * 2)  # by a shift and a turn along the axes of the tool
         by_tool = from_tool @ pose_directions(tool, lever)[0]
-        known = _covariance(model.map, geometry.slices["tool"], by_tool, set_up.columns, own @ set_up.of_mount)
-        known = known + own @ torch.diag(set_up.mount_std.square()) @ own.mT
+        in_tip = _covariance(model.map, geometry.slices["tool"], by_tool, set_up.columns, arm @ set_up.of_mount)
+        in_tip = in_tip + arm @ torch.diag(set_up.mount_std.square()) @ arm.mT
         # base T(e) for an error twist e: what stands moves by -e, at its place, seen from the base
         standing = inverse_poses((set_up.transform @ geometry.base)[None])[0]
         by_base, back = -twist_at(standing[:3, 3]), geometry.base[:3, :3].mT
         of_base = torch.block_diag(back, back) @ twist_at(geometry.base[:3, 3]) @ set_up.of_frame
-        found = _covariance(model.map, geometry.slices["base"], by_base, set_up.columns, by_base @ of_base)
+        in_base = _covariance(model.map, geometry.slices["base"], by_base, set_up.columns, by_base @ of_base)
         tip, base = geometry.on[0], model.robot.base
-        there = KnownPose(carried, known, tip, f"in the frame of '{tip}'", "in_tip")
-        poses = there, KnownPose(standing, found, base, "in the robot's base", "in_base")
+        there = KnownPose(carried, in_tip, tip, f"in the frame of '{tip}'", "in_tip")
+        poses = there, KnownPose(standing, in_base, base, "in the robot's base", "in_base")
         return cls(*(poses if camera_on_tool else reversed(poses)))
 
     @classmethod
@@ -113,35 +113,35 @@ class HandEye:
         cls, model: CalibratedKinematics, *, camera_on_tool: bool, geometry: Geometry | None = None
     ) -> dict[str, HandEye]:
         """Result for every camera, of several fixed ones every session's, by name; arguments as of :meth:`of`."""
-        cameras = [name for own in model.placement for name in own.cameras] or [ONLY_CAMERA]
-        known = {"camera_on_tool": camera_on_tool, "geometry": geometry}
+        cameras = [name for devices in model.placement for name in devices.cameras] or [ONLY_CAMERA]
+        options = {"camera_on_tool": camera_on_tool, "geometry": geometry}
         if len(cameras) == 1:
-            return {cameras[0]: cls.of(model, **known)}
-        sessions = [name for own in model.placement if own.kind in TRANSFORMS for name in own.names]
-        return {name: cls.of(model, camera=name, **known) for name in sessions}
+            return {cameras[0]: cls.of(model, **options)}
+        sessions = [name for devices in model.placement if devices.kind in TRANSFORMS for name in devices.names]
+        return {name: cls.of(model, camera=name, **options) for name in sessions}
 
     @classmethod
     def of_fit(cls, model: CalibratedKinematics) -> dict[str, HandEye]:
         """Result where the model's images, or the command that made it, say where the camera is; else nothing."""
-        made, seen = model.provenance, [one for own in model.placement for one in own.cameras.values()]
+        made, cameras = model.provenance, [camera for devices in model.placement for camera in devices.cameras.values()]
         words = shlex.split(made.command or "") if made is not None else []
-        on_tool = seen[0].on_tool if seen else "--camera-on-tool" in words
-        seen_board = bool(model.lever) and (bool(seen) or on_tool or "--robot-pose" in words)
+        on_tool = cameras[0].on_tool if cameras else "--camera-on-tool" in words
+        seen_board = bool(model.lever) and (bool(cameras) or on_tool or "--robot-pose" in words)
         if not seen_board or model.registration:
             return {}
         return cls.of_each(model, camera_on_tool=on_tool)
 
     def entry(self) -> dict[str, object]:
         """Both poses for programs."""
-        return {f"{name}_{own.key}": own.entry() for name, own in vars(self).items()}
+        return {f"{name}_{pose.key}": pose.entry() for name, pose in vars(self).items()}
 
 
-def hand_eye_sentences(found: Mapping[str, HandEye]) -> Iterator[str]:
+def hand_eye_sentences(results: Mapping[str, HandEye]) -> Iterator[str]:
     """Every camera and the board with their deviations."""
-    for name, own in found.items():
-        which = "camera" if len(found) == 1 else f"camera '{name}'"
-        yield from own.camera.sentences(f"{which} {own.camera.where} (hand-eye transform)")
-    yield from (line for own in [*found.values()][:1] for line in own.board.sentences(f"board {own.board.where}"))
+    for name, eye in results.items():
+        which = "camera" if len(results) == 1 else f"camera '{name}'"
+        yield from eye.camera.sentences(f"{which} {eye.camera.where} (hand-eye transform)")
+    yield from (line for eye in [*results.values()][:1] for line in eye.board.sentences(f"board {eye.board.where}"))
 
 
 class SetUp(NamedTuple):
@@ -163,14 +163,14 @@ class SetUp(NamedTuple):
         eye, none = torch.eye(4, dtype=points.dtype, device=points.device), points.new_zeros(6, 0)
         columns = torch.zeros(shared.shape[2], dtype=torch.bool, device=shared.device)
         here = cls(eye, eye, columns, none, none, points.new_zeros(6))
-        own = next((own for own in model.placement if own.kind in TRANSFORMS and name in own.names), None)
-        if name is None or own is None:
+        group = next((group for group in model.placement if group.kind in TRANSFORMS and name in group.names), None)
+        if name is None or group is None:
             return here
-        number = own.names.index(name)
-        transform, rows = own.constants[number].view(4, 4), own.rows[own.device == number]
+        number = group.names.index(name)
+        transform, rows = group.constants[number].view(4, 4), group.rows[group.device == number]
         if bool((transform == eye).all()):
             return here
-        framed, others = own.kind == SESSION, torch.ones(len(shared), dtype=torch.bool, device=shared.device)
+        framed, others = group.kind == SESSION, torch.ones(len(shared), dtype=torch.bool, device=shared.device)
         others[rows] = False
         alone = shared[rows] * ~(shared[others] != 0).any(1).any(0)
         slopes = frame_slopes(points[rows], points.new_zeros(3)) if framed else own_slopes(points[rows])
@@ -181,7 +181,7 @@ class SetUp(NamedTuple):
             raise InputError.of(what, expected="a model in the place of its fit", fix="calibrate with all rows")
         if framed:
             return here._replace(transform=transform, columns=columns, of_frame=twists, of_mount=still)
-        std = here.mount_std if rigid else own.deviations[number]
+        std = here.mount_std if rigid else group.deviations[number]
         return here._replace(mount=transform, columns=columns, of_frame=still, of_mount=twists, mount_std=std)
 
     def view(self, poses: Tensor) -> Tensor:
@@ -190,8 +190,8 @@ class SetUp(NamedTuple):
 
     def shifted(self, points: Tensor) -> Tensor:
         """(M, 9, k) what its shifts do to points (M, 9) of the model's tool, m."""
-        own = points.unflatten(1, (-1, 3))
-        return frame_slopes(own, points.new_zeros(3)) @ self.of_frame + own_slopes(own) @ self.of_mount
+        places = points.unflatten(1, (-1, 3))
+        return frame_slopes(places, points.new_zeros(3)) @ self.of_frame + own_slopes(places) @ self.of_mount
 
 
 def _covariance(fitted: FittedMap, part: slice, slopes: Tensor, columns: Tensor, effects: Tensor) -> Tensor:

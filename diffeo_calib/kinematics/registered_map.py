@@ -179,28 +179,28 @@ class RegisteredMap(FittedMap):
         self, x: Tensor, geodesic: GeodesicDeformation | None = None, held: slice = slice(0)
     ) -> tuple[Tensor, Linearisation]:
         """With columns by frame and markers of the registration, which are held on other points of the body."""
-        around, found = geodesic or self.geodesic, self.registration
+        around, record = geodesic or self.geodesic, self.registration
         points, at = super().linearised_value(x, around, held)
         nominal: Any = around.spec.nominal
-        if nominal.points is found.markers:
-            columns = place_slopes(around, at, points, found.centre.to(points))
+        if nominal.points is record.markers:
+            columns = place_slopes(around, at, points, record.centre.to(points))
         else:
-            columns = frame_slopes(points.unflatten(1, (-1, 3)), found.centre.to(points))
+            columns = frame_slopes(points.unflatten(1, (-1, 3)), record.centre.to(points))
         return points, at.with_columns(columns, self.fitted.columns)
 
     @property
     def _turn_variance(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
         """With that of the frame, where its rows leave a turn of many degrees undetermined."""
-        own = float(self.registration.covariance.diagonal()[3:6].sum())
-        return self.fitted._turn_variance + own * (own > NEGLIGIBLE_TURN_RAD**2)
+        variance = float(self.registration.covariance.diagonal()[3:6].sum())
+        return self.fitted._turn_variance + variance * (variance > NEGLIGIBLE_TURN_RAD**2)
 
     @cached_property
     def conditional(self) -> Conditional:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The conditional of the fit, with what the registration found from it."""
-        found, first, x = self.registration, self.fitted.columns, self.deformation.x
-        at = self.at_registration.linearise(found.q.to(x))
-        own, columns = (found.gain.to(x), range(first, first + len(found.covariance))), found.covariance.to(x)
-        return Estimated(self.fitted.conditional, at, *own, columns)
+        record, first, x = self.registration, self.fitted.columns, self.deformation.x
+        at = self.at_registration.linearise(record.q.to(x))
+        gain, columns = (record.gain.to(x), range(first, first + len(record.covariance))), record.covariance.to(x)
+        return Estimated(self.fitted.conditional, at, *gain, columns)
 
 
 def marker_slopes(deformation: GeodesicDeformation, points: FlangePoints, at: Linearisation) -> Tensor:
@@ -262,13 +262,13 @@ def moved(fitted: FittedMap, T: Tensor) -> FittedMap:
     b, p, theta = old.momenta.tensors
     deformation = GeodesicDeformation(spec, old.x, Momenta(b, p @ R.mT, theta), old.integrator)
     parts = fitted.data, turned(fitted.new_noise, R), fitted.workspace
-    known = {"unresolved": fitted.unresolved}
+    kept = {"unresolved": fitted.unresolved}
     if fitted.slopes is not None:  # what was measured has no direction of its own
         each = torch.block_diag(*[R] * (fitted.m // 3))
-        return FittedMap(deformation, fitted.noise, *parts, slopes=fitted.slopes @ each.mT, y=fitted.y, **known)
+        return FittedMap(deformation, fitted.noise, *parts, slopes=fitted.slopes @ each.mT, y=fitted.y, **kept)
     noise = Noise(turned(fitted.noise.covariance, R), (R @ fitted.noise.shared.unflatten(1, (-1, 3))).flatten(1, 2))
     y = None if fitted.y is None else (fitted.y.unflatten(1, (-1, 3)) @ R.mT + T[:3, 3].to(device)).flatten(1)
-    return FittedMap(deformation, noise, *parts, y=y, **known)
+    return FittedMap(deformation, noise, *parts, y=y, **kept)
 
 
 def turned(covariance: Tensor, R: Tensor) -> Tensor:
@@ -321,14 +321,14 @@ def undetermined(
     ]
     each = POINTS if rigid else 1
     blocks = own_blocks(covariance[None, 6:, 6:], len(markers) // each)[0]
-    for k, (own, points, tip) in enumerate(zip(blocks, markers.split(each), tips[::each], strict=True)):
+    for k, (block, points, tip) in enumerate(zip(blocks, markers.split(each), tips[::each], strict=True)):
         if not rigid:
             name = f"marker {k}" if len(markers) > 1 else "the marker"
-            parts.append((f"the place of {name} on '{tip}'", own, limit, "mm", TURN))
+            parts.append((f"the place of {name} on '{tip}'", block, limit, "mm", TURN))
             continue
         arms = points - points.mean(0)
         motion = torch.linalg.pinv(frame_slopes(points[None], points.mean(0))[0])  # (6, 9)
-        moved, lever = motion @ own @ motion.mT, float(arms.square().sum(1).mean().sqrt())
+        moved, lever = motion @ block @ motion.mT, float(arms.square().sum(1).mean().sqrt())
         parts.append((f"the place of the measured frame on '{tip}'", moved[:3, :3], limit, "mm", TURN))
         parts.append((f"the turn of the measured frame on '{tip}'", moved[3:, 3:], limit / lever, "degrees", TURN))
     return tuple(text for part in parts if (text := _sentence(*part)))

@@ -55,8 +55,8 @@ class ChangedPart:
 
     def root(self, at: Linearisation) -> Tensor:
         """(M, m, c) the columns at M configurations, m."""
-        own = self.shapes(at)
-        return own if self.joint is None else at.joint_to_start[:, :, self.joint, None] * own[:, None]
+        shapes = self.shapes(at)
+        return shapes if self.joint is None else at.joint_to_start[:, :, self.joint, None] * shapes[:, None]
 
     def before(self, at: Linearisation) -> Tensor:
         """(M, m, c) columns of old rows in a problem of the robot as it is now, see the module."""
@@ -79,14 +79,14 @@ def offsets_of(fitted: FittedMap) -> list[ChangedPart]:
     def same(at: Linearisation) -> Tensor:
         return torch.full_like(at.joint[0].points[:, :1], OFFSET_DEVIATION_RAD_M)
 
-    geometry, found = robot_map(fitted).geometry, list[ChangedPart]()
+    geometry, offsets = robot_map(fitted).geometry, list[ChangedPart]()
     for joint, name in enumerate(geometry.chain.joint_names):
         number = geometry.chain.moving_names.index(name)
         first = geometry.slices["joints"].start + 6 * number + 3 * int(geometry.chain.revolute[number])
-        own = torch.zeros_like(fitted.geodesic.spec.prior_variance)
-        own[first : first + 3] = (OFFSET_DEVIATION_RAD_M * geometry.chain.axes[number]).square()
-        found.append(ChangedPart(f"the offset of {name}", same, joint, offset=True, parameters=own))
-    return found
+        variances = torch.zeros_like(fitted.geodesic.spec.prior_variance)
+        variances[first : first + 3] = (OFFSET_DEVIATION_RAD_M * geometry.chain.axes[number]).square()
+        offsets.append(ChangedPart(f"the offset of {name}", same, joint, offset=True, parameters=variances))
+    return offsets
 
 
 def parts_of(fitted: FittedMap) -> list[ChangedPart]:
@@ -94,31 +94,31 @@ def parts_of(fitted: FittedMap) -> list[ChangedPart]:
     spec, nominal = fitted.geodesic.spec, robot_map(fitted)
     names = nominal.geometry.chain.joint_names
     terms = enumerate(spec.joint_kernel.terms)
-    own = {t.output: (number, t) for number, t in terms if isinstance(t, RadialKernel) and t.output is not None}
-    least = SMALLEST_AMPLITUDE_SHARE**2 * max((float(term.variance) for _, term in own.values()), default=0.0)
+    by_joint = {t.output: (number, t) for number, t in terms if isinstance(t, RadialKernel) and t.output is not None}
+    least = SMALLEST_AMPLITUDE_SHARE**2 * max((float(term.variance) for _, term in by_joint.values()), default=0.0)
 
     def of_joint(kernel: RadialKernel, joint: int, at: Linearisation) -> Tensor:
         points = at.joint[0].points
-        one = points.new_zeros(len(points), 1, points.shape[1])
-        one[:, 0, joint] = 1.0
-        values, vectors = torch.linalg.eigh(kernel.gram(points, one, points, one))
+        unit = points.new_zeros(len(points), 1, points.shape[1])
+        unit[:, 0, joint] = 1.0
+        values, vectors = torch.linalg.eigh(kernel.gram(points, unit, points, unit))
         kept = values > NEGLIGIBLE_EIGENVALUE_SHARE * values[-1]
         return vectors[:, kept] * values[kept].sqrt()
 
     def of_parameters(some: Tensor, at: Linearisation) -> Tensor:
         return at.sensitivity[..., some] * spec.prior_variance[some].sqrt()
 
-    found: list[ChangedPart] = []
-    for joint, (number, term) in own.items() if least > 0 else ():
+    parts: list[ChangedPart] = []
+    for joint, (number, term) in by_joint.items() if least > 0 else ():
         size = max(float(term.variance), least)
         kernel = RadialKernel.from_config(term.to_config() | {"variance": size})
-        found.append(ChangedPart(names[joint], partial(of_joint, kernel, joint), joint, kernels={number: size}))
+        parts.append(ChangedPart(names[joint], partial(of_joint, kernel, joint), joint, kernels={number: size}))
     for name, some in {"gravity": nominal.sag, "geometry": nominal.geometry.slices["joints"]}.items():
         variances = torch.zeros_like(spec.prior_variance)
         variances[some] = spec.prior_variance[some]
         if len(at := variances.nonzero()[:, 0]):
-            found.append(ChangedPart(name, partial(of_parameters, at), parameters=variances))
-    return found
+            parts.append(ChangedPart(name, partial(of_parameters, at), parameters=variances))
+    return parts
 
 
 USUAL_LOG, NAMED_LOG, EFOLDS, ALIKE_EFOLDS = -6.0, 0.0, 2.5, 1.5
@@ -146,17 +146,17 @@ class Drift:
     @cached_property
     def groups(self) -> list[list[ChangedPart]]:
         """Parts with one s^2: named joints, offsets, then the others."""
-        found = {part.name: [part] for part in self.named if part.joint is not None}
+        groups = {part.name: [part] for part in self.named if part.joint is not None}
         for part in (*offsets_of(self.rows.fitted), *parts_of(self.rows.fitted)):
-            if part.name not in found:
+            if part.name not in groups:
                 kind = "offsets" if part.offset else "transmissions" if part.joint is not None else f"all {part.name}"
-                found.setdefault(kind, []).append(part)
-        return [*found.values()]
+                groups.setdefault(kind, []).append(part)
+        return [*groups.values()]
 
     @cached_property
     def roots(self) -> list[Tensor]:
         """(M, R, c) of each group."""
-        return [torch.cat([part.root(self.rows.at) for part in own], 2) for own in self.groups]
+        return [torch.cat([part.root(self.rows.at) for part in group], 2) for group in self.groups]
 
     @cached_property
     def doubted(self) -> NewRows:
@@ -175,17 +175,17 @@ class Drift:
         precision = torch.linalg.inv(covariance + EFOLDS**2 * alike * alike[:, None])
 
         def odds(tried: Tensor, some: Tensor) -> Tensor:
-            away, own = (tried - centre) * some, torch.where(some, tried, NOTHING).exp()
-            return evidence.log_odds_of(own.repeat_interleave(counts, 1)) - 0.5 * ((away @ precision) * away).sum(1)
+            away, sizes = (tried - centre) * some, torch.where(some, tried, NOTHING).exp()
+            return evidence.log_odds_of(sizes.repeat_interleave(counts, 1)) - 0.5 * ((away @ precision) * away).sum(1)
 
-        moves, found, everything = each == each[:, None], list[float](), each >= 0
+        moves, expected, everything = each == each[:, None], list[float](), each >= 0
         for moved in (usual, *moves.repeat(ROUNDS, 1)):
             tried = torch.where(moved, grid[:, None], best)
             values = odds(tried, everything)
             best = tried[values.argmax()]
-            found.append(float(values.softmax(0) @ grid.exp()))
+            expected.append(float(values.softmax(0) @ grid.exp()))
         total, named = float(odds(best[None], everything)), float(odds(best[None], ~usual))
-        return found[-len(counts) :], total, total - named
+        return expected[-len(counts) :], total, total - named
 
     @property
     def explains(self) -> bool:
@@ -206,4 +206,4 @@ class Drift:
         if not self.named and not self.explains:
             return []
         each = zip(self.groups, self.sizes[0], strict=True)
-        return [replace(part, variance=part.variance * size) for own, size in each for part in own]
+        return [replace(part, variance=part.variance * size) for group, size in each for part in group]

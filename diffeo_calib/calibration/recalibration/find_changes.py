@@ -172,8 +172,8 @@ def likelihood_ratios(rows: NewRows, roots: dict[str, Tensor], seed: int) -> tup
     given = rows.given
     base = given.C + given.slopes @ given.prior @ given.slopes.T
     R = torch.block_diag(*rows.weighted_noise)
-    seen = rows.visible.flatten()  # what was not measured has no noise whose level may change
-    R, base, residual = R[seen][:, seen], base[seen][:, seen], rows.residual.flatten()[seen, None]
+    visible = rows.visible.flatten()  # what was not measured has no noise whose level may change
+    R, base, residual = R[visible][:, visible], base[visible][:, visible], rows.residual.flatten()[visible, None]
     # In the basis in which R is 1 and the rest diagonal all levels of noise are.
     root_of_noise = torch.linalg.cholesky(R)
     half = torch.linalg.solve_triangular(root_of_noise, base, upper=False)
@@ -193,18 +193,18 @@ def likelihood_ratios(rows: NewRows, roots: dict[str, Tensor], seed: int) -> tup
     samples = torch.cat([measured, levels[likeliest].sqrt()[:, None] * draws], 1)
     plain, sizes, ratios, variances = densities(samples), SIZES.to(base), dict[str, Tensor](), dict[str, float]()
     for name, root in roots.items():
-        U, s, _ = torch.linalg.svd(aligned(root.flatten(0, 1)[seen]), full_matrices=False)
+        U, s, _ = torch.linalg.svd(aligned(root.flatten(0, 1)[visible]), full_matrices=False)
         E = (U * s)[:, s.square() > NEGLIGIBLE_EIGENVALUE_SHARE * s[0].square()]
         each = zip(E.T / levels[:, None], plain, strict=True)
-        changed = torch.cat([own + Evidence((F @ samples).mT, F @ E).log_odds(sizes) for F, own in each])
+        changed = torch.cat([density + Evidence((F @ samples).mT, F @ E).log_odds(sizes) for F, density in each])
         ratios[name] = 2.0 * (changed.amax(0) - plain.amax(0))
         variances[name] = float(SIZES[int(changed[:, 0].argmax()) % len(SIZES)])
     largest = torch.stack(list(ratios.values())).amax(0)[1:]
-    found = {}
+    by_part = {}
     for name, values in ratios.items():
         value = float(values[0])
-        found[name] = Ratio(value, (1 + int((largest >= value).sum())) / (1 + SIMULATED_DRAWS), variances[name])
-    return found, float(NOISE_FACTORS[likeliest].sqrt())
+        by_part[name] = Ratio(value, (1 + int((largest >= value).sum())) / (1 + SIMULATED_DRAWS), variances[name])
+    return by_part, float(NOISE_FACTORS[likeliest].sqrt())
 
 
 FEWEST_ROWS = 5
@@ -237,15 +237,15 @@ def find_changes(rows: NewRows, *, level: float = LEVEL, seed: int = 0) -> tuple
     groups = groups_of(rows)
     if changes.found or not groups:
         return changes, drifts
-    found = []
+    named = []
     for where, (index, deviates) in groups.items():
-        own, _ = _changes_of(group := rows.kept(index), level=level / len(groups), seed=seed)
-        found += [replace(one, where=where) for one in own.found]
-        if deviates and not own.found:
+        verdict, _ = _changes_of(group := rows.kept(index), level=level / len(groups), seed=seed)
+        named += [replace(change, where=where) for change in verdict.found]
+        if deviates and not verdict.found:
             numbers = 3 if rows.noise_model.size % 3 == 0 else rows.noise_model.size
             size = float(group.residual.unflatten(1, (-1, numbers)).square().sum(2).mean().sqrt())  # m at the tool
-            found.append(Change(SOMETHING, size, angle=False, displacement=size, probability=level, where=where))
-    return replace(changes, found=tuple(found)), []
+            named.append(Change(SOMETHING, size, angle=False, displacement=size, probability=level, where=where))
+    return replace(changes, found=tuple(named)), []
 
 
 def groups_of(rows: NewRows) -> dict[str, tuple[Tensor, bool]]:
@@ -254,9 +254,9 @@ def groups_of(rows: NewRows) -> dict[str, tuple[Tensor, bool]]:
     Sessions, if there are several, and else the block of rows that hardly count.
     """
     data, flags = rows.set_up.data, (rows.tails.weights < OUTLIER_WEIGHT).any(1).to(HOST)
-    named = [group for one in rows.set_up.sessions for group in one.groups()]
+    named = [group for session in rows.set_up.sessions for group in session.groups()]
     if named:
-        return {name: (own, float(flags[own].double().mean()) > MOST_OUTLIERS) for name, own in named}
+        return {name: (index, float(flags[index].double().mean()) > MOST_OUTLIERS) for name, index in named}
     distinct = len(data.line_numbers.unique()) == len(data)
     numbers = data.line_numbers.to(HOST) if distinct else torch.arange(len(data), device=HOST)
     order = numbers.argsort()
@@ -280,12 +280,12 @@ def _changes_of(rows: NewRows, *, level: float, seed: int) -> tuple[Changes, lis
     drift = Drift(rows.with_weights())
     few_fit = (drift.rows.tails.weights < OUTLIER_WEIGHT).any(1).double().mean() > MOST_OUTLIERS and drift.explains
     rows = drift.doubted
-    drifts, found, first, noise = list[ChangedPart](), list[tuple[float, tuple[str, ...]]](), dict[str, float](), 1.0
+    drifts, reasons, first, noise = list[ChangedPart](), list[tuple[float, tuple[str, ...]]](), dict[str, float](), 1.0
     while roots:
         ratios, factor = likelihood_ratios(rows, roots, seed)
         # A few outliers look like a change, and a change looks like outliers: it must stand out with either weights.
         # Where hardly a row fits the old model these are no outliers.
-        doubted = not few_fit and (not first or min(one.probability for one in ratios.values()) <= level)
+        doubted = not few_fit and (not first or min(test.probability for test in ratios.values()) <= level)
         strict = likelihood_ratios(rows.with_weights(), roots, seed)[0] if doubted else ratios
         for name, (value, probability, variance) in ratios.items():
             other = strict[name]
@@ -299,9 +299,9 @@ def _changes_of(rows: NewRows, *, level: float, seed: int) -> tuple[Changes, lis
         drifts.append(replace(parts[name], variance=best.variance))
         rows = rows.drifting([best.variance**0.5 * roots.pop(name)])
         least = best.value - gates.OFFSETS_TOLD_APART if parts[name].offset else inf
-        as_good = [each for each, own in ratios.items() if parts[each].offset and own.value > least]
-        found.append((best.probability, tuple(as_good)))
-    changes = tuple(_change(rows, drift, *why) for drift, why in zip(drifts, found, strict=True))
+        as_good = [each for each, rival in ratios.items() if parts[each].offset and rival.value > least]
+        reasons.append((best.probability, tuple(as_good)))
+    changes = tuple(_change(rows, drift, *why) for drift, why in zip(drifts, reasons, strict=True))
     chain, smallest = rows.marks.fitted.geometry.chain, list[Offset]()
     for joint, part in enumerate([] if drifts else offsets_of(rows.fitted)):
         size = SHOWN * OFFSET_DEVIATION_RAD_M / float(rows.evidence(part.root(rows.at)).H.sqrt())
@@ -342,32 +342,32 @@ def hidden_offsets(robot: Tree, set_up: NewSetUp, changes: Changes) -> tuple[Off
     Args:
         robot: with n joints. set_up: where device and markers are. changes: as the rows show them.
     """
-    rows, found = set_up.registered, set_up.registration
-    if rows is None or found is None or changes.found:
+    rows, record = set_up.registered, set_up.registration
+    if rows is None or record is None or changes.found:
         return ()
     S, J = rows.by_places.flatten(0, 1), rows.at.joint_to_start.flatten(0, 1)  # (M m, 6 + 3 P), (M m, n)
-    covariance, noise = rows.inflation * rows.given.covariance, float(found.noise.diagonal().mean().sqrt())
+    covariance, noise = rows.inflation * rows.given.covariance, float(record.noise.diagonal().mean().sqrt())
     T, centre = rows.transform, rows.centre
     turn = rotation_numbers(T[None, :3, :3], "rotvec", angle="rad")[0]
     moved = torch.cat([T[:3, :3] @ centre + T[:3, 3] - centre, turn])  # m and rad, of the frame in that of the map
     places = {"the measuring device has moved": (slice(0, 6), moved)}
-    if found.shift is not None:
-        places["the markers have moved"] = (slice(6, S.shape[1]), found.shift.flatten())
+    if record.shift is not None:
+        places["the markers have moved"] = (slice(6, S.shape[1]), record.shift.flatten())
     hidden = []
-    for instead, (own, shift) in places.items():
-        white = roots(covariance[own, own], RANK_TOLERANCE)[1]
+    for instead, (part, shift) in places.items():
+        white = roots(covariance[part, part], RANK_TOLERANCE)[1]
         white = white[white.any(1)]  # markers that moved together leave it singular
         away = white @ shift
         count, total = len(away), float(away @ away)
         if total < chi2_above(LEVEL, count):
             continue
         for joint, name in enumerate(robot.joint_names):
-            d = torch.linalg.lstsq(S[:, own], J[:, joint, None]).solution
+            d = torch.linalg.lstsq(S[:, part], J[:, joint, None]).solution
             evidence = Evidence((white @ d).T @ away, (white @ d).T @ white @ d)
             if float(evidence.H) <= 0.0:  # It moves the places only as they are known not to move.
                 continue
             size, deviation = float(evidence.size), float(evidence.H) ** -0.5
-            unseen = abs(size) * float((J[:, joint, None] - S[:, own] @ d).square().mean().sqrt())
+            unseen = abs(size) * float((J[:, joint, None] - S[:, part] @ d).square().mean().sqrt())
             left = total - float(evidence.gain)
             if unseen < gates.HIDDEN_SHARE * noise and left < chi2_above(LEVEL, max(count - 1, 1)):
                 hidden.append(Offset(name, robot.kinds[joint] != "prismatic", size, deviation, instead))

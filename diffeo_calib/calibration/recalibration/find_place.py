@@ -111,27 +111,27 @@ def find_place(
     priors = priors if marker_std is None else {"stated": marker_std}
     priors = {"same": 0.0} if free == "base" else priors
     starts = search.starts(max(priors.values()))
-    found = dict[str, NewRows]()
+    placed = dict[str, NewRows]()
     for name, metres in priors.items():
-        own = {"deviations": search.deviations(metres), "marker": name}
-        settled = [start.changed(**own).settled() for start in (starts if metres >= OTHER_MARKER else starts[:1])]
-        found[name] = max(settled, key=lambda each: each.given.log_evidence())
+        prior = {"deviations": search.deviations(metres), "marker": name}
+        settled = [start.changed(**prior).settled() for start in (starts if metres >= OTHER_MARKER else starts[:1])]
+        placed[name] = max(settled, key=lambda each: each.given.log_evidence())
     kept, outliers = torch.arange(len(some), device=some.q.device), list[int]()
     while True:
-        scale = max(1.0, float(scale_of([*found.values()][-1])[0]))  # large errors under the widest prior are none
+        scale = max(1.0, float(scale_of([*placed.values()][-1])[0]))  # large errors under the widest prior are none
         logs = {
-            name: own.given.log_evidence(scale) + UNMOVED_LOG_ODDS * (name == "same") for name, own in found.items()
+            name: rows.given.log_evidence(scale) + UNMOVED_LOG_ODDS * (name == "same") for name, rows in placed.items()
         }
-        odds = {name: exp(own - max(logs.values())) for name, own in logs.items()}
-        likely = {name: own for name, own in odds.items() if own > NEGLIGIBLE_PROBABILITY * sum(odds.values())}
-        odds = {name: own / sum(likely.values()) for name, own in likely.items()}
-        best = found[max(odds, key=odds.__getitem__)]
+        odds = {name: exp(value - max(logs.values())) for name, value in logs.items()}
+        likely = {name: share for name, share in odds.items() if share > NEGLIGIBLE_PROBABILITY * sum(odds.values())}
+        odds = {name: share / sum(likely.values()) for name, share in likely.items()}
+        best = placed[max(odds, key=odds.__getitem__)]
         worst = worst_rows(best)
         if not worst or len(outliers) + len(worst) > LARGEST_OUTLIER_PART * len(some):
             break
         outliers += kept[worst].tolist()
         stay = kept.new_tensor([row for row in range(len(kept)) if row not in worst])
-        kept, found = kept[stay], {name: rows.kept(stay).settled() for name, rows in found.items()}
+        kept, placed = kept[stay], {name: rows.kept(stay).settled() for name, rows in placed.items()}
     most = max(gates.LARGEST_PER_REACH * chain.reach, gates.REGISTERED_RESIDUAL * spread)
     _refuse_others(best.given.shown(best.given.residual).unflatten(1, (-1, 3)), most)
     if opens and (beside := opened(best, some.rows(kept))) is not best:
@@ -161,19 +161,19 @@ class Search:
         """The rows beside a model; arguments and errors as of :func:`find_place`."""
         before, fit = model.registration, model.unregistered
         markers = fitted_markers(fit) if before is None else before.markers
-        own, seen = Bodies(lever), data.bodies
-        known = own.kind == seen.kind and data.markers == len(markers)
-        if known:
-            data, seen = own.represented(data), own
+        bodies, shown = Bodies(lever), data.bodies
+        alike = bodies.kind == shown.kind and data.markers == len(markers)
+        if alike:
+            data, shown = bodies.represented(data), bodies
         elif free == "base":
             what, fix = 'free="base" keeps the markers', 'pass free="both" for other markers'
             got = kind_of_points(data.markers, data.lever)
             raise InputError.of(what, expected=kind_of_points(len(markers), lever), got=got, fix=fix)
-        old = markers if known else seen.nowhere(data.markers, data.points)
+        old = markers if alike else shown.nowhere(data.markers, data.points)
         numbers = torch.arange(6 + old.numel(), device=data.q.device)
         may = torch.where(numbers < 6, free != "marker", free != "base") & (numbers < len(numbers) - 3 * ball)
-        _check_enough(data, framed=free != "marker", known=known)
-        return cls(model.with_nominal(robot_map(fit).under(data.payload)), data, old, known, may)
+        _check_enough(data, framed=free != "marker", known=alike)
+        return cls(model.with_nominal(robot_map(fit).under(data.payload)), data, old, alike, may)
 
     @property
     def fit(self) -> FittedMap:
@@ -188,8 +188,8 @@ class Search:
 
     def deviations(self, metres: float) -> Tensor:
         """(6 + 3 P,) of frame and points before the rows, for a deviation of the markers from their old places, m."""
-        own = [PLACES.sought_base_m_rad] * 6 + [metres] * self.old.numel()
-        return self.free * self.old.new_tensor(own)
+        values = [PLACES.sought_base_m_rad] * 6 + [metres] * self.old.numel()
+        return self.free * self.old.new_tensor(values)
 
     def starts(self, widest: float) -> list[NewRows]:
         """The rows around each of the places where a search may begin, with the widest prior of the markers, m.
@@ -209,23 +209,23 @@ class Search:
         open_ = framed and bool(may.any()) and bool(shown.all()) and len(known(data.points)) > len(self.free)
         if not places or (open_ and widest >= OTHER_MARKER):
             places.append(self.anywhere())
-        found, by_fit = [], self._by_fit()
+        starts, by_fit = [], self._by_fit()
         for T, markers in places:
             rows = set_up.rows((T, markers), UsualNoise(block, factor), self.deviations(widest), same=self.same)
             away = torch.cat([self.old.new_zeros(6), (self.old - markers).flatten()])
-            found.append(rows.changed(away=away, known=self._earlier(rows.centre), by_fit=by_fit))
-        return found
+            starts.append(rows.changed(away=away, known=self._earlier(rows.centre), by_fit=by_fit))
+        return starts
 
     def _earlier(self, centre: Tensor) -> Tensor:
         """(6 + 3 P, 6 + 3 P) covariance of frame and points by an earlier registration; zero without one."""
-        before, found = self.model.registration, centre.new_zeros(len(self.free), len(self.free))
+        before, covariance = self.model.registration, centre.new_zeros(len(self.free), len(self.free))
         if before is None:
-            return found
-        size = len(found) if self.known else 6
-        to = torch.eye(size, dtype=found.dtype, device=found.device)
+            return covariance
+        size = len(covariance) if self.known else 6
+        to = torch.eye(size, dtype=covariance.dtype, device=covariance.device)
         to[:6, :6] = twist_at(centre - before.centre)
-        found[:size, :size] = to @ before.covariance[:size, :size] @ to.mT
-        return found
+        covariance[:size, :size] = to @ before.covariance[:size, :size] @ to.mT
+        return covariance
 
     def _by_fit(self) -> Tensor:
         """(3 P, 3 P) covariance of the points' old places by the fit where it hardly knew them; a part of C."""
@@ -248,16 +248,16 @@ class Search:
 
     def anywhere(self) -> tuple[Tensor, Tensor]:
         """Frame (4, 4) and points in closed form, m; what never moves stays."""
-        own, points = robot_map(self.fit).geometry, self.data.points
-        tips = list(dict.fromkeys(own.on)) if len(own.on) == points.shape[1] else [own.on[0]]
+        geometry, points = robot_map(self.fit).geometry, self.data.points
+        tips = list(dict.fromkeys(geometry.on)) if len(geometry.on) == points.shape[1] else [geometry.on[0]]
         corners = tool_points(tool_transform(None).to(points.device)).repeat(len(tips), 1)
         marks = FlangePoints(robot_map(self.fit), corners, on=tuple(tip for tip in tips for _ in range(3)))
-        seen = self.fit.geodesic.with_nominal(marks)(self.data.q)
-        poses = poses_from_marks(seen.view(-1, 3, 3), TOOL_LEVER)
-        carrying = [tips.index(tip) for tip in own.on] if len(tips) > 1 else [0] * points.shape[1]
-        found = place(poses.view(-1, len(tips), 4, 4)[:, carrying], points)
+        predicted = self.fit.geodesic.with_nominal(marks)(self.data.q)
+        poses = poses_from_marks(predicted.view(-1, 3, 3), TOOL_LEVER)
+        carrying = [tips.index(tip) for tip in geometry.on] if len(tips) > 1 else [0] * points.shape[1]
+        placement = place(poses.view(-1, len(tips), 4, 4)[:, carrying], points)
         shown = (~points.isnan()).any(2).any(0)
-        return found.base, torch.where(shown[:, None], found.tool, self.old)
+        return placement.base, torch.where(shown[:, None], placement.tool, self.old)
 
 
 def _check_enough(data: Measurements, *, framed: bool, known: bool) -> None:
@@ -327,14 +327,14 @@ def opened(rows: NewRows, data: Any) -> NewRows:
         return rows
     shown, chain, mine = rows.visible[..., None], rows.nominal.geometry.chain, rows.placement
     frame, markers = (rows.by_places * shown).tensor_split([6], 2)
-    found = changes_of_set_up(frame, markers, rows.at.joint_to_start * shown, chain) + mine.hypotheses(rows, CHANGE)
-    named = [own._replace(name=mine.bodies.get(own.name, own.name)) for own in found if bool(own.effects.any())]
-    told = SampledRows(torch.arange(len(rows), device=shown.device), rows.process, None)
-    found = changed(told, named, data.line_numbers, data.row_names)
-    causes = [one for one in found if one.what.split(" seems")[0] not in chain.joint_names]  # see find_changes.py
+    cases = changes_of_set_up(frame, markers, rows.at.joint_to_start * shown, chain) + mine.hypotheses(rows, CHANGE)
+    named = [case._replace(name=mine.bodies.get(case.name, case.name)) for case in cases if bool(case.effects.any())]
+    sampled = SampledRows(torch.arange(len(rows), device=shown.device), rows.process, None)
+    cases = changed(sampled, named, data.line_numbers, data.row_names)
+    causes = [cause for cause in cases if cause.what.split(" seems")[0] not in chain.joint_names]  # see find_changes.py
     if len(rows) >= gates.MIXED_ROWS:
-        causes += two_tools(told, markers, data.line_numbers)
-    best = best_of(causes, told)
+        causes += two_tools(sampled, markers, data.line_numbers)
+    best = best_of(causes, sampled)
     if best is None:
         return rows
     columns = rows.shared[..., :0] if best.columns is None else best.columns
@@ -384,34 +384,32 @@ UNLIKELY = 0.01
 
 
 def warn_about(
-    found: Registration | None, *, outliers: bool = True, excess: bool = True, marker: str = "", among: str = ""
+    record: Registration | None, *, outliers: bool = True, excess: bool = True, marker: str = "", among: str = ""
 ) -> None:
     """Warn of outliers, of exchanged markers, of directions that rows do not determine, and of errors that remain.
 
     Args:
-        found: the registration, if a device measured coordinates. marker: what is said of the markers.
+        record: the registration, if a device measured coordinates. marker: what is said of the markers.
         outliers: whether to name the rows that took no part. excess: whether to warn of errors that remain.
         among: what has changed among the rows, in a sentence.
     """
     if among:
         warn_user(among)
-    if found is None:
+    if record is None:
         return
-    if found.outliers and outliers:
-        what = f"{len(found.outliers)} row(s) contradict all others and took no part: row {few(found.outliers)}"
+    if record.outliers and outliers:
+        what = f"{len(record.outliers)} row(s) contradict all others and took no part: row {few(record.outliers)}"
         warn_user(sentence(what, fix="measure these poses again"))
-    if found.exchanged:
-        what = (
-            f"markers {few(found.exchanged)}, or axes of a measured frame, seem to be exchanged: each is where another "
-        )
-        what += "one was"
+    if record.exchanged:
+        what = f"markers {few(record.exchanged)}, or axes of a measured frame, seem to be exchanged: each is where "
+        what += "another one was"
         warn_user(sentence(what, fix="put their columns in the order of the fit, unless they were mounted so"))
-    for text in found.undetermined:
+    for text in record.undetermined:
         warn_user(f"{text}.")
-    if found.doubtful and excess:
-        what = f"after registration the errors are {found.excess:.1f} times as large as the model leads to expect"
+    if record.doubtful and excess:
+        what = f"after registration the errors are {record.excess:.1f} times as large as the model leads to expect"
         fix = "something else has changed, or the rows are wrong: measure more poses and calibrate again"
         warn_user(sentence(what, fix=fix))
-    if marker == "same" and found.same_place is not None and found.same_place < UNLIKELY and found.shift is not None:
-        what = f"the rows say that the markers have moved by {1e3 * float(found.shift.norm(dim=1).max()):.2g} mm"
+    if marker == "same" and record.same_place is not None and record.same_place < UNLIKELY and record.shift is not None:
+        what = f"the rows say that the markers have moved by {1e3 * float(record.shift.norm(dim=1).max()):.2g} mm"
         warn_user(sentence(f'{what}, although marker="same"', fix="leave this out, in commands --free base"))

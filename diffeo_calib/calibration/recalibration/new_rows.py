@@ -84,18 +84,18 @@ class NewSetUp:
     @property
     def transform(self) -> Tensor:
         """(4, 4) from the frame of the map to that of the new rows, m."""
-        found = self.registration
-        return torch.eye(4, dtype=self.data.q.dtype, device=HOST) if found is None else found.transform
+        record = self.registration
+        return torch.eye(4, dtype=self.data.q.dtype, device=HOST) if record is None else record.transform
 
     @property
     def seen_before(self) -> Tensor:
         """(P,) boolean: the markers that new rows show and that old rows showed."""
-        seen = torch.zeros(self.nominal.geometry.markers, dtype=torch.bool, device=HOST)
+        shown = torch.zeros(self.nominal.geometry.markers, dtype=torch.bool, device=HOST)
         if self.coordinates is not None:
-            seen |= ~self.coordinates.table.points.isnan().any(2).all(0)
-        seen[-1] |= self.ball is not None
-        seen[-1] &= not self.new_ball
-        return seen
+            shown |= ~self.coordinates.table.points.isnan().any(2).all(0)
+        shown[-1] |= self.ball is not None
+        shown[-1] &= not self.new_ball
+        return shown
 
     def rows(
         self,
@@ -142,39 +142,39 @@ class NewSetUp:
         return rows.changed(shared=placement.shared(rows))
 
     def _measured(
-        self, T: Tensor, seen: Tensor, usual: UsualNoise
+        self, T: Tensor, predicted: Tensor, usual: UsualNoise
     ) -> tuple[Tensor, Stacked | None, NoiseModel, Tensor, Placement]:
         """Numbers, what these are of the points (M, 3 P), m, how they were measured, their noise, and the devices."""
-        told, of_told, sets = None, seen[:0, :, None], list[DeviceSet]()
+        numbers, noise, sets = None, predicted[:0, :, None], list[DeviceSet]()
         if self.coordinates is not None:
-            told, of_told, sets = self._coordinates(self.coordinates, T, seen, usual)
+            numbers, noise, sets = self._coordinates(self.coordinates, T, predicted, usual)
         sets += self.sessions
-        points = seen.unflatten(1, (-1, 3))
-        devices = [fitting_devices(table, points[own]) for table, own in self.readings]
+        points = predicted.unflatten(1, (-1, 3))
+        devices = [fitting_devices(table, points[part]) for table, part in self.readings]
         readings = reading_sets(self.readings, devices)
-        if told is not None and len(told.rows) == len(seen):
-            return told.y, None, told.noise_model, of_told, Placement(sets)
-        (y, sensor, observe), old = stacked(self.data.q, told, readings, seen.shape[1]), self.fitted.noise
+        if numbers is not None and len(numbers.rows) == len(predicted):
+            return numbers.y, None, numbers.noise_model, noise, Placement(sets)
+        (y, sensor, observe), old = stacked(self.data.q, numbers, readings, predicted.shape[1]), self.fitted.noise
         variance = old.covariance.diagonal(dim1=1, dim2=2)[old.visible].median()  # of what was measured, m^2
         total = torch.diag_embed(variance.expand_as(y))
-        if told is not None:
-            own, size = total[told.rows], of_told.shape[1]
-            own[:, :size, :size] = of_told
-            total[told.rows] = own
+        if numbers is not None:
+            part, size = total[numbers.rows], noise.shape[1]
+            part[:, :size, :size] = noise
+            total[numbers.rows] = part
         if sensor.stated:
             total = larger(total, sensor.known)
         sensor = sensor.without_known
         return y, observe, sensor, without_hidden(total, sensor.visible), Placement((*sets, *readings))
 
     def _coordinates(
-        self, own: Coordinates, T: Tensor, seen: Tensor, usual: UsualNoise
+        self, coordinates: Coordinates, T: Tensor, predicted: Tensor, usual: UsualNoise
     ) -> tuple[Told, Tensor, list[DeviceSet]]:
         """Rows that tell coordinates, in the model's frame; their noise, and errors of cameras."""
-        new, rows = own
+        new, rows = coordinates
         table = new.in_frames(torch.linalg.inv(T).expand(len(new), -1, -1))
         noise = noise_of_rows(self.fitted, new, table, T, usual)
         y, sensor = table.points.flatten(1), NoiseModel.of(table, 0.0).without_known
-        y, noise = torch.where(y.isnan(), seen[rows], y), without_hidden(noise, sensor.visible)
+        y, noise = torch.where(y.isnan(), predicted[rows], y), without_hidden(noise, sensor.visible)
         return Told(rows, y, sensor), noise, [*CameraErrors.around(table, rows)]
 
 
@@ -315,9 +315,9 @@ class NewRows:
     @property
     def mean_noise(self) -> Tensor:
         """(R, R) mean covariance of the rows, m^2: that of the fit for points that no row shows."""
-        found, unseen = mean_block(self.noise, self.visible), ~self.visible.any(0)
+        mean, unseen = mean_block(self.noise, self.visible), ~self.visible.any(0)
         both = unseen[:, None] & unseen
-        return torch.where(both, self.fitted.new_noise, found) if bool(unseen.any()) else found
+        return torch.where(both, self.fitted.new_noise, mean) if bool(unseen.any()) else mean
 
     @property
     def new_noise(self) -> Tensor:
@@ -328,8 +328,8 @@ class NewRows:
         old = self.fitted.new_noise
         if not self.of_coordinates:
             return old
-        found = self.mean_noise * region_factor(self.tails.freedom, int(self.noise_model.freedom.max()))
-        return found if not self.marks.same or float(found.trace()) > float(old.trace()) else old
+        block = self.mean_noise * region_factor(self.tails.freedom, int(self.noise_model.freedom.max()))
+        return block if not self.marks.same or float(block.trace()) > float(old.trace()) else old
 
     @cached_property
     def inflation(self) -> float:
@@ -364,7 +364,7 @@ class NewRows:
 
     def by_kind(self, errors: Tensor) -> Evaluations:
         """Errors (M, R) of the numbers of all rows, m, NaN where nothing was measured, in the unit of each kind."""
-        readings = [own for own in self.placement if isinstance(own, ReadingDevices)]
+        readings = [devices for devices in self.placement if isinstance(devices, ReadingDevices)]
         return errors_of_kinds(errors, self.set_up.coordinates, readings)
 
     # --- the same rows otherwise ---
@@ -381,10 +381,10 @@ class NewRows:
         """Some of the rows (k,), with their weights."""
         if len(index) == len(self):
             return self
-        own: dict[str, Any] = {name: getattr(self, name)[index] for name in ("q", "y", "noise", "shared")}
-        own |= {name: getattr(self, name).rows(index) for name in ("marks", "noise_model", "tails")}
-        own["drifts"] = self.drifts.unflatten(0, self.y.shape)[index].flatten(0, 1)
-        other = replace(self, **own, observe=None if self.observe is None else self.observe.rows(index))
+        fields: dict[str, Any] = {name: getattr(self, name)[index] for name in ("q", "y", "noise", "shared")}
+        fields |= {name: getattr(self, name).rows(index) for name in ("marks", "noise_model", "tails")}
+        fields["drifts"] = self.drifts.unflatten(0, self.y.shape)[index].flatten(0, 1)
+        other = replace(self, **fields, observe=None if self.observe is None else self.observe.rows(index))
         vars(other).update(seen=(self.points[index], self.seen[1].rows(index)), by_places=self.by_places[index])
         return other
 
@@ -446,16 +446,16 @@ def noise_of_rows(fitted: FittedMap, new: Measurements, there: Measurements, T: 
         T: (4, 4) from the frame of the model to theirs, m. usual: noise of a row.
     """
     bodies, total = new.bodies, usual.block.expand(len(new), -1, -1)
-    known = usual.factor > 0.0 and fitted.slopes is None and bool(fitted.noise.visible.all())
-    own, old = bodies.modes(there), bodies.modes_of(there, fitted.measured().unflatten(1, (-1, 3))) if known else None
-    if own is not None and old is not None:
+    alike = usual.factor > 0.0 and fitted.slopes is None and bool(fitted.noise.visible.all())
+    now, old = bodies.modes(there), bodies.modes_of(there, fitted.measured().unflatten(1, (-1, 3))) if alike else None
+    if now is not None and old is not None:
         blocks = own_blocks(fitted.noise.covariance, old.shape[1])  # (N, T, 9, 9)
         to_modes = torch.linalg.pinv(old)
         sizes = (to_modes @ blocks @ to_modes.mT).diagonal(dim1=2, dim2=3).median(0).values  # (T, 6)
         eye = torch.eye(old.shape[2], dtype=old.dtype, device=old.device)
         apart = eye - old @ to_modes
         slack = (apart @ blocks).diagonal(dim1=2, dim2=3).sum(2) / (old.shape[2] - old.shape[3])
-        each = (own * sizes[:, None]) @ own.mT + slack.median(0).values[:, None, None] * eye
+        each = (now * sizes[:, None]) @ now.mT + slack.median(0).values[:, None, None] * eye
         total = usual.factor * block_diagonal(each)
     return total if new.covariance is None else larger(total, turned(new.covariance, T[:3, :3].mT))
 

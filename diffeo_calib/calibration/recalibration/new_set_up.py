@@ -64,7 +64,7 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
     """
     new = new.to(HOST)
     check_shown(new)
-    own, readings = divided(new)
+    coordinates, readings = divided(new)
     check_same_robot(model, new)
     rare = [name for table, _ in rows_of_one_kind(new) for name in sensor_of(table).rare(table)]
     if rare:
@@ -74,29 +74,29 @@ def place_again(model: CalibratedKinematics, new: Any, marker: Marker = "evidenc
     other = "measure the same kind again, calibrate again with all rows, or register the model (`model.registered`)"
     if model.registration is not None:  # at other markers than those of the calibration
         other = "measure the markers of the calibration itself, or calibrate again with all rows"
-    check_markers(model, own, readings, other)
+    check_markers(model, coordinates, readings, other)
     old = model.map.unregistered.to(HOST)
     nominal = robot_map(old)
     geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])  # without deformation
     tip = ball_tip(readings, nominal.geometry.on[-1])
-    found = ball_of([one.table for one in readings], geometry, tip)
-    ball = None if found is None else found.tool[0]
+    place = ball_of([reading.table for reading in readings], geometry, tip)
+    ball = None if place is None else place.tool[0]
     new_ball = ball is not None and not knows_ball(model)
     if ball is not None and new_ball:
         old = with_ball(old, ball, tip, PLACES.found_m_rad)
         nominal = robot_map(old)
-    set_up = NewSetUp(old, new, own, readings, ball=ball, new_ball=new_ball)
-    if own is None:
+    set_up = NewSetUp(old, new, coordinates, readings, ball=ball, new_ball=new_ball)
+    if coordinates is None:
         return set_up
-    table = with_markers(own.table, nominal.geometry.markers, model.lever)
-    own = own._replace(table=mounted_of(model).in_any_frame(table))
+    table = with_markers(coordinates.table, nominal.geometry.markers, model.lever)
+    coordinates = coordinates._replace(table=mounted_of(model).in_any_frame(table))
     # the rows judge "same", too
     stated = MARKER_DEVIATIONS[marker][0] if marker in ("moved", "other") else None
-    rows, found, seen = _place_of_device(old, model.lever, own.table, stated, opens=opens)
+    rows, place, points = _place_of_device(old, model.lever, coordinates.table, stated, opens=opens)
     geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])
-    geometry = replace(geometry, base=found.transform @ geometry.base)
-    sessions, own = Sessions.beside(own, geometry, seen)
-    return replace(set_up, coordinates=own, sessions=sessions, registration=found, registered=rows)
+    geometry = replace(geometry, base=place.transform @ geometry.base)
+    sessions, coordinates = Sessions.beside(coordinates, geometry, points)
+    return replace(set_up, coordinates=coordinates, sessions=sessions, registration=place, registered=rows)
 
 
 def weighed(set_up: NewSetUp, marker: str, *, opens: bool = False) -> NewRows:
@@ -108,27 +108,27 @@ def weighed(set_up: NewSetUp, marker: str, *, opens: bool = False) -> NewRows:
         set_up: the rows, and where devices and markers are. marker: see :func:`diffeo_calib.recalibrate`.
         opens: whether something may have changed among the rows.
     """
-    fitted, found, ball = set_up.fitted, set_up.registration, None if set_up.new_ball else set_up.ball
-    own = fitted_markers(fitted)
-    other, known = own.clone(), slice(len(own) - set_up.new_ball)
-    if found is not None:
-        other[known] = found.markers[known]
+    fitted, record, ball = set_up.fitted, set_up.registration, None if set_up.new_ball else set_up.ball
+    old = fitted_markers(fitted)
+    other, earlier = old.clone(), slice(len(old) - set_up.new_ball)
+    if record is not None:
+        other[earlier] = record.markers[earlier]
     elif ball is not None:
         other[-1] = ball
     names = [*MARKER_DEVIATIONS] if set_up.registered is None else [set_up.registered.marker]
     names = names if marker == "evidence" else [marker]
-    names = ["same"] if found is None and ball is None else names
+    names = ["same"] if record is None and ball is None else names
     usual = UsualNoise(typical_noise(fitted.noise) if fitted.slopes is None else fitted.new_noise, 1.0)
-    frame, seen = [PLACES.found_m_rad * (found is not None)] * 6, set_up.seen_before.repeat_interleave(3)
+    frame, shown = [PLACES.found_m_rad * (record is not None)] * 6, set_up.seen_before.repeat_interleave(3)
     likely = []
     for name in names:
-        markers = other if name == "other" else own
-        deviations = torch.cat([own.new_tensor(frame), MARKER_DEVIATIONS[name][1] * seen.to(own)])
+        markers = other if name == "other" else old
+        deviations = torch.cat([old.new_tensor(frame), MARKER_DEVIATIONS[name][1] * shown.to(old)])
         rows = set_up.rows((set_up.transform, markers), usual, deviations, marker=name)
         rows = _levelled(rows).with_weights()
         beside = opened(rows, set_up.data) if opens else rows
         likely.append(rows if beside is rows else beside.with_weights())
-    return max(likely, key=lambda one: one.given.log_evidence() + UNMOVED_LOG_ODDS * (one.marker == "same"))
+    return max(likely, key=lambda each: each.given.log_evidence() + UNMOVED_LOG_ODDS * (each.marker == "same"))
 
 
 def typical_noise(noise: Noise) -> Tensor:
@@ -139,8 +139,8 @@ def typical_noise(noise: Noise) -> Tensor:
     whole = noise.visible.all(1)
     if bool(whole.any()):
         return _of_median_size(noise.covariance[whole])
-    own, seen = own_blocks(noise.covariance, noise.visible.shape[1] // 3), noise.visible[:, ::3]
-    return torch.block_diag(*[_of_median_size(own[seen[:, k], k]) for k in range(seen.shape[1])])
+    blocks, visible = own_blocks(noise.covariance, noise.visible.shape[1] // 3), noise.visible[:, ::3]
+    return torch.block_diag(*[_of_median_size(blocks[visible[:, k], k]) for k in range(visible.shape[1])])
 
 
 def _of_median_size(blocks: Tensor) -> Tensor:
@@ -161,10 +161,10 @@ def _levelled(rows: NewRows) -> NewRows:
     drifting = rows.drifting([part.root(rows.at) for part in parts_of(rows.fitted)])  # no noise
     kinds, noise = rows.noise_model.kinds, rows.noise
     for kind in range(int(rows.fitted.shows_points), int(kinds.max()) + 1):
-        own = (kinds == kind).repeat_interleave(rows.y.shape[1] // kinds.shape[1], 1) & rows.visible
+        mask = (kinds == kind).repeat_interleave(rows.y.shape[1] // kinds.shape[1], 1) & rows.visible
         levels = []
         for factor in NOISE_LEVELS.tolist():
-            root = torch.where(own, factor**0.5, 1.0)
+            root = torch.where(mask, factor**0.5, 1.0)
             level = drifting.changed(noise=root[:, :, None] * noise * root[:, None, :])
             levels.append((level.given.log_evidence() - 0.5 * (log(factor) / NOISE_EFOLDS) ** 2, level.noise))
         noise = max(levels, key=itemgetter(0))[1]
@@ -190,12 +190,12 @@ def _place_of_device(
         what, expected = "do not have the robot's size", "distances between rows as the model predicts them"
         fix, got = "check `length` and `angle`, and the order of the columns", f"{ratio:.3g} times these"
         raise MeasurementError.of(f"the new rows {what}", expected=expected, got=got, fix=fix)
-    rows, found = find_place(old, lever, largest, marker_std=marker_std, opens=opens)
+    rows, record = find_place(old, lever, largest, marker_std=marker_std, opens=opens)
     ratio = size_ratio(*(each.unflatten(1, (-1, 3)) for each in (rows.points, rows.given.shown(rows.y))))
     if abs(ratio - 1.0) > USUAL_RATIO:
         what = f"distances between the new rows are {ratio:.4f} times those that the model predicts"
         warn_user(sentence(what, fix="check the scale of the measuring device"))
-    turn, T = float(found.frame_deviations[3:].max()), found.transform
+    turn, T = float(record.frame_deviations[3:].max()), record.transform
     if turn > LARGEST_TURN_RAD:
         raise MeasurementError.of(
             "the new rows do not tell where the measuring device stands",
@@ -203,7 +203,7 @@ def _place_of_device(
             got=f"its turn is known to {degrees(turn):.2g} degrees only",
             fix="measure poses in which several joints move",
         )
-    return rows, found, predicted(device) @ T[:3, :3].mT + T[:3, 3]
+    return rows, record, predicted(device) @ T[:3, :3].mT + T[:3, 3]
 
 
 def with_ball(fitted: FittedMap, ball: Tensor, tip: str, deviation: float) -> FittedMap:
@@ -262,8 +262,8 @@ def check_arguments(model: object, new: object, marker: object) -> None:
 
 def check_other_table(model: CalibratedKinematics, new: Any) -> None:
     """Raise InputError for rows of the model's own fit, or that it learnt from: they would count twice."""
-    known = [each.table_sha256 for each in (model.provenance, model.registration) if each is not None]
-    if new.sha256 in " ".join(known).split():
+    hashes = [each.table_sha256 for each in (model.provenance, model.registration) if each is not None]
+    if new.sha256 in " ".join(hashes).split():
         used = int(rows_used_in_fit(model, new.q).sum())
         if used:
             what = f"the model was fitted to {used} of these {len(new)} measurements: they would count twice"
@@ -275,8 +275,8 @@ def size_ratio(predicted: Tensor, measured: Tensor) -> float:
 
     The middle of the markers that a row shows stands for the row.
     """
-    expected, found = (
+    expected, actual = (
         torch.pdist(points.masked_fill(measured.isnan(), nan).nanmean(1)) for points in (predicted, measured)
     )
     far = expected >= expected.quantile(FARTHEST_PAIRS) if len(expected) else expected.bool()
-    return float((found[far] / expected[far]).median()) if bool((expected[far] > 0).all()) and len(expected) else 1.0
+    return float((actual[far] / expected[far]).median()) if bool((expected[far] > 0).all()) and len(expected) else 1.0

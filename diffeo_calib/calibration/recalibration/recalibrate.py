@@ -208,15 +208,15 @@ def _result(
     model: CalibratedKinematics, place: NewSetUp, rows: NewRows, changes: Changes, *, fitted: Fit, note: str
 ) -> Recalibration:
     """The model in the new frame, and everything that was found."""
-    found, new = place.registration, place.data
+    record, new = place.registration, place.data
     fitted_map = fitted.model
-    if found is not None:
-        fitted_map = moved(fitted_map, found.transform)
+    if record is not None:
+        fitted_map = moved(fitted_map, record.transform)
     elif place.fitted.stands_free:  # still no device says where the robot stands
         fitted_map = fitted_map.without_rigid_motions()
-    own, shared = place.coordinates, fitted.problem.noise.shared[-len(rows) :]
+    marked, shared = place.coordinates, fitted.problem.noise.shared[-len(rows) :]
     # a ball that a device measured is none in an unknown place any more
-    measured = place.ball is None and own is not None and not bool(own.table.points[:, -1].isnan().all())
+    measured = place.ball is None and marked is not None and not bool(marked.table.points[:, -1].isnan().all())
     ball = place.new_ball or (knows_ball(model) and not measured)
     made = Provenance.now(new, note)
     again = model.changed(map=fitted_map, provenance=made, placement=(), learnt=None, ball=ball)
@@ -229,17 +229,17 @@ def _result(
     left = rows.given.shown(left)
     before, after, left_out = map(rows.by_kind, (rows.placed_residual, left, rows.given.left_out))
     if model.summary is not None:
-        known = {"diffeomorphic_rms": after.positions_rms, "leave_one_out_rms": left_out.positions_rms}
+        errors = {"diffeomorphic_rms": after.positions_rms, "leave_one_out_rms": left_out.positions_rms}
         certificates = {name: getattr(fitted, name) for name in CERTIFICATES}
         explained = {part.name: part.displacement for part in parts(again)}
         count = len(again.configurations)
         again.summary = replace(
-            model.summary, **known, **certificates, outliers=int(small.sum()), rows=count, parts=explained
+            model.summary, **errors, **certificates, outliers=int(small.sum()), rows=count, parts=explained
         )
     away = again.geometry.tool - fitted_markers(place.fitted)
     return Recalibration(
         model=again,
-        moved=found,
+        moved=record,
         placement=rows.placement,
         marker=rows.marker,
         changes=changes,
@@ -250,7 +250,7 @@ def _result(
         left_out=left_out,
         inflation=rows.inflation,
         fit=fitted,
-        shift=None if found is None else away * place.seen_before[:, None],
+        shift=None if record is None else away * place.seen_before[:, None],
         hidden=hidden_offsets(model.robot, place, changes),
     )
 
@@ -294,7 +294,7 @@ class Comparison:
     @property
     def telling(self) -> bool:
         """Whether the old model is certain enough at these rows: what it does not know there hides changes."""
-        return any(one.rms < UNKNOWN_PER_USUAL * self.usual[kind].rms for kind, one in self.expectations.items())
+        return any(errors.rms < UNKNOWN_PER_USUAL * self.usual[kind].rms for kind, errors in self.expectations.items())
 
     def __str__(self) -> str:
         if self.telling or self.changes.found:
@@ -382,8 +382,8 @@ def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) ->
         fix = "pass the model as it was before its registration: places are found anew"
         raise InputError.of("the first model", expected="the markers of its fit", got=got, fix=fix)
     fits = _inputs(model.robot, other.robot, other.configurations), model.configurations
-    low = torch.maximum(*(own.amin(0) for own in fits))
-    high = torch.minimum(*(own.amax(0) for own in fits))
+    low = torch.maximum(*(inputs.amin(0) for inputs in fits))
+    high = torch.minimum(*(inputs.amax(0) for inputs in fits))
     q = torch.cat(fits)
     q = q[((q >= low) & (q <= high)).all(1)]
     if len(q) < FEWEST_ROWS:
@@ -393,12 +393,12 @@ def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) ->
     q = q[:: -(-len(q) // MOST_PREDICTED)]
     there = _inputs(other.robot, model.robot, q)
 
-    def measured(own: CalibratedKinematics, q: Tensor, points: Tensor) -> Measurements:
-        return Measurements.of_points(q, points.detach(), None, model.lever).with_load(own.nominal.load)
+    def measured(source: CalibratedKinematics, q: Tensor, points: Tensor) -> Measurements:
+        return Measurements.of_points(q, points.detach(), None, model.lever).with_load(source.nominal.load)
 
     fitted = other.map.unregistered
-    found = find_place(fitted, other.lever, measured(other, there, model(q)), marker_std=OTHER_MARKER)[1]
-    placed = RegisteredMap(moved(fitted, found.transform), found)
+    record = find_place(fitted, other.lever, measured(other, there, model(q)), marker_std=OTHER_MARKER)[1]
+    placed = RegisteredMap(moved(fitted, record.transform), record)
     new = measured(model, q, placed(there).unflatten(1, (-1, 3)))
     rows = weighed(place_again(model, new, "other", opens=False), "other")
     errors, _ = roots(placed.conditional.covariance_between(placed.geodesic.linearise(there)))

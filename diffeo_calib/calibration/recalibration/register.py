@@ -70,21 +70,21 @@ def registered(
     rows = with_points(mounted_of(model).in_any_frame(rows).largest_session(), model)
     here = model.to(HOST)._carrying(model.nominal.load.under(rows.payload).typical)
     ball = model.ball and bool(rows.points[:, -1].isnan().all())
-    placed, found = _placed(here, rows, free=free, marker_std=marker_std, ball=ball, learn=learn, opens=True)
+    placed, record = _placed(here, rows, free=free, marker_std=marker_std, ball=ball, learn=learn, opens=True)
     learns, before = placed.registration is None, getattr(model.registration, "table_sha256", "")
-    found = replace(found, table_sha256=" ".join([before, new.sha256][: 1 + learns]).strip())
-    vars(placed).update({} if learns else {"registration": found})
-    known = {"map": placed.to(model.configurations.device), "lever": found.lever, "placement": (), "ball": ball}
-    seen = model.changed(**known, learnt=found if learns else None)._carrying(model.nominal.load)
-    same = found.same and ball == model.ball
-    lost = [own for own in model.placement if own.reads and not same]
+    record = replace(record, table_sha256=" ".join([before, new.sha256][: 1 + learns]).strip())
+    vars(placed).update({} if learns else {"registration": record})
+    changes = {"map": placed.to(model.configurations.device), "lever": record.lever, "placement": (), "ball": ball}
+    result = model.changed(**changes, learnt=record if learns else None)._carrying(model.nominal.load)
+    same = record.same and ball == model.ball
+    lost = [devices for devices in model.placement if devices.reads and not same]
     if lost:
-        names = few([f"'{name}'" for own in lost for name in own.names])
+        names = few([f"'{name}'" for devices in lost for name in devices.names])
         what = f"the model no longer knows the devices {names}: these rows show other markers than what they read"
         warn_user(sentence(what, fix="pass rows of the fit's markers, or rows of these devices, to keep them"))
-    kept = model.changed(placement=tuple(own for own in model.placement if own not in lost))
-    seen = seen.changed(placement=carried_devices(kept, seen, found.transform))
-    return seen.changed(placement=devices_beside(seen, new))
+    kept = model.changed(placement=tuple(devices for devices in model.placement if devices not in lost))
+    result = result.changed(placement=carried_devices(kept, result, record.transform))
+    return result.changed(placement=devices_beside(result, new))
 
 
 @small_work()
@@ -154,8 +154,8 @@ def both_dates(new: NewRows, factor: float, drifts: Sequence[ChangedPart] = ()) 
     problem = problem.with_nominal_of_rows(_sessions(geometry.tool, new, newest))
     if old.data is not None or problem.y.numel() > MAX_DENSE:
         problem = problem.with_controls(torch.cat([x, new.q]))
-    one = torch.eye(x.shape[1], dtype=x.dtype, device=x.device)[None]
-    grew = [kernel.own_blocks(x[:1], one).diagonal(dim1=1, dim2=2) for kernel in (spec.joint_kernel, joint_kernel)]
+    eye = torch.eye(x.shape[1], dtype=x.dtype, device=x.device)[None]
+    grew = [kernel.own_blocks(x[:1], eye).diagonal(dim1=1, dim2=2) for kernel in (spec.joint_kernel, joint_kernel)]
     b = b * (grew[0] / grew[1]).nan_to_num(1.0)  # fields start as they were
     b, p = pad(b, (0, 0, 0, count)) / factor, pad(p, (0, 0, 0, count * geometry.markers)) / factor
     return problem, Momenta(b, p, theta)
@@ -170,15 +170,15 @@ def _together(new: NewRows) -> tuple[Tensor, Tensor, Observation | None]:
     if new.of_coordinates:
         return torch.cat([old.measured(), new.y]), torch.cat([old.noise.covariance, own_noise]), None
     A, y = old.linearised_rows()
-    (N, r, m), (M, own) = A.shape, new.y.shape
-    size, rows = max(r, own), torch.arange(N + M, device=y.device)
+    (N, r, m), (M, count) = A.shape, new.y.shape
+    size, rows = max(r, count), torch.arange(N + M, device=y.device)
     parts = [Part(rows[:N], torch.arange(m, device=y.device), torch.arange(r, device=y.device), LinearFunctionals(A))]
-    theirs = (Part.of_coordinates(rows[:M], own),) if new.observe is None else new.observe.parts
+    theirs = (Part.of_coordinates(rows[:M], count),) if new.observe is None else new.observe.parts
     parts += [replace(part, rows=part.rows + N) for part in theirs]
     noise = [pad(each, 2 * (0, size - each.shape[1])) for each in (old.noise.covariance, own_noise)]
-    seen = torch.cat([pad(each, (0, size - each.shape[1])) for each in (old.noise.visible, new.visible)])
+    visible = torch.cat([pad(each, (0, size - each.shape[1])) for each in (old.noise.visible, new.visible)])
     numbers = torch.cat([pad(values, (0, size - values.shape[1])) for values in (y, new.y)])
-    return numbers, without_hidden(torch.cat(noise), seen), Stacked(N + M, size, m, parts)
+    return numbers, without_hidden(torch.cat(noise), visible), Stacked(N + M, size, m, parts)
 
 
 def _shared(new: NewRows, drifts: Sequence[ChangedPart]) -> Tensor:
@@ -214,28 +214,28 @@ def devices_beside(model: Any, data: Any, fitted: Sequence[Extrinsics] = ()) -> 
         model, data: the model and the rows.
         fitted: devices with their rows, if the model was fitted to these: set-ups are where the fit has them.
     """
-    found = list(model.placement)
+    devices = list(model.placement)
     for part, _ in rows_of_one_kind(data):
         sensor_of(part).check(part, model)
         points = model.at_payloads(part.payload).map(part.q).detach().unflatten(1, (-1, 3))
         for placed in sensor_of(part).settled(part, points, model.turns):
-            own = _with_rows(placed, fitted)
-            alike = [number for number, old in enumerate(found) if own.same_set(old)]
-            same = alike[0] if alike else len(found)
-            alone = [] if own.set_up and len(own.names) == 1 else [own]
-            found[same : same + 1] = [own.beside(old) for old in found[same : same + 1]] or alone
-    return tuple(found)
+            new = _with_rows(placed, fitted)
+            alike = [number for number, old in enumerate(devices) if new.same_set(old)]
+            same = alike[0] if alike else len(devices)
+            alone = [] if new.set_up and len(new.names) == 1 else [new]
+            devices[same : same + 1] = [new.beside(old) for old in devices[same : same + 1]] or alone
+    return tuple(devices)
 
 
-def _with_rows(own: Extrinsics, fitted: Sequence[Extrinsics]) -> Extrinsics:
+def _with_rows(devices: Extrinsics, fitted: Sequence[Extrinsics]) -> Extrinsics:
     """Devices with their rows of a fit, if any set of it has them; set-ups are where the fit has them."""
-    for one in fitted:
-        if one.same_set(own) and own.set_up:
-            return one
-        if one.same_set(own):
-            number = torch.tensor([own.names.index(name) for name in one.names], dtype=torch.int64, device=HOST)
-            return replace(own, rows=one.rows, device=number[one.device])
-    return own
+    for other in fitted:
+        if other.same_set(devices) and devices.set_up:
+            return other
+        if other.same_set(devices):
+            number = torch.tensor([devices.names.index(name) for name in other.names], dtype=torch.int64, device=HOST)
+            return replace(devices, rows=other.rows, device=number[other.device])
+    return devices
 
 
 def carried_devices(old: Any, new: Any, T: Tensor) -> tuple[Extrinsics, ...]:
@@ -255,7 +255,7 @@ def carried_devices(old: Any, new: Any, T: Tensor) -> tuple[Extrinsics, ...]:
     away = (before @ T[:3, :3].mT + T[:3, 3])[:, :P] - after[:, :P]
     markers = (turns[:, :P].mT @ away[..., None])[..., 0].mean(0)
     return tuple(
-        replace(own, constants=own.carried(T, before, after, markers))
-        for own in old.placement
-        if own.kind != KnownDrift.kind
+        replace(devices, constants=devices.carried(T, before, after, markers))
+        for devices in old.placement
+        if devices.kind != KnownDrift.kind
     )
