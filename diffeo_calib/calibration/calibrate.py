@@ -26,8 +26,8 @@ from diffeo_calib.calibration.choose_scales import (
     robot_problem,
 )
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.hypotheses import worth_it
-from diffeo_calib.calibration.diagnostics.judge import Finding, judge, lengths, warn_of_lengths, warn_of_taken_scales
+from diffeo_calib.calibration.diagnostics.hypotheses import lengths, warn_of_lengths, worth_it
+from diffeo_calib.calibration.diagnostics.judge import Finding, judge, warn_of_taken_scales
 from diffeo_calib.calibration.diagnostics.judged_rows import warn_of_contradictions
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_single_joints, warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.outliers import (
@@ -252,12 +252,8 @@ def _result(
         warnings="\n".join(warned) or None,
     )
     return CalibrationResult(
-        model=CalibratedKinematics(
-            robot,
-            fitted_map,
-            summary,
-            lever=placed.lever,
-            ball=placed.ball,
+        model=model.changed(
+            summary=summary,
             placement=placed.placement.placed(),
             rigid_errors=placed.identification.geometry.joint_errors,
             provenance=Provenance.now(placed.data, note),

@@ -10,10 +10,6 @@ Scales that were selected with a change in the rows call it noise; noise that ha
 after it is still no chance, since each row adds about one to the gain. Gains of changes pay for their unknowns and
 their row by the Bayesian information criterion. Codes of a mixture explain some noise too: what they explain by chance
 is measured with the effects of other rows.
-
-Errors of links and a wrong scale of the device look alike: the fit takes up either without a trace in its residuals.
-What tells them apart is how improbable links are that are wrong by so much: a length of the robot, its links or the
-device is a hypothesis beside the errors of a robot with usual errors of its links.
 """
 
 from __future__ import annotations
@@ -21,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from math import hypot, inf, log
+from math import log
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -34,20 +30,17 @@ from diffeo_calib.calibration.diagnostics.hypotheses import (
     SampledRows,
     changes_of,
     left_out_rms,
-    lengths_of,
-    links_of,
     worth_it,
 )
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, variance_ratio
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.errors import few, sentence, warn_user, with_deviation
-from diffeo_calib.common.quantiles import chi2_above
+from diffeo_calib.common.errors import few, sentence, warn_user
 from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.scales import PAYLOAD_FACTORS, Hyperparameters
 from diffeo_calib.regression.conditional import Process
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.sensors.devices import MILLIMETRE, Hypothesis
+from diffeo_calib.sensors.devices import Hypothesis
 
 ROUNDS = 20
 """Of the codes of a mixture."""
@@ -415,101 +408,3 @@ def warn_of_taken_scales(taken: LeaveOneOut, own: LeaveOneOut) -> None:
         left = float((own.errors.square().nansum() / taken.errors.square().nansum()).sqrt())
         got = f"leave-one-out errors that fall to {100 * left:.0f} % with scales of their own"
         warn_user(sentence("`scales_of` does not suit these rows", got=got, fix="leave it out (--scales-of)"))
-
-
-# --- lengths against what they are said to be -------------------------------------------------------------------------
-
-
-LEAST_OWN = 1e-6
-"""Part of what rows say of a length that must be left beside links of any size, else they tell nothing of it."""
-
-
-class Length(NamedTuple):
-    """A length against what it is said to be.
-
-    Args:
-        cause: what. value, deviation: how much it differs, in m or relative. motion: RMS motion of a point by a unit of
-            it, m. unnoticed: largest value that a usual robot shows by chance, and that passes without a warning.
-        taken_up: whether it is surely the robot's, and so part of the fit.
-    """
-
-    cause: Hypothesis
-    value: float
-    deviation: float
-    motion: float
-    unnoticed: float
-    taken_up: bool
-
-    @property
-    def gain(self) -> float:
-        """What it explains, in log evidence."""
-        return 0.5 * (self.value / self.deviation) ** 2
-
-    def __str__(self) -> str:
-        unit, size = self.cause.unit or MILLIMETRE
-        found = with_deviation(self.value / size, self.deviation / size)
-        return (
-            f"{self.cause.name} against its description: {found} {unit}, which moves points by "
-            f"{1e3 * abs(self.value) * self.motion:.2g} mm; up to {self.cause.amount(self.unnoticed)} "
-            f"({1e3 * self.unnoticed * self.motion:.2g} mm) may be wrong without a warning"
-        )
-
-
-def lengths(data: TangentData, scales: Hyperparameters, devices: Iterable[Hypothesis] = ()) -> list[Length]:
-    """Lengths against what they are said to be, that of the whole robot first, beside errors of usual size.
-
-    Links that explain the rows far better than anything that a device may have wrong are the robot's, and are opened
-    for all others; if then nothing else is wrong.
-
-    Args:
-        data: the measurements. scales: those of the model. devices: what devices are said to hold, such as a focal
-            length.
-    """
-    usual = {name: getattr(scales, name).clamp(max=most) for name, most in gates.USUAL_SCALES.items()}
-    turning = torch.tensor(data.space.periodic, dtype=torch.bool, device=data.x.device)
-    most = torch.where(turning, inf, gates.USUAL_SLIDE).to(scales.transmission_amplitude)
-    usual["transmission_amplitude"] = scales.transmission_amplitude.minimum(most)
-    known = replace(scales, **usual)
-    rows, some = SampledRows.of(data, scales if torch.equal(known.vector, scales.vector) else known)
-    links, others = [*links_of(some)], (one._replace(effects=one.effects[rows.index]) for one in devices)
-    causes = [*lengths_of(some), *others, *links]
-    E, process = torch.cat([one.effects for one in causes], 2), rows.process
-    columns = rows.columns(some.motions_in_numbers(E))
-    g, H, total = columns.T @ process.mu, columns.T @ process.factor.solve(columns), process.numbers.target @ process.mu
-    motions = (3 * (E - E.mean(0))[some.visible].square().mean(0)).sqrt().tolist()
-    least, found, alone = LEAST_OWN * H.diagonal(), dict[int, Length](), dict[int, Length]()
-    left, first = H.diagonal().nonzero()[:, 0].tolist(), len(causes) - len(links)
-    allowed, apart = chi2_above(gates.LENGTH_CHANCE / max(len(left), 1), 1) ** 0.5, gates.CHANGES_TOLD_APART
-    while left:
-        each = Evidence(g[left, None], H.diagonal()[left, None, None], float(total), len(columns))
-        deviations = (each.excess / each.H[:, 0, 0]).sqrt().tolist()
-        for k, size, chance in zip(left, each.size[:, 0].tolist(), deviations, strict=True):
-            sd, taken_up = hypot(chance, causes[k].usual), causes[k].usual > 0.0 and abs(size) <= gates.TAKEN_UP
-            found[k] = Length(causes[k], size, sd, motions[k], allowed * sd, taken_up)
-        gains = {k: found[k].gain for k in left}
-        best = max((k for k in left if k >= first), key=lambda k: gains[k], default=left[0])
-        doubts = max((gains[k] for k in left if k < first), default=0.0)
-        if gains[best] < max(0.5 * allowed**2, doubts + apart) or best < first:
-            break
-        alone, apart = alone or dict(found), 0.0  # where one link is wrong, others probably are
-        found[best], step = found[best]._replace(taken_up=True), H[best] / H[best, best]
-        total, g, H = total - g[best].square() / H[best, best], g - step * g[best], H - torch.outer(step, H[best])
-        left = (H.diagonal() > least).nonzero()[:, 0].tolist()
-    unclear = any(abs(one.value) > one.unnoticed and not one.taken_up for one in found.values())
-    return [*(alone if alone and unclear else found).values()]
-
-
-def warn_of_lengths(found: list[Length]) -> float | None:
-    """Warn of the least probable length, if it is too improbable; by how much any such length moves points, m."""
-    if not (wrong := [one for one in found if abs(one.value) > one.unnoticed]):
-        return None
-    worst = max(wrong, key=lambda one: one.gain)
-    moved = max((abs(one.value) * one.motion for one in wrong if not one.taken_up), default=None)
-    text = sentence(
-        f"{worst.cause.name} seems to differ by {worst.cause.amount(worst.value, '+')} from what it is said to be",
-        expected=f"at most about {worst.cause.amount(3 * worst.deviation)}: links and devices are seldom that wrong",
-        got=None if moved is None else f"absolute positions that may be wrong by {1e3 * moved:.2g} mm RMS",
-        fix=worst.cause.fix + "; the expected error does not hold before that is settled" * (moved is not None),
-    )
-    warn_user(text)
-    return moved
