@@ -382,8 +382,8 @@ def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) ->
         fix = "pass the model as it was before its registration: places are found anew"
         raise InputError.of("the first model", expected="the markers of its fit", got=got, fix=fix)
     fits = _inputs(model.robot, other.robot, other.configurations), model.configurations
-    low = torch.maximum(*(own.amin(0) for own in fits))
-    high = torch.minimum(*(own.amax(0) for own in fits))
+    low = torch.maximum(*(inputs.amin(0) for inputs in fits))
+    high = torch.minimum(*(inputs.amax(0) for inputs in fits))
     q = torch.cat(fits)
     q = q[((q >= low) & (q <= high)).all(1)]
     if len(q) < FEWEST_ROWS:
@@ -393,8 +393,8 @@ def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) ->
     q = q[:: -(-len(q) // MOST_PREDICTED)]
     there = _inputs(other.robot, model.robot, q)
 
-    def measured(own: CalibratedKinematics, q: Tensor, points: Tensor) -> Measurements:
-        return Measurements.of_points(q, points.detach(), None, model.lever).with_load(own.nominal.load)
+    def measured(source: CalibratedKinematics, q: Tensor, points: Tensor) -> Measurements:
+        return Measurements.of_points(q, points.detach(), None, model.lever).with_load(source.nominal.load)
 
     fitted = other.map.unregistered
     record = find_place(fitted, other.lever, measured(other, there, model(q)), marker_std=OTHER_MARKER)[1]
