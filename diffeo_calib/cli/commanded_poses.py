@@ -56,16 +56,16 @@ class Reading(NamedTuple):
 def poses_in(sheet: Sheet) -> list[Body]:
     """Places with their rotations, and poses as 6, 7, 12 or 16 numbers, in the order of columns."""
     bodies = bodies_in(sheet.numbers)
-    used = {name for own in bodies for name in (*own.place, *own.turn)}
+    used = {name for body in bodies for name in (*body.place, *body.turn)}
     others = [name for name in sheet.numbers if name not in used]
     bodies += matrices_in(sheet, others)
-    bodies += [Body(list(own.names.values()), []) for own in whole(others, "xy") if own.wished and _is_place(own)]
+    bodies += [Body(list(xy.names.values()), []) for xy in whole(others, "xy") if xy.wished and _is_place(xy)]
     for labels in NUMBERED:
-        taken = {name for own in bodies for name in (*own.place, *own.turn)}
+        taken = {name for body in bodies for name in (*body.place, *body.turn)}
         for group in whole([name for name in others if name not in taken], labels):
             names = list(group.names.values())
             bodies += [Body(names[:3], names[3:])] if group.says("tool") and _is_place(group) else []
-    return sorted(bodies, key=lambda own: sheet.header.index(own.place[0]))
+    return sorted(bodies, key=lambda body: sheet.header.index(body.place[0]))
 
 
 def _is_place(group: Group) -> bool:

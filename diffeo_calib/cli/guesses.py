@@ -237,26 +237,26 @@ def bodies_in(columns: Sequence[str]) -> list[Body]:
     Of several that are as much alike the nearest one. A rotation is four columns of a quaternion, nine of a matrix or
     three angles.
     """
-    at = {name: place for place, name in enumerate(columns)}
+    at = {name: offset for offset, name in enumerate(columns)}
     places = [group for group in whole(columns, "xyz") if not group.says("rate", "deviation", "turn")]
     turns = [(group, usual) for labels, usual in ROTATIONS for group in _rotations(columns, labels)]
     pairs = list[tuple[tuple[int, ...], str, list[str], str]]()
-    for own, (rank, (group, usual)) in product(places, enumerate(turns)):
-        first, turn = own.names["x"], list(group.names.values())
+    for place, (rank, (group, usual)) in product(places, enumerate(turns)):
+        first, turn = place.names["x"], list(group.names.values())
         unlike = (group.shared - group.says("turn", "place")) ^ ({*column(first).words} - {"x", *WORDS["place"]})
         start = min(at[name] for name in turn)
         series = turn[0] in JOINTS and start < at[first]  # of joints, rather than a quaternion
-        if own.wished == group.wished and not series:
+        if place.wished == group.wished and not series:
             pairs.append(((len(unlike), abs(start - at[first]), at[first], start, rank), first, turn, usual))
     rotations = dict[str, tuple[list[str], str]]()
     for _, first, turn, usual in sorted(pairs):
         if first not in rotations and not any(set(turn) & set(other) for other, _ in rotations.values()):
             rotations[first] = turn, usual
     bodies = list[Body]()
-    for own in sorted(places, key=lambda own: at[own.names["x"]]):
-        better = [twin.names["x"] for twin in places if twin.stem == own.stem and twin.rank < own.rank]
+    for place in sorted(places, key=lambda place: at[place.names["x"]]):
+        better = [twin.names["x"] for twin in places if twin.stem == place.stem and twin.rank < place.rank]
         left = f"places beside the measured ones of {better[0]}" if better else ""
-        names, left = list(own.names.values()), "wished places" if own.wished else left
+        names, left = list(place.names.values()), "wished places" if place.wished else left
         bodies.append(Body(names, *rotations.get(names[0], ([], "")), left=left))
     return bodies
 
@@ -310,8 +310,8 @@ def guess_readings(columns: Sequence[str]) -> dict[str, list[str]]:
             chosen = next(([there[name] for name in names] for names in each if set(names) <= set(there)), None)
             if chosen is not None and chosen not in readings.values():
                 readings[f"{word}={','.join(chosen)}"] = chosen
-    pixels = [*whole(columns, "uv"), *(own for own in whole(columns, "xy") if own.says("pixel"))]
-    names = [[*own.names.values()] for own in pixels if not own.says("rate", "deviation")]  # no currents of phases
+    pixels = [*whole(columns, "uv"), *(axes for axes in whole(columns, "xy") if axes.says("pixel"))]
+    names = [[*axes.names.values()] for axes in pixels if not axes.says("rate", "deviation")]  # no currents of phases
     return readings | {f"image={','.join(pair)},{LENS}": pair for pair in names[:1]}
 
 
@@ -454,10 +454,10 @@ def with_places(csv: Path, given: Places) -> tuple[Path, str]:
     common = {name: len({*own} & {*places.cells[name]}) for name, own in joints.cells.items() if name in places.cells}
     if not common:  # columns that name the same rows
         each = product(joints.cells.items(), places.cells.items())
-        pairs = [f"{own}={other}" for (own, names), (other, others) in each if sorted(names) == sorted({*others})]
+        pairs = [f"{key}={other}" for (key, names), (other, others) in each if sorted(names) == sorted({*others})]
         common = dict.fromkeys(pairs if len(pairs) == 1 else [], 1)
     if given.by is None and not common:
-        expected, got = "a column that both files have", " and ".join(few(own.header, 12) for own in (joints, places))
+        expected, got = "a column that both files have", " and ".join(few(part.header, 12) for part in (joints, places))
         fix = "add one, such as the number of the pose, or name two: --by COLUMN=OTHER"
         raise InputError.of("--places without --by", expected=expected, got=got, fix=fix)
     by = given.by or max(common, key=lambda name: common[name])

@@ -113,16 +113,16 @@ class Options:
     @classmethod
     def check_together(cls, given: Mapping[str, Any]) -> None:
         """Refuse options without those of which they need one, or beside those that they exclude."""
-        typed = {one.shown for one in cls.all() if given[one.field] not in (None, [], one.default)}
+        typed = {entry.shown for entry in cls.all() if given[entry.field] not in (None, [], entry.default)}
         for options, others in cls.needs:
-            for one in options.split():
-                if one in typed and typed.isdisjoint(others.split()):
-                    what = f"{one} without {' or '.join(others.split())}"
+            for name in options.split():
+                if name in typed and typed.isdisjoint(others.split()):
+                    what = f"{name} without {' or '.join(others.split())}"
                     raise InputError.of(what, fix="name this too, or leave the option out")
         for options, others in cls.excludes:
-            for one in options.split():
-                if one in typed and (found := typed.intersection(others.split())):
-                    raise InputError.of(f"{one} beside {min(found)}", fix="leave one of them out")
+            for name in options.split():
+                if name in typed and (clashes := typed.intersection(others.split())):
+                    raise InputError.of(f"{name} beside {min(clashes)}", fix="leave one of them out")
 
 
 def has(hint: Any, part: Any) -> bool:

@@ -298,18 +298,18 @@ def with_measured(source: Source) -> Source:
     several, tips = len(source.bodies) > 1, source.options.tip or ()
     of_each = (unmeasured_markers(source.robot, rows) for _, rows in source.positions() if several)
     proved = ({marker: words for marker, words, sure in every if sure} for every in of_each)
-    found = next(filter(None, proved), dict[int, str]())
-    if several and not found and len(tips) < 2:  # perhaps in units of their own
+    copies = next(filter(None, proved), dict[int, str]())
+    if several and not copies and len(tips) < 2:  # perhaps in units of their own
         alone = [replace(source, bodies=[own]).into(position=[own.written("")]).units[0].left for own in source.bodies]
         far = max(alone)
         for k, left in enumerate(alone) if gates.DIGITS_SHARE < far < LARGEST_RESIDUAL else ():
             if left < min(gates.FOLLOWED * far, gates.NOMINAL_SHARE):
-                found[k] = f"the nominal robot leaves {percent(left)} of them, and {percent(far)} of others: computed"
-    if found:
-        kept = [k for k in range(len(source.bodies)) if k not in found]
-        left = [f"{few(source.bodies[k].place)}: {words} (counted from 0); not used" for k, words in found.items()]
+                copies[k] = f"the nominal robot leaves {percent(left)} of them, and {percent(far)} of others: computed"
+    if copies:
+        kept = [k for k in range(len(source.bodies)) if k not in copies]
+        left = [f"{few(source.bodies[k].place)}: {words} (counted from 0); not used" for k, words in copies.items()]
         source = replace(source, bodies=[source.bodies[k] for k in kept]).remarking(*left)
-        source = source.into(position=[own.written("") for own in source.bodies])
+        source = source.into(position=[body.written("") for body in source.bodies])
         source = source.into(tip=[tips[k] for k in kept]) if len(tips) > 1 else source
     alone = len(source.bodies) == 1 and not (source.options.socket or source.options.reading)
     ways = list(source.positions()) if alone else []

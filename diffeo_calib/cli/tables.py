@@ -181,14 +181,14 @@ def _stated(words: Sequence[str], wanted: Container[str]) -> dict[str, tuple[Any
             if begin == name:
                 given.append([name] if hint is bool else [name, value if equal else words[place + 1]])
         given = given if has(hint, list) else given[-1:]
-        texts = [own[-1] for own in given]
+        texts = [group[-1] for group in given]
         allowed = next((get_args(part) for part in (hint, *get_args(hint)) if get_origin(part) is Literal), texts)
         if wrong := [text for text in texts if text not in allowed]:
             raise ValueError(f"'{wrong[0]}' for {name}")
         if given:
             values = [float(text) for text in texts] if has(hint, float) else texts
             value = True if hint is bool else values if has(hint, list) else values[-1]
-            stated[option.field] = value, [word for own in given for word in own]
+            stated[option.field] = value, [word for group in given for word in group]
     return stated
 
 

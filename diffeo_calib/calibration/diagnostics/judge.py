@@ -108,20 +108,20 @@ def judge(
     (rows, some), lines = SampledRows.of(data, scales), lines.to(data.x.device)
     if len(rows.index) < 4 * gates.CHANGE_ROWS:
         return None
-    changes, own = changes_of(some, devices, rows.index), lines[rows.index]
-    named = [one._replace(name=bodies.get(one.name, one.name)) for one in changes]
+    changes, sampled = changes_of(some, devices, rows.index), lines[rows.index]
+    named = [cause._replace(name=bodies.get(cause.name, cause.name)) for cause in changes]
     own_names = [names[row] for row in rows.index.tolist()]
-    found = [*changed(rows, named, own, own_names, excess=max(1.0, variance_ratio(data, left_out)))]
-    if len(own) >= gates.MIXED_ROWS:
-        found += [own for one in changes if one.name == MARKERS for own in two_tools(rows, one.effects, lines)]
-        found += other_payloads(rows, some, data, scales, lines)
+    causes = [*changed(rows, named, sampled, own_names, excess=max(1.0, variance_ratio(data, left_out)))]
+    if len(sampled) >= gates.MIXED_ROWS:
+        causes += [tool for cause in changes if cause.name == MARKERS for tool in two_tools(rows, cause.effects, lines)]
+        causes += other_payloads(rows, some, data, scales, lines)
     opens &= len(rows.index) == len(data.x)
-    return best_of([one if opens else one._replace(opens="") for one in found], rows)
+    return best_of([cause if opens else cause._replace(opens="") for cause in causes], rows)
 
 
-def best_of(found: Iterable[Candidate], rows: SampledRows) -> Finding | None:
+def best_of(candidates: Iterable[Candidate], rows: SampledRows) -> Finding | None:
     """That with which left-out errors fall most, relative to what may remain."""
-    best = min(found, key=lambda own: own.left / own.most, default=None)
+    best = min(candidates, key=lambda candidate: candidate.left / candidate.most, default=None)
     if best is None or best.left > best.most:
         return None
     moved = left_out_rms(rows.process) * (1.0 - best.left**2) ** 0.5
@@ -180,23 +180,23 @@ def changed(
 ) -> Iterator[Candidate]:
     """The clearest change during the measurements; arguments as of :func:`changes` and :func:`judge`."""
     process, order = rows.process, lines.argsort()
-    found = [*changes(hypotheses, process, order, excess=excess)]
-    best = max(found, key=lambda one: one.evidence)
+    tried = [*changes(hypotheses, process, order, excess=excess)]
+    best = max(tried, key=lambda change: change.evidence)
     what, _, _, advice, *_ = best.hypothesis
     sudden, clear = best.row is not None, best.evidence >= gates.CHANGE_EVIDENCE
     once, fix = sudden * max(best.evidence, 0.0), f"check what happened then; {advice}"
-    for one in (each for each in hypotheses if each.unit is None or (clear and each.name == what)):
-        yield from changed_twice(rows, one, order, names, once, excess=excess)
+    for cause in (each for each in hypotheses if each.unit is None or (clear and each.name == what)):
+        yield from changed_twice(rows, cause, order, names, once, excess=excess)
     if not clear:
         return
     others = [
-        one
-        for one in found
-        if (one.row is not None) == sudden
-        and one.hypothesis.name != what
-        and min(best.gain - one.gain, best.evidence - one.evidence) < gates.CHANGES_TOLD_APART
+        change
+        for change in tried
+        if (change.row is not None) == sudden
+        and change.hypothesis.name != what
+        and min(best.gain - change.gain, best.evidence - change.evidence) < gates.CHANGES_TOLD_APART
     ]
-    words = ", or ".join(dict.fromkeys(one.words(rows) for one in (best, *others)))
+    words = ", or ".join(dict.fromkeys(change.words(rows) for change in (best, *others)))
     words += " (these rows do not tell which)" * bool(others)
     words += " over the rows" if best.row is None else f" near {names[order[best.row]]}"
     kept, advice = ("the rows before it", fix) if sudden else ("the middle of the rows", SLOW)
@@ -205,14 +205,14 @@ def changed(
 
 
 def changed_twice(
-    rows: SampledRows, one: Hypothesis, order: Tensor, names: Sequence[str], once: float, *, excess: float
+    rows: SampledRows, hypothesis: Hypothesis, order: Tensor, names: Sequence[str], once: float, *, excess: float
 ) -> Iterator[Candidate]:
     """Three set-ups, which look like a drift, or what moves back, which looks like little.
 
     Each change is sought once more beside the other one. ``once``: evidence of a single one; others as of
     :func:`changes`.
     """
-    (what, E, _, advice, *_), process = one, rows.process
+    (what, E, _, advice, *_), process = hypothesis, rows.process
     first, second = _likeliest(*scans([E], process, order)), 0
     for _ in range(2):
         beside = process.opened(rows.columns(E, _from(order, first)))
@@ -235,13 +235,13 @@ def changes(
     ``order``: (N,) row numbers in the order of measurement.
     """
     ramp = order.argsort().to(process.mu) / (len(order) - 1) - 0.5
-    for one, scan in zip(hypotheses, scans([one.effects for one in hypotheses], process, order), strict=True):
+    for cause, scan in zip(hypotheses, scans([cause.effects for cause in hypotheses], process, order), strict=True):
         row = _likeliest(scan)
         jump = scan._replace(g=scan.g[row], H=scan.H[row])
-        drift = Evidence.of(process.numbers.of_table(ramp[:, None, None] * one.effects), process)
-        for found, codes, first in ((jump, _from(order, row), row), (drift, ramp, None)):
-            gain = float(found.gain) / max(excess, float(found.excess))
-            yield Change(one, codes, found.size, gain, first)
+        drift = Evidence.of(process.numbers.of_table(ramp[:, None, None] * cause.effects), process)
+        for evidence, codes, first in ((jump, _from(order, row), row), (drift, ramp, None)):
+            gain = float(evidence.gain) / max(excess, float(evidence.excess))
+            yield Change(cause, codes, evidence.size, gain, first)
 
 
 def scans(effects: Sequence[Tensor], process: Process, order: Tensor) -> Iterator[Evidence]:
@@ -287,22 +287,22 @@ class Mixture:
 
     def evidence(self, chosen: Tensor) -> tuple[Tensor, float]:
         """The unknowns (U,) with these codes (N,), and by how much the log evidence grows."""
-        found = Evidence.of(self.rows.columns(self.effects, chosen), self.rows.process)
-        eye = torch.eye(len(found.g), dtype=found.g.dtype, device=found.g.device)
-        return torch.linalg.solve(found.H + eye, found.g), float(found.log_odds(found.g.new_ones(1)))
+        evidence = Evidence.of(self.rows.columns(self.effects, chosen), self.rows.process)
+        eye = torch.eye(len(evidence.g), dtype=evidence.g.dtype, device=evidence.g.device)
+        return torch.linalg.solve(evidence.H + eye, evidence.g), float(evidence.log_odds(evidence.g.new_ones(1)))
 
     def pulls(self, chosen: Tensor, u: Tensor) -> Evidence:
         """What each row alone says of unknowns of its own beside the codes: g (N, U) and H (N, U, U)."""
         process, numbers = self.rows.process, self.rows.process.numbers
         left = process.mu - process.inverse @ (self.rows.columns(self.effects, chosen) @ u)
-        own = numbers.blocks(process.inverse)
+        blocks = numbers.blocks(process.inverse)
         g = (self.effects * numbers.in_table(left)[..., None]).sum(1)
-        return Evidence(g, self.effects.mT @ own @ self.effects)
+        return Evidence(g, self.effects.mT @ blocks @ self.effects)
 
     def decided(self, chosen: Tensor, u: Tensor) -> Tensor:
         """(N,) the likeliest code of each row while the others keep theirs."""
-        own, step = self.pulls(chosen, u), self.codes - chosen[:, None]
-        best = 2 * step * (own.g @ u)[:, None] - step.square() * (own.H @ u @ u)[:, None]
+        pulls, step = self.pulls(chosen, u), self.codes - chosen[:, None]
+        best = 2 * step * (pulls.g @ u)[:, None] - step.square() * (pulls.H @ u @ u)[:, None]
         return self.codes.gather(1, best.argmax(1, keepdim=True))[:, 0]
 
     def settled(self, chosen: Tensor) -> tuple[Tensor, Tensor, float]:
@@ -321,9 +321,9 @@ def two_tools(rows: SampledRows, effects: Tensor, lines: Tensor) -> Iterator[Can
     """Markers or tools that take turns, by the effects (N, R, U) of their shifts; lines of all rows."""
     E, N = effects * PLACES.found_m_rad, len(effects)
     mixed = Mixture(rows, E, E.new_tensor([-0.5, 0.5]).expand(N, 2))
-    own = mixed.pulls(E.new_zeros(N), E.new_zeros(E.shape[2]))
-    size = own.H.diagonal(dim1=1, dim2=2).sum(1, keepdim=True)
-    away = own.g / size.clamp(min=torch.finfo(size.dtype).tiny)  # of each row, whatever it weighs
+    pulls = mixed.pulls(E.new_zeros(N), E.new_zeros(E.shape[2]))
+    size = pulls.H.diagonal(dim1=1, dim2=2).sum(1, keepdim=True)
+    away = pulls.g / size.clamp(min=torch.finfo(size.dtype).tiny)  # of each row, whatever it weighs
     along = away @ torch.linalg.svd(away - away.mean(0), full_matrices=False).Vh[0]
     k, sums = torch.arange(1, N, device=E.device), (along.sort().values - along.mean()).cumsum(0)[:-1]
     split = along.sort().values[(sums.square() / (k * (N - k))).argmax()]  # N. Otsu, 1979
@@ -360,11 +360,11 @@ def other_payloads(
 
     columns = {"": masses} | dict(_other_columns(masses, lines))
     codes = {words: other[rows.index] / float(other.max()) for words, other in columns.items()}
-    found = {words: max((under(own, f).evidence, f) for f in PAYLOAD_FACTORS[::2]) for words, own in codes.items()}
-    best = max(found, key=lambda words: found[words])
-    if found[best][0] > found[""][0] + gates.PAYLOAD_ODDS:
+    odds = {words: max((under(code, f).evidence, f) for f in PAYLOAD_FACTORS[::2]) for words, code in codes.items()}
+    best = max(odds, key=lambda words: odds[words])
+    if odds[best][0] > odds[""][0] + gates.PAYLOAD_ODDS:
         what, fix = f"the payloads seem to be {best}", "check the column: its order, unit and digits"
-        left = left_out_rms(under(codes[best], found[best][1])) / left_out_rms(rows.process)
+        left = left_out_rms(under(codes[best], odds[best][1])) / left_out_rms(rows.process)
         yield Candidate(what, expected, fix, left, gates.WORTH)
     if len(kinds := masses.unique() / load.unit) > gates.MOST_MASSES:
         return
@@ -382,11 +382,11 @@ def other_payloads(
         yield Candidate(what, expected, fix, left, gates.PAYLOADS_LEFT)
 
 
-def _likeliest_codes(mixed: Mixture, own: Tensor, axes: Tensor) -> tuple[Tensor, float]:
+def _likeliest_codes(mixed: Mixture, given: Tensor, axes: Tensor) -> tuple[Tensor, float]:
     """Codes (N,) beside the rows' own, and how much more they explain; joints yield about their axes, in one sense."""
-    u, odds = mixed.evidence(own)
-    found = [mixed.settled(mixed.decided(own, start)) for start in (u, axes, -axes)]
-    chosen, _, best = max(found, key=lambda one: one[2])
+    u, odds = mixed.evidence(given)
+    trials = [mixed.settled(mixed.decided(given, start)) for start in (u, axes, -axes)]
+    chosen, _, best = max(trials, key=lambda trial: trial[2])
     return chosen, best - odds
 
 
@@ -402,9 +402,9 @@ def _other_columns(masses: Tensor, lines: Tensor) -> Iterator[tuple[str, Tensor]
             yield f"{factor:.4g} times as large where they {words} {mass:g}", torch.where(some, factor * masses, masses)
 
 
-def warn_of_taken_scales(taken: LeaveOneOut, own: LeaveOneOut) -> None:
+def warn_of_taken_scales(taken: LeaveOneOut, chosen: LeaveOneOut) -> None:
     """Warn if left-out errors prove that the scales of other robots are not those of these rows."""
-    if worth_it(taken.errors, own.errors):
-        left = float((own.errors.square().nansum() / taken.errors.square().nansum()).sqrt())
+    if worth_it(taken.errors, chosen.errors):
+        left = float((chosen.errors.square().nansum() / taken.errors.square().nansum()).sqrt())
         got = f"leave-one-out errors that fall to {100 * left:.0f} % with scales of their own"
         warn_user(sentence("`scales_of` does not suit these rows", got=got, fix="leave it out (--scales-of)"))
