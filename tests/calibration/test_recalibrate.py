@@ -93,7 +93,9 @@ def test_new_rows_add_to_what_the_old_model_knew() -> None:
 
 def test_recalibrated_once_more() -> None:
     """Rows of three sessions, each in its own frame."""
-    more = dc.recalibrate(again().model, positions(ARM, NEW, 7), drift="none").model
+    short = replace(again().model.map, unresolved=torch.ones(6, dtype=torch.float64))
+    found = dc.recalibrate(again().model.changed(map=short), positions(ARM, NEW, 7), drift="none")
+    assert_close((more := found.model).map.unresolved, found.inflation * short.unresolved)
     assert dc.evaluate(more, positions(ARM, 100, 6)).rms < rms(again().model)
     assert len(more.configurations) == len(old().configurations) + 2 * NEW
 

@@ -180,9 +180,9 @@ class Placement(tuple[DeviceSet, ...]):
         """
         sets, shifts, sizes = list[DeviceSet](), fitted.shifts, [own.effects(data).shape[2] for own in self]
         centre = data.points.unflatten(1, (-1, 3)).mean((0, 1))
-        whole = around.shift_covariance() if len(shifts) else shifts[:, None]
-        numbers = torch.arange(len(shifts) - sum(sizes), len(shifts), device=shifts.device)
-        for own, part in zip(self, numbers.split(sizes), strict=True):
+        first, numbers = len(around.geodesic.spec.prior_variance), torch.arange(len(shifts), device=shifts.device)
+        whole = around.parameter_covariance(first + numbers) if len(shifts) else shifts[:, None]  # after those of k0
+        for own, part in zip(self, numbers[len(shifts) - sum(sizes) :].split(sizes), strict=True):
             covariance = whole[part[:, None], part]
             sets.append(own.settled(Settled(shifts[part], covariance, around, centre, transform, **known)))
         return Placement(sets)

@@ -149,7 +149,7 @@ def recalibrate(
         marker: whether the markers on the tool are the "same" (within 0.05 mm), have "moved" by about a millimetre, or
             are "other" ones; by default the evidence of the rows decides.
         drift: "tested": parts of the robot that have changed, by a test at 1 %, may differ from what they were, and
-            geometry, load and transmissions by as much as the rows say. "none": nothing but device and markers may.
+            offsets, geometry, load and transmissions by as much as the rows say. "none": only device and markers may.
         seed: of the samples of that test.
         progress: called as ``progress(task, done, total)``.
         note: text that is kept with the model.
@@ -209,7 +209,7 @@ def _result(
 ) -> Recalibration:
     """The model in the new frame, and everything that was found."""
     record, new = place.registration, place.data
-    fitted_map = fitted.model
+    fitted_map = replace(fitted.model, unresolved=place.fitted.inflated(rows.inflation).unresolved)
     if record is not None:
         fitted_map = moved(fitted_map, record.transform)
     elif place.fitted.stands_free:  # still no device says where the robot stands

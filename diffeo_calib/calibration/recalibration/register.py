@@ -115,7 +115,8 @@ def _placed(
     if solution.interrupted:
         raise KeyboardInterrupt  # half-way the covariance would be that of the optimum
     learnt = problem.calibrated(problem.deform(solution.momenta, fit.geodesic.integrator))
-    learnt = replace(moved(learnt, registration.transform), new_noise=registration.noise)
+    short = fit.inflated(new.inflation).unresolved
+    learnt = replace(moved(learnt, registration.transform), new_noise=registration.noise, unresolved=short)
     markers = fitted_markers(learnt)
     return learnt, replace(registration, markers=markers, shift=markers - new.old_markers)
 
