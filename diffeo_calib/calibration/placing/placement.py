@@ -126,7 +126,7 @@ class DeviceSet(ABC):
         return ""
 
     def labels(self, coordinates: Coordinates, predicted: Tensor) -> Iterable[OtherLabel]:
-        """How rows that tell coordinates would err under other device names; ``predicted`` (N, P, 3) by the model, m."""
+        """How rows that tell coordinates would err under other device names; ``predicted`` (N, P, 3) by a model, m."""
         return ()
 
     def hypotheses(self, data: Seen) -> Iterable[Hypothesis]:
