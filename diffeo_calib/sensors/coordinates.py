@@ -234,6 +234,10 @@ class Poses(Positions):
 class OtherDevices(Sensor):
     """Readings of the ball, or of a frame of the tool, by other devices."""
 
+    advice = "check the unit of the readings (--length), their columns (--reading), and the device of every row"
+    advice += " (`device`, --session)"
+    """What to check if errors are no calibrated robot's."""
+
     def check(self, data: Readings, model: Any) -> None:
         """They tell of the ball alone, or of the frame of measured poses."""
         if kind_of(data).seen_points > 1:
@@ -295,6 +299,8 @@ class OtherDevices(Sensor):
 
 class Contacts(OtherDevices):
     """A ball in sockets, whose middles are found from any rows."""
+
+    advice = "check the joint values, and the socket of every row (--socket)"
 
     def check(self, data: SocketReadings, model: Any) -> None:
         check_ball(model, "rows with a ball in sockets", "rows", "rows in sockets")

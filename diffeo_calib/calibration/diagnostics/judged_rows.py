@@ -99,33 +99,33 @@ def judge(
     Raises:
         MeasurementError: another reading of the table explains impossible errors.
     """
-    impossible = gates.LARGEST_PER_REACH * model.robot.reach
-    for table, _ in divided(data)[1]:
-        away = sensor_of(table).away(table, predicted_at(model, table), places).norm(dim=1)
-        if (median := float(away.nanmedian())) > impossible:
-            fix = "check the unit of the readings (--length), their columns (--reading), and the device of every row"
-            fix += " (`device`, --session)"
-            got = f"a median of {1e3 * median:.4g} mm at the ball"
-            return Judgement(sentence("these errors are not those of a calibrated robot", got=got, fix=fix))
-    measured, errors = positions_of(model, places, data), compared.positions
-    if measured is None or errors is None or not (usual or errors.median > impossible):
-        return Judgement()
-    some, fix = _some(measured, MOST_ROWS), "register the model first: `model.registered`, evaluate --free both"
-    for step in steps_of(model, some) if usual else ():
+    impossible, errors = gates.LARGEST_PER_REACH * model.robot.reach, compared.positions
+    measured = positions_of(model, places, data)
+    some = None if measured is None or errors is None else _some(measured, MOST_ROWS)
+    for step in steps_of(model, some) if usual and some is not None else ():
         return Judgement(step.sentence())
+    for table, _ in divided(data)[1]:
+        sensor = sensor_of(table)
+        away = sensor.away(table, predicted_at(model, table), places).norm(dim=1)
+        if (median := float(away.nanmedian())) > impossible:
+            if usual and some is not None:
+                refuse_mistakes(model.robot, some)
+            got = f"a median of {1e3 * median:.4g} mm at the ball"
+            return Judgement(sentence("these errors are not those of a calibrated robot", got=got, fix=sensor.advice))
+    if some is None or errors is None or not (usual or errors.median > impossible):
+        return Judgement()
+    fix = "register the model first: `model.registered`, evaluate --free both"
     moved = [sentence(motion.sentence, fix=fix) for motion in motions(model, some)]
     causes = moved or [*filter(None, [implausible(model, some, errors)])]
-    if errors.median > impossible and causes:
+    if errors.median > impossible:
         if usual and not moved:
             refuse_mistakes(model.robot, some)
         return Judgement(" ".join(causes), (), bool(moved))
     if causes or not usual:
         return Judgement(None, causes)
     wrong = contradicted(model, some)
-    causes, claimed = (
-        [*filter(None, [block_text(model, some, wrong)])],
-        expected_rms(model, measured, errors.errors.shape[1]),
-    )
+    causes = [*filter(None, [block_text(model, some, wrong)])]
+    claimed = expected_rms(model, some, errors.errors.shape[1])
     if not causes and not wrong and errors.rms >= gates.LARGE_PER_EXPECTED * claimed:
         what = f"the errors are {errors.rms / claimed:.1f} times as large as the model expects: "
         fix = "something has changed since the fit, or these poses are unlike those of the fit: compare, or recalibrate"
