@@ -209,16 +209,16 @@ class Placed:
         if aligned is None or not wrong:
             return None
         table, flags = aligned.table, torch.zeros(len(self.data), dtype=torch.bool, device=aligned.rows.device)
-        flags[[one.row for one in wrong]] = True
+        flags[[outlier.row for outlier in wrong]] = True
         predicted, flags = model.at_payloads(table.payload)(table.q).detach(), flags[aligned.rows]
-        labels = [label for one in self.placement for label in one.labels(aligned, predicted)]
+        labels = [label for part in self.placement for label in part.labels(aligned, predicted)]
         masses = table.masses.unique().tolist()
         for mass in masses if len(masses) <= gates.MOST_MASSES else ():
             away = model.with_payload(mass)(table.q).detach() - table.points
             labels.append(OtherLabel(f"a payload of {mass:g}", table.masses != mass, away.norm(dim=-1).nanmean(1)))
         errors = (predicted - table.points).norm(dim=-1).nanmean(1)
-        fit = [(flags & one.applies & (one.errors < gates.REMAINING_UNDER_LABEL * errors), one) for one in labels]
-        rows, label = max(fit, key=lambda one: int(one[0].sum()), default=(flags, None))
+        fit = [(flags & case.applies & (case.errors < gates.REMAINING_UNDER_LABEL * errors), case) for case in labels]
+        rows, label = max(fit, key=lambda pair: int(pair[0].sum()), default=(flags, None))
         if label is None or (count := int(rows.sum())) < gates.LABEL_ROWS:
             return None
         lines = few(table.line_numbers[rows.to(table.line_numbers.device)].tolist(), 5)
@@ -319,7 +319,7 @@ def _by_coordinates(
     sessions, table = Sessions.of_table(robot, positions, progress)
     LOG.info("calibrating %s with %r", robot.name, table)
     progress("registration", 0, 1)
-    registration, tables = registered(robot, table), [one.table for one in readings]
+    registration, tables = registered(robot, table), [part.table for part in readings]
     check_beside(robot, table, registration, tables)
     warn_of_joints_below_tip(robot, table)
     warn_of_open_directions(robot, table, registration)
@@ -328,7 +328,7 @@ def _by_coordinates(
         fitted = identify(geometry, table.q, table.points).geometry  # a nominal robot may miss its ball by centimetres
         ball = ball_of(tables, fitted, ball_tip(readings, geometry.on[-1]))
         geometry = geometry if ball is None else with_ball(geometry, ball)
-    devices = tuple(fitting_devices(one, geometry.points(one.q)) for one in tables)
+    devices = tuple(fitting_devices(other, geometry.points(other.q)) for other in tables)
     rows = Rows(geometry, (MeasuredPoints.of(table.q, table.points), *map(ReadRows, tables, devices)))
     if ball is not None:
         registration = described(rows, [registration.noise])
