@@ -161,12 +161,12 @@ def recalibrate(
         InputError: arguments of another kind, joints in another order, another number of markers.
             The table of the model's own fit.
         MeasurementError: too few rows, rows that leave the place of the device open, or rows that cannot belong to
-            this robot: other units, or half of them contradicting the model.
+            this robot: other units.
         KeyboardInterrupt: Ctrl-C; nothing is kept, since it takes seconds.
 
     Warns:
-        DiffeoCalibWarning: as :meth:`CalibratedKinematics.registered`; distances of another scale; ``marker="same"``
-            although the rows say otherwise.
+        DiffeoCalibWarning: as :meth:`CalibratedKinematics.registered`; distances of another scale; half of the
+            rows contradicting the model; ``marker="same"`` although the rows say otherwise.
     """
     check_arguments(model, new, marker)
     check_other_table(model, new)

@@ -77,8 +77,7 @@ def registered(
     changes = {"map": placed.to(model.configurations.device), "lever": record.lever, "placement": (), "ball": ball}
     result = model.changed(**changes, learnt=record if learns else None)._carrying(model.nominal.load)
     same = record.same and ball == model.ball
-    lost = [devices for devices in model.placement if devices.reads and not same]
-    if lost:
+    if lost := [devices for devices in model.placement if devices.reads and not same]:
         names = few([f"'{name}'" for devices in lost for name in devices.names])
         what = f"the model no longer knows the devices {names}: these rows show other markers than what they read"
         warn_user(sentence(what, fix="pass rows of the fit's markers, or rows of these devices, to keep them"))
@@ -221,8 +220,7 @@ def devices_beside(model: Any, data: Any, fitted: Sequence[Extrinsics] = ()) -> 
         points = model.at_payloads(part.payload).map(part.q).detach().unflatten(1, (-1, 3))
         for placed in sensor_of(part).settled(part, points, model.turns):
             new = _with_rows(placed, fitted)
-            alike = [number for number, old in enumerate(devices) if new.same_set(old)]
-            same = alike[0] if alike else len(devices)
+            same = next((number for number, old in enumerate(devices) if new.same_set(old)), len(devices))
             alone = [] if new.set_up and len(new.names) == 1 else [new]
             devices[same : same + 1] = [new.beside(old) for old in devices[same : same + 1]] or alone
     return tuple(devices)
