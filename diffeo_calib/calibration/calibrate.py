@@ -26,8 +26,8 @@ from diffeo_calib.calibration.choose_scales import (
     robot_problem,
 )
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.hypotheses import worth_it
-from diffeo_calib.calibration.diagnostics.judge import Finding, judge, lengths, warn_of_lengths, warn_of_taken_scales
+from diffeo_calib.calibration.diagnostics.hypotheses import lengths, warn_of_lengths, worth_it
+from diffeo_calib.calibration.diagnostics.judge import Finding, judge, warn_of_taken_scales
 from diffeo_calib.calibration.diagnostics.judged_rows import warn_of_contradictions
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_single_joints, warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.outliers import (
@@ -59,7 +59,6 @@ from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.regression.conjugate_gradients import MAX_DENSE
-from diffeo_calib.robots.payload import check_same_load
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import CHANGE, VALUE
 
@@ -87,7 +86,9 @@ def check_controls(controls: Controls, measurements: Table) -> None:
     """Raise InputError unless this is a number of configurations, 'auto' or 'all'."""
     if not isinstance(controls, str):
         check_count(controls, "`controls`", most=len(measurements))
-        check_same_load(measurements.payload, "`controls`", controls, fix="leave `controls` out, or pass fewer rows")
+        if measurements.payload is not None:
+            what, fix = "`controls` of measurements with payloads", "leave `controls` out, or pass fewer rows"
+            raise InputError.of(what, expected="'all'", got=controls, fix=fix)
     elif controls not in ("auto", "all"):
         raise InputError.of("`controls`", expected="a number, 'auto' or 'all'", got=as_written(controls))
 
@@ -233,8 +234,9 @@ def _result(
     explained, outlying = parts(model), outliers(model, placed, data, chosen.judged, least)
     LOG.info("rows that look wrong and hardly count: %s", few([outlier.number for outlier in outlying], 20) or "none")
     warn_of_outliers(outlying, placed.data)
-    said, mislabelled = best and best.text, placed.mislabelled(model, outlying)
-    said = said if best and best.columns is None else mislabelled or said  # a wrong column explains its wrong rows
+    said = best and best.text
+    if best is None or not best.of_table:
+        said = placed.mislabelled(model, outlying) or said
     warn_of_contradictions(model, placed.coordinates, outlying, said)
     warn_of_rounding(robot, placed.data, data, chosen.left_out)
     found_lengths = lengths(data, scales, placed.placement.hypotheses(data, VALUE))
@@ -252,12 +254,8 @@ def _result(
         warnings="\n".join(warned) or None,
     )
     return CalibrationResult(
-        model=CalibratedKinematics(
-            robot,
-            fitted_map,
-            summary,
-            lever=placed.lever,
-            ball=placed.ball,
+        model=model.changed(
+            summary=summary,
             placement=placed.placement.placed(),
             rigid_errors=placed.identification.geometry.joint_errors,
             provenance=Provenance.now(placed.data, note),

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.judge import Length
+from diffeo_calib.calibration.diagnostics.hypotheses import Length
 from diffeo_calib.calibration.diagnostics.outliers import Outlier
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import Identification

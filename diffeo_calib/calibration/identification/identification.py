@@ -288,7 +288,7 @@ def estimated(rows: Rows, held: Sequence[int], prior: Prior | None = None) -> Id
     Note:
         Cost: some ten singular value decompositions of a matrix of as many rows as there are numbers and unknowns.
     """
-    some = replace(rows, parts=tuple(own.sample() for own in rows.parts))
+    some = replace(rows, parts=tuple(part.sample() for part in rows.parts))
     used, zero = prior or Prior(), rows.geometry.tool.new_zeros(rows.geometry.size)
     at = zero, zero.new_zeros(sum(rows.freedom))
     errors = some.errors(*at)
@@ -305,14 +305,14 @@ def estimated(rows: Rows, held: Sequence[int], prior: Prior | None = None) -> Id
         total = none.index_add(0, kind, (tails.weights * squares).nan_to_num(0.0))
         noise = max(sqrt(float(total.sum()) / max(float(free.sum()), 1.0)), SMALLEST_NOISE_M)
         free = free.clamp(min=1.0)
-        own, shared = (total / free).sqrt().clamp(min=SMALLEST_NOISE_M), SHARED_NUMBERS * (len(none) > 1)
-        levels = own * (noise / own) ** (shared / (free + shared))
+        alone, shared = (total / free).sqrt().clamp(min=SMALLEST_NOISE_M), SHARED_NUMBERS * (len(none) > 1)
+        levels = alone * (noise / alone) ** (shared / (free + shared))
         before, sigma = sigma, levels[kind]
         tails = reweight(squares / sigma.square() + fit.leverage / tails.weights, dim)
         if float(((sigma - before).abs() / sigma).max()) < NOISE_CHANGE:
             break
     left_out = squares / (1.0 - fit.leverage / dim).square()
-    if any(own is not whole for own, whole in zip(some.parts, rows.parts, strict=True)):
+    if any(part is not whole for part, whole in zip(some.parts, rows.parts, strict=True)):
         errors = rows.errors(*at)
         (dim, kind) = sizes_and_kinds(errors)
         tails = reweight(body_squares(errors) / levels[kind].square(), dim)
