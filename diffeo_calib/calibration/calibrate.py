@@ -59,6 +59,7 @@ from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.process.scales import Hyperparameters
 from diffeo_calib.regression.conjugate_gradients import MAX_DENSE
+from diffeo_calib.robots.payload import check_same_load
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import CHANGE, VALUE
 
@@ -86,9 +87,7 @@ def check_controls(controls: Controls, measurements: Table) -> None:
     """Raise InputError unless this is a number of configurations, 'auto' or 'all'."""
     if not isinstance(controls, str):
         check_count(controls, "`controls`", most=len(measurements))
-        if measurements.payload is not None:
-            what, fix = "`controls` of measurements with payloads", "leave `controls` out, or pass fewer rows"
-            raise InputError.of(what, expected="'all'", got=controls, fix=fix)
+        check_same_load(measurements.payload, "`controls`", controls, fix="leave `controls` out, or pass fewer rows")
     elif controls not in ("auto", "all"):
         raise InputError.of("`controls`", expected="a number, 'auto' or 'all'", got=as_written(controls))
 

@@ -119,6 +119,12 @@ class Payload:
 NO_PAYLOAD = Payload("", torch.zeros((), dtype=torch.float64, device=HOST), 1.0)
 
 
+def check_same_load(masses: Tensor | None, what: str, got: object, *, fix: str) -> None:
+    """Raise InputError for what rows with payloads of their own do not allow."""
+    if masses is not None:
+        raise InputError.of(f"{what} of measurements with payloads", expected="'all'", got=got, fix=fix)
+
+
 def check_unladen(masses: Tensor | None, what: str, *, fix: str) -> None:
     """Raise MeasurementError for masses of rows that cannot have any."""
     if masses is not None:
@@ -135,6 +141,11 @@ def common_mass(first: float | None, second: float | None) -> float | None:
 def under_mass(model: Any, mass: float | None) -> Any:
     """A model that carries a mass; unchanged if it knows of no payload."""
     return model if model.payload is None else model.with_payload(mass)
+
+
+def words_of_mass(mass: float | None) -> str:
+    """Such as ``with a payload of 3 ``; nothing for none."""
+    return "" if mass is None else f"with a payload of {mass:g} "
 
 
 def with_load(robot: Tree, name: str, place: object, on: str | None = None) -> Tree:

@@ -59,7 +59,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import roots
 from diffeo_calib.regression.tails import Tails
 from diffeo_calib.robots.cartesian import is_cartesian, pose_inputs, turns_nowhere
-from diffeo_calib.robots.payload import common_mass, under_mass
+from diffeo_calib.robots.payload import common_mass, under_mass, words_of_mass
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.coordinates import mounted_of
 from diffeo_calib.sensors.errors import Evaluations
@@ -299,7 +299,7 @@ class Comparison:
     def __str__(self) -> str:
         if self.telling or self.changes.found:
             words = "; ".join(map(str, self.hidden)) if self.hidden and not self.changes.found else str(self.changes)
-            return words if self.payload is None else f"with a payload of {self.payload:g} {words}"
+            return words_of_mass(self.payload) + words
         return (
             "these rows cannot tell whether anything has changed: the old model expects errors of them "
             f"({self.expectations.rms_text}) far above those at the rows of its fit ({self.usual.rms_text}); measure "
