@@ -48,7 +48,7 @@ from diffeo_calib.calibration.placing.sockets import (
 )
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.errors import few, sentence
+from diffeo_calib.common.errors import few, sentence, warn_user
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit, Progress
 from diffeo_calib.kinematics.evaluation import residuals
@@ -121,6 +121,8 @@ def stacked(
 
 
 LOG = logging.getLogger(__name__)
+MOST_SAGS = 5000
+"""Unknowns of gravity sag, of which there are 4.5 n^2 of n joints: matrices of so many take 200 MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +197,11 @@ class Placed:
         """The rows around the geometric calibration, weighted by its residuals; with effects (N, R, U) of unknowns."""
         geometry, theta = self.registration.geometry, self.identification.theta
         payload = Payload.of_rows(geometry.chain, self.data.payload, self.data.payload_at)
-        elastic = bool(payload) or not is_cartesian(geometry.chain)
+        sags = sum(compliance.size for compliance in geometry.chain.arrays.compliances)
+        elastic = bool(payload) or (sags <= MOST_SAGS and not is_cartesian(geometry.chain))
+        if not elastic and sags > MOST_SAGS:
+            what = f"gravity sag of {geometry.chain.n} joints is left out of the model"
+            warn_user(sentence(what, expected=f"at most {MOST_SAGS} unknowns of it", got=sags))
         nominal = GeometryMap(geometry, elastic=elastic, payload=payload)
         theta = torch.cat([theta, theta.new_zeros(nominal.parameters - geometry.size)])
         data = self._rows(nominal, theta)
