@@ -26,8 +26,8 @@ from diffeo_calib.calibration.choose_scales import (
     robot_problem,
 )
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.hypotheses import worth_it
-from diffeo_calib.calibration.diagnostics.judge import Finding, judge, lengths, warn_of_lengths, warn_of_taken_scales
+from diffeo_calib.calibration.diagnostics.hypotheses import lengths, warn_of_lengths, worth_it
+from diffeo_calib.calibration.diagnostics.judge import Finding, judge, warn_of_taken_scales
 from diffeo_calib.calibration.diagnostics.judged_rows import warn_of_contradictions
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_single_joints, warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.outliers import (
@@ -172,7 +172,7 @@ def calibrate(
         warn_of_no_errors(robot, data, placed.registration, placed.identification)
         warn_of_stuck(data, measurements)
         if placed.coordinates is None:
-            warn_of_what_is_open(data, [own.devices for own in placed.readings])
+            warn_of_what_is_open(data, [kind.devices for kind in placed.readings])
         stages = placed.registration, placed.identification
         scales_for = partial(choose_scales, given=hyperparameters, models=scales_of, seed=seed, progress=progress)
         chosen = scales_for(data, measurements, *stages)
@@ -230,18 +230,19 @@ def _result(
     for devices in placed.placement:
         devices.warn_of_weakness(model)
     least = gates.UNCHOSEN_FACTOR if len(data.x) < FEWEST_POSES else 1.0
-    explained, found = parts(model), outliers(model, placed, data, chosen.judged, least)
-    LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
-    warn_of_outliers(found, placed.data)
-    said, mislabelled = best and best.text, placed.mislabelled(model, found)
-    said = said if best and best.columns is None else mislabelled or said  # a wrong column explains its wrong rows
-    warn_of_contradictions(model, placed.coordinates, found, said)
+    explained, outlying = parts(model), outliers(model, placed, data, chosen.judged, least)
+    LOG.info("rows that look wrong and hardly count: %s", few([outlier.number for outlier in outlying], 20) or "none")
+    warn_of_outliers(outlying, placed.data)
+    said = best and best.text
+    if best is None or not best.of_table:
+        said = placed.mislabelled(model, outlying) or said
+    warn_of_contradictions(model, placed.coordinates, outlying, said)
     warn_of_rounding(robot, placed.data, data, chosen.left_out)
     found_lengths = lengths(data, scales, placed.placement.hypotheses(data, VALUE))
     summary = Summary(
         **dict(zip(OF_POSITIONS, placed.stage_rms(model), strict=False)),
         leave_one_out_rms=placed.by_kind(chosen.left_out.errors).positions_rms,
-        outliers=len(found),
+        outliers=len(outlying),
         noise_degrees_of_freedom=data.tails.freedom,
         **{name: getattr(fitted, name) for name in ("coupling_residual", "end_residual", "energy", "status")},
         scales=chosen.selection.status,
@@ -252,12 +253,8 @@ def _result(
         warnings="\n".join(warned) or None,
     )
     return CalibrationResult(
-        model=CalibratedKinematics(
-            robot,
-            fitted_map,
-            summary,
-            lever=placed.lever,
-            ball=placed.ball,
+        model=model.changed(
+            summary=summary,
             placement=placed.placement.placed(),
             rigid_errors=placed.identification.geometry.joint_errors,
             provenance=Provenance.now(placed.data, note),
@@ -268,7 +265,7 @@ def _result(
         tails=data.tails,
         leave_one_out=chosen.left_out,
         parts=explained,
-        outliers=found,
+        outliers=outlying,
         fit=fitted,
         lengths=found_lengths,
         partial=best is not None and best.columns is not None,

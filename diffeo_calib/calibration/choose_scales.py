@@ -134,34 +134,34 @@ def choose_scales(
         data = data.with_position_errors(scales)
         scales = with_axis_errors(data, with_payload_factor(data, scales, seed), measurements.line_numbers)
         data = data.with_position_errors(scales)
-        found = Selection(scales, f"those of {len(models)} other model{'s' * (len(models) > 1)}")
+        selection = Selection(scales, f"those of {len(models)} other model{'s' * (len(models) > 1)}")
         data = weighed(data, scales, seed)
-        return _inflated(found, None, data, measurements, seed=seed, progress=progress)
+        return _inflated(selection, None, data, measurements, seed=seed, progress=progress)
     if poses < FEWEST_POSES:
         count = f"{poses} poses" if poses == len(measurements) else f"{poses} different poses"
         fix = f"measure at least {FEWEST_POSES} poses, better 60; trust held-out errors only"
         warn_user(sentence(f"{count} are too few to select scales: defaults are used", fix=fix))
-        found = Selection(centre, f"defaults, since {count} are too few to select them")
+        selection = Selection(centre, f"defaults, since {count} are too few to select them")
     else:
         # fields explain gross errors where these weigh as much as beside the geometry, whose errors are larger
         least = DOUBTED_WEIGHT * (not measurements.without_device)  # spreads in sockets are the geometry's own
-        found = select(centre, data.trusted(least), seed=seed, progress=progress)
-        data = weighed(data, found.scales, seed)
+        selection = select(centre, data.trusted(least), seed=seed, progress=progress)
+        data = weighed(data, selection.scales, seed)
         again = True
-        while again and not found.interrupted:  # from the start once more where gross errors show only now
+        while again and not selection.interrupted:  # from the start once more where gross errors show only now
             gross = data.tails.gross
-            start = None if gross else found.scales  # which let the fields explain gross errors
-            found = select(centre, data, start=start, seed=seed, progress=progress)
-            found, data = _supported(found, data, seed)
+            start = None if gross else selection.scales  # which let the fields explain gross errors
+            selection = select(centre, data, start=start, seed=seed, progress=progress)
+            selection, data = _supported(selection, data, seed)
             again = data.tails.gross and not gross
-        found = replace(found, scales=with_payload_factor(data, found.scales, seed))
+        selection = replace(selection, scales=with_payload_factor(data, selection.scales, seed))
         how = {"poses": poses, "lines": measurements.line_numbers, "seed": seed, "progress": progress}
-        centre, found, data = _with_position_errors(centre, found, data, **how)
-    return _inflated(found, centre, data, measurements, seed=seed, progress=progress)
+        centre, selection, data = _with_position_errors(centre, selection, data, **how)
+    return _inflated(selection, centre, data, measurements, seed=seed, progress=progress)
 
 
 def _inflated(
-    found: Selection,
+    selection: Selection,
     centre: Hyperparameters | None,
     data: TangentData,
     measurements: Any,
@@ -170,7 +170,7 @@ def _inflated(
     progress: Progress,
 ) -> ChosenScales:
     """The scales found, widened where cross-validation or places contradict them."""
-    left_out = leave_one_out(data, found.scales, seed)
+    left_out = leave_one_out(data, selection.scales, seed)
     _warn_of_wrong_scales(data, left_out)
     groups = measurements.groups().to(data.x.device)
     poses = int(groups.max()) + 1
@@ -178,22 +178,22 @@ def _inflated(
     factor, row_scales, resting = 1.0, None, measurements.places >= 0
     if not bool(resting.all()):
         inflation: float | None = few
-        if centre is None or (poses >= FEWEST_POSES and not found.interrupted):
-            inflation = cross_validated_inflation(centre, found.scales, data, groups, seed=seed, progress=progress)
-            found = replace(found, interrupted=inflation is None)
+        if centre is None or (poses >= FEWEST_POSES and not selection.interrupted):
+            inflation = cross_validated_inflation(centre, selection.scales, data, groups, seed=seed, progress=progress)
+            selection = replace(selection, interrupted=inflation is None)
         if is_cartesian(data.nominal.geometry.chain) and poses >= FEWEST_HALVED:
-            inflation = max(inflation or few, inflation_by_parts(data, found.scales, seed))
+            inflation = max(inflation or few, inflation_by_parts(data, selection.scales, seed))
         least = float(data.tails.gross or measurements.without_device)  # no reading shows every direction
         factor = max(inflation or few, least)
-        row_scales = found.scales if factor < 1.0 else None  # narrow regions make no outliers
+        row_scales = selection.scales if factor < 1.0 else None  # narrow regions make no outliers
     if bool(resting.any()):
-        row_scales = found.scales.inflated(max(factor, few) ** 0.5)
+        row_scales = selection.scales.inflated(max(factor, few) ** 0.5)
         units = measurements.places, measurements.socket_numbers, groups.to(resting.device)
-        factor = max(factor, inflation_by_places(data, found.scales, *units))
-    unresolved = None if centre is None else unresolved_errors(found, centre, data, poses, seed=seed, factor=factor)
-    scales, words = found.scales.inflated(factor**0.5), "; noise of the commands counts as the machine's errors"
-    found = replace(found, scales=scales, status=found.status + words * (unresolved is not None))
-    return ChosenScales(found, data, leave_one_out(data, scales, seed), row_scales, unresolved)
+        factor = max(factor, inflation_by_places(data, selection.scales, *units))
+    unresolved = None if centre is None else unresolved_errors(selection, centre, data, poses, seed=seed, factor=factor)
+    scales, words = selection.scales.inflated(factor**0.5), "; noise of the commands counts as the machine's errors"
+    selection = replace(selection, scales=scales, status=selection.status + words * (unresolved is not None))
+    return ChosenScales(selection, data, leave_one_out(data, scales, seed), row_scales, unresolved)
 
 
 FEWEST_REPEATS = 10
@@ -205,7 +205,7 @@ NOTHING = 1e-6
 
 
 def unresolved_errors(
-    found: Selection, centre: Hyperparameters, data: TangentData, poses: int, *, seed: int = 0, factor: float = 1.0
+    selection: Selection, centre: Hyperparameters, data: TangentData, poses: int, *, seed: int = 0, factor: float = 1.0
 ) -> Tensor | None:
     """Variances (n,) of a machine's errors that its fields do not resolve, times a factor, m^2 or rad^2; None for none.
 
@@ -215,9 +215,9 @@ def unresolved_errors(
     are too short are no larger than those of the fields: of a perfect machine there are none.
     """
     repeated, chain = len(data.x) - poses, data.nominal.geometry.chain
-    if not is_cartesian(chain) or repeated >= FEWEST_REPEATS or poses < FEWEST_POSES or found.interrupted:
+    if not is_cartesian(chain) or repeated >= FEWEST_REPEATS or poses < FEWEST_POSES or selection.interrupted:
         return None
-    scales, without = found.scales, replace(centre, joint_noise=NOTHING * centre.joint_noise)
+    scales, without = selection.scales, replace(centre, joint_noise=NOTHING * centre.joint_noise)
     moved = (data.jacobian * scales.joint_noise.square() * data.jacobian).sum(2).mean()
     start = replace(scales, joint_noise=without.joint_noise, sensor_noise=(scales.sensor_noise.square() + moved).sqrt())
     other = select(without, data, start=start, seed=seed)
@@ -236,16 +236,16 @@ def noise_of_few(data: TangentData, poses: int, registration: Identification, id
     return max(identification.noise, NOISE_SHARE * registration.noise)
 
 
-def _supported(found: Selection, data: TangentData, seed: int) -> tuple[Selection, TangentData]:
+def _supported(selection: Selection, data: TangentData, seed: int) -> tuple[Selection, TangentData]:
     """Drop amplitudes that the data do not support, and with the weights that follow."""
-    noise = data.noise_model.mean_covariance(found.scales, data.jacobian)
-    scales = found.scales.supported(data.jacobian, noise)
-    return replace(found, scales=scales), weighed(data, scales, seed)
+    noise = data.noise_model.mean_covariance(selection.scales, data.jacobian)
+    scales = selection.scales.supported(data.jacobian, noise)
+    return replace(selection, scales=scales), weighed(data, scales, seed)
 
 
 def _with_position_errors(
     centre: Hyperparameters,
-    found: Selection,
+    selection: Selection,
     data: TangentData,
     *,
     poses: int,
@@ -255,19 +255,19 @@ def _with_position_errors(
 ) -> tuple[Hyperparameters, Selection, TangentData]:
     """Add the gear lines, then the axes, that the data show; choose the other scales again for what is left."""
     for stage in ("gear lines",) * (poses >= position_errors.FEWEST_POSES) + ("axes",):
-        if found.interrupted:
+        if selection.interrupted:
             break
         progress(stage, 0, 1)
         if stage == "axes":
-            start = with_axis_errors(data, found.scales, lines)
-        elif gears := position_errors.find_gear_lines(data, start := found.scales, seed):
+            start = with_axis_errors(data, selection.scales, lines)
+        elif gears := position_errors.find_gear_lines(data, start := selection.scales, seed):
             start = replace(start, lines=gears)
-        if start is not found.scales:
+        if start is not selection.scales:
             data = data.with_position_errors(start)
             centre = replace(centre, **{name: getattr(start, name) for name in FOUND})
             again = select(centre, data, start=start, seed=seed, progress=progress)
-            found, data = _supported(again, data, seed)
-    return replace(centre, payload=found.scales.payload), found, data
+            selection, data = _supported(again, data, seed)
+    return replace(centre, payload=selection.scales.payload), selection, data
 
 
 def _warn_of_wrong_scales(data: TangentData, left_out: LeaveOneOut) -> None:
@@ -299,7 +299,7 @@ def with_payload_factor(data: TangentData, scales: Hyperparameters, seed: int = 
         return scales
     some = data.sample(POSES, COORDINATES, seed)[1]
     tried = [replace(scales, payload=factor) for factor in PAYLOAD_FACTORS]
-    return max(tried, key=lambda one: some.process(one).evidence)
+    return max(tried, key=lambda candidate: some.process(candidate).evidence)
 
 
 RESIDUAL_TOLERANCE = 1e-5
@@ -316,14 +316,14 @@ def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
     how |= {"new_noise": data.noise_of_any_row(scales)}
 
     def problem(y: Tensor, noise: Noise, nominal: GeometryMap, observe: Observation | None) -> Problem:
-        own = Problem(nominal.typical, data.x, y, noise=noise, observe=observe, **how)
-        return own.with_nominal_of_rows(nominal)
+        plain = Problem(nominal.typical, data.x, y, noise=noise, observe=observe, **how)
+        return plain.with_nominal_of_rows(nominal)
 
     whole = problem(data.y, Noise(data.weighted_noise(scales), data.shared), data.nominal, data.observe)
     if data.basis is None:
         return whole
-    told, noise = LinearFunctionals(data.basis.mT), Noise(data.noise_of_numbers(scales), data.in_numbers(data.shared))
-    return problem(told.value(data.y), noise, data.nominal.changed(rigid=True), told).standing_for(whole)
+    basis, noise = LinearFunctionals(data.basis.mT), Noise(data.noise_of_numbers(scales), data.in_numbers(data.shared))
+    return problem(basis.value(data.y), noise, data.nominal.changed(rigid=True), basis).standing_for(whole)
 
 
 MOST_REACH = 1.5
@@ -339,10 +339,10 @@ def check_models(models: object, robot: Tree) -> None:
         if not isinstance(model, CalibratedKinematics):
             expected = "a calibrated robot, such as `result.model`"
             raise InputError.of(what, expected=expected, got=type(model).__name__)
-        own, other = (tuple(each.periodic) for each in (robot, model.robot))
-        if own != other or robot.moving != model.robot.moving:
+        turning, other = (tuple(each.periodic) for each in (robot, model.robot))
+        if turning != other or robot.moving != model.robot.moving:
             got = f"{model.robot.n} joints, {sum(other)} of them revolute, {model.robot.moving} moving"
-            expected = f"{robot.n} joints, {sum(own)} of them revolute, {robot.moving} moving, as of '{robot.name}'"
+            expected = f"{robot.n} joints, {sum(turning)} of them revolute, {robot.moving} moving, as of '{robot.name}'"
             raise InputError.of(what, expected=expected, got=got, fix="pass models of the same type of robot")
         ratio = model.robot.reach / robot.reach if robot.reach < inf else 1.0
         if not 1 / MOST_REACH < ratio < MOST_REACH:
@@ -375,4 +375,4 @@ def _lines(model: CalibratedKinematics) -> list[GearLine]:
     """Gear lines of a model with their prior amplitudes."""
     deviations = model.map.unregistered.deformation.spec.prior_variance.sqrt()[model.nominal.parts["waves"]]
     waves = model.nominal.own.waves
-    return [GearLine(*one, amplitude) for one, amplitude in zip(waves, deviations[::2].tolist(), strict=True)]
+    return [GearLine(*wave, amplitude) for wave, amplitude in zip(waves, deviations[::2].tolist(), strict=True)]

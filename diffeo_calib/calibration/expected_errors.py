@@ -90,25 +90,25 @@ class ExpectedError:
     @classmethod
     def of(cls, model: CalibratedKinematics) -> ExpectedError:
         """Expected error of a model."""
-        fitted, q, found = model.map, model.map.everywhere, OpenPlaces.of(model.map)
-        shown, own, some = _shown(model), fitted.unregistered, _some_rows(fitted.x)
+        fitted, q, opened = model.map, model.map.everywhere, OpenPlaces.of(model.map)
+        shown, bare, some = _shown(model), fitted.unregistered, _some_rows(fitted.x)
 
         def rms(covariance: Tensor) -> float:
             return _distance(shown @ covariance @ shown.mT)
 
-        points, at = own.geodesic.linearised_value(q)
+        points, at = bare.geodesic.linearised_value(q)
         away = points[:, -3:] - points[:, -3:].mean(0)
-        last = torch.eye(own.m, dtype=points.dtype, device=points.device)[-3:].expand(len(points), -1, -1)
+        last = torch.eye(bare.m, dtype=points.dtype, device=points.device)[-3:].expand(len(points), -1, -1)
         along = (away / away.square().sum()).flatten()  # of a growth of the robot about the middle of its points
-        size = float((along @ own.conditional.covariance_between(at.projected(last)) @ along).clamp(min=0).sqrt())
+        size = float((along @ bare.conditional.covariance_between(at.projected(last)) @ along).clamp(min=0).sqrt())
         whole = expected = rms(fitted.posterior(q, noise=False)[1])
-        if found.motions.shape[1]:
-            left = found.without(found.without(fitted.joint_covariance(q)).mT)
+        if opened.motions.shape[1]:
+            left = opened.without(opened.without(fitted.joint_covariance(q)).mT)
             expected = min(whole, rms(diagonal_blocks(left, len(q))))
         share = min(size * float(away.square().sum(1).mean().sqrt()) / max(expected, 1e-12), 1.0)
         doubt = 0.0 if model.summary is None else model.summary.length_in_doubt or 0.0
         measured = rms(fitted.posterior(fitted.x[some], noise=False)[1])
-        return cls(hypot(expected, doubt), hypot(whole, doubt), measured, found.names_on(model), size, share, doubt)
+        return cls(hypot(expected, doubt), hypot(whole, doubt), measured, opened.names_on(model), size, share, doubt)
 
     @property
     def sentence(self) -> str:
@@ -149,19 +149,19 @@ def expected_errors(
         model: a calibrated model. stages: name -> kinematics, (N, n) -> (N, P, 3) in m.
         expected: what it expects of its own errors, if that has been found already.
     """
-    fitted, found = model.map.unregistered, OpenPlaces.of(model.map)
-    own = (expected or ExpectedError.of(model)).workspace
+    fitted, opened = model.map.unregistered, OpenPlaces.of(model.map)
+    workspace = (expected or ExpectedError.of(model)).workspace
     q, shown = fitted.everywhere, _shown(model)
     places = model(q).detach().flatten(1)
 
     def from_truth(points: Tensor) -> float:
-        apart = found.without((points.flatten(1) - places).reshape(-1, 1)).view(places.shape) + places
+        apart = opened.without((points.flatten(1) - places).reshape(-1, 1)).view(places.shape) + places
         apart, targets = ((shown @ each[:, :, None]).view(-1, 3) for each in (apart, places))
         if fitted.stands_free:
             T = rigid_fit(apart, targets)
             apart = apart @ T[:3, :3].mT + T[:3, 3]
         bodies = len(shown) // 3
-        return float(((apart - targets).square().sum() / (len(q) * bodies) + own**2).sqrt())
+        return float(((apart - targets).square().sum() / (len(q) * bodies) + workspace**2).sqrt())
 
     return {name: from_truth(kinematics(q).detach()) for name, kinematics in stages.items()}
 
@@ -232,21 +232,21 @@ def _places(model_map: FittedMap) -> tuple[Tensor, Tensor, Tensor]:
     registration, fitted = model_map.registration, model_map.unregistered
     q = fitted.everywhere
     if registration is not None and not registration.same:  # it found other markers
-        known: Any = model_map.conditional
+        conditional: Any = model_map.conditional
         rows = registration.q.to(q)
-        return (known.root, *(known.slopes(model_map.linearised_value(at)[1]) for at in (q, rows)))
+        return (conditional.root, *(conditional.slopes(model_map.linearised_value(at)[1]) for at in (q, rows)))
     nominal = fitted.geodesic.spec.nominal
-    own = torch.tensor(nominal.places, dtype=torch.int64, device=fitted.x.device)
-    opened, theta = fitted.open_directions[own], q.new_zeros(nominal.parameters)
-    anywhere = nominal.sensitivities(q, theta)[..., own].flatten(0, 1)
+    columns = torch.tensor(nominal.places, dtype=torch.int64, device=fitted.x.device)
+    opened, theta = fitted.open_directions[columns], q.new_zeros(nominal.parameters)
+    anywhere = nominal.sensitivities(q, theta)[..., columns].flatten(0, 1)
     if fitted.stands_free:
         moved = anywhere[:, :6]
         anywhere = anywhere - moved @ (torch.linalg.pinv(moved) @ anywhere)
-    root, _ = roots(fitted.with_motions.posterior(fitted.parameters_as_points(own))[0] + opened @ opened.mT)
+    root, _ = roots(fitted.with_motions.posterior(fitted.parameters_as_points(columns))[0] + opened @ opened.mT)
     if registration is not None:  # its rows may show what those of the fit left open
-        return root, anywhere, nominal.sensitivities(registration.q.to(q), theta)[..., own].flatten(0, 1)
+        return root, anywhere, nominal.sensitivities(registration.q.to(q), theta)[..., columns].flatten(0, 1)
     some = _some_rows(fitted.x)
-    rows = fitted.functionals[some] @ nominal.sensitivities(fitted.x[some], theta)[..., own]
+    rows = fitted.functionals[some] @ nominal.sensitivities(fitted.x[some], theta)[..., columns]
     rows, shared = (
         (each * fitted.noise.visible[some, :, None]).flatten(0, 1) for each in (rows, fitted.noise.shared[some])
     )
@@ -279,10 +279,10 @@ def with_open_directions(fitted: FittedMap, q: Tensor, registration: Identificat
     if not isinstance(nominal, GeometryMap):
         return fitted
     parts, chain, prior = nominal.geometry.slices, nominal.geometry.chain, Prior()
-    found, least = registration.deviations.to(before), torch.zeros_like(before)
+    deviations, least = registration.deviations.to(before), torch.zeros_like(before)
     most = before.new_tensor([PLACES.open_base_m] * 3 + [PLACES.open_base_rad] * 3)
-    least[parts["base"]] = torch.minimum(BASE_PER_DEVIATION * found[parts["base"]], most)
-    least[parts["tool"]] = found[parts["tool"]]
+    least[parts["base"]] = torch.minimum(BASE_PER_DEVIATION * deviations[parts["base"]], most)
+    least[parts["tool"]] = deviations[parts["tool"]]
     still = (q.amax(0) - q.amin(0)) < STILL_RANGE
     unseen = ~((chain.coupling.to(before) != 0) & ~still).any(1)  # (n_all,)
     if undetermined_places(chain, q, registration, rigid=rigid):
@@ -355,16 +355,16 @@ def accuracy(
         InputError: no row measured in this unit.
     """
     judged = list(errors)
-    own = [one for one in judged if one.unit == unit and one.count]
-    of = ["" if one.what == ERRORS else f"({one.label}) " for one in own]
-    measured = [Accuracy(one.rms, unit, f"{of[k]}on {one.count} rows{which}") for k, one in enumerate(own)]
+    counted = [entry for entry in judged if entry.unit == unit and entry.count]
+    of = ["" if entry.what == ERRORS else f"({entry.label}) " for entry in counted]
+    measured = [Accuracy(entry.rms, unit, f"{of[k]}on {entry.count} rows{which}") for k, entry in enumerate(counted)]
     if unit != "m" and measured:
         return measured[0]
     if unit != "m":
         fix = "give the limit in mm: without positions the error that the model expects is compared with it"
-        got = ", ".join(one.kind for one in judged)
+        got = ", ".join(entry.kind for entry in judged)
         raise InputError.of(f"a limit in {unit}", expected="rows in this unit", got=got, fix=fix)
-    if not any(one.what == ERRORS for one in own):
+    if not any(entry.what == ERRORS for entry in counted):
         how = "expected over the joint ranges of the fit, without measured positions"
         measured.append(Accuracy((expected or ExpectedError.of(model)).whole, unit, how))
-    return max(measured, key=lambda one: one.value)
+    return max(measured, key=lambda entry: entry.value)

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.judge import Length
+from diffeo_calib.calibration.diagnostics.hypotheses import Length
 from diffeo_calib.calibration.diagnostics.outliers import Outlier
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import Identification
@@ -93,8 +93,8 @@ class CalibrationResult:
     def _repr_html_(self) -> str:
         """The model and what it explains, for notebooks."""
         rows = [[part.name, f"{1e3 * part.displacement:.4f}"] for part in self.parts]
-        found = f"{len({one.row for one in self.outliers})} rows look wrong" if self.outliers else "no row looks wrong"
-        parts = table_html(f"{self.status}; {found}", ("part", "displacement [mm]"), rows)
+        words = f"{len({one.row for one in self.outliers})} rows look wrong" if self.outliers else "no row looks wrong"
+        parts = table_html(f"{self.status}; {words}", ("part", "displacement [mm]"), rows)
         return self.model._repr_html_() + parts
 
     @property
@@ -139,21 +139,21 @@ class CalibrationResult:
     @property
     def stages(self) -> dict[str, Callable[[Tensor], Tensor]]:
         """Name of each stage -> its kinematics, (N, n) -> (N, P, 3) in m."""
-        own = self.registration.geometry.points, self.identification.geometry.points, self.model
-        return dict(zip(STAGES, own, strict=True))
+        kinematics = self.registration.geometry.points, self.identification.geometry.points, self.model
+        return dict(zip(STAGES, kinematics, strict=True))
 
     def places(self, stage: str = STAGES[-1]) -> Places:
         """Where the devices are as of a stage: frames of sessions, devices of readings."""
-        now = [own.devices for own in self.readings]
+        now = [kind.devices for kind in self.readings]
         devices = (self.registration.devices, self.identification.devices, now)[STAGES.index(stage)]
-        others = [own.devices for own in self.placement if not own.devices.reads]
+        others = [kind.devices for kind in self.placement if not kind.devices.reads]
         return Places(joined([*others, *devices]), self.placed.ball)
 
     def errors(self, data: Any) -> dict[str, dict[str, Evaluation]]:
         """Errors by the kind of the rows and by stage, of rows in the measuring frames of the sessions."""
-        found = {name: residuals(kinematics, self.places(name), data) for name, kinematics in self.stages.items()}
-        kinds = next(iter(found.values()))
-        return {kind: {name: own[kind] for name, own in found.items()} for kind in kinds}
+        by_stage = {name: residuals(kinematics, self.places(name), data) for name, kinematics in self.stages.items()}
+        kinds = next(iter(by_stage.values()))
+        return {kind: {name: by_kind[kind] for name, by_kind in by_stage.items()} for kind in kinds}
 
     @property
     def left_out(self) -> Evaluations:
@@ -206,24 +206,24 @@ def parts(model: CalibratedKinematics) -> list[Part]:
     jacobian = nominal.jacobian(x, theta)
     joints, offsets = _joint_parts(model, x, jacobian)
     registered, refined = nominal.geometry.points(x), nominal.geometry.points(x, errors)
-    found = [Part("geometry", _rms((refined - registered).flatten(1) + jacobian @ offsets))]
+    explained = [Part("geometry", _rms((refined - registered).flatten(1) + jacobian @ offsets))]
     effects = nominal.sensitivities(x, theta) * theta
     if nominal.elasticity is not None:
         sag = effects[..., nominal.sag]
-        found += [Part(name, _rms(sag[..., own].sum(-1))) for name, own in nominal.elasticity.parts.items()]
+        explained += [Part(name, _rms(sag[..., columns].sum(-1))) for name, columns in nominal.elasticity.parts.items()]
     crooked = effects[..., nominal.parts["axes"]].split([6 * count for *_, count in nominal.own.axes], -1)
     for (axis, *_), moved in zip(nominal.own.axes, crooked, strict=False):
-        found.append(Part(f"the axis of {model.robot.moving_names[axis]}", _rms(moved.sum(-1))))
+        explained.append(Part(f"the axis of {model.robot.moving_names[axis]}", _rms(moved.sum(-1))))
     joints += [Part(f"gear line {line.frequency:.1f} of {line.joint}", line.displacement) for line in gear_lines(model)]
     points = deformation.spec.nominal(x, theta).reshape(-1, deformation.spec.task_dim)
     bent = deformation.spec.task_kernel.field(points, deformation.task_controls, deformation.momenta.task)
-    return [*found, *joints, Part("task space", _rms(bent))]
+    return [*explained, *joints, Part("task space", _rms(bent))]
 
 
 def _joint_parts(model: CalibratedKinematics, x: Tensor, jacobian: Tensor) -> tuple[list[Part], Tensor]:
     """Transmission of every joint, then the coupled joint errors; and the transmissions' means (n,)."""
     deformation = model.map.deformation
-    found, coupled, means = [], torch.zeros_like(jacobian[..., 0]), torch.zeros_like(x[0])
+    explained, coupled, means = [], torch.zeros_like(jacobian[..., 0]), torch.zeros_like(x[0])
     for term in deformation.spec.joint_kernel.terms:
         v = term.field(x, deformation.x, deformation.momenta.joint)
         if isinstance(term, RadialKernel) and term.output is not None:
@@ -231,10 +231,10 @@ def _joint_parts(model: CalibratedKinematics, x: Tensor, jacobian: Tensor) -> tu
             varying = v - v.mean(0)
             angle = float(varying[:, term.output].square().mean().sqrt())
             moved = _rms((jacobian @ varying[:, :, None])[..., 0])
-            found.append(Part(f"transmission of {model.robot.joint_names[term.output]}", moved, angle))
+            explained.append(Part(f"transmission of {model.robot.joint_names[term.output]}", moved, angle))
         else:
             coupled = coupled + (jacobian @ v[:, :, None])[..., 0]
-    return [*found, Part("coupled joint errors", _rms(coupled))], means
+    return [*explained, Part("coupled joint errors", _rms(coupled))], means
 
 
 def _rms(displacements: Tensor) -> float:

@@ -135,16 +135,16 @@ def _parts(word: str) -> list[str]:
 
 def groups(names: Sequence[str], labels: Sequence[str]) -> Iterator[Group]:
     """The columns whose names differ by some of these labels alone, in the order of the labels."""
-    found: dict[tuple[tuple[str, ...], tuple[str, ...], int], dict[str, str]] = {}
-    wanted, seen = set(labels), Counter[tuple[str, ...]]()
+    grouped: dict[tuple[tuple[str, ...], tuple[str, ...], int], dict[str, str]] = {}
+    wanted, counts = set(labels), Counter[tuple[str, ...]]()
     for words, name in ((column(name).words, name) for name in names):
-        seen[words] += 1  # X and x are columns of two groups
+        counts[words] += 1  # X and x are columns of two groups
         for start, end in combinations(range(len(words) + 1), 2):
             label = "".join(words[start:end]) if end - start <= LONGEST_LABEL else ""
             if label and label in wanted:
-                found.setdefault((words[:start], words[end:], seen[words]), {})[label] = name
-    for (before, after, _), own in found.items():
-        yield Group(before, after, {label: own[label] for label in labels if label in own})
+                grouped.setdefault((words[:start], words[end:], counts[words]), {})[label] = name
+    for (before, after, _), columns in grouped.items():
+        yield Group(before, after, {label: columns[label] for label in labels if label in columns})
 
 
 def whole(names: Sequence[str], labels: Sequence[str]) -> Iterator[Group]:

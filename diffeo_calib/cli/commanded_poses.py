@@ -14,7 +14,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.identification.registration import spread
-from diffeo_calib.cli.column_names import WORDS, Group, column, whole
+from diffeo_calib.cli.column_names import WORDS, column, whole
 from diffeo_calib.cli.guesses import Body, RowColumns, Sheet, bodies_in, matrices_in, rows_in
 from diffeo_calib.cli.options import Rows, Units
 from diffeo_calib.cli.proposals import LARGEST_RESIDUAL, Source, percent, ranked, reason, source_of
@@ -28,6 +28,7 @@ from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.poses import rotation_matrices
 from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, UNITS_PER_METRE, ZERO, numbers_of
 from diffeo_calib.robots.cartesian import cartesian
+from diffeo_calib.sensors.tables import measured_positions
 
 NUMBERED = "0123456", "1234567", "012345", "123456"
 """Poses of the tool as a series: a place, then a quaternion, a rotation vector or angles."""
@@ -55,21 +56,19 @@ class Reading(NamedTuple):
 
 def poses_in(sheet: Sheet) -> list[Body]:
     """Places with their rotations, and poses as 6, 7, 12 or 16 numbers, in the order of columns."""
-    found = bodies_in(sheet.numbers)
-    used = {name for own in found for name in (*own.place, *own.turn)}
+    bodies = bodies_in(sheet.numbers)
+    used = {name for body in bodies for name in (*body.place, *body.turn)}
     others = [name for name in sheet.numbers if name not in used]
-    found += matrices_in(sheet, others)
-    found += [Body(list(own.names.values()), []) for own in whole(others, "xy") if own.wished and _is_place(own)]
+    bodies += matrices_in(sheet, others)
+    flat = [xy for xy in whole(others, "xy") if xy.wished and not xy.says("rate", "deviation")]
+    bodies += [Body([*xy.names.values()], []) for xy in flat]
     for labels in NUMBERED:
-        taken = {name for own in found for name in (*own.place, *own.turn)}
+        taken = {name for body in bodies for name in (*body.place, *body.turn)}
         for group in whole([name for name in others if name not in taken], labels):
             names = list(group.names.values())
-            found += [Body(names[:3], names[3:])] if group.says("tool") and _is_place(group) else []
-    return sorted(found, key=lambda own: sheet.header.index(own.place[0]))
-
-
-def _is_place(group: Group) -> bool:
-    return not group.says("rate", "deviation")
+            if group.says("tool") and not group.says("rate", "deviation"):
+                bodies.append(Body(names[:3], names[3:]))
+    return sorted(bodies, key=lambda body: sheet.header.index(body.place[0]))
 
 
 def machine_of(bodies: Sequence[Body]) -> Body:
@@ -78,14 +77,14 @@ def machine_of(bodies: Sequence[Body]) -> Body:
     What is only said to be measured is the machine's where something else was seen as well.
     """
     seen = WORDS["seen"] - {"target"}
-    others = any(own.words & seen for own in bodies)
+    others = any(body.words & seen for body in bodies)
 
-    def rank(own: Body) -> int:
-        if others and own.words & WORDS["measured"] and not own.words & seen:
+    def rank(body: Body) -> int:
+        if others and body.words & WORDS["measured"] and not body.words & seen:
             return 3
-        if own.words & WORDS["machine"]:
-            return 2 + bool(own.words & WORDS["measured"])
-        return bool(own.words & (WORDS["wished"] - {"target"})) - len(own.words & (WORDS["seen"] | WORDS["measured"]))
+        if body.words & WORDS["machine"]:
+            return 2 + bool(body.words & WORDS["measured"])
+        return bool(body.words & (WORDS["wished"] - {"target"})) - len(body.words & (WORDS["seen"] | WORDS["measured"]))
 
     return max(bodies, key=rank)
 
@@ -105,55 +104,54 @@ def commanded(sheet: Sheet) -> Source:
     machine = machine_of(bodies)
     used = [*machine.place, *machine.turn]
     others = tuple(name for name in sheet.numbers if name not in used)
-    if not others:
-        what = f"what was measured of the machine in '{sheet.path}'"
-        raise InputError.of(what, expected="columns beside its poses", got=f"{few(used, 16)} alone")
     rows = rows_in(replace(sheet, numbers=others), used)
     if rows.bodies and rows.bodies[0].turn:  # poses of one frame
         body, *others = rows.bodies
-        rows.left.extend(f"{few(own.place)}: beside the pose of {few(body.place)}; not used" for own in others)
+        rows.left.extend(f"{few(extra.place)}: beside the pose of {few(body.place)}; not used" for extra in others)
         rows = rows._replace(bodies=[body], options={**rows.options, "position": [body.written()]})
     tried = list[list[Source]]()
     for lengths in UNUSUAL_LENGTHS:
         tried.append(ranked(_ways(sheet, machine, rows, lengths=lengths)))
         if tried[-1] and tried[-1][0].left <= LARGEST_RESIDUAL:
             break
-    found = min(tried, key=lambda own: own[0].left if own else inf)
-    if found and found[0].left == inf:
-        found[0].share()  # says why
-    if not found or found[0].left > LARGEST_RESIDUAL:
-        got = f"{percent(found[0].left)} of what the rows vary unexplained" if found else "no way to read them"
+    ways = min(tried, key=lambda ranking: ranking[0].left if ranking else inf)
+    if ways and ways[0].left == inf:
+        ways[0].share()  # says why
+    if not ways or ways[0].left > LARGEST_RESIDUAL:
+        got = f"{percent(ways[0].left)} of what the rows vary unexplained" if ways else "no way to read them"
         what = f"poses of the machine in {few(used, 16)}"
         fix = "check that the rows belong together, or write the campaign file yourself; for joints name the robot"
         if not machine.turn:  # by two axes, in columns of any names
             fix += "; if the machine turns too, a function makes its poses: "
             fix += f"fit --robot-pose {','.join(used)},...=FILE.py:NAME"
         raise InputError.of(what, expected="a convention and units that explain the rows", got=got, fix=fix)
-    best, *_ = alike = [one for one in found if _as_good(one, found[0])]
-    why = f"{reason(best, *(one for one in found if one not in alike))}; by their names, in place of joint values"
+    best, *_ = alike = [way for way in ways if _as_good(way, ways[0])]
+    why = reason(best, *(way for way in ways if way not in alike))
     by_size, whose = "the size of the numbers", _lengths(machine.place, _numbers(sheet, machine.place))
-    why = {"robot_pose": why, "length": by_size, "joint_length": by_size, "convention": "the same"}
+    why = {"robot_pose": f"{why}; by their names, in place of joint values", "angle": why, "convention": why}
+    why |= {"length": by_size, "joint_length": by_size}
     why |= {"rotation": "beside the columns of its place", "camera_on_tool": "what stands is seen from the flange"}
     best = best.into(why)
     if len(whose) > 1 and best.options.joint_length is None:
         more = f"{by_size}; which machine it is, they do not tell"
         best = best.asking("length", dict.fromkeys(whose, more))
-    unsure = 2 * len(alike) >= len(found) >= MOST_WAYS
+    unsure = 2 * len(alike) >= len(ways) >= MOST_WAYS
     for name in TURNED:
-        values = dict.fromkeys(getattr(one.options, name) for one in alike)
+        values = dict.fromkeys(getattr(way.options, name) for way in alike)
         if len(values) > 1 or unsure:
             best = best.asking(name, {value: best.why[name] for value in values if value})
     return best
 
 
-def _as_good(one: Source, best: Source) -> bool:
+def _as_good(way: Source, best: Source) -> bool:
     """Whether the rows do not tell a way from the best one: who saw whom changes what a residual is a share of."""
 
-    def metres(own: Source) -> float:
-        return own.left * spread(own.data.largest_session().points)
+    def metres(source: Source) -> float:
+        positions = measured_positions(source.data)
+        return source.left * (1.0 if positions is None else spread(positions.largest_session().points))
 
     factor = gates.READINGS_TOLD_APART
-    return one.left < factor * best.left or (one.left <= LARGEST_RESIDUAL and metres(one) < factor * metres(best))
+    return way.left <= factor * best.left or (way.left <= LARGEST_RESIDUAL and metres(way) < factor * metres(best))
 
 
 def _ways(sheet: Sheet, machine: Body, rows: RowColumns, *, lengths: tuple[str, str]) -> Iterator[Source]:
@@ -192,9 +190,9 @@ def _numbers(sheet: Sheet, names: Sequence[str]) -> Tensor:
     """Columns as they are (N, c), of the rows without an empty cell among them."""
     flat = [ZERO] * len(sheet.cells[sheet.header[0]])  # places in a plane
     columns = [numbers_in(sheet.cells.get(name, flat), sheet.decimal) for name in names]
-    values = [[nan if value is None else value for value in own] for own in columns]
-    found = torch.tensor(values, dtype=torch.float64, device=HOST)
-    return found[:, found.isfinite().all(0)].T
+    values = [[nan if value is None else value for value in series] for series in columns]
+    numbers = torch.tensor(values, dtype=torch.float64, device=HOST)
+    return numbers[:, numbers.isfinite().all(0)].T
 
 
 def _lengths(names: Sequence[str], values: Tensor) -> tuple[str, ...]:
@@ -212,17 +210,17 @@ def _lengths(names: Sequence[str], values: Tensor) -> tuple[str, ...]:
 
 def _readings(numbers: Tensor) -> dict[Reading, Tensor]:
     """Rotations (N, 3, 3) in every convention that can be meant."""
-    found = dict[Reading, Tensor]()
+    rotations = dict[Reading, Tensor]()
     count = numbers.shape[1]
     for convention in (name for name in ALL_CONVENTIONS if numbers_of(name) == count):
         for angle in ("deg", "rad") if count == 3 else ("rad",):
             with suppress(InputError):
-                found[Reading(convention, angle)] = rotation_matrices(numbers, convention, angle=angle)
-    return found
+                rotations[Reading(convention, angle)] = rotation_matrices(numbers, convention, angle=angle)
+    return rotations
 
 
 def _alike(
-    commanded: tuple[Tensor, dict[Reading, Tensor]], seen: tuple[Tensor, dict[Reading, Tensor]]
+    commanded: tuple[Tensor, dict[Reading, Tensor]], target: tuple[Tensor, dict[Reading, Tensor]]
 ) -> list[tuple[Reading, Reading, bool]]:
     """Ways to read the rotations of both bodies, and whether what stands was seen from the flange, the likeliest first.
 
@@ -231,17 +229,17 @@ def _alike(
     geometry", 1991). So are those of the inverse: who saw whom is for the rows to tell.
 
     Args:
-        commanded: places (N, 3), m, and rotations (N, 3, 3) by reading. seen: of the other body.
+        commanded: places (N, 3), m, and rotations (N, 3, 3) by reading. target: of the other body.
     """
     some = slice(None, None, -(-len(commanded[0]) // MOST_ROWS))
-    bodies = [(place[some], torch.stack([*turns.values()])[:, some]) for place, turns in (commanded, seen)]
+    bodies = [(place[some], torch.stack([*turns.values()])[:, some]) for place, turns in (commanded, target)]
     size = max(float((place - place.mean(0)).norm(dim=1).mean()) for place, _ in bodies) or 1.0
-    own, others = (_screws(*body, size) for body in bodies)
-    whole = own.abs().mean(1)[:, None] + others.abs().mean(1)  # small where radians are read as degrees
-    away = (own[:, None] - others).abs().sort(dim=2).values  # the worst may be of gross rows
+    flange, others = (_screws(*body, size) for body in bodies)
+    whole = flange.abs().mean(1)[:, None] + others.abs().mean(1)  # small where radians are read as degrees
+    away = (flange[:, None] - others).abs().sort(dim=2).values  # the worst may be of gross rows
     left = (away[:, :, : ceil(GOOD_MOTIONS * away.shape[2])].mean(2) / whole.clamp(min=EXACT)).flatten().tolist()
-    found = sorted(zip(left, product(commanded[1], seen[1]), strict=True), key=lambda entry: entry[0])
-    alike = [pair for one, pair in found if one <= ALIKE * max(found[0][0], EXACT)][: MOST_WAYS // 2]
+    pairs = sorted(zip(left, product(commanded[1], target[1]), strict=True), key=lambda entry: entry[0])
+    alike = [pair for misfit, pair in pairs if misfit <= ALIKE * max(pairs[0][0], EXACT)][: MOST_WAYS // 2]
     return [(*pair, camera) for pair in alike for camera in (False, True)]
 
 
@@ -251,12 +249,12 @@ def _screws(places: Tensor, R: Tensor, size: float) -> Tensor:
     Args:
         places: (N, 3), m. R: (c, N, 3, 3), of c readings.
     """
-    found = list[Tensor]()
+    motions = list[Tensor]()
     for step in STEPS:
         turns = R.mT @ R.roll(-step, 1)
         shifts = (R.mT @ (places.roll(-step, 0) - places)[..., None])[..., 0]
         skew = turns - turns.mT
         axes = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], 2)
         trace = turns.diagonal(dim1=2, dim2=3).sum(2)
-        found += [torch.atan2(axes.norm(dim=2), trace - 1), (axes * shifts).sum(2) / (2 * size)]
-    return torch.cat(found, 1)
+        motions += [torch.atan2(axes.norm(dim=2), trace - 1), (axes * shifts).sum(2) / (2 * size)]
+    return torch.cat(motions, 1)

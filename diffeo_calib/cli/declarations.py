@@ -383,5 +383,5 @@ class DemoOptions(Command):
     seed: int = option("Seed of the arm and the noise.", **SEED)
 
 
-COMMANDS = {one.__name__.removesuffix("Options").lower(): one for one in Command.__subclasses__()}
+COMMANDS = {kind.__name__.removesuffix("Options").lower(): kind for kind in Command.__subclasses__()}
 """By name, in the order of the help."""

@@ -96,7 +96,7 @@ class Sheet:
 
 def guess_sheet(path: Path) -> Sheet:
     """The separator and decimal mark with which most columns are numbers; MeasurementError says why none is right."""
-    found, reasons = list[Sheet](), list[tuple[int, MeasurementError]]()
+    sheets, reasons = list[Sheet](), list[tuple[int, MeasurementError]]()
     for sep in SEPARATORS:
         width = 0
         try:
@@ -120,11 +120,11 @@ def guess_sheet(path: Path) -> Sheet:
                 elif 2 * len(wrong) < len(each) or number(wrong[0][2], decimal, grouped=True) is not None:
                     odd += wrong  # most are numbers, or they look like numbers
             why = str(bad_cells(path, odd, "a number", number_hint(odd[0][2], decimal))) if odd else ""
-            found.append(Sheet(path, sep, decimal, tuple(columns), tuple(numbers), tuple(file.notes), why))
-    most = max((len(sheet.numbers) for sheet in found), default=0)
-    likely = [sheet for sheet in found if len(sheet.numbers) == most]  # columns may have different decimal marks
-    best = max(likely, key=lambda own: sum(own.decimal in "".join(own.cells[k]) for k in own.numbers), default=None)
-    width, reason = max(reasons, key=lambda one: one[0], default=(0, None))
+            sheets.append(Sheet(path, sep, decimal, tuple(columns), tuple(numbers), tuple(file.notes), why))
+    most = max((len(sheet.numbers) for sheet in sheets), default=0)
+    likely = [sheet for sheet in sheets if len(sheet.numbers) == most]  # columns may have different decimal marks
+    best = max(likely, key=lambda way: sum(way.decimal in "".join(way.cells[k]) for k in way.numbers), default=None)
+    width, reason = max(reasons, key=lambda pair: pair[0], default=(0, None))
     if reason is not None and (best is None or not best.numbers or width > 2 * len(best.numbers)):
         raise reason
     if best is None or not best.numbers:
@@ -157,7 +157,7 @@ def guess_joints(columns: Sequence[str], joints: Sequence[str]) -> list[JointCol
         return [JointColumns([*columns[: len(joints)]], "the first columns: no line of the file names them", ())]
     if set(joints) <= set(columns):
         return [JointColumns(list(joints), "named as in the URDF", ())]
-    found: dict[tuple[str, ...], JointColumns] = {}
+    candidates: dict[tuple[str, ...], JointColumns] = {}
     for labels, named, group in _named_after(columns, joints):
         names, numbered = list(group.names.values()), labels[-1].isdigit()
         missing = [k for k, label in enumerate(labels) if label not in group.names]
@@ -172,13 +172,13 @@ def guess_joints(columns: Sequence[str], joints: Sequence[str]) -> list[JointCol
         rank = group.wished, bool(numbered and not group.says("joint")), not said, len(missing), len(unlike)
         why = ", commanded" if group.wished else f", reported: '{min(said)}'" if said else ""
         why += "".join(f", {rails[0]} for {joints[k]}" for k in missing)
-        found.setdefault(tuple(names), JointColumns(names, named + why, rank))
-    return sorted(found.values(), key=lambda one: one.rank)
+        candidates.setdefault(tuple(names), JointColumns(names, named + why, rank))
+    return sorted(candidates.values(), key=lambda candidate: candidate.rank)
 
 
 def joints_without_column(columns: Sequence[str], joints: Sequence[str]) -> list[str]:
     """The joints that no column is named after, of the naming that most columns follow."""
-    closest = max(_named_after(columns, joints), key=lambda found: len(found[2].names), default=None)
+    closest = max(_named_after(columns, joints), key=lambda naming: len(naming[2].names), default=None)
     if closest is None:
         return list(joints)
     return [joint for joint, label in zip(joints, closest[0], strict=True) if label not in closest[2].names]
@@ -187,17 +187,17 @@ def joints_without_column(columns: Sequence[str], joints: Sequence[str]) -> list
 def _named_after(columns: Sequence[str], joints: Sequence[str]) -> Iterator[tuple[list[str], str, Group]]:
     """Columns with some of the labels that joints may have, all of these in the robot's order, and what they are."""
     words, n = [column(joint).words for joint in joints], len(joints)
-    counts = Counter(word for own in words for word in set(own))
-    full = ["".join(own) for own in words]
-    bare = ["".join(word for word in own if counts[word] < n or n == 1) for own in words]
-    alone = [next((word for word in own if counts[word] == 1 and not word.isdigit()), "") for own in words]
+    counts = Counter(word for parts in words for word in set(parts))
+    full = ["".join(parts) for parts in words]
+    bare = ["".join(word for word in parts if counts[word] < n or n == 1) for parts in words]
+    alone = [next((word for word in parts if counts[word] == 1 and not word.isdigit()), "") for parts in words]
     usual = "named as in the URDF but for units, case and what all have in common"
     labels = [(usual, full)] + [(usual, own) for own in (bare, alone) if all(own) and not all(map(str.isdigit, own))]
     labels += [("named as on the robot's pendant", list(names)) for names in PENDANTS if len(names) == n]
     series = [[f"{k + first:0{width}d}" for k in range(n)] for first in (0, 1) for width in (1, 2)]
-    series += [["", *own[:-1]] for own in series if n > 1]  # the first joint is a rail
-    labels += [("numbered in the order of the URDF's joints", own) for own in series]
-    return ((own, how, group) for how, own in labels for group in groups(columns, own))
+    series += [["", *digits[:-1]] for digits in series if n > 1]  # the first joint is a rail
+    labels += [("numbered in the order of the URDF's joints", digits) for digits in series]
+    return ((naming, how, group) for how, naming in labels for group in groups(columns, naming))
 
 
 def _is_external(name: str) -> bool:
@@ -237,51 +237,51 @@ def bodies_in(columns: Sequence[str]) -> list[Body]:
     Of several that are as much alike the nearest one. A rotation is four columns of a quaternion, nine of a matrix or
     three angles.
     """
-    at = {name: place for place, name in enumerate(columns)}
+    at = {name: offset for offset, name in enumerate(columns)}
     places = [group for group in whole(columns, "xyz") if not group.says("rate", "deviation", "turn")]
     turns = [(group, usual) for labels, usual in ROTATIONS for group in _rotations(columns, labels)]
     pairs = list[tuple[tuple[int, ...], str, list[str], str]]()
-    for own, (rank, (group, usual)) in product(places, enumerate(turns)):
-        first, turn = own.names["x"], list(group.names.values())
+    for place, (rank, (group, usual)) in product(places, enumerate(turns)):
+        first, turn = place.names["x"], list(group.names.values())
         unlike = (group.shared - group.says("turn", "place")) ^ ({*column(first).words} - {"x", *WORDS["place"]})
         start = min(at[name] for name in turn)
         series = turn[0] in JOINTS and start < at[first]  # of joints, rather than a quaternion
-        if own.wished == group.wished and not series:
+        if place.wished == group.wished and not series:
             pairs.append(((len(unlike), abs(start - at[first]), at[first], start, rank), first, turn, usual))
-    found = dict[str, tuple[list[str], str]]()
+    rotations = dict[str, tuple[list[str], str]]()
     for _, first, turn, usual in sorted(pairs):
-        if first not in found and not any(set(turn) & set(other) for other, _ in found.values()):
-            found[first] = turn, usual
+        if first not in rotations and not any(set(turn) & set(other) for other, _ in rotations.values()):
+            rotations[first] = turn, usual
     bodies = list[Body]()
-    for own in sorted(places, key=lambda own: at[own.names["x"]]):
-        better = [one.names["x"] for one in places if one.stem == own.stem and one.rank < own.rank]
+    for place in sorted(places, key=lambda place: at[place.names["x"]]):
+        better = [twin.names["x"] for twin in places if twin.stem == place.stem and twin.rank < place.rank]
         left = f"places beside the measured ones of {better[0]}" if better else ""
-        names, left = list(own.names.values()), "wished places" if own.wished else left
-        bodies.append(Body(names, *found.get(names[0], ([], "")), left=left))
+        names, left = list(place.names.values()), "wished places" if place.wished else left
+        bodies.append(Body(names, *rotations.get(names[0], ([], "")), left=left))
     return bodies
 
 
 def _numbered(columns: Sequence[str]) -> list[Body]:
     """Series of three numbers that may be places; else the first columns of another file, which has no names."""
-    each = (own for labels in ("123", "012") for own in whole(columns, labels) if not _goes_on(columns, own))
-    found = [own.names.values() for own in each if not (own.wished or own.says("rate", "deviation", "turn"))]
+    each = (group for labels in ("123", "012") for group in whole(columns, labels) if not _goes_on(columns, group))
+    series = [group.names.values() for group in each if not (group.wished or group.says("rate", "deviation", "turn"))]
     counted = [name for name in columns if name.isdecimal()]
-    return [Body([*names], []) for names in found or [counted[:3]] * (len(counted) > 2)]
+    return [Body([*names], []) for names in series or [counted[:3]] * (len(counted) > 2)]
 
 
 def spherical_in(sheet: Sheet, columns: Sequence[str]) -> list[Body]:
     """A place as a distance and two angles, of which the second is above the horizon or from the zenith."""
-    found = list[Column]()
+    parts = list[Column]()
     for role, units in (("distance", LENGTHS.values()), ("around", SPHERICAL_UNITS), ("vertical", SPHERICAL_UNITS)):
-        own = (one for one in map(column, columns) if WORDS[role] & {*one.words} and one.unit in {*units, ""})
-        found += [one for one in own if one not in found][:1]
-    if len(found) < 3:
+        fitting = (part for part in map(column, columns) if WORDS[role] & {*part.words} and part.unit in {*units, ""})
+        parts += [part for part in fitting if part not in parts][:1]
+    if len(parts) < 3:
         return []
-    names, words, known = [one.name for one in found], {*found[2].words}, {one.unit for one in found[1:]} - {""}
+    names, words, stated = [part.name for part in parts], {*parts[2].words}, {part.unit for part in parts[1:]} - {""}
     turned = numbers_in(sheet.cells[names[1]], sheet.decimal)
     large = any(abs(value) > 2 * pi for value in turned if value is not None)
-    known = known or {*SPHERICAL_UNITS} - ({"rad"} if large else set())
-    ways = [way for way in SPHERICAL if way.rpartition("_")[2] in known]
+    stated = stated or {*SPHERICAL_UNITS} - ({"rad"} if large else set())
+    ways = [way for way in SPHERICAL if way.rpartition("_")[2] in stated]
     for role in ("elevation", "zenith"):
         ways = [way for way in ways if way.startswith(role) or not WORDS[role] & words]
     return [Body(names, [], spherical=tuple(ways))]
@@ -292,7 +292,7 @@ def _rotations(columns: Sequence[str], labels: Sequence[str]) -> Iterator[Group]
     following = [f"q{len(labels) + int(labels[0][1])}"] if labels[0] in JOINTS else []
     marks = {"r", "m", "t"} if labels[0] in ("00", "11") else {"r"}
     for group in whole(columns, labels):
-        longer = any(one[:2] == group[:2] for one in groups(columns, following))
+        longer = any(other[:2] == group[:2] for other in groups(columns, following))
         plain = labels[0] in ("x", "00", "11") and not (group.says("turn") or group.shared & marks)
         if not (longer or plain or group.says("rate", "deviation")):
             yield group
@@ -300,33 +300,33 @@ def _rotations(columns: Sequence[str], labels: Sequence[str]) -> Iterator[Group]
 
 def guess_readings(columns: Sequence[str]) -> dict[str, list[str]]:
     """Texts of `fit --reading` of all kinds of devices, by the names of their columns; these columns."""
-    found, described = dict[str, list[str]](), [column(name) for name in reversed(columns)]
+    readings, described = dict[str, list[str]](), [column(name) for name in reversed(columns)]
     for kind in known_kinds().values():
         numbers = [""] if kind.numbers_each == 1 else [f"{k + 1}" for k in range(kind.numbers_each)]
         units = {*LENGTHS.values()} if kind.unit == MILLIMETRES else {kind.unit[0]}
-        there = {one.plain: one.name for one in described if not one.unit or one.unit in units}
-        for word, known in kind.columns().items():
-            each = ([f"{column(name).plain}{number}" for number in numbers] for name in known)
-            own = next(([there[name] for name in names] for names in each if set(names) <= set(there)), None)
-            if own is not None and own not in found.values():
-                found[f"{word}={','.join(own)}"] = own
-    pixels = [*whole(columns, "uv"), *(own for own in whole(columns, "xy") if own.says("pixel"))]
-    names = [[*own.names.values()] for own in pixels if not own.says("rate", "deviation")]  # no currents of phases
-    return found | {f"image={','.join(own)},{LENS}": own for own in names[:1]}
+        there = {entry.plain: entry.name for entry in described if not entry.unit or entry.unit in units}
+        for word, usual in kind.columns().items():
+            each = ([f"{column(name).plain}{number}" for number in numbers] for name in usual)
+            chosen = next(([there[name] for name in names] for names in each if set(names) <= set(there)), None)
+            if chosen is not None and chosen not in readings.values():
+                readings[f"{word}={','.join(chosen)}"] = chosen
+    pixels = [*whole(columns, "uv"), *(axes for axes in whole(columns, "xy") if axes.says("pixel"))]
+    names = [[*axes.names.values()] for axes in pixels if not axes.says("rate", "deviation")]  # no currents of phases
+    return readings | {f"image={','.join(pair)},{LENS}": pair for pair in names[:1]}
 
 
 def guess_deviations(columns: Sequence[str], triples: Sequence[Sequence[str]]) -> list[str] | None:
     """Columns whose names are those of the positions but for a word such as std, in their order; None if one lacks."""
 
-    def without(one: Column, *roles: str) -> str:
-        return "".join(word for word in one.words if not any(word in WORDS[role] for role in roles))
+    def without(entry: Column, *roles: str) -> str:
+        return "".join(word for word in entry.words if not any(word in WORDS[role] for role in roles))
 
-    deviations = [one for one in map(column, columns) if {*one.words} & WORDS["deviation"]]
-    known = {without(one, "deviation"): one.name for one in deviations}
-    known |= {without(one, "deviation", "measured"): one.name for one in deviations}
+    deviations = [entry for entry in map(column, columns) if {*entry.words} & WORDS["deviation"]]
+    by_name = {without(entry, "deviation"): entry.name for entry in deviations}
+    by_name |= {without(entry, "deviation", "measured"): entry.name for entry in deviations}
     wanted = [column(name) for triple in triples for name in triple]
-    found = [known.get(one.plain) or known.get(without(one, "measured")) for one in wanted]
-    return None if None in found else [name for name in found if name is not None]
+    names = [by_name.get(entry.plain) or by_name.get(without(entry, "measured")) for entry in wanted]
+    return None if None in names else [name for name in names if name is not None]
 
 
 # --- what was measured ---
@@ -348,23 +348,23 @@ class RowColumns(NamedTuple):
 
 def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
     """The probable contents of a table beside its joints."""
-    known = {name.lower(): name for name in sheet.header}
-    sockets = [known[name] for name in ("place", "socket") if name in known and "socket" in known]
+    by_name = {name.lower(): name for name in sheet.header}
+    sockets = [by_name[name] for name in ("place", "socket") if name in by_name and "socket" in by_name]
     with_gaps = sheet.header if sockets else sheet.numbers  # rows in sockets have no positions
-    found = bodies_in([name for name in with_gaps if name not in joints])
-    left = [f"{few(own.place)}: {own.left}" for own in found if own.left]
+    places = bodies_in([name for name in with_gaps if name not in joints])
+    left = [f"{few(body.place)}: {body.left}" for body in places if body.left]
     others = [name for name in sheet.numbers if name not in joints]
     nameless = all(name.isdecimal() for name in sheet.header) and len(others) > 2
-    bodies = [Body(others[:3], [])] if nameless else [own for own in found if not own.left]
+    bodies = [Body(others[:3], [])] if nameless else [body for body in places if not body.left]
     bodies = bodies or matrices_in(sheet, others)[:1] or spherical_in(sheet, others)
     if not bodies and len(joints) == 2:  # a machine in a plane, and what was measured in it
-        flat = [own for own in whole(others, "xy") if not (own.wished or own.says("rate", "deviation"))]
-        bodies = [Body([*own.names.values(), ZERO], []) for own in flat]
+        flat = [group for group in whole(others, "xy") if not (group.wished or group.says("rate", "deviation"))]
+        bodies = [Body([*group.names.values(), ZERO], []) for group in flat]
     corners = _corners_in(sheet) if {IMAGE, *POINT, *PIXEL} <= {*sheet.cells} else []
     devices = guess_readings([name for name in others if not corners or name not in (*POINT, *PIXEL)])
     readings = [*corners, *devices]
     if bodies or sockets or len(readings) > 1:  # beside other kinds of rows, or one another, some cells are empty
-        there = (text for text, own in devices.items() if all("" in sheet.cells[name] for name in own))
+        there = (text for text, names in devices.items() if all("" in sheet.cells[name] for name in names))
         readings = [*corners, *there]
     bodies = bodies or ([] if sockets or readings else _numbered(others))
     if not bodies and not sockets and not readings:
@@ -373,9 +373,9 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
         fix = f"if they are in another file: --places FILE --by {common}; "
         fix += "without a tracker: a ball in sockets has columns `place` and `socket`, which `init` knows, a device a "
         fix += "column such as `distance`, `wire` or `height`; `fit --help` lists all options, see --reading"
-        got = "; ".join(left) or few(sheet.numbers, 20)
+        got = "; ".join(left) or few(sheet.numbers, 20) or "no other columns"
         raise InputError.of(f"positions in '{sheet.path}'", expected=expected, got=got, fix=fix)
-    options: dict[str, Any] = {"position": [own.written() for own in bodies] or None, "reading": readings or None}
+    options: dict[str, Any] = {"position": [body.written() for body in bodies] or None, "reading": readings or None}
     options["socket"] = ",".join(sockets) or None
     why = {"position": f"{len(bodies)} marker(s), by their names", "reading": _of_readings(readings)}
     why["socket"] = "by their names; a ball on the tool rested in this socket of a block there"
@@ -413,9 +413,9 @@ def marker_of_lines(sheet: Sheet, joints: Sequence[str]) -> str | None:
 
 def matrices_in(sheet: Sheet, columns: Sequence[str]) -> list[Body]:
     """Poses that are written as 16 or 12 numbers by rows or columns."""
-    found = list[Body]()
+    bodies = list[Body]()
     for labels in ENTRIES:
-        used = {name for own in found for name in (*own.place, *own.turn)}
+        used = {name for body in bodies for name in (*body.place, *body.turn)}
         for group in whole([name for name in columns if name not in used], labels):
             if group.wished or _goes_on(columns, group):
                 continue
@@ -424,8 +424,8 @@ def matrices_in(sheet: Sheet, columns: Sequence[str]) -> list[Body]:
             by_rows = all(number(cell, sheet.decimal) == 0 for cell in below)
             entries = [names[4 * row : 4 * row + 4] if by_rows else names[row::4] for row in range(3)]
             turn = [name for row in entries for name in row[:3]]
-            found.append(Body([row[3] for row in entries], turn, "a matrix"))
-    return found
+            bodies.append(Body([row[3] for row in entries], turn, "a matrix"))
+    return bodies
 
 
 def _corners_in(sheet: Sheet) -> list[str]:
@@ -434,8 +434,8 @@ def _corners_in(sheet: Sheet) -> list[str]:
     files = [csv.parent / f"{name}.yaml" for name in dict.fromkeys(sheet.cells.get(CAMERA, ())) if name]
     if len(files) > 1 and all(file.is_file() for file in files):
         return [f"{CORNERS}{file}" for file in files]
-    own, cameras = csv.with_suffix(".yaml"), list[Path]()
-    for file in [own] if own.is_file() else csv.parent.glob("*.yaml"):
+    sidecar, cameras = csv.with_suffix(".yaml"), list[Path]()
+    for file in [sidecar] if sidecar.is_file() else csv.parent.glob("*.yaml"):
         with suppress(InputError):  # no camera
             read_camera(file)
             cameras.append(file)
@@ -454,10 +454,10 @@ def with_places(csv: Path, given: Places) -> tuple[Path, str]:
     common = {name: len({*own} & {*places.cells[name]}) for name, own in joints.cells.items() if name in places.cells}
     if not common:  # columns that name the same rows
         each = product(joints.cells.items(), places.cells.items())
-        pairs = [f"{own}={other}" for (own, names), (other, others) in each if sorted(names) == sorted({*others})]
+        pairs = [f"{key}={other}" for (key, names), (other, others) in each if sorted(names) == sorted({*others})]
         common = dict.fromkeys(pairs if len(pairs) == 1 else [], 1)
     if given.by is None and not common:
-        expected, got = "a column that both files have", " and ".join(few(own.header, 12) for own in (joints, places))
+        expected, got = "a column that both files have", " and ".join(few(part.header, 12) for part in (joints, places))
         fix = "add one, such as the number of the pose, or name two: --by COLUMN=OTHER"
         raise InputError.of("--places without --by", expected=expected, got=got, fix=fix)
     by = given.by or max(common, key=lambda name: common[name])

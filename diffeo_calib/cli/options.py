@@ -77,14 +77,14 @@ class Option(NamedTuple):
     how: dict[str, Any]  # its help and limits
 
     @classmethod
-    def of(cls, own: Field[Any], hint: Any) -> Option:
+    def of(cls, entry: Field[Any], hint: Any) -> Option:
         """The option of a field."""
-        kind, how = own.metadata["kind"], dict(own.metadata["how"])
+        kind, how = entry.metadata["kind"], dict(entry.metadata["how"])
         if not how["help"]:
-            how["help"] = described().get(own.name, "") + " Repeatable." * has(hint, list)
-        long = f"--{own.name.replace('_', '-')}"
-        names = tuple(filter(None, (SHORT.get(own.name), long))) if own.metadata["named"] else ()
-        return cls(own.name, hint, own.default, names, (*names, how["metavar"])[0], kind, how)
+            how["help"] = described().get(entry.name, "") + " Repeatable." * has(hint, list)
+        long = f"--{entry.name.replace('_', '-')}"
+        names = tuple(filter(None, (SHORT.get(entry.name), long))) if entry.metadata["named"] else ()
+        return cls(entry.name, hint, entry.default, names, (*names, how["metavar"])[0], kind, how)
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
@@ -103,31 +103,31 @@ class Options:
     def all(cls) -> tuple[Option, ...]:
         """Its options."""
         hints = get_type_hints(cls)
-        return tuple(Option.of(own, hints[own.name]) for own in fields(cls))
+        return tuple(Option.of(entry, hints[entry.name]) for entry in fields(cls))
 
     @classmethod
     def names(cls) -> set[str]:
         """Names of its fields."""
-        return {own.name for own in fields(cls)}
+        return {entry.name for entry in fields(cls)}
 
     @classmethod
     def check_together(cls, given: Mapping[str, Any]) -> None:
         """Refuse options without those of which they need one, or beside those that they exclude."""
-        typed = {one.shown for one in cls.all() if given[one.field] not in (None, [], one.default)}
+        typed = {entry.shown for entry in cls.all() if given[entry.field] not in (None, [], entry.default)}
         for options, others in cls.needs:
-            for one in options.split():
-                if one in typed and typed.isdisjoint(others.split()):
-                    what = f"{one} without {' or '.join(others.split())}"
+            for name in options.split():
+                if name in typed and typed.isdisjoint(others.split()):
+                    what = f"{name} without {' or '.join(others.split())}"
                     raise InputError.of(what, fix="name this too, or leave the option out")
         for options, others in cls.excludes:
-            for one in options.split():
-                if one in typed and (found := typed.intersection(others.split())):
-                    raise InputError.of(f"{one} beside {min(found)}", fix="leave one of them out")
+            for name in options.split():
+                if name in typed and (clashes := typed.intersection(others.split())):
+                    raise InputError.of(f"{name} beside {min(clashes)}", fix="leave one of them out")
 
 
 def has(hint: Any, part: Any) -> bool:
     """Whether a type, or a part of it, is this one."""
-    return part in {hint, get_origin(hint)} or any(has(one, part) for one in get_args(hint))
+    return part in {hint, get_origin(hint)} or any(has(inner, part) for inner in get_args(hint))
 
 
 # --- groups of several commands -----------------------------------------------------------------------------------
@@ -219,8 +219,8 @@ class Rows(Places, Units):
 
     def left_open(self) -> set[str]:
         """Columns too, unless some are named; not the file of the places of the fit."""
-        own = {"places", "by"} if self.places is None else {"places"}
-        return super().left_open() | (set() if self.named else Rows.names() - Units.names() - own)
+        joining = {"places", "by"} if self.places is None else {"places"}
+        return super().left_open() | (set() if self.named else Rows.names() - Units.names() - joining)
 
     @property
     def images(self) -> bool:

@@ -75,7 +75,7 @@ COLUMNS = "joints", "robot_pose", "position", "marker", "socket", "rotation", "s
 REASONS = {
     **dict.fromkeys(("angle", "rotation_angle", "decimal"), "the same"),
     "joint_length": "the same: the slides are in another unit",
-    "camera_on_tool": "the same; else the board is on the tool",
+    "camera_on_tool": "as of length; else the board is on the tool",
     "rotation": "by their names; without these three lines positions alone are calibrated",
     "dh_convention": "the convention with which it explains the rows",
     "base": "root of the URDF",
@@ -100,8 +100,9 @@ class Source:
     remarks: tuple[str, ...] = ()
 
     def into(self, why: Mapping[str, str] | None = None, **options: Any) -> Source:
-        """Read the table with other options."""
-        return replace(self, options=replace(self.options, **options), why={**self.why, **(why or {})})
+        """Read the table with other options; what is decided is asked no more."""
+        asked = {name: values for name, values in self.asked.items() if name not in options}
+        return replace(self, options=replace(self.options, **options), why={**self.why, **(why or {})}, asked=asked)
 
     def remarking(self, *remarks: str) -> Source:
         """Add remarks."""
@@ -113,7 +114,7 @@ class Source:
 
     def lines(self, folder: Path) -> Iterator[str]:
         """The options but for defaults as entries of a campaign in a folder; comments where the user is to decide."""
-        for option in sorted(FitOptions.all(), key=lambda own: own.field != "csv"):
+        for option in sorted(FitOptions.all(), key=lambda entry: entry.field != "csv"):
             name, value = option.field, getattr(self.options, option.field)
             values = self.asked.get(name, {} if value in (None, option.default) else {"": self.why.get(name, "")})
             for other, why in values.items():
@@ -125,7 +126,7 @@ class Source:
     def columns(self) -> set[str]:
         """Names that its options hold, of columns and others."""
         used = {IMAGE, *POINT, *PIXEL, CAMERA} if self.options.images else set[str]()
-        values = [getattr(self.options, name) for name in COLUMNS] + [[*own] for own in self.asked.values()]
+        values = [getattr(self.options, name) for name in COLUMNS] + [[*choices] for choices in self.asked.values()]
         texts = (text for value in values for text in (value if isinstance(value, list) else [value or ""]))
         return used.union(*(re.split("[=,{}]", str(text)) for text in texts))
 
@@ -154,21 +155,21 @@ class Source:
         if positions is None or self.options.rotation:
             check_poses(self.data)
         if positions is not None:
-            own = positions.largest_session()
-            if (left := likely_mistakes.residual_of(self.robot, own)) == inf:
-                what, expected = f"{len(own)} row(s) of '{self.sheet.path}'", "enough for base and markers"
+            session = positions.largest_session()
+            if (left := likely_mistakes.residual_of(self.robot, session)) == inf:
+                what, expected = f"{len(session)} row(s) of '{self.sheet.path}'", "enough for base and markers"
                 raise MeasurementError.of(what, expected=expected, fix="measure more rows, at several places")
-            return left / max(spread(own.points), SMALLEST_SPREAD_M)
+            return left / max(spread(session.points), SMALLEST_SPREAD_M)
         tables = self.data.parts
         if (resting := resting_rows(tables)) is not None:
             rests = register_sockets(self.robot, resting.q, resting.device)
             ball = rests.positions[resting.device]
             around = float((ball - ball.mean(0)).norm(dim=1).median())
             return float(rests.distances.median()) / around if around > 0.0 else inf
-        lengths = [one for one in tables if one.kind != "image"]
+        lengths = [table for table in tables if table.kind != "image"]
         if not lengths:
-            return max(images_error(self.robot, one) for one in tables)
-        size = float(torch.cat([one.reported.flatten() for one in lengths]).square().mean().sqrt())
+            return max(images_error(self.robot, table) for table in tables)
+        size = float(torch.cat([table.reported.flatten() for table in lengths]).square().mean().sqrt())
         return rough_error(Geometry.nominal(self.robot), lengths) / max(size, SMALLEST_SPREAD_M)
 
     @property
@@ -188,20 +189,20 @@ class Source:
 
     def positions(self) -> Iterator[tuple[Source, Measurements]]:
         """Ways in all units that can be read, with the positions of the largest set-up; none where there are none."""
-        for one in self.units if self.bodies else ():
-            found = None
+        for way in self.units if self.bodies else ():
+            measured = None
             with quiet(), suppress(DiffeoCalibError):
-                found = measured_positions(one.data)
-            if found is not None:
-                yield one, found.largest_session()
+                measured = measured_positions(way.data)
+            if measured is not None:
+                yield way, measured.largest_session()
 
     def in_units(self, *, slides: bool = False) -> Iterator[Source]:
         """Ways in units of length and angle, and with a camera on the tool; ``slides`` in another unit than lengths."""
         periodic = self.robot.periodic
         lengths = ["mm"] if self.without_length and all(periodic) else list(UNITS_PER_METRE)
         angles = ("rad", "deg") if any(periodic) else ("rad",)
-        ways = next((own.spherical for own in self.bodies if own.spherical), ("",))
-        places = [[own.written(way) for own in self.bodies] or None for way in ways]
+        ways = next((body.spherical for body in self.bodies if body.spherical), ("",))
+        places = [[body.written(way) for body in self.bodies] or None for way in ways]
         each = product(lengths, angles, lengths if slides else [None], (False, True)[: 1 + self.options.images], places)
         for length, angle, slide, camera, position in each:
             if slide != length:
@@ -211,8 +212,8 @@ class Source:
     def other_units(self) -> list[str]:
         """Columns of joints and positions whose names say other units."""
         turning = [name for name, turns in zip(self.joints, self.robot.periodic, strict=True) if turns]
-        lengths = 1 if any(own.spherical for own in self.bodies) else None  # the others are angles
-        places = [name for own in self.bodies for name in own.place[:lengths]]
+        lengths = 1 if any(body.spherical for body in self.bodies) else None  # the others are angles
+        places = [name for body in self.bodies for name in body.place[:lengths]]
         pairs = *product(turning, (self.options.angle,)), *product(places, (self.options.length,))
         return [name for name, unit in pairs if column(name).unit not in ("", unit)]
 
@@ -229,7 +230,7 @@ def source_of(sheet: Sheet, robot: Tree, rows: RowColumns, /, **options: Any) ->
 def _in_folder(name: str, value: Any, folder: Path) -> Any:
     """A value as it is written: files are relative to the folder; of one in a list that is no position alone."""
     if isinstance(value, list):
-        texts = [_in_folder(name, own, folder) for own in value]
+        texts = [_in_folder(name, part, folder) for part in value]
         return texts if len(texts) > 1 or name == "position" else texts[0]
     if str(value).startswith(CORNERS) and str(value).endswith(".yaml"):
         return CORNERS + relpath(str(value).removeprefix(CORNERS), folder)
@@ -238,13 +239,13 @@ def _in_folder(name: str, value: Any, folder: Path) -> Any:
 
 def ranked(ways: Iterable[Source]) -> list[Source]:
     """Ways to read a table, the one that leaves the least first."""
-    return sorted(ways, key=lambda one: one.left)
+    return sorted(ways, key=lambda way: way.left)
 
 
-def is_clear(found: Sequence[Source], ratio: float = CLEAR_RATIO) -> bool:
+def is_clear(ways: Sequence[Source], ratio: float = CLEAR_RATIO) -> bool:
     """Whether the first way leaves little, and every other one more by this factor."""
-    best, *others = found
-    return best.left < LARGEST_RESIDUAL and all(best.left < one.left >= ratio * best.left for one in others)
+    best, *others = ways
+    return best.left < LARGEST_RESIDUAL and all(best.left < other.left >= ratio * best.left for other in others)
 
 
 def percent(share: float, digits: int = 3) -> str:
@@ -259,7 +260,7 @@ def reason(best: Source, *others: Source) -> str:
         what = "images of the nominal robot differ, relative to all rows, by"
     elif best.without_length:
         what = "the nominal robot spreads the ball in a socket, relative to all rows, by"
-    least = min((one.left for one in others), default=inf)
+    least = min((other.left for other in others), default=inf)
     than = f"read in any other way at least {percent(least)}" if least < inf else "the table contradicts any other way"
     return f"{what} {percent(best.left, 2)}{f', {than}' * bool(others)}"
 
@@ -267,22 +268,22 @@ def reason(best: Source, *others: Source) -> str:
 # --- what one search each decides -------------------------------------------------------------------------------------
 
 
-def with_joint_columns(source: Source, found: Sequence[JointColumns]) -> Source:
+def with_joint_columns(source: Source, series: Sequence[JointColumns]) -> Source:
     """The columns of the joints: of those that names do not tell apart those that the nominal robot explains.
 
     Where it does not tell them apart either, each is a line that the user may choose.
     """
-    how = {",".join(one.names): one.how for one in found}
-    equal, why = [",".join(one.names) for one in found if one.rank == found[0].rank], ""
+    how = {",".join(entry.names): entry.how for entry in series}
+    equal, why = [",".join(entry.names) for entry in series if entry.rank == series[0].rank], ""
     source = source.into(joints=equal[0])
     if len(equal) > 1:
         ways = ranked(way for names in equal for way in source.into(joints=names).in_units())
-        best, second = ways[0], next(one for one in ways if one.options.joints != ways[0].options.joints)
+        best, second = ways[0], next(other for other in ways if other.options.joints != ways[0].options.joints)
         if not is_clear([best, second], gates.READINGS_TOLD_APART):
             return source.asking("joints", {names: f"uncomment the right line: {how[names]}" for names in equal})
         source, why = source.into(joints=best.options.joints), f"; {reason(best, second)}"
-    for one in (one for one in found[:4] if ",".join(one.names) != source.options.joints):
-        why += f"; not {one.names[0]} to {one.names[-1]}" + " (commanded)" * bool(one.rank and one.rank[0])
+    for entry in (entry for entry in series[:4] if ",".join(entry.names) != source.options.joints):
+        why += f"; not {entry.names[0]} to {entry.names[-1]}" + " (commanded)" * bool(entry.rank and entry.rank[0])
     return source.into({"joints": how[source.options.joints or ""] + why})
 
 
@@ -296,22 +297,23 @@ def with_measured(source: Source) -> Source:
         why = "names the marker of each line: the first line alone of every pose holds its joint values"
         return source.into({"marker": why}, marker=names)
     several, tips = len(source.bodies) > 1, source.options.tip or ()
-    of_each = (unmeasured_markers(source.robot, own) for _, own in source.positions() if several)
+    of_each = (unmeasured_markers(source.robot, rows) for _, rows in source.positions() if several)
     proved = ({marker: words for marker, words, sure in every if sure} for every in of_each)
-    found = next(filter(None, proved), dict[int, str]())
-    if several and not found and len(tips) < 2:  # perhaps in units of their own
+    copies = next(filter(None, proved), dict[int, str]())
+    if several and not copies and len(tips) < 2:  # perhaps in units of their own
         alone = [replace(source, bodies=[own]).into(position=[own.written("")]).units[0].left for own in source.bodies]
         far = max(alone)
         for k, left in enumerate(alone) if gates.DIGITS_SHARE < far < LARGEST_RESIDUAL else ():
             if left < min(gates.FOLLOWED * far, gates.NOMINAL_SHARE):
-                found[k] = f"the nominal robot leaves {percent(left)} of them, and {percent(far)} of others: computed"
-    if found:
-        kept = [k for k in range(len(source.bodies)) if k not in found]
-        left = [f"{few(source.bodies[k].place)}: {words} (counted from 0); not used" for k, words in found.items()]
+                copies[k] = f"the nominal robot leaves {percent(left)} of them, and {percent(far)} of others: computed"
+    if copies:
+        kept = [k for k in range(len(source.bodies)) if k not in copies]
+        left = [f"{few(source.bodies[k].place)}: {words} (counted from 0); not used" for k, words in copies.items()]
         source = replace(source, bodies=[source.bodies[k] for k in kept]).remarking(*left)
-        source = source.into(position=[own.written("") for own in source.bodies])
+        source = source.into(position=[body.written("") for body in source.bodies])
         source = source.into(tip=[tips[k] for k in kept]) if len(tips) > 1 else source
-    alone = len(source.bodies) == 1 and not (source.options.socket or source.options.reading)
+    others = source.options.socket or source.options.reading or source.options.marker
+    alone = len(source.bodies) == 1 and not others
     ways = list(source.positions()) if alone else []
     for _, data in ways[:1] if is_clear(source.units) else ways:
         with quiet(), suppress(DiffeoCalibError):
@@ -327,65 +329,65 @@ def with_units(source: Source) -> Source:
     Raises:
         InputError: none of them, or several. MeasurementError: rows that calibrate nothing.
     """
-    periodic, why, found = source.robot.periodic, "", source.units
-    if not all(periodic) and (found[0].left > DOUBTFUL or not is_clear(found)):
-        others = ranked([*found, *source.in_units(slides=True)])
-        found = others if is_clear(others) else found
+    periodic, why, ways = source.robot.periodic, "", source.units
+    if not all(periodic) and (ways[0].left > DOUBTFUL or not is_clear(ways)):
+        others = ranked([*ways, *source.in_units(slides=True)])
+        ways = others if is_clear(others) else ways
     if not any(periodic):  # all lengths in another unit are another size, which the rows do not show
         low, high = source.robot.limits.unbind(1)
-        values = [(one, one.data.q) for one in found if one.left < inf]
-        inside = [(one, q.amax(0) - q.amin(0)) for one, q in values if bool(((q >= low) & (q <= high)).all())]
-        if chosen := [one for one, moved in inside if float((moved / (high - low)).max()) > SMALLEST_PART]:
-            found, why = chosen, ", by the limits of the joints: the numbers leave it open"
-    excluded, named = found[-1].left == inf, [one for one in found if not one.other_units()]
-    if not is_clear(found) and 0 < len(named) < len(found) and named[0].left < CLEAR_RATIO * found[0].left:
-        found, why = named, ", by the names of the columns: the numbers leave it open" + why
-    best, clear = found[0], is_clear(found)
-    if not clear and (seen := with_rotation(source, camera=True)) is not source:
-        return seen
+        values = [(way, way.data.q) for way in ways if way.left < inf]
+        inside = [(way, q.amax(0) - q.amin(0)) for way, q in values if bool(((q >= low) & (q <= high)).all())]
+        if chosen := [way for way, moved in inside if float((moved / (high - low)).max()) > SMALLEST_PART]:
+            ways, why = chosen, ", by the limits of the joints: the numbers leave it open"
+    excluded, named = ways[-1].left == inf, [way for way in ways if not way.other_units()]
+    if not is_clear(ways) and 0 < len(named) < len(ways) and named[0].left < CLEAR_RATIO * ways[0].left:
+        ways, why = named, ", by the names of the columns: the numbers leave it open" + why
+    best, clear = ways[0], is_clear(ways)
+    if not clear and (turned := with_rotation(source, camera=True)) is not source:
+        return turned
     if best.left == inf:
         best.share()  # says why
     if best.left >= DOUBTFUL and any(periodic) and (meant := _with_meanings(best)) is not best:
         return meant
     if not clear:
-        raise _unclear(found, excluded=excluded)
-    why = reason(*found) + why
+        raise _unclear(ways, excluded=excluded)
+    why = reason(*ways) + why
     if source.without_length and all(periodic):
         return best.into({"length": "of lengths that you add: the table holds none", "angle": why})
     return best.into({"length": why})
 
 
-def _unclear(found: Sequence[Source], *, excluded: bool) -> InputError:
+def _unclear(ways: Sequence[Source], *, excluded: bool) -> InputError:
     """None of the ranked ways in units is right, or several are; with what may be the reason."""
-    parts = [one for one in found if one.left < inf]
+    parts = [way for way in ways if way.left < inf]
 
-    def words(one: Source) -> str:
-        written = (one.options.position or [""])[0].rpartition("=")[0]
-        values = [getattr(one.options, name) for name in ("length", "angle", "joint_length")]
-        return " and ".join(filter(None, [*values, written, "camera on the tool" * one.options.camera_on_tool]))
+    def words(way: Source) -> str:
+        written = (way.options.position or [""])[0].rpartition("=")[0]
+        values = [getattr(way.options, name) for name in ("length", "angle", "joint_length")]
+        return " and ".join(filter(None, [*values, written, "camera on the tool" * way.options.camera_on_tool]))
 
-    got = "; ".join(f"{words(one)}: {percent(one.left)}" for one in parts)
+    got = "; ".join(f"{words(way)}: {percent(way.left)}" for way in parts)
     got += "; the units that the file states exclude others" * excluded
     fix = ""
-    if found[0].bodies and not (found[0].options.socket or found[0].options.reading):
+    if ways[0].bodies and not (ways[0].options.socket or ways[0].options.reading):
         fix = "no signs, zeros, coupling or units of the joints do either: "
     fix += "check the table's joints against the robot's, or write the file yourself; of a robot with several tips "
     fix += "the columns of each are to be named after it, such as left_x"
-    for one in (own for own in parts if own.options.angle == "deg"):
-        largest = zip(one.joints, one.robot.periodic, one.data.q.abs().amax(0).rad2deg().tolist(), strict=True)
+    for way in (source for source in parts if source.options.angle == "deg"):
+        largest = zip(way.joints, way.robot.periodic, way.data.q.abs().amax(0).rad2deg().tolist(), strict=True)
         if far := {name: most for name, turns, most in largest if turns and most > LARGEST_TURN_DEG}:
             got = f"up to {max(far.values()):.4g} in {few([*far])}: no angles, but pulses or ticks of encoders"
             fix = f'write joints = "360/COUNTS*{{{next(iter(far))}}},..." with the counts per turn of each axis, as '
             fix += "the controller states them, negative where it counts the other way"
             return InputError.of("columns of the joints", expected="rad or deg", got=got, fix=fix)
-    for one, own in _of_one_size(found[0]):
-        fix = likely_mistakes.likely_mistake(one.robot, own, one.left * spread(own.points)) or fix
-        third = len(own) // 3
-        for name, rows in (("first", range(third)), ("last", range(len(own) - third, len(own)))):
-            part = own.rows(list(rows))
-            left = likely_mistakes.residual_of(one.robot, part) / max(spread(part.points), SMALLEST_SPREAD_M)
+    for way, data in _of_one_size(ways[0]):
+        fix = likely_mistakes.likely_mistake(way.robot, data, way.left * spread(data.points)) or fix
+        third = len(data) // 3
+        for name, rows in (("first", range(third)), ("last", range(len(data) - third, len(data)))):
+            part = data.rows(list(rows))
+            left = likely_mistakes.residual_of(way.robot, part) / max(spread(part.points), SMALLEST_SPREAD_M)
             if left < DOUBTFUL:
-                got += f"; the {name} {third} rows alone, {one.options.length} and {one.options.angle}: {percent(left)}"
+                got += f"; the {name} {third} rows alone, {way.options.length} and {way.options.angle}: {percent(left)}"
                 fix = "if the device moved between rows, name its set-ups in a column, `session`"
     what = "units with which the robot explains what the rows vary"
     return InputError.of(what, expected="one clear reading", got=f"left unexplained {got}", fix=fix)
@@ -395,12 +397,12 @@ def _of_one_size(source: Source) -> list[tuple[Source, Measurements]]:
     """Ways in units in which robot and positions are of one size, the likeliest first."""
     turning = torch.tensor(source.robot.periodic, dtype=torch.bool, device=HOST)
     likely = dict[str, tuple[float, Source, Measurements]]()
-    for one, own in sorted(source.positions(), key=lambda pair: pair[0].options.angle != "rad"):
-        small = bool((own.q[:, turning].abs() < LARGEST_JOINT_ANGLE_RAD).all())
-        moved = spread(source.robot.tip_poses(own.q)[:, :1, :3, 3]), spread(own.points)
-        if (one.options.angle == "deg" or small) and min(moved) > 0.0:
-            likely.setdefault(one.options.length or "", (abs(log(moved[0] / moved[1])), one, own))
-    return [(one, own) for _, one, own in sorted(likely.values(), key=lambda entry: entry[0])[:MOST_LENGTHS]]
+    for way, data in sorted(source.positions(), key=lambda pair: pair[0].options.angle != "rad"):
+        small = bool((data.q[:, turning].abs() < LARGEST_JOINT_ANGLE_RAD).all())
+        moved = spread(source.robot.tip_poses(data.q)[:, :1, :3, 3]), spread(data.points)
+        if (way.options.angle == "deg" or small) and min(moved) > 0.0:
+            likely.setdefault(way.options.length or "", (abs(log(moved[0] / moved[1])), way, data))
+    return [(way, data) for _, way, data in sorted(likely.values(), key=lambda entry: entry[0])[:MOST_LENGTHS]]
 
 
 def _with_meanings(best: Source) -> Source:
@@ -411,18 +413,18 @@ def _with_meanings(best: Source) -> Source:
     """
     if best.options.socket or best.options.reading:
         return best
-    for one, data in _of_one_size(best):
-        units = one.options.angle or "", UNITS_PER_METRE[one.options.length or ""]
-        found, joints = likely_mistakes.conventions_of(best.robot, data, units[0]), JointExpressions.of(best.joints)
-        if not found:
+    for way, data in _of_one_size(best):
+        units = way.options.angle or "", UNITS_PER_METRE[way.options.length or ""]
+        meanings, joints = likely_mistakes.conventions_of(best.robot, data, units[0]), JointExpressions.of(best.joints)
+        if not meanings:
             continue
-        meant, more = dict[str, str](), "; these rows do not tell which: uncomment one" * (len(found) > 1)
-        for meaning in found:
+        meant, more = dict[str, str](), "; these rows do not tell which: uncomment one" * (len(meanings) > 1)
+        for meaning in meanings:
             text = ",".join(meaning.of_columns(joints.matrix, joints.offset, *units).texts(joints.columns, *units))
             why = f"the nominal robot then leaves {percent(meaning.left, 2)} of what the rows vary, with the columns "
             meant[text] = f"{why}as they are {percent(best.left)}{more}"
-        explained = one.into({"length": "with these joints"})
-        if len(found) > 1:
+        explained = way.into({"length": "with these joints"})
+        if len(meanings) > 1:
             return with_measured(explained.asking("joints", meant))
         text = next(iter(meant))
         return with_measured(explained.into({"joints": meant[text]}, joints=text))  # only now
@@ -436,23 +438,21 @@ def with_rotation(source: Source, *, camera: bool = False) -> Source:
     are no columns of a rotation; with a remark, but for a camera, if no convention is clearly better.
     """
     bodies = source.bodies
-    found = [own for own in bodies if own.turn]
-    if not found or source.options.marker is not None:
+    turned = [body for body in bodies if body.turn]
+    if not turned or source.options.marker is not None:
         return source
-    numbers = len(found[0].turn)
-    own_body = len(bodies) == max(len(source.options.tip or ()), 1) == len(found)
+    numbers = len(turned[0].turn)
+    own_body = len(bodies) == max(len(source.options.tip or ()), 1) == len(turned)
     conventions = [name for name in ALL_CONVENTIONS if numbers_of(name) == numbers] if own_body else []
     turns = list(product(conventions, ("deg", "rad") if numbers == 3 else (None,)))
-    known = {"rotation": [",".join(own.turn) for own in found], "camera_on_tool": camera}
+    given = {"rotation": [",".join(body.turn) for body in turned], "camera_on_tool": camera}
     units = source.in_units() if camera else [source]
-    ways = ranked(one.into(**known, convention=c, rotation_angle=d) for one in units for c, d in turns)
+    ways = ranked(way.into(**given, convention=c, rotation_angle=d) for way in units for c, d in turns)
     if not ways or not is_clear(ways, gates.READINGS_TOLD_APART):
         what = "rotations of no convention that is clearly better than others"
         what = what if own_body else "rotations, but not one for each marker"
-        usual, names = (
-            " or ".join(dict.fromkeys(own.usual for own in found)),
-            [name for own in found for name in own.turn],
-        )
+        usual = " or ".join(dict.fromkeys(body.usual for body in turned))
+        names = [name for body in turned for name in body.turn]
         remark = f"{few(names, 9)}: {what}; not used; such names usually mean {usual}"
         return source if camera else source.remarking(remark)
     why = {"convention": reason(*ways)}
@@ -464,16 +464,16 @@ def with_rotation(source: Source, *, camera: bool = False) -> Source:
 
 def with_deviations(source: Source) -> Source:
     """With standard deviations of the positions, or a remark why there are none."""
-    names = guess_deviations(source.sheet.numbers, [own.place for own in source.bodies])
+    names = guess_deviations(source.sheet.numbers, [body.place for body in source.bodies])
     if names is None:
         return source
-    known, found = source.into(std=",".join(names)), None
+    weighted, measured = source.into(std=",".join(names)), None
     with quiet(), suppress(DiffeoCalibError):
-        found = measured_positions(known.data)
-    if found is None or found.std is None or (typical := float(found.std.nanmedian())) > LARGEST_DEVIATION:
+        measured = measured_positions(weighted.data)
+    if measured is None or measured.std is None or (typical := float(measured.std.nanmedian())) > LARGEST_DEVIATION:
         return source.remarking(f"{few(names)}: no standard deviations of positions, or not all positive; not used")
     why = f"by their names; median {1e3 * typical:.2g} mm, noise beyond these is estimated"
-    return known.into({"std": why})
+    return weighted.into({"std": why})
 
 
 def with_distances(source: Source) -> Source:

@@ -55,8 +55,8 @@ def table_format(units: Units) -> TableFormat:
     if units.robot_pose is not None and units.joints is not None:
         fix = "name the columns of the pose, or those of the joints"
         raise InputError.of("--joints beside --robot-pose", expected="one of them", got="both", fix=fix)
-    own = PoseColumns.of(units.robot_pose) if units.robot_pose is not None else joints if any(joints) else ()
-    return TableFormat(length, angle, sep, decimal, joint_length=units.joint_length, joints=own)
+    columns = PoseColumns.of(units.robot_pose) if units.robot_pose is not None else joints if any(joints) else ()
+    return TableFormat(length, angle, sep, decimal, joint_length=units.joint_length, joints=columns)
 
 
 def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
@@ -129,7 +129,7 @@ def as_at_the_fit(command: str, given: Given) -> Given:
             order = _stated(stored, {"marker"}).get("marker", ("", []))[0].partition("=")[1:]
             given = replace(given, marker=marker + "".join(order))
             add_to_command_line(["--marker", marker + "".join(order)])
-        known = _stated(stored, wanted)
+        stated = _stated(stored, wanted)
     except (ValueError, IndexError) as error:  # of a file that was edited
         fix = "name the columns (--position, --socket, --reading), --length and --angle"
         raise InputError.of("the options that the model was fitted with", got=shown(str(error)), fix=fix) from error
@@ -138,11 +138,11 @@ def as_at_the_fit(command: str, given: Given) -> Given:
     if PROGRAM in program and pose in (None, program.partition("=")[0]):  # of other names: places
         fix = f"type it again, a model file starts no program: --robot-pose {program}"
         raise InputError.of("--robot-pose", expected="the function that the model was fitted with", fix=fix)
-    order = sorted(known, key=lambda name: name in Units.names())
-    if words := [word for name in order for word in known[name][1]]:
+    order = sorted(stated, key=lambda name: name in Units.names())
+    if words := [word for name in order for word in stated[name][1]]:
         say(f"tables are read as at the fit: {shlex.join(words)}")
     add_to_command_line(words)
-    return replace(given, **{name: value for name, (value, _) in known.items()})
+    return replace(given, **{name: value for name, (value, _) in stated.items()})
 
 
 def rows_in_table(csv: Path, rows: Rows) -> tuple[Rows, list[str]]:
@@ -173,23 +173,23 @@ def _stated(words: Sequence[str], wanted: Container[str]) -> dict[str, tuple[Any
 
     ValueError or IndexError for a value that is none.
     """
-    found = dict[str, tuple[Any, list[str]]]()
-    for option in (one for one in Rows.all() if one.field in wanted):
+    stated = dict[str, tuple[Any, list[str]]]()
+    for option in (entry for entry in Rows.all() if entry.field in wanted):
         name, hint, given = option.shown, option.hint, list[list[str]]()
         for place, word in enumerate(words):
             begin, equal, value = word.partition("=")
             if begin == name:
                 given.append([name] if hint is bool else [name, value if equal else words[place + 1]])
         given = given if has(hint, list) else given[-1:]
-        texts = [own[-1] for own in given]
-        allowed = next((get_args(one) for one in (hint, *get_args(hint)) if get_origin(one) is Literal), texts)
+        texts = [group[-1] for group in given]
+        allowed = next((get_args(part) for part in (hint, *get_args(hint)) if get_origin(part) is Literal), texts)
         if wrong := [text for text in texts if text not in allowed]:
             raise ValueError(f"'{wrong[0]}' for {name}")
         if given:
             values = [float(text) for text in texts] if has(hint, float) else texts
             value = True if hint is bool else values if has(hint, list) else values[-1]
-            found[option.field] = value, [word for own in given for word in own]
-    return found
+            stated[option.field] = value, [word for group in given for word in group]
+    return stated
 
 
 # --- tables -------------------------------------------------------------------------------------------------------
@@ -263,15 +263,15 @@ def targets_of(path: Path, table: TableFormat, given: Targets, tools: int) -> Te
 
 def of_robot(table: TableFormat, robot: Tree) -> TableFormat:
     """Name the joints of a robot, in columns that it names, or else after them; or with its poses."""
-    joints, own = table.joints, list(robot.joint_names)
+    joints, defaults = table.joints, list(robot.joint_names)
     if isinstance(joints, PoseColumns):
         count = robot.n if joints.is_program else len(joints.columns) if not joints.convention else POSE_JOINTS
         if not is_cartesian(robot) or robot.n != count:
             expected = f"the {robot.n} joint values of robot '{robot.name}'"
             raise InputError.of(f"--robot-pose {','.join(joints.columns)}", expected=expected, got="other inputs")
         return replace(table, joints=replace(joints, robot=robot), kinds=robot.kinds)
-    names, order = list(joints) or own, ",".join(own)
-    if names != own and sorted(names) == sorted(own):
+    names, order = list(joints) or defaults, ",".join(defaults)
+    if names != defaults and sorted(names) == sorted(defaults):
         what = "--joints names the robot's joints in another order than the robot's"
         fix = "leave it out: columns that are named after the joints are found wherever they are"
         raise InputError.of(what, expected=order, got=",".join(names), fix=fix)
@@ -313,15 +313,15 @@ def _names_of_each(texts: list[str] | None) -> list[str] | list[list[str]] | Non
 
 def socket_columns(socket: str, rows: Rows, table: TableFormat) -> SocketColumns:
     """The options of sockets in SI units."""
-    known, std = dict[tuple[str, str], float](), rows.distance_std
+    lengths, std = dict[tuple[str, str], float](), rows.distance_std
     for text in rows.distance or ():
         pair, _, length = text.rpartition("=")
         names, value = _split_names(pair), _number(length) or 0.0
         if len(names) != 2 or value <= 0.0:
             fix = "write two names of sockets and a length, such as 0,1=50 or front/0,front/1=50"
             raise InputError.of(f"--distance {text}", expected="A,B=LENGTH", fix=fix)
-        known[names[0], names[1]] = value / table.per_metre
-    return SocketColumns(tuple(_split_names(socket)), known or None, None if std is None else std / table.per_metre)
+        lengths[names[0], names[1]] = value / table.per_metre
+    return SocketColumns(tuple(_split_names(socket)), lengths or None, None if std is None else std / table.per_metre)
 
 
 def readings_columns(texts: Sequence[str], rows: Rows, names: Sequence[str] = ()) -> tuple[Any, ...]:
@@ -343,8 +343,8 @@ def image_columns(texts: Sequence[str], rows: Rows) -> ImageColumns:
     if len(names) == 1:
         width, _, height = names[0].partition(",")
         sized = width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0
-        known = (int(width), int(height)) if sized else read_camera(names[0])
-        return ImageColumns(known, rows.camera_on_tool, rows.session)
+        camera = (int(width), int(height)) if sized else read_camera(names[0])
+        return ImageColumns(camera, rows.camera_on_tool, rows.session)
     cameras = {Path(name).stem: read_camera(name) for name in names}
     if len(cameras) < len(names):
         fix = "name the file of each camera after the camera in the table, such as left.yaml"

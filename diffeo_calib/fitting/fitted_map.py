@@ -242,9 +242,9 @@ class FittedMap:
             at: the linearisation.
             directions: (M, r, m') linear functions of the points whose covariance (M, r, r) is wanted instead.
         """
-        return self._of_fields(at, directions) + self._short_errors(at, directions)
+        return self._of_fields(at, directions) + self.short_errors(at, directions)
 
-    def _short_errors(self, at: Linearisation, directions: Tensor | None = None) -> Tensor:
+    def short_errors(self, at: Linearisation, directions: Tensor | None = None) -> Tensor:
         """Covariance (M, r, r) of what the fields do not resolve: independent at every configuration."""
         variances = 0.0 if self.unregistered.unresolved is None else self.unregistered.unresolved
         by_joints = sum((node.weight * node.effect for node in at.joint), torch.zeros_like(at.joint_to_start))
@@ -342,11 +342,6 @@ class FittedMap:
         """Posterior covariance of the parameters theta with these numbers: (k,) -> (k, k) in m^2, m rad or rad^2."""
         return self.conditional.posterior(self.parameters_as_points(which))[0]
 
-    def shift_covariance(self) -> Tensor:
-        """(c, c) posterior covariance of the shifts that rows of the fit share, in units of their deviations."""
-        first = len(self.geodesic.spec.prior_variance)
-        return self.parameter_covariance(first + torch.arange(self.noise.shared.shape[2], device=self.x.device))
-
     def parameters_as_points(self, which: Tensor) -> Linearisation:
         """The parameters with these numbers as if they were the coordinates of one configuration.
 
@@ -363,7 +358,7 @@ class FittedMap:
 
     def covariance_between(self, at: Linearisation) -> Tensor:
         """Posterior covariance of all points of a linearisation together: (M m', M m')."""
-        return self.conditional.covariance_between(at) + torch.block_diag(*self._short_errors(at))
+        return self.conditional.covariance_between(at) + torch.block_diag(*self.short_errors(at))
 
     def measured(self) -> Tensor:
         """(N, m) the measurements that lead to this map and its posterior, m, or (N, r) with slopes.

@@ -73,10 +73,9 @@ def choose_scales(problem: Problem, *, robust: bool = False, iterations: int = 1
         chosen = _likeliest(_weighted(problem, tails.weights), parts[0], iterations)
     if not tails.gross:
         return plain
-    if len(rows := (tails.weights[:, 0] < GROSS_WEIGHT).nonzero()[:, 0].tolist()):
-        warn_user(
-            sentence(f"the errors of rows {few(rows)} are gross, and their noise was raised", fix="check these rows")
-        )
+    if rows := (tails.weights[:, 0] < GROSS_WEIGHT).nonzero()[:, 0].tolist():
+        what = f"the errors of rows {few(rows)} are gross, and their noise was raised"
+        warn_user(sentence(what, fix="check these rows"))
     return chosen
 
 

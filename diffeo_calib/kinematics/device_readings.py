@@ -107,9 +107,8 @@ class FittedDevice(NamedTuple):
             covariance = fitted.conditional.covariance(at, A) + B @ B.mT
         else:
             covariance = fitted.with_shifts(at.projected(A), B, self.columns)
-        if noise:
-            covariance = covariance + (A @ fitted.new_noise @ A.mT if self.noise is None else self.noise)
-        return observation.value(points).detach(), covariance
+        of_device = A @ fitted.new_noise @ A.mT if self.noise is None else self.noise
+        return observation.value(points).detach(), covariance + (of_device if noise else fitted.short_errors(at, A))
 
 
 def predicted_readings(model: Any, q: Tensor, *, noise: bool = True) -> list[PredictedReadings]:

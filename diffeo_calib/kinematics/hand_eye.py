@@ -163,14 +163,14 @@ class SetUp(NamedTuple):
         eye, none = torch.eye(4, dtype=points.dtype, device=points.device), points.new_zeros(6, 0)
         columns = torch.zeros(shared.shape[2], dtype=torch.bool, device=shared.device)
         here = cls(eye, eye, columns, none, none, points.new_zeros(6))
-        own = next((own for own in model.placement if own.kind in TRANSFORMS and name in own.names), None)
-        if name is None or own is None:
+        group = next((group for group in model.placement if group.kind in TRANSFORMS and name in group.names), None)
+        if name is None or group is None:
             return here
-        number = own.names.index(name)
-        transform, rows = own.constants[number].view(4, 4), own.rows[own.device == number]
+        number = group.names.index(name)
+        transform, rows = group.constants[number].view(4, 4), group.rows[group.device == number]
         if bool((transform == eye).all()):
             return here
-        framed, others = own.kind == SESSION, torch.ones(len(shared), dtype=torch.bool, device=shared.device)
+        framed, others = group.kind == SESSION, torch.ones(len(shared), dtype=torch.bool, device=shared.device)
         others[rows] = False
         alone = shared[rows] * ~(shared[others] != 0).any(1).any(0)
         slopes = frame_slopes(points[rows], points.new_zeros(3)) if framed else own_slopes(points[rows])
@@ -181,7 +181,7 @@ class SetUp(NamedTuple):
             raise InputError.of(what, expected="a model in the place of its fit", fix="calibrate with all rows")
         if framed:
             return here._replace(transform=transform, columns=columns, of_frame=twists, of_mount=still)
-        std = here.mount_std if rigid else own.deviations[number]
+        std = here.mount_std if rigid else group.deviations[number]
         return here._replace(mount=transform, columns=columns, of_frame=still, of_mount=twists, mount_std=std)
 
     def view(self, poses: Tensor) -> Tensor:

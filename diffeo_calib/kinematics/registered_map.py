@@ -261,14 +261,13 @@ def moved(fitted: FittedMap, T: Tensor) -> FittedMap:
     R = T[:3, :3].to(device)
     b, p, theta = old.momenta.tensors
     deformation = GeodesicDeformation(spec, old.x, Momenta(b, p @ R.mT, theta), old.integrator)
-    parts = fitted.data, turned(fitted.new_noise, R), fitted.workspace
-    kept = {"unresolved": fitted.unresolved}
+    changes = {"deformation": deformation, "new_noise": turned(fitted.new_noise, R)}
     if fitted.slopes is not None:  # what was measured has no direction of its own
         each = torch.block_diag(*[R] * (fitted.m // 3))
-        return FittedMap(deformation, fitted.noise, *parts, slopes=fitted.slopes @ each.mT, y=fitted.y, **kept)
+        return replace(fitted, slopes=fitted.slopes @ each.mT, **changes)
     noise = Noise(turned(fitted.noise.covariance, R), (R @ fitted.noise.shared.unflatten(1, (-1, 3))).flatten(1, 2))
     y = None if fitted.y is None else (fitted.y.unflatten(1, (-1, 3)) @ R.mT + T[:3, 3].to(device)).flatten(1)
-    return FittedMap(deformation, noise, *parts, y=y, **kept)
+    return replace(fitted, noise=noise, y=y, **changes)
 
 
 def turned(covariance: Tensor, R: Tensor) -> Tensor:

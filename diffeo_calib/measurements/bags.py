@@ -36,7 +36,7 @@ LONGEST_GAP_S, LONGEST_GAP = 0.5, 5.0
 """The larger of these, s and median intervals, is the longest time between messages across which is interpolated."""
 
 
-def read_bag(bag: Path, joints: str, seen: str) -> tuple[Recording, list[str], Recording]:
+def read_bag(bag: Path, joints: str, view: str) -> tuple[Recording, list[str], Recording]:
     """Two topics of a bag: joint values (T, n), rad or m, their names, and places (T, 3), m, perhaps with quaternions.
 
     Joints are joined by their names over all messages and publishers: each has the times of the messages that hold it,
@@ -44,30 +44,30 @@ def read_bag(bag: Path, joints: str, seen: str) -> tuple[Recording, list[str], R
 
     Args:
         joints: topic of sensor_msgs/JointState, or TOPIC:NAME,NAME for some of its joints.
-        seen: of geometry_msgs, stamped points, poses or transforms; or images. Of tf2_msgs/TFMessage with the frame
+        view: of geometry_msgs, stamped points, poses or transforms; or images. Of tf2_msgs/TFMessage with the frame
             whose motion was measured: TOPIC:CHILD, or TOPIC:PARENT>CHILD for two frames that transforms join.
 
     Raises:
         InputError: rosbags is missing, or the bag cannot be read.
         MeasurementError: topics, joints or frames that it does not have, or topics that hold something else.
     """
-    (joints, _, wanted), (seen, _, frames) = (words.partition(":") for words in (joints, seen))
+    (joints, _, wanted), (view, _, frames) = (words.partition(":") for words in (joints, view))
     states, edges, fixed = dict[str, _Rows](), dict[_Edge, _Rows](), set[_Edge]()
     places: _Rows = []
-    for topic, message in _messages(bag, (joints, seen), f"{seen}_static"):
-        if topic == joints != seen:
+    for topic, message in _messages(bag, (joints, view), f"{view}_static"):
+        if topic == joints != view:
             _add_joints(states, message, topic)
             continue
-        for one in getattr(message, "transforms", ()):
-            edge = one.header.frame_id.strip("/"), one.child_frame_id.strip("/")
-            edges.setdefault(edge, []).append([_time(one, seen), *_place(one, seen)])
-            fixed |= {edge} if topic != seen else set()
+        for transform in getattr(message, "transforms", ()):
+            edge = transform.header.frame_id.strip("/"), transform.child_frame_id.strip("/")
+            edges.setdefault(edge, []).append([_time(transform, view), *_place(transform, view)])
+            fixed |= {edge} if topic != view else set()
         if not hasattr(message, "transforms"):
             places.append([_time(message, topic), *_place(message, topic)])
-    known, names = _joined(states, [word.strip() for word in wanted.split(",") if word.strip()], joints)
+    recording, names = _joined(states, [word.strip() for word in wanted.split(",") if word.strip()], joints)
     if frames and not edges:
-        raise MeasurementError.of(f"frames of {seen}", expected="transforms (TFMessage)", fix=f"name the topic {seen}")
-    return known, names, _moving(edges, fixed, frames, seen) if edges else _recording(places, seen)
+        raise MeasurementError.of(f"frames of {view}", expected="transforms (TFMessage)", fix=f"name the topic {view}")
+    return recording, names, _moving(edges, fixed, frames, view) if edges else _recording(places, view)
 
 
 def _add_joints(states: dict[str, _Rows], message: Any, topic: str) -> None:
@@ -103,41 +103,41 @@ def _joined(states: Mapping[str, _Rows], wanted: list[str], topic: str) -> tuple
     most = max((states[name] for name in names), key=len, default=[])
     times: Array = np.array(sorted(time for time, _ in most if first <= time <= last))
     for name in names:
-        own: Array = np.array(sorted(time for time, _ in states[name]))
-        times = times[_near(times, own)] if len(own) > 1 else times
+        stamps: Array = np.array(sorted(time for time, _ in states[name]))
+        times = times[_near(times, stamps)] if len(stamps) > 1 else times
     parts = [np.interp(times, *np.array(sorted(states[name])).T) for name in names]
     return _recording(np.column_stack([times, *parts]).tolist(), topic), names
 
 
-def _near(times: Array, own: Array) -> Array:
+def _near(times: Array, stamps: Array) -> Array:
     """Which times have one of a part, in order, within the gap across which it is interpolated."""
-    limit = max(LONGEST_GAP_S, LONGEST_GAP * float(np.median(np.diff(own))))
-    after = np.searchsorted(own, times).clip(1, len(own) - 1)
-    return np.minimum(abs(times - own[after - 1]), abs(own[after] - times)) <= limit
+    limit = max(LONGEST_GAP_S, LONGEST_GAP * float(np.median(np.diff(stamps))))
+    after = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
+    return np.minimum(abs(times - stamps[after - 1]), abs(stamps[after] - times)) <= limit
 
 
 def _moving(edges: Mapping[_Edge, _Rows], fixed: Collection[_Edge], frames: str, topic: str) -> Recording:
     """The motion of a frame in its parent, or in any frame to which transforms join it, at times of the rarest."""
     parent, _, child = (word.strip().strip("/") for word in frames.rpartition(">"))
-    parents = [parent] if parent else [one for one, other in edges if other == child]
-    paths = [path for one in parents if (path := _path(edges, one, child))]
+    parents = [parent] if parent else [start for start, other in edges if other == child]
+    paths = [path for start in parents if (path := _path(edges, start, child))]
     moved = [edge for edge, _ in paths[0] if edge not in fixed] if len(paths) == 1 else []
     if not moved:
         expected = f"one moving frame, as '{topic}:CHILD' or '{topic}:PARENT>CHILD'"
         got = f"{frames or 'none'} of {few(['>'.join(edge) for edge in edges if edge not in fixed], 20)}"
         raise MeasurementError.of(f"the frame in {topic}", expected=expected, got=got)
     tables = {edge: _recording(edges[edge], f"{'>'.join(edge)} in {topic}") for edge in moved}
-    first, last = max(one.times[0] for one in tables.values()), min(one.times[-1] for one in tables.values())
-    times = min((one.times for one in tables.values()), key=len)
+    first, last = max(table.times[0] for table in tables.values()), min(table.times[-1] for table in tables.values())
+    times = min((table.times for table in tables.values()), key=len)
     times = times[(times >= first) & (times <= last)]
-    for one in tables.values():
-        times = times[_near(times, one.times)]
+    for table in tables.values():
+        times = times[_near(times, table.times)]
     whole = torch.eye(4, dtype=torch.float64, device=HOST)
     for edge, forward in paths[0]:
-        own = np.tile(edges[edge][-1][1:], (len(times), 1)) if edge not in tables else tables[edge].at(times)
-        places, turns = torch.from_numpy(own).split([3, 4], 1)
-        one = transforms(rotation_matrices(turns / turns.norm(dim=1, keepdim=True), QUATERNION), places)
-        whole = whole @ (one if forward else torch.linalg.inv(one))
+        values = np.tile(edges[edge][-1][1:], (len(times), 1)) if edge not in tables else tables[edge].at(times)
+        places, turns = torch.from_numpy(values).split([3, 4], 1)
+        motion = transforms(rotation_matrices(turns / turns.norm(dim=1, keepdim=True), QUATERNION), places)
+        whole = whole @ (motion if forward else torch.linalg.inv(motion))
     turns = rotation_numbers(whole[:, :3, :3], QUATERNION)
     return _recording(np.column_stack([times, whole[:, :3, 3], turns]).tolist(), topic)
 
@@ -198,14 +198,14 @@ def _messages(bag: Path, wanted: tuple[str, ...], optional: str = "") -> Iterato
         raise InputError.of(what, fix=fix) from error
     try:
         with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            topics = sorted({one.topic for one in reader.connections})
+            topics = sorted({connection.topic for connection in reader.connections})
             missing = [topic for topic in wanted if topic not in topics]
             if missing:
                 expected = f"one of {few(topics)}" if topics else "topics with messages"
                 raise MeasurementError.of(f"{bag}: no topic {few(missing)}", expected=expected)
-            connections = [one for one in reader.connections if one.topic in (*wanted, optional)]
-            for one, _, raw in reader.messages(connections=connections):
-                yield one.topic, reader.deserialize(raw, one.msgtype)
+            connections = [connection for connection in reader.connections if connection.topic in (*wanted, optional)]
+            for connection, _, raw in reader.messages(connections=connections):
+                yield connection.topic, reader.deserialize(raw, connection.msgtype)
     except DiffeoCalibError:
         raise
     except Exception as error:  # rosbags raises errors of many kinds for damaged files
@@ -229,7 +229,7 @@ def _place(message: Any, topic: str) -> list[float]:
         return []
 
     def part(path: str) -> Any:
-        return reduce(lambda own, name: getattr(own, name, None), path.split("."), message)
+        return reduce(lambda field, name: getattr(field, name, None), path.split("."), message)
 
     place, turn = (next(filter(None, map(part, paths)), None) for paths in (PLACES, TURNS))
     if place is None:

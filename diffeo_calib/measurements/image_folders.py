@@ -54,7 +54,7 @@ class Folder:
     @property
     def used(self) -> list[Seen]:
         """Images that show the board."""
-        return [one for one in self.images if not one.refused]
+        return [image for image in self.images if not image.refused]
 
     def rows(self, per_metre: float, decimal: str = ".") -> list[list[str]]:
         """Cells of every corner: image, joints as read, place on the board in units per metre, pixels."""
@@ -63,16 +63,16 @@ class Folder:
             return [repr(float(value)).replace(".", decimal) for value in values]
 
         return [
-            [one.name, *one.cells, *written([*(per_metre * self.board.points[k, :2]), *uv])]
-            for one in self.used
-            for k, uv in zip(one.numbers.tolist(), one.pixels.tolist(), strict=True)
+            [image.name, *image.cells, *written([*(per_metre * self.board.points[k, :2]), *uv])]
+            for image in self.used
+            for k, uv in zip(image.numbers.tolist(), image.pixels.tolist(), strict=True)
         ]
 
     def camera(self, board: BoardPrior) -> Camera:
         """Prior of lens and board: a first guess with wide deviations."""
         corners = torch.full((len(self.used), len(self.board.points), 5), torch.nan, dtype=torch.float64, device=HOST)
-        for row, one in enumerate(self.used):
-            whole = np.concatenate([self.board.points[one.numbers], one.pixels], 1)
+        for row, image in enumerate(self.used):
+            whole = np.concatenate([self.board.points[image.numbers], image.pixels], 1)
             corners[row, : len(whole)] = torch.from_numpy(whole)
         return first_guess(Images(corners[..., :3], corners[..., 3:], *self.size), board)
 
@@ -80,11 +80,11 @@ class Folder:
 def page(folders: Sequence[Folder]) -> str:
     """An overview in HTML: every image with its corners, or why it is refused."""
     cells = "".join(
-        f'<figure><img src="data:image/jpeg;base64,{one.thumbnail}"><figcaption>'
-        f"{html.escape(one.name if len(folders) == 1 else f'{folder.name}/{one.name}')}: "
-        f"{html.escape(one.refused) or f'{len(one.numbers)} corners'}</figcaption></figure>"
+        f'<figure><img src="data:image/jpeg;base64,{image.thumbnail}"><figcaption>'
+        f"{html.escape(image.name if len(folders) == 1 else f'{folder.name}/{image.name}')}: "
+        f"{html.escape(image.refused) or f'{len(image.numbers)} corners'}</figcaption></figure>"
         for folder in folders
-        for one in folder.images
+        for image in folder.images
     )
     style = "figure{display:inline-block;margin:6px;width:320px;vertical-align:top;font:13px sans-serif}"
     used, whole = (sum(map(len, each)) for each in zip(*((own.used, own.images) for own in folders), strict=True))
@@ -119,30 +119,30 @@ def read_folders(
     files = _ordered(folders, joints, len(rows)) if place is None else _named(folders, [row[place] for row in rows])
     table = table.without([] if place is None else [header[place]])
     rows = [cells for _, cells in table.rows]
-    found = []
-    for folder, name, own in zip(folders, names, files, strict=True):
-        whole = [(file, cells) for file, cells in zip(own, rows, strict=True) if file is not None]
-        paired = f"row 1 is {own[0]}, row {len(own)} is {own[-1]}: by the numbers in the names" * (place is None)
-        found.append(_folder(folder, Folder(name, board, table.header, [], (0, 0), paired), whole, progress))
-    return found
+    searched = []
+    for folder, name, paths in zip(folders, names, files, strict=True):
+        whole = [(file, cells) for file, cells in zip(paths, rows, strict=True) if file is not None]
+        paired = f"row 1 is {paths[0]}, row {len(paths)} is {paths[-1]}: by the numbers in the names" * (place is None)
+        searched.append(_folder(folder, Folder(name, board, table.header, [], (0, 0), paired), whole, progress))
+    return searched
 
 
-def _folder(folder: Path, empty: Folder, known: Sequence[tuple[str, list[str]]], progress: Progress) -> Folder:
+def _folder(folder: Path, empty: Folder, rows: Sequence[tuple[str, list[str]]], progress: Progress) -> Folder:
     """Find the board in the files of one folder, with the cells of their rows."""
     board = empty.board
     cv2 = opencv()
-    read = [cv2.imread(str(folder / file), cv2.IMREAD_GRAYSCALE) for file, _ in known]
+    read = [cv2.imread(str(folder / file), cv2.IMREAD_GRAYSCALE) for file, _ in rows]
     sizes = Counter(image.shape for image in read if image is not None)
     if not sizes:
         raise MeasurementError.of(f"the images of '{folder}'", expected="files that OpenCV reads", got="none")
     usual = sizes.most_common(1)[0][0]
     images = []
-    for own, image in zip(known, read, strict=True):
-        progress("images", len(images), len(known))
-        images.append(_seen(*own, image, board, usual))
-    found = replace(empty, images=images, size=(usual[1], usual[0]))
-    if len(found.used) <= sum(one.refused.startswith(BENT) for one in images):
-        some = [own for own in read if own is not None][:3]
+    for row, image in zip(rows, read, strict=True):
+        progress("images", len(images), len(rows))
+        images.append(_seen(*row, image, board, usual))
+    filled = replace(empty, images=images, size=(usual[1], usual[0]))
+    if len(filled.used) <= sum(image.refused.startswith(BENT) for image in images):
+        some = [image for image in read if image is not None][:3]
         layout = other_layout(some, board)
         likely = None if layout else next(filter(None, map(other_dictionary, some)), None)
         fix = "check the lengths and numbers of the board, and the images"
@@ -151,15 +151,15 @@ def _folder(folder: Path, empty: Folder, known: Sequence[tuple[str, list[str]]],
         elif likely and likely.rpartition("_")[0] not in board.text.upper():
             fix = f"most markers are of {likely}: check --board"
         what = f"images of '{folder}' that show {board.text}"
-        got = few([f"{one.name}: {one.refused}" for one in images if one.refused])
+        got = few([f"{image.name}: {image.refused}" for image in images if image.refused])
         raise MeasurementError.of(what, expected="some", got=got, fix=fix)
-    return found
+    return filled
 
 
 def _named(folders: Sequence[Path], names: Sequence[str]) -> list[list[str | None]]:
     """The file of each row in every folder, by its name."""
     files = [[name if (folder / name).is_file() else None for name in names] for folder in folders]
-    missing = [name for name, *own in zip(names, *files, strict=True) if not any(own)]
+    missing = [name for name, *matches in zip(names, *files, strict=True) if not any(matches)]
     if missing:
         where = " or ".join(f"'{folder}'" for folder in folders)
         raise MeasurementError.of(f"images in {where}", expected="those of the table", got=f"no {few(missing)}")
@@ -169,12 +169,12 @@ def _named(folders: Sequence[Path], names: Sequence[str]) -> list[list[str | Non
 def _ordered(folders: Sequence[Path], joints: Path, count: int) -> list[list[str]]:
     """The file of each row in every folder, in the order of the numbers in their names: 2.png before 10.png."""
     parts = re.compile(r"(\D*)(\d*)")
-    names = ([own.name for own in folder.iterdir() if own.suffix.lower() in SUFFIXES] for folder in folders)
+    names = ([file.name for file in folder.iterdir() if file.suffix.lower() in SUFFIXES] for folder in folders)
     places = (
-        {name: [(text, int(k or -1)) for text, k in parts.findall(name.lower())] for name in own} for own in names
+        {name: [(text, int(k or -1)) for text, k in parts.findall(name.lower())] for name in group} for group in names
     )
-    files = [sorted(own, key=lambda name: (own[name], name)) for own in places]
-    others = [f"{len(own)} in '{folder}'" for folder, own in zip(folders, files, strict=True) if len(own) != count]
+    files = [sorted(order, key=lambda name: (order[name], name)) for order in places]
+    others = [f"{len(each)} in '{folder}'" for folder, each in zip(folders, files, strict=True) if len(each) != count]
     if others:
         expected, got = f"{count} images, one for each row of '{joints}'", few(others)
         fix = "add a column `image` with the name of each row's file"

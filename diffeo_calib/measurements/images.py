@@ -107,7 +107,7 @@ class ImageTable(RowGroups):
         """
         angles, joints = checks.joint_table(q, joint_names)
         numbers, names = (None, ()) if seen_by is None else checks.numbered(seen_by, len(angles))
-        known = _known(names or (ONLY_CAMERA,), camera)
+        priors = _known(names or (ONLY_CAMERA,), camera)
         given = torch.as_tensor(corners, dtype=torch.float64, device=HOST).detach().clone()
         if given.ndim != 3 or given.shape[2] != 5:
             fix = (
@@ -116,15 +116,15 @@ class ImageTable(RowGroups):
             raise MeasurementError.of("`corners`", expected="shape (N, K, 5)", got=tuple(given.shape), fix=fix)
         checks.check_rows(angles, given, "corners")
         given = given.masked_fill(given.isnan().any(2, keepdim=True), torch.nan)
-        own = torch.zeros(len(angles), dtype=torch.int64, device=HOST) if numbers is None else numbers
-        found = _sights([given[own == number] for number in range(len(known))], known, board)
-        order = torch.cat([(own == number).nonzero()[:, 0] for number in range(len(known))]).argsort()
+        whose = torch.zeros(len(angles), dtype=torch.int64, device=HOST) if numbers is None else numbers
+        sights = _sights([given[whose == number] for number in range(len(priors))], priors, board)
+        order = torch.cat([(whose == number).nonzero()[:, 0] for number in range(len(priors))]).argsort()
         poses, *errors = (
-            torch.cat([getattr(one, name) for one in found])[order] for name in ("poses", "covariance", "shared")
+            torch.cat([getattr(sight, name) for sight in sights])[order] for name in ("poses", "covariance", "shared")
         )
         named = {"camera_on_tool": camera_on_tool, "doubt": doubt}
-        cameras = dict(zip(known, (one.camera for one in found), strict=True))
-        columns = {"corners": given, "cameras": cameras, "seen_by": own}
+        cameras = dict(zip(priors, (sight.camera for sight in sights), strict=True))
+        columns = {"corners": given, "cameras": cameras, "seen_by": whose}
         columns |= errors_of_poses(poses, *errors, camera_on_tool=camera_on_tool)
         data = with_attributes(cls.from_poses(angles, poses, joints, **named), **columns)
         return data.with_sessions(seen_by, remounted=camera_on_tool)
@@ -160,7 +160,7 @@ class ImageTable(RowGroups):
                 raise MeasurementError.of(what, expected="one board that stayed, so no set-ups", got=got, fix=fix)
             return names
         pairs = zip(self.camera_names, names, strict=True)
-        return [name if f"{name}/".startswith(f"{own}/") else f"{own}/{name}" for own, name in pairs]
+        return [name if f"{name}/".startswith(f"{camera}/") else f"{camera}/{name}" for camera, name in pairs]
 
     def sees_board_from_tool(self, *, commanded: bool = False) -> bool | None:
         """Whether the camera is on the tool, or stands; None if nothing says that a camera saw a board.
@@ -171,10 +171,10 @@ class ImageTable(RowGroups):
 
     def shared_errors(self) -> Iterator[SharedErrors]:
         """Errors that images share; none of other rows."""
-        shared, own, lever = self.pose_shared, self.pose_covariance, self.lever
-        if self.seen_by is not None and shared is not None and own is not None and lever is not None:
+        shared, covariance, lever = self.pose_shared, self.pose_covariance, self.lever
+        if self.seen_by is not None and shared is not None and covariance is not None and lever is not None:
             slopes = pose_jacobian(self.frames, lever, self.board)[:, 0]
-            yield SharedErrors(self.cameras, self.seen_by, slopes @ shared, slopes @ own @ slopes.mT)
+            yield SharedErrors(self.cameras, self.seen_by, slopes @ shared, slopes @ covariance @ slopes.mT)
 
     def by_board_size(self) -> Tensor:
         """Effects (N, 9, 1) on the points of poses of a board that is larger than was said, as a share; m."""
@@ -188,23 +188,23 @@ class ImageTable(RowGroups):
             raise AssertionError("a table of images")
         effects = torch.zeros_like(self.pose_shared[..., :1])
         for number, camera in enumerate(self.cameras.values()):
-            own = self.seen_by == number
-            effects[own] = self.pose_shared[own] @ camera.longer[:, None]
+            mask = self.seen_by == number
+            effects[mask] = self.pose_shared[mask] @ camera.longer[:, None]
         return with_attributes(self, pose_covariance=self.pose_covariance + deviation**2 * effects @ effects.mT)
 
     def errors_along(self, R: Tensor) -> dict[str, object]:
         """Known errors along axes turned by R (N, 3, 3), as if those of the coordinates were independent."""
-        found: dict[str, object] = {}
+        errors: dict[str, object] = {}
         for name in ("std", "rotation_std"):
-            own = getattr(self, name)
-            if own is not None:
-                found[name] = (own.view(len(self), -1, 3).square() @ R.square().mT).sqrt().view_as(own)
+            spread = getattr(self, name)
+            if spread is not None:
+                errors[name] = (spread.view(len(self), -1, 3).square() @ R.square().mT).sqrt().view_as(spread)
         if self.pose_covariance is None or self.pose_shared is None or self.pose_larger is None:
-            return found
+            return errors
         axes = torch.zeros_like(self.pose_covariance)
         axes[:, :3, :3] = axes[:, 3:, 3:] = R
         of_poses = axes @ self.pose_covariance @ axes.mT, axes @ self.pose_shared, axes @ self.pose_larger
-        return found | dict(zip(OF_POSES, of_poses, strict=True))
+        return errors | dict(zip(OF_POSES, of_poses, strict=True))
 
     def with_board_at(self, q: Tensor, poses: Tensor, errors: tuple[Tensor, Tensor]) -> Self:
         """The rows as if at q (N, n) the cameras had seen their board at poses (N, 4, 4), m; corners stay.
@@ -212,9 +212,9 @@ class ImageTable(RowGroups):
         ``errors``: as of :func:`~diffeo_calib.cameras.images.expected`, of lens and board as effects of unit variance.
         """
         on_tool = self.board is not None
-        seen = self.from_poses(q, poses, self.joint_names, camera_on_tool=on_tool, lever=self.lever, doubt=False)
-        own = {name: getattr(seen, name) for name in ("q", "poses", "points", "board")}
-        return with_attributes(self, **own, **errors_of_poses(poses, *errors, camera_on_tool=on_tool))
+        table = self.from_poses(q, poses, self.joint_names, camera_on_tool=on_tool, lever=self.lever, doubt=False)
+        columns = {name: getattr(table, name) for name in ("q", "poses", "points", "board")}
+        return with_attributes(self, **columns, **errors_of_poses(poses, *errors, camera_on_tool=on_tool))
 
     def on_frames(self, transforms: Tensor) -> Self:
         """The rows of cameras at (N, 4, 4) [m] in another frame on the tool as if they had been there, as one session.
@@ -253,17 +253,17 @@ def _known(names: Sequence[str], camera: Any) -> dict[str, Known]:
         return {name: camera[name] for name in names}
     if len(names) > 1 and isinstance(camera, Camera):
         raise MeasurementError.of("`camera`", expected=f"those of {listed(names)}", got="one camera", fix=fix)
-    found: dict[str, Any] = dict.fromkeys(names, camera)
-    return found
+    priors: dict[str, Any] = dict.fromkeys(names, camera)
+    return priors
 
 
-def _sights(corners: Sequence[Tensor], known: Mapping[str, Known], board: BoardPrior | None) -> Sequence[Sights]:
+def _sights(corners: Sequence[Tensor], priors: Mapping[str, Known], board: BoardPrior | None) -> Sequence[Sights]:
     """What each camera saw, of its corners (N_i, K, 5); a warning or an error about one that saw it otherwise."""
     images = []
-    for (name, own), rows in zip(known.items(), corners, strict=True):
-        whose, size = f" of camera '{name}'" * (len(known) > 1), own
-        if isinstance(own, Camera):
-            size = own.width, own.height
+    for (name, prior), rows in zip(priors.items(), corners, strict=True):
+        whose, size = f" of camera '{name}'" * (len(priors) > 1), prior
+        if isinstance(prior, Camera):
+            size = prior.width, prior.height
         shown = Images(rows[..., :3], rows[..., 3:], *size)
         if not bool(shown.seen.any()):
             raise MeasurementError.of(f"`corners`{whose}", expected="some corners", got="NaN alone")
@@ -274,12 +274,12 @@ def _sights(corners: Sequence[Tensor], known: Mapping[str, Known], board: BoardP
             fix = "pass the size of the images in which the corners were found, or a camera calibrated at that size"
             raise MeasurementError.of(f"the corners{whose}", expected=expected, got=got, fix=fix)
         images.append(shown)
-    cameras = [own if isinstance(own, Camera) else None for own in known.values()]
-    found = sighted_by_several(images, cameras, board)
-    for name, camera, seen, shown in zip(known, cameras, found, images, strict=True):
-        if camera is not None and len(seen.poses) >= FEWEST_IMAGES:
-            _check_camera(seen, sighted(shown, None, board), name if len(known) > 1 else "")
-    return found
+    cameras = [prior if isinstance(prior, Camera) else None for prior in priors.values()]
+    sights = sighted_by_several(images, cameras, board)
+    for name, camera, sight, shown in zip(priors, cameras, sights, images, strict=True):
+        if camera is not None and len(sight.poses) >= FEWEST_IMAGES:
+            _check_camera(sight, sighted(shown, None, board), name if len(priors) > 1 else "")
+    return sights
 
 
 def errors_of_poses(poses: Tensor, covariance: Tensor, shared: Tensor, *, camera_on_tool: bool) -> dict[str, Tensor]:
@@ -289,14 +289,14 @@ def errors_of_poses(poses: Tensor, covariance: Tensor, shared: Tensor, *, camera
     return dict(zip(OF_POSES, (covariance, sign * shared, sign * larger), strict=True))
 
 
-def _check_camera(found: Sights, free: Sights, name: str) -> None:
+def _check_camera(sights: Sights, free: Sights, name: str) -> None:
     """Refuse, or warn of, images that the given camera explains worse than a free one."""
-    factor = found.camera.noise / free.camera.noise
+    factor = sights.camera.noise / free.camera.noise
     if factor < CAMERA_WARNED:
         return
     camera = f"camera '{name}'" if name else "camera"
-    given, own = (", ".join(f"{v:.0f}" for v in one.camera.lens[:4].tolist()) for one in (found, free))
-    got = f"{found.camera.noise:.2f} px with fx, fy, cx, cy = {given}, and {free.camera.noise:.2f} px with {own}"
+    given, fitted = (", ".join(f"{v:.0f}" for v in each.camera.lens[:4].tolist()) for each in (sights, free))
+    got = f"{sights.camera.noise:.2f} px with fx, fy, cx, cy = {given}, and {free.camera.noise:.2f} px with {fitted}"
     fix = "leave the camera out, or pass that of these images: same camera, zoom, focus and size"
     if factor > CAMERA_REFUSED:
         what = f"errors of corners with the given {camera}"

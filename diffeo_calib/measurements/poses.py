@@ -82,12 +82,12 @@ def rotation_numbers(matrices: Tensor, convention: str, *, angle: str = "rad") -
     count, given = numbers_of(convention, angle), real_tensor(matrices, "rotations").detach()
     if given.ndim < 3 or given.shape[-2:] != (3, 3):
         raise InputError.of("`rotations` has the wrong shape", expected="(N, 3, 3)", got=tuple(given.shape))
-    seen = ~given.isnan().flatten(-2).any(-1)
-    found = given.new_full((*seen.shape, count), torch.nan)
-    exact = checked_rotations(given[seen])
+    visible = ~given.isnan().flatten(-2).any(-1)
+    values = given.new_full((*visible.shape, count), torch.nan)
+    exact = checked_rotations(given[visible])
     if count == 9 or not len(exact):
-        found[seen] = exact.flatten(1)[:, :count]
-        return found
+        values[visible] = exact.flatten(1)[:, :count]
+        return values
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  # slow to import, needed for poses only
 
     rotation, degrees = Rotation.from_matrix(exact.cpu().numpy()), angle == "deg"
@@ -100,8 +100,8 @@ def rotation_numbers(matrices: Tensor, convention: str, *, angle: str = "rad") -
     else:
         with quiet(UserWarning):  # gimbal lock: SciPy sets the third angle to zero
             numbers = rotation.as_euler(convention, degrees=degrees)
-    found[seen] = torch.as_tensor(numbers.copy(), dtype=torch.float64, device=exact.device)
-    return found
+    values[visible] = torch.as_tensor(numbers.copy(), dtype=torch.float64, device=exact.device)
+    return values
 
 
 def mark_points(poses: Tensor, lever: float) -> Tensor:
@@ -225,10 +225,10 @@ def frames_of_points(points: Tensor, lever: float) -> Tensor:
     triples = points.unflatten(1, (-1, POINTS))
     if wrapped(points):
         return poses_of_triangles(triples)
-    seen = ~triples.isnan().flatten(2).any(2)
-    found = triples.new_full((*seen.shape, 4, 4), torch.nan)
-    found[seen] = poses_from_marks(triples[seen], lever)
-    return found
+    visible = ~triples.isnan().flatten(2).any(2)
+    frames = triples.new_full((*visible.shape, 4, 4), torch.nan)
+    frames[visible] = poses_from_marks(triples[visible], lever)
+    return frames
 
 
 def transforms_of_frames(rotations: Tensor, places: Tensor) -> Tensor:
@@ -288,8 +288,8 @@ def kind_of_points(points: int, lever: float | None) -> str:
 def inverse_poses(poses: Tensor) -> Tensor:
     """Camera in the board's frame from board in the camera's frame, or the other way round: (..., 4, 4)."""
     turned = poses[..., :3, :3].mT
-    found = transforms(turned, -(turned @ poses[..., :3, 3:])[..., 0])
-    return torch.where(poses.isnan(), poses, found)
+    inverse = transforms(turned, -(turned @ poses[..., :3, 3:])[..., 0])
+    return torch.where(poses.isnan(), poses, inverse)
 
 
 def _by_motion(arms: Tensor) -> Tensor:

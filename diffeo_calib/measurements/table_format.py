@@ -244,8 +244,8 @@ def described() -> dict[str, str]:
     Sentences that speak of Python are left out.
     """
     text = dedent("        " + (TableFormat.__doc__ or "").partition("Args:")[2].partition("Raises:")[0].strip())
-    found = re.findall(r"^(\w+): (.*(?:\n +.*)*)", text, re.MULTILINE)
-    words = {name: re.sub(r"`(\w+)`", lambda own: f"--{own[1].replace('_', '-')}", said) for name, said in found}
+    pairs = re.findall(r"^(\w+): (.*(?:\n +.*)*)", text, re.MULTILINE)
+    words = {name: re.sub(r"`(\w+)`", lambda match: f"--{match[1].replace('_', '-')}", said) for name, said in pairs}
     whole = {name: " ".join(f"{said[0].upper()}{said[1:]}".split()) for name, said in words.items()}
     return {name: re.sub(r"(?<=\.) [^.]*\bPython\b[^.]*\.", "", said) for name, said in whole.items()}
 

@@ -15,7 +15,7 @@ from table_bank import refused, warned
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.judge import lengths
+from diffeo_calib.calibration.diagnostics.hypotheses import lengths
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.scales.selection import defaults
 from diffeo_calib.common.errors import DiffeoCalibWarning

@@ -27,6 +27,7 @@ from torch.distributions import MultivariateNormal
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.recalibration.drift import grown, parts_of
 from diffeo_calib.calibration.recalibration.find_changes import NOISE_FACTORS, SIZES, likelihood_ratios
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.measurements.rows import with_attributes
@@ -93,7 +94,9 @@ def test_new_rows_add_to_what_the_old_model_knew() -> None:
 
 def test_recalibrated_once_more() -> None:
     """Rows of three sessions, each in its own frame."""
-    more = dc.recalibrate(again().model, positions(ARM, NEW, 7), drift="none").model
+    short = replace(again().model.map, unresolved=torch.ones(6, dtype=torch.float64))
+    found = dc.recalibrate(again().model.changed(map=short), positions(ARM, NEW, 7), drift="none")
+    assert_close((more := found.model).map.unresolved, found.inflation * short.unresolved)
     assert dc.evaluate(more, positions(ARM, 100, 6)).rms < rms(again().model)
     assert len(more.configurations) == len(old().configurations) + 2 * NEW
 
@@ -295,6 +298,9 @@ def test_the_smallest_offset_that_rows_show() -> None:
     assert unchanged.hidden == ()
     waist, _, elbow, *_ = unchanged.changes.smallest
     assert waist.size == inf  # the device's place hides it
+    rigid = replace(old().map.geodesic.spec, joint_kernel=old().map.geodesic.spec.joint_kernel.scaled(0.0))
+    sizes = {number: size for part in parts_of(old().map) for number, size in part.kernels.items()}
+    assert [float(grown(rigid, parts_of(old().map))[0].terms[number].variance) for number in sizes] == [*sizes.values()]
     assert 2e-5 < elbow.size < 3e-4
     for factor in (0.2, 1.5):
         found = dc.compare(old(), with_offset(rows, 2, factor * elbow.size)).changes.found

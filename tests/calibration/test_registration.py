@@ -17,7 +17,7 @@ from table_bank import warned
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.open_directions import warn_of_open_directions
+from diffeo_calib.calibration.diagnostics.open_directions import warn_of_open_directions, warn_of_single_joints
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import find_joint_offsets, register, with_joint_offsets
 from diffeo_calib.common.errors import MeasurementError
@@ -165,7 +165,8 @@ NAMED = {
 
 def sentences(robot: dc.Chain, data: dc.Measurements) -> list[str]:
     """What is warned about after registration."""
-    return warned(warn_of_open_directions, robot, data, register(robot, data.q, data.points))[1]
+    single = warned(warn_of_single_joints, robot, data)[1]
+    return [*single, *warned(warn_of_open_directions, robot, data, register(robot, data.q, data.points))[1]]
 
 
 def campaign(name: str, kind: str, rows: int, seed: int = 0) -> tuple[SimulatedArm, dc.Measurements]:

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.judged_rows import implausible
+from diffeo_calib.calibration.diagnostics.judged_rows import implausible, judge
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.kinematics.evaluation import rows_used_in_fit
+from diffeo_calib.kinematics.evaluation import place, residuals, rows_used_in_fit
 from diffeo_calib.kinematics.joint_ranges import joints_outside_range, refuse_other_angles, warn_outside_range
 from diffeo_calib.measurements.poses import mark_points, rotation_matrices, transforms
 from diffeo_calib.measurements.rows import with_attributes
@@ -167,6 +167,19 @@ def test_rows_in_another_unit_of_angles_are_named(name: str, factor: float, unit
     for verb in (dc.evaluate, dc.CalibratedKinematics.registered, dc.recalibrate, dc.compare):
         with pytest.raises((MeasurementError, dc.DiffeoCalibWarning), match=words):
             verb(kind.model, in_other_unit(kind.new, factor))
+
+
+@pytest.mark.slow
+def test_what_is_wrong_with_all_rows_is_named_by_positions_then_by_readings() -> None:
+    several, sockets = kind_named("several kinds"), kind_named("ball in sockets")
+    parts = [with_attributes(part, q=torch.cat([part.q[:3], part.q[4:], part.q[3:4]])) for part in several.data.parts]
+    rows = dc.Observations(parts, several.data.index)
+    places = place(several.model, rows)
+    text = judge(several.model, places, rows, residuals(several.model, places, rows)).refusal or ""
+    assert text.startswith("from line 4 on the measured values belong to the joints 1 line above")
+    order = torch.randperm(len(sockets.data), generator=torch.Generator().manual_seed(0))
+    with pytest.warns(dc.DiffeoCalibWarning, match=r"mm at the ball; check the joint values, and the socket of every"):
+        dc.evaluate(sockets.model, with_attributes(sockets.data, q=sockets.data.q[order]))
 
 
 def test_what_is_not_taken_for_another_unit(arm: Case) -> None:

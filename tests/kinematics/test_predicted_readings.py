@@ -68,6 +68,9 @@ def test_the_place_of_the_whole_scene_moves_no_reading() -> None:
     bare = [float(own.deviations[row, 0]) for row, own in enumerate(of_rows(kind.model, part, noise=False))]
     whole = [float(own.deviations[row, 0]) for row, own in enumerate(of_rows(kind.model, part))]
     assert max(bare) < 0.3
+    short = replace(kind.model.map, unresolved=1e-8 * part.q.new_ones(part.q.shape[1]))
+    wide = of_rows(kind.model.changed(map=short), part, noise=False)  # to errors that the fields do not resolve
+    assert all(float(own.deviations[row, 0]) > bare[row] for row, own in enumerate(wide))
     assert all(0.0 < one < other for one, other in zip(bare, whole, strict=True))
     (placed,) = kind.model.placement
     assert float(1e3 * placed.deviations[:, :3].median()) > 2 * float(np.median(bare))

@@ -55,23 +55,23 @@ class Convention:
     @property
     def cost(self) -> int:
         """How many values are not those that were read; a factor of all joints counts once, and with it its zero."""
-        own, mixed = self.matrix.diagonal(), (self.matrix != 0.0).sum(1) > 1
-        factors = {round(value, 9) for value in own.abs().tolist()} - {0.0, 1.0}
+        diagonal, mixed = self.matrix.diagonal(), (self.matrix != 0.0).sum(1) > 1
+        factors = {round(value, 9) for value in diagonal.abs().tolist()} - {0.0, 1.0}
         zeros = [round(value, 9) for value in self.offset.tolist() if value]
-        changes = (own < 0.0).sum() + mixed.sum() + (own == 0.0).sum() // 2
+        changes = (diagonal < 0.0).sum() + mixed.sum() + (diagonal == 0.0).sum() // 2
         return int(changes) + len(factors) + len(set(zeros) if factors else zeros)
 
     def texts(self, names: tuple[str, ...] | list[str], angle: str, per_metre: float) -> list[str]:
         """Expressions for `joints`: names of the columns, and the units of the table."""
-        found = []
+        texts = []
         for k, turns in enumerate(self.robot.periodic):
             terms = [_term(value, name, angle) for value, name in zip(self.matrix[k].tolist(), names, strict=True)]
             zero = float(self.offset[k])
             constant = (degrees(zero) if angle == "deg" else zero) if turns else zero * per_metre
             quarters = RIGHT_ANGLES.get(round(zero / (pi / 2), 6)) if turns and angle == "rad" else None
             text = "".join(terms).removeprefix("+") + (quarters or f"{constant:+.6g}" * (constant != 0.0))
-            found.append(text[1:-1] if text[1:-1] in names else text)
-        return found
+            texts.append(text[1:-1] if text[1:-1] in names else text)
+        return texts
 
     def of_columns(self, matrix: Tensor, offset: Tensor, angle: str, per_metre: float) -> Convention:
         """Conventions of cells (N, c) of columns where the joint values that were read are ``matrix @ cells + offset``.
@@ -81,16 +81,16 @@ class Convention:
         """
         turn = pi / 180 if angle == "deg" else 1.0
         per_unit = offset.new_tensor([turn if turns else 1.0 / per_metre for turns in self.robot.periodic])
-        own = self.matrix.to(matrix)
-        return replace(self, matrix=own @ matrix, offset=self.offset.to(offset) + own @ (per_unit * offset))
+        factors = self.matrix.to(matrix)
+        return replace(self, matrix=factors @ matrix, offset=self.offset.to(offset) + factors @ (per_unit * offset))
 
 
 def _term(value: float, name: str, angle: str) -> str:
     """A factor and its column: -360/4096*{name}."""
     turn, words = (360.0, "360") if angle == "deg" else (2 * pi, "2*pi")
-    known = {1.0: "", 180 / pi: "180/pi*", pi / 180: "pi/180*"} | {1 / ratio: f"1/{ratio}*" for ratio in RATIOS}
-    known |= {turn / 2**k: f"{words}/{2**k}*" for k in range(8, 25)}
-    text = next((text for one, text in known.items() if abs(one - abs(value)) < 1e-9 * one), f"{abs(value):.6g}*")
+    named = {1.0: "", 180 / pi: "180/pi*", pi / 180: "pi/180*"} | {1 / ratio: f"1/{ratio}*" for ratio in RATIOS}
+    named |= {turn / 2**k: f"{words}/{2**k}*" for k in range(8, 25)}
+    text = next((text for size, text in named.items() if abs(size - abs(value)) < 1e-9 * size), f"{abs(value):.6g}*")
     return f"{'-' if value < 0.0 else '+'}{text}{{{name}}}" if value else ""
 
 
@@ -124,17 +124,17 @@ def conventions(
         """Conventions that are good in a rigid frame too, one for each pattern of signs."""
         kept = list[Tensor]()
         for row, pattern in enumerate(starts.matrix.sign()):
-            known = len(kept) == EXAMINED or any(torch.equal(pattern, one) for one in kept)
-            if not known and judged(starts.matrix[row], starts.offset[row]).left < limit:
+            skipped = len(kept) == EXAMINED or any(torch.equal(pattern, candidate) for candidate in kept)
+            if not skipped and judged(starts.matrix[row], starts.offset[row]).left < limit:
                 kept.append(pattern)
                 yield _Starts(*(part[row : row + 1] for part in starts))
 
-    first = next((one for starts in search.tried() for one in rigid(search.best(starts))), None)
-    plain = [] if first is None else [search.plainer(one) for one in rigid(search.equivalents(first))]
-    good = sorted((judged(*one) for one in plain), key=lambda one: one.left)
-    near = [one for one in good if one.left < min(limit, KEEPS * good[0].left)]
-    least = min((one.cost for one in near), default=0)
-    return [one for one in near if one.cost == least and least]
+    first = next((candidate for starts in search.tried() for candidate in rigid(search.best(starts))), None)
+    plain = [] if first is None else [search.plainer(candidate) for candidate in rigid(search.equivalents(first))]
+    good = sorted((judged(*candidate) for candidate in plain), key=lambda candidate: candidate.left)
+    near = [candidate for candidate in good if candidate.left < min(limit, KEEPS * good[0].left)]
+    least = min((candidate.cost for candidate in near), default=0)
+    return [candidate for candidate in near if candidate.cost == least and least]
 
 
 class _Starts(NamedTuple):
@@ -167,23 +167,23 @@ class _Search:
         """(n, 2) limits, half a turn or a metre to both sides where there are none [rad or m]."""
         limits = self.robot.limits
         half = torch.where(self.turning, pi, 1.0).to(limits)[:, None]
-        known = limits.isfinite() & (limits[:, 1:] > limits[:, :1])
-        return torch.where(known, limits, torch.cat([-half, half], 1))
+        bounded = limits.isfinite() & (limits[:, 1:] > limits[:, :1])
+        return torch.where(bounded, limits, torch.cat([-half, half], 1))
 
     def tried(self) -> Iterator[_Starts]:
         """Starts: signs and zeros; exchanged or coupled columns; other units of all joints, and of some."""
         n, turning = self.robot.n, self.turning
-        one, span = torch.eye(n, dtype=torch.float64, device=HOST), self.q.amax(0) - self.q.amin(0)
+        identity, span = torch.eye(n, dtype=torch.float64, device=HOST), self.q.amax(0) - self.q.amin(0)
         width = self.room[:, 1] - self.room[:, 0]
         large = turning & (span > MOST_PART * width)
         small = turning & (span < LEAST_PART * width)
         if not bool(large.any()):
-            yield self.starts(one, self.zeros(ZEROS))
+            yield self.starts(identity, self.zeros(ZEROS))
         exchanged = ([b if k == a else a if k == b else k for k in range(n)] for a, b in combinations(range(n), 2))
-        mixed = [self.starts(one[order], self.zeros(2), 0) for order in exchanged]
+        mixed = [self.starts(identity[order], self.zeros(2), 0) for order in exchanged]
         for k in (k for k in range(n - 1) if bool(turning[k] & turning[k + 1])):
             for sign in (1.0, -1.0):
-                coupled = one.clone()
+                coupled = identity.clone()
                 coupled[k + 1, k] = sign
                 mixed.append(self.starts(coupled, self.zeros(4), 3))
         if not bool(large.any()) and mixed:
@@ -195,14 +195,14 @@ class _Search:
             part = (factor * span / width)[moving]
             possible = strange or (percent and number < 2)
             if possible and bool(((part < MOST_PART) & (part > LEAST_PART)).all()):
-                own = self.starts(torch.where(turning, factor, 1.0)[:, None] * one, self.zeros(ZEROS // 2))
-                yield own._replace(scaled=(moving & (number < 2)).expand_as(own.offset))  # limits are rough
+                starts = self.starts(torch.where(turning, factor, 1.0)[:, None] * identity, self.zeros(ZEROS // 2))
+                yield starts._replace(scaled=(moving & (number < 2)).expand_as(starts.offset))  # limits are rough
         for odd in (large, large | small):
             if 0 < int(odd.sum()) < max(int(turning.sum()), 2):
-                own = self.starts(one, self.zeros(ZEROS))
-                grid = torch.rand(own.offset.shape, generator=seeded(1), dtype=torch.float64, device=HOST)
+                starts = self.starts(identity, self.zeros(ZEROS))
+                grid = torch.rand(starts.offset.shape, generator=seeded(1), dtype=torch.float64, device=HOST)
                 size = torch.where(odd, 0.08 * 12.0**grid * width / span.clamp(min=1e-9), 1.0)
-                yield own._replace(matrix=own.matrix * size[..., None], scaled=odd.expand_as(own.offset))
+                yield starts._replace(matrix=starts.matrix * size[..., None], scaled=odd.expand_as(starts.offset))
 
     def factors(self) -> list[Tensor]:
         """-100..100 and 0..100 of the limits, degrees, radians and ticks as factors (n,) of the values as read."""
@@ -216,15 +216,15 @@ class _Search:
         generator, shape = seeded(0), (count, self.robot.n)
         quarters = torch.randint(-1, 3, shape, generator=generator, device=HOST) * (pi / 2)
         drawn = torch.rand(shape, generator=generator, dtype=torch.float64, device=HOST) < 0.5
-        found = torch.where(drawn & self.turning, quarters, 0.0).double()
+        offsets = torch.where(drawn & self.turning, quarters, 0.0).double()
         usual = self.room.mean(1), torch.where(self.turning, -pi, 0.0).double(), self.room[:, 0]
-        found[:4] = torch.stack([torch.zeros_like(usual[0]), *usual])[:count]
-        return found
+        offsets[:4] = torch.stack([torch.zeros_like(usual[0]), *usual])[:count]
+        return offsets
 
     def starts(self, matrix: Tensor, zeros: Tensor, most: int = 4, *, fewer: bool = True) -> _Starts:
         """One matrix with up to ``most`` changes of sign, and zeros (K, n), half as many for each change."""
         n, matrices, offsets = self.robot.n, [], []
-        for flips in (own for count in range(most + 1) for own in combinations(range(n), count)):
+        for flips in (joints for count in range(most + 1) for joints in combinations(range(n), count)):
             sign = torch.ones(n, 1, dtype=torch.float64, device=HOST)
             sign[list(flips)] = -1.0
             offsets.append(zeros[: max(len(zeros) >> len(flips), 2)] if fewer else zeros)
@@ -236,46 +236,46 @@ class _Search:
     def best(self, starts: _Starts) -> _Starts:
         """The most promising, improved; the best first."""
         starts = self.improved(starts, FIRST_STEPS)
-        found = self.improved(_chosen(starts, starts.share.argsort()[:KEPT]), STEPS)
-        order = found.share.argsort()
-        return _chosen(found, order[found.share[order] < PROMISING])
+        improved = self.improved(_chosen(starts, starts.share.argsort()[:KEPT]), STEPS)
+        order = improved.share.argsort()
+        return _chosen(improved, order[improved.share[order] < PROMISING])
 
-    def equivalents(self, found: _Starts) -> _Starts:
+    def equivalents(self, start: _Starts) -> _Starts:
         """One of the starts (1,), and those with other signs and half turns that explain as much, few signs first."""
         n, turns = self.robot.n, self.robot.periodic
         halves = [(), *((k,) for k in range(n)), *((k, k + gap) for gap in (2, 3) for k in range(n - gap))]
-        added = [[pi if k in own else 0.0 for k in range(n)] for own in halves if all(turns[k] for k in own)]
-        zeros = found.offset + torch.tensor(added, dtype=torch.float64, device=HOST)
-        bare = found.matrix[0] * torch.where(found.matrix[0].diagonal() < 0.0, -1.0, 1.0)[:, None]
+        added = [[pi if k in joints else 0.0 for k in range(n)] for joints in halves if all(turns[k] for k in joints)]
+        zeros = start.offset + torch.tensor(added, dtype=torch.float64, device=HOST)
+        bare = start.matrix[0] * torch.where(start.matrix[0].diagonal() < 0.0, -1.0, 1.0)[:, None]
         starts = self.starts(bare, zeros, fewer=False)
-        tried = self.improved(starts._replace(scaled=found.scaled.expand_as(starts.offset)), 2)
-        tried = self.improved(_chosen(tried, tried.share < PROMISING + float(found.share)), FIRST_STEPS)
-        good = _chosen(tried, tried.share < max(NICE, KEEPS * float(found.share)))
-        return _joined([good, found])
+        tried = self.improved(starts._replace(scaled=start.scaled.expand_as(starts.offset)), 2)
+        tried = self.improved(_chosen(tried, tried.share < PROMISING + float(start.share)), FIRST_STEPS)
+        good = _chosen(tried, tried.share < max(NICE, KEEPS * float(start.share)))
+        return _joined([good, start])
 
-    def plainer(self, found: _Starts) -> tuple[Tensor, Tensor]:
+    def plainer(self, start: _Starts) -> tuple[Tensor, Tensor]:
         """M and b of one of the starts (1,), with known factors and the plainest zeros that explain as much."""
-        limit, factors = max(NICE, KEEPS * float(found.share)), self.factors()
+        limit, factors = max(NICE, KEEPS * float(start.share)), self.factors()
         identity = torch.eye(self.robot.n, dtype=torch.bool, device=HOST)
-        known = torch.stack([*factors, *(torch.ones_like(factors[0]) / ratio for ratio in (1, *RATIOS))])
-        for k in found.scaled[0].nonzero()[:, 0].tolist():
-            near = known[(known[:, k] / found.matrix[0, k].abs().max() - 1.0).abs() < 0.05, k]
-            tried = _joined([found] * max(len(near), 1))
+        usual = torch.stack([*factors, *(torch.ones_like(factors[0]) / ratio for ratio in (1, *RATIOS))])
+        for k in start.scaled[0].nonzero()[:, 0].tolist():
+            near = usual[(usual[:, k] / start.matrix[0, k].abs().max() - 1.0).abs() < 0.05, k]
+            tried = _joined([start] * max(len(near), 1))
             if len(near):
                 matrix = torch.where(identity[k][:, None], tried.matrix.sign() * near[:, None, None], tried.matrix)
-                found = self._taken(found, tried._replace(matrix=matrix, scaled=tried.scaled & ~identity[k]), limit)
+                start = self._taken(start, tried._replace(matrix=matrix, scaled=tried.scaled & ~identity[k]), limit)
         for k in range(self.robot.n):
             ends = [float(self.room[k].mean()), *self.room[k].tolist()]
             nice = [0.0, *([pi / 2, -pi / 2, pi] if bool(self.turning[k]) else []), *ends]
-            tried = _joined([found] * len(nice))
+            tried = _joined([start] * len(nice))
             values = torch.tensor(nice, dtype=torch.float64, device=HOST)[:, None]
             offset = torch.where(identity[k], values, tried.offset)
-            found = self._taken(found, tried._replace(offset=offset, free=tried.free & ~identity[k]), limit)
-        turned = pi - (pi - found.offset[0]).remainder(2 * pi)
+            start = self._taken(start, tried._replace(offset=offset, free=tried.free & ~identity[k]), limit)
+        turned = pi - (pi - start.offset[0]).remainder(2 * pi)
         rounded = torch.where(
-            self.turning, turned.rad2deg().round(decimals=1).deg2rad(), found.offset[0].round(decimals=4)
+            self.turning, turned.rad2deg().round(decimals=1).deg2rad(), start.offset[0].round(decimals=4)
         )
-        return found.matrix[0], torch.where(found.free[0], rounded, found.offset[0])
+        return start.matrix[0], torch.where(start.free[0], rounded, start.offset[0])
 
     def _taken(self, now: _Starts, tried: _Starts, limit: float) -> _Starts:
         """The first that leaves little and about as little as the best of them, else what there was."""

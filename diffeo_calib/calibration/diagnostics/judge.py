@@ -10,10 +10,6 @@ Scales that were selected with a change in the rows call it noise; noise that ha
 after it is still no chance, since each row adds about one to the gain. Gains of changes pay for their unknowns and
 their row by the Bayesian information criterion. Codes of a mixture explain some noise too: what they explain by chance
 is measured with the effects of other rows.
-
-Errors of links and a wrong scale of the device look alike: the fit takes up either without a trace in its residuals.
-What tells them apart is how improbable links are that are wrong by so much: a length of the robot, its links or the
-device is a hypothesis beside the errors of a robot with usual errors of its links.
 """
 
 from __future__ import annotations
@@ -21,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from math import hypot, inf, log
+from math import log
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -34,20 +30,17 @@ from diffeo_calib.calibration.diagnostics.hypotheses import (
     SampledRows,
     changes_of,
     left_out_rms,
-    lengths_of,
-    links_of,
     worth_it,
 )
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, variance_ratio
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.errors import few, sentence, warn_user, with_deviation
-from diffeo_calib.common.quantiles import chi2_above
+from diffeo_calib.common.errors import few, sentence, warn_user
 from diffeo_calib.process.evidence import Evidence
 from diffeo_calib.process.scales import PAYLOAD_FACTORS, Hyperparameters
 from diffeo_calib.regression.conditional import Process
 from diffeo_calib.robots.placement import PLACES
-from diffeo_calib.sensors.devices import MILLIMETRE, Hypothesis
+from diffeo_calib.sensors.devices import Hypothesis
 
 ROUNDS = 20
 """Of the codes of a mixture."""
@@ -87,10 +80,12 @@ class Finding(NamedTuple):
     """The best explanation in a sentence.
 
     Columns (N, R, U), m, are the effects of unknowns that the model shall have, with unit variance; None for none.
+    A wrong column of the table explains wrong rows, too.
     """
 
     text: str
     columns: Tensor | None
+    of_table: bool
 
 
 def judge(
@@ -115,20 +110,20 @@ def judge(
     (rows, some), lines = SampledRows.of(data, scales), lines.to(data.x.device)
     if len(rows.index) < 4 * gates.CHANGE_ROWS:
         return None
-    changes, own = changes_of(some, devices, rows.index), lines[rows.index]
-    named = [one._replace(name=bodies.get(one.name, one.name)) for one in changes]
+    changes, sampled = changes_of(some, devices, rows.index), lines[rows.index]
+    named = [cause._replace(name=bodies.get(cause.name, cause.name)) for cause in changes]
     own_names = [names[row] for row in rows.index.tolist()]
-    found = [*changed(rows, named, own, own_names, excess=max(1.0, variance_ratio(data, left_out)))]
-    if len(own) >= gates.MIXED_ROWS:
-        found += [own for one in changes if one.name == MARKERS for own in two_tools(rows, one.effects, lines)]
-        found += other_payloads(rows, some, data, scales, lines)
+    causes = [*changed(rows, named, sampled, own_names, excess=max(1.0, variance_ratio(data, left_out)))]
+    if len(sampled) >= gates.MIXED_ROWS:
+        causes += [tool for cause in changes if cause.name == MARKERS for tool in two_tools(rows, cause.effects, lines)]
+        causes += other_payloads(rows, some, data, scales, lines)
     opens &= len(rows.index) == len(data.x)
-    return best_of([one if opens else one._replace(opens="") for one in found], rows)
+    return best_of([cause if opens else cause._replace(opens="") for cause in causes], rows)
 
 
-def best_of(found: Iterable[Candidate], rows: SampledRows) -> Finding | None:
+def best_of(candidates: Iterable[Candidate], rows: SampledRows) -> Finding | None:
     """That with which left-out errors fall most, relative to what may remain."""
-    best = min(found, key=lambda own: own.left / own.most, default=None)
+    best = min(candidates, key=lambda candidate: candidate.left / candidate.most, default=None)
     if best is None or best.left > best.most:
         return None
     moved = left_out_rms(rows.process) * (1.0 - best.left**2) ** 0.5
@@ -140,7 +135,7 @@ def best_of(found: Iterable[Candidate], rows: SampledRows) -> Finding | None:
         fix += f"; the model holds for {best.opens}"
         columns = rows.in_coordinates(rows.process.numbers.in_table(best.columns))
         columns = OPENED_M * columns / columns[columns.any(2)].square().sum(1).mean().sqrt()
-    return Finding(sentence(best.what, expected=best.expected, got=got, fix=fix), columns)
+    return Finding(sentence(best.what, expected=best.expected, got=got, fix=fix), columns, best.columns is NOTHING)
 
 
 # --- changes during the measurements ----------------------------------------------------------------------------------
@@ -187,23 +182,23 @@ def changed(
 ) -> Iterator[Candidate]:
     """The clearest change during the measurements; arguments as of :func:`changes` and :func:`judge`."""
     process, order = rows.process, lines.argsort()
-    found = [*changes(hypotheses, process, order, excess=excess)]
-    best = max(found, key=lambda one: one.evidence)
+    tried = [*changes(hypotheses, process, order, excess=excess)]
+    best = max(tried, key=lambda change: change.evidence)
     what, _, _, advice, *_ = best.hypothesis
     sudden, clear = best.row is not None, best.evidence >= gates.CHANGE_EVIDENCE
     once, fix = sudden * max(best.evidence, 0.0), f"check what happened then; {advice}"
-    for one in (each for each in hypotheses if each.unit is None or (clear and each.name == what)):
-        yield from changed_twice(rows, one, order, names, once, excess=excess)
+    for cause in (each for each in hypotheses if each.unit is None or (clear and each.name == what)):
+        yield from changed_twice(rows, cause, order, names, once, excess=excess)
     if not clear:
         return
     others = [
-        one
-        for one in found
-        if (one.row is not None) == sudden
-        and one.hypothesis.name != what
-        and min(best.gain - one.gain, best.evidence - one.evidence) < gates.CHANGES_TOLD_APART
+        change
+        for change in tried
+        if (change.row is not None) == sudden
+        and change.hypothesis.name != what
+        and min(best.gain - change.gain, best.evidence - change.evidence) < gates.CHANGES_TOLD_APART
     ]
-    words = ", or ".join(dict.fromkeys(one.words(rows) for one in (best, *others)))
+    words = ", or ".join(dict.fromkeys(change.words(rows) for change in (best, *others)))
     words += " (these rows do not tell which)" * bool(others)
     words += " over the rows" if best.row is None else f" near {names[order[best.row]]}"
     kept, advice = ("the rows before it", fix) if sudden else ("the middle of the rows", SLOW)
@@ -212,14 +207,14 @@ def changed(
 
 
 def changed_twice(
-    rows: SampledRows, one: Hypothesis, order: Tensor, names: Sequence[str], once: float, *, excess: float
+    rows: SampledRows, hypothesis: Hypothesis, order: Tensor, names: Sequence[str], once: float, *, excess: float
 ) -> Iterator[Candidate]:
     """Three set-ups, which look like a drift, or what moves back, which looks like little.
 
     Each change is sought once more beside the other one. ``once``: evidence of a single one; others as of
     :func:`changes`.
     """
-    (what, E, _, advice, *_), process = one, rows.process
+    (what, E, _, advice, *_), process = hypothesis, rows.process
     first, second = _likeliest(*scans([E], process, order)), 0
     for _ in range(2):
         beside = process.opened(rows.columns(E, _from(order, first)))
@@ -242,13 +237,13 @@ def changes(
     ``order``: (N,) row numbers in the order of measurement.
     """
     ramp = order.argsort().to(process.mu) / (len(order) - 1) - 0.5
-    for one, scan in zip(hypotheses, scans([one.effects for one in hypotheses], process, order), strict=True):
+    for cause, scan in zip(hypotheses, scans([cause.effects for cause in hypotheses], process, order), strict=True):
         row = _likeliest(scan)
         jump = scan._replace(g=scan.g[row], H=scan.H[row])
-        drift = Evidence.of(process.numbers.of_table(ramp[:, None, None] * one.effects), process)
-        for found, codes, first in ((jump, _from(order, row), row), (drift, ramp, None)):
-            gain = float(found.gain) / max(excess, float(found.excess))
-            yield Change(one, codes, found.size, gain, first)
+        drift = Evidence.of(process.numbers.of_table(ramp[:, None, None] * cause.effects), process)
+        for evidence, codes, first in ((jump, _from(order, row), row), (drift, ramp, None)):
+            gain = float(evidence.gain) / max(excess, float(evidence.excess))
+            yield Change(cause, codes, evidence.size, gain, first)
 
 
 def scans(effects: Sequence[Tensor], process: Process, order: Tensor) -> Iterator[Evidence]:
@@ -294,22 +289,22 @@ class Mixture:
 
     def evidence(self, chosen: Tensor) -> tuple[Tensor, float]:
         """The unknowns (U,) with these codes (N,), and by how much the log evidence grows."""
-        found = Evidence.of(self.rows.columns(self.effects, chosen), self.rows.process)
-        eye = torch.eye(len(found.g), dtype=found.g.dtype, device=found.g.device)
-        return torch.linalg.solve(found.H + eye, found.g), float(found.log_odds(found.g.new_ones(1)))
+        evidence = Evidence.of(self.rows.columns(self.effects, chosen), self.rows.process)
+        eye = torch.eye(len(evidence.g), dtype=evidence.g.dtype, device=evidence.g.device)
+        return torch.linalg.solve(evidence.H + eye, evidence.g), float(evidence.log_odds(evidence.g.new_ones(1)))
 
     def pulls(self, chosen: Tensor, u: Tensor) -> Evidence:
         """What each row alone says of unknowns of its own beside the codes: g (N, U) and H (N, U, U)."""
         process, numbers = self.rows.process, self.rows.process.numbers
         left = process.mu - process.inverse @ (self.rows.columns(self.effects, chosen) @ u)
-        own = numbers.blocks(process.inverse)
+        blocks = numbers.blocks(process.inverse)
         g = (self.effects * numbers.in_table(left)[..., None]).sum(1)
-        return Evidence(g, self.effects.mT @ own @ self.effects)
+        return Evidence(g, self.effects.mT @ blocks @ self.effects)
 
     def decided(self, chosen: Tensor, u: Tensor) -> Tensor:
         """(N,) the likeliest code of each row while the others keep theirs."""
-        own, step = self.pulls(chosen, u), self.codes - chosen[:, None]
-        best = 2 * step * (own.g @ u)[:, None] - step.square() * (own.H @ u @ u)[:, None]
+        pulls, step = self.pulls(chosen, u), self.codes - chosen[:, None]
+        best = 2 * step * (pulls.g @ u)[:, None] - step.square() * (pulls.H @ u @ u)[:, None]
         return self.codes.gather(1, best.argmax(1, keepdim=True))[:, 0]
 
     def settled(self, chosen: Tensor) -> tuple[Tensor, Tensor, float]:
@@ -328,9 +323,9 @@ def two_tools(rows: SampledRows, effects: Tensor, lines: Tensor) -> Iterator[Can
     """Markers or tools that take turns, by the effects (N, R, U) of their shifts; lines of all rows."""
     E, N = effects * PLACES.found_m_rad, len(effects)
     mixed = Mixture(rows, E, E.new_tensor([-0.5, 0.5]).expand(N, 2))
-    own = mixed.pulls(E.new_zeros(N), E.new_zeros(E.shape[2]))
-    size = own.H.diagonal(dim1=1, dim2=2).sum(1, keepdim=True)
-    away = own.g / size.clamp(min=torch.finfo(size.dtype).tiny)  # of each row, whatever it weighs
+    pulls = mixed.pulls(E.new_zeros(N), E.new_zeros(E.shape[2]))
+    size = pulls.H.diagonal(dim1=1, dim2=2).sum(1, keepdim=True)
+    away = pulls.g / size.clamp(min=torch.finfo(size.dtype).tiny)  # of each row, whatever it weighs
     along = away @ torch.linalg.svd(away - away.mean(0), full_matrices=False).Vh[0]
     k, sums = torch.arange(1, N, device=E.device), (along.sort().values - along.mean()).cumsum(0)[:-1]
     split = along.sort().values[(sums.square() / (k * (N - k))).argmax()]  # N. Otsu, 1979
@@ -367,11 +362,11 @@ def other_payloads(
 
     columns = {"": masses} | dict(_other_columns(masses, lines))
     codes = {words: other[rows.index] / float(other.max()) for words, other in columns.items()}
-    found = {words: max((under(own, f).evidence, f) for f in PAYLOAD_FACTORS[::2]) for words, own in codes.items()}
-    best = max(found, key=lambda words: found[words])
-    if found[best][0] > found[""][0] + gates.PAYLOAD_ODDS:
+    odds = {words: max((under(code, f).evidence, f) for f in PAYLOAD_FACTORS[::2]) for words, code in codes.items()}
+    best = max(odds, key=lambda words: odds[words])
+    if odds[best][0] > odds[""][0] + gates.PAYLOAD_ODDS:
         what, fix = f"the payloads seem to be {best}", "check the column: its order, unit and digits"
-        left = left_out_rms(under(codes[best], found[best][1])) / left_out_rms(rows.process)
+        left = left_out_rms(under(codes[best], odds[best][1])) / left_out_rms(rows.process)
         yield Candidate(what, expected, fix, left, gates.WORTH)
     if len(kinds := masses.unique() / load.unit) > gates.MOST_MASSES:
         return
@@ -389,11 +384,11 @@ def other_payloads(
         yield Candidate(what, expected, fix, left, gates.PAYLOADS_LEFT)
 
 
-def _likeliest_codes(mixed: Mixture, own: Tensor, axes: Tensor) -> tuple[Tensor, float]:
+def _likeliest_codes(mixed: Mixture, given: Tensor, axes: Tensor) -> tuple[Tensor, float]:
     """Codes (N,) beside the rows' own, and how much more they explain; joints yield about their axes, in one sense."""
-    u, odds = mixed.evidence(own)
-    found = [mixed.settled(mixed.decided(own, start)) for start in (u, axes, -axes)]
-    chosen, _, best = max(found, key=lambda one: one[2])
+    u, odds = mixed.evidence(given)
+    trials = [mixed.settled(mixed.decided(given, start)) for start in (u, axes, -axes)]
+    chosen, _, best = max(trials, key=lambda trial: trial[2])
     return chosen, best - odds
 
 
@@ -409,107 +404,9 @@ def _other_columns(masses: Tensor, lines: Tensor) -> Iterator[tuple[str, Tensor]
             yield f"{factor:.4g} times as large where they {words} {mass:g}", torch.where(some, factor * masses, masses)
 
 
-def warn_of_taken_scales(taken: LeaveOneOut, own: LeaveOneOut) -> None:
+def warn_of_taken_scales(taken: LeaveOneOut, chosen: LeaveOneOut) -> None:
     """Warn if left-out errors prove that the scales of other robots are not those of these rows."""
-    if worth_it(taken.errors, own.errors):
-        left = float((own.errors.square().nansum() / taken.errors.square().nansum()).sqrt())
+    if worth_it(taken.errors, chosen.errors):
+        left = float((chosen.errors.square().nansum() / taken.errors.square().nansum()).sqrt())
         got = f"leave-one-out errors that fall to {100 * left:.0f} % with scales of their own"
         warn_user(sentence("`scales_of` does not suit these rows", got=got, fix="leave it out (--scales-of)"))
-
-
-# --- lengths against what they are said to be -------------------------------------------------------------------------
-
-
-LEAST_OWN = 1e-6
-"""Part of what rows say of a length that must be left beside links of any size, else they tell nothing of it."""
-
-
-class Length(NamedTuple):
-    """A length against what it is said to be.
-
-    Args:
-        cause: what. value, deviation: how much it differs, in m or relative. motion: RMS motion of a point by a unit of
-            it, m. unnoticed: largest value that a usual robot shows by chance, and that passes without a warning.
-        taken_up: whether it is surely the robot's, and so part of the fit.
-    """
-
-    cause: Hypothesis
-    value: float
-    deviation: float
-    motion: float
-    unnoticed: float
-    taken_up: bool
-
-    @property
-    def gain(self) -> float:
-        """What it explains, in log evidence."""
-        return 0.5 * (self.value / self.deviation) ** 2
-
-    def __str__(self) -> str:
-        unit, size = self.cause.unit or MILLIMETRE
-        found = with_deviation(self.value / size, self.deviation / size)
-        return (
-            f"{self.cause.name} against its description: {found} {unit}, which moves points by "
-            f"{1e3 * abs(self.value) * self.motion:.2g} mm; up to {self.cause.amount(self.unnoticed)} "
-            f"({1e3 * self.unnoticed * self.motion:.2g} mm) may be wrong without a warning"
-        )
-
-
-def lengths(data: TangentData, scales: Hyperparameters, devices: Iterable[Hypothesis] = ()) -> list[Length]:
-    """Lengths against what they are said to be, that of the whole robot first, beside errors of usual size.
-
-    Links that explain the rows far better than anything that a device may have wrong are the robot's, and are opened
-    for all others; if then nothing else is wrong.
-
-    Args:
-        data: the measurements. scales: those of the model. devices: what devices are said to hold, such as a focal
-            length.
-    """
-    usual = {name: getattr(scales, name).clamp(max=most) for name, most in gates.USUAL_SCALES.items()}
-    turning = torch.tensor(data.space.periodic, dtype=torch.bool, device=data.x.device)
-    most = torch.where(turning, inf, gates.USUAL_SLIDE).to(scales.transmission_amplitude)
-    usual["transmission_amplitude"] = scales.transmission_amplitude.minimum(most)
-    known = replace(scales, **usual)
-    rows, some = SampledRows.of(data, scales if torch.equal(known.vector, scales.vector) else known)
-    links, others = [*links_of(some)], (one._replace(effects=one.effects[rows.index]) for one in devices)
-    causes = [*lengths_of(some), *others, *links]
-    E, process = torch.cat([one.effects for one in causes], 2), rows.process
-    columns = rows.columns(some.motions_in_numbers(E))
-    g, H, total = columns.T @ process.mu, columns.T @ process.factor.solve(columns), process.numbers.target @ process.mu
-    motions = (3 * (E - E.mean(0))[some.visible].square().mean(0)).sqrt().tolist()
-    least, found, alone = LEAST_OWN * H.diagonal(), dict[int, Length](), dict[int, Length]()
-    left, first = H.diagonal().nonzero()[:, 0].tolist(), len(causes) - len(links)
-    allowed, apart = chi2_above(gates.LENGTH_CHANCE / max(len(left), 1), 1) ** 0.5, gates.CHANGES_TOLD_APART
-    while left:
-        each = Evidence(g[left, None], H.diagonal()[left, None, None], float(total), len(columns))
-        deviations = (each.excess / each.H[:, 0, 0]).sqrt().tolist()
-        for k, size, chance in zip(left, each.size[:, 0].tolist(), deviations, strict=True):
-            sd, taken_up = hypot(chance, causes[k].usual), causes[k].usual > 0.0 and abs(size) <= gates.TAKEN_UP
-            found[k] = Length(causes[k], size, sd, motions[k], allowed * sd, taken_up)
-        gains = {k: found[k].gain for k in left}
-        best = max((k for k in left if k >= first), key=lambda k: gains[k], default=left[0])
-        doubts = max((gains[k] for k in left if k < first), default=0.0)
-        if gains[best] < max(0.5 * allowed**2, doubts + apart) or best < first:
-            break
-        alone, apart = alone or dict(found), 0.0  # where one link is wrong, others probably are
-        found[best], step = found[best]._replace(taken_up=True), H[best] / H[best, best]
-        total, g, H = total - g[best].square() / H[best, best], g - step * g[best], H - torch.outer(step, H[best])
-        left = (H.diagonal() > least).nonzero()[:, 0].tolist()
-    unclear = any(abs(one.value) > one.unnoticed and not one.taken_up for one in found.values())
-    return [*(alone if alone and unclear else found).values()]
-
-
-def warn_of_lengths(found: list[Length]) -> float | None:
-    """Warn of the least probable length, if it is too improbable; by how much any such length moves points, m."""
-    if not (wrong := [one for one in found if abs(one.value) > one.unnoticed]):
-        return None
-    worst = max(wrong, key=lambda one: one.gain)
-    moved = max((abs(one.value) * one.motion for one in wrong if not one.taken_up), default=None)
-    text = sentence(
-        f"{worst.cause.name} seems to differ by {worst.cause.amount(worst.value, '+')} from what it is said to be",
-        expected=f"at most about {worst.cause.amount(3 * worst.deviation)}: links and devices are seldom that wrong",
-        got=None if moved is None else f"absolute positions that may be wrong by {1e3 * moved:.2g} mm RMS",
-        fix=worst.cause.fix + "; the expected error does not hold before that is settled" * (moved is not None),
-    )
-    warn_user(text)
-    return moved

@@ -66,14 +66,14 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Any) -> Evaluation | 
         expected = "a calibrated model or another function of joint values"
         raise InputError.of("`kinematics`", expected=expected, got=type(kinematics).__name__)
     places = place(kinematics, data)
-    found = residuals(kinematics, places, data)
+    errors = residuals(kinematics, places, data)
     if isinstance(kinematics, CalibratedKinematics):
-        doubt = judge(kinematics, places, data, found, usual=False)
+        doubt = judge(kinematics, places, data, errors, usual=False)
         if doubt.moved:
             raise MeasurementError(doubt.refusal)
         if doubt.refusal is not None:
             warn_user(doubt.refusal)
-    return replace(found.main, placed=found.placed, numbers=found.numbers) if len(found) == 1 else found
+    return replace(errors.main, placed=errors.placed, numbers=errors.numbers) if len(errors) == 1 else errors
 
 
 @dataclass(frozen=True)
@@ -88,44 +88,44 @@ class Judgement:
 
 
 def judge(
-    model: CalibratedKinematics, places: Places, data: Any, found: Evaluations, *, usual: bool = True
+    model: CalibratedKinematics, places: Places, data: Any, compared: Evaluations, *, usual: bool = True
 ) -> Judgement:
     """Name rows that look wrong, and likely causes of large errors.
 
     Args:
-        model: a calibrated model. places, data, found: see :func:`~diffeo_calib.kinematics.evaluation.residuals`.
+        model: a calibrated model. places, data, compared: see :func:`~diffeo_calib.kinematics.evaluation.residuals`.
         usual: whether to look at errors below a tenth of the robot's reach, and for wrong rows.
 
     Raises:
         MeasurementError: another reading of the table explains impossible errors.
     """
-    impossible = gates.LARGEST_PER_REACH * model.robot.reach
-    for table, _ in divided(data)[1]:
-        away = sensor_of(table).away(table, predicted_at(model, table), places).norm(dim=1)
-        if (median := float(away.nanmedian())) > impossible:
-            fix = "check the unit of the readings (--length), their columns (--reading), and the device of every row"
-            fix += " (`device`, --session)"
-            got = f"a median of {1e3 * median:.4g} mm at the ball"
-            return Judgement(sentence("these errors are not those of a calibrated robot", got=got, fix=fix))
-    seen, errors = positions_of(model, places, data), found.positions
-    if seen is None or errors is None or not (usual or errors.median > impossible):
-        return Judgement()
-    some, fix = _some(seen, MOST_ROWS), "register the model first: `model.registered`, evaluate --free both"
-    for step in steps_of(model, some) if usual else ():
+    impossible, errors = gates.LARGEST_PER_REACH * model.robot.reach, compared.positions
+    measured = positions_of(model, places, data)
+    some = None if measured is None or errors is None else _some(measured, MOST_ROWS)
+    for step in steps_of(model, some) if usual and some is not None else ():
         return Judgement(step.sentence())
+    for table, _ in divided(data)[1]:
+        sensor = sensor_of(table)
+        away = sensor.away(table, predicted_at(model, table), places).norm(dim=1)
+        if (median := float(away.nanmedian())) > impossible:
+            if usual and some is not None:
+                refuse_mistakes(model.robot, some)
+            got = f"a median of {1e3 * median:.4g} mm at the ball"
+            return Judgement(sentence("these errors are not those of a calibrated robot", got=got, fix=sensor.advice))
+    if some is None or errors is None or not (usual or errors.median > impossible):
+        return Judgement()
+    fix = "register the model first: `model.registered`, evaluate --free both"
     moved = [sentence(motion.sentence, fix=fix) for motion in motions(model, some)]
     causes = moved or [*filter(None, [implausible(model, some, errors)])]
-    if errors.median > impossible and causes:
+    if errors.median > impossible:
         if usual and not moved:
             refuse_mistakes(model.robot, some)
         return Judgement(" ".join(causes), (), bool(moved))
     if causes or not usual:
         return Judgement(None, causes)
     wrong = contradicted(model, some)
-    causes, claimed = (
-        [*filter(None, [block_text(model, some, wrong)])],
-        expected_rms(model, seen, errors.errors.shape[1]),
-    )
+    causes = [*filter(None, [block_text(model, some, wrong)])]
+    claimed = expected_rms(model, some, errors.errors.shape[1])
     if not causes and not wrong and errors.rms >= gates.LARGE_PER_EXPECTED * claimed:
         what = f"the errors are {errors.rms / claimed:.1f} times as large as the model expects: "
         fix = "something has changed since the fit, or these poses are unlike those of the fit: compare, or recalibrate"
@@ -134,21 +134,21 @@ def judge(
     return Judgement(None, causes, outliers=wrong, rows=len(some))
 
 
-def check_errors(model: CalibratedKinematics, found: Evaluation, usual: float) -> None:
+def check_errors(model: CalibratedKinematics, evaluation: Evaluation, usual: float) -> None:
     """Raise MeasurementError if so many positions are far from a model that it holds for a part of the rows alone.
 
     Args:
-        model: the fitted model. found: errors of positions, of rows that were held out if there are any.
+        model: the fitted model. evaluation: errors of positions, of rows that were held out if there are any.
         usual: median error of the rows of the fit after a geometric calibration, m.
     """
     reach = model.robot.reach
     limit = min(max(gates.LARGE_PER_REACH * reach, gates.LARGE_PER_USUAL * usual), gates.LARGEST_PER_REACH * reach)
-    share = float((known(found.errors) > limit).double().mean())
+    share = float((known(evaluation.errors) > limit).double().mean())
     if share > gates.MOST_LARGE:
         raise MeasurementError.of(
             f"{100 * share:.0f} % of the judged positions are more than {1e3 * limit:.3g} mm from the model",
             expected="errors of a calibrated robot",
-            got=f"an RMS error of {1e3 * found.rms:.4g} mm",
+            got=f"an RMS error of {1e3 * evaluation.rms:.4g} mm",
             fix="did device, robot or tool move between rows? Name the set-ups (`session`); the model that was written "
             "holds for a part of the rows at most",
         )
@@ -156,11 +156,11 @@ def check_errors(model: CalibratedKinematics, found: Evaluation, usual: float) -
 
 def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> str | None:
     """A sentence about errors that no calibrated robot has: expected and found median, what to check; else None."""
-    found, options = _expected(model, data), sensor_of(data).options
+    predicted, options = _expected(model, data), sensor_of(data).options
     largest = model.robot.reach * gates.LARGEST_PER_REACH
-    medians = [(errors.median, float(found.claimed.median()), 1e3, "mm", largest)]
+    medians = [(errors.median, float(predicted.claimed.median()), 1e3, "mm", largest)]
     if errors.orientation is not None:
-        turns = found.covariance[..., 3:, 3:].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+        turns = predicted.covariance[..., 3:, 3:].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
         medians.append((radians(errors.orientation.median), float(turns.median()), degrees(1.0), "degrees", inf))
     for median, usual, per_unit, unit, most in medians:
         if median > min(most, gates.LARGEST_PER_EXPECTED * usual):
@@ -208,11 +208,11 @@ def steps_of(model: CalibratedKinematics, data: Measurements) -> list[Step]:
 def block_text(model: CalibratedKinematics, data: Measurements, wrong: Sequence[Outlier]) -> str | None:
     """One sentence about wrong rows that follow one another, with their common cause if there is one; else None."""
     order = data.line_numbers.argsort()
-    flags = flagged(len(data), [one.row for one in wrong])[order]
-    found = find_block(flags)
-    if found is None:
+    flags = flagged(len(data), [outlier.row for outlier in wrong])[order]
+    span = find_block(flags)
+    if span is None:
         return None
-    start, end = found
+    start, end = span
     block = data.rows(order[start:end])
     lines, last = block.line_numbers.tolist(), " to the end of the table" * (end == len(data))
     size = float((model.at_payloads(block.payload)(block.q) - block.points).norm(dim=-1).nanmedian())
@@ -237,17 +237,17 @@ def common_cause(
 
 
 def warn_of_contradictions(
-    model: CalibratedKinematics, own: Coordinates | None, wrong: Sequence[Outlier], moved: str | None
+    model: CalibratedKinematics, coordinates: Coordinates | None, wrong: Sequence[Outlier], moved: str | None
 ) -> None:
     """Warn of the best explanation of wrong rows of a fit, see :func:`common_cause`.
 
     Args:
-        model: the fitted model. own: its rows that tell coordinates. wrong: the outliers among all rows.
+        model: the fitted model. coordinates: its rows that tell coordinates. wrong: the outliers among all rows.
     """
-    if own is not None:
-        numbers = {row: number for number, row in enumerate(own.rows.tolist())}
-        wrong = [replace(one, row=numbers[one.row]) for one in wrong if one.row in numbers]
-        moved = common_cause(model, own.table, wrong, moved)
+    if coordinates is not None:
+        numbers = {row: number for number, row in enumerate(coordinates.rows.tolist())}
+        wrong = [replace(outlier, row=numbers[outlier.row]) for outlier in wrong if outlier.row in numbers]
+        moved = common_cause(model, coordinates.table, wrong, moved)
     if moved is not None:
         warn_user(moved)
 
@@ -283,14 +283,14 @@ def motions(model: CalibratedKinematics, data: Measurements) -> list[Motion]:
 
     if size(errors) < gates.LEAST_EXCESS**2 * usual:
         return []
-    found = list[Motion]()
+    likely = list[Motion]()
     for what, by, left, unknowns in (_of_device(data.points, errors), _of_markers(laden, data.q, errors)):
         freedom = count - unknowns
         share = float(left.square().nansum() / errors.square().nansum()) * count / freedom if freedom > 0 else 1.0
         if size(left) < gates.MOST_LEFT**2 * usual:
-            found.append(Motion(what, by, left, 1.0 - share))
-    least = max([gates.LEAST_EXPLAINED, *(each.explained - gates.AS_GOOD for each in found)])
-    return sorted((each for each in found if each.explained >= least), key=lambda motion: -motion.explained)
+            likely.append(Motion(what, by, left, 1.0 - share))
+    least = max([gates.LEAST_EXPLAINED, *(each.explained - gates.AS_GOOD for each in likely)])
+    return sorted((each for each in likely if each.explained >= least), key=lambda motion: -motion.explained)
 
 
 def _of_device(measured: Tensor, errors: Tensor) -> tuple[str, str, Tensor, int]:
@@ -304,9 +304,9 @@ def _of_device(measured: Tensor, errors: Tensor) -> tuple[str, str, Tensor, int]
 
 def _of_markers(model: CalibratedKinematics, q: Tensor, errors: Tensor) -> tuple[str, str, Tensor, int]:
     points = FlangePoints(model.nominal, model.geometry.tool, same=True)
-    geodesic, away, seen = model.map.geodesic.with_nominal(points), errors.flatten(1), ~errors.flatten(1).isnan()
+    geodesic, away, visible = model.map.geodesic.with_nominal(points), errors.flatten(1), ~errors.flatten(1).isnan()
     slopes = marker_slopes(geodesic, points, geodesic.linearise(q))  # (N, m, m)
-    step = torch.linalg.lstsq(slopes[seen], away[seen][:, None], driver="gelsd").solution[:, 0]
+    step = torch.linalg.lstsq(slopes[visible], away[visible][:, None], driver="gelsd").solution[:, 0]
     shift = step.view(-1, 3).norm(dim=1)
     what = f"{model.bodies.moved_words(len(shift))} on the flange"
     return what, f"{1e3 * float(shift.max()):.3g} mm", (away - slopes @ step).view_as(errors), len(step)

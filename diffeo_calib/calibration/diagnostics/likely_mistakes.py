@@ -155,9 +155,9 @@ def likely_mistake(
         return ""
     whole = [entry for entry in good if not entry[2].partial] or good
     share, best, reading = min(whole, key=lambda entry: entry[0])
-    words, near = reading.words, sorted((own, one.option) for own, _, one in whole if one.option)
+    words, near = reading.words, sorted((part, other.option) for part, _, other in whole if other.option)
     if reading.option:
-        options = [option for own, option in near if own < gates.READINGS_TOLD_APART * share]
+        options = [option for part, option in near if part < gates.READINGS_TOLD_APART * share]
         words = f"the rotations seem to be written with {' or '.join(options)}"
         words += ", which these rows do not tell apart" * (len(options) > 1)
     return f"{words} (the median residual falls from {1e3 * typical:.3g} to {1e3 * best:.3g} mm)"
@@ -168,58 +168,58 @@ def likely_mistake(
 
 def other_points(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Points in another unit, in a frame of the other hand, of exchanged tips; they or a joint of other rows."""
-    own, bodies = Reading.of(robot, data), data.points.unflatten(1, (data.origins.shape[1], -1))
+    as_read, bodies = Reading.of(robot, data), data.points.unflatten(1, (data.origins.shape[1], -1))
     for factor, times, size in _units_of_length():
         points = (bodies + (factor - 1.0) * data.origins[:, :, None]).flatten(1, 2)  # a pose stays as large
         words = f"the positions seem to be {times:.4g} times too {size}: check their unit (`length`)"
-        yield replace(own, points=points, words=words)
+        yield replace(as_read, points=points, words=words)
     words = "the points seem to be one row too {}: pair every configuration with its own"
-    yield replace(own, q=data.q[:-1], points=data.points[1:], words=words.format("late"))
-    yield replace(own, q=data.q[1:], points=data.points[:-1], words=words.format("early"))
+    yield replace(as_read, q=data.q[:-1], points=data.points[1:], words=words.format("late"))
+    yield replace(as_read, q=data.q[1:], points=data.points[:-1], words=words.format("early"))
     for joint, name in enumerate(robot.joint_names):
         for which, own_rows, others in (("after", slice(1, None), slice(-1)), ("before", slice(-1), slice(1, None))):
             q, words = data.q[own_rows].clone(), f"the values of {name} seem to be those of the row {which}"
             q[:, joint] = data.q[others, joint]
-            yield replace(own, q=q, points=data.points[own_rows], words=f"{words}: pair them with their own rows")
+            yield replace(as_read, q=q, points=data.points[own_rows], words=f"{words}: pair them with their own rows")
     words = "the frame of the measurements seems to be left-handed: exchange two position columns, or change a sign"
     for mirrored in data.bodies.mirrored(data):
-        yield replace(own, points=mirrored, words=words)
+        yield replace(as_read, points=mirrored, words=words)
     for one, other in combinations(robot.tips, 2):
         exchanged = {one: other, other: one}
         words = f"the markers on '{one}' and '{other}' seem to be exchanged: check which columns belong to which tip"
-        yield replace(own, words=words, on=tuple(exchanged.get(tip, tip) for tip in own.on))
+        yield replace(as_read, words=words, on=tuple(exchanged.get(tip, tip) for tip in as_read.on))
 
 
 def other_rotations(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Measured poses whose rotations are read in other ways, or whose poses are inverted."""
-    return (replace(Reading.of(robot, data), **one) for one in rereadings(data))
+    return (replace(Reading.of(robot, data), **changes) for changes in rereadings(data))
 
 
 def other_units(robot: Tree, data: Measurements, *, slides: bool = True) -> Iterator[Reading]:
     """Joint values in other units of angles, and of lengths if ``slides``."""
-    own, turning = Reading.of(robot, data), torch.tensor(robot.periodic, dtype=torch.bool, device=data.q.device)
+    as_read, turning = Reading.of(robot, data), torch.tensor(robot.periodic, dtype=torch.bool, device=data.q.device)
     for factor, words in ANGLE_MISTAKES if any(robot.periodic) else ():
-        yield replace(own, q=torch.where(turning, factor * data.q, data.q), words=words)
+        yield replace(as_read, q=torch.where(turning, factor * data.q, data.q), words=words)
     for factor, times, words in _units_of_length() if slides and not all(robot.periodic) else ():
         text = f"the values of prismatic joints seem to be {times:.4g} times too {words}: check their unit"
-        yield replace(own, q=torch.where(turning, data.q, factor * data.q), words=f"{text} (`joint_length`)")
+        yield replace(as_read, q=torch.where(turning, data.q, factor * data.q), words=f"{text} (`joint_length`)")
 
 
 def other_mimics(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Joints that follow others the other way round, twice or half as far, or not at all."""
-    own, config = Reading.of(robot, data), robot.to_config()
+    as_read, config = Reading.of(robot, data), robot.to_config()
     for place, joint in enumerate(robot.joints):
         for factor in (-1.0, 0.5, 2.0, 0.0) if joint.mimic else ():
             mimic = {name: factor * value for name, value in (joint.mimic or {}).items()}
             joints = [*robot.joints[:place], replace(joint, mimic=mimic), *robot.joints[place + 1 :]]
-            other = robot_from_config(config | {"joints": [one.to_config() for one in joints]}, robot.source)
+            other = robot_from_config(config | {"joints": [each.to_config() for each in joints]}, robot.source)
             words = f"joint '{joint.name}' seems to follow with {factor:g} times its multiplier"
-            yield replace(own, robot=other, words=f"{words}: check it in the robot's description")
+            yield replace(as_read, robot=other, words=f"{words}: check it in the robot's description")
 
 
 def _units_of_length() -> Iterator[tuple[float, float, str]]:
     """Factors that turn one unit of length into another, and by how many times values then are too small or large."""
-    for factor in sorted({one / other for one, other in permutations(UNITS_PER_METRE.values(), 2)}):
+    for factor in sorted({unit / other for unit, other in permutations(UNITS_PER_METRE.values(), 2)}):
         yield (factor, factor, "small") if factor > 1.0 else (factor, 1 / factor, "large")
 
 
@@ -240,7 +240,7 @@ def longer_chains(robot: Tree, data: Measurements) -> Iterator[Reading]:
         if longer.joint_names[: robot.n] != robot.joint_names or not all(name in spare for name in added):
             continue
         slides = [not turns for turns in longer.periodic[robot.n :]]
-        values = [_joint_values(columns, spare[name], slides=own) for name, own in zip(added, slides, strict=True)]
+        values = [_joint_values(columns, spare[name], slides=slide) for name, slide in zip(added, slides, strict=True)]
         more = torch.stack(values, dim=1).to(data.q.device)
         if bool((more.amax(0) - more.amin(0) > gates.FIXED_RANGE).all()):
             what = f"the table has a column for joint '{joint}', which is below the tip '{robot.tip}'"
@@ -254,17 +254,17 @@ def other_columns(robot: Tree, data: Measurements) -> Iterator[Reading]:
     if columns is None:
         return
     spare, as_read = _spare(columns, table), Reading.of(robot, data)
-    for k, (joint, own) in enumerate(zip(robot.joint_names, columns.joints.texts, strict=True)):
-        for name in _similar([joint, own], spare):
+    for k, (joint, text) in enumerate(zip(robot.joint_names, columns.joints.texts, strict=True)):
+        for name in _similar([joint, text], spare):
             q = data.q.clone()
             q[:, k] = _joint_values(columns, spare[name], slides=not robot.periodic[k]).to(q.device)
-            words = f"column '{shown(name)}' fits as {joint} in place of '{shown(own)}': check the joint columns"
+            words = f"column '{shown(name)}' fits as {joint} in place of '{shown(text)}': check the joint columns"
             yield replace(as_read, q=q, words=words)
     for marker, triple in enumerate([] if columns.table.spherical else columns.table.triples):
-        for axis, own in enumerate(triple):
-            for name in _similar([own], spare):
+        for axis, text in enumerate(triple):
+            for name in _similar([text], spare):
                 points = with_coordinate(data, marker, axis, spare[name] / columns.table.per_metre)
-                words = f"column '{shown(name)}' fits in place of '{shown(own)}': check the position columns"
+                words = f"column '{shown(name)}' fits in place of '{shown(text)}': check the position columns"
                 yield replace(as_read, points=points, words=words)
 
 
@@ -277,7 +277,7 @@ def _spare(columns: Columns, table: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def _similar(names: Sequence[str], spare: Mapping[str, Tensor]) -> list[str]:
     """The columns whose names are the most similar to some of these names."""
     short = [name for name in spare if len(name) <= LONGEST_NAME]
-    closeness = {name: max(SequenceMatcher(None, own, name).ratio() for own in names) for name in short}
+    closeness = {name: max(SequenceMatcher(None, wanted, name).ratio() for wanted in names) for name in short}
     return sorted(short, key=lambda name: -closeness[name])[:MOST_COLUMNS]
 
 
@@ -290,16 +290,16 @@ def _joint_values(columns: Columns, values: Tensor, *, slides: bool) -> Tensor:
 
 def other_conventions(robot: Tree, data: Measurements, judge: Judge = registered) -> Iterator[Reading]:
     """Joint values, or commanded poses, in another convention."""
-    (columns, table), own = numeric_table(data), Reading.of(robot, data)
+    (columns, table), as_read = numeric_table(data), Reading.of(robot, data)
     pose = None if columns is None else columns.joints
     if is_cartesian(robot):
         if columns is not None and isinstance(pose, PoseColumns):
             for machine, q, text in pose.reread(table, columns.table.joints_per_metre):
-                yield replace(own, robot=machine, q=q, words=f"the commanded poses fit with {text}")
+                yield replace(as_read, robot=machine, q=q, words=f"the commanded poses fit with {text}")
         return
-    found = conventions_of(robot, data, "rad" if columns is None else columns.table.angle, judge)
-    for one in found[:1]:
-        yield replace(own, q=data.q @ one.matrix.mT + one.offset, words=_convention_words(found, columns))
+    fitting = conventions_of(robot, data, "rad" if columns is None else columns.table.angle, judge)
+    for best in fitting[:1]:
+        yield replace(as_read, q=data.q @ best.matrix.mT + best.offset, words=_convention_words(fitting, columns))
 
 
 EVERY_GROUP = (
@@ -315,24 +315,24 @@ EVERY_GROUP = (
 
 def conventions_of(robot: Tree, data: Measurements, angle: str, judge: Judge = registered) -> list[Convention]:
     """What joint values mean whose rows the robot does not explain, see :func:`conventions`."""
-    own = Reading.of(robot, data)
+    as_read = Reading.of(robot, data)
 
     def left(q: Tensor) -> float:
-        residual, size = judge(replace(own, q=q))
+        residual, size = judge(replace(as_read, q=q))
         return residual / max(size, 1e-12)
 
     return conventions(robot, data, left, degrees(1.0) if angle == "deg" else 1.0)
 
 
-def _convention_words(found: Sequence[Convention], columns: Columns | None) -> str:
+def _convention_words(fitting: Sequence[Convention], columns: Columns | None) -> str:
     """Advice on conventions of a table, or of joint values in SI, which rows do not tell apart."""
     if columns is None:
-        names, units, what = found[0].robot.joint_names, ("deg", 1e3), ", in degrees and mm,"
+        names, units, what = fitting[0].robot.joint_names, ("deg", 1e3), ", in degrees and mm,"
     else:
         names, units, what = columns.joints.columns, (columns.table.angle, columns.table.joints_per_metre), ""
         read = JointExpressions.of(columns.joints.texts)
-        found = [own.of_columns(read.matrix, read.offset, *units) for own in found]
-    texts = [f"joints='{','.join(own.texts(names, *units))}'" for own in found]
+        fitting = [convention.of_columns(read.matrix, read.offset, *units) for convention in fitting]
+    texts = [f"joints='{','.join(convention.texts(names, *units))}'" for convention in fitting]
     doubt = ", which these rows do not tell apart" if len(texts) > 1 else ""
     return f"the rows fit{what} with {' or '.join(texts)}{doubt}"
 
@@ -342,10 +342,10 @@ def warn_of_joints_below_tip(robot: Tree, data: Measurements) -> None:
 
     Columns of joints that do not move the markers, such as those of a gripper, explain nothing: no warning.
     """
-    longer = [(registered(one)[0], one) for one in longer_chains(robot, data)]
+    longer = [(registered(candidate)[0], candidate) for candidate in longer_chains(robot, data)]
     if not longer:
         return
-    (best, reading), own = min(longer, key=lambda entry: entry[0]), residual_of(robot, data)
-    if best < gates.JOINT_BELOW_TIP * own:
-        got = f"a median residual that falls from {1e3 * own:.3g} to {1e3 * best:.3g} mm with it"
+    (best, reading), residual = min(longer, key=lambda entry: entry[0]), residual_of(robot, data)
+    if best < gates.JOINT_BELOW_TIP * residual:
+        got = f"a median residual that falls from {1e3 * residual:.3g} to {1e3 * best:.3g} mm with it"
         warn_user(sentence("a joint below the tip seems to move the markers", got=got, fix=reading.words))

@@ -58,7 +58,7 @@ def warn_of_single_joints(robot: Tree, data: Any) -> None:
     moved = (data.q - data.q.median(0).values).abs() > gates.MOVED_RAD_M
     single, joints = int((moved.sum(1) <= 1).sum()), moved.any(0)
     if single >= gates.SINGLE_SHARE * len(data) and int(joints.sum()) >= gates.SINGLE_JOINTS:
-        names = few([name for name, own in zip(robot.joint_names, joints, strict=True) if bool(own)], 12)
+        names = few([name for name, flag in zip(robot.joint_names, joints, strict=True) if bool(flag)], 12)
         what = f"{names} moved one at a time in {single} of {len(data)} rows"
         fix = "what depends on several joints, such as sag, is extrapolated; measure poses in which all joints differ"
         warn_user(sentence(what, fix=fix))
@@ -110,17 +110,17 @@ def warn_of_what_is_open(data: TangentData, devices: Sequence[Devices]) -> None:
     if not data.shared.shape[2]:
         return
     whole = data.nominal.jacobian(data.x, data.theta)
-    seen = data.jacobian.square().mean((0, 1)).sqrt() / whole.square().mean((0, 1)).sqrt().clamp(min=1e-9)
+    shares = data.jacobian.square().mean((0, 1)).sqrt() / whole.square().mean((0, 1)).sqrt().clamp(min=1e-9)
     by_ball = data.sensitivities[..., data.nominal.geometry.slices["tool"]].flatten(0, 1)
     tilt = torch.linalg.svdvals(without_shared(by_ball, data.shared.flatten(0, 1))) / data.coordinates**0.5
-    for own in devices:
-        for what, fix in own.open_sentences():
+    for device in devices:
+        for what, fix in device.open_sentences():
             warn_user(sentence(what, fix=fix))
     if float(tilt.min()) < gates.TILTED:
         what = "the tool is hardly tilted: where the ball is on it, along one direction, is not determined"
         warn_user(sentence(what, fix=TILT))
     names = data.nominal.geometry.chain.joint_names
-    unseen = [name for name, share in zip(names, seen.tolist(), strict=True) if share < gates.UNSEEN]
+    unseen = [name for name, share in zip(names, shares.tolist(), strict=True) if share < gates.UNSEEN]
     if unseen:
         what = f"the readings hardly change with {few(unseen)}: errors of such joints are not determined"
         warn_user(sentence(what, fix="add devices that see these joints turn"))
@@ -180,11 +180,11 @@ def _error_with_place(fitted: FittedMap, q: Tensor, goal: Tensor, socket: Tensor
         return inf
     socket = socket[there]
     at, new = fitted.geodesic.linearise(fitted.everywhere), fitted.geodesic.linearise(q[there])
-    known, m = fitted.conditional, fitted.m
-    own, between = known.covariance_between(new), known.covariance_between(at, new)
-    same = (socket[:, None] == socket).to(own) * PLACES.found_m_rad**2
+    conditional, m = fitted.conditional, fitted.m
+    within, between = conditional.covariance_between(new), conditional.covariance_between(at, new)
+    same = (socket[:, None] == socket).to(within) * PLACES.found_m_rad**2
     noise = torch.block_diag(*fitted.new_noise.expand(len(socket), -1, -1))
-    K = own + noise + torch.kron(same, torch.eye(m, dtype=own.dtype, device=own.device))
+    K = within + noise + torch.kron(same, torch.eye(m, dtype=within.dtype, device=within.device))
     gain = between @ torch.linalg.solve(K, between.mT)
-    after = known.covariance(at) - diagonal_blocks(gain, len(fitted.everywhere))
+    after = conditional.covariance(at) - diagonal_blocks(gain, len(fitted.everywhere))
     return float(after.diagonal(dim1=1, dim2=2).sum(1).mean().clamp(min=0).sqrt())

@@ -96,10 +96,10 @@ def excluded(
         factor: by which an error must exceed what chance explains. by_others: whether the others tell how large errors
             are, and not the model.
     """
-    seen, level = ~squares.isnan(), gates.OUTLIER_CHANCE / len(known(squares))
-    kinds = freedom[seen].unique().tolist()
-    size = torch.cat([squares[seen & (freedom == k)] / chi2_median(k) for k in kinds]).median()
-    lower, limits = gates.MEDIAN_EFFICIENCY * float(freedom[seen].sum()), torch.zeros_like(squares)
+    present, level = ~squares.isnan(), gates.OUTLIER_CHANCE / len(known(squares))
+    kinds = freedom[present].unique().tolist()
+    size = torch.cat([squares[present & (freedom == k)] / chi2_median(k) for k in kinds]).median()
+    lower, limits = gates.MEDIAN_EFFICIENCY * float(freedom[present].sum()), torch.zeros_like(squares)
     for k in kinds:
         limits[freedom == k] = above_estimated(level, k, lower) if by_others else chi2_above(level, k)
     return squares > factor**2 * size.clamp(min=least) * limits
@@ -119,24 +119,24 @@ def outliers(
     bad = excluded(squares, noise.of_freedom(float, squares), least=least)
     each = left_out.errors.unflatten(1, (noise.bodies, -1))
     distances = each.nan_to_num(0.0).norm(dim=2) if noise.size % 3 else each.unflatten(2, (-1, 3)).mean(2).norm(dim=2)
-    found = []
+    outlying = []
     if placed.coordinates is not None:
         table, rows = placed.coordinates
-        own = found_outliers(model, table, bad[rows], distances[rows], weights[rows])
-        found += [replace(one, row=int(rows[one.row])) for one in own]
-    for one in placed.readings:
-        sizes = each[one.rows, 0].nan_to_num(0.0).norm(dim=1)
-        shown = errors_of_kinds(left_out.errors, None, [one]).main
+        suspects = found_outliers(model, table, bad[rows], distances[rows], weights[rows])
+        outlying += [replace(outlier, row=int(rows[outlier.row])) for outlier in suspects]
+    for kind in placed.readings:
+        sizes = each[kind.rows, 0].nan_to_num(0.0).norm(dim=1)
+        shown = errors_of_kinds(left_out.errors, None, [kind]).main
         unit, per_unit = shown.shown
-        wrong = bad[one.rows, 0].nonzero()[:, 0].tolist()
-        balls = model.at_payloads(one.data.payload)(one.data.q).detach()[:, -1] if wrong else ()
+        wrong = bad[kind.rows, 0].nonzero()[:, 0].tolist()
+        balls = model.at_payloads(kind.data.payload)(kind.data.q).detach()[:, -1] if wrong else ()
         for number in wrong:
-            row, line = int(one.rows[number]), int(one.data.line_numbers[number])
+            row, line = int(kind.rows[number]), int(kind.data.line_numbers[number])
             reading, size = (per_unit * float(shown.errors[number, 0]), unit), float(sizes[number])
-            name, weight = one.data.row_names[number], float(weights[row, 0])
-            reason = one.reason(balls[number], gates.REMAINING_ERROR * size)
-            found.append(Outlier(row, None, line, name, size, weight, reason, reading=reading))
-    return sorted(found, key=lambda outlier: -outlier.distance)
+            name, weight = kind.data.row_names[number], float(weights[row, 0])
+            reason = kind.reason(balls[number], gates.REMAINING_ERROR * size)
+            outlying.append(Outlier(row, None, line, name, size, weight, reason, reading=reading))
+    return sorted(outlying, key=lambda outlier: -outlier.distance)
 
 
 def contradicted(model: CalibratedKinematics, data: Measurements) -> list[Outlier]:
@@ -144,9 +144,9 @@ def contradicted(model: CalibratedKinematics, data: Measurements) -> list[Outlie
 
     Their distances are judged by the model's own deviations, or by the median distance if the model is overconfident.
     """
-    found = data.bodies.predicted(model.at_payloads(data.payload), data.q)
-    errors = data.bodies.errors(data, found.points)  # (N, bodies, 3 or 6) m and rad, NaN for hidden markers
-    squares = (errors * torch.linalg.solve(found.covariance, errors[..., None])[..., 0]).sum(-1)
+    predicted = data.bodies.predicted(model.at_payloads(data.payload), data.q)
+    errors = data.bodies.errors(data, predicted.points)  # (N, bodies, 3 or 6) m and rad, NaN for hidden markers
+    squares = (errors * torch.linalg.solve(predicted.covariance, errors[..., None])[..., 0]).sum(-1)
     freedom = torch.full_like(squares, errors.shape[-1])
     bad = excluded(squares, freedom, factor=gates.OVERCONFIDENT, by_others=False)
     return found_outliers(model, data, bad, errors[..., :3].norm(dim=-1))
@@ -165,12 +165,12 @@ def found_outliers(
         return []
     labels = data.bodies.labels(data, model.on)
     data = data if labels[0][1] is None else data.with_tips([str(tip) for _, tip in labels])
-    predicted, found, names = model.at_payloads(data.payload)(data.q).detach(), list[Outlier](), data.row_names
+    predicted, outlying, names = model.at_payloads(data.payload)(data.q).detach(), list[Outlier](), data.row_names
     for row, body in bad.nonzero().tolist():
         (marker, tip), weight = labels[body], None if weights is None else float(weights[row, body])
         reason, line = _reason(row, body, data, predicted, bad), int(data.line_numbers[row])
-        found.append(Outlier(row, marker, line, names[row], float(distances[row, body]), weight, reason, tip))
-    return sorted(found, key=lambda outlier: -outlier.distance)
+        outlying.append(Outlier(row, marker, line, names[row], float(distances[row, body]), weight, reason, tip))
+    return sorted(outlying, key=lambda outlier: -outlier.distance)
 
 
 def _reason(row: int, body: int, data: Measurements, predicted: Tensor, bad: Tensor) -> str:
@@ -211,58 +211,58 @@ def _device_rows(data: Any) -> Iterator[DeviceRows]:
     for part, numbers in zip(data.parts, data.index, strict=True):
         names = [name * (place < 0) for name, place in zip(part.device_names, part.places.tolist(), strict=True)]
         for name in dict.fromkeys(names):
-            own = [row for row, other in enumerate(names) if other == name]
-            yield DeviceRows(f"{part.kind}s" + f" of '{name}'" * bool(name), numbers[own], part.rows(own))
+            rows = [row for row, other in enumerate(names) if other == name]
+            yield DeviceRows(f"{part.kind}s" + f" of '{name}'" * bool(name), numbers[rows], part.rows(rows))
 
 
 def stuck_columns(data: Any) -> list[DeviceRows]:
     """Columns of any table in which a device reports one value in all rows where it reports any, and these rows."""
-    found = list[DeviceRows]()
+    stuck = list[DeviceRows]()
     for words, rows, table in _device_rows(data):
         for name, values in table.measured().items():
             if not isinstance(values, Tensor) or name.startswith(OF_DEVIATIONS):
                 continue
-            seen = ~values.isnan()
-            if int(seen.sum()) >= gates.STUCK_ROWS and bool((values[seen] == values[seen][0]).all()):
-                found.append(DeviceRows(f"'{name}' of the {words}", rows[seen.to(rows.device)], table))
-    return found
+            present = ~values.isnan()
+            if int(present.sum()) >= gates.STUCK_ROWS and bool((values[present] == values[present][0]).all()):
+                stuck.append(DeviceRows(f"'{name}' of the {words}", rows[present.to(rows.device)], table))
+    return stuck
 
 
 def _stuck_words(stuck: Sequence[DeviceRows]) -> str:
     several = len(stuck) > 1
-    names = few([one.words for one in stuck], MOST_NAMES)
+    names = few([column.words for column in stuck], MOST_NAMES)
     return f"{names} hold{'s' * (not several)} one value in all of {'their' if several else 'its'} rows"
 
 
 def warn_of_stuck(data: TangentData, table: Any) -> None:
     """Warn of columns of one value although the robot moves what they tell, by the geometric calibration."""
     size, bad = spread(data.points.unflatten(1, (-1, 3))), []
-    for one in stuck_columns(table):
-        rows, shape = one.rows.to(data.values.device), (data.noise_model.bodies, -1)
-        values, seen = data.values[rows].unflatten(1, shape), data.visible[rows].unflatten(1, shape)  # (M, P, r) m
-        own = [values[:, body, flags] for body, flags in enumerate(seen.all(0)) if bool(flags.any())]
-        spreads = [float(torch.linalg.svdvals(body - body.mean(0))[-1]) for body in own]
+    for part in stuck_columns(table):
+        rows, shape = part.rows.to(data.values.device), (data.noise_model.bodies, -1)
+        values, visible = data.values[rows].unflatten(1, shape), data.visible[rows].unflatten(1, shape)  # (M, P, r) m
+        bodies = [values[:, body, flags] for body, flags in enumerate(visible.all(0)) if bool(flags.any())]
+        spreads = [float(torch.linalg.svdvals(body - body.mean(0))[-1]) for body in bodies]
         least = min(spreads, default=0.0) / len(rows) ** 0.5  # RMS motion along any direction, m
-        bad += [(one, least)] if least > gates.GEOMETRIC_RESIDUAL * size else []
+        bad += [(part, least)] if least > gates.GEOMETRIC_RESIDUAL * size else []
     if bad:
         expected = f"values that change by {1e3 * min(least for _, least in bad):.3g} mm or more, as the robot moves"
-        what, fix = _stuck_words([one for one, _ in bad]), "check the sensor and the columns, or leave these rows out"
+        what, fix = _stuck_words([part for part, _ in bad]), "check the sensor and the columns, or leave these rows out"
         warn_user(sentence(what, expected=expected, fix=fix))
 
 
-def warn_of_outliers(found: Sequence[Outlier], data: Any) -> None:
+def warn_of_outliers(outlying: Sequence[Outlier], data: Any) -> None:
     """Warn if so many rows, of all or of one device, are outliers that the inliers may be the wrong ones.
 
     Args:
-        found: the outliers among the rows of a table, the worst first. data: the table.
+        outlying: the outliers among the rows of a table, the worst first. data: the table.
     """
-    wrong = list({one.row for one in found})
+    wrong = list({outlier.row for outlier in outlying})
     flags, devices = flagged(len(data), wrong), list(_device_rows(data))
-    many = [one for one in devices if float(flags[one.rows].double().mean()) > gates.GROSS_SHARE]
+    many = [part for part in devices if float(flags[part.rows].double().mean()) > gates.GROSS_SHARE]
     if not many and float(flags.double().mean()) <= gates.GROSS_SHARE:
         return
-    counts = few([f"{int(flags[one.rows].sum())} of {len(one.rows)} {one.words}" for one in many], MOST_NAMES)
-    held = [one for one in stuck_columns(data) if bool(flags[one.rows].any())]
+    counts = few([f"{int(flags[part.rows].sum())} of {len(part.rows)} {part.words}" for part in many], MOST_NAMES)
+    held = [part for part in stuck_columns(data) if bool(flags[part.rows].any())]
     also = f"; {_stuck_words(held)}: a stuck sensor?" if held else ""
     if float(flags.double().mean()) > gates.GROSS_SHARE:
         what = f"{len(wrong)} of {len(data)} rows are outliers: do not rely on this calibration"
@@ -272,7 +272,7 @@ def warn_of_outliers(found: Sequence[Outlier], data: Any) -> None:
         what = f"{counts} are outliers, so that they hardly count"
         fix = "check these devices, their columns and units; of a set-up, whether more has moved than was said: leave "
         fix += "it out, and recalibrate the model with its rows alone, which finds both device and markers"
-    expected, got = f"at most {100 * gates.GROSS_SHARE:.0f} %", f"for the worst row: {found[0].reason}"
+    expected, got = f"at most {100 * gates.GROSS_SHARE:.0f} %", f"for the worst row: {outlying[0].reason}"
     warn_user(sentence(what, expected=expected, got=got, fix=fix + also))
 
 

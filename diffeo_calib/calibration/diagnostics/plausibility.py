@@ -190,15 +190,15 @@ def warn_of_rounding(robot: Tree, data: Any, tangent: TangentData, left_out: Lea
         robot: n joints. data: N rows. tangent: the same around the geometric calibration.
         left_out: leave-one-out errors.
     """
-    each = [quantum(own, turning=turns) for own, turns in zip(data.q.unbind(1), robot.periodic, strict=True)]
-    steps = {name: own for name, own in zip(robot.joint_names, each, strict=True) if own is not None}
+    each = [quantum(values, turning=turns) for values, turns in zip(data.q.unbind(1), robot.periodic, strict=True)]
+    steps = {name: step for name, step in zip(robot.joint_names, each, strict=True) if step is not None}
     if not steps or len(data) < gates.DIGIT_ROWS:
         return
-    variances = tangent.x.new_tensor([0.0 if own is None else own[0] ** 2 / 12 for own in each])  # uniform
+    variances = tangent.x.new_tensor([0.0 if step is None else step[0] ** 2 / 12 for step in each])  # uniform
     points = tangent.y.shape[1] // 3 if tangent.noise_model.modes.shape[1] else tangent.noise_model.bodies
     caused = float((tangent.jacobian.square() @ variances).unflatten(1, (points, -1)).sum(-1).mean().sqrt())
-    seen = left_out.errors.unflatten(1, (points, -1))
-    squares, size = seen.square().nansum(-1)[~seen.isnan().all(-1)], seen.shape[2]
+    errors = left_out.errors.unflatten(1, (points, -1))
+    squares, size = errors.square().nansum(-1)[~errors.isnan().all(-1)], errors.shape[2]
     remaining = float((size * squares.median() / chi2_median(size)).sqrt())
     if gates.ROUNDING_LEAST * remaining < caused < gates.ROUNDING_MOST * remaining:
         words = " and ".join(sorted({words for _, words in steps.values()}))
@@ -281,8 +281,8 @@ def marker_column(geometry: Geometry, data: Measurements) -> tuple[str, str] | N
         rows = torch.tensor([[text == name for name in names] for text in texts], dtype=error.dtype, device=HOST)
         if float(rows.sum(0).min()) < gates.MARKER_ROWS or "" in names:
             continue
-        means = [rows.mT @ own / rows.sum(0)[:, None] for own in (in_tip, error)]
-        left = [float((own - rows @ mean).norm()) for own, mean in zip((in_tip, error), means, strict=True)]
+        means = [rows.mT @ values / rows.sum(0)[:, None] for values in (in_tip, error)]
+        left = [float((values - rows @ mean).norm()) for values, mean in zip((in_tip, error), means, strict=True)]
         alone, freedom = float(in_tip.norm()), ((len(texts) - 1) / (len(texts) - len(names))) ** 0.5
         if left[0] * freedom < gates.MARKERS_LEFT * min(alone, left[1] * freedom):
             jump, per_row = 1e3 * float(torch.cdist(means[0], means[0]).max()), 1e3 / len(texts) ** 0.5
@@ -314,12 +314,12 @@ def _check_registration(robot: Tree, data: Measurements, registration: Identific
         check_fit(robot, data, typical, what, expected=expected, got=f"a median of {typical:.3g} m")
 
 
-def warn_of_no_errors(robot: Tree, data: TangentData, registration: Identification, found: Identification) -> None:
+def warn_of_no_errors(robot: Tree, data: TangentData, registration: Identification, fit: Identification) -> None:
     """Warn of rows that show no errors of the robot: they may have been computed, not measured.
 
     Args:
         robot: n joints. data: the rows around the geometric calibration.
-        registration: base and markers, or ball and devices. found: the geometric calibration.
+        registration: base and markers, or ball and devices. fit: the geometric calibration.
     """
     points = data.nominal(data.x, torch.zeros_like(data.theta))
     predicted = points if data.observe is None else data.observe.value(points)
@@ -328,7 +328,7 @@ def warn_of_no_errors(robot: Tree, data: TangentData, registration: Identificati
     slices, count = data.nominal.geometry.slices, gates.NOMINAL_OVERDETERMINED
     placed = sum(slices[name].stop - slices[name].start for name in ("base", "tool"))
     exact = rms < gates.EXACT_SHARE * size and data.coordinates > count * placed
-    shown = registration.noise > min(gates.NOMINAL_RATIO * found.noise, gates.NOMINAL_SHARE * size)
+    shown = registration.noise > min(gates.NOMINAL_RATIO * fit.noise, gates.NOMINAL_SHARE * size)
     enough = robot.n >= gates.NOMINAL_JOINTS and data.coordinates > count * data.nominal.geometry.size
     if exact or (enough and not shown):
         what = f"these rows show no errors of the robot: its description explains them to {1e3 * rms:.2g} mm RMS"
@@ -355,25 +355,25 @@ def unmeasured_markers(robot: Tree, data: Measurements) -> Iterator[Unmeasured]:
     places, turns, size = data.origins, robot.tip_poses(data.q)[..., :3, :3], spread(data.points)
     about = torch.linalg.svdvals((turns - turns[:1]).reshape(-1, 3))  # of turns about one axis the last one is 0
     turning = float(about[-1]) > gates.MOVED_RAD_M * len(turns) ** 0.5
-    for one, other in combinations(range(places.shape[1]), 2):
-        away = places[:, other] - places[:, one]
+    for marker, other in combinations(range(places.shape[1]), 2):
+        away = places[:, other] - places[:, marker]
         away = away[~away.isnan().any(-1)]
         if len(away) < gates.STUCK_ROWS:
             continue
         shifted = bool(away.any())
         if not shifted or (turning and float((away - away.median(0).values).abs().max()) < gates.DIGITS_SHARE * size):
-            words = f"marker {other} is a copy of marker {one}" + ", shifted by the same in every row" * shifted
+            words = f"marker {other} is a copy of marker {marker}" + ", shifted by the same in every row" * shifted
             yield Unmeasured(other, words, proved=True)
     tips = data.bodies.tips(data.on or robot.tips[:1] * data.points.shape[1])
     if robot.n < gates.NOMINAL_JOINTS or len(set(tips)) == len(tips):
         return
-    own = [inf] * len(tips)  # median residuals of the nominal robot, m, of each by itself
-    for k, seen in enumerate(data.seen_bodies.unbind(1)):
-        if int(seen.sum()) >= gates.STUCK_ROWS:
-            alone = Measurements.of_points(data.q[seen], data.origins[seen][:, [k]], (tips[k],), None)
-            own[k] = residual_of(robot, alone)
-    for k, typical in enumerate(own):
-        far = max(other for other, tip in zip(own, tips, strict=True) if tip == tips[k])
+    medians = [inf] * len(tips)  # median residuals of the nominal robot, m, of each by itself
+    for k, visible in enumerate(data.seen_bodies.unbind(1)):
+        if int(visible.sum()) >= gates.STUCK_ROWS:
+            alone = Measurements.of_points(data.q[visible], data.origins[visible][:, [k]], (tips[k],), None)
+            medians[k] = residual_of(robot, alone)
+    for k, typical in enumerate(medians):
+        far = max(other for other, tip in zip(medians, tips, strict=True) if tip == tips[k])
         explained = gates.DIGITS_SHARE * size < far < gates.RIGHT_READING * size
         if explained and typical < min(gates.FOLLOWED * far, gates.NOMINAL_SHARE * size):
             words = f"marker {k} follows the nominal robot to {1e3 * typical:.4f} mm, another one to {1e3 * far:.3g} mm"
@@ -396,7 +396,7 @@ def check_markers(robot: Tree, data: Measurements) -> None:
 
 
 def check_socket_registration(
-    robot: Tree, data: SocketReadings, found: SocketRegistration, around: Geometry | None = None
+    robot: Tree, data: SocketReadings, fit: SocketRegistration, around: Geometry | None = None
 ) -> None:
     """Refuse rows that fit with one mistake undone, or that do not determine where the ball is.
 
@@ -404,9 +404,9 @@ def check_socket_registration(
         DiffeoCalibWarning: a ball in no socket, a tool that never tilted, a known distance that is not the robot's.
 
     Args:
-        robot: n joints. data: the rows. found: their registration. around: the robot as a device saw it.
+        robot: n joints. data: the rows. fit: their registration. around: the robot as a device saw it.
     """
-    median, socket = float(found.distances.median()), data.device
+    median, socket = float(fit.distances.median()), data.device
     far = median > gates.SOCKET_FAR * robot.reach
 
     def left(reading: Reading) -> tuple[float, float]:
@@ -422,28 +422,28 @@ def check_socket_registration(
     said = {"expected": expected, "got": f"a median of {1e3 * median:.3g} mm"}
     otherwise = fix + "place and of the socket in it" if far else None
     check_fit(robot, data, median, what, **said, otherwise=otherwise, groups=tried, judge=left)
-    most, _, least = found.tilt.tolist()
+    most, _, least = fit.tilt.tolist()
     if most < gates.TURNED:
         what = "the tool hardly turns while the ball rests in a socket: where the ball is on the tool is not determined"
         raise MeasurementError.of(what, fix="measure each socket with the tool turned and tilted in many ways")
     if least < gates.TILTED:
         what = "the tool is never tilted in the sockets: the place of the ball along one direction is not determined"
         warn_user(sentence(what, fix=TILT))
-    _check_distances(data, found)
+    _check_distances(data, fit)
 
 
-def warn_of_other_robot(robot: Tree, device: Measurements, start: Identification, found: SocketRegistration) -> None:
+def warn_of_other_robot(robot: Tree, device: Measurements, start: Identification, fit: SocketRegistration) -> None:
     """Warn of rows in sockets that do not belong to the robot that a device measured.
 
     Args:
-        robot: n joints. device: rows with measured positions. start: their registration. found: that of the ball.
+        robot: n joints. device: rows with measured positions. start: their registration. fit: that of the ball.
     """
     if len(known(device.points)) < gates.OVERDETERMINED * (6 + 3 * device.markers):
         return  # few positions are fitted nearly exactly: their residual does not show the robot's errors
-    typical, own = float(distances(start.geometry, device).nanmedian()), float(found.distances.median())
-    if own > max(gates.OTHER_ROBOT_RESIDUALS * typical, gates.OTHER_ROBOT_SHARE * robot.reach):
+    typical, scatter = float(distances(start.geometry, device).nanmedian()), float(fit.distances.median())
+    if scatter > max(gates.OTHER_ROBOT_RESIDUALS * typical, gates.OTHER_ROBOT_SHARE * robot.reach):
         what = "the rows in sockets do not fit the robot whose positions were measured"
-        got = f"a median of {1e3 * own:.3g} mm"
+        got = f"a median of {1e3 * scatter:.3g} mm"
         expected = f"a spread within sockets below the {1e3 * typical:.3g} mm of these"
         fix = "check that all rows are of one robot, with the same joint columns and units, and name their own sockets"
         warn_user(sentence(what, expected=expected, got=got, fix=fix))
@@ -458,9 +458,9 @@ def warn_of_wrong_sockets(data: SocketReadings, points: Tensor) -> None:
     socket = data.device
     middles = socket_means(points, socket)
     away = (points[:, None] - middles).norm(dim=-1)  # (N, S)
-    own = away.gather(1, socket[:, None])[:, 0]
+    error = away.gather(1, socket[:, None])[:, 0]
     nearest, where = away.scatter(1, socket[:, None], torch.inf).min(1)
-    wrong = (own > gates.WRONG_SOCKET_MEDIANS * own.median()) & (nearest < gates.OTHER_SOCKET_FITS * own)
+    wrong = (error > gates.WRONG_SOCKET_MEDIANS * error.median()) & (nearest < gates.OTHER_SOCKET_FITS * error)
     rows = wrong.nonzero()[:, 0].tolist()
     if not rows:
         return
@@ -471,18 +471,18 @@ def warn_of_wrong_sockets(data: SocketReadings, points: Tensor) -> None:
     warn_user(sentence(what, fix="check their sockets; they hardly count"))
 
 
-def _check_distances(data: SocketReadings, found: SocketRegistration) -> None:
+def _check_distances(data: SocketReadings, fit: SocketRegistration) -> None:
     """Refuse known distances that are those of the robot in another unit, and warn of other ones."""
     sockets = data.sockets
     for first, second, length in sockets.distances:
-        seen = float((found.positions[first] - found.positions[second]).norm())
+        apart = float((fit.positions[first] - fit.positions[second]).norm())
         there = (data.device == first) | (data.device == second)
-        off = max(float(own.median()) for own in (found.distances, found.distances[there]))  # as bent links leave it
-        if abs(seen - length) <= max(gates.DISTANCE_SHARE * length, gates.DISTANCE_MEDIANS * off):
+        off = max(float(values.median()) for values in (fit.distances, fit.distances[there]))  # as bent links leave it
+        if abs(apart - length) <= max(gates.DISTANCE_SHARE * length, gates.DISTANCE_MEDIANS * off):
             continue
         what = f"the known distance of the sockets '{sockets.names[first]}' and '{sockets.names[second]}'"
-        said = {"expected": f"about {1e3 * seen:.4g} mm, by the robot", "got": f"{1e3 * length:.4g} mm"}
-        if in_other_unit(length / max(seen, 1e-9), gates.DISTANCE_SHARE):
+        said = {"expected": f"about {1e3 * apart:.4g} mm, by the robot", "got": f"{1e3 * length:.4g} mm"}
+        if in_other_unit(length / max(apart, 1e-9), gates.DISTANCE_SHARE):
             raise MeasurementError.of(what, **said, fix="check the unit of `distances` (mm or m)")
         fix = "check between which sockets it is, and that the rows carry the names of their own sockets"
         warn_user(sentence(what, **said, fix=fix))

@@ -68,7 +68,7 @@ def out_of_step(predicted: Tensor, measured: Tensor, line_numbers: Tensor, typic
         rows, others = _paired(lines, number - gates.LARGEST_LAG)
         each[rows] = largest_known((predicted[others] - measured[rows]).norm(dim=-1))
     costs = (distances / (gates.LAG_NEAR * typical)).square().clamp(max=1.0).nan_to_num(1.0)
-    own, steps = distances[gates.LARGEST_LAG], list[tuple[int, Step]]()
+    paired, steps = distances[gates.LARGEST_LAG], list[tuple[int, Step]]()
     least, second = costs.topk(2, dim=0, largest=False).values
     scores = torch.where(costs == least, second, least) - costs - gates.LAG_MISFIT * (costs == 1.0) * ~distances.isnan()
     scores[gates.LARGEST_LAG] = -1.0
@@ -80,7 +80,7 @@ def out_of_step(predicted: Tensor, measured: Tensor, line_numbers: Tensor, typic
             return [step for _, step in sorted(steps)]
         there, scores[:, start:end] = distances[number, start:end], -float(len(lines))
         fits = there <= gates.LAG_NEAR * typical
-        moved = int((fits & (own[start:end] > gates.LAG_GROSS * typical)).sum())
+        moved = int((fits & (paired[start:end] > gates.LAG_GROSS * typical)).sum())
         if moved >= gates.LAG_ROWS and int(fits.sum()) >= gates.LAG_SHARE * int((~there.isnan()).sum()):
             last = end == len(lines)
             steps.append((start, Step(int(lines[start]), int(lines[end - 1]), number - gates.LARGEST_LAG, last, moved)))
@@ -114,14 +114,14 @@ def check_row_order(robot: Tree, data: Measurements, registration: Identificatio
     Raises:
         MeasurementError: with the line, and where the right joints are.
     """
-    own, geometry = largest_distances(registration.geometry, data), registration.geometry
-    typical = float(own.median())
+    away, geometry = largest_distances(registration.geometry, data), registration.geometry
+    typical = float(away.median())
     if typical > CONSISTENT * spread(data.points):
-        found = next(_consistent(robot, data), None)
-        if found is None:
+        window = next(_consistent(robot, data), None)
+        if window is None:
             return
-        geometry, typical = found
-    elif int((own > gates.LAG_GROSS * typical).sum()) < gates.LAG_ROWS:
+        geometry, typical = window
+    elif int((away > gates.LAG_GROSS * typical).sum()) < gates.LAG_ROWS:
         return
     steps = out_of_step(geometry.points(data.q), data.points, data.line_numbers, typical)
     near = largest_distances(geometry, data) <= gates.LAG_GROSS * typical
@@ -140,9 +140,9 @@ def _consistent(robot: Tree, data: Measurements) -> Iterator[tuple[Geometry, flo
     limit, order = CONSISTENT * spread(data.points), data.line_numbers.argsort().to(data.q.device)
     windows = [rows for parts in gates.WINDOW_PARTS for rows in order.tensor_split(parts)]
     for lag, rows in product(gates.WINDOW_LAGS, windows):
-        own, other = _paired(data.line_numbers[rows], lag)
-        q, points = data.q[rows][other], data.points[rows][own]
-        if len(own) >= gates.WINDOW_ROWS and can_register(points):
+        here, other = _paired(data.line_numbers[rows], lag)
+        q, points = data.q[rows][other], data.points[rows][here]
+        if len(here) >= gates.WINDOW_ROWS and can_register(points):
             geometry = registered_geometry(robot, q, points, marker_tips(robot, data))
             typical = float(largest_known((geometry.points(q) - points).norm(dim=-1)).median())
             if typical <= limit:

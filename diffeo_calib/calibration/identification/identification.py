@@ -149,7 +149,7 @@ class MeasuredPoints(NamedTuple):
         if len(self.q) <= count:
             return self
         index = torch.randperm(len(self.q), generator=seeded(0), device=self.q.device)[:count].sort().values
-        return MeasuredPoints(*(own[index] for own in self))
+        return MeasuredPoints(*(tensor[index] for tensor in self))
 
     def devices(self, shifts: Tensor) -> tuple[Devices, ...]:
         """The devices of readings after shifts (c,)."""
@@ -177,10 +177,10 @@ class ReadRows(NamedTuple):
         return -self.devices(shifts)[0].errors(self.data, self.around.points_of(points))[:, None]
 
     def slopes(self, points: Tensor, by_errors: Tensor, shifts: Tensor) -> Tensor:
-        (devices,), seen = self.devices(shifts), self.around.points_of(points)
+        (devices,), places = self.devices(shifts), self.around.points_of(points)
         device = devices.numbers(self.data)
-        own = devices.observation(device).slope(seen) @ by_errors[:, -devices.seen_points :].flatten(1, 2)
-        return torch.cat([own, devices.shared(seen, device)], 2)[:, None]
+        slopes = devices.observation(device).slope(places) @ by_errors[:, -devices.seen_points :].flatten(1, 2)
+        return torch.cat([slopes, devices.shared(places, device)], 2)[:, None]
 
     def sample(self) -> ReadRows:
         return self
@@ -196,22 +196,22 @@ class Rows:
     @property
     def freedom(self) -> list[int]:
         """Number of shifts of every part."""
-        return [own.freedom for own in self.parts]
+        return [part.freedom for part in self.parts]
 
     def errors(self, theta: Tensor, shifts: Tensor) -> list[Tensor]:
         """Predicted minus measured numbers (N, B, d) of every part, m."""
         each = zip(self.parts, shifts.split(self.freedom), strict=True)
-        return [own.errors(self.geometry.points(own.q, theta), some) for own, some in each]
+        return [part.errors(self.geometry.points(part.q, theta), some) for part, some in each]
 
     def slopes(self, theta: Tensor, shifts: Tensor, root: Tensor) -> list[Tensor]:
         """Derivatives of all numbers by the unknowns u (f,), theta = root u, then by all shifts."""
-        sizes, found, f = self.freedom, [], root.shape[1]
-        for place, (own, some) in enumerate(zip(self.parts, shifts.split(sizes), strict=True)):
-            by_errors = self.geometry.sensitivities(own.q, theta) @ root  # (N, P, 3, f) of the markers
-            slopes = own.slopes(self.geometry.points(own.q, theta), by_errors, some)
+        sizes, blocks, f = self.freedom, [], root.shape[1]
+        for place, (part, some) in enumerate(zip(self.parts, shifts.split(sizes), strict=True)):
+            by_errors = self.geometry.sensitivities(part.q, theta) @ root  # (N, P, 3, f) of the markers
+            slopes = part.slopes(self.geometry.points(part.q, theta), by_errors, some)
             around = sum(sizes[:place]), sum(sizes[place + 1 :])
-            found.append(torch.cat([slopes[..., :f], torch.nn.functional.pad(slopes[..., f:], around)], 3))
-        return found
+            blocks.append(torch.cat([slopes[..., :f], torch.nn.functional.pad(slopes[..., f:], around)], 3))
+        return blocks
 
     def found(self, fit: Fit, noise: float, prior: Prior, tails: Tails) -> Identification:
         """A fit to some of the rows, with the errors and weights (M,) of all of them."""
@@ -226,21 +226,21 @@ class Rows:
             weights=tuple(_as_bodies(tails.weights, errors)),
             freedom=tails.freedom,
             shifts=shifts,
-            devices=tuple(one for own, some in zip(self.parts, shifts, strict=True) for one in own.devices(some)),
+            devices=tuple(each for part, some in zip(self.parts, shifts, strict=True) for each in part.devices(some)),
         )
 
 
 def body_squares(errors: Sequence[Tensor]) -> Tensor:
     """Squares (M,) of errors (N, B, d) of all bodies of several kinds of rows; NaN where hidden."""
-    return torch.cat([own.square().sum(2).flatten() for own in errors])
+    return torch.cat([part.square().sum(2).flatten() for part in errors])
 
 
 def sizes_and_kinds(errors: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     """Numbers d (M,) of all bodies, and (M,) of which kind of rows each is."""
-    sizes = [own[..., 0].numel() for own in errors]
+    sizes = [part[..., 0].numel() for part in errors]
     counts = torch.tensor(sizes, dtype=torch.int64, device=errors[0].device)
     kind = torch.arange(len(errors), device=errors[0].device).repeat_interleave(counts)
-    return errors[0].new_tensor([own.shape[2] for own in errors])[kind], kind
+    return errors[0].new_tensor([part.shape[2] for part in errors])[kind], kind
 
 
 def typical_noise(errors: Sequence[Tensor]) -> Tensor:
@@ -248,8 +248,8 @@ def typical_noise(errors: Sequence[Tensor]) -> Tensor:
 
     The median of chi-squared is by Wilson and Hilferty.
     """
-    medians = torch.stack([own.square().sum(2).nanmedian() for own in errors])
-    dim = medians.new_tensor([own.shape[2] for own in errors])
+    medians = torch.stack([part.square().sum(2).nanmedian() for part in errors])
+    dim = medians.new_tensor([part.shape[2] for part in errors])
     return (medians / (dim * (1.0 - 2.0 / (9.0 * dim)) ** 3)).sqrt().clamp(min=SMALLEST_NOISE_M)
 
 
@@ -288,7 +288,7 @@ def estimated(rows: Rows, held: Sequence[int], prior: Prior | None = None) -> Id
     Note:
         Cost: some ten singular value decompositions of a matrix of as many rows as there are numbers and unknowns.
     """
-    some = replace(rows, parts=tuple(own.sample() for own in rows.parts))
+    some = replace(rows, parts=tuple(part.sample() for part in rows.parts))
     used, zero = prior or Prior(), rows.geometry.tool.new_zeros(rows.geometry.size)
     at = zero, zero.new_zeros(sum(rows.freedom))
     errors = some.errors(*at)
@@ -305,14 +305,14 @@ def estimated(rows: Rows, held: Sequence[int], prior: Prior | None = None) -> Id
         total = none.index_add(0, kind, (tails.weights * squares).nan_to_num(0.0))
         noise = max(sqrt(float(total.sum()) / max(float(free.sum()), 1.0)), SMALLEST_NOISE_M)
         free = free.clamp(min=1.0)
-        own, known = (total / free).sqrt().clamp(min=SMALLEST_NOISE_M), SHARED_NUMBERS * (len(none) > 1)
-        levels = own * (noise / own) ** (known / (free + known))
+        alone, shared = (total / free).sqrt().clamp(min=SMALLEST_NOISE_M), SHARED_NUMBERS * (len(none) > 1)
+        levels = alone * (noise / alone) ** (shared / (free + shared))
         before, sigma = sigma, levels[kind]
         tails = reweight(squares / sigma.square() + fit.leverage / tails.weights, dim)
         if float(((sigma - before).abs() / sigma).max()) < NOISE_CHANGE:
             break
     left_out = squares / (1.0 - fit.leverage / dim).square()
-    if any(own is not whole for own, whole in zip(some.parts, rows.parts, strict=True)):
+    if any(part is not whole for part, whole in zip(some.parts, rows.parts, strict=True)):
         errors = rows.errors(*at)
         (dim, kind) = sizes_and_kinds(errors)
         tails = reweight(body_squares(errors) / levels[kind].square(), dim)
@@ -364,9 +364,9 @@ def solve(
     u0 = root.new_zeros(f + sum(rows.freedom))
     if start is not None:
         u0 = torch.cat([(root.mT @ start[0]) / root.square().sum(0), start[1]])
-    hidden = [own.isnan() for own in rows.errors(root @ u0[:f], u0[f:])]
+    hidden = [part.isnan() for part in rows.errors(root @ u0[:f], u0[f:])]
     weights = _as_bodies(1 / sigma, hidden)
-    size = len(u0) + sum(own.numel() for own in hidden)
+    size = len(u0) + sum(part.numel() for part in hidden)
 
     def residual(u: np.ndarray) -> np.ndarray:
         at = torch.from_numpy(u).clone()
@@ -374,7 +374,7 @@ def solve(
             each = zip(weights, rows.errors(root @ at[:f], at[f:]), hidden, strict=True)
         except InputError:  # behind a camera: scipy shortens the step
             return np.full(size, np.inf)
-        return torch.cat([*((w[..., None] * own).masked_fill(h, 0.0).flatten() for w, own, h in each), at]).numpy()
+        return torch.cat([*((w[..., None] * part).masked_fill(h, 0.0).flatten() for w, part, h in each), at]).numpy()
 
     def jacobian(u: np.ndarray) -> np.ndarray:
         at = torch.from_numpy(u).clone()
@@ -382,22 +382,22 @@ def solve(
 
     derivatives: Any = jacobian  # scipy's stubs know its names of difference schemes only
     with torch_alone():
-        found = least_squares(residual, u0.numpy(), derivatives, **options)
-    u = torch.from_numpy(found.x).clone()  # aligned: the same digits every time
+        solution = least_squares(residual, u0.numpy(), derivatives, **options)
+    u = torch.from_numpy(solution.x).clone()  # aligned: the same digits every time
     return posterior(rows, sigma, root, (root @ u[:f], u[f:]))
 
 
 def _as_bodies(values: Tensor, errors: Sequence[Tensor]) -> list[Tensor]:
     """Values (M,) of all bodies as (N, B) of those with errors (N, B, d)."""
-    each = values.split([own[..., 0].numel() for own in errors])
-    return [own.view(like.shape[:2]) for own, like in zip(each, errors, strict=True)]
+    each = values.split([part[..., 0].numel() for part in errors])
+    return [part.view(like.shape[:2]) for part, like in zip(each, errors, strict=True)]
 
 
 def _white_slopes(rows: Rows, sigma: Tensor, root: Tensor, at: tuple[Tensor, Tensor]) -> Tensor:
     """Slopes of all numbers in units of their noise by unknowns u and shifts, with the prior's rows; zero if hidden."""
     errors, slopes = rows.errors(*at), rows.slopes(*at, root)
     each = zip(_as_bodies(sigma, errors), errors, slopes, strict=True)
-    white = [(own / s[..., None, None]).masked_fill(e.isnan()[..., None], 0.0).flatten(0, 2) for s, e, own in each]
+    white = [(slope / s[..., None, None]).masked_fill(e.isnan()[..., None], 0.0).flatten(0, 2) for s, e, slope in each]
     return torch.cat([*white, torch.eye(white[0].shape[1], dtype=root.dtype, device=root.device)])
 
 
@@ -406,10 +406,10 @@ def posterior(rows: Rows, sigma: Tensor, root: Tensor, at: tuple[Tensor, Tensor]
     white, f, errors = _white_slopes(rows, sigma, root, at), root.shape[1], rows.errors(*at)
     with torch_alone():
         U, s, Vt = np.linalg.svd(white.numpy(), full_matrices=False)  # s >= 1 by the prior rows
-    known = root @ torch.from_numpy(Vt.T / s).clone()[:f]
-    leverage = torch.from_numpy(np.square(U[: -white.shape[1]]).sum(1)).split([own.numel() for own in errors])
-    each = [own.view(like.shape).sum(2).flatten() for own, like in zip(leverage, errors, strict=True)]
-    return Fit(at[0], known @ known.mT, at[1], errors, torch.cat(each))
+    factor = root @ torch.from_numpy(Vt.T / s).clone()[:f]
+    leverage = torch.from_numpy(np.square(U[: -white.shape[1]]).sum(1)).split([part.numel() for part in errors])
+    each = [part.view(like.shape).sum(2).flatten() for part, like in zip(leverage, errors, strict=True)]
+    return Fit(at[0], factor @ factor.mT, at[1], errors, torch.cat(each))
 
 
 def described(rows: Rows, noise: Sequence[float] = (), *, adrift: bool = False) -> Identification:
@@ -426,8 +426,8 @@ def described(rows: Rows, noise: Sequence[float] = (), *, adrift: bool = False) 
     at = zero, zero.new_zeros(sum(rows.freedom))
     errors = rows.errors(*at)
     levels = torch.cat([zero.new_tensor(noise), typical_noise(errors)[len(noise) :]])
-    seen = levels.new_tensor([int((~own.isnan()).all(2).sum()) for own in errors])
+    counts = levels.new_tensor([int((~part.isnan()).all(2).sum()) for part in errors])
     # The errors of a nominal robot vary slowly with its configuration, so that many rows share them.
-    sigma = (levels.clamp(min=SMALLEST_NOISE_M) * seen.sqrt())[sizes_and_kinds(errors)[1]]
+    sigma = (levels.clamp(min=SMALLEST_NOISE_M) * counts.sqrt())[sizes_and_kinds(errors)[1]]
     fit = posterior(rows, sigma, root, at)
     return rows.found(fit, float(levels[0]), Prior(), Tails(inf, torch.ones_like(sigma)))

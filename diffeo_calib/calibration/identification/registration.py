@@ -89,8 +89,8 @@ def registered_geometry(robot: Tree | Geometry, q: Tensor, points: Tensor, on: t
         never = few((~seen_markers(points)).all(0).nonzero()[:, 0].tolist())
         what, fix = f"{len(q)} rows never show marker {never}", "measure rows that show it, or leave it out"
         raise MeasurementError.of(what, expected="every marker in some rows", fix=fix)
-    found = place(bare.marker_poses(q), points)
-    base, tool = found.base, found.tool
+    placed = place(bare.marker_poses(q), points)
+    base, tool = placed.base, placed.tool
     if turns_nowhere(chain):  # where the marker sits, or the middle of several, belongs to the base
         middle = tool.mean(0)
         base, tool = base @ transforms(torch.eye(3, dtype=tool.dtype, device=tool.device), middle), tool - middle
@@ -145,9 +145,9 @@ def register_sockets(robot: Tree | Geometry, q: Tensor, socket: Tensor) -> Socke
         before, weights = weights, median_weights(distances, HALF_WEIGHT_MEDIANS)
         if float((weights - before).abs().max()) < SETTLED:
             break
-    seen = R @ ball + t
+    places = R @ ball + t
     tilt = torch.linalg.svdvals(A.flatten(0, 1)) / len(A) ** 0.5
-    return SocketRegistration(bare.with_tool(ball[None]), _means(seen, socket, weights), distances, tilt)
+    return SocketRegistration(bare.with_tool(ball[None]), _means(places, socket, weights), distances, tilt)
 
 
 def socket_means(points: Tensor, socket: Tensor) -> Tensor:
@@ -205,9 +205,9 @@ def offset_twists(geometry: Geometry) -> Tensor:
     chain = geometry.chain
     turning, coupling = chain.revolute[:, None], chain.coupling.to(geometry.base)
     axes = torch.cat([torch.where(turning, 0.0, chain.axes), torch.where(turning, chain.axes, 0.0)], 1)  # (n_all, 6)
-    found = coupling.new_zeros(geometry.size, chain.n)
-    found[geometry.slices["joints"]] = (axes[:, :, None] * coupling[:, None]).flatten(0, 1)
-    return found
+    twists = coupling.new_zeros(geometry.size, chain.n)
+    twists[geometry.slices["joints"]] = (axes[:, :, None] * coupling[:, None]).flatten(0, 1)
+    return twists
 
 
 def with_joint_offsets(geometry: Geometry, offsets: Tensor) -> Geometry:
@@ -280,7 +280,7 @@ def with_large_offsets(data: Measurements, registration: Identification, inliers
     turned = offsets[torch.tensor(chain.periodic, dtype=torch.bool, device=offsets.device)]
     if not explained or bool((turned.abs() > LARGEST_OFFSET_RAD).any()):
         return registration
-    plain, other = (identify(one, data.q[inliers], data.points[inliers]) for one in (geometry, again.geometry))
+    plain, other = (identify(start, data.q[inliers], data.points[inliers]) for start in (geometry, again.geometry))
     if other.left_out > LEFT_OUT * plain.left_out:
         return registration
     smallest = REPORTED * float(offsets.abs().max())
@@ -314,8 +314,8 @@ def _inliers(robot: Tree, data: Measurements, on: tuple[str, ...]) -> Tensor:
         return every
     best = start
     generator = seeded(0)
-    seen = data.visible.double().mean()
-    drawn = SURPLUS * math.ceil((2.0 / data.markers + 1.0) / float(seen))  # 6 + 3 P unknowns, 3 P coordinates
+    share = data.visible.double().mean()
+    drawn = SURPLUS * math.ceil((2.0 / data.markers + 1.0) / float(share))  # 6 + 3 P unknowns, 3 P coordinates
     for _ in range(DRAWS if len(data) > 2 * drawn else 0):
         rows = torch.randperm(len(data), generator=generator, device=HOST)[:drawn]
         if not can_register(data.points[rows]):

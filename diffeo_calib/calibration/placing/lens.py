@@ -45,12 +45,12 @@ class CameraErrors(DeviceSet):
     @classmethod
     def around(cls, data: Measurements, rows: Tensor) -> list[Any]:
         """Cameras of the images of a table beside a model, none for other tables; arguments as of :meth:`of_table`."""
-        return [cls(BoardCameras.of_rows(rows, one.seen_by), one) for one in data.shared_errors()]
+        return [cls(BoardCameras.of_rows(rows, shared.seen_by), shared) for shared in data.shared_errors()]
 
     def effects(self, data: Seen) -> Tensor:
-        found = data.y.new_zeros(*data.y.shape, self.shared.slopes.shape[2])
-        found[self.rows, : self.shared.slopes.shape[1]] = self.shared.slopes
-        return found
+        effects = data.y.new_zeros(*data.y.shape, self.shared.slopes.shape[2])
+        effects[self.rows, : self.shared.slopes.shape[1]] = self.shared.slopes
+        return effects
 
     def with_rows(self, other: OtherRows) -> Any:
         if other.aligned is None:
@@ -87,21 +87,21 @@ class LensAndBoard(CameraErrors):
         Raises:
             MeasurementError: a board of another size than was said.
         """
-        found: list[Any] = []
+        sets: list[Any] = []
         for shared in data.shared_errors():
             away = (data.points - registration.geometry.points(data.q)).norm(dim=2)
             cameras, on_tool = dict[str, BoardCamera](), data.board is not None
             for number, (name, camera) in enumerate(shared.cameras.items()):
-                own = shared.seen_by == number
-                nominal = registration.rms if len(shared.cameras) == 1 else float(away[own].square().mean().sqrt())
+                mask = shared.seen_by == number
+                nominal = registration.rms if len(shared.cameras) == 1 else float(away[mask].square().mean().sqrt())
                 explained = Explained(nominal, 0.0, 0.0, 0.0, 0.0, _corners(shared, number))
                 cameras[name] = BoardCamera(camera, on_tool, explained)
             free = _places(data, rows, registration, sessions)
             apart, places = shared.slopes.flatten(0, 1), free.flatten(0, 1)
             apart = apart - places @ torch.linalg.lstsq(places, apart, driver="gelsd").solution
             larger = _relative_size(data, registration, free)
-            own = data.bodies.pose_lever(), apart.view_as(shared.slopes), larger
-            found.append(cls(BoardCameras.of_rows(rows, shared.seen_by).with_cameras(cameras), shared, *own))
+            rest = data.bodies.pose_lever(), apart.view_as(shared.slopes), larger
+            sets.append(cls(BoardCameras.of_rows(rows, shared.seen_by).with_cameras(cameras), shared, *rest))
             if abs(larger) >= SIZE_WARNED:
                 what = "the size of the board does not fit that of the robot"
                 got = f"lengths in the images {100 * abs(larger):.1f} % {'larger' if larger > 0 else 'smaller'}"
@@ -109,27 +109,27 @@ class LensAndBoard(CameraErrors):
                     "measure the printed squares with a caliper (printers scale to fit the page), and check their unit"
                 )
                 warn_user(sentence(f"{what}: {got}", fix=fix))
-        return found
+        return sets
 
-    def settled(self, found: Settled) -> LensAndBoard:
-        spread, cameras = torch.linalg.cholesky(found.covariance), dict[str, BoardCamera]()
-        for number, (name, own) in enumerate(self.devices.cameras.items()):
+    def settled(self, fit: Settled) -> LensAndBoard:
+        spread, cameras = torch.linalg.cholesky(fit.covariance), dict[str, BoardCamera]()
+        for number, (name, device) in enumerate(self.devices.cameras.items()):
             camera = self.shared.cameras[name]
-            change, root = camera.root @ found.shifts, camera.root @ spread
+            change, root = camera.root @ fit.shifts, camera.root @ spread
             effects = self.apart[self.shared.seen_by == number] @ torch.linalg.pinv(camera.root)
             lens, board = (_at_tool(effects, change, part) for part in PARTS)
             lens_std, board_std = (_at_tool(effects, root, part) for part in PARTS)
-            known = {"lens": lens, "board": board, "lens_std": lens_std, "board_std": board_std}
+            errors = {"lens": lens, "board": board, "lens_std": lens_std, "board_std": board_std}
             camera = replace(camera, unknowns=camera.unknowns + change, root=root)
-            cameras[name] = BoardCamera(camera, own.on_tool, replace(own.explained, **known))
-        shared = self.shared._replace(cameras={name: own.camera for name, own in cameras.items()})
+            cameras[name] = BoardCamera(camera, device.on_tool, replace(device.explained, **errors))
+        shared = self.shared._replace(cameras={name: device.camera for name, device in cameras.items()})
         return replace(self, shared=shared, devices=self.devices.with_cameras(cameras))
 
     def hypotheses(self, data: Seen) -> Iterator[Hypothesis]:
         effects = data.points.new_zeros(*data.points.shape, 1)
         for number, camera in enumerate(self.shared.cameras.values()):
-            own = self.shared.seen_by == number
-            effects[self.rows[own], : self.shared.slopes.shape[1]] = self.shared.slopes[own] @ camera.longer[:, None]
+            mask = self.shared.seen_by == number
+            effects[self.rows[mask], : self.shared.slopes.shape[1]] = self.shared.slopes[mask] @ camera.longer[:, None]
         effects = data.slopes @ effects
         yield Hypothesis("the focal length of the images", effects, ("%", 1e-2), FOCUS, about=ROW)
 
@@ -146,8 +146,8 @@ class LensAndBoard(CameraErrors):
         """Take the noise of the images from a table."""
         (shared,) = table.shared_errors()
         cameras = {
-            name: replace(own, explained=replace(own.explained, corners=_corners(shared, number)))
-            for number, (name, own) in enumerate(self.devices.cameras.items())
+            name: replace(device, explained=replace(device.explained, corners=_corners(shared, number)))
+            for number, (name, device) in enumerate(self.devices.cameras.items())
         }
         return replace(self, shared=shared, devices=self.devices.with_cameras(cameras))
 
@@ -158,9 +158,9 @@ class LensAndBoard(CameraErrors):
             return super().elsewhere(row, points, devices)
         name, camera = [*self.shared.cameras.items()][number[0]]
         poses = poses_from_marks(points, self.lever)
-        for own in (one.devices for one in devices if one.devices.kind in TRANSFORMS):
-            last = [k for k, set_up in enumerate(own.names) if set_up.partition("/")[0] == name][-1:]
-            poses = own.view(last[0], poses) if last else poses
+        for set_ups in (part.devices for part in devices if part.devices.kind in TRANSFORMS):
+            last = [k for k, set_up in enumerate(set_ups.names) if set_up.partition("/")[0] == name][-1:]
+            poses = set_ups.view(last[0], poses) if last else poses
         boards = inverse_poses(poses) if self.on_tool else poses
         there = sees(camera, boards)
 
@@ -186,11 +186,11 @@ class LensAndBoard(CameraErrors):
         return "measure the printed squares with a caliper and give `images --board-std`"
 
     def entry(self) -> dict[str, object]:
-        found = {
-            name: own.camera.entry() | {"explained_m": vars(own.explained) | {"arm": own.explained.arm}}
-            for name, own in self.devices.cameras.items()
+        entries = {
+            name: device.camera.entry() | {"explained_m": vars(device.explained) | {"arm": device.explained.arm}}
+            for name, device in self.devices.cameras.items()
         }
-        return {"cameras": found} if len(found) > 1 else {"camera": next(iter(found.values()))}
+        return {"cameras": entries} if len(entries) > 1 else {"camera": next(iter(entries.values()))}
 
 
 def _corners(shared: SharedErrors, number: int) -> float:
@@ -215,12 +215,12 @@ def _relative_size(data: Measurements, registration: Identification, places: Ten
     """
     geometry, slopes = registration.geometry, torch.cat([places, data.by_board_size()], 2)
     errors, weights = (data.points - geometry.points(data.q)).flatten(1), torch.ones_like(slopes[:, :1, :1])
-    found = slopes.new_zeros(slopes.shape[2])
+    shifts = slopes.new_zeros(slopes.shape[2])
     for _ in range(ROUNDS):
         matrix, target = (weights * slopes).flatten(0, 1), (weights[..., 0] * errors).flatten()
-        found = torch.linalg.lstsq(matrix, target[:, None], driver="gelsd").solution[:, 0]
-        weights = median_weights((errors - slopes @ found).norm(dim=1), OUTLIER_MEDIANS).sqrt()[:, None, None]
-    return float(found[-1])
+        shifts = torch.linalg.lstsq(matrix, target[:, None], driver="gelsd").solution[:, 0]
+        weights = median_weights((errors - slopes @ shifts).norm(dim=1), OUTLIER_MEDIANS).sqrt()[:, None, None]
+    return float(shifts[-1])
 
 
 def _places(data: Measurements, rows: Tensor, registration: Identification, sessions: Sequence[Sessions]) -> Tensor:
@@ -230,8 +230,8 @@ def _places(data: Measurements, rows: Tensor, registration: Identification, sess
     base, tool = (slopes[..., geometry.slices[name]] for name in ("base", "tool"))
     whole = torch.eye(slopes.shape[1], dtype=slopes.dtype, device=slopes.device).expand(len(slopes), -1, -1)
     at = data.points, tool, data.points.mean((0, 1))
-    own = [one.increments(*at, one.by_row(int(rows.max()) + 1)[rows], whole) for one in sessions]
-    return torch.cat([base, tool, *own], 2)
+    steps = [part.increments(*at, part.by_row(int(rows.max()) + 1)[rows], whole) for part in sessions]
+    return torch.cat([base, tool, *steps], 2)
 
 
 def _rms_distance(coordinates: Tensor) -> float:

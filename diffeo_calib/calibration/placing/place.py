@@ -48,7 +48,7 @@ from diffeo_calib.calibration.placing.sockets import (
 )
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.errors import few, sentence
+from diffeo_calib.common.errors import few, sentence, warn_user
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit, Progress
 from diffeo_calib.kinematics.evaluation import residuals
@@ -82,45 +82,47 @@ class Told(NamedTuple):
 
 
 def stacked(
-    q: Tensor, own: Told | None, readings: Sequence[ReadingDevices], dim: int
+    q: Tensor, told: Told | None, readings: Sequence[ReadingDevices], dim: int
 ) -> tuple[Tensor, NoiseModel, Stacked]:
     """Rows that tell coordinates, and readings of the last marker, in one layout.
 
     Args:
-        q: (N, n) configurations of all rows. own: the rows that tell coordinates. readings: devices and their rows.
+        q: (N, n) configurations of all rows. told: the rows that tell coordinates. readings: devices and their rows.
         dim: coordinates m of the points of a row.
 
     Returns:
         What they report (N, R), m, zero where absent, how they were measured, and what that is of the points.
     """
-    N, size = len(q), max([one.data.values.shape[1] for one in readings] + ([own.noise_model.size] if own else []))
-    bodies = own.noise_model.bodies if own else 1
+    N, size = len(q), max([part.data.values.shape[1] for part in readings] + ([told.noise_model.size] if told else []))
+    bodies = told.noise_model.bodies if told else 1
     y, visible = q.new_zeros(N, bodies * size), torch.zeros(N, bodies * size, dtype=torch.bool, device=q.device)
-    known = q.new_zeros(N, bodies * size, bodies * size)
+    covariance = q.new_zeros(N, bodies * size, bodies * size)
     kinds, parts = torch.zeros(N, bodies, dtype=torch.int64, device=q.device), []
-    first, modes, slack = 0, known.new_zeros(N, 0, size, 6), 0.0
-    if own is not None:
-        rows = own.rows
-        parts.append(Part.of_coordinates(rows, own.y.shape[1]))
-        y[rows], visible[rows], known[rows] = own.y, own.noise_model.visible, own.noise_model.known
-        kinds[rows], first, slack = own.noise_model.kinds, own.noise_model.kind_count, own.noise_model.slack
-        modes = known.new_zeros(N, *own.noise_model.modes.shape[1:])
-        modes[rows] = own.noise_model.modes
+    first, modes, slack = 0, covariance.new_zeros(N, 0, size, 6), 0.0
+    if told is not None:
+        rows = told.rows
+        parts.append(Part.of_coordinates(rows, told.y.shape[1]))
+        y[rows], visible[rows], covariance[rows] = told.y, told.noise_model.visible, told.noise_model.known
+        kinds[rows], first, slack = told.noise_model.kinds, told.noise_model.kind_count, told.noise_model.slack
+        modes = covariance.new_zeros(N, *told.noise_model.modes.shape[1:])
+        modes[rows] = told.noise_model.modes
     every = torch.arange(dim, device=q.device)
-    for kind, one in enumerate(readings, first):
-        place, seen = (one.rows[:, None], one.numbers), every[-3 * one.devices.seen_points :]
-        parts.append(Part(one.rows, seen, one.numbers, one.devices.observation(one.device)))
-        y[place], visible[place] = one.devices.values(one.data), True
-        kinds[one.rows, 0] = kind
+    for kind, part in enumerate(readings, first):
+        place, columns = (part.rows[:, None], part.numbers), every[-3 * part.devices.seen_points :]
+        parts.append(Part(part.rows, columns, part.numbers, part.devices.observation(part.device)))
+        y[place], visible[place] = part.devices.values(part.data), True
+        kinds[part.rows, 0] = kind
         if modes.shape[1]:
-            modes[one.rows[:, None], 0, one.numbers, one.numbers] = 1.0
-        if one.data.std is not None:
-            metres = one.devices.metres[one.device][:, None]
-            known[one.rows[:, None], one.numbers, one.numbers] = (one.data.std * metres).square()
-    return y, NoiseModel(visible, kinds, known, modes, slack), Stacked(N, bodies * size, dim, parts)
+            modes[part.rows[:, None], 0, part.numbers, part.numbers] = 1.0
+        if part.data.std is not None:
+            metres = part.devices.metres[part.device][:, None]
+            covariance[part.rows[:, None], part.numbers, part.numbers] = (part.data.std * metres).square()
+    return y, NoiseModel(visible, kinds, covariance, modes, slack), Stacked(N, bodies * size, dim, parts)
 
 
 LOG = logging.getLogger(__name__)
+MOST_SAGS = 5000
+"""Unknowns of gravity sag, of which there are 4.5 n^2 of n joints: matrices of so many take 200 MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +139,7 @@ class Placed:
     @property
     def readings(self) -> list[ReadingDevices]:
         """The devices of readings and their rows."""
-        return [own for own in self.placement if isinstance(own, ReadingDevices)]
+        return [part for part in self.placement if isinstance(part, ReadingDevices)]
 
     @property
     def free(self) -> bool:
@@ -160,15 +162,15 @@ class Placed:
 
     def shown(self, row: Any) -> tuple[str, float]:
         """Unit in which errors of a row, a table of its own, are shown, and how many of it are a metre at the tool."""
-        for one in self.readings:
-            if one.data.kind == row.kind:
-                return row.unit[0], float(one.devices.in_unit(row, torch.ones_like(row.values))[0, 0])
+        for part in self.readings:
+            if part.data.kind == row.kind:
+                return row.unit[0], float(part.devices.in_unit(row, torch.ones_like(row.values))[0, 0])
         return shown_unit("m")
 
     def elsewhere(self, row: int, q: Tensor) -> list[Elsewhere]:
         """A row at other configurations q (M, n), as far as the devices of each set measured it."""
         points = self.identification.geometry.points(q)
-        return [own.elsewhere(row, points, self.placement) for own in self.placement]
+        return [devices.elsewhere(row, points, self.placement) for devices in self.placement]
 
     def settled(self, fitted: Fit, fitted_map: FittedMap, chosen: ChosenScales) -> Placed:
         """Move the devices to where a fit puts them, and with all markers of the model.
@@ -178,10 +180,10 @@ class Placed:
         """
         here = torch.eye(4, dtype=chosen.data.y.dtype, device=chosen.data.y.device)
         placement = self.placement.settled(fitted, fitted_map, chosen.data, here, chosen=chosen)
-        own = self.coordinates
-        if own is not None:
-            own = own._replace(table=with_markers(own.table, self.registration.geometry.markers))
-        return replace(self, placement=placement, coordinates=own)
+        aligned = self.coordinates
+        if aligned is not None:
+            aligned = aligned._replace(table=with_markers(aligned.table, self.registration.geometry.markers))
+        return replace(self, placement=placement, coordinates=aligned)
 
     def stage_rms(self, model: Callable[[Tensor], Tensor]) -> list[float | None]:
         """RMS errors, m, of registration, geometry and a model in measured positions; None without any."""
@@ -195,7 +197,11 @@ class Placed:
         """The rows around the geometric calibration, weighted by its residuals; with effects (N, R, U) of unknowns."""
         geometry, theta = self.registration.geometry, self.identification.theta
         payload = Payload.of_rows(geometry.chain, self.data.payload, self.data.payload_at)
-        elastic = bool(payload) or not is_cartesian(geometry.chain)
+        sags = sum(compliance.size for compliance in geometry.chain.arrays.compliances)
+        elastic = bool(payload) or (sags <= MOST_SAGS and not is_cartesian(geometry.chain))
+        if not elastic and sags > MOST_SAGS:
+            what = f"gravity sag of {geometry.chain.n} joints is left out of the model"
+            warn_user(sentence(what, expected=f"at most {MOST_SAGS} unknowns of it", got=sags))
         nominal = GeometryMap(geometry, elastic=elastic, payload=payload)
         theta = torch.cat([theta, theta.new_zeros(nominal.parameters - geometry.size)])
         data = self._rows(nominal, theta)
@@ -205,20 +211,20 @@ class Placed:
 
     def mislabelled(self, model: Any, wrong: Sequence[Outlier]) -> str | None:
         """A sentence about wrong rows that fit another session or payload than theirs; None without any."""
-        own = self.coordinates
-        if own is None or not wrong:
+        aligned = self.coordinates
+        if aligned is None or not wrong:
             return None
-        table, flags = own.table, torch.zeros(len(self.data), dtype=torch.bool, device=own.rows.device)
-        flags[[one.row for one in wrong]] = True
-        seen, flags = model.at_payloads(table.payload)(table.q).detach(), flags[own.rows]
-        labels = [label for one in self.placement for label in one.labels(own, seen)]
+        table, flags = aligned.table, torch.zeros(len(self.data), dtype=torch.bool, device=aligned.rows.device)
+        flags[[outlier.row for outlier in wrong]] = True
+        predicted, flags = model.at_payloads(table.payload)(table.q).detach(), flags[aligned.rows]
+        labels = [label for part in self.placement for label in part.labels(aligned, predicted)]
         masses = table.masses.unique().tolist()
         for mass in masses if len(masses) <= gates.MOST_MASSES else ():
             away = model.with_payload(mass)(table.q).detach() - table.points
             labels.append(OtherLabel(f"a payload of {mass:g}", table.masses != mass, away.norm(dim=-1).nanmean(1)))
-        errors = (seen - table.points).norm(dim=-1).nanmean(1)
-        fit = [(flags & one.applies & (one.errors < gates.REMAINING_UNDER_LABEL * errors), one) for one in labels]
-        rows, label = max(fit, key=lambda one: int(one[0].sum()), default=(flags, None))
+        errors = (predicted - table.points).norm(dim=-1).nanmean(1)
+        fit = [(flags & case.applies & (case.errors < gates.REMAINING_UNDER_LABEL * errors), case) for case in labels]
+        rows, label = max(fit, key=lambda pair: int(pair[0].sum()), default=(flags, None))
         if label is None or (count := int(rows.sum())) < gates.LABEL_ROWS:
             return None
         lines = few(table.line_numbers[rows.to(table.line_numbers.device)].tolist(), 5)
@@ -235,12 +241,12 @@ class Placed:
 
     def widened(self, data: TangentData, scales: Hyperparameters) -> tuple[Placed, str] | None:
         """Count what differs from row to row as their noise, in a sentence; None if nothing clearly does."""
-        found = variation(data, scales, self.placement.hypotheses(data, ROW))
-        if found is None or self.coordinates is None:
+        noise = variation(data, scales, self.placement.hypotheses(data, ROW))
+        if noise is None or self.coordinates is None:
             return None
-        table = self.coordinates.table.with_own_focal_lengths(found[0])
-        sets = (one.widened(table) if isinstance(one, LensAndBoard) else one for one in self.placement)
-        return replace(self, coordinates=self.coordinates._replace(table=table), placement=Placement(sets)), found[1]
+        table = self.coordinates.table.with_own_focal_lengths(noise[0])
+        sets = (part.widened(table) if isinstance(part, LensAndBoard) else part for part in self.placement)
+        return replace(self, coordinates=self.coordinates._replace(table=table), placement=Placement(sets)), noise[1]
 
     def beside(self, data: Any, like: TangentData) -> tuple[Placed, TangentData]:
         """Other rows of the same devices, and around the same linearisation with all weights 1.
@@ -256,45 +262,45 @@ class Placed:
             aligned = coordinates._replace(table=self.placement.aligned(coordinates.table))
         centre = like.points.unflatten(1, (-1, 3)).mean((0, 1))
         other = OtherRows(data, coordinates, aligned, readings, centre)
-        placement = Placement(one.with_rows(other) for one in self.placement)
-        found, counts = self.identification, [len(one.rows) for one in readings]
+        placement = Placement(part.with_rows(other) for part in self.placement)
+        fit, counts = self.identification, [len(part.rows) for part in readings]
         counts = counts if coordinates is None else [len(coordinates.rows), *counts]
-        weights = [w.new_ones(count, w.shape[1]) for w, count in zip(found.weights, counts, strict=True)]
-        found = replace(found, weights=tuple(weights), freedom=inf)
-        own = replace(self, data=data, coordinates=aligned, placement=placement, identification=found)
-        rows = own._rows(like.nominal.under(data.payload), like.theta)
+        weights = [w.new_ones(count, w.shape[1]) for w, count in zip(fit.weights, counts, strict=True)]
+        fit = replace(fit, weights=tuple(weights), freedom=inf)
+        placed = replace(self, data=data, coordinates=aligned, placement=placement, identification=fit)
+        rows = placed._rows(like.nominal.under(data.payload), like.theta)
         rows = replace(rows, held=like.held, adrift=like.adrift)
-        return own, replace(rows, shared=placement.shared(rows))
+        return placed, replace(rows, shared=placement.shared(rows))
 
     def _rows(self, nominal: GeometryMap, theta: Tensor) -> TangentData:
         """Rows of several kinds, or of readings: the numbers of every row, those of its first body first."""
-        own, told, found = None, None, self.identification
-        weights, weighed = [*found.weights], [one.rows for one in self.readings]
+        positions, rows, fit = None, None, self.identification
+        weights, weighed = [*fit.weights], [devices.rows for devices in self.readings]
         if self.coordinates is not None:
-            own = self._coordinates(nominal, theta, self.coordinates)
-            if len(own.x) == len(self.data):
-                return own
-            weights[0], weighed = own.tails.weights, [self.coordinates.rows, *weighed]
-            told = Told(self.coordinates.rows, own.y, own.noise_model)
-        y, noise, observe = stacked(self.data.q, told, self.readings, 3 * nominal.geometry.markers)
+            positions = self._coordinates(nominal, theta, self.coordinates)
+            if len(positions.x) == len(self.data):
+                return positions
+            weights[0], weighed = positions.tails.weights, [self.coordinates.rows, *weighed]
+            rows = Told(self.coordinates.rows, positions.y, positions.noise_model)
+        y, noise, observe = stacked(self.data.q, rows, self.readings, 3 * nominal.geometry.markers)
         every = self.data.q.new_ones(len(self.data), noise.bodies)
         for some, each in zip(weighed, weights, strict=True):
             every[some, : each.shape[1]] = each
-        numbers = y, noise, Tails(found.freedom, every)
-        return TangentData(nominal, theta, self.data.q, *numbers, observe=observe, beside=own)
+        numbers = y, noise, Tails(fit.freedom, every)
+        return TangentData(nominal, theta, self.data.q, *numbers, observe=observe, beside=positions)
 
-    def _coordinates(self, nominal: GeometryMap, theta: Tensor, own: Coordinates) -> TangentData:
+    def _coordinates(self, nominal: GeometryMap, theta: Tensor, aligned: Coordinates) -> TangentData:
         """Rows that tell coordinates, of the markers that they show."""
-        (table, rows), geometry, found = own, nominal.geometry, self.identification
+        (table, rows), geometry, fit = aligned, nominal.geometry, self.identification
         on_markers = nominal.with_geometry(
             geometry.with_tool(geometry.tool[: table.markers], geometry.on[: table.markers])
         )
         theta = torch.cat([theta[: on_markers.geometry.size], theta[geometry.size :]])
-        nominal, noise = on_markers.rows(rows), NoiseModel.of(with_best_seen_point(table, found), found.noise)
-        seen, predicted = table.points.flatten(1), nominal(table.q, theta)
-        y = torch.where(seen.isnan(), predicted, seen)  # hidden markers: any value would do
-        worst = found.tails.weights.unflatten(1, (noise.bodies, -1)).amin(2)  # a pose is as wrong as its worst point
-        return TangentData(nominal, theta, table.q, y, noise, replace(found.tails, weights=worst))
+        nominal, noise = on_markers.rows(rows), NoiseModel.of(with_best_seen_point(table, fit), fit.noise)
+        measured, predicted = table.points.flatten(1), nominal(table.q, theta)
+        y = torch.where(measured.isnan(), predicted, measured)  # hidden markers: any value would do
+        worst = fit.tails.weights.unflatten(1, (noise.bodies, -1)).amin(2)  # a pose is as wrong as its worst point
+        return TangentData(nominal, theta, table.q, y, noise, replace(fit.tails, weights=worst))
 
 
 def place(robot: Tree, data: Any, progress: Progress) -> Placed:
@@ -305,61 +311,61 @@ def place(robot: Tree, data: Any, progress: Progress) -> Placed:
     """
     check_poses(data)
     coordinates, readings = divided(data)
-    check_rows(robot, [one.table for one in readings], alone=coordinates is None)
+    check_rows(robot, [part.table for part in readings], alone=coordinates is None)
     if coordinates is None:
         return _by_readings(robot, data, readings, progress)
     return _by_coordinates(robot, data, coordinates, readings, progress)
 
 
 def _by_coordinates(
-    robot: Tree, data: Any, own: Coordinates, readings: list[OtherReadings], progress: Progress
+    robot: Tree, data: Any, positions: Coordinates, readings: list[OtherReadings], progress: Progress
 ) -> Placed:
     """Rows that tell coordinates find the robot, around it devices of readings are found; then all rows together."""
-    own.table.check_every_marker_seen()
-    sessions, table = Sessions.of_table(robot, own, progress)
+    positions.table.check_every_marker_seen()
+    sessions, table = Sessions.of_table(robot, positions, progress)
     LOG.info("calibrating %s with %r", robot.name, table)
     progress("registration", 0, 1)
-    registration, tables = registered(robot, table), [one.table for one in readings]
+    registration, tables = registered(robot, table), [part.table for part in readings]
     check_beside(robot, table, registration, tables)
     warn_of_joints_below_tip(robot, table)
     warn_of_open_directions(robot, table, registration)
     geometry, ball = registration.geometry, None
     if not all(map(sees_frame, tables)):
-        known = identify(geometry, table.q, table.points).geometry  # a nominal robot may miss its ball by centimetres
-        ball = ball_of(tables, known, ball_tip(readings, geometry.on[-1]))
+        fitted = identify(geometry, table.q, table.points).geometry  # a nominal robot may miss its ball by centimetres
+        ball = ball_of(tables, fitted, ball_tip(readings, geometry.on[-1]))
         geometry = geometry if ball is None else with_ball(geometry, ball)
-    devices = tuple(fitting_devices(one, geometry.points(one.q)) for one in tables)
+    devices = tuple(fitting_devices(other, geometry.points(other.q)) for other in tables)
     rows = Rows(geometry, (MeasuredPoints.of(table.q, table.points), *map(ReadRows, tables, devices)))
     if ball is not None:
         registration = described(rows, [registration.noise])
     registration = replace(registration, devices=devices)
     progress("geometry", 0, 1)
-    found = estimated(rows, held_parameters(geometry))
-    warn_of_wrong_names(tables, found.geometry)
-    LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", 1e3 * registration.rms, 1e3 * found.rms)
-    seen, count = found.geometry, table.markers  # without a ball, which a device does not see
-    check_identification(table, replace(found, geometry=seen.with_tool(seen.tool[:count], seen.on[:count])))
-    cameras = LensAndBoard.of_table(table, own.rows, registration, sessions)
-    placement = Placement((*sessions, *cameras, *reading_sets(readings, found.devices, "the measuring frame")))
-    return Placed(data, own._replace(table=table), placement, registration, found)
+    fit = estimated(rows, held_parameters(geometry))
+    warn_of_wrong_names(tables, fit.geometry)
+    LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", 1e3 * registration.rms, 1e3 * fit.rms)
+    model, count = fit.geometry, table.markers  # without a ball, which a device does not see
+    check_identification(table, replace(fit, geometry=model.with_tool(model.tool[:count], model.on[:count])))
+    cameras = LensAndBoard.of_table(table, positions.rows, registration, sessions)
+    placement = Placement((*sessions, *cameras, *reading_sets(readings, fit.devices, "the measuring frame")))
+    return Placed(data, positions._replace(table=table), placement, registration, fit)
 
 
 def _by_readings(robot: Tree, data: Any, readings: list[OtherReadings], progress: Progress) -> Placed:
     """Ball, devices and geometric errors by readings alone."""
     progress("geometry", 0, 1)
     LOG.info("calibrating %s with %r", robot.name, data)
-    tables = [one.table for one in readings]
+    tables = [part.table for part in readings]
     tip = () if tables[0].on is None else (tables[0].on,)
     registration = register_ball(robot, tables, tip)
     rows = Rows(registration.geometry, tuple(map(ReadRows, tables, registration.devices)))
     held, prior = held_parameters(rows.geometry, adrift=True), prior_of(tables)
-    found = estimated(rows, held, prior)
-    warn_of_wrong_names(tables, found.geometry)
-    LOG.info("registration RMS %.4f mm, geometry %.4f mm", 1e3 * registration.rms, 1e3 * found.rms)
+    fit = estimated(rows, held, prior)
+    warn_of_wrong_names(tables, fit.geometry)
+    LOG.info("registration RMS %.4f mm, geometry %.4f mm", 1e3 * registration.rms, 1e3 * fit.rms)
     if any(free := [devices.freed() for devices in registration.devices]):  # what was said to be known is tested
         each = zip(tables, registration.devices, free, strict=True)
-        parts = tuple(ReadRows(data, opened or own) for data, own, opened in each)
+        parts = tuple(ReadRows(data, opened or stated) for data, stated, opened in each)
         again = estimated(replace(rows, parts=parts), held, prior)
         for devices in again.devices:
-            devices.check_freed(found.noise, again.noise)
-    return Placed(data, None, Placement(reading_sets(readings, found.devices)), registration, found)
+            devices.check_freed(fit.noise, again.noise)
+    return Placed(data, None, Placement(reading_sets(readings, fit.devices)), registration, fit)

@@ -94,9 +94,9 @@ class DeviceSet(ABC):
 
     def by_row(self, count: int) -> Tensor:
         """(N,) numbers of the devices of all rows, -1 for rows of none."""
-        found = torch.full((count,), NO_SOCKET, dtype=torch.int64, device=HOST)
-        found[self.rows] = self.device
-        return found
+        numbers = torch.full((count,), NO_SOCKET, dtype=torch.int64, device=HOST)
+        numbers[self.rows] = self.device
+        return numbers
 
     def of_rows(self: S, rows: Tensor) -> S:
         """Renumber the rows: ``rows`` (M,) are their numbers in a larger table."""
@@ -110,7 +110,7 @@ class DeviceSet(ABC):
     def effects(self, data: Seen) -> Tensor:
         """Uncertainty of the devices, as effects of unit variance that rows share: (N, R, c), m."""
 
-    def settled(self: S, found: Settled) -> S:
+    def settled(self: S, fit: Settled) -> S:
         """The devices where a fit puts them."""
         return self
 
@@ -125,8 +125,8 @@ class DeviceSet(ABC):
         """What would make the robot's size better known; nothing where these devices have a size of their own."""
         return ""
 
-    def labels(self, own: Coordinates, seen: Tensor) -> Iterable[OtherLabel]:
-        """How rows that tell coordinates would err under other names of devices; ``seen`` (N, P, 3) by the model, m."""
+    def labels(self, coordinates: Coordinates, predicted: Tensor) -> Iterable[OtherLabel]:
+        """How rows that tell coordinates would err under other device names; ``predicted`` (N, P, 3) by a model, m."""
         return ()
 
     def hypotheses(self, data: Seen) -> Iterable[Hypothesis]:
@@ -156,20 +156,20 @@ class Placement(tuple[DeviceSet, ...]):
 
     def one(self, kind: type[S]) -> S | None:
         """The first set of a kind; None without one."""
-        return next((own for own in self if isinstance(own, kind)), None)
+        return next((part for part in self if isinstance(part, kind)), None)
 
     def hypotheses(self, data: Seen, about: str) -> list[Hypothesis]:
         """Hypotheses about a subject of :class:`Hypothesis`: what devices are said to hold, or what may change."""
-        return [one for own in self for one in own.hypotheses(data) if one.about == about]
+        return [hypothesis for part in self for hypothesis in part.hypotheses(data) if hypothesis.about == about]
 
     @property
     def bodies(self) -> Mapping[str, str]:
         """See :attr:`DeviceSet.bodies`."""
-        return {name: words for own in self for name, words in own.bodies.items()}
+        return {name: words for part in self for name, words in part.bodies.items()}
 
     def shared(self, data: Seen) -> Tensor:
         """Effects of all devices, side by side: (N, R, c)."""
-        return torch.cat([data.y.new_zeros(*data.y.shape, 0), *(own.effects(data) for own in self)], 2)
+        return torch.cat([data.y.new_zeros(*data.y.shape, 0), *(part.effects(data) for part in self)], 2)
 
     def settled(self, fitted: Fit, around: FittedMap, data: Seen, transform: Tensor, **known: Any) -> Placement:
         """Move the devices to where a fit puts them; its last shifts are theirs.
@@ -178,34 +178,34 @@ class Placement(tuple[DeviceSet, ...]):
             fitted: the fit. around: its map, with the covariances of the model. data: its rows.
             transform, known: see :class:`Settled`.
         """
-        sets, shifts, sizes = list[DeviceSet](), fitted.shifts, [own.effects(data).shape[2] for own in self]
+        sets, shifts, sizes = list[DeviceSet](), fitted.shifts, [devices.effects(data).shape[2] for devices in self]
         centre = data.points.unflatten(1, (-1, 3)).mean((0, 1))
-        whole = around.shift_covariance() if len(shifts) else shifts[:, None]
-        numbers = torch.arange(len(shifts) - sum(sizes), len(shifts), device=shifts.device)
-        for own, part in zip(self, numbers.split(sizes), strict=True):
+        first, numbers = len(around.geodesic.spec.prior_variance), torch.arange(len(shifts), device=shifts.device)
+        whole = around.parameter_covariance(first + numbers) if len(shifts) else shifts[:, None]  # after those of k0
+        for devices, part in zip(self, numbers[len(shifts) - sum(sizes) :].split(sizes), strict=True):
             covariance = whole[part[:, None], part]
-            sets.append(own.settled(Settled(shifts[part], covariance, around, centre, transform, **known)))
+            sets.append(devices.settled(Settled(shifts[part], covariance, around, centre, transform, **known)))
         return Placement(sets)
 
     def aligned(self, data: T) -> T:
         """Measured positions in the frame of the model; unchanged where one set-up measured all."""
-        for own in self:
-            data = own.devices.aligned(data)
+        for part in self:
+            data = part.devices.aligned(data)
         return data
 
     def sentences(self) -> list[str]:
-        return [line for own in self for line in own.sentences()]
+        return [line for part in self for line in part.sentences()]
 
     def entry(self) -> dict[str, Any]:
-        found: dict[str, Any] = {}
-        for name, own in (item for one in self for item in one.entry().items()):
-            before = found.get(name, {})  # of devices of another kind
-            found[name] = own | {key: before[key] | own[key] for key in before}
-        return found
+        entries: dict[str, Any] = {}
+        for name, entry in (item for part in self for item in part.entry().items()):
+            before = entries.get(name, {})  # of devices of another kind
+            entries[name] = entry | {key: before[key] | entry[key] for key in before}
+        return entries
 
     def placed(self) -> tuple[Extrinsics, ...]:
         """What a model keeps of all devices."""
-        return tuple(own.devices for own in self if own.names)
+        return tuple(part.devices for part in self if part.names)
 
 
 class Elsewhere(NamedTuple):

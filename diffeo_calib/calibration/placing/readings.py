@@ -74,8 +74,8 @@ class ReadingDevices(DeviceSet):
         """Where a geometric calibration found them, with what is known of them before the fit."""
         return cls(devices, data, frame)
 
-    def reason(self, seen: Tensor, small: float) -> str:
-        """Probable cause of a row whose readings are wrong: ``seen`` (3,) its ball, ``small`` an error that fits, m."""
+    def reason(self, ball: Tensor, small: float) -> str:
+        """Probable cause of a row whose readings are wrong: its ``ball`` (3,), ``small`` an error that fits, m."""
         return FAR
 
     @property
@@ -89,44 +89,44 @@ class ReadingDevices(DeviceSet):
 
     def _of_all_rows(self, effects: Tensor, data: Seen) -> Tensor:
         """Effects (M, r, U) on the own rows as those on all (N, R, U)."""
-        found = effects.new_zeros(*data.y.shape, effects.shape[2])
-        found[self.rows[:, None], self.numbers] = effects
-        return found
+        whole = effects.new_zeros(*data.y.shape, effects.shape[2])
+        whole[self.rows[:, None], self.numbers] = effects
+        return whole
 
     def effects(self, data: Seen) -> Tensor:
         return self._of_all_rows(self.devices.shared(self._seen(data), self.device), data)
 
     def hypotheses(self, data: Seen) -> Iterator[Hypothesis]:
-        for one in self.devices.hypotheses(self._seen(data), self.device):
-            yield one._replace(effects=self._of_all_rows(one.effects, data))
+        for hypothesis in self.devices.hypotheses(self._seen(data), self.device):
+            yield hypothesis._replace(effects=self._of_all_rows(hypothesis.effects, data))
 
-    def settled(self, found: Settled) -> ReadingDevices:
-        root, moved = self.devices.root, self.devices.shifted(found.shifts)
-        known = (root @ found.covariance @ root.mT).diagonal().clamp(min=0).sqrt()
-        return replace(self, devices=replace(moved, deviations=known.view_as(moved.deviations)))
+    def settled(self, fit: Settled) -> ReadingDevices:
+        root, moved = self.devices.root, self.devices.shifted(fit.shifts)
+        std = (root @ fit.covariance @ root.mT).diagonal().clamp(min=0).sqrt()
+        return replace(self, devices=replace(moved, deviations=std.view_as(moved.deviations)))
 
     def with_rows(self, other: OtherRows) -> ReadingDevices:
-        own = next(one for one in other.readings if one.table.column_kind == self.data.column_kind)
-        return replace(self, data=own.table).measuring(own.rows, self.devices.numbers(own.table))
+        readings = next(part for part in other.readings if part.table.column_kind == self.data.column_kind)
+        return replace(self, data=readings.table).measuring(readings.rows, self.devices.numbers(readings.table))
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:
         """Warn if most of the expected error is the robot's size."""
-        if model.map.workspace is None or (found := ExpectedError.of(model)).size_share < gates.SIZE_SHARE:
+        if model.map.workspace is None or (error := ExpectedError.of(model)).size_share < gates.SIZE_SHARE:
             return
         what = (
-            f"the readings hold too little length: the robot's size is known to {100 * found.size:.2f} % (one standard "
-            f"deviation), which is {100 * found.size_share:.0f} % of the expected error of {1e3 * found.workspace:.2f} "
+            f"the readings hold too little length: the robot's size is known to {100 * error.size:.2f} % (one standard "
+            f"deviation), which is {100 * error.size_share:.0f} % of the expected error of {1e3 * error.workspace:.2f} "
             "mm and rests on the robot's description"
         )
         warn_user(sentence(what, fix=self.devices.size_fix))
 
     def sentences(self) -> list[str]:
-        return [self.devices.sentence(number, own, self.frame) for number, own in enumerate(self.devices.deviations)]
+        return [self.devices.sentence(number, std, self.frame) for number, std in enumerate(self.devices.deviations)]
 
     def entry(self) -> dict[str, object]:
         values = {"constants": self.devices.constants, "deviations": self.devices.deviations}
-        own = {what: dict(zip(self.names, each.tolist(), strict=True)) for what, each in values.items()}
-        return {"devices": own}
+        entries = {what: dict(zip(self.names, each.tolist(), strict=True)) for what, each in values.items()}
+        return {"devices": entries}
 
 
 def register_readings(bare: Geometry, tables: Sequence[Readings]) -> Identification:
@@ -142,30 +142,30 @@ def register_readings(bare: Geometry, tables: Sequence[Readings]) -> Identificat
     Warns:
         DiffeoCalibWarning: readings that no place of ball and devices explains in either unit.
     """
-    most, found = LARGEST_SHARE * bare.chain.reach, _rough_fits(bare, tables, bare.tool[:1])
-    doubted = bool(found) and found[0].worst[0] > DOUBTED_SHARE * bare.chain.reach
+    most, fits = LARGEST_SHARE * bare.chain.reach, _rough_fits(bare, tables, bare.tool[:1])
+    doubted = bool(fits) and fits[0].worst[0] > DOUBTED_SHARE * bare.chain.reach
     for factor, words in ((1e3, "small"), (1e-3, "large")) if doubted else ():
-        other = [replace(own, values=factor * own.values) if own.unit[0] == "mm" else own for own in tables]
+        other = [replace(part, values=factor * part.values) if part.unit[0] == "mm" else part for part in tables]
         there = _rough_fits(bare, other, bare.tool[:1])
-        if there and there[0].worst[0] < min(most, FAR_BETTER * found[0].worst[0]):
+        if there and there[0].worst[0] < min(most, FAR_BETTER * fits[0].worst[0]):
             fix = f"they seem to be 1000 times too {words}: check the units of the readings (mm or m)"
-            raise MeasurementError.of(UNEXPLAINED, **found[0].said(most), fix=fix)
-    if not found or found[0].worst[0] > most:
+            raise MeasurementError.of(UNEXPLAINED, **fits[0].said(most), fix=fix)
+    if not fits or fits[0].worst[0] > most:
         balls = BALL_SPREAD_M * torch.randn(BALLS_TRIED, 3, dtype=torch.float64, generator=seeded(0), device=HOST)
-        found = sorted([*found, *_rough_fits(bare, tables, balls)], key=itemgetter(0))
-    if not found:
+        fits = sorted([*fits, *_rough_fits(bare, tables, balls)], key=itemgetter(0))
+    if not fits:
         raise MeasurementError.of(UNEXPLAINED, fix=CHECK)
-    best = found[0]
+    best = fits[0]
     if best.worst[0] > most:
         warn_user(sentence(UNEXPLAINED, **best.said(most), fix=CHECK))
-    noise = float(torch.cat([own.flatten() for own in best.errors]).square().mean().sqrt())
+    noise = float(torch.cat([part.flatten() for part in best.errors]).square().mean().sqrt())
     return described(best.rows, [noise] * len(tables), adrift=True)
 
 
 def rough_error(bare: Geometry, tables: Sequence[Readings]) -> float:
     """RMS error of the readings from the start of :func:`register_readings`, m; infinite where none leads on."""
-    found = _rough_fits(bare, tables, bare.tool[:1], ftol=COMPARED)
-    return float(torch.cat([own.flatten() for own in found[0].errors]).square().mean().sqrt()) if found else inf
+    fits = _rough_fits(bare, tables, bare.tool[:1], ftol=COMPARED)
+    return float(torch.cat([part.flatten() for part in fits[0].errors]).square().mean().sqrt()) if fits else inf
 
 
 def images_error(robot: Tree, data: Readings) -> float:
@@ -178,22 +178,22 @@ def images_error(robot: Tree, data: Readings) -> float:
 
     poses = robot(data.q)
     rows = [data.device == device for device in range(len(data.names))]
-    if min(int(own.sum()) for own in rows) < FEWEST_IMAGES:
+    if min(int(mask.sum()) for mask in rows) < FEWEST_IMAGES:
         return inf
 
     def share(ball: Any) -> float:
         at = poses[:, :3, :3] @ poses.new_tensor(ball) + poses[:, :3, 3]
-        return max(_projection_error(at[own], data.reported[own]) for own in rows)
+        return max(_projection_error(at[mask], data.reported[mask]) for mask in rows)
 
     return float(minimize(share, [0.0] * 3, method="Nelder-Mead", options=BALL_SEARCH).fun)
 
 
 def _projection_error(points: Tensor, image: Tensor) -> float:
     """Median distance of images (N, 2) from the best projection of points (N, 3), as a share of their spread."""
-    at, seen = (points - points.mean(0)) / points.std(), (image - image.mean(0)) / image.std()
-    P = projection(seen, at)
+    at, pixels = (points - points.mean(0)) / points.std(), (image - image.mean(0)) / image.std()
+    P = projection(pixels, at)
     shown = at @ P[:, :3].mT + P[:, 3]
-    return float((shown[:, :2] / shown[:, 2:] - seen).norm(dim=1).median() / seen.norm(dim=1).median())
+    return float((shown[:, :2] / shown[:, 2:] - pixels).norm(dim=1).median() / pixels.norm(dim=1).median())
 
 
 class RoughFit(NamedTuple):
@@ -215,15 +215,15 @@ class RoughFit(NamedTuple):
 
 def _rough_fits(bare: Geometry, tables: Sequence[Readings], balls: Tensor, **how: float) -> list[RoughFit]:
     """From each ball (B, 3) in the tip's frame, m, that leads anywhere, the best first; ``how``: options of scipy."""
-    found = list[RoughFit]()
+    fits = list[RoughFit]()
     for ball in balls:
         with suppress(InputError):  # the start has the ball at a fixed point or behind a camera
-            found.append(_rough_fit(bare, tables, ball, how))
-    found.sort(key=itemgetter(0))
-    for best in found[:1]:  # a device may be lost where the ball was far away: all anew around the ball that was found
+            fits.append(_rough_fit(bare, tables, ball, how))
+    fits.sort(key=itemgetter(0))
+    for best in fits[:1]:  # a device may be lost where the ball was far away: all anew around the ball that was found
         with suppress(InputError):
-            found.append(_rough_fit(bare, tables, best.rows.geometry.tool[0], how))
-    return sorted(found, key=itemgetter(0))
+            fits.append(_rough_fit(bare, tables, best.rows.geometry.tool[0], how))
+    return sorted(fits, key=itemgetter(0))
 
 
 def _rough_fit(bare: Geometry, tables: Sequence[Readings], ball: Tensor, how: Mapping[str, float]) -> RoughFit:
@@ -240,15 +240,15 @@ def _rough_fit(bare: Geometry, tables: Sequence[Readings], ball: Tensor, how: Ma
         for number, name in enumerate(data.names)
     )
     each = zip(rows.parts, fit.shifts.split(rows.freedom), strict=True)
-    moved = [one for own, some in each for one in own.devices(some)]
+    moved = [device for part, some in each for device in part.devices(some)]
     return RoughFit(worst, Rows(geometry.absorb(fit.theta), tuple(map(ReadRows, tables, moved))), fit.errors)
 
 
 def ball_of_readings(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Geometry | None:
     """A known robot with the ball of readings on a tip as its only marker; None without readings of a ball."""
-    for one in readings:
-        check_devices(one)
-    readings = [own for own in readings if kind_of(own).seen_points == 1]
+    for data in readings:
+        check_devices(data)
+    readings = [table for table in readings if kind_of(table).seen_points == 1]
     if not readings:
         return None
     return register_readings(geometry.with_tool(geometry.tool[-1:], (tip,)), readings).geometry

@@ -63,17 +63,17 @@ class Sessions(DeviceSet):
     centre: Tensor | None = None  # (3,) about which frames turn, m; by default the middle of the rows
 
     @classmethod
-    def of_table(cls, robot: Tree, own: Coordinates, progress: Progress) -> tuple[list[Sessions], Measurements]:
+    def of_table(cls, robot: Tree, coordinates: Coordinates, progress: Progress) -> tuple[list[Sessions], Measurements]:
         """The sessions of rows, and these as those of one; none for one session.
 
         Raises:
             MeasurementError: a session with too few rows, or rows that do not fit the robot.
         """
-        table = own.table
+        table = coordinates.table
         if len(table.present_sessions) < 2:
             return [], table
         progress("sessions", 0, 1)
-        found, median = cls.find(robot, table, set_up_kind(table))
+        sessions, median = cls.find(robot, table, set_up_kind(table))
         with suppress(MeasurementError):
             other = MeasuringFrames if table.remounted else MountedMarkers
             ratio = cls.find(robot, table, other)[1] / median if table.lever is None else 1.0
@@ -86,7 +86,7 @@ class Sessions(DeviceSet):
                 option = "leave out" if table.remounted else "add"
                 fix = f"{option} --remounted (in Python `remounted=True` of `with_sessions`) if that is so"
                 warn_user(sentence(words, fix=fix))
-        return [found.of_rows(own.rows)], found.devices.aligned(table)
+        return [sessions.of_rows(coordinates.rows)], sessions.devices.aligned(table)
 
     @classmethod
     def find(cls, robot: Tree, data: Measurements, kind: type[SetUps]) -> tuple[Sessions, float]:
@@ -97,13 +97,13 @@ class Sessions(DeviceSet):
         """
         geometry = register_inliers(robot, data.largest_session())[0].geometry
         for _ in range(ROUNDS):  # a better geometry gives better places
-            found = cls.around(data, kind, geometry, geometry.points(data.q))
-            together = found.devices.aligned(data)
+            sessions = cls.around(data, kind, geometry, geometry.points(data.q))
+            together = sessions.devices.aligned(data)
             start = registered_geometry(robot, data.q, together.points, marker_tips(robot, data))
             geometry = identify(start, data.q, together.points).geometry
         away = (geometry.points(data.q) - together.points).norm(dim=2)
         median, rows, name = max(
-            ((float(away[rows].nanmedian()), rows, name) for name, rows in found.groups()), key=lambda one: one[0]
+            ((float(away[rows].nanmedian()), rows, name) for name, rows in sessions.groups()), key=lambda each: each[0]
         )
         alone = data.rows(rows).with_sessions(None)
         if median > gates.GEOMETRIC_RESIDUAL * spread(alone.points):
@@ -111,29 +111,29 @@ class Sessions(DeviceSet):
                 refuse_mistakes(robot, alone)
             except MeasurementError as error:
                 raise MeasurementError(f"{name}: {error}") from error
-        return found, median
+        return sessions, median
 
     @classmethod
-    def around(cls, data: Measurements, kind: type[SetUps], geometry: Geometry, seen: Tensor) -> Sessions:
+    def around(cls, data: Measurements, kind: type[SetUps], geometry: Geometry, points: Tensor) -> Sessions:
         """The sessions of rows whose points (N, P, 3) are known in the frame of the largest one, m."""
         names, session = sessions_of(data)
         reference = int(torch.bincount(session[session != NO_SOCKET], minlength=len(names)).argmax())
-        found = kind.of(seen, data, geometry.marker_turns)
+        set_ups = kind.of(points, data, geometry.marker_turns)
         rows = (session != NO_SOCKET).nonzero()[:, 0]
-        return cls(found.with_reference(reference), reference, data.markers).measuring(rows, session[rows])
+        return cls(set_ups.with_reference(reference), reference, data.markers).measuring(rows, session[rows])
 
     @staticmethod
-    def beside(own: Coordinates, geometry: Geometry, seen: Tensor) -> tuple[list[Sessions], Coordinates]:
+    def beside(positions: Coordinates, geometry: Geometry, points: Tensor) -> tuple[list[Sessions], Coordinates]:
         """The sessions of new rows, and these as of the largest one; none for one session.
 
         Args:
-            own: rows of a table.
-            geometry: of the robot in the frame of the largest session. seen: (M, P, 3) their points there, m.
+            positions: rows of a table.
+            geometry: of the robot in the frame of the largest session. points: (M, P, 3) their points there, m.
         """
-        if len(own.table.present_sessions) < 2:
-            return [], own
-        found = Sessions.around(own.table, set_up_kind(own.table), geometry, seen)
-        return [found.of_rows(own.rows)], own._replace(table=found.devices.aligned(own.table))
+        if len(positions.table.present_sessions) < 2:
+            return [], positions
+        sessions = Sessions.around(positions.table, set_up_kind(positions.table), geometry, points)
+        return [sessions.of_rows(positions.rows)], positions._replace(table=sessions.devices.aligned(positions.table))
 
     @property
     def transforms(self) -> Tensor:
@@ -155,27 +155,27 @@ class Sessions(DeviceSet):
         Args:
             session: (N,) numbers of the rows' sessions.
         """
-        own = self.devices.increments(points, slopes, by_tool, centre)
+        steps = self.devices.increments(points, slopes, by_tool, centre)
         session = session.to(points.device)
-        return torch.cat([own * (session == number)[:, None, None] for number in self.others], dim=2)
+        return torch.cat([steps * (session == number)[:, None, None] for number in self.others], dim=2)
 
     def effects(self, data: Seen) -> Tensor:
         places, by_tool = data.points.unflatten(1, (-1, 3)), data.by_tool[..., : 3 * self.markers]
         centre = places.mean((0, 1)) if self.centre is None else self.centre
         return self.increments(places, by_tool, centre, self.by_row(len(data.y)), data.slopes)
 
-    def settled(self, found: Settled) -> Sessions:
-        steps, k = found.shifts.view(len(self.others), -1), self.devices.deviations.shape[1]
-        std = found.covariance.diagonal().clamp(min=0).sqrt().view_as(steps) if k else steps[:, :0]
-        moved = self.devices.moved(self.others, steps, std, found.centre, found.transform)
-        return replace(self, devices=moved if found.known is None else moved.after(found.known))
+    def settled(self, fit: Settled) -> Sessions:
+        steps, k = fit.shifts.view(len(self.others), -1), self.devices.deviations.shape[1]
+        std = fit.covariance.diagonal().clamp(min=0).sqrt().view_as(steps) if k else steps[:, :0]
+        moved = self.devices.moved(self.others, steps, std, fit.centre, fit.transform)
+        return replace(self, devices=moved if fit.known is None else moved.after(fit.known))
 
-    def labels(self, own: Coordinates, seen: Tensor) -> Iterator[OtherLabel]:
-        session = self.by_row(int(own.rows.max()) + 1)[own.rows]
-        points, count = own.table.points, self.markers
+    def labels(self, coordinates: Coordinates, predicted: Tensor) -> Iterator[OtherLabel]:
+        session = self.by_row(int(coordinates.rows.max()) + 1)[coordinates.rows]
+        points, count = coordinates.table.points, self.markers
         for number, name in enumerate(self.names if self.devices.kind == SESSION else ()):
             T = torch.linalg.inv(self.transforms[number]) @ self.transforms[session]
-            away = points[:, :count] @ T[:, :3, :3].mT + T[:, None, :3, 3] - seen[:, :count]
+            away = points[:, :count] @ T[:, :3, :3].mT + T[:, None, :3, 3] - predicted[:, :count]
             applies = (session != number) & (session != NO_SOCKET)
             yield OtherLabel(f"session '{name}'", applies, away.norm(dim=-1).nanmean(1))
 
@@ -213,8 +213,8 @@ class Drift(DeviceSet):
         joints = tuple(zip(chain.joint_names, chain.periodic, strict=True))
         nothing = values.new_zeros(values.shape[1], OFFSETS + len(joints))
         ends = values.amin(0), values.amax(0), *values.new_zeros(3, len(nothing))
-        known = KnownDrift(data.covariate_names, torch.cat([torch.stack(ends, 1), nothing], 1), nothing, joints=joints)
-        return [cls(known, known.ramp(data), data.q)]
+        drift = KnownDrift(data.covariate_names, torch.cat([torch.stack(ends, 1), nothing], 1), nothing, joints=joints)
+        return [cls(drift, drift.ramp(data), data.q)]
 
     def effects(self, data: Seen) -> Tensor:
         places = data.points.unflatten(1, (-1, 3))
@@ -224,13 +224,13 @@ class Drift(DeviceSet):
         whole = data.slopes @ torch.cat([frame, GROWTH * away, offsets], 2)
         return (whole[:, :, None] * self.ramp[:, None, :, None]).flatten(2)
 
-    def settled(self, found: Settled) -> Drift:
-        own = found.shifts.new_tensor([FRAME_M_RAD] * 6 + [GROWTH] + [OFFSET_RAD_M] * len(self.devices.joints))
-        shifts = own * found.shifts.view(len(self.names), -1)
-        deviations = own * found.covariance.diagonal().sqrt().view(len(self.names), -1)
-        constants = torch.cat([self.devices.constants[:, :2], found.centre.expand(len(shifts), 3), shifts], 1)
-        known = replace(self.devices, constants=constants, deviations=deviations)
-        return replace(self, devices=known, centre=found.centre)
+    def settled(self, fit: Settled) -> Drift:
+        units = fit.shifts.new_tensor([FRAME_M_RAD] * 6 + [GROWTH] + [OFFSET_RAD_M] * len(self.devices.joints))
+        shifts = units * fit.shifts.view(len(self.names), -1)
+        deviations = units * fit.covariance.diagonal().sqrt().view(len(self.names), -1)
+        constants = torch.cat([self.devices.constants[:, :2], fit.centre.expand(len(shifts), 3), shifts], 1)
+        drift = replace(self.devices, constants=constants, deviations=deviations)
+        return replace(self, devices=drift, centre=fit.centre)
 
     def with_rows(self, other: OtherRows) -> Drift:
         return replace(self, ramp=self.devices.ramp(other.data), q=other.data.q, centre=other.centre)

@@ -84,8 +84,8 @@ class SocketDevices(ReadingDevices):
         """Known distances are linearised anew there."""
         return cls(SocketPlaces.of(data, devices.constants), data, frame)
 
-    def reason(self, seen: Tensor, small: float) -> str:
-        return other_socket(seen, self.positions, self.names, small)
+    def reason(self, ball: Tensor, small: float) -> str:
+        return other_socket(ball, self.positions, self.names, small)
 
     def elsewhere(self, row: int, points: Tensor, devices: Placement) -> Elsewhere:
         if not bool((self.rows == row).any()):
@@ -109,13 +109,13 @@ class SocketDevices(ReadingDevices):
             name = f"the distance of '{pair[0]}' and '{pair[1]}' ({1e3 * length:.2f} mm)"
             yield Hypothesis(name, data.slopes @ effects, ("mm", 1e-3), fix, about=VALUE)
 
-    def settled(self, found: Settled) -> SocketDevices:
-        root, moved = self.devices.root, self.devices.shifted(found.shifts)
-        if found.fitted.workspace is not None:  # no device tells where all of them are
+    def settled(self, fit: Settled) -> SocketDevices:
+        root, moved = self.devices.root, self.devices.shifted(fit.shifts)
+        if fit.fitted.workspace is not None:  # no device tells where all of them are
             B = frame_slopes(moved.constants[None], moved.constants.mean(0))[0]  # (3 S, 6)
             root = root - B @ (torch.linalg.pinv(B) @ root)
-        std = (root @ found.covariance @ root.mT).diagonal().clamp(min=0).sqrt().view(-1, 3)
-        left_out = () if found.chosen is None else self._left_out(found.chosen)
+        std = (root @ fit.covariance @ root.mT).diagonal().clamp(min=0).sqrt().view(-1, 3)
+        left_out = () if fit.chosen is None else self._left_out(fit.chosen)
         devices = replace(moved, deviations=std, before=())
         return replace(self, devices=devices, left_out=left_out)
 
@@ -124,7 +124,7 @@ class SocketDevices(ReadingDevices):
 
         What the others tell about shifts that they share with it, those of a distance, is no prediction of the model.
         """
-        data, sockets, found = chosen.data, self.sockets, []
+        data, sockets, places = chosen.data, self.sockets, []
         process = data.process(chosen.selection.scales)
         numbers, shared = process.numbers, process.numbers.of_table(data.shared)
         socket = self.by_row(len(data.y))
@@ -138,8 +138,8 @@ class SocketDevices(ReadingDevices):
             predicted = self.positions[socket[rows]] - errors.view(-1, 3)
             away, distances = socket_errors(predicted, socket[rows], sockets)
             spread = float(away.square().sum(1).mean().sqrt())
-            found.append(PlaceErrors(name, len(rows), spread, tuple(one.error for one in distances)))
-        return tuple(found)
+            places.append(PlaceErrors(name, len(rows), spread, tuple(distance.error for distance in distances)))
+        return tuple(places)
 
     def warn_of_weakness(self, model: CalibratedKinematics) -> None:
         """Warn of sockets near a plane if one place away from it would make the expected error smaller."""
@@ -150,8 +150,8 @@ class SocketDevices(ReadingDevices):
     @property
     def left_out_spread(self) -> float:
         """Root mean square distance from the middle of its socket over the rows of all places, each left out, m."""
-        rows = sum(one.rows for one in self.left_out)
-        return (sum(one.rows * one.spread**2 for one in self.left_out) / rows) ** 0.5
+        rows = sum(place.rows for place in self.left_out)
+        return (sum(place.rows * place.spread**2 for place in self.left_out) / rows) ** 0.5
 
     def entry(self) -> dict[str, object]:
         """Positions by name, and spread of places left out, for programs; in m."""
@@ -166,10 +166,10 @@ class SocketDevices(ReadingDevices):
             f"socket '{name}': {_listed(place)} mm in {self.frame}, deviations {among}{_listed(deviation)} mm"
             for name, place, deviation in each
         ]
-        for one in self.left_out:
-            errors = ", ".join(f"{1e3 * error:+.3f}" for error in one.distance_errors)
-            known = f", distance {errors} mm" * bool(errors)
-            lines.append(f"place '{one.place}' left out: spread {1e3 * one.spread:.4f} mm{known} ({one.rows} rows)")
+        for left in self.left_out:
+            errors = ", ".join(f"{1e3 * error:+.3f}" for error in left.distance_errors)
+            text = f", distance {errors} mm" * bool(errors)
+            lines.append(f"place '{left.place}' left out: spread {1e3 * left.spread:.4f} mm{text} ({left.rows} rows)")
         return [*lines, f"spread within sockets, each place left out: {1e3 * self.left_out_spread:.4f} mm"]
 
 
@@ -177,9 +177,9 @@ def _listed(values: Tensor) -> str:
     return ", ".join(f"{value:.3f}" for value in values.tolist())
 
 
-def other_socket(seen: Tensor, positions: Tensor, names: Sequence[str], small: float) -> str:
+def other_socket(ball: Tensor, positions: Tensor, names: Sequence[str], small: float) -> str:
     """Why a ball (3,) is far from its socket: it may be in another one of places (S, 3), at most ``small`` m away."""
-    away = (seen - positions).norm(dim=1)
+    away = (ball - positions).norm(dim=1)
     nearest = int(away.argmin())
     if float(away[nearest]) > small:
         return "far from where the other rows of its socket predict it"
@@ -196,12 +196,12 @@ def reading_sets(
     """Sets of devices and the rows that they measured; ``frame``: that of the devices, in words."""
     each = zip(readings, devices, strict=True)
     sets = ((SETS.get(table.kind, ReadingDevices).found(own, table, frame), table, rows) for (table, rows), own in each)
-    return tuple(one.measuring(rows, one.devices.numbers(table)) for one, table, rows in sets)
+    return tuple(part.measuring(rows, part.devices.numbers(table)) for part, table, rows in sets)
 
 
 def resting_rows(tables: Sequence[Any]) -> SocketReadings | None:
     """The rows in sockets among tables of one kind each; None without any."""
-    return next((own for own in tables if own.kind == KIND), None)
+    return next((table for table in tables if table.kind == KIND), None)
 
 
 def ball_of(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Geometry | None:
@@ -234,10 +234,10 @@ def register_ball(robot: Tree, tables: Sequence[Readings], tip: tuple[str, ...])
     if not resting.sockets.distances:
         what = "no distance between sockets is known: the size of the robot rests on its description"
         warn_user(sentence(what, fix="pass one: a printed block with two sockets and a caliper are enough"))
-    found = register_sockets(robot, resting.q, resting.device)
-    check_socket_registration(robot, resting, found)
-    devices = [fitting_devices(one, found.geometry.points(one.q)) for one in tables]
-    return described(Rows(found.geometry, tuple(map(ReadRows, tables, devices))), adrift=True)
+    start = register_sockets(robot, resting.q, resting.device)
+    check_socket_registration(robot, resting, start)
+    devices = [fitting_devices(table, start.geometry.points(table.q)) for table in tables]
+    return described(Rows(start.geometry, tuple(map(ReadRows, tables, devices))), adrift=True)
 
 
 def prior_of(tables: Sequence[Readings]) -> Prior | None:
@@ -248,9 +248,9 @@ def prior_of(tables: Sequence[Readings]) -> Prior | None:
 def check_beside(robot: Tree, device: Measurements, start: Identification, tables: Sequence[Readings]) -> None:
     """Check rows in sockets beside measured positions; ``start``: the registration of these."""
     if (resting := resting_rows(tables)) is not None:
-        found = register_sockets(start.geometry, resting.q, resting.device)
-        check_socket_registration(robot, resting, found, start.geometry)
-        warn_of_other_robot(robot, device, start, found)
+        fit = register_sockets(start.geometry, resting.q, resting.device)
+        check_socket_registration(robot, resting, fit, start.geometry)
+        warn_of_other_robot(robot, device, start, fit)
 
 
 def warn_of_wrong_names(tables: Sequence[Readings], geometry: Geometry) -> None:
@@ -273,24 +273,24 @@ def contradicted_in_sockets(model: CalibratedKinematics, data: Any) -> list[Outl
     resting = resting_rows(data.parts)
     if resting is None:
         return []
-    seen, socket, N = model.map, resting.device.to(resting.q.device), len(resting)
-    predicted = seen(resting.q).detach()[:, -3:]
+    fitted, socket, N = model.map, resting.device.to(resting.q.device), len(resting)
+    predicted = fitted(resting.q).detach()[:, -3:]
     middles, eye = socket_means(predicted, socket), torch.eye(3, dtype=predicted.dtype, device=predicted.device)
     rests = torch.nn.functional.one_hot(socket).to(predicted)
     judged = rests.sum(0)[socket] > FEWEST_BESIDE
     if not bool(judged.any()):
         return []
-    last = torch.nn.functional.pad(eye, (seen.m - 3, 0)).expand(N, -1, -1)
-    own = seen.conditional.covariance_between(seen.geodesic.linearise(resting.q).projected(last))
+    last = torch.nn.functional.pad(eye, (fitted.m - 3, 0)).expand(N, -1, -1)
+    spread = fitted.conditional.covariance_between(fitted.geodesic.linearise(resting.q).projected(last))
     places = torch.kron(PLACES.found_m_rad * rests, eye).view(N, 3, -1)
     wide = torch.eye(places.shape[2], dtype=places.dtype, device=places.device)
-    noise, every = seen.new_noise[-3:, -3:].expand(N, -1, -1), torch.ones_like(predicted, dtype=torch.bool)
-    rows = LinearRows(middles[socket] - predicted, places, own, noise, every, wide, wide[0] * 0.0, wide * 0.0)
+    noise, every = fitted.new_noise[-3:, -3:].expand(N, -1, -1), torch.ones_like(predicted, dtype=torch.bool)
+    rows = LinearRows(middles[socket] - predicted, places, spread, noise, every, wide, wide[0] * 0.0, wide * 0.0)
     squares = rows.left_out_squares.masked_fill(~judged, torch.nan)
     bad = excluded(squares, torch.full_like(squares, 3.0), least=0.0)
-    found, sizes, names = list[Outlier](), rows.left_out.norm(dim=1), resting.row_names
+    outliers, sizes, names = list[Outlier](), rows.left_out.norm(dim=1), resting.row_names
     for row in bad.nonzero()[:, 0].tolist():
         small = gates.REMAINING_ERROR * float((predicted[row] - middles[socket[row]]).norm())
         reason = other_socket(predicted[row], middles, resting.names, small)
-        found.append(Outlier(row, None, int(resting.line_numbers[row]), names[row], float(sizes[row]), None, reason))
-    return sorted(found, key=lambda outlier: -outlier.distance)
+        outliers.append(Outlier(row, None, int(resting.line_numbers[row]), names[row], float(sizes[row]), None, reason))
+    return sorted(outliers, key=lambda outlier: -outlier.distance)

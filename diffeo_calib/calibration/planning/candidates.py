@@ -76,10 +76,10 @@ def all_of(criteria: Sequence[Criterion]) -> Criterion | None:
     """Whether all allow a configuration, each asked only where those before it do; None without any."""
 
     def criterion(q: Tensor) -> Tensor:
-        found = torch.ones(len(q), dtype=torch.bool, device=q.device)
-        for one in criteria:
-            found[found.clone()] = one(q[found])
-        return found
+        allowed = torch.ones(len(q), dtype=torch.bool, device=q.device)
+        for allows in criteria:
+            allowed[allowed.clone()] = allows(q[allowed])
+        return allowed
 
     return criterion if criteria else None
 
@@ -182,8 +182,8 @@ def candidates(
         sockets = as_tensor(places, "places", ("D", 3), fix="pass x, y, z of every socket, in m")
         at_ball = as_tensor((0.0, 0.0, 0.0) if ball is None else ball, "ball", (3,))
         criteria = {"places": lambda q: ((q >= lower) & (q <= upper)).all(1), **criteria}
-    generator, found = seeded(check_seed(seed)), [lower.new_empty(0, robot.n)]
-    seen = dict.fromkeys(criteria, 0)
+    generator, batches = seeded(check_seed(seed)), [lower.new_empty(0, robot.n)]
+    asked = dict.fromkeys(criteria, 0)
     passed = dict.fromkeys(criteria, 0)
     drawn, accepted, together = 0, 0, CONFIGURATIONS_AT_ONCE if places is None else count
     while accepted < count:
@@ -193,14 +193,14 @@ def candidates(
         if places is not None:
             q = brought_to(robot, q, at_ball, sockets[torch.arange(len(q), device=sockets.device) % len(sockets)])
         for name, criterion in criteria.items():
-            seen[name] += len(q)
+            asked[name] += len(q)
             q = q[_allowed(name, criterion, q)] if len(q) else q
             passed[name] += len(q)
         drawn, accepted = drawn + together, accepted + len(q)
-        found.append(q)
+        batches.append(q)
         if accepted < count and drawn >= FIRST_DRAWS and accepted < LEAST_SHARE * drawn:
-            raise _too_few(drawn, accepted, seen, passed)
-    return torch.cat(found)[:count]
+            raise _too_few(drawn, accepted, asked, passed)
+    return torch.cat(batches)[:count]
 
 
 def brought_to(robot: Tree, q: Tensor, ball: Tensor, places: Tensor) -> Tensor:
@@ -289,17 +289,17 @@ def _criteria(robot: Tree, keep: object, tracker: object, floor: float | None, c
         raise InputError.of("`keep`", expected="a function (N, n) -> (N,)", got=type(keep).__name__)
     tip = torch.zeros(1, 3, dtype=torch.float64, device=HOST)
     points = tip if tracker is None else as_tensor(tracker.marker, "marker", (3,))[None]
-    found: dict[str, Criterion] = {}
+    criteria: dict[str, Criterion] = {}
     if tracker is not None:
-        found["tracker"] = tracker.sees(robot)
+        criteria["tracker"] = tracker.sees(robot)
     if floor is not None:
         check_number(floor, "`floor`, a height in m", above=-float("inf"))
-        found["floor"] = lambda q: (_links(robot, q, points)[..., 2] >= floor).all(1)
+        criteria["floor"] = lambda q: (_links(robot, q, points)[..., 2] >= floor).all(1)
     if column is not None:
-        found["column"] = outside_column(robot, column, points)
+        criteria["column"] = outside_column(robot, column, points)
     if keep is not None:
-        found["keep"] = keep
-    return found
+        criteria["keep"] = keep
+    return criteria
 
 
 def _allowed(name: str, criterion: Criterion, q: Tensor) -> Tensor:
@@ -315,11 +315,11 @@ def _allowed(name: str, criterion: Criterion, q: Tensor) -> Tensor:
     return torch.from_numpy(value.copy())
 
 
-def _too_few(drawn: int, accepted: int, seen: dict[str, int], passed: dict[str, int]) -> InputError:
+def _too_few(drawn: int, accepted: int, asked: dict[str, int], passed: dict[str, int]) -> InputError:
     """Names the criterion that refuses the largest share of what reaches it."""
-    shares = {name: 1 - passed[name] / seen[name] for name in seen if seen[name]}
+    shares = {name: 1 - passed[name] / asked[name] for name in asked if asked[name]}
     worst = max(shares, key=lambda name: shares[name])
-    each = ", ".join(f"`{name}` {100 * shares.get(name, 0):.2f} % of {seen[name]}" for name in seen)
+    each = ", ".join(f"`{name}` {100 * shares.get(name, 0):.2f} % of {asked[name]}" for name in asked)
     return InputError.of(
         f"`{worst}` refuses nearly everything: {accepted} of {drawn} random configurations can be measured",
         expected=f"at least one in {1 / LEAST_SHARE:.0f}",

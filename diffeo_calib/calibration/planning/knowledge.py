@@ -98,43 +98,43 @@ class Scene(NamedTuple):
         return len(self.averaged) < self.points.shape[1]
 
     def choose(
-        self, known: Conditional, rows: tuple[Linearisation, Tensor, Tensor], targets: Tensor, count: int
+        self, posterior: Conditional, rows: tuple[Linearisation, Tensor, Tensor], targets: Tensor, count: int
     ) -> tuple[list[int], Tensor]:
         """Choose ``count`` of O measurements, at most one at every configuration.
 
         Args:
-            known: before the first. rows: what they report, its noise (O, r, r), m^2, and their configurations (O,).
+            posterior: before the first. rows: what they report, its noise (O, r, r), m^2, their configurations (O,).
             targets: (T,) numbers of the configurations where the robot shall be known.
 
         Returns:
             numbers of the measurements in the order in which they were taken, and the mean variance (count + 1,) of the
             targets' coordinates after 0, 1, ... of them, m^2.
         """
-        told, noise, place = rows
-        at, seen = known.features(self.at.rows(targets)), known.features(told)
+        measured, noise, place = rows
+        at, features = posterior.features(self.at.rows(targets)), posterior.features(measured)
         P = torch.eye(at.known.shape[1], dtype=at.known.dtype, device=at.known.device)
         if self.free:
             B = at.at.sensitivity[..., list(self.at.spec.nominal.places[:6])].flatten(0, 1)  # by motions of the base
             P = P - B @ torch.linalg.pinv(B)
-        own = diagonal_blocks(P @ at.between() @ P, len(targets))
+        blocks = diagonal_blocks(P @ at.between() @ P, len(targets))
 
         def between(number: int) -> Tensor:
-            return seen.rows(torch.tensor([number], dtype=torch.int64, device=P.device)).between(seen)
+            return features.rows(torch.tensor([number], dtype=torch.int64, device=P.device)).between(features)
 
         how = {"place": place, "open_": torch.ones_like(place, dtype=torch.bool), "count": count}
-        order, by = greedy(P @ at.between(seen), seen.blocks() + noise, between, **how)
-        variance = self.along(own).diagonal(dim1=1, dim2=2).mean()
+        order, by = greedy(P @ at.between(features), features.blocks() + noise, between, **how)
+        variance = self.along(blocks).diagonal(dim1=1, dim2=2).mean()
         lowered = (by.unflatten(2, (len(targets), -1)) @ self.averaged.mT).square().sum(1).mean((1, 2))
         return order, torch.cat([variance[None], -lowered]).cumsum(0).clamp(min=0)
 
 
 def greedy(
-    C: Tensor, own: Tensor, between: Callable[[int], Tensor], *, place: Tensor, open_: Tensor, count: int
+    C: Tensor, blocks: Tensor, between: Callable[[int], Tensor], *, place: Tensor, open_: Tensor, count: int
 ) -> tuple[list[int], Tensor]:
     """Options that lower the variance of k numbers most, one after the other, see the module.
 
     Args:
-        C: (k, M r) covariance of the numbers with the M options. own: (M, r, r) that of each, with noise.
+        C: (k, M r) covariance of the numbers with the M options. blocks: (M, r, r) that of each, with noise.
         between: covariance (r, M r) of an option with all, without noise.
         place: (M,) where each is measured: at one place one is taken. open_: (M,) boolean: those that can be taken.
 
@@ -144,20 +144,20 @@ def greedy(
     Raises:
         NumericalError: the covariance of the measurements is not positive definite.
     """
-    M, r, _ = own.shape
+    M, r, _ = blocks.shape
     order, taken, lowered = list[int](), C.new_zeros(0, M * r), list[Tensor]()
     each = C.T.contiguous().view(M, r, -1)
     for _ in range(count):
-        gains = torch.linalg.solve(own, each @ each.mT).diagonal(dim1=1, dim2=2).sum(1)
+        gains = torch.linalg.solve(blocks, each @ each.mT).diagonal(dim1=1, dim2=2).sum(1)
         best = int(torch.where(open_, gains, -torch.inf).argmax())
         mine = slice(best * r, best * r + r)
         with large_work(taken.numel()):
             both = torch.cat([between(best) - taken[:, mine].T @ taken, each[best]], 1)
-            both = torch.linalg.solve_triangular(lower_root(own[best]), both, upper=False)
+            both = torch.linalg.solve_triangular(lower_root(blocks[best]), both, upper=False)
             row, by = both[:, : M * r], both[:, M * r :]
             each.flatten(0, 1).addmm_(row.T, by, alpha=-1.0)
             taken, less = torch.cat([taken, row]), row.T.reshape(M, r, r)
-        own, open_ = own - less @ less.mT, open_ & (place != place[best])
+        blocks, open_ = blocks - less @ less.mT, open_ & (place != place[best])
         order.append(best)
         lowered.append(by)
     return order, torch.stack(lowered) if lowered else each.new_zeros(0, r, len(C))
@@ -183,8 +183,8 @@ def of_robot(
     marker, scales = asked
     usual = torch.eye(4, dtype=torch.float64, device=HOST) if frames else MARKER
     points, on, lever = _measured_points(robot, marker, usual)
-    near, known, wanted = groups
-    q, numbers = gathered((near, known, known[:0], wanted), points.numel())
+    near, before, wanted = groups
+    q, numbers = gathered((near, before, before[:0], wanted), points.numel())
     geometry, near, residual = Geometry.nominal(robot).with_tool(points, on), q[numbers[0]], USUAL_RESIDUAL
     if len(near) > 1:
         residual *= float(geometry.points(near).reshape(-1, 3).std(0).norm())
@@ -201,9 +201,9 @@ def of_robot(
     scales = defaults(around(near), residual, Prior()) if scales is None else scales
     data = replace(around(q), held=held_parameters(geometry, adrift=free), adrift=free)
     deviations, noise = data.prior_variance(scales).sqrt(), data.noise(scales)
-    known = BeforeData(deviations), data.linearisation(scales), len(deviations)
+    before = BeforeData(deviations), data.linearisation(scales), len(deviations)
     averaged = Bodies(lever).averaging(noise)
-    scene = Scene(*known, data.points, noise, geometry.base, averaged, points.numel(), free, unplaced=False)
+    scene = Scene(*before, data.points, noise, geometry.base, averaged, points.numel(), free, unplaced=False)
     return scene, numbers
 
 
@@ -212,17 +212,17 @@ def _measured_points(robot: Tree, marker: object, usual: object) -> tuple[Tensor
     by_tip = marker if isinstance(marker, Mapping) else dict.fromkeys(robot.tips, marker)
     if not by_tip or not set(by_tip) <= set(robot.tips):
         raise InputError.of("`marker`", expected=f"markers on {few(robot.tips)}", got=as_written(marker))
-    found, on, levers = list[Tensor](), tuple[str, ...](), set[float | None]()
+    marks, on, levers = list[Tensor](), tuple[str, ...](), set[float | None]()
     for tip, given in by_tip.items():
         value = as_tensor(usual if given is None else given, "marker", (3,), also=(("P", 3), (4, 4)))
         framed = value.shape == (4, 4)
-        found.append(mark_points(rigid(value, "marker")[None], LEVER)[0] if framed else value.reshape(-1, 3))
-        on += (tip,) * len(found[-1])
+        marks.append(mark_points(rigid(value, "marker")[None], LEVER)[0] if framed else value.reshape(-1, 3))
+        on += (tip,) * len(marks[-1])
         levers.add(LEVER if framed else None)
     if len(levers) > 1:
         fix = "give markers on all tips, or frames on all"
         raise InputError.of("`marker` has points and frames", expected="one kind", fix=fix)
-    points = torch.cat(found)
+    points = torch.cat(marks)
     if (away := float(points.norm(dim=1).max())) > robot.reach:
         expected = f"within the robot's reach of {robot.reach:.3g} m"
         raise InputError.of(
@@ -241,12 +241,12 @@ def of_model(model: CalibratedKinematics, free: str | None, groups: Sequence[Ten
         groups: see :func:`of_robot`, so is what is returned.
     """
     fitted, fit, tool = model.map, model.map.unregistered, model.nominal.geometry.slices["tool"]
-    (near, known, wanted), registration = groups, fitted.registration
-    told = known[:0] if registration is None or free is not None else registration.q.to(known)
-    q, numbers = gathered((near, known, told, wanted), fitted.m)
+    (near, before, wanted), registration = groups, fitted.registration
+    registered = before[:0] if registration is None or free is not None else registration.q.to(before)
+    q, numbers = gathered((near, before, registered, wanted), fitted.m)
     if registration is not None and free != registration.free:
         free = registration.free if free is None else "both"
-    seen = device_coordinates(fitted.m, ball=model.ball, free=fitted.stands_free)
+    shown = device_coordinates(fitted.m, ball=model.ball, free=fitted.stands_free)
     middle = fitted.deformation.z1.view(-1, 3).mean(0)
     points, parts = [], []
     for rows in q.split(PREDICT_ROWS):
@@ -258,11 +258,11 @@ def of_model(model: CalibratedKinematics, free: str | None, groups: Sequence[Ten
         parts.append(at)
     moved = fitted.new_noise.new_zeros(6 + fitted.m)
     moved[:6] = PLACES.found_m_rad * (free in ("base", "both"))
-    moved[6 : 6 + seen] = PLACES.found_m_rad * (free in ("marker", "both"))
-    known = Opened(fit.with_motions, fit.columns, moved), Linearisation.joined(parts), fit.columns + len(moved)
+    moved[6 : 6 + shown] = PLACES.found_m_rad * (free in ("marker", "both"))
+    before = Opened(fit.with_motions, fit.columns, moved), Linearisation.joined(parts), fit.columns + len(moved)
     noise = fitted.new_noise.expand(len(q), -1, -1)
-    where = torch.cat(points), noise, model.geometry.base.to(moved), model.bodies.averaging(noise), seen
-    return Scene(*known, *where, fitted.stands_free, without_positions(model)), numbers
+    where = torch.cat(points), noise, model.geometry.base.to(moved), model.bodies.averaging(noise), shown
+    return Scene(*before, *where, fitted.stands_free, without_positions(model)), numbers
 
 
 def without_positions(model: CalibratedKinematics) -> bool:
@@ -274,9 +274,9 @@ def without_positions(model: CalibratedKinematics) -> bool:
         return True
     shared = model.map.noise.shared
     other = torch.zeros(len(shared), dtype=torch.bool, device=shared.device)
-    for own in model.placement:
-        if own.seen_points or own.cameras:
-            other[own.rows] = True
-        if own.cameras:
+    for devices in model.placement:
+        if devices.seen_points or devices.cameras:
+            other[devices.rows] = True
+        if devices.cameras:
             other |= (shared != 0).any(1).sum(1) >= len(UNKNOWNS)
     return bool(other.all())

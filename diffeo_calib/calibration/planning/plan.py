@@ -150,8 +150,8 @@ class Plan:
         Raises:
             ImportError: pandas is not installed.
         """
-        own = dict(zip(self.joint_names, self.q.T, strict=True)) | {"rank": self.rank}
-        return data_frame(own | ({"device": list(self.devices)} if self.devices else {}))
+        columns = dict(zip(self.joint_names, self.q.T, strict=True)) | {"rank": self.rank}
+        return data_frame(columns | ({"device": list(self.devices)} if self.devices else {}))
 
     def write(self, path: str | PathLike[str], table: TableFormat) -> None:
         """Write as :meth:`to_csv` does, in a format given as one object, which may name the joints otherwise."""
@@ -217,9 +217,9 @@ def plan(
     check_count(count, "`count`, at most the number of candidates", most=len(q))
     _check_belonging(robot_or_model, {"marker": marker, "hyperparameters": hyperparameters}, free)
     near = q if target is None else _configurations(robot, target, "target")
-    known = q[:0] if measured is None else _configurations(robot, measured, "measured")
+    earlier = q[:0] if measured is None else _configurations(robot, measured, "measured")
     sensors = sensors_for(robot_or_model, sensor)
-    groups = near, known, q
+    groups = near, earlier, q
     if isinstance(robot_or_model, Tree):
         how = {"frames": any(one.of_frames for one in sensors), "free": not any(one.of_positions for one in sensors)}
         scene, at = of_robot(robot_or_model, (marker, hyperparameters), groups, **how)
@@ -227,13 +227,13 @@ def plan(
         scene, at = of_model(robot_or_model, free, groups)
     targets, *before, wanted = at
     measured_rows = list(_measured(scene, sensors, *before))
-    told = [own for one in sensors for own in one.told(scene, wanted)]
-    reachable = len(torch.cat([one.rows for one in told]).unique())
+    parts = [part for one in sensors for part in one.told(scene, wanted)]
+    reachable = len(torch.cat([part.rows for part in parts]).unique())
     if reachable < count:
         fix = "pass other candidates: those at which the devices see the tool or its board, or that bring the ball to "
         what, fix = "candidates that can be measured", fix + "its sockets"
         raise InputError.of(what, expected=f"at least {count}", got=str(reachable), fix=fix)
-    options = Options.of(scene, told)
+    options = Options.of(scene, parts)
     new = options.noise.new_ones(options.at.sensitivity.shape[2] - scene.columns)
     posterior: Conditional = Opened(scene.known, scene.columns, new)
     for rows in measured_rows:
@@ -242,13 +242,13 @@ def plan(
     LOG.info("%d poses chosen of %d", count, len(q))
     noise = 3 * scene.along(scene.noise[targets]).diagonal(dim1=1, dim2=2).mean()
     stated = next((3 * one.std**2 for one in sensors if one.of_positions and one.std is not None), float(noise))
-    rows, names = options.rows[order] - int(wanted[0]), [told[k].name for k in options.device[order].tolist()]
+    rows, names = options.rows[order] - int(wanted[0]), [parts[k].name for k in options.device[order].tolist()]
     path = short_path(q[rows], robot.periodic)
     return Plan(
         q=q[rows][path],
         rank=path + 1,
         rows=rows[path],
-        devices=tuple(names[k] for k in path.tolist()) if len(told) > 1 else (),
+        devices=tuple(names[k] for k in path.tolist()) if len(parts) > 1 else (),
         expected_rms=(3 * variance).sqrt(),
         noise_rms=stated**0.5,
         assumed=isinstance(robot_or_model, Tree) and hyperparameters is None,
@@ -258,17 +258,17 @@ def plan(
     )
 
 
-def _measured(scene: Scene, sensors: Sequence[Sensor], known: Tensor, registration: Tensor) -> Iterator[Options]:
+def _measured(scene: Scene, sensors: Sequence[Sensor], earlier: Tensor, registration: Tensor) -> Iterator[Options]:
     """What was measured already: by one device, and by that of a registration, which measured positions or poses."""
-    if len(known):
-        told = [own for one in sensors for own in one.told(scene, known)]
-        if len(told) > 1 or len(told[0].rows) < len(known):
+    if len(earlier):
+        parts = [part for sensor in sensors for part in sensor.told(scene, earlier)]
+        if len(parts) > 1 or len(parts[0].rows) < len(earlier):
             fix = "leave `measured` out, and fit the model again with these rows"
             raise InputError.of("`measured`", expected="configurations that one device has measured", fix=fix)
-        yield Options.of(scene, told)
+        yield Options.of(scene, parts)
     if len(registration):
-        told = Positions(of_frames=scene.framed).told(scene._replace(unplaced=False), registration)
-        yield Options.of(scene, list(told))
+        parts = Positions(of_frames=scene.framed).told(scene._replace(unplaced=False), registration)
+        yield Options.of(scene, list(parts))
 
 
 def drawn(
@@ -295,22 +295,22 @@ def drawn(
     """
     model = isinstance(given, CalibratedKinematics)
     base = given.geometry.base if model else torch.eye(4, dtype=torch.float64, device=HOST)
-    reached = [one.reached(base) for one in sensors]
-    held = [one["places"] for one in reached if "places" in one]  # all sockets are one sensor
+    reached = [sensor.reached(base) for sensor in sensors]
+    held = [where["places"] for where in reached if "places" in where]  # all sockets are one sensor
     each: list[tuple[int, dict[str, Any], Tensor]] = [
         (reached.count({}), {}, markers.mean(0)),
-        *((1, one, markers.mean(0)) for one in reached if "keep" in one),
+        *((1, where, markers.mean(0)) for where in reached if "keep" in where),
         (int(bool(held)), {"places": torch.cat(held) if held else None}, markers[-1]),
     ]
-    whole, found = sum(number for number, *_ in each), []
+    whole, draws = sum(number for number, *_ in each), []
     for number, where, marker in each:
         if number:
-            criteria = [one for one in (where.get("keep"), keep) if one is not None]
-            seen = None if tracker is None else replace(tracker, marker=marker.tolist())
+            criteria = [asked for asked in (where.get("keep"), keep) if asked is not None]
+            device = None if tracker is None else replace(tracker, marker=marker.tolist())
             how = cell | where | {"ranges": where.get("ranges", {}) | dict(ranges or {}), "keep": all_of(criteria)}
             robot = given.robot if model else given
-            found.append(candidates(robot, -(-count * number // whole), tracker=seen, ball=marker, **how))
-    return torch.cat(found)
+            draws.append(candidates(robot, -(-count * number // whole), tracker=device, ball=marker, **how))
+    return torch.cat(draws)
 
 
 def _check_belonging(given: Tree | CalibratedKinematics, of_robots: dict[str, object], free: str | None) -> None:

@@ -61,26 +61,26 @@ class Options(NamedTuple):
     device: Tensor  # (O,) numbers of the devices
 
     @classmethod
-    def of(cls, scene: Scene, told: Sequence[Told]) -> Options:
+    def of(cls, scene: Scene, parts: Sequence[Told]) -> Options:
         """Join rows of all sensors; what some do not report is noise of 1 m that nothing moves."""
-        r, width, found = max(one.slopes.shape[1] for one in told), scene.columns, []
-        for number, one in enumerate(told):
-            new = one.columns == NEW
-            columns, own = torch.where(new, width - 1 + new.cumsum(0), one.columns), one.slopes.shape[1]
+        r, width, joined = max(part.slopes.shape[1] for part in parts), scene.columns, []
+        for number, part in enumerate(parts):
+            new = part.columns == NEW
+            columns, count = torch.where(new, width - 1 + new.cumsum(0), part.columns), part.slopes.shape[1]
             width += int(new.sum())
-            if len(one.rows):
-                at = scene.at.rows(one.rows).projected(pad(one.slopes, (0, 0, 0, r - own)))
-                noise = torch.eye(r, dtype=one.noise.dtype, device=one.noise.device).repeat(len(one.rows), 1, 1)
-                noise[:, :own, :own] = one.noise
-                found.append((one, columns, at, noise, torch.full_like(one.rows, number)))
+            if len(part.rows):
+                at = scene.at.rows(part.rows).projected(pad(part.slopes, (0, 0, 0, r - count)))
+                noise = torch.eye(r, dtype=part.noise.dtype, device=part.noise.device).repeat(len(part.rows), 1, 1)
+                noise[:, :count, :count] = part.noise
+                joined.append((part, columns, at, noise, torch.full_like(part.rows, number)))
         each = []
-        for one, columns, at, _, _ in found:
+        for part, columns, at, _, _ in joined:
             whole = pad(at.sensitivity, (0, width - at.sensitivity.shape[2]))
-            whole[:, : one.slopes.shape[1]].index_add_(2, columns, one.effects)
+            whole[:, : part.slopes.shape[1]].index_add_(2, columns, part.effects)
             each.append(replace(at, sensitivity=whole))
-        told, _, _, noise, device = zip(*found, strict=True)
+        parts, _, _, noise, device = zip(*joined, strict=True)
         return cls(
-            torch.cat([one.rows for one in told]), Linearisation.joined(each), torch.cat(noise), torch.cat(device)
+            torch.cat([part.rows for part in parts]), Linearisation.joined(each), torch.cat(noise), torch.cat(device)
         )
 
 
@@ -187,25 +187,25 @@ class DeviceReadings(Sensor):
     @classmethod
     def of(cls, kind: str, numbers: object, std: float | None, offset_std: float = 0.0) -> DeviceReadings:
         """Devices that a user describes, see :attr:`Devices.stated_as`."""
-        own: Any = known_kinds()[kind]
-        count = own.stated_as.count(",") + 1
-        given = as_tensor(numbers, f"devices of {kind}s", ("D", count), fix=f"pass {own.stated_as} of each, in m")
-        constants = own.stated(given)
+        family: Any = known_kinds()[kind]
+        count = family.stated_as.count(",") + 1
+        given = as_tensor(numbers, f"devices of {kind}s", ("D", count), fix=f"pass {family.stated_as} of each, in m")
+        constants = family.stated(given)
         if not bool(constants.isfinite().all()):
-            expected = f"{own.stated_as} with a direction"
+            expected = f"{family.stated_as} with a direction"
             raise InputError.of(f"devices of {kind}s", expected=expected, got=as_written(given.tolist()))
         names = tuple(f"{kind} {number}" for number in range(1, len(given) + 1))
-        prior = constants.new_tensor(own.prior(offset_std))
-        devices = (own((name,), each[None], prior[None]) for name, each in zip(names, constants, strict=True))
-        return cls(std, names=names, devices=tuple(FittedDevice(one, torch.diag(prior)) for one in devices))
+        prior = constants.new_tensor(family.prior(offset_std))
+        devices = (family((name,), each[None], prior[None]) for name, each in zip(names, constants, strict=True))
+        return cls(std, names=names, devices=tuple(FittedDevice(device, torch.diag(prior)) for device in devices))
 
     def sentences(self) -> list[str]:
         """One for each."""
-        return [f"{name}: {one.devices.where(0)}" for name, one in zip(self.names, self.devices, strict=True)]
+        return [f"{name}: {device.devices.where(0)}" for name, device in zip(self.names, self.devices, strict=True)]
 
     def reached(self, base: Tensor) -> dict[str, Any]:
         """Where the ball must be brought."""
-        held = torch.cat([one.devices.places for one in self.devices])
+        held = torch.cat([device.devices.places for device in self.devices])
         held = held if self.new else (held - base[:3, 3]) @ base[:3, :3]
         return {"places": held} if len(held) else {}
 
@@ -213,20 +213,20 @@ class DeviceReadings(Sensor):
         """Every device at the configurations in which it sees the tool: the ball, or the last measured frames."""
         base = scene.base if self.new else torch.eye(4, dtype=scene.base.dtype, device=scene.base.device)
         whole = torch.eye(scene.points.shape[1], dtype=base.dtype, device=base.device)
-        for name, one in zip(self.names, self.devices, strict=True):
-            count = one.devices.seen_points
+        for name, gauge in zip(self.names, self.devices, strict=True):
+            count = gauge.devices.seen_points
             last = scene.averaged[-3:] if count == 1 else whole[-3 * count :]
             points = ((scene.points[among] @ last.mT).unflatten(1, (-1, 3)) - base[:3, 3]) @ base[:3, :3]
             points, device = points.flatten(1), torch.zeros_like(among)
-            there = one.devices.sees(points, device)
+            there = gauge.devices.sees(points, device)
             points, rows = points[there], among[there]
             to_seen = torch.block_diag(*[base[:3, :3].mT] * count) @ last
-            A, effects = one.devices.observation(device[there]).slope(points) @ to_seen, one.by_increments(points)
-            usual = A @ scene.noise[rows] @ A.mT if one.noise is None else one.noise.expand(len(rows), -1, -1)
-            columns = among.new_full((one.root.shape[1],), NEW)
-            if one.columns is not None:
-                columns = len(scene.at.spec.prior_variance) + one.columns.nonzero()[:, 0]
-            yield Told(name, rows, A, effects @ one.root, columns, self._noise(usual))
+            A, effects = gauge.devices.observation(device[there]).slope(points) @ to_seen, gauge.by_increments(points)
+            usual = A @ scene.noise[rows] @ A.mT if gauge.noise is None else gauge.noise.expand(len(rows), -1, -1)
+            columns = among.new_full((gauge.root.shape[1],), NEW)
+            if gauge.columns is not None:
+                columns = len(scene.at.spec.prior_variance) + gauge.columns.nonzero()[:, 0]
+            yield Told(name, rows, A, effects @ gauge.root, columns, self._noise(usual))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -240,21 +240,21 @@ class BoardImages(Sensor):
     rows: Tensor  # (M,) of the fit in that session
 
     @classmethod
-    def last(cls, model: CalibratedKinematics, name: str, seen: BoardCamera, rows: Tensor) -> BoardImages:
+    def last(cls, model: CalibratedKinematics, name: str, camera: BoardCamera, rows: Tensor) -> BoardImages:
         """Of a camera that measured these rows (M,) of the fit, in its last session.
 
         Where no row says it, in its last set-up, by a recalibration; in the model's place where it was registered.
         """
-        known: Any = {"model": model, "name": name, "seen": seen}
-        sets = [own for own in model.placement if own.kind in TRANSFORMS and model.registration is None]
-        for own in sets:
-            here = torch.isin(own.rows, rows)
+        fields: Any = {"model": model, "name": name, "seen": camera}
+        sets = [group for group in model.placement if group.kind in TRANSFORMS and model.registration is None]
+        for group in sets:
+            here = torch.isin(group.rows, rows)
             if bool(here.any()):
-                number = int(own.device[here][own.rows[here].argmax()])
-                rows = rows[torch.isin(rows, own.rows[own.device == number])]
-                return cls(**known, set_up=SetUp.of(model, own.names[number]), rows=rows)
-        names = (word for own in sets for word in reversed(own.names) if word.partition("/")[0] == name)
-        return cls(**known, set_up=SetUp.of(model, next(names, None)), rows=rows)
+                number = int(group.device[here][group.rows[here].argmax()])
+                rows = rows[torch.isin(rows, group.rows[group.device == number])]
+                return cls(**fields, set_up=SetUp.of(model, group.names[number]), rows=rows)
+        names = (word for group in sets for word in reversed(group.names) if word.partition("/")[0] == name)
+        return cls(**fields, set_up=SetUp.of(model, next(names, None)), rows=rows)
 
     @cached_property
     def lens(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -270,13 +270,13 @@ class BoardImages(Sensor):
         new = root, torch.full_like(root[0], NEW, dtype=torch.int64), little
         if self.model.registration is not None or not len(rows):
             return new
-        known, by_lens = self.tells(self.model(self.model.configurations[rows]).detach().flatten(1))
+        of_corners, by_lens = self.tells(self.model(self.model.configurations[rows]).detach().flatten(1))
         if not bool(by_lens.isfinite().all()):  # it was seen from other places since
             return new
         of_fit = fitted.noise.shared[rows][:, :9].clone()
         of_fit[..., self.set_up.columns] = 0.0
         effects = torch.linalg.lstsq(by_lens.flatten(0, 1), of_fit.flatten(0, 1), driver="gelsd").solution
-        beyond = (fitted.noise.covariance[rows][:, :9, :9] - known).median(0).values
+        beyond = (fitted.noise.covariance[rows][:, :9, :9] - of_corners).median(0).values
         values, axes = torch.linalg.eigh(0.5 * (beyond + beyond.mT))
         first = len(fitted.geodesic.spec.prior_variance)
         columns = first + torch.arange(effects.shape[1], device=effects.device)
@@ -296,12 +296,12 @@ class BoardImages(Sensor):
         """Covariances (O, 9, 9), m^2, of images of points (O, 9), m, and effects (O, 9, 14) of lens and board."""
         boards, lever = self.boards(points), self.model.bodies.pose_lever()
         covariance, effects = expected(self.seen.camera, boards)
-        tool, turn, seen = poses_from_marks(points.unflatten(1, (3, 3)), lever), self.set_up.transform[:3, :3].mT, None
+        tool, turn, board = poses_from_marks(points.unflatten(1, (3, 3)), lever), self.set_up.transform[:3, :3].mT, None
         if self.seen.on_tool:
             M = self.set_up.mount
-            turn, seen = M[:3, :3], boards[:, :3, 3] @ M[:3, :3].mT + M[:3, 3]
+            turn, board = M[:3, :3], boards[:, :3, 3] @ M[:3, :3].mT + M[:3, 3]
             tool = inverse_poses(M @ boards)
-        slopes = pose_jacobian(tool[:, None], lever, seen)[:, 0] @ torch.block_diag(turn, turn)
+        slopes = pose_jacobian(tool[:, None], lever, board)[:, 0] @ torch.block_diag(turn, turn)
         return slopes @ covariance @ slopes.mT, slopes @ effects
 
     def told(self, scene: Scene, among: Tensor) -> Iterator[Told]:
@@ -314,7 +314,7 @@ class BoardImages(Sensor):
             noise, parts = noise + rest, [(columns, by_lens @ root)]
         first = len(scene.at.spec.prior_variance)
         parts.append((first + self.set_up.columns.nonzero()[:, 0], self.set_up.shifted(points)))
-        columns, effects = torch.cat([own for own, _ in parts]), torch.cat([own for _, own in parts], 2)
+        columns, effects = torch.cat([numbers for numbers, _ in parts]), torch.cat([moves for _, moves in parts], 2)
         every = torch.eye(9, dtype=points.dtype, device=points.device).expand(len(rows), 9, 9)
         yield Told(self.name, rows, every, effects, columns, self._noise(noise))
 
@@ -325,19 +325,19 @@ def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
     Raises:
         InputError: files of early versions, which do not say where devices of readings are.
     """
-    found: list[Sensor] = [] if without_positions(model) else [Positions(of_frames=model.lever is not None)]
-    for own in model.placement:
-        for k, (name, seen) in enumerate(own.cameras.items()):
-            found.append(BoardImages.last(model, name, seen, own.rows[own.device == k]))
-    words = [word for own in model.placement for word in own.names]
-    for own in model.placement:
-        for number, word in enumerate(own.names if own.seen_points else ()):
-            name = f"{own.kind} {word}" if words.count(word) > 1 else word
-            found.append(DeviceReadings(names=(name,), devices=(FittedDevice.of(model.map, own, number),), new=False))
-    if not found:
+    sensors: list[Sensor] = [] if without_positions(model) else [Positions(of_frames=model.lever is not None)]
+    for kit in model.placement:
+        for k, (name, camera) in enumerate(kit.cameras.items()):
+            sensors.append(BoardImages.last(model, name, camera, kit.rows[kit.device == k]))
+    words = [word for kit in model.placement for word in kit.names]
+    for kit in model.placement:
+        for number, word in enumerate(kit.names if kit.seen_points else ()):
+            name = f"{kit.kind} {word}" if words.count(word) > 1 else word
+            sensors.append(DeviceReadings(names=(name,), devices=(FittedDevice.of(model.map, kit, number),), new=False))
+    if not sensors:
         fix = "say by `sensor` what will measure"
         raise InputError.of("the file of this model does not say which devices measured its rows", fix=fix)
-    return tuple(found)
+    return tuple(sensors)
 
 
 def sensors_for(given: Tree | CalibratedKinematics, sensor: object = None) -> tuple[Sensor, ...]:
@@ -345,7 +345,7 @@ def sensors_for(given: Tree | CalibratedKinematics, sensor: object = None) -> tu
     if sensor is None:
         return sensor_of(given) if isinstance(given, CalibratedKinematics) else (Positions(),)
     several: tuple[Any, ...] = tuple(sensor) if isinstance(sensor, Sequence) else (sensor,)
-    if not several or not all(isinstance(one, Sensor) for one in several):
+    if not several or not all(isinstance(each, Sensor) for each in several):
         fix = "pass dc.Sensor.positions(), dc.Sensor.distances(points), ..."
         raise InputError.of("`sensor`", expected="a dc.Sensor or several", got=as_written(sensor), fix=fix)
     return several

@@ -69,7 +69,8 @@ def grown(spec: Any, drifts: Sequence[ChangedPart]) -> tuple[Kernel, Tensor]:
     for part in drifts:
         prior += part.variance * part.parameters
         for number, variance in part.kernels.items():
-            terms[number] = terms[number].scaled(1.0 + part.variance * variance / float(terms[number].variance))
+            config, more = terms[number].to_config(), part.variance * variance
+            terms[number] = RadialKernel.from_config(config | {"variance": config["variance"] + more})
     return SumKernel(terms), prior
 
 

@@ -113,18 +113,18 @@ def find_place(
     starts = search.starts(max(priors.values()))
     placed = dict[str, NewRows]()
     for name, metres in priors.items():
-        own = {"deviations": search.deviations(metres), "marker": name}
-        settled = [start.changed(**own).settled() for start in (starts if metres >= OTHER_MARKER else starts[:1])]
+        prior = {"deviations": search.deviations(metres), "marker": name}
+        settled = [start.changed(**prior).settled() for start in (starts if metres >= OTHER_MARKER else starts[:1])]
         placed[name] = max(settled, key=lambda each: each.given.log_evidence())
     kept, outliers = torch.arange(len(some), device=some.q.device), list[int]()
     while True:
         scale = max(1.0, float(scale_of([*placed.values()][-1])[0]))  # large errors under the widest prior are none
         logs = {
-            name: own.given.log_evidence(scale) + UNMOVED_LOG_ODDS * (name == "same") for name, own in placed.items()
+            name: rows.given.log_evidence(scale) + UNMOVED_LOG_ODDS * (name == "same") for name, rows in placed.items()
         }
-        odds = {name: exp(own - max(logs.values())) for name, own in logs.items()}
-        likely = {name: own for name, own in odds.items() if own > NEGLIGIBLE_PROBABILITY * sum(odds.values())}
-        odds = {name: own / sum(likely.values()) for name, own in likely.items()}
+        odds = {name: exp(value - max(logs.values())) for name, value in logs.items()}
+        likely = {name: share for name, share in odds.items() if share > NEGLIGIBLE_PROBABILITY * sum(odds.values())}
+        odds = {name: share / sum(likely.values()) for name, share in likely.items()}
         best = placed[max(odds, key=odds.__getitem__)]
         worst = worst_rows(best)
         if not worst or len(outliers) + len(worst) > LARGEST_OUTLIER_PART * len(some):
@@ -162,18 +162,18 @@ class Search:
         before, fit = model.registration, model.unregistered
         markers = fitted_markers(fit) if before is None else before.markers
         bodies, shown = Bodies(lever), data.bodies
-        known = bodies.kind == shown.kind and data.markers == len(markers)
-        if known:
+        alike = bodies.kind == shown.kind and data.markers == len(markers)
+        if alike:
             data, shown = bodies.represented(data), bodies
         elif free == "base":
             what, fix = 'free="base" keeps the markers', 'pass free="both" for other markers'
             got = kind_of_points(data.markers, data.lever)
             raise InputError.of(what, expected=kind_of_points(len(markers), lever), got=got, fix=fix)
-        old = markers if known else shown.nowhere(data.markers, data.points)
+        old = markers if alike else shown.nowhere(data.markers, data.points)
         numbers = torch.arange(6 + old.numel(), device=data.q.device)
         may = torch.where(numbers < 6, free != "marker", free != "base") & (numbers < len(numbers) - 3 * ball)
-        _check_enough(data, framed=free != "marker", known=known)
-        return cls(model.with_nominal(robot_map(fit).under(data.payload)), data, old, known, may)
+        _check_enough(data, framed=free != "marker", known=alike)
+        return cls(model.with_nominal(robot_map(fit).under(data.payload)), data, old, alike, may)
 
     @property
     def fit(self) -> FittedMap:

@@ -236,8 +236,7 @@ def with_ball(fitted: FittedMap, ball: Tensor, tip: str, deviation: float) -> Fi
     markers = nominal.geometry.markers
     slopes = torch.nn.functional.pad(fitted.functionals, (0, 3))
     new_noise = torch.block_diag(fitted.new_noise, own_blocks(fitted.new_noise[None], markers)[0].mean(0))
-    parts = fitted.noise, fitted.data, new_noise, fitted.workspace
-    return FittedMap(deformation, *parts, slopes=slopes, y=fitted.measured(), unresolved=fitted.unresolved)
+    return replace(fitted, deformation=deformation, new_noise=new_noise, slopes=slopes, y=fitted.measured())
 
 
 Marker = Literal["evidence", "same", "moved", "other"]

@@ -149,7 +149,7 @@ def recalibrate(
         marker: whether the markers on the tool are the "same" (within 0.05 mm), have "moved" by about a millimetre, or
             are "other" ones; by default the evidence of the rows decides.
         drift: "tested": parts of the robot that have changed, by a test at 1 %, may differ from what they were, and
-            geometry, load and transmissions by as much as the rows say. "none": nothing but device and markers may.
+            offsets, geometry, load and transmissions by as much as the rows say. "none": only device and markers may.
         seed: of the samples of that test.
         progress: called as ``progress(task, done, total)``.
         note: text that is kept with the model.
@@ -161,12 +161,12 @@ def recalibrate(
         InputError: arguments of another kind, joints in another order, another number of markers.
             The table of the model's own fit.
         MeasurementError: too few rows, rows that leave the place of the device open, or rows that cannot belong to
-            this robot: other units, or half of them contradicting the model.
+            this robot: other units.
         KeyboardInterrupt: Ctrl-C; nothing is kept, since it takes seconds.
 
     Warns:
-        DiffeoCalibWarning: as :meth:`CalibratedKinematics.registered`; distances of another scale; ``marker="same"``
-            although the rows say otherwise.
+        DiffeoCalibWarning: as :meth:`CalibratedKinematics.registered`; distances of another scale; half of the
+            rows contradicting the model; ``marker="same"`` although the rows say otherwise.
     """
     check_arguments(model, new, marker)
     check_other_table(model, new)
@@ -209,7 +209,7 @@ def _result(
 ) -> Recalibration:
     """The model in the new frame, and everything that was found."""
     record, new = place.registration, place.data
-    fitted_map = fitted.model
+    fitted_map = replace(fitted.model, unresolved=place.fitted.inflated(rows.inflation).unresolved)
     if record is not None:
         fitted_map = moved(fitted_map, record.transform)
     elif place.fitted.stands_free:  # still no device says where the robot stands
@@ -382,8 +382,8 @@ def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) ->
         fix = "pass the model as it was before its registration: places are found anew"
         raise InputError.of("the first model", expected="the markers of its fit", got=got, fix=fix)
     fits = _inputs(model.robot, other.robot, other.configurations), model.configurations
-    low = torch.maximum(*(own.amin(0) for own in fits))
-    high = torch.minimum(*(own.amax(0) for own in fits))
+    low = torch.maximum(*(inputs.amin(0) for inputs in fits))
+    high = torch.minimum(*(inputs.amax(0) for inputs in fits))
     q = torch.cat(fits)
     q = q[((q >= low) & (q <= high)).all(1)]
     if len(q) < FEWEST_ROWS:
@@ -393,8 +393,8 @@ def _predicted_rows(model: CalibratedKinematics, other: CalibratedKinematics) ->
     q = q[:: -(-len(q) // MOST_PREDICTED)]
     there = _inputs(other.robot, model.robot, q)
 
-    def measured(own: CalibratedKinematics, q: Tensor, points: Tensor) -> Measurements:
-        return Measurements.of_points(q, points.detach(), None, model.lever).with_load(own.nominal.load)
+    def measured(source: CalibratedKinematics, q: Tensor, points: Tensor) -> Measurements:
+        return Measurements.of_points(q, points.detach(), None, model.lever).with_load(source.nominal.load)
 
     fitted = other.map.unregistered
     record = find_place(fitted, other.lever, measured(other, there, model(q)), marker_std=OTHER_MARKER)[1]

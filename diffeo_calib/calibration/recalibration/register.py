@@ -42,7 +42,6 @@ from diffeo_calib.maps.observation import LinearFunctionals, Observation, Part, 
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conjugate_gradients import MAX_DENSE
-from diffeo_calib.robots.payload import joined_masses
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import mounted_of, sensor_of
 from diffeo_calib.sensors.devices import Extrinsics
@@ -77,8 +76,7 @@ def registered(
     changes = {"map": placed.to(model.configurations.device), "lever": record.lever, "placement": (), "ball": ball}
     result = model.changed(**changes, learnt=record if learns else None)._carrying(model.nominal.load)
     same = record.same and ball == model.ball
-    lost = [devices for devices in model.placement if devices.reads and not same]
-    if lost:
+    if lost := [devices for devices in model.placement if devices.reads and not same]:
         names = few([f"'{name}'" for devices in lost for name in devices.names])
         what = f"the model no longer knows the devices {names}: these rows show other markers than what they read"
         warn_user(sentence(what, fix="pass rows of the fit's markers, or rows of these devices, to keep them"))
@@ -115,7 +113,8 @@ def _placed(
     if solution.interrupted:
         raise KeyboardInterrupt  # half-way the covariance would be that of the optimum
     learnt = problem.calibrated(problem.deform(solution.momenta, fit.geodesic.integrator))
-    learnt = replace(moved(learnt, registration.transform), new_noise=registration.noise)
+    short = fit.inflated(new.inflation).unresolved
+    learnt = replace(moved(learnt, registration.transform), new_noise=registration.noise, unresolved=short)
     markers = fitted_markers(learnt)
     return learnt, replace(registration, markers=markers, shift=markers - new.old_markers)
 
@@ -201,7 +200,8 @@ def _sessions(tool: Tensor, new: NewRows, newest: GeometryMap) -> SessionMarkers
         session, tools, by_row = by_row.session, by_row.tools, by_row.nominal
     latest = torch.full((len(new.q),), len(tools), dtype=torch.int64, device=x.device)
     if isinstance(by_row, GeometryMap):
-        newest = newest.under(joined_masses(by_row.load, new.marks.fitted.load))
+        before, after = by_row.load, new.marks.fitted.load
+        newest = newest.under(torch.cat([before.masses, after.masses.to(before.masses)]) if before and after else None)
     return SessionMarkers(newest, torch.cat([session, latest]), torch.cat([tools, newest.geometry.tool[None]]))
 
 
@@ -220,8 +220,7 @@ def devices_beside(model: Any, data: Any, fitted: Sequence[Extrinsics] = ()) -> 
         points = model.at_payloads(part.payload).map(part.q).detach().unflatten(1, (-1, 3))
         for placed in sensor_of(part).settled(part, points, model.turns):
             new = _with_rows(placed, fitted)
-            alike = [number for number, old in enumerate(devices) if new.same_set(old)]
-            same = alike[0] if alike else len(devices)
+            same = next((number for number, old in enumerate(devices) if new.same_set(old)), len(devices))
             alone = [] if new.set_up and len(new.names) == 1 else [new]
             devices[same : same + 1] = [new.beside(old) for old in devices[same : same + 1]] or alone
     return tuple(devices)

@@ -81,7 +81,7 @@ def weighed(data: TangentData, scales: Hyperparameters, seed: int = 0) -> Tangen
     def squares(tails: Tails, *, left_out: bool) -> Tensor:
         if left_out:
             return leave_one_out(data.with_tails(tails), scales, seed).squares
-        found = torch.empty_like(tails.weights)
+        averages = torch.empty_like(tails.weights)
         for rows, part in _parts(data, seed):
             part.expected(scales)  # the same for all weights
             now = part.with_tails(tails.rows(rows))
@@ -89,8 +89,8 @@ def weighed(data: TangentData, scales: Hyperparameters, seed: int = 0) -> Tangen
             inverse = now.blocks_in_coordinates(process.numbers.blocks(process.inverse))
             residual = noise @ now.in_coordinates(process.numbers.in_table(process.mu)[:, :, None])
             moments = residual @ residual.mT + noise - noise @ inverse @ noise
-            found[rows] = now.noise_model.squares(now.noise(scales), moments)
-        return found
+            averages[rows] = now.noise_model.squares(now.noise(scales), moments)
+        return averages
 
     return data.with_tails(estimated(data.tails, data.noise_model.freedom, squares))
 
@@ -132,11 +132,11 @@ def left_out_rows(data: TangentData, scales: Hyperparameters, part: Tensor, new:
         data: the measurements. scales: held fixed. part: (N,) that is left out with each row; negative for none: NaN.
         new: (N, m, m) noise of a new measurement like each row, whose predicted covariance is the unit of squares.
     """
-    process, own = data.process(scales), data.weighted_noise(scales)
+    process, noise = data.process(scales), data.weighted_noise(scales)
     errors, covariance = process.rows_left_out(part)
     errors = data.in_coordinates(errors[:, :, None])[:, :, 0]
-    predicted = data.blocks_in_coordinates(covariance) - own + new
-    predicted = torch.where(part[:, None, None] < 0, own, predicted)
+    predicted = data.blocks_in_coordinates(covariance) - noise + new
+    predicted = torch.where(part[:, None, None] < 0, noise, predicted)
     return errors, data.noise_model.squares(predicted, errors[:, :, None] * errors[:, None])
 
 
@@ -197,13 +197,13 @@ def cross_validated_inflation(
                 if again.interrupted:
                     return None
                 part = torch.where(torch.isin(numbers, numbers[rows]), numbers, -1)
-                own = left_out_rows(data, again.scales, part, data.noise_of_new_rows(again.scales))[1]
-                squares[rows] = own[rows]
+                distances = left_out_rows(data, again.scales, part, data.noise_of_new_rows(again.scales))[1]
+                squares[rows] = distances[rows]
         except KeyboardInterrupt:
             return None
     squares = squares.masked_fill(data.tails.weights < OUTLIER_WEIGHT, nan)
-    seen = (~squares.isnan()).any(1)
-    each = torch.bincount(numbers[seen], minlength=int(numbers.max()) + 1)[numbers].clamp(min=1)
+    judged = (~squares.isnan()).any(1)
+    each = torch.bincount(numbers[judged], minlength=int(numbers.max()) + 1)[numbers].clamp(min=1)
     weights = (1.0 / (each * squares.shape[1]))[:, None].expand_as(squares)
     return region_scale(squares, data.noise_model.freedom, weights)
 
@@ -243,8 +243,8 @@ def inflation_by_parts(data: TangentData, scales: Hyperparameters, seed: int = 0
     part = halved(data.x)[process.numbers.owner]
     errors, covariance = process.left_out(part)
     squares = list[Tensor]()
-    for own in part.unique():
-        at = (part == own).nonzero()[:, 0]
+    for number in part.unique():
+        at = (part == number).nonzero()[:, 0]
         values, modes = torch.linalg.eigh(covariance[at[:, None], at])
         squares.append(((modes.mT @ errors[at]).square() / values)[-PART_MODES:].mean())  # hidden rows have fewer
     return region_scale(PART_MODES * torch.stack(squares), PART_MODES)
@@ -255,10 +255,10 @@ def halved(x: Tensor) -> Tensor:
     scaled = (x - x.amin(0)) / (x.amax(0) - x.amin(0)).clamp(min=torch.finfo(x.dtype).tiny)
     part = torch.zeros(len(x), dtype=torch.int64, device=x.device)
     for _ in range(HALVINGS):
-        for own in part.unique().flip(0):  # no new number is still to be halved
-            at = (part == own).nonzero()[:, 0]
+        for number in part.unique().flip(0):  # no new number is still to be halved
+            at = (part == number).nonzero()[:, 0]
             along = scaled[at, (scaled[at].amax(0) - scaled[at].amin(0)).argmax()]
-            part[at] = 2 * own + (along > along.median())
+            part[at] = 2 * number + (along > along.median())
     return part
 
 
@@ -290,5 +290,5 @@ def motions(x: Tensor, groups: Tensor) -> Tensor:
         for together in (groups, runs):
             lowest = labels.new_full((int(together.max()) + 1,), len(x))
             labels = lowest.scatter_reduce(0, together, labels, "amin")[together]
-    found = labels.unique(return_inverse=True)[1]
-    return found if int(found.max()) + 1 >= FEWEST_MOTIONS else groups.unique(return_inverse=True)[1]
+    numbers = labels.unique(return_inverse=True)[1]
+    return numbers if int(numbers.max()) + 1 >= FEWEST_MOTIONS else groups.unique(return_inverse=True)[1]

@@ -77,29 +77,29 @@ class NoiseModel:
     @classmethod
     def alike(cls, rows: int, bodies: int, size: int = 3) -> NoiseModel:
         """N rows that report as many bodies of one kind with as many numbers each."""
-        known = torch.zeros(rows, bodies * size, bodies * size, dtype=torch.float64, device=HOST)
+        covariance = torch.zeros(rows, bodies * size, bodies * size, dtype=torch.float64, device=HOST)
         kinds = torch.zeros(rows, bodies, dtype=torch.int64, device=HOST)
         visible = torch.ones(rows, bodies * size, dtype=torch.bool, device=HOST)
-        return cls(visible, kinds, known, known.new_zeros(rows, 0, size, FREEDOM_OF_POSES))
+        return cls(visible, kinds, covariance, covariance.new_zeros(rows, 0, size, FREEDOM_OF_POSES))
 
     @classmethod
     def of(cls, data: Measurements, residual: float) -> NoiseModel:
         """Noise of measured coordinates; ``residual`` is that of the geometric calibration per coordinate, m."""
-        size, visible, known = data.bodies.points, data.visible.repeat_interleave(3, 1), data.covariance
+        size, visible, covariance = data.bodies.points, data.visible.repeat_interleave(3, 1), data.covariance
         plain = cls.alike(len(data), data.markers // size, 3 * size)
-        known, modes = plain.known if known is None else known, data.bodies.modes(data)
-        finest = known.new_zeros(0)  # deviation of poses along any direction
+        covariance, modes = plain.known if covariance is None else covariance, data.bodies.modes(data)
+        finest = covariance.new_zeros(0)  # deviation of poses along any direction
         if 3 * size >= FREEDOM_OF_POSES:
-            finest = torch.linalg.eigvalsh(own_blocks(known, plain.bodies))[..., -FREEDOM_OF_POSES]
+            finest = torch.linalg.eigvalsh(own_blocks(covariance, plain.bodies))[..., -FREEDOM_OF_POSES]
             finest = finest[finest > SMALLEST_NOISE_M**2]
         # that size would drown what images of a board tell across the line of sight: a tenth of that along it
         slack = min(SLACK_SHARE * residual, FINEST_SHARE * (float(finest.median()) ** 0.5 if len(finest) else residual))
-        return cls(visible, plain.kinds, known, plain.modes if modes is None else modes, slack)
+        return cls(visible, plain.kinds, covariance, plain.modes if modes is None else modes, slack)
 
     def rows(self, index: Tensor) -> NoiseModel:
         """Noise of some configurations."""
-        own = self.visible[index], self.kinds[index], self.known[index], self.modes[index]
-        return NoiseModel(*own, self.slack, self.smallest_noise)
+        arrays = self.visible[index], self.kinds[index], self.known[index], self.modes[index]
+        return NoiseModel(*arrays, self.slack, self.smallest_noise)
 
     @property
     def bodies(self) -> int:
@@ -139,16 +139,16 @@ class NoiseModel:
     @property
     def freedom(self) -> Tensor:
         """(N, B) numbers that tell of each body, such as 3 coordinates of a point and 6 of a pose; 1 where hidden."""
-        own, poses = self.visible.unflatten(1, (self.bodies, -1)).sum(2), self.modes.shape[1]
-        own[:, :poses] = (self.modes != 0.0).any(2).sum(2)
-        return (own * self.seen).clamp(min=1)
+        counts, poses = self.visible.unflatten(1, (self.bodies, -1)).sum(2), self.modes.shape[1]
+        counts[:, :poses] = (self.modes != 0.0).any(2).sum(2)
+        return (counts * self.seen).clamp(min=1)
 
     def of_freedom(self, value: Callable[[int], float], like: Tensor) -> Tensor:
         """A function of each body's degrees of freedom: like squares (N, B)."""
-        found, freedom = torch.zeros_like(like), self.freedom
+        values, freedom = torch.zeros_like(like), self.freedom
         for number in freedom.unique().tolist():
-            found[freedom == number] = value(number)
-        return found
+            values[freedom == number] = value(number)
+        return values
 
     def covariance(self, scales: Hyperparameters, jacobian: Tensor) -> Tensor:
         """R_i without tails: Jacobian of k0 (N, R, n) -> (N, R, R) in m^2; absent numbers carry no information."""
@@ -157,8 +157,8 @@ class NoiseModel:
 
     def mean_covariance(self, scales: Hyperparameters, jacobian: Tensor) -> Tensor:
         """The mean of R_i without tails, everything visible: (R, R) in m^2."""
-        own = mean_block(self._of_bodies(scales), self.visible)  # not known of hidden poses
-        return self._of_all(scales, jacobian).mean(0) + own
+        bodies = mean_block(self._of_bodies(scales), self.visible)  # not known of hidden poses
+        return self._of_all(scales, jacobian).mean(0) + bodies
 
     def typical(self, scales: Hyperparameters, jacobian: Tensor, freedom: float) -> Tensor:
         """Mean covariance (R, R), whose 95 % region holds 95 %: inflated by heavy tails, and where the rows differ."""
@@ -182,9 +182,9 @@ class NoiseModel:
         if not poses:
             return self.known
         size = torch.cat([scales.sensor_noise.expand(3), scales.rotation_noise.expand(3)])
-        own = (self.modes * size.square()) @ self.modes.mT
-        own = own if self.kind_count == 1 else own * (self.kinds == 0)[:, :poses, None, None]
-        return self.known + torch.nn.functional.pad(block_diagonal(own), (0, self.size * (self.bodies - poses)) * 2)
+        blocks = (self.modes * size.square()) @ self.modes.mT
+        blocks = blocks if self.kind_count == 1 else blocks * (self.kinds == 0)[:, :poses, None, None]
+        return self.known + torch.nn.functional.pad(block_diagonal(blocks), (0, self.size * (self.bodies - poses)) * 2)
 
     def weighted(self, covariance: Tensor, tails: Tails) -> Tensor:
         """R_i with every body's noise divided by its weight, 1 where hidden; correlations are kept."""
@@ -196,27 +196,27 @@ class NoiseModel:
 
         NaN for hidden bodies.
         """
-        blocks, seen = [own_blocks(matrix, self.bodies) for matrix in (covariance, errors)], self.seen
+        blocks, present = [own_blocks(matrix, self.bodies) for matrix in (covariance, errors)], self.seen
         absent = ~self.visible.unflatten(1, (self.bodies, -1))
         if self.modes.shape[1] == self.bodies:
             to_body = torch.linalg.pinv(self.modes)  # (N, T, 6, 9)
             blocks = [to_body @ matrix @ to_body.mT for matrix in blocks]
-            absent = (self.modes == 0.0).all(2) | ~seen[..., None]
+            absent = (self.modes == 0.0).all(2) | ~present[..., None]
         both = absent[..., None] | absent[..., None, :]
         eye = torch.eye(absent.shape[2], dtype=covariance.dtype, device=covariance.device)
-        found = torch.linalg.solve(torch.where(both, eye, blocks[0]), blocks[1].masked_fill(both, 0.0))
-        return found.diagonal(dim1=-2, dim2=-1).sum(-1).masked_fill(~seen, nan)
+        ratios = torch.linalg.solve(torch.where(both, eye, blocks[0]), blocks[1].masked_fill(both, 0.0))
+        return ratios.diagonal(dim1=-2, dim2=-1).sum(-1).masked_fill(~present, nan)
 
 
-def differing_factor(covariance: Tensor, mean: Tensor, seen: Tensor) -> float:
+def differing_factor(covariance: Tensor, mean: Tensor, measured: Tensor) -> float:
     """Factor, one or more, on the mean covariance with which 95 % regions of markers hold 95 % of all rows' errors.
 
     Args:
         covariance: (N, 3 P, 3 P) of every row, m^2. mean: (3 P, 3 P) over the rows, m^2.
-        seen: (N, 3 P) boolean: the coordinates that were measured.
+        measured: (N, 3 P) boolean: the coordinates that were measured.
     """
     markers = len(mean) // 3
-    visible = seen.unflatten(1, (markers, 3)).all(2)
+    visible = measured.unflatten(1, (markers, 3)).all(2)
     relative = torch.linalg.solve(own_blocks(mean[None], markers), own_blocks(covariance, markers))[visible]
     first = relative.diagonal(dim1=-2, dim2=-1).sum(-1)
     second = (relative * relative.mT).sum((-2, -1))
@@ -237,29 +237,29 @@ SAME_BOARD_M = 1e-6
 """Boards of several sessions, brought into one frame, are farther apart than this."""
 
 
-def with_best_seen_point(data: Measurements, found: Identification) -> Measurements:
+def with_best_seen_point(data: Measurements, fit: Identification) -> Measurements:
     """The measurements with the point in the place of the board's origin; unchanged unless a camera is on the tool.
 
     Known deviations are those of the origin, and boards of several sessions have no point in common: the origin stays.
 
     Args:
-        data: N rows. found: their geometric calibration.
+        data: N rows. fit: their geometric calibration.
     """
-    seen = seen_board(data)
-    if seen is None or data.covariance is not None:
+    view = seen_board(data)
+    if view is None or data.covariance is not None:
         return data
-    origins, S = seen.origins, seen.axes
+    origins, S = view.origins, view.axes
     if float((origins - origins[0]).abs().max()) > SAME_BOARD_M:
         return data
-    predicted = poses_from_marks(found.geometry.points(data.q), seen.lever)
+    predicted = poses_from_marks(fit.geometry.points(data.q), view.lever)
     turned = S.mT - predicted[:, :3, :3].mT  # R_i - R^_i
     towards = inverse_poses(predicted)
-    away = seen.board - towards[:, :3, :3] @ origins[0] - towards[:, :3, 3]
-    weights = found.tails.weights.amin(1)
+    away = view.board - towards[:, :3, :3] @ origins[0] - towards[:, :3, 3]
+    weights = fit.tails.weights.amin(1)
     size = float((weights * away.square().mean(1)).sum() / weights.sum())
     eye = torch.eye(3, dtype=away.dtype, device=away.device)
     normal = torch.einsum("n,nki,nkj->ij", weights, turned, turned) + size / PRIOR_M**2 * eye
     push, point = -torch.einsum("n,nki,nk->i", weights, turned, away), torch.zeros_like(origins[0])
     point[:2] = torch.linalg.solve(normal[:2, :2], push[:2])
     LOG.info("the board is seen best at %s mm from its origin", [round(v, 1) for v in (1e3 * point).tolist()])
-    return with_attributes(data, board=seen.board + (S.mT @ point))
+    return with_attributes(data, board=view.board + (S.mT @ point))

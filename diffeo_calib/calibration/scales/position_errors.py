@@ -77,10 +77,10 @@ def find_gear_lines(data: TangentData, scales: Hyperparameters, seed: int = 0) -
     data = data.sample(len(data.x), MOST_COORDINATES, seed)[1]
     turning = [joint for joint, periodic in enumerate(data.space.periodic) if periodic]
     scan = _Scan(data.process(scales))
-    found: list[GearLine] = []
+    lines: list[GearLine] = []
     falls = {joint: scan.falls(joint) for joint in turning}
-    while falls and len(found) < MOST_LINES:
-        joint = max(falls, key=lambda one: float(falls[one].max()))
+    while falls and len(lines) < MOST_LINES:
+        joint = max(falls, key=lambda candidate: float(falls[candidate].max()))
         if float(falls[joint].max()) < scan.threshold(list(falls)):
             break
         frequency = scan.refined(joint, float(scan.frequencies[falls[joint].argmax()]))
@@ -90,9 +90,9 @@ def find_gear_lines(data: TangentData, scales: Hyperparameters, seed: int = 0) -
         if line is None or rest is None or _ambiguous(falls, after, joint, frequency, scan):
             del falls[joint]
         else:
-            found.append(line)
+            lines.append(line)
             falls, scan = after, rest
-    return tuple(found)
+    return tuple(lines)
 
 
 def _ambiguous(falls: dict[int, Tensor], after: dict[int, Tensor], joint: int, frequency: float, scan: _Scan) -> bool:
@@ -145,8 +145,8 @@ class _Scan:
         grid = torch.zeros(bins, dtype=values.dtype, device=values.device)
         grid.index_add_(0, index, values.flatten() * (1.0 - share))
         grid.index_add_(0, (index + 1).remainder(bins), values.flatten() * share)
-        found = torch.fft.rfft(grid)[self._steps].conj()
-        return found / torch.sinc(self.frequencies * spacing / (2.0 * pi)).square()
+        sums = torch.fft.rfft(grid)[self._steps].conj()
+        return sums / torch.sinc(self.frequencies * spacing / (2.0 * pi)).square()
 
     def _waves(self, joint: int, frequencies: Tensor) -> Tensor:
         """Cosines and sines of a joint (N, F, 2)."""
@@ -169,13 +169,13 @@ class _Scan:
 
     def line(self, joint: int, frequency: float) -> GearLine | None:
         """The line with the amplitude b of the largest marginal likelihood; None if that is zero."""
-        found = self._evidence(joint, self.q.new_tensor([frequency]))
-        found = Evidence(found.g[0], found.H[0])
-        a = torch.linalg.eigvalsh(found.H)
+        evidence = self._evidence(joint, self.q.new_tensor([frequency]))
+        evidence = Evidence(evidence.g[0], evidence.H[0])
+        a = torch.linalg.eigvalsh(evidence.H)
         if float(a[0]) < SMALLEST_CORNER * float(a[1]):
             return None
-        b2 = found.size.square().sum() * torch.logspace(-3, 1, 401, dtype=a.dtype, device=a.device)
-        odds = found.log_odds(b2)
+        b2 = evidence.size.square().sum() * torch.logspace(-3, 1, 401, dtype=a.dtype, device=a.device)
+        odds = evidence.log_odds(b2)
         return GearLine(joint, frequency, float(b2[odds.argmax()]) ** 0.5) if float(odds.max()) > 0 else None
 
     def without(self, joint: int, frequency: float) -> _Scan:
@@ -244,7 +244,7 @@ def with_axis_errors(data: TangentData, scales: Hyperparameters, lines: Tensor) 
     Rows that are measured along an axis, in the order of ``lines`` (N,), take errors of the axis for those of a base
     that drifts, with the same functions: they are of the base where that explains them clearly better.
     """
-    chain, found = data.nominal.geometry.chain, list[Axis]()
+    chain, proven = data.nominal.geometry.chain, list[Axis]()
     if is_cartesian(chain) or len(data.x) < FEWEST_ROWS:  # commanded poses have no axes
         return scales
     index, some = data.sample(len(data.x), AXIS_COORDINATES, seed=0)
@@ -253,39 +253,39 @@ def with_axis_errors(data: TangentData, scales: Hyperparameters, lines: Tensor) 
     process, rest = some.process(scales), {*(ranges[1] - ranges[0] > STILL).nonzero()[:, 0].tolist()}
     while rest:
         tried = [_axis(joint, some, process, values[index], ranges[:, joint]) for joint in rest]
-        best = max(tried, key=lambda one: one.odds - TOLD_APART * (one.own[0] == chain.moving))
+        best = max(tried, key=lambda axis: axis.odds - TOLD_APART * (axis.own[0] == chain.moving))
         if best.odds < ODDS:
             break
-        drift = max((one.odds for one in tried if one.own[0] == chain.moving), default=0.0)
+        drift = max((axis.odds for axis in tried if axis.own[0] == chain.moving), default=0.0)
         if best.own[0] < chain.moving and drift > max(ODDS, best.odds - TOLD_APART):
             what = f"errors by the position of {chain.moving_names[best.own[0]]} may be a drift of the device as well"
             fix = "measure some of its positions again at another time"
             warn_user(sentence(what, expected="rows in random order", fix=fix))
-        found.append(best)
-        rest = {one.own[0] for one in tried if one.odds > PLAUSIBLE} - {best.own[0]}
+        proven.append(best)
+        rest = {axis.own[0] for axis in tried if axis.odds > PLAUSIBLE} - {best.own[0]}
         process = process.opened(best.effects * axis_deviations(best.errors, best.lengthscale, FUNCTIONS), 1.0)
-    found = [one for one in found if one.own[0] < chain.moving]
-    if not found:
+    proven = [axis for axis in proven if axis.own[0] < chain.moving]
+    if not proven:
         return scales
-    errors, lengths = torch.stack([one.errors for one in found]), torch.stack([one.lengthscale for one in found])
-    return replace(scales, axes=tuple(one.own for one in found), axis_errors=errors, axis_lengthscale=lengths)
+    errors, lengths = torch.stack([axis.errors for axis in proven]), torch.stack([axis.lengthscale for axis in proven])
+    return replace(scales, axes=tuple(axis.own for axis in proven), axis_errors=errors, axis_lengthscale=lengths)
 
 
 def _axis(joint: int, data: TangentData, process: Process, values: Tensor, ends: Tensor) -> Axis:
     """The likeliest errors of the axis of a moving joint, or of the base by the last of the values (N, L + 1)."""
     low, high = ends.tolist()
-    margin, own = MARGIN * (high - low), 6 * ((joint + 1) % values.shape[1])
+    margin, column = MARGIN * (high - low), 6 * ((joint + 1) % values.shape[1])
     axis = joint, low - margin, high + margin, FUNCTIONS
     waves = Waves(*(torch.from_numpy(part).to(values.device) for part in axis_waves([axis], values.shape[1])))
     functions = wave_angles(waves, values, torch).cos()  # (N, K)
-    effects = (data.sensitivities[:, :, None, own : own + 6] * functions[:, None, :, None]).flatten(2)
+    effects = (data.sensitivities[:, :, None, column : column + 6] * functions[:, None, :, None]).flatten(2)
     E = process.numbers.of_table(data.motions_in_numbers(effects))
-    seen, found = Evidence.of(E, process), list[Axis]()
+    evidence, tried = Evidence.of(E, process), list[Axis]()
     for ratio, lengthscale in (MIDDLE, *product(*GRID)):
         errors, length = E.new_tensor([1.0, ratio]), E.new_tensor(lengthscale)
         shape = axis_deviations(errors, length, FUNCTIONS)
-        odds = Evidence(shape * seen.g, shape[:, None] * seen.H * shape).log_odds(SHIFTS_M.to(E).square())
-        found.append(Axis(axis, E, float(odds.max()), errors * SHIFTS_M[int(odds.argmax())].to(E), length))
-        if found[0].odds < PLAUSIBLE:
+        odds = Evidence(shape * evidence.g, shape[:, None] * evidence.H * shape).log_odds(SHIFTS_M.to(E).square())
+        tried.append(Axis(axis, E, float(odds.max()), errors * SHIFTS_M[int(odds.argmax())].to(E), length))
+        if tried[0].odds < PLAUSIBLE:
             break
-    return max(found, key=lambda one: one.odds)
+    return max(tried, key=lambda candidate: candidate.odds)

@@ -98,7 +98,7 @@ def select(
             search.climb([start], iterations or ITERATIONS)
         else:
             usual = centre.transmission_lengthscale
-            factors = [one / MESHING_LENGTHSCALE_RAD for one in TRANSMISSION_STARTS_RAD]
+            factors = [length / MESHING_LENGTHSCALE_RAD for length in TRANSMISSION_STARTS_RAD]
             starts = [replace(centre, transmission_lengthscale=usual * factor) for factor in factors]
             if is_cartesian(data.nominal.geometry.chain):  # from the others, short waves look like noise
                 lengths = {"coupled_lengthscale": SHORT * centre.coupled_lengthscale}
@@ -169,7 +169,7 @@ def _means(centre: Hyperparameters, data: TangentData) -> Tensor:
 @cache
 def _means_of(kinds: tuple[int, ...], sizes: tuple[tuple[str, int], ...]) -> Tensor:
     keys = [(name, kinds[k] if name in JOINT_SCALES else k) for name, size in sizes for k in range(size)]
-    same = torch.tensor([[one == other for other in keys] for one in keys], dtype=torch.float64, device=HOST)
+    same = torch.tensor([[key == other for other in keys] for key in keys], dtype=torch.float64, device=HOST)
     return same / same.sum(1)
 
 
@@ -199,14 +199,14 @@ class _Search:
         self.done = min(self.done + 1, self.ends)
         self.progress("hyper-parameters", self.done, self.total)
         point = torch.from_numpy(vector)
-        found = log_posterior(point, self.centre, self.data)
-        if found is None:
+        posterior = log_posterior(point, self.centre, self.data)
+        if posterior is None:
             return OBJECTIVE_OF_FAILURE, np.zeros_like(vector)
-        value = found.likelihood + found.prior
+        value = posterior.likelihood + posterior.prior
         if value > self.best_value:
             self.best, self.best_value = self.centre.from_logarithms(point), value
-            self.best_likelihood = found.likelihood
-        return -value, -found.gradient.numpy()
+            self.best_likelihood = posterior.likelihood
+        return -value, -posterior.gradient.numpy()
 
 
 LARGEST_AMPLITUDE_RATIO = 3.0

@@ -199,8 +199,8 @@ class TangentData:
         if count == len(self.x):
             return torch.arange(count, device=self.x.device), self
         order = torch.randperm(len(self.x), generator=seeded(seed), device=HOST)
-        own = torch.nn.functional.one_hot(self.noise_model.row_kinds.to(HOST)[order])
-        turn = (own * own.cumsum(0)).sum(1)
+        kinds = torch.nn.functional.one_hot(self.noise_model.row_kinds.to(HOST)[order])
+        turn = (kinds * kinds.cumsum(0)).sum(1)
         order = order[turn.argsort(stable=True)]
         rows = order[:count].sort().values.to(self.x.device)
         return rows, self.rows(rows)
@@ -219,8 +219,8 @@ class TangentData:
 
     def with_position_errors(self, scales: Hyperparameters) -> TangentData:
         """Add gear lines and axes to the map, which add nothing yet."""
-        own = PositionErrors(tuple((line.joint, line.frequency) for line in scales.lines), scales.axes)
-        nominal = self.nominal.changed(own=own)
+        errors = PositionErrors(tuple((line.joint, line.frequency) for line in scales.lines), scales.axes)
+        nominal = self.nominal.changed(own=errors)
         theta = self.theta.new_zeros(nominal.parameters)
         theta[: nominal.sag.stop] = self.theta[: nominal.sag.stop]
         other = self._variant(nominal=nominal, theta=theta)
@@ -230,8 +230,8 @@ class TangentData:
     def _variant(self, share: Callable[[Tensor], Tensor] = lambda values: values, **changes: Any) -> TangentData:
         """A copy with changes, which takes over its share of the cached properties."""
         other = replace(self, **changes)
-        known = (name for name in LINEARISED if vars(self).get(name) is not None)
-        vars(other).update({name: share(vars(self)[name]) for name in known})
+        names = (name for name in LINEARISED if vars(self).get(name) is not None)
+        vars(other).update({name: share(vars(self)[name]) for name in names})
         return other
 
     # --- the model with given scales ---
@@ -279,24 +279,24 @@ class TangentData:
         if self.beside is None:
             return NoiseModel.alike(len(whole), whole.shape[1] // 3).typical(scales, whole, freedom)
         # tails of the rows beside are those of the geometric calibration
-        known = replace(self.beside, tails=self.tails).noise_of_any_row(scales)
+        markers = replace(self.beside, tails=self.tails).noise_of_any_row(scales)
         ball = NoiseModel.alike(len(whole), 1).typical(scales, whole[:, -3:], freedom)
-        return known if len(known) == whole.shape[1] else torch.block_diag(known, ball)
+        return markers if len(markers) == whole.shape[1] else torch.block_diag(markers, ball)
 
     def noise_of_new_rows(self, scales: Hyperparameters) -> Tensor:
         """(N, m, m) covariance of new measurements like these rows, m^2, as predictions have it.
 
         Rows with known deviations keep their own: the mean over images, say, is the noise of none of them.
         """
-        own = self.noise(scales)
+        noise = self.noise(scales)
         if self.observe is not None or self.noise_model.stated:
-            return own * region_factor(self.tails.freedom, int(self.noise_model.freedom.max()))
-        return without_hidden(self.noise_of_any_row(scales).expand_as(own), self.visible)
+            return noise * region_factor(self.tails.freedom, int(self.noise_model.freedom.max()))
+        return without_hidden(self.noise_of_any_row(scales).expand_as(noise), self.visible)
 
     def numbers(self, scales: Hyperparameters) -> Numbers:
         """All that the rows tell; the shifts that they share are the last unknowns."""
 
-        def told() -> Numbers:
+        def computed() -> Numbers:
             S, at = self.motions_in_numbers(self.sensitivities), self.linearisation(scales)
             at = at if self.basis is None else replace(at.projected(self.basis.mT), sensitivity=S)
             shown = self.visible
@@ -304,7 +304,7 @@ class TangentData:
                 shown = self.noise_model.seen.repeat_interleave(self.size // self.noise_model.bodies, 1)
             return Numbers.of(at.with_columns(self.in_numbers(self.shared), S.shape[2]), self.target, shown)
 
-        return self._kept("_numbers", scales, told)
+        return self._kept("_numbers", scales, computed)
 
     @cached_property
     def pairs(self) -> Pairs:

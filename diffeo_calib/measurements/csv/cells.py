@@ -89,7 +89,7 @@ def _near(missing: Sequence[str], free: Sequence[str]) -> str:
     hints = []
     for name in [name for name in missing[:MOST_NAMES] if len(name) <= LONGEST_NAME]:
         near = difflib.get_close_matches(re.sub("joint|_", "", name.lower()) or name, names, n=2)
-        hints += [f"for '{shown(name)}', did you mean {' or '.join(shown(names[one]) for one in near)}"] * bool(near)
+        hints += [f"for '{shown(name)}', did you mean {' or '.join(shown(names[key]) for key in near)}"] * bool(near)
     return "; ".join(hints) if hints else "pass the names as written in the header"
 
 
@@ -103,11 +103,11 @@ def numbers_in(texts: Sequence[str], decimal: str, *, whole: bool = True) -> lis
         with suppress(ValueError):
             return [float(text) for text in plain]
     grouped = any(_GROUP[decimal] in text and number(text, decimal) is not None for text in texts)
-    found = [number(text, decimal, grouped=grouped) for text in texts]
-    if whole and None in found and any(number(text, decimal, grouped=True) is None for text in texts):
+    values = [number(text, decimal, grouped=grouped) for text in texts]
+    if whole and None in values and any(number(text, decimal, grouped=True) is None for text in texts):
         other = [number(text, _GROUP[decimal]) for text in texts]
-        return found if None in other else other
-    return found
+        return values if None in other else other
+    return values
 
 
 _GROUP = {".": ",", ",": "."}
@@ -131,8 +131,8 @@ def number(text: str, decimal: str, *, grouped: bool = False) -> float | None:
     for mark in (_GROUP[decimal], "'", " "):
         if mark in text:
             pattern = rf"[+-]?[1-9]\d{{0,2}}((?:{re.escape(mark)}\d{{3}})+)({re.escape(decimal)}\d*)?"
-            found = re.fullmatch(pattern, text, re.ASCII)
-            if found and (mark != _GROUP[decimal] or found[2] or len(found[1]) > 4 or grouped):
+            matched = re.fullmatch(pattern, text, re.ASCII)
+            if matched and (mark != _GROUP[decimal] or matched[2] or len(matched[1]) > 4 or grouped):
                 text = text.replace(mark, "")
     if decimal != ".":
         text = text.replace(".", "?").replace(decimal, ".")  # a point is not part of a number here

@@ -66,7 +66,7 @@ class Body(NamedTuple):
     @property
     def values(self) -> list[Column]:
         """Those that hold no deviations; deviations where there are no others."""
-        return [one for one in self.columns if one.check != DEVIATION] or [*self.columns]
+        return [column for column in self.columns if column.check != DEVIATION] or [*self.columns]
 
 
 @dataclass(frozen=True)
@@ -94,14 +94,14 @@ class Columns:
             raise MeasurementError.of(what, got="joints that are all taken as revolute", fix=fix)
         for name, column in table.beside.items():
             column_names(name, [column], "the name of a column", (1,))
-        given, found = table.joints, list[Column]()
+        given, others = table.joints, list[Column]()
         for sensor in sensors:
-            own = [column for body in sensor.bodies(table) for column in body.columns]
-            found += [one for one in own if one not in found or one.check != DEVIATION]  # kinds may share deviations
+            new = [column for body in sensor.bodies(table) for column in body.columns]
+            others += [one for one in new if one not in others or one.check != DEVIATION]  # kinds may share deviations
         read = replace(given, angle=table.angle) if isinstance(given, PoseColumns) else JointExpressions.of(names)
         checks = {"payload": MASS}
         beside = (Column(column.strip(), check=checks.get(name)) for name, column in table.beside.items())
-        columns = cls(table, read, prismatic, kinds_known, (*found, *beside), sensors)
+        columns = cls(table, read, prismatic, kinds_known, (*others, *beside), sensors)
         if twice := repeated(columns.names) or repeated(names):
             markers = len(table.triples)
             what = "`joints`" + " and `position`" * bool(markers)
@@ -131,21 +131,21 @@ class Columns:
     @property
     def hideable(self) -> list[Body]:
         """The columns of every body that lines may leave empty, markers and frames first."""
-        some = [body for one in self.sensors if self.all_hidden or one.hidden for body in one.bodies(self.table)]
-        read = ([one for one in body.columns if one in self.numbers] for body in some)
-        return [Body(own, body.word) for body, own in zip(some, read, strict=True) if own and body.word]
+        some = [body for kind in self.sensors if self.all_hidden or kind.hidden for body in kind.bodies(self.table)]
+        read = ([column for column in body.columns if column in self.numbers] for body in some)
+        return [Body(columns, body.word) for body, columns in zip(some, read, strict=True) if columns and body.word]
 
     def places(self, some: Sequence[Column]) -> list[int]:
         """Their places among all columns."""
-        return [len(self.joints.columns) + self.numbers.index(one) for one in some]
+        return [len(self.joints.columns) + self.numbers.index(column) for column in some]
 
     def cells(self, q: Tensor, numbers: Mapping[str, Tensor]) -> dict[str, list[float]]:
         """The cells of columns by name, of joint values (N, n) and of numbers (N,) by their columns, in SI."""
         joints = zip(self.joints.columns, self.joints_from_si(q).T.tolist(), strict=True)
-        found = {
+        cells = {
             one.name: (numbers[one.name].cpu() * one.per_si).tolist() for one in self.numbers if one.name in numbers
         }
-        return dict(joints) | found
+        return dict(joints) | cells
 
     def joints_from_si(self, q: Tensor) -> Tensor:
         """Joint values (N, n) in rad and m as the cells (N, c) of their columns, in the file's units."""
@@ -161,12 +161,12 @@ class Columns:
         """Sentences about values (N, c), in the file's units, that look as if they were in another unit."""
         count, table, plain = len(self.joints.columns), self.table, self.joints.plain
         q = self.joints.values(raw[:, :count])[:, plain] if bool(plain.any()) else raw[:, :0]
-        slide, known = self.prismatic[plain], self.kinds_known
-        sentences = unlikely_units("angles", q[:, ~slide], table.angle, "angle", kinds_known=known)
+        slide, given = self.prismatic[plain], self.kinds_known
+        sentences = unlikely_units("angles", q[:, ~slide], table.angle, "angle", kinds_known=given)
         sentences += unlikely_units("prismatic joints", q[:, slide], table.joint_unit, "joint_length")
         for what, option in (("positions", "length"), ("rotations", "rotation_angle")):
-            own = [one for one in self.numbers if one.what == what]
-            sentences += unlikely_units(what, raw[:, self.places(own)], str(own[0].unit), option) if own else []
+            alike = [column for column in self.numbers if column.what == what]
+            sentences += unlikely_units(what, raw[:, self.places(alike)], str(alike[0].unit), option) if alike else []
         return sentences
 
 
@@ -191,13 +191,13 @@ def _joint_columns(joints: Any, kinds: Sequence[str] | None) -> tuple[tuple[str,
     ):
         expected, fix = "names of columns, or a robot", "pass a list such as ['q1', 'q2'], in the robot's order"
         raise MeasurementError.of("`joints`", expected=expected, got=as_written(joints), fix=fix)
-    known = kinds is not None
-    kinds = list(kinds) if known else ["revolute"] * len(joints)
+    given = kinds is not None
+    kinds = list(kinds) if given else ["revolute"] * len(joints)
     if len(kinds) != len(joints):
         expected = f"{len(kinds)} columns of joints, one for each of `kinds`"
         fix = "name a column for every joint of the robot, in its order"
         raise MeasurementError.of("`joints`", expected=expected, got=f"{len(joints)} ({listed(joints)})", fix=fix)
     for kind in kinds:
-        check_choice("kinds", kind, [known for known in KINDS if known != "fixed"])
+        check_choice("kinds", kind, [allowed for allowed in KINDS if allowed != "fixed"])
     prismatic = torch.tensor([kind == "prismatic" for kind in kinds], dtype=torch.bool, device=HOST)
-    return tuple(name.strip() for name in joints), prismatic, known
+    return tuple(name.strip() for name in joints), prismatic, given

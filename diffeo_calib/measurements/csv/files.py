@@ -71,9 +71,9 @@ def read_observations(
     rows, alone = read_table(file, columns, zeros=not growing), len(columns.sensors) == 1
     tables = []
     for sensor, here in _divided(rows):
-        found, own = sensor.table(here)
-        found = found.with_line_numbers(own.lines).with_payload(own.beside.get("payload"))
-        tables.append(found.with_covariates(**{name: own.beside.get(name) for name in ("time", "temperature")}))
+        part, first = sensor.table(here)
+        part = part.with_line_numbers(first.lines).with_payload(first.beside.get("payload"))
+        tables.append(part.with_covariates(**{name: first.beside.get(name) for name in ("time", "temperature")}))
     data = tables[0] if alone else joined_tables(tables)
     data = data if alone else data.rows(data.line_numbers.argsort(stable=True))
     data = data.with_columns(file_sha256=rows.sha256)
@@ -165,12 +165,12 @@ def read_measurements(
     Warns:
         DiffeoCalibWarning: values that look as if they were in another unit; rows dropped; what was skipped.
     """
-    known = {name: columns.pop(name, None) for name in ("socket", "distances", "distance_std")}
-    sockets, socket, on = None, known.pop("socket"), columns.get("on")
+    options = {name: columns.pop(name, None) for name in ("socket", "distances", "distance_std")}
+    sockets, socket, on = None, options.pop("socket"), columns.get("on")
     if socket is not None:
         tip = None if not on or isinstance(on, str) else on[-1]
-        sockets = SocketColumns((socket,) if isinstance(socket, str) else tuple(socket), **known, on=tip)
-    elif any(value is not None for value in known.values()):
+        sockets = SocketColumns((socket,) if isinstance(socket, str) else tuple(socket), **options, on=tip)
+    elif any(value is not None for value in options.values()):
         raise MeasurementError.of("`distances` without `socket`", fix="name the columns of the sockets too")
     table = TableFormat(length, angle, **columns, joints=robot, position=position, sockets=sockets)
     if joints is None:
@@ -247,17 +247,17 @@ def write_predictions(
     table = replace(table, std=[f"{prefix}std_{axis}" for prefix in prefixes for axis in "xyz"])
     table = table.for_writing(rotation_std=True, prefixes=prefixes) if poses else table
     numeric = columns_of(table)
-    own: PositionColumns = numeric.sensors[0]
-    of_bodies = [name for body in own.each for k in (0, 2, 1, 3) for name in body[k]]
+    sensor: PositionColumns = numeric.sensors[0]
+    of_bodies = [name for body in sensor.each for k in (0, 2, 1, 3) for name in body[k]]
     names = [*numeric.joints.columns, *of_bodies]
 
     def rows(q: Tensor, mean: Tensor, deviations: Tensor, *others: Tensor) -> Cells:
         frames, spreads = by_frame(mean) if poses else None, deviations.reshape(len(q), len(prefixes), -1)
         places, turns = (mean, None) if frames is None else (frames[..., :3, 3], spreads[..., 3:])
-        cells = numeric.cells(q, own.numbers(places, frames, spreads[..., :3], turns))
+        cells = numeric.cells(q, sensor.numbers(places, frames, spreads[..., :3], turns))
         beside = torch.cat(others, 1).tolist() if others else [[]] * len(q)
         lines = zip(*(cells[name] for name in names), strict=True)
-        return [[*line, *own] for line, own in zip(lines, beside, strict=True)]
+        return [[*line, *extra] for line, extra in zip(lines, beside, strict=True)]
 
     write_rows(path, [*names, *more], (rows(*block) for block in blocks), table)
 
@@ -302,26 +302,26 @@ def write_measurements(path: str | PathLike[str], data: Any, table: TableFormat,
     numeric = columns_of(table)
     check_count("joint columns", numeric.joints.texts, whole.n, "joint")
     sockets = () if table.sockets is None else table.sockets.names
-    images = [IMAGE, CAMERA] * any(isinstance(one, ImageColumns) for one in table.readings)
-    sessions = {table.session, *(one.device for one in table.readings)} - {None}
+    images = [IMAGE, CAMERA] * any(isinstance(reading, ImageColumns) for reading in table.readings)
+    sessions = {table.session, *(reading.device for reading in table.readings)} - {None}
     twice = repeated([*numeric.names, *sockets, *images, *sessions])
     if twice:
         what, fix, got = "the names of the columns", "rename the joints or positions", f"{listed(twice)} twice"
         raise MeasurementError.of(what, expected="distinct names", got=got, fix=fix)
-    found: list[tuple[int, dict[str, float | str]]] = []
+    written: list[tuple[int, dict[str, float | str]]] = []
     for part, rows, sensor in zip(whole.parts, whole.index, kinds, strict=True):
         numbers, texts, lines = sensor.written(part, table)
         beside = part.drifting | ({} if part.payload is None else {"payload": part.payload})
-        numbers |= {getattr(table, name): own[lines.to(own.device)] for name, own in beside.items()}
+        numbers |= {getattr(table, name): values[lines.to(values.device)] for name, values in beside.items()}
         cells = {**numeric.cells(part.q[lines.to(part.q.device)], numbers), **texts}
         each = [dict(zip(cells, line, strict=True)) for line in zip(*cells.values(), strict=True)]
-        found += zip(rows[lines].tolist(), each, strict=True)
-    there = {name for _, cells in found for name in cells}
+        written += zip(rows[lines].tolist(), each, strict=True)
+    there = {name for _, cells in written for name in cells}
     if empty := [name for name in numeric.names if name not in there]:
         what, got = f"the column(s) {listed(empty)}", "measurements without these values"
         raise MeasurementError.of(what, got=got, fix="leave the names out")
     header = [name for name in (*numeric.names, *numeric.texts) if name in there]
-    in_order = sorted(found, key=lambda line: line[0])
+    in_order = sorted(written, key=lambda line: line[0])
     write_rows(path, header, [[[cells.get(name, "") for name in header] for _, cells in in_order]], table)
     return table
 
@@ -358,28 +358,28 @@ def _sheet(whole: Observations, table: TableFormat) -> tuple[TableFormat, list[A
             std = table.std or [f"std_{name}" for triple in triples for name in triple]
             check_count("columns of standard deviations", flat_names(std), 3 * len(triples), "coordinate")
             table = replace(table, std=std)
-    known = [*whole.covariate_names, *["payload"] * (whole.payload is not None)]
-    beside = {name: getattr(table, name) or name for name in known}
-    own = session if device is not None and device.session is not None else None
+    fields = [*whole.covariate_names, *["payload"] * (whole.payload is not None)]
+    beside = {name: getattr(table, name) or name for name in fields}
+    column = session if device is not None and device.session is not None else None
     others = _others(whole, session)
-    sockets = next((one for one in others if isinstance(one, SocketColumns)), None)
-    readings = tuple(one for one in others if one not in (None, sockets))
-    table = replace(table, **beside, sockets=sockets, readings=readings, session=own)
-    return table, [one or PositionColumns(table.for_reading()) for one in others]
+    sockets = next((other for other in others if isinstance(other, SocketColumns)), None)
+    readings = tuple(other for other in others if other not in (None, sockets))
+    table = replace(table, **beside, sockets=sockets, readings=readings, session=column)
+    return table, [other or PositionColumns(table.for_reading()) for other in others]
 
 
 def _others(whole: Observations, session: str | None) -> list[Any]:
     """The columns of each part, None for positions and poses; those of a second part of a kind with a number."""
-    found, taken = list[Any](), list[str]()
+    columns, taken = list[Any](), list[str]()
     for part in whole.parts:
         if "corners" in part.columns:
-            found.append(ImageColumns.of(part, session))
+            columns.append(ImageColumns.of(part, session))
         elif part.kind == "socket":
             sockets = part.sockets  # a reader finds these alone
             distances = {(sockets.names[a], sockets.names[b]): length for a, b, length in sockets.distances}
-            found.append(SocketColumns((SOCKET,), distances or None, sockets.distance_std, part.ball_tip))
+            columns.append(SocketColumns((SOCKET,), distances or None, sockets.distance_std, part.ball_tip))
         elif part.kind in ("position", "pose"):
-            found.append(None)
+            columns.append(None)
         else:
             taken.append(part.value_names[0])
             number = "" if (count := taken.count(taken[-1])) == 1 else str(count)
@@ -387,5 +387,5 @@ def _others(whole: Observations, session: str | None) -> list[Any]:
             std = () if part.std is None else tuple(f"std_{name}" for name in names)
             lens = part.intrinsics if part.kind == "image" else None
             how = {"intrinsics": lens, "std": std, "on": part.on, "unit": part.unit}
-            found.append(ReadingColumns(part.kind, names, session, part.offset_std, **how))
-    return found
+            columns.append(ReadingColumns(part.kind, names, session, part.offset_std, **how))
+    return columns

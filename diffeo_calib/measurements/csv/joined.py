@@ -96,44 +96,44 @@ def joined_file(
     of the files is found by it. ``several``: whether lines of places may share their joint values, as those of markers
     do. MeasurementError for a file that cannot be read or lacks the column, several partners of a line, or no pair.
     """
-    own, _, other = by.partition("=")
-    tables = table, measured = _Table.read(joints, own, sep), _Table.read(places, other or own, sep)
-    times, common = [own.numbers(own.by, decimal) for own in tables], {*table.keys} & {*measured.keys} - {""}
-    timed = all(len(own) > 1 and np.isfinite(own).all() for own in times)
-    if timed and all((np.diff(own) > 0).all() and np.median(np.diff(own)) < LIMITS.window for own in times):
-        one, other = (_motion(own, at, decimal) for own, at in zip(tables, times, strict=True))  # of two clocks
+    column, _, other = by.partition("=")
+    tables = table, measured = _Table.read(joints, column, sep), _Table.read(places, other or column, sep)
+    times, common = [file.numbers(file.by, decimal) for file in tables], {*table.keys} & {*measured.keys} - {""}
+    timed = all(len(clock) > 1 and np.isfinite(clock).all() for clock in times)
+    if timed and all((np.diff(clock) > 0).all() and np.median(np.diff(clock)) < LIMITS.window for clock in times):
+        one, other = (_motion(file, at, decimal) for file, at in zip(tables, times, strict=True))  # of two clocks
         rests, offset = stops(one, Recording(other.times, other.values[:, :3]), StopLimits(joints=1.0, seen=1.0))
         pairs = [(_nearest(times[0], stop.time), _nearest(times[1], stop.time - offset)) for stop in rests]
         how = f"at the middle of every stop, {offset:+.2f} s added to the times of {places.name}"
     elif timed and 2 * len(common) < len({*measured.keys}):
         pairs, how = _by_time(*times)
     else:
-        known = dict[str, list[int]]()
+        by_text = dict[str, list[int]]()
         for row, text in enumerate(table.keys):
             if text:
-                known.setdefault(text, []).append(row)
-        pairs, how = [(row, at) for at, text in enumerate(measured.keys) for row in known.get(text, ())], f"by {by}"
+                by_text.setdefault(text, []).append(row)
+        pairs, how = [(row, at) for at, text in enumerate(measured.keys) for row in by_text.get(text, ())], f"by {by}"
     without = [
-        f"{len(rows)} of {own.path.name} ({few([own.keys[row] for row in rows])})"
-        for k, own in enumerate(tables)
-        if (rows := sorted({*range(len(own.keys))} - {pair[k] for pair in pairs}))
+        f"{len(rows)} of {file.path.name} ({few([file.keys[row] for row in rows])})"
+        for k, file in enumerate(tables)
+        if (rows := sorted({*range(len(file.keys))} - {pair[k] for pair in pairs}))
     ]
     if not pairs:
         fix = "name a column with the same texts in both files, or with times of one clock"
         expected, got = "values that both files have", " and ".join(without)
         raise MeasurementError.of(f"--by {shown(by)}", expected=expected, got=got, fix=fix)
     _refuse_several(tables, pairs, several=several)
-    found = HeldFile(places)
-    found.content = _written(tables, pairs, sep)
-    found.words = f"{places}, joined with {joints}"
-    found.sentence = f"{len(pairs)} lines of {places.name} are joined with lines of {joints.name} {how}"
-    found.sentence += f"; lines without a partner: {' and '.join(without)}" * bool(without)
-    return found
+    joined = HeldFile(places)
+    joined.content = _written(tables, pairs, sep)
+    joined.words = f"{places}, joined with {joints}"
+    joined.sentence = f"{len(pairs)} lines of {places.name} are joined with lines of {joints.name} {how}"
+    joined.sentence += f"; lines without a partner: {' and '.join(without)}" * bool(without)
+    return joined
 
 
 def _by_time(joints: Array, places: Array) -> tuple[Pairs, str]:
     """Times (N,) and (M,) that are the nearest to each other, within half a step; and in words."""
-    step = min(float(np.median(np.diff(np.sort(own)))) for own in (joints, places))
+    step = min(float(np.median(np.diff(np.sort(times)))) for times in (joints, places))
     if len(joints) == len(places):
         away = joints - places
         offset, spread = float(np.median(away)), float(np.ptp(away))
@@ -143,7 +143,7 @@ def _by_time(joints: Array, places: Array) -> tuple[Pairs, str]:
             return list(zip(every, every, strict=True)), f"by time, {offset:+.2f} added to those of the places"
     nearest = [(_nearest(joints, at), place) for place, at in enumerate(places)]
     apart = {pair: float(abs(joints[pair[0]] - places[pair[1]])) for pair in nearest}
-    pairs = [one for one in nearest if apart[one] < 0.5 * step and _nearest(places, joints[one[0]]) == one[1]]
+    pairs = [match for match in nearest if apart[match] < 0.5 * step and _nearest(places, joints[match[0]]) == match[1]]
     return pairs, f"by the nearest time, at most {max((apart[pair] for pair in pairs), default=0.0):.3g} apart"
 
 
@@ -151,13 +151,13 @@ def _nearest(times: Array, time: float) -> int:
     return int(np.abs(times - time).argmin())
 
 
-def _motion(own: _Table, times: Array, decimal: str) -> Recording:
+def _motion(table: _Table, times: Array, decimal: str) -> Recording:
     """The columns of numbers that do not always grow, in units of what is no motion; the clearest ones first."""
-    columns = [own.numbers(name, decimal) for name in own.sheet.header if name != own.by]
+    columns = [table.numbers(name, decimal) for name in table.sheet.header if name != table.by]
     moving = [v for v in columns if np.isfinite(v).all() and np.ptp(v) > 0.0 and not (np.diff(v) > 0).all()]
     if not moving:
         fix = "join the files by names, or remove the lines with empty cells"
-        raise MeasurementError.of(f"file '{own.path}'", expected="columns of numbers that move and rest", fix=fix)
+        raise MeasurementError.of(f"file '{table.path}'", expected="columns of numbers that move and rest", fix=fix)
     scaled = [v / max(MOVED * np.ptp(v), NOISE_FACTOR * Recording(times, v[:, None]).noise) for v in moving]
     return Recording(times, np.stack(sorted(scaled, key=np.ptp, reverse=True), axis=1))
 
@@ -167,11 +167,11 @@ def _refuse_several(tables: Sequence[_Table], pairs: Pairs, *, several: bool) ->
     for k in (1,) if several else (0, 1):
         row, count = Counter(pair[k] for pair in pairs).most_common(1)[0]
         if count > 1:
-            own, other = tables[k], tables[1 - k]
+            table, other = tables[k], tables[1 - k]
             lines = [other.sheet.rows[pair[1 - k]][0] for pair in pairs if pair[k] == row]
             fix = "remove the lines that do not belong there"
             fix += "; if they are of several markers, name the column of these (--marker)" * (k == 0)
-            what = f"file '{own.path}', line {own.sheet.rows[row][0]}, {own.by} {shown(own.keys[row])}"
+            what = f"file '{table.path}', line {table.sheet.rows[row][0]}, {table.by} {shown(table.keys[row])}"
             raise MeasurementError.of(
                 what, expected="one partner", got=f"lines {few(lines)} of '{other.path}'", fix=fix
             )
@@ -183,8 +183,8 @@ def _written(tables: Sequence[_Table], pairs: Pairs, sep: str) -> bytes:
     twice = {*table.header} & {*measured.header}
     names = [
         f"{of}.{name}" if name in twice else name
-        for of, own in zip(("joints", "places"), (table, measured), strict=True)
-        for name in own.header
+        for of, sheet in zip(("joints", "places"), (table, measured), strict=True)
+        for name in sheet.header
     ]
     lines = {1: names}
     for row, place in pairs:
@@ -233,8 +233,8 @@ class Recording:
         """(T,) whether no value changes by more than the tolerance within a window around each time."""
         first = np.searchsorted(self.times, self.times - 0.5 * window, "left")
         last = np.searchsorted(self.times, self.times + 0.5 * window, "right")
-        found = [np.ptp(self.values[a:b], axis=0).max() for a, b in zip(first, last, strict=True)]
-        return np.array(found) <= tolerance
+        ranges = [np.ptp(self.values[a:b], axis=0).max() for a, b in zip(first, last, strict=True)]
+        return np.array(ranges) <= tolerance
 
     def at(self, times: Array) -> Array:
         """Values (T, d) at other times, s."""
@@ -258,44 +258,44 @@ class Stop:
 
 
 def stops(
-    joints: Recording, seen: Recording, limits: StopLimits = LIMITS, offset: float | None = None
+    joints: Recording, measured: Recording, limits: StopLimits = LIMITS, offset: float | None = None
 ) -> tuple[list[Stop], float]:
-    """Stops in two recordings, in order, and the seconds to add to the times of ``seen``, estimated by default.
+    """Stops in two recordings, in order, and the seconds to add to the times of ``measured``, estimated by default.
 
-    The first three columns of ``seen`` are places, which tell whether it moves.
+    The first three columns of ``measured`` are places, which tell whether it moves.
 
     Raises:
         MeasurementError: recordings of different times, too few motions to tell the offset, or no stop.
     """
-    _check_times(joints, seen.times + (offset or 0.0), limits.offset if offset is None else 0.0)
-    places = Recording(seen.times, seen.values[:, :3])
+    _check_times(joints, measured.times + (offset or 0.0), limits.offset if offset is None else 0.0)
+    places = Recording(measured.times, measured.values[:, :3])
     rests = joints.still(limits.joints, limits.window)
     tolerance = max(limits.seen, NOISE_FACTOR * places.noise)
     resting = places.still(tolerance, limits.window)
     if offset is None:
-        offset = _offset((joints.times, rests), (seen.times, resting), limits.offset)
-    times = seen.times + offset
-    found = []
+        offset = _offset((joints.times, rests), (measured.times, resting), limits.offset)
+    times = measured.times + offset
+    at_stops = []
     for begin, end in _both(joints.times, rests, times, resting, limits):
         here, there = (joints.times >= begin) & (joints.times <= end), (times >= begin) & (times <= end)
         if here.any() and there.sum() > 1:
-            values = seen.values[there]
+            values = measured.values[there]
             middle = 0.5 * (begin + end), joints.values[here].mean(0), values.mean(0)
-            found.append(Stop(*middle, values.std(0, ddof=1), len(values)))
-    if not found:
+            at_stops.append(Stop(*middle, values.std(0, ddof=1), len(values)))
+    if not at_stops:
         fix = "record for longer, allow larger motions, or leave out joints that never rest"
         raise MeasurementError.of("stops", expected="some", got="none in which both recordings stand still", fix=fix)
-    return found, offset
+    return at_stops, offset
 
 
-def rows_of(names: Sequence[str], found: Sequence[Stop]) -> list[dict[str, float]]:
+def rows_of(names: Sequence[str], at_stops: Sequence[Stop]) -> list[dict[str, float]]:
     """The rows of stops: column -> value, in s, m and rad; without rotations that never change: none were measured."""
-    rows, changes = [], (np.ptp([one.seen[3:] for one in found], axis=0) > SAME_TURN).any()
-    for one in found:
-        turn = one.seen[3:] / np.linalg.norm(one.seen[3:]) if changes else one.seen[:0]
+    rows, changes = [], (np.ptp([stop.seen[3:] for stop in at_stops], axis=0) > SAME_TURN).any()
+    for stop in at_stops:
+        turn = stop.seen[3:] / np.linalg.norm(stop.seen[3:]) if changes else stop.seen[:0]
         columns = ["time", *names, *PLACE, *TURN[: len(turn)], *(f"std_{axis}" for axis in PLACE), "readings"]
-        numbers = [one.time, *one.joints, *one.seen[:3], *turn, *one.deviations[:3]]
-        rows.append(dict(zip(columns, [*map(float, numbers), one.count], strict=True)))
+        numbers = [stop.time, *stop.joints, *stop.seen[:3], *turn, *stop.deviations[:3]]
+        rows.append(dict(zip(columns, [*map(float, numbers), stop.count], strict=True)))
     return rows
 
 
@@ -310,18 +310,18 @@ def pictured(
         MeasurementError: recordings of different times, or no stop with an image.
     """
     _check_times(joints, times + offset, 0.0)
-    rests, found, without = joints.still(limits.joints, limits.window), [], 0
+    rests, pictures, without = joints.still(limits.joints, limits.window), [], 0
     for begin, end in _both(joints.times, rests, joints.times, rests, limits):
         nearest = np.abs(times + offset - 0.5 * (begin + end)).argmin()
         if begin <= times[nearest] + offset <= end:
             here = (joints.times >= begin) & (joints.times <= end)
-            found.append((joints.values[here].mean(0), float(times[nearest])))
+            pictures.append((joints.values[here].mean(0), float(times[nearest])))
         else:
             without += 1
-    if not found:
+    if not pictures:
         got = f"{without} stops, all without an image"
         raise MeasurementError.of("stops with an image", expected="some", got=got, fix="check the offset of the clocks")
-    return found, without
+    return pictures, without
 
 
 def _check_times(joints: Recording, times: Array, tolerance: float) -> None:
@@ -333,11 +333,11 @@ def _check_times(joints: Recording, times: Array, tolerance: float) -> None:
         raise MeasurementError.of("the times of what was seen", expected=expected, got=got, fix=fix)
 
 
-def _offset(joints: tuple[Array, Array], seen: tuple[Array, Array], largest: float) -> float:
+def _offset(joints: tuple[Array, Array], measured: tuple[Array, Array], largest: float) -> float:
     """Seconds to add to the times of the second recording so that both rest together."""
-    begin = min(joints[0][0], seen[0][0]) - largest
-    grid = np.arange(begin, max(joints[0][-1], seen[0][-1]) + largest, STEP_S)
-    one, other = (_on(grid, *part) for part in (joints, seen))
+    begin = min(joints[0][0], measured[0][0]) - largest
+    grid = np.arange(begin, max(joints[0][-1], measured[0][-1]) + largest, STEP_S)
+    one, other = (_on(grid, *part) for part in (joints, measured))
     if min(np.count_nonzero(np.diff(part)) for part in (one, other)) < FEWEST_CHANGES:
         fix = "let the robot move between stops while both are recorded, or give the offset"
         raise MeasurementError.of("the offset between the clocks", expected="several motions and stops", fix=fix)

@@ -198,8 +198,8 @@ class PoseColumns:
         if self.robot is None or not self.convention:
             return values
         q = torch.cat([values[:, :3], values[:, 3:].deg2rad() if self.angle == "deg" else values[:, 3:]], 1)
-        known = q.isfinite().all(1, keepdim=True)
-        poses = self.robot(q.where(known, 0.0)).masked_fill(~known[..., None], torch.nan)
+        finite = q.isfinite().all(1, keepdim=True)
+        poses = self.robot(q.where(finite, 0.0)).masked_fill(~finite[..., None], torch.nan)
         turns = rotation_numbers(poses[:, :3, :3], self.convention, angle=self.angle)
         return torch.cat([poses[:, :3, 3], turns], 1)
 
@@ -211,19 +211,19 @@ def _made(program: str, cells: Tensor) -> Tensor:
     if function is None:
         raise MeasurementError.of(f"the file '{path}'", expected=f"a function {name}", got="none of this name")
     try:
-        found = torch.as_tensor(function(cells), dtype=cells.dtype, device=cells.device)
+        output = torch.as_tensor(function(cells), dtype=cells.dtype, device=cells.device)
     except Exception as error:
         raise MeasurementError.of(f"{program} of {len(cells)} rows", got=f"{type(error).__name__}: {error}") from error
-    places = found.ndim == 2 and 1 <= found.shape[1] <= 3
-    if found.ndim == 0 or len(found) != len(cells) or not (places or found.shape[1:] == (4, 4)):
+    places = output.ndim == 2 and 1 <= output.shape[1] <= 3
+    if output.ndim == 0 or len(output) != len(cells) or not (places or output.shape[1:] == (4, 4)):
         expected = f"places ({len(cells)}, k) with k = 1, 2 or 3, or poses ({len(cells)}, 4, 4)"
-        raise MeasurementError.of(f"what {program} returns", expected=expected, got=str(tuple(found.shape)))
-    lost = (~found.isfinite().flatten(1).all(1)).nonzero()[:, 0].tolist()
+        raise MeasurementError.of(f"what {program} returns", expected=expected, got=str(tuple(output.shape)))
+    lost = (~output.isfinite().flatten(1).all(1)).nonzero()[:, 0].tolist()
     if lost:
         fix = "leave these rows out, or check the unit of their columns"
         what = f"what {program} returns of row {few(lost)}"
         raise MeasurementError.of(what, expected="finite numbers", got="NaN or infinity", fix=fix)
-    return found
+    return output
 
 
 @cache

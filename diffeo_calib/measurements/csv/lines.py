@@ -120,9 +120,9 @@ class CsvLines:
             and not (self._commented and _is_comment(cells))
         ]
         first = [next(filter(None, cells)) for _, cells in kept]
-        last = [own for own in takewhile(bool, map(STATISTICS.fullmatch, reversed(first))) if own]
-        once = all(first.count(own[0]) == 1 for own in last)  # no name of a marker, or word of all rows
-        if once and len(last) < len(kept) and any(own[1] for own in last):
+        last = [match for match in takewhile(bool, map(STATISTICS.fullmatch, reversed(first))) if match]
+        once = all(first.count(match[0]) == 1 for match in last)  # no name of a marker, or word of all rows
+        if once and len(last) < len(kept) and any(match[1] for match in last):
             kept = kept[: len(kept) - len(last)]
         sizes = expected, expected + self._extra
         bad = [(line, len(cells)) for line, cells in kept if len(cells) not in sizes or any(cells[expected:])]
@@ -141,7 +141,7 @@ class CsvLines:
     def _cells(self) -> Iterator[tuple[int, list[str]]]:
         """Line number and stripped cells of every line that is not blank."""
         line, text = 0, io.StringIO(self._text, newline="")
-        texts = (re.sub(" +", " ", own.strip(" ")) for own in text) if self._aligned else text
+        texts = (re.sub(" +", " ", raw.strip(" ")) for raw in text) if self._aligned else text
         reader = csv.reader(texts, delimiter=self.sep, strict=True, skipinitialspace=self.sep != " ")
         try:
             for cells in reader:
@@ -310,31 +310,31 @@ def _joined(names: list[list[str]]) -> list[str]:
             line[k] = line[k] or line[k - 1]  # a name stands above the first of its columns alone
     for chosen in (*combinations(above, 1), *combinations(above, 2)):
         each = zip(*chosen, header, strict=False)
-        found = ["_".join(cells) if cells[-1] in twice else cells[-1] for cells in each]
-        if twice and not any(repeated(found)):
-            return found
+        joined = ["_".join(cells) if cells[-1] in twice else cells[-1] for cells in each]
+        if twice and not any(repeated(joined)):
+            return joined
     return header
 
 
 def _items(text: str) -> list[str]:
     """The items of a list in one cell; none of another cell, or where commas may be decimal marks."""
-    found = LIST.fullmatch(text)
-    if found and "." not in text and re.search(r"\d,\d", text) and re.search(r"\d *;|\d +[-+\d]", text):
+    matched = LIST.fullmatch(text)
+    if matched and "." not in text and re.search(r"\d,\d", text) and re.search(r"\d *;|\d +[-+\d]", text):
         return []
-    return re.findall(r"[^\s,;\[\]()'\"]+", re.sub(r"\w+\.\w+\(([^()]*)\)", r"\1", found[1])) if found else []
+    return re.findall(r"[^\s,;\[\]()'\"]+", re.sub(r"\w+\.\w+\(([^()]*)\)", r"\1", matched[1])) if matched else []
 
 
 def _lists(lines: Lines) -> dict[int, tuple[int, ...]]:
     """Shapes of the lists that most lines hold in a place."""
-    found = dict[int, tuple[int, ...]]()
+    shapes = dict[int, tuple[int, ...]]()
     for place in range(max((len(cells) for _, cells in lines), default=0)):
         texts = [cells[place] for _, cells in lines if len(cells) > place and cells[place]]
         counts = [len(_items(text)) for text in texts]
         count = max(filter(None, counts), key=counts.count, default=0)
         if count > 1 and 2 * counts.count(count) >= len(counts):  # a line of names, and at least one row
             rows = max(texts[counts.index(count)].count("[") - 1, 1)
-            found[place] = (rows, count // rows) if rows > 1 and count % rows == 0 else (count,)
-    return found
+            shapes[place] = (rows, count // rows) if rows > 1 and count % rows == 0 else (count,)
+    return shapes
 
 
 def _parts(cell: str, shape: tuple[int, ...] | None) -> list[str]:
@@ -384,14 +384,14 @@ def _value(text: str) -> bool:
 def _numbers(cells: Sequence[str]) -> int:
     """How many cells are numbers; 0 where they are less than half of those that are filled, or count the columns."""
     filled = [cell for cell in cells if number(cell, ".") is None or _value(cell)]
-    found = sum(map(_value, filled))
-    return 0 if _counted(cells) or 2 * found < len(filled) else found
+    count = sum(map(_value, filled))
+    return 0 if _counted(cells) or 2 * count < len(filled) else count
 
 
 def _counted(cells: Sequence[str]) -> bool:
     """Whether the numbers among some cells count joints or columns."""
-    found = [cell for cell in cells if _value(cell)]
-    return len(found) > 3 and found in ([str(k + first) for k in range(len(found))] for first in (0, 1))
+    numbers = [cell for cell in cells if _value(cell)]
+    return len(numbers) > 3 and numbers in ([str(k + first) for k in range(len(numbers))] for first in (0, 1))
 
 
 def write_rows(path: str | PathLike[str], names: Sequence[str], blocks: Iterable[Cells], table: TableFormat) -> None:
@@ -416,6 +416,6 @@ def write_columns(path: Path, sheet: TextTable, cells: Mapping[str, Column], tab
 
     ``cells``: name -> texts, or numbers in the units of the file, of which NaN is an empty cell.
     """
-    added = {name: own for name, own in cells.items() if name not in sheet.header}
+    added = {name: column for name, column in cells.items() if name not in sheet.header}
     kept = [cells.get(name, [row[k] for _, row in sheet.rows]) for k, name in enumerate(sheet.header)]
     write_rows(path, [*sheet.header, *added], [list(zip(*kept, *added.values(), strict=True))], table)

@@ -83,8 +83,8 @@ class PositionColumns(SensorColumns):
 
     @property
     def texts(self) -> Mapping[str, bool]:
-        own = self.form.session, self.form.marker and self.form.marker.partition("=")[0]
-        return {name: True for name in own if name is not None}
+        names = self.form.session, self.form.marker and self.form.marker.partition("=")[0]
+        return {name: True for name in names if name is not None}
 
     @cached_property
     def each(self) -> list[OfBody]:
@@ -107,12 +107,12 @@ class PositionColumns(SensorColumns):
             what = "`std` of a distance and two angles"
             raise MeasurementError.of(what, expected="one column for each marker", got=listed(std), fix=fix)
 
-        def own(names: Sequence[str], k: int) -> Sequence[str]:
+        def of_body(names: Sequence[str], k: int) -> Sequence[str]:
             each = len(names) // count
             return names[k * each : (k + 1) * each] if each else names
 
         every = flat_names(form.triples), turn, std or (), turn_std
-        return [OfBody(*(own(names, k) for names in every)) for k in range(count)]
+        return [OfBody(*(of_body(names, k) for names in every)) for k in range(count)]
 
     def bodies(self, table: TableFormat) -> list[Body]:
         """Deviations of all belong to none of several, nor does a coordinate that is 0 in all rows."""
@@ -125,28 +125,28 @@ class PositionColumns(SensorColumns):
             Column("", unit, DEVIATION),
         )
         each = [
-            [kind._replace(name=name) for names, kind in zip(own, kinds, strict=True) for name in names]
-            for own in self.each
+            [kind._replace(name=name) for names, kind in zip(body, kinds, strict=True) for name in names]
+            for body in self.each
         ]
         if form.spherical:
             unit = form.spherical.rpartition("_")[2]
-            each = [[own[0], *(Column(one.name, unit) for one in own[1:3]), *own[3:]] for own in each]
-        some = dict.fromkeys(one for own in each for one in own if one.check == DEVIATION or one.name == ZERO)
-        shared = [one for one in some if sum(one in own for own in each) > 1]
-        found = [Body([one for one in own if one not in shared], f"shows this {word}") for own in each]
-        return [*found, Body(shared, "")]
+            each = [[body[0], *(Column(column.name, unit) for column in body[1:3]), *body[3:]] for body in each]
+        some = dict.fromkeys(one for body in each for one in body if one.check == DEVIATION or one.name == ZERO)
+        shared = [column for column in some if sum(column in body for body in each) > 1]
+        bodies = [Body([column for column in body if column not in shared], f"shows this {word}") for body in each]
+        return [*bodies, Body(shared, "")]
 
     def filled(self, rows: FileRows) -> Tensor:
-        return torch.stack([~rows.numbers(own.place[:1]).isnan()[:, 0] for own in self.each]).any(0)
+        return torch.stack([~rows.numbers(body.place[:1]).isnan()[:, 0] for body in self.each]).any(0)
 
     def table(self, rows: FileRows) -> tuple[Measurements, FileRows]:
         """MeasurementError for numbers that do not form a rotation."""
         form, names, joints = self.form, None, rows.columns.joints.texts
-        places = (rows.numbers(own.place) for own in self.each)
-        points = torch.stack([torch.cat([own, 0.0 * own[:, : 3 - own.shape[1]]], 1) for own in places], 1)  # in a plane
+        places = (rows.numbers(body.place) for body in self.each)
+        points = torch.stack([torch.cat([xyz, 0.0 * xyz[:, : 3 - xyz.shape[1]]], 1) for xyz in places], 1)  # in a plane
         points = from_spherical(points, form.spherical) if form.spherical else points
         std, turn_std = (
-            torch.stack([rows.numbers(own[k]).expand(-1, 3) for own in self.each], 1) if self.each[0][k] else None
+            torch.stack([rows.numbers(body[k]).expand(-1, 3) for body in self.each], 1) if self.each[0][k] else None
             for k in (2, 3)
         )
         if form.marker is not None:
@@ -158,8 +158,8 @@ class PositionColumns(SensorColumns):
             data = Measurements(rows.q, points, joints, names, std=std, doubt=False)
         else:
             poses = of_frames(transforms_of_frames(self._rotations(rows, form.convention), points))
-            known = [own if own is None or len(self.each) > 1 else own[:, 0] for own in (std, turn_std)]
-            how = {"lever": form.lever, "position_std": known[0], "rotation_std": known[1]}
+            spreads = [spread if spread is None or len(self.each) > 1 else spread[:, 0] for spread in (std, turn_std)]
+            how = {"lever": form.lever, "position_std": spreads[0], "rotation_std": spreads[1]}
             data = Measurements.from_poses(
                 rows.q, poses, joints, **how, camera_on_tool=form.camera_on_tool, doubt=False
             )
@@ -191,18 +191,18 @@ class PositionColumns(SensorColumns):
 
     def _rotations(self, rows: FileRows, convention: str) -> Tensor:
         """Rotations (N, T, 3, 3) of frames, NaN where hidden."""
-        numbers = torch.stack([rows.numbers(own.turn) for own in self.each], 1)
-        seen = ~numbers.isnan().any(2)
-        shown = seen.nonzero().tolist()
+        numbers = torch.stack([rows.numbers(body.turn) for body in self.each], 1)
+        visible = ~numbers.isnan().any(2)
+        shown = visible.nonzero().tolist()
 
         def place(number: int) -> str:
             row, frame = shown[number]
             return f"file '{rows.path}', line {rows.lines[row]}, columns {', '.join(self.each[frame].turn)}"
 
-        found = numbers.new_full((*seen.shape, 3, 3), torch.nan)
+        rotations = numbers.new_full((*visible.shape, 3, 3), torch.nan)
         with of_measurements():
-            found[seen] = rotation_matrices(numbers[seen], convention, place=place)
-        return found
+            rotations[visible] = rotation_matrices(numbers[visible], convention, place=place)
+        return rotations
 
     def numbers(
         self, places: Tensor, frames: Tensor | None, std: Tensor | None, turn_std: Tensor | None
@@ -210,9 +210,9 @@ class PositionColumns(SensorColumns):
         """Places (N, B, 3), rotations of frames (N, B, 4, 4), and deviations (N, B, 3), in SI, by their columns."""
         places = to_spherical(places, self.form.spherical) if self.form.spherical else places
         turns = None if frames is None else rotation_numbers(frames[..., :3, :3], self.form.convention or "rotvec")
-        parts = [(k, own) for k, own in enumerate((places, turns, std, turn_std)) if own is not None]
-        each = ((own[:, body], names[k]) for body, names in enumerate(self.each) for k, own in parts)
-        return {name: column for own, names in each for name, column in zip(names, own.T, strict=True)}
+        parts = [(k, part) for k, part in enumerate((places, turns, std, turn_std)) if part is not None]
+        each = ((part[:, body], names[k]) for body, names in enumerate(self.each) for k, part in parts)
+        return {name: column for part, names in each for name, column in zip(names, part.T, strict=True)}
 
     def written(self, part: Any, table: TableFormat) -> Written:
         frames = part.frames if part.frames is None or part.board is None else inverse_poses(part.frames)
@@ -252,8 +252,8 @@ class SocketColumns(SensorColumns):
         fix = "fill it in; lines without a socket hold a measured position, whose columns must be named (`position`)"
         parts = [rows.named(name, "the name of a place or socket", fix) for name in self.names]
         names = [SEPARATOR.join(row) for row in zip(*parts, strict=True)]
-        known = {"distances": self.distances, "distance_std": self.distance_std}
-        data = Measurements.from_sockets(rows.q, names, rows.columns.joints.texts, **known, doubt=False)
+        options = {"distances": self.distances, "distance_std": self.distance_std}
+        data = Measurements.from_sockets(rows.q, names, rows.columns.joints.texts, **options, doubt=False)
         return data.with_tips(None if self.on is None else [self.on]), rows
 
     def written(self, part: Any, table: TableFormat) -> Written:
@@ -297,9 +297,9 @@ class ReadingColumns(SensorColumns):
             raise MeasurementError.of(f"`intrinsics` of {self.kind!r}", got=got, fix=fix)
         count = {"distance": 1, "height": 1, "image": 2}.get(self.kind, 0)
         for name, allowed in (("values", (count,)), ("std", (0, 1, count))):
-            own: Any = getattr(self, name)
-            if isinstance(own, bool) or not isinstance(own, (int, float)):
-                names: Any = (own,) if isinstance(own, str) else own
+            given: Any = getattr(self, name)
+            if isinstance(given, bool) or not isinstance(given, (int, float)):
+                names: Any = (given,) if isinstance(given, str) else given
                 expected = f"{count} names of columns for {self.kind!r}"
                 names = column_names(name, names, expected, allowed) if count else tuple(names)
                 object.__setattr__(self, name, names)
@@ -318,8 +318,8 @@ class ReadingColumns(SensorColumns):
 
     def bodies(self, table: TableFormat) -> list[Body]:
         unit, check = self.unit_in(table), LENGTH if self.kind == "distance" and not self.offset_std else None
-        own = [Column(name, unit, check) for name in self.values] if isinstance(self.values, tuple) else []
-        return [Body([*own, *(Column(name, unit, DEVIATION) for name in self.std)], f"holds {self.word}")]
+        values = [Column(name, unit, check) for name in self.values] if isinstance(self.values, tuple) else []
+        return [Body([*values, *(Column(name, unit, DEVIATION) for name in self.std)], f"holds {self.word}")]
 
     def filled(self, rows: FileRows) -> Tensor:
         if isinstance(self.values, tuple):
@@ -333,20 +333,20 @@ class ReadingColumns(SensorColumns):
         q, joints, table = rows.q, rows.columns.joints.texts, rows.columns.table
         per_si = Column("", self.unit_in(table)).per_si
         if isinstance(self.values, tuple):
-            seen = rows.numbers(self.values)
+            values = rows.numbers(self.values)
         else:
-            seen = torch.full((len(q), 1), float(self.values) / per_si, dtype=torch.float64, device=HOST)
+            values = torch.full((len(q), 1), float(self.values) / per_si, dtype=torch.float64, device=HOST)
         devices = rows.devices(self.device, "the name of the device of this reading", ONE_READING)
-        std = rows.numbers(self.std).expand_as(seen) if self.std else None
-        given, known = (q, seen, devices, joints), {"std": std, "doubt": False}
+        std = rows.numbers(self.std).expand_as(values) if self.std else None
+        given, options = (q, values, devices, joints), {"std": std, "doubt": False}
         if (lens := self.intrinsics) is not None:
-            data = Readings.images(*given, focal=lens[:2], centre=lens[2:], **known)
+            data = Readings.images(*given, focal=lens[:2], centre=lens[2:], **options)
         elif self.kind == "distance":
-            for text in unlikely_units("positions", seen * per_si, table.length, "length"):
+            for text in unlikely_units("positions", values * per_si, table.length, "length"):
                 warn_user(f"file '{rows.path}': {text}".replace("positions", "distances"))
-            data = Readings.distances(*given, offset_std=self.offset_std, **known)
+            data = Readings.distances(*given, offset_std=self.offset_std, **options)
         else:
-            data = Readings.of(self.kind, *given, unit=self.unit, numbers=seen.shape[1], **known)
+            data = Readings.of(self.kind, *given, unit=self.unit, numbers=values.shape[1], **options)
         return data.with_tips(None if self.on is None else [self.on]), rows
 
     def written(self, part: Any, table: TableFormat) -> Written:
@@ -385,8 +385,8 @@ class ImageColumns(SensorColumns):
         return {CAMERA: False, IMAGE: True} | ({} if self.device is None else {self.device: True})
 
     def bodies(self, table: TableFormat) -> list[Body]:
-        own = [Column(name, table.length) for name in POINT] + [Column(name) for name in PIXEL]
-        return [Body(own, f"holds {self.word}")]
+        columns = [Column(name, table.length) for name in POINT] + [Column(name) for name in PIXEL]
+        return [Body(columns, f"holds {self.word}")]
 
     def filled(self, rows: FileRows) -> Tensor:
         return rows.filled(IMAGE)
@@ -398,11 +398,11 @@ class ImageColumns(SensorColumns):
         images, q = dict[str, list[int]](), rows.q
         for row, name in enumerate(names):
             images.setdefault(name, []).append(row)
-        for name, own in images.items():
-            other = (q[own] != q[own[0]]).any(1).nonzero()[:, 0].tolist()
+        for name, indices in images.items():
+            other = (q[indices] != q[indices[0]]).any(1).nonzero()[:, 0].tolist()
             if other:
                 what = f"file '{rows.path}', image '{name}'"
-                got = f"other ones in line {few([rows.lines[own[row]] for row in other])}"
+                got = f"other ones in line {few([rows.lines[indices[row]] for row in other])}"
                 fix = "give every image a name of its own, and its joint values in all of its lines"
                 raise MeasurementError.of(what, expected="the joint values of its first line", got=got, fix=fix)
         points, pixels = rows.numbers(POINT), rows.numbers(PIXEL)
@@ -412,13 +412,13 @@ class ImageColumns(SensorColumns):
             bad = [(rows.lines[row], (*POINT, *PIXEL)[k], "") for row, k in empty]
             raise bad_cells(rows.path, bad, "a number", "fill it in, or delete the line")
         corners = flat.new_full((len(images), max(map(len, images.values())), 5), torch.nan)
-        for number, own in enumerate(images.values()):
-            corners[number, : len(own)] = flat[own]
-        first = rows.of(torch.tensor([own[0] for own in images.values()], dtype=torch.int64, device=HOST))
-        known: dict[str, Any] = {"camera_on_tool": self.camera_on_tool, "doubt": False}
+        for number, indices in enumerate(images.values()):
+            corners[number, : len(indices)] = flat[indices]
+        first = rows.of(torch.tensor([indices[0] for indices in images.values()], dtype=torch.int64, device=HOST))
+        options: dict[str, Any] = {"camera_on_tool": self.camera_on_tool, "doubt": False}
         if CAMERA in rows.texts:
-            known["seen_by"] = first.named(CAMERA, "the name of the camera")
-        data = Measurements.from_images(first.q, corners, self.camera, rows.columns.joints.texts, **known)
+            options["seen_by"] = first.named(CAMERA, "the name of the camera")
+        data = Measurements.from_images(first.q, corners, self.camera, rows.columns.joints.texts, **options)
         data = data.with_columns(image_names=dict(zip(first.lines, images, strict=True)))
         set_ups = first.devices(self.device, "a name")
         return (data if set_ups is None else data.with_sessions(set_ups)), first
@@ -426,12 +426,12 @@ class ImageColumns(SensorColumns):
     def written(self, part: Any, table: TableFormat) -> Written:
         """A line for each corner."""
         number, corner = (~part.corners[..., 0].isnan()).nonzero().unbind(1)
-        seen, whose = part.corners[number, corner], number.tolist()
+        visible, whose = part.corners[number, corner], number.tolist()
         texts = {IMAGE: [str(k) for k in whose]}
         named = {CAMERA: part.camera_names} if len(part.cameras) > 1 else {}
         named |= {} if self.device is None else {self.device: part.device_names}
         texts |= {name: [column[k] for k in whose] for name, column in named.items()}
-        return dict(zip((*POINT, *PIXEL), seen[:, [0, 1, 3, 4]].T, strict=True)), texts, number
+        return dict(zip((*POINT, *PIXEL), visible[:, [0, 1, 3, 4]].T, strict=True)), texts, number
 
 
 def columns_of(table: TableFormat) -> Columns:

@@ -105,7 +105,7 @@ def _joined_sheets(sheets: Mapping[str, list[list[str]]]) -> tuple[Rows, list[st
         return None
     (by,), (one, other) = common, each
     first, second = ({row[rows[0].index(by)]: row for row in rows} for rows in each)
-    if {*first} != {*second} or len({len(own) for own in (one, other, first)}) > 1:
+    if {*first} != {*second} or len({len(table) for table in (one, other, first)}) > 1:
         return None
     kept = [name != by for name in other[0]]
     cells = [[*row, *compress(second[key], kept)] for key, row in first.items()]
@@ -121,12 +121,12 @@ def _cell(value: Any) -> str:
 
 def _array(path: Path, file: BinaryIO) -> tuple[Rows, list[str]]:
     """An array (N, k), or one with names."""
-    found = _loaded(path, lambda: np.load(file, allow_pickle=False))
-    if found.dtype.names:
-        return _joined(path, {name: found[name] for name in found.dtype.names})
-    if found.ndim != 2 or found.dtype.kind not in "fiu":
-        raise _no_table(path, f"an array of shape {found.shape}", "save numbers of shape (N, columns), or with names")
-    return _texts(found), []
+    array = _loaded(path, lambda: np.load(file, allow_pickle=False))
+    if array.dtype.names:
+        return _joined(path, {name: array[name] for name in array.dtype.names})
+    if array.ndim != 2 or array.dtype.kind not in "fiu":
+        raise _no_table(path, f"an array of shape {array.shape}", "save numbers of shape (N, columns), or with names")
+    return _texts(array), []
 
 
 def _variables(path: Path, file: BinaryIO) -> tuple[Rows, list[str]]:
@@ -134,14 +134,14 @@ def _variables(path: Path, file: BinaryIO) -> tuple[Rows, list[str]]:
     from scipy.io import loadmat  # noqa: PLC0415  # slow to import
 
     whole = _loaded(path, lambda: loadmat(file, squeeze_me=True, struct_as_record=True))
-    found = dict[str, Any]()
+    arrays = dict[str, Any]()
     for name, value in whole.items():
         fields = getattr(getattr(value, "dtype", None), "names", None)
         if fields and value.ndim == 0:
-            found |= {f"{name}_{field}": value[field].item() for field in fields}
+            arrays |= {f"{name}_{field}": value[field].item() for field in fields}
         elif not name.startswith("__"):
-            found[name] = value
-    return _joined(path, found)
+            arrays[name] = value
+    return _joined(path, arrays)
 
 
 def _loaded(path: Path, load: Callable[[], Any]) -> Any:
@@ -153,10 +153,10 @@ def _loaded(path: Path, load: Callable[[], Any]) -> Any:
 
 def _joined(path: Path, arrays: Mapping[str, Any]) -> tuple[Rows, list[str]]:
     """Arrays (N, ...) of numbers or texts side by side below their names; those of other lengths are left out."""
-    known = {name: np.asarray(array) for name, array in arrays.items()}
-    cells = {name: array for name, array in known.items() if array.dtype.kind == "O"}  # of MATLAB
-    known |= {name: array.astype(str) for name, array in cells.items() if all(isinstance(v, str) for v in array.flat)}
-    usable = {name: array for name, array in known.items() if array.dtype.kind in "fiubUS" and 0 < array.ndim < 4}
+    given = {name: np.asarray(array) for name, array in arrays.items()}
+    cells = {name: array for name, array in given.items() if array.dtype.kind == "O"}  # of MATLAB
+    given |= {name: array.astype(str) for name, array in cells.items() if all(isinstance(v, str) for v in array.flat)}
+    usable = {name: array for name, array in given.items() if array.dtype.kind in "fiubUS" and 0 < array.ndim < 4}
     written, turned = Counter[int](), Counter[int]()  # columns of arrays with so many rows, as they are and if turned
     for array in usable.values():
         rows, columns = len(array), array[:1].size
@@ -164,13 +164,13 @@ def _joined(path: Path, arrays: Mapping[str, Any]) -> tuple[Rows, list[str]]:
         written[rows] += few_columns
         turned[max(rows, columns) if array.ndim == 2 else rows] += few_columns
     if not usable:
-        raise _no_table(path, f"the arrays {few(list(known))}", "save numbers of shape (N,) or (N, columns)")
+        raise _no_table(path, f"the arrays {few(list(given))}", "save numbers of shape (N,) or (N, columns)")
     rows = max(written, turned, key=lambda counts: max(counts.values())).most_common(1)[0][0]
     usable = {name: array.T if array.ndim == 2 and len(array) != rows else array for name, array in usable.items()}
-    own = {name: array for name, array in usable.items() if len(array) == rows}
-    header = [column for name, array in own.items() for column in names_of(name, array.shape[1:])]
-    values = zip(*(_texts(array.reshape(rows, math.prod(array.shape[1:]))) for array in own.values()), strict=True)
-    left = [name for name in known if name not in own]
+    kept = {name: array for name, array in usable.items() if len(array) == rows}
+    header = [column for name, array in kept.items() for column in names_of(name, array.shape[1:])]
+    values = zip(*(_texts(array.reshape(rows, math.prod(array.shape[1:]))) for array in kept.values()), strict=True)
+    left = [name for name in given if name not in kept]
     notes = [f"arrays {few(left)} left out: no numbers or texts of {rows} rows"] * bool(left)
     return [header, *([cell for part in row for cell in part] for row in values)], notes
 

@@ -51,13 +51,13 @@ class TableOrigin:
 
         With ``gaps`` some cells may be empty or not a number, and are NaN then.
         """
-        found = {}
+        columns = {}
         for name, cells in self.texts(line_numbers).items():
             values = numbers_in(cells, self.columns.table.decimal)
             there = [value for value in values if not gaps or value is None or not math.isnan(value)]
             if there and all(value is not None and math.isfinite(value) for value in there):
-                found[name] = torch.tensor(values, dtype=torch.float64, device=HOST)
-        return found
+                columns[name] = torch.tensor(values, dtype=torch.float64, device=HOST)
+        return columns
 
     def texts(self, line_numbers: Tensor) -> dict[str, list[str]]:
         """The cells of all columns in these lines (N,); empty if the file has changed since, or is gone."""
@@ -65,8 +65,8 @@ class TableOrigin:
             return {}
         try:
             file = CsvLines(self.path, self.columns.table.sep, self.columns.names)
-            known = dict(file.rows()) if file.sha256 == self.sha256 else {}
-            wanted = [known[line] for line in line_numbers.tolist()]
+            rows = dict(file.rows()) if file.sha256 == self.sha256 else {}
+            wanted = [rows[line] for line in line_numbers.tolist()]
         except (MeasurementError, KeyError):
             return {}
         return dict(zip(file.header, map(list, zip(*wanted, strict=True)), strict=True))
@@ -91,7 +91,7 @@ class FileRows(NamedTuple):
     def of(self, rows: Tensor) -> FileRows:
         """The rows with these numbers (M,), or those that a mask (N,) chooses."""
         chosen = torch.arange(len(self.lines), device=HOST)[rows].tolist()
-        texts = {name: [own[row] for row in chosen] for name, own in self.texts.items()}
+        texts = {name: [cells[row] for row in chosen] for name, cells in self.texts.items()}
         return self._replace(raw=self.raw[rows], texts=texts, lines=[self.lines[row] for row in chosen])
 
     @property
@@ -102,8 +102,8 @@ class FileRows(NamedTuple):
 
     def numbers(self, names: Sequence[str]) -> Tensor:
         """(N, k) numbers of some columns, in SI."""
-        own = [one for name in names for one in self.columns.numbers if one.name == name]
-        return self.raw[:, self.columns.places(own)] / self.raw.new_tensor([one.per_si for one in own])
+        columns = [column for name in names for column in self.columns.numbers if column.name == name]
+        return self.raw[:, self.columns.places(columns)] / self.raw.new_tensor([column.per_si for column in columns])
 
     @property
     def beside(self) -> dict[str, Tensor]:
@@ -158,7 +158,7 @@ def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
     cells = [[row[place] for row in rows] for place in places]
     file.units |= {file.header[place]: "deg" for place, own in zip(places, cells, strict=True) if "°" in "".join(own)}
     _check_units(file, columns)
-    words = [["" if text.lower() == "nan" else text for text in own] for own in cells[len(columns.names) :]]
+    words = [["" if text.lower() == "nan" else text for text in column] for column in cells[len(columns.names) :]]
     numbers, notes = _numbers(path, columns, lines, cells[: len(columns.names)], whole=zeros)
     for column, values in zip(columns.numbers, numbers[:, len(columns.joints.columns) :].T, strict=True):
         check = column.check
@@ -168,21 +168,21 @@ def read_table(path: Path, columns: Columns, *, zeros: bool = True) -> FileRows:
             raise bad_cells(path, bad, check.expected, check.fix)
     for text in ["; ".join(file.notes + notes)] * bool(file.notes + notes) + columns.unlikely_units(numbers):
         warn_user(f"file '{path}': {text}")
-    for own in columns.hideable:
-        if bool(numbers[:, columns.places(own.values)].isnan().all()):
-            names = few([one.name for one in own.values])
+    for body in columns.hideable:
+        if bool(numbers[:, columns.places(body.values)].isnan().all()):
+            names = few([column.name for column in body.values])
             what, fix = f"file '{path}', columns {names}: empty in all {len(numbers)} lines", "leave them out"
-            raise MeasurementError.of(what, expected=f"some line that {own.word}", fix=fix)
+            raise MeasurementError.of(what, expected=f"some line that {body.word}", fix=fix)
     markers = columns.hideable[: len(columns.table.triples)]
-    for own in markers if zeros else ():
-        _hide_marks(path, columns, numbers, lines, own)
+    for body in markers if zeros else ():
+        _hide_marks(path, columns, numbers, lines, body)
     whole = FileRows(path, columns, numbers, dict(zip(named, words, strict=True)), lines, file.sha256)
     if not markers or columns.all_hidden:
         return whole
-    seen = ~torch.stack([numbers[:, columns.places(own.values)].isnan().all(1) for own in markers]).all(0)
-    if gone := [lines[row] for row in (~seen).nonzero()[:, 0].tolist()]:
+    visible = ~torch.stack([numbers[:, columns.places(body.values)].isnan().all(1) for body in markers]).all(0)
+    if gone := [lines[row] for row in (~visible).nonzero()[:, 0].tolist()]:
         warn_user(f"file '{path}': no marker was seen in line {few(gone)}: {len(gone)} row(s) left out")
-    return whole.of(seen)
+    return whole.of(visible)
 
 
 def _with_joints(path: Path, rows: Lines, places: Sequence[int], names: int | None) -> Lines:
@@ -196,13 +196,13 @@ def _with_joints(path: Path, rows: Lines, places: Sequence[int], names: int | No
     if names is None:
         warn_user(f"file '{path}': no joint values in line {few(sorted(empty))}: {len(empty)} row(s) left out")
         return [(line, cells) for line, cells in rows if line not in empty]
-    above, filled, seen = dict[int, str](), list[tuple[int, list[str]]](), set[str]()
+    above, filled, named = dict[int, str](), list[tuple[int, list[str]]](), set[str]()
     for line, cells in rows:
         if line not in empty:
-            above, seen = {place: cells[place] for place in places}, set()
-        elif cells[names] in seen:
+            above, named = {place: cells[place] for place in places}, set()
+        elif cells[names] in named:
             above = {}
-        seen.add(cells[names])
+        named.add(cells[names])
         filled.append((line, [above.get(place, cell) for place, cell in enumerate(cells)]))
     return filled
 
@@ -216,17 +216,17 @@ def _numbers(
     MeasurementError for other cells without a number.
     """
     names, decimal, hideable = columns.names, columns.table.decimal, columns.hideable
-    found = [numbers_in(column, decimal, whole=whole) for column in cells]
-    if any(None in column for column in found):
-        rows = zip(lines, zip(*cells, strict=True), zip(*found, strict=True), strict=True)
-        bad = [(line, names[k], texts[k]) for line, texts, own in rows for k, one in enumerate(own) if one is None]
+    parsed = [numbers_in(column, decimal, whole=whole) for column in cells]
+    if any(None in column for column in parsed):
+        rows = zip(lines, zip(*cells, strict=True), zip(*parsed, strict=True), strict=True)
+        bad = [(line, names[k], texts[k]) for line, texts, read in rows for k, cell in enumerate(read) if cell is None]
         raise bad_cells(path, bad, "a number", number_hint(bad[0][2], decimal))
-    numbers = torch.tensor(found, dtype=torch.float64, device=HOST).T
+    numbers = torch.tensor(parsed, dtype=torch.float64, device=HOST).T
     empty, large = numbers.isnan(), numbers.abs() >= LARGEST_NUMBER
     needed, shows = torch.zeros_like(empty), torch.zeros_like(empty[:, 0])
     theirs = torch.zeros_like(empty[:1])
-    for own in hideable:
-        values, every = columns.places(own.values), columns.places(own.columns)
+    for body in hideable:
+        values, every = columns.places(body.values), columns.places(body.columns)
         here = ~(empty[:, values].all(1) | large[:, values].all(1))
         needed[:, every] |= here[:, None]
         theirs[:, every] = True
@@ -248,30 +248,30 @@ def _numbers(
         if cells[k][row].lower() not in ("", "nan"):
             words[cells[k][row]].append(lines[row])
     said = " and ".join(f"'{shown(text)}' ({len(at)})" for text, at in words.items())
-    at = few(sorted({line for own in words.values() for line in own}))
+    at = few(sorted({line for group in words.values() for line in group}))
     notes = [f"cells that hold {said} are taken as empty (line {at})"] * bool(words)
     return numbers.masked_fill(gaps, math.nan), notes
 
 
-def _hide_marks(path: Path, columns: Columns, numbers: Tensor, lines: Sequence[int], own: Body) -> None:
+def _hide_marks(path: Path, columns: Columns, numbers: Tensor, lines: Sequence[int], body: Body) -> None:
     """Write NaN where a marker is at 0, 0, 0, or thrice at -9999, far from all rows: a device does not see it then.
 
     One row at 0, 0, 0 may be the frame's origin, or the first pose: all others must be farther from it than from one
     another. Another number must stand in rows of several configurations.
     """
-    at = columns.places([one for one in own.columns if one.what == "positions"])
+    at = columns.places([column for column in body.columns if column.what == "positions"])
     points, q = numbers[:, at], numbers[:, : len(columns.joints.columns)]
     alike = (points == points[:, :1]).all(1) & ((points[:, 0] == 0.0) | (len(at) > 1))  # a distance alone may repeat
     for mark in points[alike, 0].unique().tolist():
         lost = alike & (points[:, 0] == mark)
-        seen = points[~lost & points.isfinite().all(1)] - mark
-        some, single = seen[:FEW_ROWS].unique(dim=0), len(q[lost].unique(dim=0)) == 1
+        others = points[~lost & points.isfinite().all(1)] - mark
+        some, single = others[:FEW_ROWS].unique(dim=0), len(q[lost].unique(dim=0)) == 1
         if len(some) < 2 or (single and mark != 0.0):
             continue
         apart = torch.cdist(some, some).fill_diagonal_(math.inf).amin(1)
         limit = MUCH_FARTHER * apart.amax() if single or mark != 0.0 else apart.median()
-        if bool(seen.norm(dim=1).amin() > limit):
-            for place in columns.places(own.columns):
+        if bool(others.norm(dim=1).amin() > limit):
+            for place in columns.places(body.columns):
                 numbers[lost, place] = math.nan
             names, said = few([columns.names[k] for k in at]), ", ".join([f"{mark:g}"] * len(at))
             where = few([lines[row] for row in lost.nonzero()[:, 0].tolist()])
@@ -316,11 +316,11 @@ def rereadings(data: Any) -> Iterator[dict[str, Any]]:
     if data.frames is None or data.lever is None:
         return
     lever, on, seen_from_tool = data.lever, data.on or (), data.board is not None
-    seen = inverse_poses if seen_from_tool else torch.clone  # there and back
-    written = seen(data.frames)
+    convert = inverse_poses if seen_from_tool else torch.clone  # there and back
+    written = convert(data.frames)
 
     def reread(frames: Tensor, words: str, option: str = "") -> dict[str, Any]:
-        return {"points": points_of_frames(seen(frames), lever), "words": words, "option": option, "on": on}
+        return {"points": points_of_frames(convert(frames), lever), "words": words, "option": option, "on": on}
 
     turns, places = written[..., :3, :3], written[..., :3, 3]
     yield reread(inverse_poses(written), NOT_INVERTED if seen_from_tool else INVERTED)
@@ -339,10 +339,10 @@ def with_coordinate(data: Any, marker: int, axis: int, values: Tensor) -> Tensor
     if data.frames is None:
         points[:, marker, axis] = values.where(~points[:, marker, axis].isnan(), torch.nan)
         return points
-    seen = inverse_poses if data.board is not None else torch.clone
-    written = seen(data.frames)
+    convert = inverse_poses if data.board is not None else torch.clone
+    written = convert(data.frames)
     written[:, marker, axis, 3] = values
-    return points_of_frames(seen(written), data.lever)
+    return points_of_frames(convert(written), data.lever)
 
 
 def numeric_table(data: Any) -> tuple[Columns | None, Mapping[str, Tensor]]:
