@@ -167,6 +167,7 @@ def table(rows: SocketRows, names: tuple[str, ...] | None = None, **options: obj
 
 def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows) -> None:
     bare: Any = {"distances": None, "distance_std": None}
+    ball = kind_named("ball in sockets")
 
     def staged(data: SocketReadings) -> Callable[[], object]:
         return lambda: place(plain.nominal, data, silent)
@@ -177,6 +178,7 @@ def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows
         (r"expected about (49|50)\..* mm, by the robot, got 5e\+04 mm", staged(table(some, distances={PAIR: 50.0}))),
         ("check the unit of `distances`", staged(table(some, distances={PAIR: 5e-5}))),
         ("rows with sockets: expected no sessions", lambda: table(some).with_sessions(["a"] * 18 + ["b"] * 18)),
+        ("expected 'flange', got 'hand'", lambda: dc.evaluate(ball.model, ball.new.with_tips(["hand"]))),
         ("expected names alone", lambda: dc.Readings.of("socket", some.q, 0.0, some.names)),
         ("rows with sockets: expected no payloads", staged(table(some).with_payload(2.0))),
         *(
@@ -260,6 +262,8 @@ def test_tables_that_cannot_be_made(some: SocketRows) -> None:
     )
     with pytest.warns(dc.DiffeoCalibWarning, match="1 of 2 rows repeat an earlier row"):
         dc.Measurements.from_sockets(some.q[[0, 0]], ["a", "b"])
+    with pytest.warns(dc.DiffeoCalibWarning, match="between sockets are not used beside images"):
+        table(some).beside_images()
     assert table(some).with_sessions(["day"] * 36).names == table(some).names
     known = wrong(some, distances={PAIR: 0.05, ("0/0", "2/1"): 0.7}).sockets
     assert known.distances == ((0, 1, 0.05), (2, 3, 0.05), (4, 5, 0.05), (0, 5, 0.7))
