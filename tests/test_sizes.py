@@ -101,6 +101,19 @@ def test_big_pieces_are_found() -> None:
     assert not list(too_big(Path("f.py"), f"class Problem:\n    def __init__(self, {names}):\n        pass\n"))
 
 
+VAGUE, MOST_USES = ("found", "known", "one", "own", "seen", "told"), 150
+"""Words that say nothing of what a name holds, and how often the package may use each as one."""
+
+
+def test_names_say_what_they_hold() -> None:
+    package = Path(diffeo_calib.__file__).parent
+    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in FILES if package in path.parents]
+    kinds = {ast.Name: "id", ast.Attribute: "attr", ast.arg: "arg", ast.keyword: "arg", ast.FunctionDef: "name"}
+    nodes = [node for tree in trees for node in ast.walk(tree) if type(node) in kinds]
+    uses = Counter(getattr(node, kinds[type(node)]) for node in nodes)
+    assert {word: uses[word] for word in VAGUE if uses[word] > MOST_USES} == {}
+
+
 # --- lines only fall ----------------------------------------------------------------------------------------------
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.identification.registration import spread
-from diffeo_calib.cli.column_names import WORDS, Group, column, whole
+from diffeo_calib.cli.column_names import WORDS, column, whole
 from diffeo_calib.cli.guesses import Body, RowColumns, Sheet, bodies_in, matrices_in, rows_in
 from diffeo_calib.cli.options import Rows, Units
 from diffeo_calib.cli.proposals import LARGEST_RESIDUAL, Source, percent, ranked, reason, source_of
@@ -28,6 +28,7 @@ from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.poses import rotation_matrices
 from diffeo_calib.measurements.table_format import ALL_CONVENTIONS, UNITS_PER_METRE, ZERO, numbers_of
 from diffeo_calib.robots.cartesian import cartesian
+from diffeo_calib.sensors.tables import measured_positions
 
 NUMBERED = "0123456", "1234567", "012345", "123456"
 """Poses of the tool as a series: a place, then a quaternion, a rotation vector or angles."""
@@ -59,17 +60,15 @@ def poses_in(sheet: Sheet) -> list[Body]:
     used = {name for body in bodies for name in (*body.place, *body.turn)}
     others = [name for name in sheet.numbers if name not in used]
     bodies += matrices_in(sheet, others)
-    bodies += [Body(list(xy.names.values()), []) for xy in whole(others, "xy") if xy.wished and _is_place(xy)]
+    flat = [xy for xy in whole(others, "xy") if xy.wished and not xy.says("rate", "deviation")]
+    bodies += [Body([*xy.names.values()], []) for xy in flat]
     for labels in NUMBERED:
         taken = {name for body in bodies for name in (*body.place, *body.turn)}
         for group in whole([name for name in others if name not in taken], labels):
             names = list(group.names.values())
-            bodies += [Body(names[:3], names[3:])] if group.says("tool") and _is_place(group) else []
+            if group.says("tool") and not group.says("rate", "deviation"):
+                bodies.append(Body(names[:3], names[3:]))
     return sorted(bodies, key=lambda body: sheet.header.index(body.place[0]))
-
-
-def _is_place(group: Group) -> bool:
-    return not group.says("rate", "deviation")
 
 
 def machine_of(bodies: Sequence[Body]) -> Body:
@@ -105,9 +104,6 @@ def commanded(sheet: Sheet) -> Source:
     machine = machine_of(bodies)
     used = [*machine.place, *machine.turn]
     others = tuple(name for name in sheet.numbers if name not in used)
-    if not others:
-        what = f"what was measured of the machine in '{sheet.path}'"
-        raise InputError.of(what, expected="columns beside its poses", got=f"{few(used, 16)} alone")
     rows = rows_in(replace(sheet, numbers=others), used)
     if rows.bodies and rows.bodies[0].turn:  # poses of one frame
         body, *others = rows.bodies
@@ -130,9 +126,10 @@ def commanded(sheet: Sheet) -> Source:
             fix += f"fit --robot-pose {','.join(used)},...=FILE.py:NAME"
         raise InputError.of(what, expected="a convention and units that explain the rows", got=got, fix=fix)
     best, *_ = alike = [way for way in ways if _as_good(way, ways[0])]
-    why = f"{reason(best, *(way for way in ways if way not in alike))}; by their names, in place of joint values"
+    why = reason(best, *(way for way in ways if way not in alike))
     by_size, whose = "the size of the numbers", _lengths(machine.place, _numbers(sheet, machine.place))
-    why = {"robot_pose": why, "length": by_size, "joint_length": by_size, "convention": "the same"}
+    why = {"robot_pose": f"{why}; by their names, in place of joint values", "angle": why, "convention": why}
+    why |= {"length": by_size, "joint_length": by_size}
     why |= {"rotation": "beside the columns of its place", "camera_on_tool": "what stands is seen from the flange"}
     best = best.into(why)
     if len(whose) > 1 and best.options.joint_length is None:
@@ -150,10 +147,11 @@ def _as_good(way: Source, best: Source) -> bool:
     """Whether the rows do not tell a way from the best one: who saw whom changes what a residual is a share of."""
 
     def metres(source: Source) -> float:
-        return source.left * spread(source.data.largest_session().points)
+        positions = measured_positions(source.data)
+        return source.left * (1.0 if positions is None else spread(positions.largest_session().points))
 
     factor = gates.READINGS_TOLD_APART
-    return way.left < factor * best.left or (way.left <= LARGEST_RESIDUAL and metres(way) < factor * metres(best))
+    return way.left <= factor * best.left or (way.left <= LARGEST_RESIDUAL and metres(way) < factor * metres(best))
 
 
 def _ways(sheet: Sheet, machine: Body, rows: RowColumns, *, lengths: tuple[str, str]) -> Iterator[Source]:

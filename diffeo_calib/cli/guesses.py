@@ -373,7 +373,7 @@ def rows_in(sheet: Sheet, joints: list[str]) -> RowColumns:
         fix = f"if they are in another file: --places FILE --by {common}; "
         fix += "without a tracker: a ball in sockets has columns `place` and `socket`, which `init` knows, a device a "
         fix += "column such as `distance`, `wire` or `height`; `fit --help` lists all options, see --reading"
-        got = "; ".join(left) or few(sheet.numbers, 20)
+        got = "; ".join(left) or few(sheet.numbers, 20) or "no other columns"
         raise InputError.of(f"positions in '{sheet.path}'", expected=expected, got=got, fix=fix)
     options: dict[str, Any] = {"position": [body.written() for body in bodies] or None, "reading": readings or None}
     options["socket"] = ",".join(sockets) or None

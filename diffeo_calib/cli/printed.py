@@ -88,7 +88,7 @@ def motion_lines(motion: Registration, tips: Sequence[str], *, doubt: str = "") 
     if motion.free != "base":
         tips = tips if len(tips) == len(motion.markers) else [tips[0]] * len(motion.markers)
         rigid = motion.lever is not None
-        yield from marker_lines(motion.markers, tips, poses=rigid, known=None if rigid else motion.marker_deviations)
+        yield from marker_lines(motion.markers, tips, poses=rigid, std=None if rigid else motion.marker_deviations)
         if motion.shift is not None:
             largest = 1e3 * float(motion.shift.norm(dim=1).max())
             sure = f" (unmoved with probability {motion.same_place:.2f})" if motion.same_place is not None else ""

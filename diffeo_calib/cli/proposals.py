@@ -75,7 +75,7 @@ COLUMNS = "joints", "robot_pose", "position", "marker", "socket", "rotation", "s
 REASONS = {
     **dict.fromkeys(("angle", "rotation_angle", "decimal"), "the same"),
     "joint_length": "the same: the slides are in another unit",
-    "camera_on_tool": "the same; else the board is on the tool",
+    "camera_on_tool": "as of length; else the board is on the tool",
     "rotation": "by their names; without these three lines positions alone are calibrated",
     "dh_convention": "the convention with which it explains the rows",
     "base": "root of the URDF",
@@ -100,8 +100,9 @@ class Source:
     remarks: tuple[str, ...] = ()
 
     def into(self, why: Mapping[str, str] | None = None, **options: Any) -> Source:
-        """Read the table with other options."""
-        return replace(self, options=replace(self.options, **options), why={**self.why, **(why or {})})
+        """Read the table with other options; what is decided is asked no more."""
+        asked = {name: values for name, values in self.asked.items() if name not in options}
+        return replace(self, options=replace(self.options, **options), why={**self.why, **(why or {})}, asked=asked)
 
     def remarking(self, *remarks: str) -> Source:
         """Add remarks."""
@@ -311,7 +312,8 @@ def with_measured(source: Source) -> Source:
         source = replace(source, bodies=[source.bodies[k] for k in kept]).remarking(*left)
         source = source.into(position=[body.written("") for body in source.bodies])
         source = source.into(tip=[tips[k] for k in kept]) if len(tips) > 1 else source
-    alone = len(source.bodies) == 1 and not (source.options.socket or source.options.reading)
+    others = source.options.socket or source.options.reading or source.options.marker
+    alone = len(source.bodies) == 1 and not others
     ways = list(source.positions()) if alone else []
     for _, data in ways[:1] if is_clear(source.units) else ways:
         with quiet(), suppress(DiffeoCalibError):
@@ -449,10 +451,8 @@ def with_rotation(source: Source, *, camera: bool = False) -> Source:
     if not ways or not is_clear(ways, gates.READINGS_TOLD_APART):
         what = "rotations of no convention that is clearly better than others"
         what = what if own_body else "rotations, but not one for each marker"
-        usual, names = (
-            " or ".join(dict.fromkeys(body.usual for body in turned)),
-            [name for body in turned for name in body.turn],
-        )
+        usual = " or ".join(dict.fromkeys(body.usual for body in turned))
+        names = [name for body in turned for name in body.turn]
         remark = f"{few(names, 9)}: {what}; not used; such names usually mean {usual}"
         return source if camera else source.remarking(remark)
     why = {"convention": reason(*ways)}

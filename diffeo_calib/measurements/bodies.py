@@ -84,8 +84,8 @@ class Bodies:
         """Measured frames (4, 4) in the frames of their tips, m, with what they are; none for markers."""
         if self.lever is None:
             return []
-        found = zip(self.tips(geometry.on), pose_math.frames_of_points(geometry.tool[None], self.lever)[0], strict=True)
-        return [(f"measured frame in the frame of {tip}", frame) for tip, frame in found]
+        pairs = zip(self.tips(geometry.on), pose_math.frames_of_points(geometry.tool[None], self.lever)[0], strict=True)
+        return [(f"measured frame in the frame of {tip}", frame) for tip, frame in pairs]
 
     def predicted(self, model: Any, q: Any, *, noise: bool = True) -> Predicted:
         """Prediction of a calibrated model at configurations (N, n), by default of new measurements."""
@@ -146,10 +146,10 @@ class Bodies:
         """Modes of other rows of the device, whose points (K, P, 3) are known, m: a camera sees its board there."""
         if self.lever is None:
             return None
-        frames, seen = pose_math.frames_of_points(points, self.lever), seen_board(data)
+        frames, camera = pose_math.frames_of_points(points, self.lever), seen_board(data)
         board = None
-        if seen is not None:
-            away = seen.origins.mean(0) - frames[:, 0, :3, 3]
+        if camera is not None:
+            away = camera.origins.mean(0) - frames[:, 0, :3, 3]
             board = (frames[:, 0, :3, :3].mT @ away[..., None])[..., 0]
         return pose_math.pose_jacobian(frames, self.lever, board)
 
@@ -204,8 +204,8 @@ class Bodies:
             return [""]
         if self.lever is not None:
             return [f"{tip}_" for tip in pose_math.frame_tips(model.on, count)]
-        seen = count - model.ball
-        return [*("marker_" if seen == 1 else f"marker{k + 1}_" for k in range(seen)), *[f"{BALL}_"] * model.ball]
+        markers = count - model.ball
+        return [*("marker_" if markers == 1 else f"marker{k + 1}_" for k in range(markers)), *[f"{BALL}_"] * model.ball]
 
     def name(self, number: int, count: int) -> str:
         """Name of one of several bodies."""
@@ -243,14 +243,14 @@ def placement_lines(
 
 
 def marker_lines(
-    points: Tensor, tips: Sequence[str], *, poses: bool, ball: bool = False, known: Tensor | None = None
+    points: Tensor, tips: Sequence[str], *, poses: bool, ball: bool = False, std: Tensor | None = None
 ) -> Iterator[str]:
-    """Places (P, 3) of markers, m, or of the frames that they represent; ``known``: standard deviations (P, 3)."""
+    """Places (P, 3) of markers, m, or of the frames that they represent; ``std``: standard deviations (P, 3)."""
     places, tips = (points, tips) if not poses else (points.unflatten(0, (-1, 3)).mean(1), tips[:: pose_math.POINTS])
     for k, (place, tip) in enumerate(zip(places, tips, strict=True)):
         what = "measured frame" if poses else "marker" + f" {k}" * (len(places) > 1 + ball)
         what = "ball" if ball and k == len(places) - 1 > 0 else what
-        end = "" if known is None else f", known to {triple(1e3 * known[k], '.2g')} mm"
+        end = "" if std is None else f", known to {triple(1e3 * std[k], '.2g')} mm"
         yield f"{what} in the frame of '{tip}': {triple(1e3 * place)} mm{end}"
 
 

@@ -101,8 +101,8 @@ def numbered(names: object, rows: int, what: str = "the names of sessions") -> t
     if unnamed:
         text = f"{what}: {len(unnamed)} row(s) have no name, the first is row {unnamed[0]}"
         raise MeasurementError.of(text, fix="name every row")
-    known = tuple(dict.fromkeys(texts))
-    return numbers_of(texts, known), known
+    distinct = tuple(dict.fromkeys(texts))
+    return numbers_of(texts, distinct), distinct
 
 
 LARGEST_SI = 1e9
@@ -192,8 +192,8 @@ def deviations(value: object, name: str, like: Tensor) -> Tensor | None:
         where, got = [int(i) for i in bad[0]], float(given[tuple(bad[0])])
         what = f"`{name}`" + f", first at index {where}" * bool(where)
         raise MeasurementError.of(what, expected="positive numbers", got=got, fix="leave it out if it is not known")
-    found = given.reshape(*given.shape, *[1] * (like.ndim - given.ndim)).expand(like.shape)
-    return found.masked_fill(empty, torch.nan)
+    spread = given.reshape(*given.shape, *[1] * (like.ndim - given.ndim)).expand(like.shape)
+    return spread.masked_fill(empty, torch.nan)
 
 
 def copied(value: object, name: str, shape: Shape, *also: Shape, fix: str) -> Tensor:
@@ -205,8 +205,8 @@ def copied(value: object, name: str, shape: Shape, *also: Shape, fix: str) -> Te
 def tip_names(names: Sequence[str] | None, bodies: int, points: int = 1) -> tuple[str, ...] | None:
     """The tip of each point, of names of the tips of bodies, markers or frames, with so many points each."""
     each = "marker" if points == 1 else "measured frame"
-    found = checked_names(names, "on", bodies, each, distinct=False)
-    return found and tuple(name for name in found for _ in range(points))
+    tips = checked_names(names, "on", bodies, each, distinct=False)
+    return tips and tuple(name for name in tips for _ in range(points))
 
 
 def texts_of(numbers: Tensor | None, names: Sequence[str], rows: int) -> list[str]:
@@ -214,9 +214,9 @@ def texts_of(numbers: Tensor | None, names: Sequence[str], rows: int) -> list[st
     return [""] * rows if numbers is None else [names[number] if number >= 0 else "" for number in numbers.tolist()]
 
 
-def numbers_of(names: Sequence[str], known: Sequence[str]) -> Tensor:
+def numbers_of(names: Sequence[str], among: Sequence[str]) -> Tensor:
     """(N,) int64, numbers of names among the known ones, -1 for "": the inverse of :func:`texts_of`."""
-    numbers = {"": -1} | {name: number for number, name in enumerate(known)}
+    numbers = {"": -1} | {name: number for number, name in enumerate(among)}
     return torch.tensor([numbers[name] for name in names], dtype=torch.int64, device=HOST)
 
 
@@ -279,12 +279,12 @@ def rare_names(names: Sequence[str], lines: Sequence[int], fewest: int) -> list[
 
     Most of them are spelling mistakes of another name. Names that differ in digits, such as "0/0" and "0/1", are not.
     """
-    counts, found = Counter(name for name in names if name), []
+    counts, texts = Counter(name for name in names if name), []
     digits = {name: "".join(filter(str.isdigit, name)) for name in counts}
     for name, count in counts.items():
         if count < fewest:
-            own = [line for line, other in zip(lines, names, strict=True) if other == name]
+            numbers = [line for line, other in zip(lines, names, strict=True) if other == name]
             usual = [other for other, rows in counts.items() if rows >= fewest and digits[other] == digits[name]]
             meant = "".join(f", perhaps meant as '{other}'" for other in get_close_matches(name, usual, n=1))
-            found.append(f"'{name}' in {count} row{'s' * (count > 1)} ({few(own)}){meant}")
-    return found
+            texts.append(f"'{name}' in {count} row{'s' * (count > 1)} ({few(numbers)}){meant}")
+    return texts

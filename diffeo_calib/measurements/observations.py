@@ -46,8 +46,8 @@ class Observations(RowGroups):
         alike = {name: getattr(tables[0], name) for name in ("joint_names", "payload_at", "covariate_names")}
         alike |= {name: common([getattr(part, name) for part in tables]) for name in ("file_sha256", "origin")}
         for name in ("q", "line_numbers", "payload", "covariates"):
-            own = [getattr(part, name) for part in tables]
-            alike[name] = None if own[0] is None else self._whole(own)
+            columns = [getattr(part, name) for part in tables]
+            alike[name] = None if columns[0] is None else self._whole(columns)
         set_attributes(self, **alike)
 
     @classmethod
@@ -126,9 +126,9 @@ class Observations(RowGroups):
         """See :class:`RowGroups`."""
         chosen = chosen_rows(index, len(self))
         parts, numbers = [], []
-        for part, own in zip(self.parts, self.index, strict=True):
+        for part, whole in zip(self.parts, self.index, strict=True):
             place = torch.full((len(self),), -1, dtype=torch.int64, device=HOST)
-            place[own] = torch.arange(len(part), device=HOST)
+            place[whole] = torch.arange(len(part), device=HOST)
             here = (place[chosen] >= 0).nonzero()[:, 0]
             if len(here):
                 parts.append(part.rows(place[chosen][here]))
@@ -146,8 +146,8 @@ class Observations(RowGroups):
 
     def _texts(self, texts: Sequence[Sequence[str]]) -> list[str]:
         """Join texts."""
-        found = [text for own in texts for text in own]
-        return [found[place] for place in torch.cat(self.index).argsort().tolist()]
+        every = [text for part in texts for text in part]
+        return [every[place] for place in torch.cat(self.index).argsort().tolist()]
 
 
 class Rows(NamedTuple):
@@ -166,11 +166,11 @@ def _pieces(tables: Sequence[Any]) -> list[Rows]:
         if not isinstance(table, RowGroups):
             expected, got = "dc.Measurements, dc.Readings or Observations", type(table).__name__
             raise MeasurementError.of("tables to join", expected=expected, got=got)
-    found, start = [], 0
+    pieces, start = [], 0
     for table in given:
-        found += [Rows(part, start + rows) for part, rows in zip(table.parts, table.index, strict=True)]
+        pieces += [Rows(part, start + rows) for part, rows in zip(table.parts, table.index, strict=True)]
         start += len(table)
-    return found
+    return pieces
 
 
 def joined_tables(tables: Sequence[Any], *, apart: bool = False) -> Any:
@@ -181,7 +181,7 @@ def joined_tables(tables: Sequence[Any], *, apart: bool = False) -> Any:
     pieces = _pieces(tables)
     groups: dict[object, list[Rows]] = {}
     if any("corners" in piece.table.columns for piece in pieces):
-        pieces = [Rows(own, piece.rows[here]) for piece in pieces for own, here in piece.table.beside_images()]
+        pieces = [Rows(part, piece.rows[here]) for piece in pieces for part, here in piece.table.beside_images()]
     for piece in pieces:
         groups.setdefault(piece.table.column_kind, []).append(piece)
     parts = [type(group[0].table).in_one([piece.table for piece in group]) for group in groups.values()]
@@ -197,11 +197,11 @@ def _check_joinable(tables: Sequence[Any]) -> None:
         fix = "the ball in sockets and that of readings is one: pass the rows of one ball"
         raise MeasurementError.of("the ball of the tables", expected="one tip", got=few(sorted(tips)), fix=fix)
     ways = dict[tuple[str, str], set[object]]()  # in which devices of a kind and name read: which one is meant?
-    for table in (one for one in tables if one.kind not in WITH_POSITION):
+    for table in (part for part in tables if part.kind not in WITH_POSITION):
         for name in set(table.device_names):
             ways.setdefault((table.kind, name), set()).add(table.column_kind)
-    found = [f"{kind}s of '{name}'" for (kind, name), own in ways.items() if len(own) > 1]
-    if found:
+    several = [f"{kind}s of '{name}'" for (kind, name), each in ways.items() if len(each) > 1]
+    if several:
         expected = "one kind of zero, lens, unit and known deviations for a device"
         fix = "name different devices differently, and give the deviations of all readings of a device, or of none"
-        raise MeasurementError.of(few(sorted(found)), expected=expected, got="several", fix=fix)
+        raise MeasurementError.of(few(sorted(several)), expected=expected, got="several", fix=fix)

@@ -105,12 +105,12 @@ class Readings(RowGroups):
         if isinstance(offset_std, bool) or not isinstance(offset_std, (int, float)) or not 0.0 <= offset_std < inf:
             fix = "pass metres, or 0 for absolute lengths"
             raise MeasurementError.of("`offset_std`", expected="0 or more", got=as_written(offset_std), fix=fix)
-        found = cls.of("distance", q, lengths, devices, joint_names, std=std, doubt=False, name="lengths")
-        low = int(found.values.argmin())
-        if not offset_std and float(found.values[low]) <= 0.0:
-            got, fix = f"{float(found.values[low]):g} m in row {low}", "check the column, or pass `offset_std`"
+        table = cls.of("distance", q, lengths, devices, joint_names, std=std, doubt=False, name="lengths")
+        low = int(table.values.argmin())
+        if not offset_std and float(table.values[low]) <= 0.0:
+            got, fix = f"{float(table.values[low]):g} m in row {low}", "check the column, or pass `offset_std`"
             raise MeasurementError.of("`lengths`", expected="above 0", got=got, fix=fix)
-        return replace(found, offset_std=float(offset_std)).doubted(doubt)
+        return replace(table, offset_std=float(offset_std)).doubted(doubt)
 
     @classmethod
     def heights(
@@ -161,12 +161,12 @@ class Readings(RowGroups):
         c = checks.copied(centre, "centre", (2,), fix="pass (cx, cy) in pixels")
         if not bool((f > 0).all()):
             raise MeasurementError.of("`focal`", expected="two positive numbers", got=as_written(f.tolist()))
-        seen = cls.of("image", q, pixels, devices, joint_names, std=std, doubt=False, name="pixels", numbers=2)
+        table = cls.of("image", q, pixels, devices, joint_names, std=std, doubt=False, name="pixels", numbers=2)
         fx, fy, cx, cy = *f.tolist(), *c.tolist()
-        known = None if seen.std is None else seen.std / f.to(seen.std)
-        tangents = (seen.values - c.to(seen.values)) / f.to(seen.values)
+        spread = None if table.std is None else table.std / f.to(table.std)
+        tangents = (table.values - c.to(table.values)) / f.to(table.values)
         unit = "px", (fx + fy) / 2.0
-        changed = replace(seen, values=tangents, std=known, intrinsics=(fx, fy, cx, cy), unit=unit)
+        changed = replace(table, values=tangents, std=spread, intrinsics=(fx, fy, cx, cy), unit=unit)
         return changed.doubted(doubt)
 
     @classmethod
@@ -200,6 +200,8 @@ class Readings(RowGroups):
         Raises:
             MeasurementError: wrong shapes, values that are not finite, or a deviation that is not positive.
         """
+        if kind == "socket":
+            raise MeasurementError.of("rows in sockets", expected="names alone", fix="pass Measurements.from_sockets")
         angles, joints = checks.joint_table(q, joint_names)
         N = len(angles)
         given = [float(values)] * N if isinstance(values, (int, float)) and not isinstance(values, bool) else values
@@ -207,9 +209,9 @@ class Readings(RowGroups):
         fix = f"pass {numbers} per row" + ", in m" * (unit == MILLIMETRES and numbers == 1)
         read = checks.copied(given, name, *shapes, fix=fix).reshape(N, numbers).to(angles.device)
         whose, names = checks.numbered([ONE_DEVICE] * N if devices is None else devices, N)
-        known = checks.deviations(std, "std", read)
-        found = cls(kind, angles, read, whose.to(HOST), names, joint_names=joints, std=known, unit=unit)
-        return found.doubted(doubt)
+        spread = checks.deviations(std, "std", read)
+        table = cls(kind, angles, read, whose.to(HOST), names, joint_names=joints, std=spread, unit=unit)
+        return table.doubted(doubt)
 
     @classmethod
     def joined(cls, parts: Sequence[Any]) -> Any:
@@ -278,9 +280,9 @@ class Readings(RowGroups):
 
     def rows(self, index: object) -> Readings:
         """See :class:`RowGroups`; the devices are those of these rows."""
-        found = super().rows(index)
-        used, numbers = found.device.unique(return_inverse=True)
-        return with_attributes(found, device=numbers, names=tuple(self.names[number] for number in used.tolist()))
+        chosen = super().rows(index)
+        used, numbers = chosen.device.unique(return_inverse=True)
+        return with_attributes(chosen, device=numbers, names=tuple(self.names[number] for number in used.tolist()))
 
     def with_tips(self, on: Sequence[str] | None) -> Readings:
         """Return the same readings with their ball on this tip, one name, else MeasurementError."""
@@ -297,21 +299,21 @@ MARKER, CONTACT = "marker", "contact"
 """Kinds of readings of points of a tool whose poses are measured."""
 
 
-def read_of_tool(own: Any, kind: str, values: Tensor, names: Sequence[str], std: Tensor | None = None) -> Readings:
+def read_of_tool(table: Any, kind: str, values: Tensor, names: Sequence[str], std: Tensor | None = None) -> Readings:
     """Rows of a table as readings (N, 3) of points of a tool whose poses are measured, see sensors/tool_frames.py."""
-    read = Readings.of(kind, own.q, values, names, own.joint_names, std=std, doubt=False, numbers=3)
+    read = Readings.of(kind, table.q, values, names, table.joint_names, std=std, doubt=False, numbers=3)
     alike = ("payload", "payload_at", "covariates", "covariate_names", "line_numbers", "file_sha256", "origin")
-    return with_attributes(read, **{name: getattr(own, name) for name in alike})
+    return with_attributes(read, **{name: getattr(table, name) for name in alike})
 
 
 def as_readings(table: Any) -> list[tuple[Readings, Tensor]]:
     """Positions of markers as readings with their rows (M,): every marker of every set-up has a device of its own."""
-    found = []
+    parts = []
     for marker, name in enumerate(table.marker_names or range(1, table.markers + 1)):
         rows = table.visible[:, marker].nonzero()[:, 0].cpu()
-        own = table.rows(rows)
+        part = table.rows(rows)
         of_marker = f" {name}" if table.markers > 1 else ""
-        names = [f"{device or 'tracker'}{of_marker}" for device in own.device_names]
-        std = None if own.std is None else own.std[:, marker]
-        found.append((read_of_tool(own, MARKER, own.points[:, marker], names, std), rows))
-    return found
+        names = [f"{device or 'tracker'}{of_marker}" for device in part.device_names]
+        std = None if part.std is None else part.std[:, marker]
+        parts.append((read_of_tool(part, MARKER, part.points[:, marker], names, std), rows))
+    return parts

@@ -180,11 +180,11 @@ class RowGroups:
         """Give tables the same columns, those of a few being empty, and set-ups or devices numbered alike."""
         column, texts = cls.NUMBERED
         names = tuple(dict.fromkeys(name for table in tables for name in getattr(table, texts)))
-        found = []
+        parts = []
         for table in tables:
             new, numbers = checks.numbers_of([*getattr(table, texts), ""], names), getattr(table, column)
-            found.append(table if numbers is None else with_attributes(table, **{column: new[numbers], texts: names}))
-        return found
+            parts.append(table if numbers is None else with_attributes(table, **{column: new[numbers], texts: names}))
+        return parts
 
     @property
     def n(self) -> int:
@@ -204,8 +204,8 @@ class RowGroups:
         """The same rows with other attributes; tensors (N, ...) have a value for each row."""
 
         def changed(part: Any, rows: Tensor) -> Any:
-            own = {name: v[rows.to(v.device)] if isinstance(v, Tensor) else v for name, v in columns.items()}
-            return with_attributes(part, **own)
+            chosen = {name: v[rows.to(v.device)] if isinstance(v, Tensor) else v for name, v in columns.items()}
+            return with_attributes(part, **chosen)
 
         return self.of_each(changed)
 
@@ -252,11 +252,11 @@ class RowGroups:
         Raises:
             MeasurementError: not one per row, or not finite.
         """
-        known = {name: own for name, own in (("time", time), ("temperature", temperature)) if own is not None}
+        given = {name: values for name, values in (("time", time), ("temperature", temperature)) if values is not None}
         fix = "pass a finite number for each row"
-        found = [checks.copied(own, name, (len(self),), fix=fix).to(self.q.device) for name, own in known.items()]
-        columns = torch.stack(found, 1) if found else None
-        return self.with_columns(covariates=columns, covariate_names=tuple(known))
+        parts = [checks.copied(values, name, (len(self),), fix=fix).to(self.q.device) for name, values in given.items()]
+        columns = torch.stack(parts, 1) if parts else None
+        return self.with_columns(covariates=columns, covariate_names=tuple(given))
 
     def with_load(self, load: Payload) -> Self:
         """The same rows with the masses of a payload, if there is one."""
@@ -269,15 +269,15 @@ class RowGroups:
 
     def copies(self) -> list[tuple[int, int]]:
         """(earlier row, row) for every row that repeats an earlier one of its kind exactly; real repeats differ."""
-        found = list[tuple[int, int]]()
+        pairs = list[tuple[int, int]]()
         for part, rows in zip(self.parts, self.index, strict=True):
             values = part.compared.cpu().numpy()
             values = np.where(np.isnan(values), np.nan, values) + 0.0  # one kind of NaN; -0.0 becomes 0.0
             first: dict[bytes, int] = {}
-            for own, row in zip(values, rows.tolist(), strict=True):
-                earlier = first.setdefault(own.tobytes(), row)
-                found += [(min(earlier, row), max(earlier, row))] * (earlier != row)
-        return sorted(found, key=lambda pair: pair[1])
+            for numbers, row in zip(values, rows.tolist(), strict=True):
+                earlier = first.setdefault(numbers.tobytes(), row)
+                pairs += [(min(earlier, row), max(earlier, row))] * (earlier != row)
+        return sorted(pairs, key=lambda pair: pair[1])
 
     def _repr_html_(self) -> str:
         ranges = list[tuple[str, Tensor, str]]()
@@ -287,8 +287,8 @@ class RowGroups:
             ranges.append((name, values, turns))
         measured = (column for part in self.parts for column in part.measured().items())
         ranges += [(name, values, "") for name, values in measured if isinstance(values, Tensor)]
-        seen = ((name, values[~values.isnan()], turns) for name, values, turns in ranges)
-        rows = [[name, f"{float(v.min()):.4f}", f"{float(v.max()):.4f}", turns] for name, v, turns in seen if len(v)]
+        finite = ((name, values[~values.isnan()], turns) for name, values, turns in ranges)
+        rows = [[name, f"{float(v.min()):.4f}", f"{float(v.max()):.4f}", turns] for name, v, turns in finite if len(v)]
         return table_html(repr(self), ("column", "from [rad, m or px]", "to", "degrees"), rows)
 
     @property
@@ -347,9 +347,9 @@ class RowGroups:
             names[rows.numpy()] = ["" if rests else name and f"{part.kind} {name}" for name, rests in each]
         test[held] = out = ~in_train(labels, fraction, seed, kind)
         for name in np.unique(names[test]):
-            own = (names == name) & (name != "")
-            for unit in np.unique(units[out & own[held]]) if own.sum() >= FEWEST_PER_DEVICE else ():
-                if (own & ~test).sum() < FEWEST_PER_DEVICE and (test[held] & (units != unit)).any():
+            mask = (names == name) & (name != "")
+            for unit in np.unique(units[out & mask[held]]) if mask.sum() >= FEWEST_PER_DEVICE else ():
+                if (mask & ~test).sum() < FEWEST_PER_DEVICE and (test[held] & (units != unit)).any():
                     test[held[units == unit]] = False
         return self.rows(~test), self.rows(test)
 

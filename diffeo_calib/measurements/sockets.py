@@ -17,7 +17,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import number_of
 from diffeo_calib.common.device import methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, as_written, few, listed, sentence, warn_user
-from diffeo_calib.measurements.checks import numbers_of
+from diffeo_calib.measurements.checks import numbered, numbers_of
 from diffeo_calib.measurements.readings import CONTACT, Readings, read_of_tool
 
 if TYPE_CHECKING:
@@ -64,28 +64,28 @@ class Sockets:
         if deviation is None or not 0.0 < deviation < inf:
             fix = "pass how well the distances are known, such as 3e-5 for a printed block, measured with a caliper"
             raise MeasurementError.of("`distance_std`", expected="a positive number in m", got=as_written(std), fix=fix)
-        found: dict[tuple[int, int], float] = {}
+        lengths: dict[tuple[int, int], float] = {}
         for pair, length in distances.items():
             metres = number_of(length)
             if metres is None or not 0.0 < metres < inf:
                 raise MeasurementError.of(f"the distance of {pair}", expected="metres above 0", got=as_written(length))
             for both in _pairs(names, pair):
-                if found.setdefault(both, metres) != metres:
+                if lengths.setdefault(both, metres) != metres:
                     where = " and ".join(names[number] for number in both)
-                    got = f"{found[both]:g} and {length:g} m"
+                    got = f"{lengths[both]:g} and {length:g} m"
                     raise MeasurementError.of(f"the distance of {where}", expected="one value", got=got)
-        return cls(names, tuple((*both, length) for both, length in found.items()), deviation)
+        return cls(names, tuple((*both, length) for both, length in lengths.items()), deviation)
 
     @property
     def blocks(self) -> list[tuple[tuple[int, int, float], ...]]:
         """Known distances by block: those of the same sockets at several places, which have one error in common."""
-        found: dict[tuple[str, str, float], list[tuple[int, int, float]]] = {}
+        blocks: dict[tuple[str, str, float], list[tuple[int, int, float]]] = {}
         for first, second, length in self.distances:
             pair = sorted(self.names[number] for number in (first, second))
             if _place(pair[0]) == _place(pair[1]):
                 pair = [name.rpartition(SEPARATOR)[2] for name in pair]
-            found.setdefault((pair[0], pair[1], length), []).append((first, second, length))
-        return [tuple(known) for known in found.values()]
+            blocks.setdefault((pair[0], pair[1], length), []).append((first, second, length))
+        return [tuple(block) for block in blocks.values()]
 
     @property
     def place_names(self) -> tuple[str, ...]:
@@ -120,8 +120,8 @@ class SocketReadings(Readings):
     def sockets(self) -> Sockets:
         """The sockets of these rows, and known distances between them."""
         number = {name: number for number, name in enumerate(self.names)}
-        known = ((number[a], number[b], away) for a, b, away in self.distances if {a, b} <= number.keys())
-        return Sockets(self.names, tuple(known), self.distance_std)
+        lengths = ((number[a], number[b], away) for a, b, away in self.distances if {a, b} <= number.keys())
+        return Sockets(self.names, tuple(lengths), self.distance_std)
 
     @property
     def blocks(self) -> list[tuple[tuple[int, int, float], ...]]:
@@ -155,10 +155,18 @@ class SocketReadings(Readings):
         """The names of the sockets."""
         return {"socket": self.device_names}
 
+    @property
+    def compared(self) -> Tensor:
+        """See :class:`RowGroups`: in one configuration the ball rests in one socket."""
+        return self.q
+
     def with_sessions(self, names: object, **_: object) -> Self:
-        """Raise MeasurementError: sockets of another set-up are other sockets."""
-        fix = "give the sockets of each session names of their own, and leave the sessions out"
-        raise MeasurementError.of("rows with sockets", expected="no sessions", got=as_written(names), fix=fix)
+        """The same rows; MeasurementError for several sessions: sockets of another set-up are other sockets."""
+        sessions = () if names is None else numbered(names, len(self))[1]
+        if len(sessions) > 1:
+            fix = "give the sockets of each session names of their own, and leave the sessions out"
+            raise MeasurementError.of("rows with sockets", expected="no sessions", got=few(sessions), fix=fix)
+        return self
 
     def explained(self) -> tuple[Tensor, Tensor, str | None]:
         """See :meth:`Measurements.explained`: every socket is at one place."""
@@ -184,7 +192,7 @@ def _pairs(names: tuple[str, ...], pair: object) -> list[tuple[int, int]]:
         if set(given) <= set(numbers):
             return [(min(numbers[g] for g in given), max(numbers[g] for g in given))]
         places = dict.fromkeys(_place(name) for name in names)
-        here = [[numbers.get(f"{place}{SEPARATOR}{one}") for one in given] for place in places]
+        here = [[numbers.get(f"{place}{SEPARATOR}{socket}") for socket in given] for place in places]
         both = [(min(a, b), max(a, b)) for a, b in here if a is not None and b is not None]
         if both:
             return both

@@ -96,9 +96,9 @@ class Measurements(ImageTable):
         checks.check_rows(angles, places, "points")
         checks.check_size(places, "points")
         markers = checks.checked_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
-        known = checks.deviations(std, "std", places)
+        spread = checks.deviations(std, "std", places)
         tips = checks.tip_names(on, places.shape[1])
-        set_attributes(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
+        set_attributes(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=spread)
         set_attributes(self, line_numbers=torch.arange(len(angles), device=HOST))
         self.doubted(doubt)
 
@@ -151,12 +151,12 @@ class Measurements(ImageTable):
         checks.check_rows(angles, frames, "poses")
         places = frames[..., :3, 3]
         like = places if places.shape[1] > 1 else places[:, 0]
-        known = checks.deviations(position_std, "position_std", like)
-        found = {"poses": pose_math.of_frames(frames), "lever": float(lever), "board": board}
-        found["std"] = known if known is None else known.view(places.shape)
-        found["rotation_std"] = checks.deviations(rotation_std, "rotation_std", like)
+        spread = checks.deviations(position_std, "position_std", like)
+        columns = {"poses": pose_math.of_frames(frames), "lever": float(lever), "board": board}
+        columns["std"] = spread if spread is None else spread.view(places.shape)
+        columns["rotation_std"] = checks.deviations(rotation_std, "rotation_std", like)
         data = cls(angles, points, joints, doubt=False)
-        return with_attributes(data, **found).with_tips(on).doubted(doubt)
+        return with_attributes(data, **columns).with_tips(on).doubted(doubt)
 
     @classmethod
     def of_points(cls, q: Tensor, points: Tensor, on: Sequence[str] | None, lever: float | None) -> Measurements:
@@ -196,10 +196,10 @@ class Measurements(ImageTable):
         """
         angles, joints = checks.joint_table(q, joint_names)
         numbers, names = checks.numbered(sockets, len(angles), "`sockets`")
-        known = Sockets.of(names, distances, distance_std)
-        apart = tuple((names[a], names[b], length) for a, b, length in known.distances)
+        layout = Sockets.of(names, distances, distance_std)
+        apart = tuple((names[a], names[b], length) for a, b, length in layout.distances)
         zeros = torch.zeros(len(angles), 3, dtype=torch.float64, device=angles.device)
-        how: Any = {"joint_names": joints, "distances": apart, "distance_std": known.distance_std}
+        how: Any = {"joint_names": joints, "distances": apart, "distance_std": layout.distance_std}
         return SocketReadings(KIND, angles, zeros, numbers.to(HOST), names, **how).doubted(doubt)
 
     @classmethod
@@ -235,8 +235,8 @@ class Measurements(ImageTable):
         if std is None and turn_std is None:
             return None
         zero = torch.zeros_like(frames[..., :3, 3])
-        known = torch.cat([zero if own is None else own.view_as(zero) for own in (std, turn_std)], dim=-1)
-        factor = (slopes * known[..., None, :]).nan_to_num(0.0)  # hidden frames
+        spread = torch.cat([zero if part is None else part.view_as(zero) for part in (std, turn_std)], dim=-1)
+        factor = (slopes * spread[..., None, :]).nan_to_num(0.0)  # hidden frames
         return pose_math.block_diagonal(factor @ factor.mT)
 
     @property
@@ -318,13 +318,13 @@ class Measurements(ImageTable):
         camera's axes.
         """
         columns = dict[str, Any]()
-        names, turns = ([f"{prefix}{name}" for prefix in self.prefixes for name in own] for own in (XYZ, TURNS))
+        names, turns = ([f"{prefix}{name}" for prefix in self.prefixes for name in axes] for axes in (XYZ, TURNS))
         columns |= zip(names, self.origins.flatten(1).T, strict=False)
         if self.frames is not None:
             vectors = pose_math.rotation_numbers(self.frames[..., :3, :3], "rotvec")
             columns |= zip(turns, vectors.flatten(1).T, strict=False)
-        for known, own in ((self.std, names), (self.rotation_std, turns)):
-            columns |= {} if known is None else zip([f"std_{name}" for name in own], known.flatten(1).T, strict=False)
+        for std, axes in ((self.std, names), (self.rotation_std, turns)):
+            columns |= {} if std is None else zip([f"std_{name}" for name in axes], std.flatten(1).T, strict=False)
         return columns if self.session is None else columns | {"session": self.device_names}
 
     def with_tips(self, on: Sequence[str] | None) -> Measurements:
@@ -370,11 +370,11 @@ class Measurements(ImageTable):
                 tool; several cameras on the tool, in several set-ups.
         """
         names = self.set_ups(names, remounted=remounted)
-        numbers, known = (None, ()) if names is None else checks.numbered(names, len(self))
+        numbers, texts = (None, ()) if names is None else checks.numbered(names, len(self))
         if remounted and self.lever is not None and self.board is None:
             fix = "give their positions alone (leave the rotation out)"
             raise MeasurementError.of("markers that were mounted anew", expected="positions", got="poses", fix=fix)
-        return with_attributes(self, session=numbers, session_names=known, remounted=remounted and numbers is not None)
+        return with_attributes(self, session=numbers, session_names=texts, remounted=remounted and numbers is not None)
 
     def doubted(self, doubt: bool = True) -> Measurements:
         """See :class:`RowGroups`; MeasurementError for a marker, or frame, that no row shows."""

@@ -131,11 +131,6 @@ def check_unladen(masses: Tensor | None, what: str, *, fix: str) -> None:
         raise MeasurementError.of(what, expected="no payloads", got="a column of masses", fix=fix)
 
 
-def joined_masses(before: Payload, after: Payload) -> Tensor | None:
-    """The masses of the rows of one payload and then of another one; None where either is not known."""
-    return torch.cat([before.masses, after.masses.to(before.masses)]) if before and after else None
-
-
 def common_mass(first: float | None, second: float | None) -> float | None:
     """The mass under which two models are compared: that of the first, 0 where one knows of none; None for neither."""
     if first is None and second is None:

@@ -40,11 +40,11 @@ class Explained:
 
     def sentence(self) -> str:
         """In mm."""
-        own = {name: f"{1e3 * value:.3f}" for name, value in (vars(self) | {"arm": self.arm}).items()}
+        sizes = {name: f"{1e3 * value:.3f}" for name, value in (vars(self) | {"arm": self.arm}).items()}
         return (
-            f"arm or camera? the nominal arm misses the images by {own['nominal']} mm RMS at the tool: "
-            f"arm {own['arm']}, lens {own['lens']} (still unknown {own['lens_std']}), board {own['board']} "
-            f"(still unknown {own['board_std']}), corners of one image {own['corners']}"
+            f"arm or camera? the nominal arm misses the images by {sizes['nominal']} mm RMS at the tool: "
+            f"arm {sizes['arm']}, lens {sizes['lens']} (still unknown {sizes['lens_std']}), board {sizes['board']} "
+            f"(still unknown {sizes['board_std']}), corners of one image {sizes['corners']}"
         )
 
 
@@ -63,12 +63,12 @@ class BoardCamera:
     def numbers(self) -> Tensor:
         """The constants of a device."""
         camera, unknowns = self.camera, self.camera.unknowns
-        own = [float(self.on_tool), camera.width, camera.height, camera.half_size, camera.noise]
-        own += [*astuple(self.explained), *([] if camera.view is None else camera.view.numbers)]
+        head = [float(self.on_tool), camera.width, camera.height, camera.half_size, camera.noise]
+        head += [*astuple(self.explained), *([] if camera.view is None else camera.view.numbers)]
         root = unknowns.new_zeros(SIZE, SIZE)
-        known = camera.root if camera.root.shape[1] <= SIZE else torch.linalg.qr(camera.root.mT).R.mT
-        root[:, : known.shape[1]] = known
-        return torch.cat([unknowns.new_tensor(own), root.flatten(), unknowns])
+        factor = camera.root if camera.root.shape[1] <= SIZE else torch.linalg.qr(camera.root.mT).R.mT
+        root[:, : factor.shape[1]] = factor
+        return torch.cat([unknowns.new_tensor(head), root.flatten(), unknowns])
 
     @classmethod
     def of(cls, numbers: Tensor) -> BoardCamera | None:
@@ -78,11 +78,11 @@ class BoardCamera:
         """
         if len(numbers) <= SIZE:
             return None
-        own, root, unknowns = numbers.split([len(numbers) - SIZE * (SIZE + 1), SIZE * SIZE, SIZE])
-        head, view = own[: 5 + EXPLAINED], own[5 + EXPLAINED :]
+        rest, root, unknowns = numbers.split([len(numbers) - SIZE * (SIZE + 1), SIZE * SIZE, SIZE])
+        head, view = rest[: 5 + EXPLAINED], rest[5 + EXPLAINED :]
         on_tool, width, height, half_size, noise, *explained = head.tolist()
-        known = View(view[4:].view(-1, 3), int(view[0]), *view[1:4].tolist()) if len(view) else None
-        camera = Camera(int(width), int(height), half_size, unknowns, root.view(SIZE, SIZE), noise, known)
+        shown = View(view[4:].view(-1, 3), int(view[0]), *view[1:4].tolist()) if len(view) else None
+        camera = Camera(int(width), int(height), half_size, unknowns, root.view(SIZE, SIZE), noise, shown)
         return cls(camera, bool(on_tool), Explained(*explained))
 
 
@@ -100,18 +100,18 @@ class BoardCameras(Extrinsics):
 
     def with_cameras(self, cameras: Mapping[str, BoardCamera]) -> BoardCameras:
         """The same rows of cameras by their names."""
-        numbers = torch.stack([own.numbers for own in cameras.values()])
-        deviations = torch.stack([own.camera.deviations for own in cameras.values()])
+        numbers = torch.stack([device.numbers for device in cameras.values()])
+        deviations = torch.stack([device.camera.deviations for device in cameras.values()])
         return replace(self, names=tuple(cameras), constants=numbers, deviations=deviations)
 
     @property
     def cameras(self) -> dict[str, BoardCamera]:
         each = zip(self.names, map(BoardCamera.of, self.constants), strict=True)
-        return {name: own for name, own in each if own is not None}
+        return {name: camera for name, camera in each if camera is not None}
 
     def sentences(self) -> list[str]:
         """Lens of each camera, of several with its name, the board that all of them saw, and what explains what."""
-        each = {f"{name}: " * (len(self.cameras) > 1): own for name, own in self.cameras.items()}
-        lenses = [f"{name}{line}" for name, own in each.items() for line in own.camera.sentences()]
-        board = [own.camera.board_sentence() for own in [*each.values()][:1]]
-        return [*lenses, *board, *(f"{name}{own.explained.sentence()}" for name, own in each.items())]
+        each = {f"{name}: " * (len(self.cameras) > 1): device for name, device in self.cameras.items()}
+        lenses = [f"{name}{line}" for name, device in each.items() for line in device.camera.sentences()]
+        board = [device.camera.board_sentence() for device in [*each.values()][:1]]
+        return [*lenses, *board, *(f"{name}{device.explained.sentence()}" for name, device in each.items())]

@@ -56,22 +56,22 @@ class Places:
 
     def aligned(self, data: Any) -> Any:
         """Measured positions in the frame of the model."""
-        for own in self.devices.values():
-            data = own.aligned(data)
+        for part in self.devices.values():
+            data = part.aligned(data)
         return data
 
     def beside(self, other: Places) -> Places:
         """Both of them."""
-        devices, found = joined([*self.devices.values(), *other.devices.values()]), (*self.found, *other.found)
-        return Places(devices, self.ball or other.ball, found, self.numbers + other.numbers)
+        devices, sentences = joined([*self.devices.values(), *other.devices.values()]), (*self.found, *other.found)
+        return Places(devices, self.ball or other.ball, sentences, self.numbers + other.numbers)
 
 
 def joined(devices: Iterable[Extrinsics]) -> dict[str, Any]:
     """Join devices of each kind."""
-    found = dict[str, Any]()
-    for own in devices:
-        found[own.kind] = found[own.kind].beside(own) if own.kind in found else own
-    return found
+    kinds = dict[str, Any]()
+    for part in devices:
+        kinds[part.kind] = kinds[part.kind].beside(part) if part.kind in kinds else part
+    return kinds
 
 
 def known_devices(model: object) -> dict[str, Any]:
@@ -93,8 +93,8 @@ CHECK_READINGS = "check the columns of the readings, their unit, and which devic
 def fitting_devices(data: Readings, points: Tensor) -> Devices:
     """The devices where they fit readings best, for known points (N, P, 3) of the tool, m."""
     kind = kind_of(data)
-    seen = kind.points_of(points)
-    return kind.at(data, seen).refined(data, seen)
+    shown = kind.points_of(points)
+    return kind.at(data, shown).refined(data, shown)
 
 
 def placed(data: Readings, points: Tensor) -> Devices:
@@ -106,16 +106,16 @@ def placed(data: Readings, points: Tensor) -> Devices:
     check_devices(data)
     what, fix = "no place of the devices explains the readings", CHECK_READINGS
     try:
-        found = fitting_devices(data, points)
+        devices = fitting_devices(data, points)
     except InputError as error:  # the ball at a fixed point or behind a camera
         raise MeasurementError.of(f"{what} ({error})", fix=fix) from None
-    seen = found.points_of(points)
-    error = float(found.errors(data, seen).square().sum(1).median().sqrt())
-    most = LARGEST_SHARE * float((seen - seen.mean(0)).square().sum(1).mean().sqrt())
+    shown = devices.points_of(points)
+    error = float(devices.errors(data, shown).square().sum(1).median().sqrt())
+    most = LARGEST_SHARE * float((shown - shown.mean(0)).square().sum(1).mean().sqrt())
     if error > most:
         expected = f"residuals well below {1e3 * most:.0f} mm for points that far apart"
         warn_user(sentence(what, expected=expected, got=f"a median of {1e3 * error:.3g} mm", fix=fix))
-    return found
+    return devices
 
 
 @dataclass(frozen=True)
@@ -171,10 +171,10 @@ class Positions(Sensor):
 
     def check(self, data: Measurements, model: Any) -> None:
         """The same kind of bodies, on the same tips; three markers are not a pose, although both are three points."""
-        own, seen = model.bodies, data.bodies
-        if own.kind != seen.kind:
-            what = f"the model was calibrated with {own.kind}"
-            raise InputError.of(what, expected=f"measured {own.kind}", got=seen.kind, fix=self.fix)
+        fitted, bodies = model.bodies, data.bodies
+        if fitted.kind != bodies.kind:
+            what = f"the model was calibrated with {fitted.kind}"
+            raise InputError.of(what, expected=f"measured {fitted.kind}", got=bodies.kind, fix=self.fix)
         check_tips(data, model.on[: data.markers if model.ball else None])
 
     def place(self, data: Measurements, beside: Beside) -> Places:
@@ -182,19 +182,19 @@ class Positions(Sensor):
 
         The rows of a single unknown set-up are those of a model that knows none, unless no device shares its frame.
         """
-        known = set_up_kind(data).among(beside.known, beside.turns)
+        old = set_up_kind(data).among(beside.known, beside.turns)
         if beside.unplaced and not data.remounted:
             data = data.with_sessions([name or ROWS for name in data.device_names])
         names = dict.fromkeys(name for name in data.device_names if name)
-        frames, new = known.only(names), [name for name in names if name not in known.names]
+        frames, new = old.only(names), [name for name in names if name not in old.names]
         sought = data.remounted or len(names) > 1 or beside.every_session or beside.unplaced
-        if not new or not (sought or known.names):
+        if not new or not (sought or old.names):
             return Places(joined([frames] if frames.names else []))
         rows = of_devices(data, new)
-        found = type(known).of(beside.points(rows), rows, beside.turns)
-        frames = frames.beside(found)
-        said = [BALL_IS_THE_MARKER] if frames.names == (ROWS,) else found.found_sentences()
-        return Places(joined([frames]), found=tuple(said), numbers=found.fitted_numbers)
+        set_ups = type(old).of(beside.points(rows), rows, beside.turns)
+        frames = frames.beside(set_ups)
+        said = [BALL_IS_THE_MARKER] if frames.names == (ROWS,) else set_ups.found_sentences()
+        return Places(joined([frames]), found=tuple(said), numbers=set_ups.fitted_numbers)
 
     def errors(self, data: Measurements, points: Tensor, places: Places) -> Evaluation:
         names, data = data.device_names, places.aligned(data)
@@ -242,23 +242,23 @@ class OtherDevices(Sensor):
         """They tell of the ball alone, or of the frame of measured poses."""
         if kind_of(data).seen_points > 1:
             model.bodies.pose_lever()
-            needed, known = (points // model.bodies.points for points in (kind_of(data).seen_points, model.markers))
-            if needed > known:
-                raise InputError.of(f"{data.kind}s", expected=f"a model of poses of {needed} frames", got=known)
+            needed, held = (points // model.bodies.points for points in (kind_of(data).seen_points, model.markers))
+            if needed > held:
+                raise InputError.of(f"{data.kind}s", expected=f"a model of poses of {needed} frames", got=held)
             return
         check_ball(model, "readings of a ball", "such readings", "readings")
 
     def place(self, data: Readings, beside: Beside) -> Places:
-        known = beside.known.get(data.kind)
-        if known is not None and set(data.names) <= set(known.names):
-            return Places(joined([known]))
-        names = tuple(name for name in data.names if known is None or name not in known.names)
+        old = beside.known.get(data.kind)
+        if old is not None and set(data.names) <= set(old.names):
+            return Places(joined([old]))
+        names = tuple(name for name in data.names if old is None or name not in old.names)
         rows = of_devices(data, names)
         devices = placed(rows, beside.points(rows))
         free = int((devices.deviations > KNOWN_DEVIATION).sum())
         words = few([f"'{name}'" for name in names])
         sentence = f"the places of the devices of {data.kind}s were found from these rows: {words}"
-        return Places(joined([devices] if known is None else [known, devices]), found=(sentence,), numbers=free)
+        return Places(joined([devices] if old is None else [old, devices]), found=(sentence,), numbers=free)
 
     def errors(self, data: Readings, points: Tensor, places: Places) -> Evaluation:
         devices = places.devices.get(data.kind)
@@ -281,16 +281,16 @@ class OtherDevices(Sensor):
 
     def settled(self, data: Readings, points: Tensor, turns: Turns) -> tuple[Extrinsics, ...]:
         """The devices, with the standard deviations of their increments."""
-        found = self.around(data, points)
-        seen = found.points_of(points)
-        median = float(found.errors(data, seen).norm(dim=1).median())
+        devices = self.around(data, points)
+        shown = devices.points_of(points)
+        median = float(devices.errors(data, shown).norm(dim=1).median())
         if median > LARGEST_MEDIAN_M:
             fix = "recalibrate, which finds another ball; or check the rows"
             expected, got = f"at most {1e3 * LARGEST_MEDIAN_M:g} mm at the ball", f"{1e3 * median:.3g} mm"
             raise MeasurementError.of(
                 "median error of readings at the best places", expected=expected, got=got, fix=fix
             )
-        return (replace(found, deviations=found.open_deviations(data, seen)),)
+        return (replace(devices, deviations=devices.open_deviations(data, shown)),)
 
     def around(self, data: Any, points: Tensor) -> Devices:
         """The devices where rows put them, that tell enough, see :func:`placed`."""
@@ -323,21 +323,21 @@ class Contacts(OtherDevices):
             away = socket_errors(model(q).detach()[:, -1], data.device.to(q.device), data.sockets)[0].norm(dim=1)
             return float(away.nanmedian()) / max(motion, SMALLEST_MOTION_M)
 
-        own = share(data.q)
+        spread = share(data.q)
         for factor, fix in ANGLE_MISTAKES:
             other = share(torch.where(turning, factor * data.q, data.q))
-            if other < REMAINING_SPREAD * own:
+            if other < REMAINING_SPREAD * spread:
                 expected = f"a spread within sockets of {1e2 * other:.2g} % of the tip's motion, as in the other unit"
-                raise MeasurementError.of("the joint values", expected=expected, got=f"{1e2 * own:.2g} %", fix=fix)
+                raise MeasurementError.of("the joint values", expected=expected, got=f"{1e2 * spread:.2g} %", fix=fix)
 
     def place(self, data: SocketReadings, beside: Beside) -> Places:
         """The middles of the sockets, which :meth:`errors` finds."""
         count, lone = len(data.names), self.rare(data)
-        found = [f"the middles of {count} sockets were found from these rows"]
+        texts = [f"the middles of {count} sockets were found from these rows"]
         if lone:
             what = f"{len(lone)} of {len(data)} rows show no error: they are alone in their socket, so its middle"
-            found.append(f"{what}: {few(lone)}")
-        return Places(found=tuple(found), numbers=NUMBERS_OF_A_SOCKET * count)
+            texts.append(f"{what}: {few(lone)}")
+        return Places(found=tuple(texts), numbers=NUMBERS_OF_A_SOCKET * count)
 
     def errors(self, data: SocketReadings, points: Tensor, places: Places) -> Evaluation:
         """Spread within sockets, and errors of known distances."""
@@ -366,22 +366,22 @@ def of_devices(data: Any, names: Collection[str]) -> Any:
 SENSORS: dict[str, Sensor] = {"position": Positions(), "pose": Poses(), KIND: Contacts()}
 
 
-def errors_of_kinds(errors: Tensor, own: Coordinates | None, readings: Sequence[Any]) -> Evaluations:
+def errors_of_kinds(errors: Tensor, coordinates: Coordinates | None, readings: Sequence[Any]) -> Evaluations:
     """Errors of rows of any kinds, laid out by coordinates and readings, kind by kind and in their own units.
 
     Args:
         errors: (N, R) m, NaN where nothing was measured; those of poses are of the points that represent each.
-        own: rows that tell coordinates, which are their first numbers.
+        coordinates: rows that tell coordinates, which are their first numbers.
         readings: sets of devices of readings, with their rows and where their numbers stand.
     """
-    found = list[tuple[Evaluation, Tensor]]()
-    if own is not None:
-        sizes, table = errors[own.rows].unflatten(1, (-1, 3)).norm(dim=2), own.table
-        found.append((Evaluation(sizes, line_numbers=table.line_numbers, kind=table.kind), own.rows))
-    for one in readings:
-        numbers = errors[one.rows[:, None], one.numbers]
-        found.append((sensor_of(one.data).in_unit(one.data, one.devices, numbers), one.rows))
-    return Evaluations.of(found)
+    parts = list[tuple[Evaluation, Tensor]]()
+    if coordinates is not None:
+        sizes, table = errors[coordinates.rows].unflatten(1, (-1, 3)).norm(dim=2), coordinates.table
+        parts.append((Evaluation(sizes, line_numbers=table.line_numbers, kind=table.kind), coordinates.rows))
+    for part in readings:
+        numbers = errors[part.rows[:, None], part.numbers]
+        parts.append((sensor_of(part.data).in_unit(part.data, part.devices, numbers), part.rows))
+    return Evaluations.of(parts)
 
 
 def alone(socket: Tensor) -> Tensor:
@@ -411,15 +411,15 @@ def check_ball(model: Any, what: str, of: str, needed: str) -> None:
         raise InputError.of(what, expected=f"a model of {of}", got=got, fix=fix)
 
 
-def check_tips(data: Measurements, own: tuple[str, ...]) -> None:
+def check_tips(data: Measurements, tips: tuple[str, ...]) -> None:
     """Raise MeasurementError if the measurements say that their points are on other tips than these of a model.
 
     Points whose tips are not named are those of the model, in its order.
     """
-    if data.on is not None and data.on != own:
+    if data.on is not None and data.on != tips:
         bodies = data.bodies
         what = f"the measurements' {bodies.many} are on other tips than the model's"
-        expected, got = (listed(on[:: bodies.points]) for on in (own, data.on))
+        expected, got = (listed(on[:: bodies.points]) for on in (tips, data.on))
         raise MeasurementError.of(what, expected=expected, got=got, fix=f"put the {bodies.many} in its order")
 
 
@@ -430,14 +430,14 @@ def marker_tips(robot: Tree, data: Measurements) -> tuple[str, ...]:
         MeasurementError: a tip that the robot does not have, or a robot with several tips and measurements that do not
             say on which of them their markers are.
     """
-    bodies, one = data.bodies, "marker" if data.lever is None else "frame"
+    bodies, body = data.bodies, "marker" if data.lever is None else "frame"
     if data.on is not None and not set(data.on) <= set(robot.tips):
-        what, fix = f"`on`: the tips of robot '{robot.name}'", f"name the tip of every {one}"
+        what, fix = f"`on`: the tips of robot '{robot.name}'", f"name the tip of every {body}"
         got = listed(data.on[:: bodies.points])
         raise MeasurementError.of(what, expected=f"names among {listed(robot.tips)}", got=got, fix=fix)
     if data.on is None and len(robot.tips) > 1:
         what = f"robot '{robot.name}' has {len(robot.tips)} tips ({listed(robot.tips)})"
-        fix = f"pass Measurements{'.from_poses' * (data.lever is not None)}(..., on=[...]) with the tip of every {one}"
+        fix = f"pass Measurements{'.from_poses' * (data.lever is not None)}(..., on=[...]) with the tip of every {body}"
         what += f", and the measurements do not say on which of them their {bodies.many} are"
         raise MeasurementError.of(what, fix=fix)
     return data.on or (robot.tip,) * data.markers
@@ -454,10 +454,10 @@ def check_joint_order(robot: Tree, data: Any) -> None:
 
 def check_payload_link(link: str, data: Any) -> None:
     """Raise MeasurementError for payloads at another link than that of a model's fit; "" for a model without."""
-    own = None if data.payload is None else data.payload_at
-    if link and own is not None and own != link:
+    place = None if data.payload is None else data.payload_at
+    if link and place is not None and place != link:
         fix = "leave these rows out, or calibrate with the payload there"
-        raise MeasurementError.of("the payload of the measurements", expected=f"at '{link}'", got=f"'{own}'", fix=fix)
+        raise MeasurementError.of("the payload of the measurements", expected=f"at '{link}'", got=f"'{place}'", fix=fix)
 
 
 def joint_name_fix(robot: Tree, names: Sequence[str]) -> str:

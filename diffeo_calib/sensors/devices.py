@@ -66,8 +66,8 @@ class Hypothesis(NamedTuple):
 
     def amount(self, size: float, sign: str = "") -> str:
         """A size of its unknown, m, rad or relative, with its unit."""
-        unit, one = self.unit or MILLIMETRE
-        return f"{size / one:{sign}.2g} {unit}"
+        unit, scale = self.unit or MILLIMETRE
+        return f"{size / scale:{sign}.2g} {unit}"
 
 
 def _nothing() -> Tensor:
@@ -139,12 +139,12 @@ class Extrinsics(ABC):
 
     def only(self, names: Collection[str]) -> Self:
         """Keep devices with some names, and their rows."""
-        own = tuple(name for name in self.names if name in names)
-        kept = [self.names.index(name) for name in own]
-        places = [own.index(name) if name in own else -1 for name in self.names]
+        chosen = tuple(name for name in self.names if name in names)
+        kept = [self.names.index(name) for name in chosen]
+        places = [chosen.index(name) if name in chosen else -1 for name in self.names]
         device = torch.tensor(places, dtype=torch.int64, device=HOST)[self.device.to(HOST)]
         values = {"rows": self.rows[device >= 0], "device": device[device >= 0]}
-        return replace(self, names=own, constants=self.constants[kept], deviations=self.deviations[kept], **values)
+        return replace(self, names=chosen, constants=self.constants[kept], deviations=self.deviations[kept], **values)
 
     def beside(self, other: Self) -> Self:
         """Add devices of the same kind under other names."""
@@ -227,14 +227,14 @@ class Devices(Extrinsics):
 
     def observation(self, device: Tensor) -> Observation:
         """What rows of these devices (N,) observe, m."""
-        own, dim = self.constants[device], 3 * self.seen_points
-        return ReadPoints(self._read_metres, own, dim, self.numbers_each, self.check_seen)
+        constants, dim = self.constants[device], 3 * self.seen_points
+        return ReadPoints(self._read_metres, constants, dim, self.numbers_each, self.check_seen)
 
     def by_increments(self, points: Tensor, device: Tensor) -> Tensor:
         """Derivatives (N, r, k) of what rows of these devices (N,) observe at points (N, 3 k), m, by increments."""
-        own, none = self.constants[device], torch.zeros_like(self.deviations)
-        self.check_seen(own, points)
-        by_own = vmap(jacrev(self._read_metres))(own, points)  # (N, r, c)
+        constants, none = self.constants[device], torch.zeros_like(self.deviations)
+        self.check_seen(constants, points)
+        by_own = vmap(jacrev(self._read_metres))(constants, points)  # (N, r, c)
         return by_own @ vmap(jacrev(self.changed, argnums=1))(self.constants, none)[device]
 
     @property
@@ -285,8 +285,8 @@ class Devices(Extrinsics):
 
     def hypotheses(self, points: Tensor, device: Tensor) -> Iterator[Hypothesis]:
         """What may be wrong, or change between rows of these devices (N,) at points (N, 3), m: where each stands."""
-        for name, own in self._of_each(self.by_increments(points, device), device):
-            yield Hypothesis(f"{self.kind} device '{name}'", own)
+        for name, effects in self._of_each(self.by_increments(points, device), device):
+            yield Hypothesis(f"{self.kind} device '{name}'", effects)
 
     def _of_each(self, effects: Tensor, device: Tensor) -> Iterator[tuple[str, Tensor]]:
         """The effects (N, r, U) on the rows of each device by itself, with its name."""
@@ -307,8 +307,8 @@ class Devices(Extrinsics):
     def at(cls, data: Readings, points: Tensor) -> Devices:
         """The devices of readings of known points (N, 3 k), m, in closed form."""
         rows = [data.device == number for number in range(len(data.names))]
-        seen = cls.bodies(points)
-        return cls.of(data, torch.stack([cls.start(data.values[own], seen[own]) for own in rows]))
+        bodies = cls.bodies(points)
+        return cls.of(data, torch.stack([cls.start(data.values[mask], bodies[mask]) for mask in rows]))
 
     @property
     def freedom(self) -> int:
@@ -320,15 +320,15 @@ class Devices(Extrinsics):
         return super().same_set(other) and bool(set(self.names) & set(other.names))
 
     def sentences(self) -> list[str]:
-        return [self.sentence(number, own, MODEL_FRAME) for number, own in enumerate(self.deviations)]
+        return [self.sentence(number, std, MODEL_FRAME) for number, std in enumerate(self.deviations)]
 
     def carried(self, T: Tensor, before: Tensor, after: Tensor, markers: Tensor) -> Tensor:
-        own = torch.arange(len(self.names), device=before.device).repeat_interleave(len(before))
+        device = torch.arange(len(self.names), device=before.device).repeat_interleave(len(before))
         old, new = (self.points_of(points).repeat(len(self.names), 1) for points in (before, after))
-        sees = self.sees(old, own)
-        old, new, own = old[sees], new[sees], own[sees]
-        values = self.turned(self.observation(own).value(old) / self.metres[own, None], T)
-        data = Readings(self.kind, old[:, :1], values, own, self.names)
+        sees = self.sees(old, device)
+        old, new, device = old[sees], new[sees], device[sees]
+        values = self.turned(self.observation(device).value(old) / self.metres[device, None], T)
+        data = Readings(self.kind, old[:, :1], values, device, self.names)
         return replace(self, constants=self.at(data, new).constants).refined(data, new).constants
 
     @property
@@ -361,9 +361,9 @@ class Devices(Extrinsics):
 
     def shared(self, points: Tensor, device: Tensor) -> Tensor:
         """Uncertainty of the devices, as effects of unit variance that rows share: (N, r, D k)."""
-        own = self.by_increments(points, device)  # (N, r, k)
-        whose = torch.nn.functional.one_hot(device, len(self.constants)).to(own)
-        return (whose[:, None, :, None] * own[:, :, None]).flatten(2) @ self.root
+        effects = self.by_increments(points, device)  # (N, r, k)
+        whose = torch.nn.functional.one_hot(device, len(self.constants)).to(effects)
+        return (whose[:, None, :, None] * effects[:, :, None]).flatten(2) @ self.root
 
     def refined(self, data: Readings, points: Tensor) -> Devices:
         """The places that fit readings of known points (N, 3 k), m, best, by reweighted least squares."""
@@ -407,8 +407,8 @@ def refuse_first(rows: Tensor, what: str, fix: str) -> None:
 def least_squares(matrix: Tensor, target: Tensor) -> Tensor:
     """Least squares with columns of equal size, small directions left at zero."""
     scale = matrix.square().mean(0).sqrt().clamp(min=SMALLEST_M)
-    found = torch.linalg.lstsq(matrix / scale, target[:, None], rcond=1e-4, driver="gelsd").solution[:, 0]
-    return found / scale
+    scaled = torch.linalg.lstsq(matrix / scale, target[:, None], rcond=1e-4, driver="gelsd").solution[:, 0]
+    return scaled / scale
 
 
 def median_weights(distances: Tensor, half: float) -> Tensor:

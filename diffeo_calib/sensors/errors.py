@@ -63,11 +63,11 @@ def socket_errors(predicted: Tensor, socket: Tensor, sockets: Sockets) -> tuple[
     """
     count = torch.bincount(socket, minlength=len(sockets.names)).to(predicted)
     middles = predicted.new_zeros(len(sockets.names), 3).index_add(0, socket, predicted) / count[:, None]
-    seen = (count > 0).tolist()
+    used = (count > 0).tolist()
     distances = tuple(
-        DistanceError(sockets.names[a], sockets.names[b], known, float((middles[a] - middles[b]).norm()))
-        for a, b, known in sockets.distances
-        if seen[a] and seen[b]
+        DistanceError(sockets.names[a], sockets.names[b], length, float((middles[a] - middles[b]).norm()))
+        for a, b, length in sockets.distances
+        if used[a] and used[b]
     )
     alone = (count == 1)[socket]
     return (middles[socket] - predicted).masked_fill(alone[:, None], torch.nan), distances
@@ -166,8 +166,8 @@ class Evaluation:
         angles, turns = self.angles.rad2deg().view(len(self.errors), -1), None
         if self.turns is not None:
             turns = self.turns.rad2deg()
-        known = {"line_numbers": self.line_numbers, "devices": self.devices, "unit": "deg"}
-        return Evaluation(angles, away=turns, what=ORIENTATION, kind=ORIENTATION, **known)
+        labels = {"line_numbers": self.line_numbers, "devices": self.devices, "unit": "deg"}
+        return Evaluation(angles, away=turns, what=ORIENTATION, kind=ORIENTATION, **labels)
 
     @property
     def each(self) -> list[Evaluation]:
@@ -176,25 +176,25 @@ class Evaluation:
 
     def __repr__(self) -> str:
         sizes = [
-            f"{len(known(one.errors))} {WORDS[one.what]} in {one.unit}: "
-            + ", ".join(f"{n}={getattr(one, n):.4g}" for n in NAMES)
-            for one in self.each
+            f"{len(known(part.errors))} {WORDS[part.what]} in {part.unit}: "
+            + ", ".join(f"{n}={getattr(part, n):.4g}" for n in NAMES)
+            for part in self.each
         ]
-        found = f"; {self.numbers} numbers found from these rows" * (self.numbers > 0)
-        return f"Evaluation({'; '.join(sizes)}{found})"
+        text = f"; {self.numbers} numbers found from these rows" * (self.numbers > 0)
+        return f"Evaluation({'; '.join(sizes)}{text})"
 
     def _repr_html_(self) -> str:
         """A table of the errors, for notebooks."""
         words = {ERRORS: "position", ORIENTATION: "orientation"}
         rows = [
-            [f"{words.get(one.what, one.title)} [{one.shown[0]}]", *(f"{value:.4f}" for value in one.sizes)]
-            for one in self.each
+            [f"{words.get(part.what, part.title)} [{part.shown[0]}]", *(f"{value:.4f}" for value in part.sizes)]
+            for part in self.each
         ]
         return table_html(f"Errors of {len(self.errors)} rows", ("", *SIZES), rows)
 
     def lines(self) -> Iterator[dict[str, Any]]:
         """One entry for every row and body, as :meth:`Evaluations.to_frame` writes them: mm, px, deg."""
-        return (line for one in self.each for line in one._lines())
+        return (line for part in self.each for line in part._lines())
 
     def _lines(self) -> Iterator[dict[str, Any]]:
         unit, per_unit = self.shown
@@ -202,8 +202,8 @@ class Evaluation:
         lines = range(len(sizes)) if self.line_numbers is None else self.line_numbers.tolist()
         numbers = [[[]] * sizes.shape[1]] * len(sizes) if self.away is None else (per_unit * self.away).tolist()
         devices = self.devices or [""] * len(sizes)
-        for row, (line, device, own, parts) in enumerate(zip(lines, devices, sizes.tolist(), numbers, strict=True)):
-            for marker, (size, components) in enumerate(zip(own, parts, strict=True)):
+        for row, (line, device, bodies, parts) in enumerate(zip(lines, devices, sizes.tolist(), numbers, strict=True)):
+            for marker, (size, components) in enumerate(zip(bodies, parts, strict=True)):
                 padded = [*components, *[torch.nan] * (3 - len(components))]
                 entry = {"row": row, "line": line, "kind": self.kind, "device": device, "marker": marker}
                 yield entry | dict(zip(COMPONENTS, padded, strict=True)) | {"size": size, "unit": unit}
@@ -263,18 +263,16 @@ class Evaluations(Mapping[str, Evaluation]):
         self.placed, self.numbers = tuple(placed), numbers
 
     @classmethod
-    def of(
-        cls, found: Iterable[tuple[Evaluation, Tensor]], placed: Sequence[str] = (), numbers: int = 0
-    ) -> Evaluations:
+    def of(cls, each: Iterable[tuple[Evaluation, Tensor]], placed: Sequence[str] = (), numbers: int = 0) -> Evaluations:
         """Errors of rows of one kind each, with their row numbers (M,); of several of one kind: distance, distance 2.
 
         A kind whose rows all show no error, alone in their sockets, is left out.
         """
         kinds, index = dict[str, Evaluation](), dict[str, Tensor]()
-        for one, rows in ((one, rows) for one, rows in found if one.count):
-            taken = sum(other.kind == one.kind for other in kinds.values())
-            name = f"{one.kind} {taken + 1}" if taken else one.kind
-            kinds[name], index[name] = one, rows
+        for part, rows in ((part, rows) for part, rows in each if part.count):
+            taken = sum(other.kind == part.kind for other in kinds.values())
+            name = f"{part.kind} {taken + 1}" if taken else part.kind
+            kinds[name], index[name] = part, rows
         return cls(kinds, index, placed, numbers)
 
     def __getitem__(self, kind: str) -> Evaluation:
@@ -287,16 +285,14 @@ class Evaluations(Mapping[str, Evaluation]):
         return len(self._kinds)
 
     def __repr__(self) -> str:
-        kinds = ", ".join(f"{kind}: {found!r}" for kind, found in self.items())
+        kinds = ", ".join(f"{kind}: {errors!r}" for kind, errors in self.items())
         return f"Evaluations({kinds}; {self.numbers} numbers found from these rows)"
 
     def rows(self, mask: Tensor) -> Evaluations:
         """The errors of some rows, chosen by a mask (N,); kinds without an error are left out."""
         mask = mask.cpu()
-        some = {
-            kind: found.rows(mask[self.index[kind]]) for kind, found in self.items() if mask[self.index[kind]].any()
-        }
-        some = {kind: found for kind, found in some.items() if found.count}
+        some = {kind: part.rows(mask[self.index[kind]]) for kind, part in self.items() if mask[self.index[kind]].any()}
+        some = {kind: part for kind, part in some.items() if part.count}
         place = mask.cumsum(0) - 1
         index = {kind: place[self.index[kind][mask[self.index[kind]]]] for kind in some}
         return Evaluations(some, index, self.placed, self.numbers)
@@ -304,7 +300,7 @@ class Evaluations(Mapping[str, Evaluation]):
     @property
     def positions(self) -> Evaluation | None:
         """Errors of measured positions or poses; None if none was measured."""
-        return next((found for found in self.values() if found.what == ERRORS), None)
+        return next((part for part in self.values() if part.what == ERRORS), None)
 
     @property
     def main(self) -> Evaluation:
@@ -326,7 +322,7 @@ class Evaluations(Mapping[str, Evaluation]):
     def rms_text(self) -> str:
         """Root mean square of every kind with its unit."""
         what = {SPREAD: " (spread)", READINGS: " (readings)"}
-        return ", ".join(f"{kind} {one.rms_text}{what.get(one.what, '')}" for kind, one in self.items())
+        return ", ".join(f"{kind} {part.rms_text}{what.get(part.what, '')}" for kind, part in self.items())
 
     @property
     def rms(self) -> float:

@@ -53,8 +53,8 @@ class Cameras(Devices):
         return torch.cat([torch.cat([R, t], 2).flatten(1), depth], 1)
 
     def sees(self, points: Tensor, device: Tensor) -> Tensor:
-        seen = self._seen(self.constants[device], points)
-        return seen[:, 2] > cos(VIEW_HALF_ANGLE_RAD) * seen.norm(dim=1)
+        rays = self._seen(self.constants[device], points)
+        return rays[:, 2] > cos(VIEW_HALF_ANGLE_RAD) * rays.norm(dim=1)
 
     @classmethod
     def start(cls, values: Tensor, points: Tensor) -> Tensor:
@@ -87,8 +87,8 @@ class Cameras(Devices):
     @classmethod
     def read(cls, constants: Tensor, body: Tensor) -> Tensor:
         """Image points times the mean depth, m."""
-        seen = cls._seen(constants, body)
-        return constants[12] * seen[:2] / seen[2]
+        ray = cls._seen(constants, body)
+        return constants[12] * ray[:2] / ray[2]
 
     @staticmethod
     def changed(constants: Tensor, increments: Tensor) -> Tensor:
@@ -105,14 +105,14 @@ class Cameras(Devices):
         yield from super().hypotheses(points, device)
         image = self.observation(device).value(points)
         fix = "check the intrinsic parameters, and the size of the images"
-        for name, own in self._of_each(image[..., None], device):
-            yield Hypothesis(f"the focal length of '{name}'", own, ("%", 1e-2), fix, about=VALUE)
+        for name, effect in self._of_each(image[..., None], device):
+            yield Hypothesis(f"the focal length of '{name}'", effect, ("%", 1e-2), fix, about=VALUE)
         for axis in range(2):
             shift = torch.zeros_like(image[..., None])
             shift[:, axis, 0] = self.metres[device]
-            for name, own in self._of_each(shift, device):
+            for name, effect in self._of_each(shift, device):
                 words = f"the principal point of '{name}' along {'uv'[axis]} (in focal lengths)"
-                yield Hypothesis(words, own, ("%", 1e-2), fix, about=VALUE)
+                yield Hypothesis(words, effect, ("%", 1e-2), fix, about=VALUE)
 
     def where(self, number: int) -> str:
         pose = self.poses[number]

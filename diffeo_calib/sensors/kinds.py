@@ -57,8 +57,8 @@ def register(kind: type[Devices]) -> type[Devices]:
 @cache
 def known_kinds() -> dict[str, type[Devices]]:
     """All kinds by their names, those of installed packages too."""
-    for found in entry_points(group="diffeo_calib.sensors"):
-        found.load()
+    for entry in entry_points(group="diffeo_calib.sensors"):
+        entry.load()
     return KINDS
 
 
@@ -112,15 +112,15 @@ def stored_devices(entry: Any, rows: int) -> Extrinsics:
     inside = bool(((numbers >= 0) & (numbers < rows)).all() & ((device >= 0) & (device < len(names))).all())
     if len(numbers) != len(device) or not inside:
         raise InputError.of("the rows of the devices of a model", expected=f"numbers below {rows}")
-    found: Any = {**known_kinds(), **WITHOUT_READINGS}.get(entry["kind"])
-    differs = found is not None and found.reads and deviations.shape[1] != found.increments_each
-    if found is None or differs:
-        found = partial(Unregistered, read_kind=entry["kind"])
+    sensor: Any = {**known_kinds(), **WITHOUT_READINGS}.get(entry["kind"])
+    differs = sensor is not None and sensor.reads and deviations.shape[1] != sensor.increments_each
+    if sensor is None or differs:
+        sensor = partial(Unregistered, read_kind=entry["kind"])
         what = f"the model has {len(names)} devices of the kind {entry['kind']!r}, which is not registered here"
         what += f" with {deviations.shape[1]} increments" * differs
         fix = "import the module that registers it (`diffeo_calib.sensors.kinds.register`) and load the model again, "
         warn_user(sentence(f"{what}: their readings are not predicted", fix=fix + "or install its package"))
-    return found(names, constants, deviations, numbers, device, _shown(entry.get("shown")))
+    return sensor(names, constants, deviations, numbers, device, _shown(entry.get("shown")))
 
 
 def _shown(entry: Any) -> Shown | None:

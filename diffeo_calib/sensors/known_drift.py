@@ -49,17 +49,17 @@ class KnownDrift(Extrinsics):
             InputError: numbers that do not fit the robot's joints.
         """
         sets = getattr(model, "placement", None) or ()
-        own: Any = next((own for own in sets if own.kind == cls.kind), None)
-        if own is None:
+        drift: Any = next((drift for drift in sets if drift.kind == cls.kind), None)
+        if drift is None:
             return None
         joints = tuple(zip(model.robot.joint_names, model.robot.periodic, strict=True))
         size = OFFSETS + len(joints)
-        if own.constants.shape[1] != ENDS_AND_CENTRE + size or own.deviations.shape[1] != size:
-            got = f"{own.constants.shape[1]} and {own.deviations.shape[1]}"
+        if drift.constants.shape[1] != ENDS_AND_CENTRE + size or drift.deviations.shape[1] != size:
+            got = f"{drift.constants.shape[1]} and {drift.deviations.shape[1]}"
             raise InputError.of(
                 "the drift of a model", expected=f"{ENDS_AND_CENTRE + size} and {size} numbers", got=got
             )
-        return replace(own, joints=joints)
+        return replace(drift, joints=joints)
 
     @property
     def ends(self) -> dict[str, tuple[float, float]]:
@@ -112,10 +112,10 @@ class KnownDrift(Extrinsics):
 
     def in_rows(self, data: Any) -> Iterator[str]:
         """Sentence on how the drift is treated in rows that are judged."""
-        told = [name for name in self.names if name in data.drifting]
-        if told:
-            yield f"the drift with {' and '.join(told)} that the fit found is part of the predictions of these rows"
-        if len(told) < len(self.names):
+        present = [name for name in self.names if name in data.drifting]
+        if present:
+            yield f"the drift with {' and '.join(present)} that the fit found is part of the predictions of these rows"
+        if len(present) < len(self.names):
             yield f"rows without {' and '.join(self.names)} are judged as if measured at {self.holds()}"
         for name, (low, high) in self.ends.items():
             values = data.drifting.get(name)
@@ -135,7 +135,7 @@ class KnownDrift(Extrinsics):
         if float(u[GROWTH].abs()) > SURE * float(sd[GROWTH]):
             yield f"lengths by {1e6 * float(u[GROWTH]):+.2g} ppm"
         offsets = zip(self.joints, u[OFFSETS:].tolist(), sd[OFFSETS:].tolist(), strict=True)
-        for (name, turns), own, deviation in offsets:
-            if abs(own) > SURE * deviation:
-                size = with_deviation(1e3 * own, 1e3 * deviation)
+        for (name, turns), shift, deviation in offsets:
+            if abs(shift) > SURE * deviation:
+                size = with_deviation(1e3 * shift, 1e3 * deviation)
                 yield f"the offset of {name} by {size} {'mrad' if turns else 'mm'}"

@@ -55,9 +55,9 @@ class FixedPoints(Devices):
     @classmethod
     def start(cls, values: Tensor, points: Tensor) -> Tensor:
         """|z|^2 - 2 z.f + |f|^2 = l^2 is linear in f and |f|^2."""
-        one = torch.ones_like(values)
-        found = least_squares(torch.cat([-2 * points, one], 1), (values**2)[:, 0] - points.square().sum(1))
-        return torch.cat([found[:3], found.new_zeros(1)])
+        ones = torch.ones_like(values)
+        solution = least_squares(torch.cat([-2 * points, ones], 1), (values**2)[:, 0] - points.square().sum(1))
+        return torch.cat([solution[:3], solution.new_zeros(1)])
 
     @staticmethod
     def read(constants: Tensor, body: Tensor) -> Tensor:
@@ -73,9 +73,9 @@ class FixedPoints(Devices):
         return f"from {triple(1e3 * self.constants[number, :3])} mm"
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
-        found, std = 1e3 * self.constants[number], 1e3 * deviations
-        zero = f", its zero at {found[3]:.3f} +- {std[3]:.3f} mm" * bool(self.deviations[number, 3] > FIXED_DEVIATION_M)
-        place = f"{triple(found[:3])} +- {triple(std[:3])} mm in {frame}"
+        sizes, std = 1e3 * self.constants[number], 1e3 * deviations
+        zero = f", its zero at {sizes[3]:.3f} +- {std[3]:.3f} mm" * bool(self.deviations[number, 3] > FIXED_DEVIATION_M)
+        place = f"{triple(sizes[:3])} +- {triple(std[:3])} mm in {frame}"
         return f"fixed point '{self.names[number]}': {place}{zero}"
 
     def freed(self) -> FixedPoints | None:
@@ -88,9 +88,9 @@ class FixedPoints(Devices):
     def hypotheses(self, points: Tensor, device: Tensor) -> Iterator[Hypothesis]:
         effects = self.by_increments(points, device)
         yield Hypothesis("the zero of all devices", effects[..., 3:], ("mm", 1e-3))
-        for name, own in self._of_each(effects, device):
-            yield Hypothesis(f"the zero of '{name}'", own[..., 3:], ("mm", 1e-3))
-            yield Hypothesis(f"the fixed end of '{name}'", own[..., :3])
+        for name, effect in self._of_each(effects, device):
+            yield Hypothesis(f"the zero of '{name}'", effect[..., 3:], ("mm", 1e-3))
+            yield Hypothesis(f"the fixed end of '{name}'", effect[..., :3])
 
     def check_freed(self, noise: float, free_noise: float) -> None:
         """Lengths whose zero seems to be another one than the device's."""

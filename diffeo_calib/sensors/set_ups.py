@@ -75,10 +75,10 @@ class SetUps(Extrinsics):
         """
 
     @classmethod
-    def among(cls, known: Mapping[str, Any], turns: Turns | None) -> Self:
+    def among(cls, devices: Mapping[str, Any], turns: Turns | None) -> Self:
         """Set-ups of this kind among the devices that a model knows, by kind."""
         none = torch.zeros(0, 0, dtype=torch.float64, device=HOST)
-        return replace(known.get(cls.kind, cls((), none, none)), turns=turns)
+        return replace(devices.get(cls.kind, cls((), none, none)), turns=turns)
 
     @abstractmethod
     def aligned(self, data: Any) -> Any:
@@ -105,7 +105,7 @@ class SetUps(Extrinsics):
         """Rows of known set-ups as those of the model's tool, under their names, wherever the device stands now."""
         return data
 
-    def after(self, known: SetUps) -> Self:
+    def after(self, old: SetUps) -> Self:
         """Set-ups that were found in rows that :meth:`in_any_frame` of others had changed."""
         return self
 
@@ -135,8 +135,8 @@ class SetUps(Extrinsics):
 
     def with_reference(self, reference: int) -> Self:
         """Make one of them the model's."""
-        own = torch.arange(len(self.names), device=HOST)[:, None] == reference
-        constants, deviations = torch.where(own, self.same, self.constants), self.deviations.masked_fill(own, 0.0)
+        mask = torch.arange(len(self.names), device=HOST)[:, None] == reference
+        constants, deviations = torch.where(mask, self.same, self.constants), self.deviations.masked_fill(mask, 0.0)
         return replace(self, constants=constants, deviations=deviations)
 
     @property
@@ -165,14 +165,14 @@ class SetUps(Extrinsics):
 
     def numbers(self, data: Any) -> Tensor:
         """(N,) number here of each row's set-up, -1 for none; MeasurementError for one that is not known."""
-        names, known = data.device_names, ["" if name == ROWS else name for name in self.names]
-        if data.session is None and known != [""]:
+        names, named = data.device_names, ["" if name == ROWS else name for name in self.names]
+        if data.session is None and named != [""]:
             raise MeasurementError.of("the measurements have no sessions", fix="pass data.with_sessions(names)")
-        unknown = [name for name in dict.fromkeys(names) if name and name not in known]
+        unknown = [name for name in dict.fromkeys(names) if name and name not in named]
         if unknown:
             fix = "register the model with rows of the new set-up"
             raise MeasurementError.of(f"the sessions {unknown}", expected=f"some of {listed(self.names)}", fix=fix)
-        return numbers_of(names, known)
+        return numbers_of(names, named)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,14 +184,14 @@ class MeasuringFrames(SetUps):
     @classmethod
     def of(cls, predicted: Tensor, data: Measurements, turns: Turns | None) -> MeasuringFrames:
         """The markers stay; points may have a ball as one more."""
-        names, own = sessions_of(data)
+        names, session = sessions_of(data)
         predicted = predicted[:, : data.markers]
         check_same_markers(predicted, data.points)
-        rows = [(own == place).to(predicted.device) for place in range(len(names))]
-        found = torch.stack([robust_fit(predicted[some], data.points[some]).to(HOST) for some in rows]).flatten(1)
+        rows = [(session == place).to(predicted.device) for place in range(len(names))]
+        frames = torch.stack([robust_fit(predicted[some], data.points[some]).to(HOST) for some in rows]).flatten(1)
         cameras = set(data.session_names) <= set(data.cameras)  # nothing on the tool was mounted again between these
         free = NUMBERS_OF_A_FRAME + 3 * data.markers * (not cameras)
-        return cls(names, found, found[:, :0], turns=turns, increments_each=free)
+        return cls(names, frames, frames[:, :0], turns=turns, increments_each=free)
 
     def aligned(self, data: Any) -> Any:
         return data.in_frames(torch.linalg.inv(self.of_rows(data).unflatten(1, (4, 4))))
@@ -229,8 +229,8 @@ class MountedMarkers(SetUps):
         names, whose = sessions_of(data)
         P = min(data.markers, predicted.shape[1])
         away = _turned(turns, data)[:, :P].mT @ (data.points[:, :P] - predicted[:, :P])[..., None]
-        found = [_middle(away[whose == number][..., 0]) for number in range(len(names))]
-        shifts, deviations = (torch.stack(each).flatten(1).to(HOST) for each in zip(*found, strict=True))
+        middles = [_middle(away[whose == number][..., 0]) for number in range(len(names))]
+        shifts, deviations = (torch.stack(each).flatten(1).to(HOST) for each in zip(*middles, strict=True))
         return cls(names, shifts, deviations, turns=turns, increments_each=3 * data.markers)
 
     def aligned(self, data: Any) -> Any:
@@ -249,10 +249,10 @@ class MountedMarkers(SetUps):
     def sentence(self, number: int) -> str:
         shift, std = (values[number].view(-1, 3) for values in (self.constants, self.deviations))
         sizes = zip((1e3 * shift.norm(dim=1)).tolist(), (1e3 * std.norm(dim=1) / 3**0.5).tolist(), strict=True)
-        seen = zip(sizes, seen_mounted(std).tolist(), strict=True)
-        known = ", ".join(f"{size:.3f} +- {own:.3f} mm" if shown else "not seen" for (size, own), shown in seen)
+        each = zip(sizes, seen_mounted(std).tolist(), strict=True)
+        text = ", ".join(f"{size:.3f} +- {spread:.3f} mm" if shown else "not seen" for (size, spread), shown in each)
         markers = "markers are" if len(shift) > 1 else "marker is"
-        return f"session '{self.names[number]}': its {markers} {known} away from that of the model"
+        return f"session '{self.names[number]}': its {markers} {text} away from that of the model"
 
     @property
     def same(self) -> Tensor:
@@ -270,9 +270,9 @@ class MountedFrames(SetUps):
         names, whose = sessions_of(data)
         lever = data.bodies.pose_lever()
         X = frames_of_points(predicted[:, :3], lever)[:, 0]
-        seen = (data.points - X[:, None, :3, 3]) @ X[:, :3, :3]  # in the frame of the model's tool
-        found = [_middle(seen[whose == number]) for number in range(len(names))]
-        points, deviations = (torch.stack(each).to(HOST) for each in zip(*found, strict=True))
+        places = (data.points - X[:, None, :3, 3]) @ X[:, :3, :3]  # in the frame of the model's tool
+        middles = [_middle(places[whose == number]) for number in range(len(names))]
+        points, deviations = (torch.stack(each).to(HOST) for each in zip(*middles, strict=True))
         shifts = deviations.square().mean(1).sqrt()
         M = poses_from_marks(points, lever).flatten(1)
         free = {"turns": turns, "increments_each": NUMBERS_OF_A_FRAME}
@@ -282,8 +282,8 @@ class MountedFrames(SetUps):
         return data.on_frames(self.of_rows(data).unflatten(1, (4, 4)))
 
     def increments(self, points: Tensor, slopes: Tensor, by_tool: Tensor, centre: Tensor) -> Tensor:
-        found = self.unit * own_slopes(points[:, :3])
-        return slopes[..., : found.shape[1]] @ found
+        steps = self.unit * own_slopes(points[:, :3])
+        return slopes[..., : steps.shape[1]] @ steps
 
     def in_any_frame(self, data: Measurements) -> Measurements:
         if not data.remounted or not set(data.device_names) <= {*self.names, ""}:
@@ -291,13 +291,13 @@ class MountedFrames(SetUps):
         names = {"session": data.session, "session_names": data.session_names, "remounted": True}
         return with_attributes(self.aligned(data), **names)
 
-    def after(self, known: SetUps) -> MountedFrames:
-        if not set(self.names) <= set(known.names):
+    def after(self, old: SetUps) -> MountedFrames:
+        if not set(self.names) <= set(old.names):
             return self
-        own = [known.names.index(name) for name in self.names]
-        M, before = (each.unflatten(1, (4, 4)) for each in (self.constants, known.constants[own]))
+        index = [old.names.index(name) for name in self.names]
+        M, before = (each.unflatten(1, (4, 4)) for each in (self.constants, old.constants[index]))
         here = (self.deviations == 0).all(1, keepdim=True)  # the reference is where it was before
-        deviations = torch.where(here, known.deviations[own], self.deviations)
+        deviations = torch.where(here, old.deviations[index], self.deviations)
         return replace(self, constants=(M @ before).flatten(1), deviations=deviations)
 
     def stepped(self, constants: Tensor, steps: Tensor, centre: Tensor, T: Tensor) -> Tensor:
@@ -314,8 +314,8 @@ class MountedFrames(SetUps):
 
     def sentence(self, number: int) -> str:
         shift, turn = _size(self.constants[number])
-        known, degrees = 1e3 * float(self.deviations[number, :3].norm()), turn * 180.0 / torch.pi
-        away = f"{1e3 * shift:.3f} +- {known:.3f} mm and {degrees:.3f} degrees away on the tool from the model's"
+        spread, degrees = 1e3 * float(self.deviations[number, :3].norm()), turn * 180.0 / torch.pi
+        away = f"{1e3 * shift:.3f} +- {spread:.3f} mm and {degrees:.3f} degrees away on the tool from the model's"
         return f"'{self.names[number]}' is {away}"
 
 
@@ -344,13 +344,13 @@ def check_same_markers(points: Tensor, measured: Tensor) -> None:
         )
 
 
-def robust_fit(seen: Tensor, measured: Tensor) -> Tensor:
+def robust_fit(points: Tensor, measured: Tensor) -> Tensor:
     """The rigid transform (4, 4) from seen to measured points (N, P, 3) by the rows that are no gross outliers, m."""
-    inside = torch.ones(len(seen), dtype=torch.bool, device=seen.device)
-    T = torch.eye(4, dtype=seen.dtype, device=seen.device)
+    inside = torch.ones(len(points), dtype=torch.bool, device=points.device)
+    T = torch.eye(4, dtype=points.dtype, device=points.device)
     for _ in range(ROUNDS):
-        T = rigid_fit(seen[inside].flatten(0, 1), measured[inside].flatten(0, 1))
-        away = largest_known((seen @ T[:3, :3].mT + T[:3, 3] - measured).norm(dim=-1))
+        T = rigid_fit(points[inside].flatten(0, 1), measured[inside].flatten(0, 1))
+        away = largest_known((points @ T[:3, :3].mT + T[:3, 3] - measured).norm(dim=-1))
         inside = away <= GROSS_DISTANCES * away.nanmedian()
     return T
 
@@ -406,12 +406,12 @@ def sessions_of(data: Measurements) -> tuple[tuple[str, ...], Tensor]:
     if data.session is None:
         raise MeasurementError.of("the measurements have no sessions", fix="pass data.with_sessions(names)")
     present = data.session[data.session != NO_SOCKET].unique().tolist()
-    own, names = torch.full_like(data.session, NO_SOCKET), tuple(data.session_names[number] for number in present)
+    session, names = torch.full_like(data.session, NO_SOCKET), tuple(data.session_names[number] for number in present)
     for place, (number, name) in enumerate(zip(present, names, strict=True)):
         rows = data.session == number
-        own[rows] = place
+        session[rows] = place
         if int(rows.sum()) < FEWEST_ROWS:
             fix = "check the name in these rows, measure more rows in it, or leave it out"
             got = few(rare_names(data.device_names, data.line_numbers.tolist(), FEWEST_ROWS))
             raise MeasurementError.of(f"session '{name}'", expected=f"{FEWEST_ROWS} rows", got=got, fix=fix)
-    return names, own
+    return names, session

@@ -43,11 +43,11 @@ def with_markers(table: Measurements, markers: int, lever: float | None = None) 
     return table.with_markers(markers)
 
 
-def check_markers(model: Any, own: Coordinates | None, readings: Sequence[OtherReadings], other: str) -> None:
+def check_markers(model: Any, coordinates: Coordinates | None, readings: Sequence[OtherReadings], other: str) -> None:
     """Raise InputError for rows that show other markers than a calibrated model; ``other``: what to do about these."""
     markers, lever, ball = model.nominal.geometry.markers, model.lever, model.ball
-    table = None if own is None else own.table
-    frames = [one.table.kind for one in readings if sees_frame(one.table)]
+    table = None if coordinates is None else coordinates.table
+    frames = [part.table.kind for part in readings if sees_frame(part.table)]
     if lever is None and frames:
         raise InputError.of(f"{frames[0]}s", expected="a model of poses", got="one of markers", fix=other)
     balls = len(frames) < len(readings)
@@ -58,14 +58,14 @@ def check_markers(model: Any, own: Coordinates | None, readings: Sequence[OtherR
         return
     same = (table.lever is None) == (lever is None)
     if not same or table.markers not in {markers, markers - ball}:
-        kinds = [kind_of_points(*one) for one in ((markers, lever), (table.markers, table.lever))]
+        kinds = [kind_of_points(*pair) for pair in ((markers, lever), (table.markers, table.lever))]
         raise InputError.of("the new rows", expected=kinds[0], got=kinds[1], fix=other)
 
 
 def measured_positions(data: Any) -> Measurements | None:
     """The rows of any table whose positions or poses a device measured; None without any."""
-    own = divided(data)[0]
-    return None if own is None else own.table
+    positions = divided(data)[0]
+    return None if positions is None else positions.table
 
 
 def with_points(data: Measurements, model: Any) -> Measurements:
@@ -75,7 +75,7 @@ def with_points(data: Measurements, model: Any) -> Measurements:
 
 def with_positions(data: Any, change: Callable[[Any], Any]) -> Any:
     """Any table with a change of its rows whose positions or poses a device measured; the other ones stay."""
-    parts = [own if own.without_device else change(own) for own in data.parts]
+    parts = [part if part.without_device else change(part) for part in data.parts]
     return Observations(parts, data.index) if len(parts) > 1 else parts[0]
 
 

@@ -56,8 +56,8 @@ class Trackers(Devices):
     @classmethod
     def start(cls, values: Tensor, bodies: Tensor) -> Tensor:
         """The place of a robot whose tip has these poses."""
-        found = place(bodies[:, None], values[:, None])
-        return torch.cat([found.base[:3].flatten(), found.tool[0]])
+        fit = place(bodies[:, None], values[:, None])
+        return torch.cat([fit.base[:3].flatten(), fit.tool[0]])
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
         marker, std = 1e3 * self.constants[number, 12:], 1e3 * deviations[6:]
@@ -88,9 +88,9 @@ class SocketPlaces(Devices):
             first, second, lengths = (list(each) for each in zip(*block, strict=True))
             away = constants[second] - constants[first]
             U = (one_hot[second] - one_hot[first])[:, :, None] * torch.nn.functional.normalize(away)[:, None]
-            own = torch.cat([U.flatten(1), (away.new_tensor(lengths) - away.norm(dim=1))[:, None]], 1)
-            noise = (1.0 + ALIKE**2 * own.new_ones(len(own)).diag()) * data.distance_std**2
-            equations.append(torch.linalg.solve_triangular(torch.linalg.cholesky(noise), own, upper=False))
+            matrix = torch.cat([U.flatten(1), (away.new_tensor(lengths) - away.norm(dim=1))[:, None]], 1)
+            noise = (1.0 + ALIKE**2 * matrix.new_ones(len(matrix)).diag()) * data.distance_std**2
+            equations.append(torch.linalg.solve_triangular(torch.linalg.cholesky(noise), matrix, upper=False))
         R = torch.linalg.qr(torch.cat(equations), mode="r").R[: 3 * D]
         root = torch.linalg.inv(R[:, :-1])
         places = constants + (root @ R[:, -1]).view(-1, 3)

@@ -251,11 +251,13 @@ def test_a_session_that_begins_earlier_than_said_and_a_payload_that_rows_did_not
     whole = dc.Measurements(*ARM.measure(ROWS, seed=1))
     points, names = whole.points.clone(), ["before"] * 33 + ["after"] * 27
     points[30:] += torch.tensor([2e-3, -1e-3, 5e-4], dtype=torch.float64)
+    far = whole.points + 0.03 * (torch.arange(ROWS) >= 18)[:, None, None]
     masses = torch.tensor([0.0, 5.0, 10.0], dtype=torch.float64)[torch.arange(ROWS) % 3]
     laden, labels = dc.Measurements(*ARM.measure(ROWS, seed=1, payload=masses)), masses.clone()
     labels[2:9:3] = 0.0
     for data, words in (
         (dc.Measurements(whole.q, points).with_sessions(names), "3 rows .* fit session 'after': lines 30, 31, 32"),
+        (dc.Measurements(whole.q, far).with_sessions(names), "15 rows .* fit session 'after': lines 18, 19, 20"),
         (laden.with_payload(labels), "fit a payload of 10: lines 2,"),
         (laden.with_payload(masses), ""),
     ):

@@ -355,3 +355,12 @@ def test_rows_with_known_deviations_keep_their_own() -> None:
     torch.testing.assert_close(data.noise_of_new_rows(scales), wanted, rtol=1e-12, atol=0.0)
     found = plain.noise_of_new_rows(scales)
     assert_close(found, found[:1].expand_as(found), rtol=1e-12, atol=0)
+
+
+def test_gravity_sag_of_many_joints_is_left_out() -> None:
+    # 60 joints have 16,470 unknowns of it, whose matrices took 14 GB.
+    robot = dc.from_dh([dc.DHRow(0.0, 0.05, 0.08, (k % 3 - 1) * math.pi / 2) for k in range(40)])
+    q = 0.4 * torch.rand(30, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - 0.2
+    placed = place(robot, dc.Measurements(q, robot(q)[:, None, :3, 3], doubt=False), silent)
+    with pytest.warns(dc.DiffeoCalibWarning, match="sag of 40 joints is left out .*at most 5000 unknowns of it, got 7"):
+        assert placed.tangent_data().nominal.elasticity is None

@@ -48,10 +48,6 @@ def from_the_tool(path: Path, commanded: Tensor, convention: str = "xyz", angle:
     return poses_table(path, commanded, seen(commanded, camera_on_tool=True), convention, angle)
 
 
-def hand_eye_table(path: Path) -> Path:
-    return from_the_tool(path, flange())
-
-
 def fixed_camera(path: Path, convention: str) -> Path:
     return poses_table(path, flange(), seen(flange(), camera_on_tool=False), convention)
 
@@ -64,7 +60,7 @@ def places(rows: int = 20, axes: int = 3, size: float = 1.0) -> Tensor:
 
 
 def in_inches(path: Path) -> Path:
-    header, *rows = cells(hand_eye_table(path))
+    header, *rows = cells(from_the_tool(path, flange()))
     lines = [header, *([*(str(float(cell) / 25.4) for cell in row[:3]), *row[3:]] for row in rows)]
     path.write_text("\n".join(map(",".join, lines)) + "\n", encoding="utf-8")
     return path
@@ -139,6 +135,15 @@ def of_two_markers(path: Path) -> Path:
     return write_columns(path, cmdx_cmdy_cmdz=own, **markers)
 
 
+def in_sockets(path: Path) -> Path:
+    """A ball near the flange: quaternions in the wrong order leave little too."""
+    commanded, ball = flange(), torch.tensor([0.03, -0.02, 0.02], dtype=torch.float64)
+    commanded[:, :3, 3] = places(3).repeat(len(commanded) // 3, 1) - commanded[:, :3, :3] @ ball
+    quaternions = rotation_numbers(commanded[:, :3, :3], "quat_xyzw")
+    names = torch.arange(len(commanded))[:, None] % 3
+    return write_columns(path, X_Y_Z=1e3 * commanded[:, :3, 3], qx_qy_qz_qw=quaternions, socket=names)
+
+
 TOOL = {"rotation": "qx,qy,qz,qw", "convention": "quat_xyzw", "length": "mm", "camera-on-tool": True}
 FIXED = {**TOOL, "camera-on-tool": None}
 QUATERNIONS = {**FIXED, "robot-pose": "X,Y,Z,q0,q1,q2,q3=quat_wxyz"}
@@ -150,7 +155,7 @@ OPEN = {"robot-pose": None, "convention": None, "rotation-angle": None}
 EITHER = [f'# robot-pose = "{POSE}={name}"' for name in ("xyz", "XYZ")]
 IN_INCHES = {"joint-length": "inch", "length": "mm"}
 READ: dict[str, tuple[Callable[[Path], Path], dict[str, Any], list[str]]] = {
-    "fixed angles": (hand_eye_table, {**TOOL, **SOME, "angle": "deg"}, []),
+    "fixed angles": (partial(from_the_tool, commanded=flange()), {**TOOL, **SOME, "angle": "deg"}, []),
     "Euler angles": (partial(fixed_camera, convention="ZYX"), {**FIXED, "robot-pose": f"{POSE}=ZYX"}, []),
     "quaternions": (partial(fixed_camera, convention="quat_wxyz"), QUATERNIONS, []),
     "inches": (in_inches, {**SOME, **IN_INCHES}, []),
@@ -162,6 +167,8 @@ READ: dict[str, tuple[Callable[[Path], Path], dict[str, Any], list[str]]] = {
     "a degree and wrong rows": (partial(noisy, noise=0.017, wrong=(5, 6)), OPENCV, []),
     "flipped boards": (partial(noisy, flipped=(4, 13)), OPENCV, []),
     "two markers": (of_two_markers, TWO, []),
+    "no errors": (partial(write_columns, cmdx_cmdy_cmdz=places(), x_y_z=places()), {"length": "m"}, []),
+    "sockets": (in_sockets, {"robot-pose": "X,Y,Z,qx,qy,qz,qw=quat_xyzw", "socket": "socket"}, []),
     "5 mm, or 5 m": (partial(of_places, size=5.0), {"length": None}, ['# length = "m"', '# length = "mm"']),
     "metres": (partial(of_places, size=15.0, measured=1e3), {"joint-length": "m", "length": "mm"}, []),
     "15 inches": (partial(of_places, size=0.381, per_metre=1000 / 25.4, measured=1e3), IN_INCHES, []),
@@ -205,7 +212,7 @@ def test_whose_columns_are_the_machine_s(names: str, machine: str, tmp_path: Pat
 
 def test_a_robot_whose_joints_the_table_lacks(tmp_path: Path, init: Any) -> None:
     SimulatedArm().write_urdf(tmp_path / "arm.urdf")
-    found, text = init(hand_eye_table(tmp_path / "t.csv"), tmp_path / "arm.urdf")
+    found, text = init(from_the_tool(tmp_path / "t.csv", flange()), tmp_path / "arm.urdf")
     assert "not used, no column is named after its joints" in text
     assert found["robot-pose"] == f"{POSE}=xyz"
 
@@ -217,6 +224,7 @@ def test_places_measured_in_a_plane(tmp_path: Path, init: Any) -> None:
     table = write_columns(tmp_path / "t.csv", **{"cmdx_cmdy": 1e3 * commanded, "measx_measy": 1e3 * measured})
     found, _ = init(table)
     refused = init(write_columns(tmp_path / "um.csv", **{"cmdx_um|cmdy_um": 1e6 * commanded, "x|y": 1e3 * measured}))[1]
+    assert "got no other columns; if" in init(write_columns(tmp_path / "alone.csv", cmdx_cmdy=commanded))[1]
     assert "cmdx_um, cmdy_um in um: expected m, mm, cm, inch; convert them" in refused
     assert found["position"] == ["measx,measy,0"]
     assert (found["robot-pose"], found["length"]) == ("cmdx,cmdy", "mm")
@@ -252,7 +260,7 @@ def check_hand_eye(path: Path, **truths: Tensor) -> None:
 @pytest.mark.usefixtures("given_scales")
 def test_hand_eye_in_two_commands(tmp_path: Path, command: Command) -> None:
     """And the same poses again: predicted and planned under the names of the table, and corrected by little."""
-    table, model, out = hand_eye_table(tmp_path / "t.csv"), tmp_path / "t.safetensors", tmp_path / "f.json"
+    table, model, out = from_the_tool(tmp_path / "t.csv", flange()), tmp_path / "t.safetensors", tmp_path / "f.json"
     assert command("init", table, "-o", tmp_path / "c.toml").code == 0
     done = command("fit", tmp_path / "c.toml", "--holdout", "0", "--json", out, "--report", tmp_path / "r")
     assert done.code == 0, done.error
@@ -321,7 +329,7 @@ def test_poses_of_a_tool_that_never_tilts(tmp_path: Path, command: Command) -> N
     ],
 )
 def test_poses_that_are_refused(pose: str, options: list[str], message: str, command: Command, tmp_path: Path) -> None:
-    table = hand_eye_table(tmp_path / "t.csv")
+    table = from_the_tool(tmp_path / "t.csv", flange())
     given = ["--robot-pose", pose, "--length", "mm", *(table if word == "t.csv" else word for word in options), *SEEN]
     done = command("fit", table, *given, "-o", tmp_path / "m")
     assert done.code == 1

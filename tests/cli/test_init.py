@@ -359,6 +359,8 @@ def test_signs_and_a_zero_are_proposed_and_read(tmp_path: Path, command: Command
     assert "joints" not in found
     lines = [line for line in text.splitlines() if line.startswith("# joints = ")]
     assert ["uncomment one" in line for line in lines] == [True, True]
+    found, _ = proposed(([f"A{k}" for k in range(1, 7)], read), (SERIES, read), (XYZ, points))
+    assert found["joints"] == "A1,-{A2},{A3}-90,A4,A5,A6"  # of equal series the first
 
 
 @pytest.mark.parametrize("table", [TableFormat("m", "rad", ";", ","), TableFormat("mm", "deg", "\t")])

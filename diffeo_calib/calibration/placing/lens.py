@@ -92,16 +92,16 @@ class LensAndBoard(CameraErrors):
             away = (data.points - registration.geometry.points(data.q)).norm(dim=2)
             cameras, on_tool = dict[str, BoardCamera](), data.board is not None
             for number, (name, camera) in enumerate(shared.cameras.items()):
-                own = shared.seen_by == number
-                nominal = registration.rms if len(shared.cameras) == 1 else float(away[own].square().mean().sqrt())
+                mask = shared.seen_by == number
+                nominal = registration.rms if len(shared.cameras) == 1 else float(away[mask].square().mean().sqrt())
                 explained = Explained(nominal, 0.0, 0.0, 0.0, 0.0, _corners(shared, number))
                 cameras[name] = BoardCamera(camera, on_tool, explained)
             free = _places(data, rows, registration, sessions)
             apart, places = shared.slopes.flatten(0, 1), free.flatten(0, 1)
             apart = apart - places @ torch.linalg.lstsq(places, apart, driver="gelsd").solution
             larger = _relative_size(data, registration, free)
-            own = data.bodies.pose_lever(), apart.view_as(shared.slopes), larger
-            sets.append(cls(BoardCameras.of_rows(rows, shared.seen_by).with_cameras(cameras), shared, *own))
+            rest = data.bodies.pose_lever(), apart.view_as(shared.slopes), larger
+            sets.append(cls(BoardCameras.of_rows(rows, shared.seen_by).with_cameras(cameras), shared, *rest))
             if abs(larger) >= SIZE_WARNED:
                 what = "the size of the board does not fit that of the robot"
                 got = f"lengths in the images {100 * abs(larger):.1f} % {'larger' if larger > 0 else 'smaller'}"

@@ -48,7 +48,7 @@ from diffeo_calib.calibration.placing.sockets import (
 )
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.errors import few, sentence
+from diffeo_calib.common.errors import few, sentence, warn_user
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit, Progress
 from diffeo_calib.kinematics.evaluation import residuals
@@ -121,6 +121,8 @@ def stacked(
 
 
 LOG = logging.getLogger(__name__)
+MOST_SAGS = 5000
+"""Unknowns of gravity sag, of which there are 4.5 n^2 of n joints: matrices of so many take 200 MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +197,11 @@ class Placed:
         """The rows around the geometric calibration, weighted by its residuals; with effects (N, R, U) of unknowns."""
         geometry, theta = self.registration.geometry, self.identification.theta
         payload = Payload.of_rows(geometry.chain, self.data.payload, self.data.payload_at)
-        elastic = bool(payload) or not is_cartesian(geometry.chain)
+        sags = sum(compliance.size for compliance in geometry.chain.arrays.compliances)
+        elastic = bool(payload) or (sags <= MOST_SAGS and not is_cartesian(geometry.chain))
+        if not elastic and sags > MOST_SAGS:
+            what = f"gravity sag of {geometry.chain.n} joints is left out of the model"
+            warn_user(sentence(what, expected=f"at most {MOST_SAGS} unknowns of it", got=sags))
         nominal = GeometryMap(geometry, elastic=elastic, payload=payload)
         theta = torch.cat([theta, theta.new_zeros(nominal.parameters - geometry.size)])
         data = self._rows(nominal, theta)
@@ -209,16 +215,16 @@ class Placed:
         if aligned is None or not wrong:
             return None
         table, flags = aligned.table, torch.zeros(len(self.data), dtype=torch.bool, device=aligned.rows.device)
-        flags[[one.row for one in wrong]] = True
+        flags[[outlier.row for outlier in wrong]] = True
         predicted, flags = model.at_payloads(table.payload)(table.q).detach(), flags[aligned.rows]
-        labels = [label for one in self.placement for label in one.labels(aligned, predicted)]
+        labels = [label for part in self.placement for label in part.labels(aligned, predicted)]
         masses = table.masses.unique().tolist()
         for mass in masses if len(masses) <= gates.MOST_MASSES else ():
             away = model.with_payload(mass)(table.q).detach() - table.points
             labels.append(OtherLabel(f"a payload of {mass:g}", table.masses != mass, away.norm(dim=-1).nanmean(1)))
         errors = (predicted - table.points).norm(dim=-1).nanmean(1)
-        fit = [(flags & one.applies & (one.errors < gates.REMAINING_UNDER_LABEL * errors), one) for one in labels]
-        rows, label = max(fit, key=lambda one: int(one[0].sum()), default=(flags, None))
+        fit = [(flags & case.applies & (case.errors < gates.REMAINING_UNDER_LABEL * errors), case) for case in labels]
+        rows, label = max(fit, key=lambda pair: int(pair[0].sum()), default=(flags, None))
         if label is None or (count := int(rows.sum())) < gates.LABEL_ROWS:
             return None
         lines = few(table.line_numbers[rows.to(table.line_numbers.device)].tolist(), 5)
@@ -319,7 +325,7 @@ def _by_coordinates(
     sessions, table = Sessions.of_table(robot, positions, progress)
     LOG.info("calibrating %s with %r", robot.name, table)
     progress("registration", 0, 1)
-    registration, tables = registered(robot, table), [one.table for one in readings]
+    registration, tables = registered(robot, table), [part.table for part in readings]
     check_beside(robot, table, registration, tables)
     warn_of_joints_below_tip(robot, table)
     warn_of_open_directions(robot, table, registration)
@@ -328,7 +334,7 @@ def _by_coordinates(
         fitted = identify(geometry, table.q, table.points).geometry  # a nominal robot may miss its ball by centimetres
         ball = ball_of(tables, fitted, ball_tip(readings, geometry.on[-1]))
         geometry = geometry if ball is None else with_ball(geometry, ball)
-    devices = tuple(fitting_devices(one, geometry.points(one.q)) for one in tables)
+    devices = tuple(fitting_devices(other, geometry.points(other.q)) for other in tables)
     rows = Rows(geometry, (MeasuredPoints.of(table.q, table.points), *map(ReadRows, tables, devices)))
     if ball is not None:
         registration = described(rows, [registration.noise])

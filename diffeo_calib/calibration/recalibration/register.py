@@ -42,7 +42,6 @@ from diffeo_calib.maps.observation import LinearFunctionals, Observation, Part, 
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conjugate_gradients import MAX_DENSE
-from diffeo_calib.robots.payload import joined_masses
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.coordinates import mounted_of, sensor_of
 from diffeo_calib.sensors.devices import Extrinsics
@@ -201,7 +200,8 @@ def _sessions(tool: Tensor, new: NewRows, newest: GeometryMap) -> SessionMarkers
         session, tools, by_row = by_row.session, by_row.tools, by_row.nominal
     latest = torch.full((len(new.q),), len(tools), dtype=torch.int64, device=x.device)
     if isinstance(by_row, GeometryMap):
-        newest = newest.under(joined_masses(by_row.load, new.marks.fitted.load))
+        before, after = by_row.load, new.marks.fitted.load
+        newest = newest.under(torch.cat([before.masses, after.masses.to(before.masses)]) if before and after else None)
     return SessionMarkers(newest, torch.cat([session, latest]), torch.cat([tools, newest.geometry.tool[None]]))
 
 

@@ -35,7 +35,6 @@ from diffeo_calib.cli.proposals import (
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.checks import quiet
-from diffeo_calib.measurements.csv.lines import read_cells
 from diffeo_calib.robots.dh_file import DHFile
 from diffeo_calib.robots.urdf import chains_in
 from diffeo_calib.robots.urdf_elements import JointElement
@@ -49,8 +48,6 @@ FLANGES = ("flange", "tool0")
 def run(given: InitOptions) -> None:
     """Propose a campaign, write it, and print it; a file that was edited is replaced with --force alone."""
     output = given.output
-    if given.csv.is_dir():
-        read_cells(given.csv, ",")  # says why not
     csv, by = with_places(given.csv, given)
     sheet = guess_sheet(csv)
     try:
