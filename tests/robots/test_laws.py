@@ -97,7 +97,7 @@ def test_poses_and_jacobians_are_those_of_pinocchio(name: str, tmp_path: Path, r
                 assert_close(slopes[row, number], turned, rtol=0, atol=1e-12)
 
 
-def test_shapes_of_one_tip_and_of_several() -> None:
+def test_shapes_of_one_tip_and_of_several(tmp_path: Path) -> None:
     both, left = BODY["both hands"], BODY["one hand, the other as load"]
     q = draw(3, both.n)
     assert both(q).shape == (3, 2, 4, 4)
@@ -105,8 +105,13 @@ def test_shapes_of_one_tip_and_of_several() -> None:
     assert left(q).shape == (3, 4, 4)
     assert left.jacobian(q).shape == (3, 6, 17)
     assert_close(both(q)[:, 0], left(q), rtol=0, atol=0)
-    with pytest.warns(dc.DiffeoCalibWarning, match=r"left out: 'right_shoulder_pitch'.*; pass load=\['right_hand'\]"):
-        serial = dc.load_urdf(URDF_FILE, "pelvis", "left_hand")
+    bracket = '<link name="b"/><joint name="f" type="fixed"><parent link="chest"/><child link="b"/></joint></robot>'
+    before, joint, after = URDF_FILE.read_text(encoding="utf-8").partition('"right_shoulder_pitch" type="revolute">')
+    text = before + joint + after.replace("chest", "b", 1)
+    (tmp_path / "bracket.urdf").write_text(text.replace("</robot>", bracket))
+    for path in (tmp_path / "bracket.urdf", URDF_FILE):
+        with pytest.warns(dc.DiffeoCalibWarning, match=r"left out: 'right_shoulder_pitch'.* load=\['right_hand'\]"):
+            serial = dc.load_urdf(path, "pelvis", "left_hand")
     assert isinstance(serial, dc.Chain)
     assert serial.n == 10
     assert_close(serial(q[:, :10]), left(q), rtol=0, atol=0)
