@@ -21,6 +21,7 @@ from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap
+from diffeo_calib.maps.observation import single_coordinates
 from diffeo_calib.regression.conditional import Conditional, Opened, without_rigid_motions
 from diffeo_calib.regression.conjugate_gradients import condition
 from diffeo_calib.regression.control_points import ControlPointRegression
@@ -124,9 +125,8 @@ class FittedMap:
 
     @property
     def shows_points(self) -> bool:
-        """Whether every row tells all coordinates, each by itself, but for places that rows share."""
-        A = self.functionals
-        return A.shape[1] == self.m and bool((torch.eye(self.m, dtype=A.dtype, device=A.device) == A).all())
+        """Whether every number is a single coordinate, but for places that rows share."""
+        return single_coordinates(self.functionals)
 
     def with_nominal(self, nominal: NominalMap) -> FittedMap:
         """The same map around another nominal map with the same parameters, with what it knows of its covariances."""

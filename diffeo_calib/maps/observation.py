@@ -117,6 +117,11 @@ class LinearFunctionals(Observation):
         return self.axes
 
 
+def single_coordinates(slopes: Tensor) -> bool:
+    """Whether all numbers with these slopes (N, r, m) are single coordinates of points, or hidden."""
+    return bool(((slopes == 0.0) | (slopes == 1.0)).all())
+
+
 class FromPlaces(LinearFunctionals):
     """Points minus the places (N, m) that hold them, m."""
 

@@ -200,6 +200,8 @@ class Readings(RowGroups):
         Raises:
             MeasurementError: wrong shapes, values that are not finite, or a deviation that is not positive.
         """
+        if kind == "socket":
+            raise MeasurementError.of("rows in sockets", expected="names alone", fix="pass Measurements.from_sockets")
         angles, joints = checks.joint_table(q, joint_names)
         N = len(angles)
         given = [float(values)] * N if isinstance(values, (int, float)) and not isinstance(values, bool) else values

@@ -17,7 +17,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import number_of
 from diffeo_calib.common.device import methods_outside_inference_mode
 from diffeo_calib.common.errors import MeasurementError, as_written, few, listed, sentence, warn_user
-from diffeo_calib.measurements.checks import numbers_of
+from diffeo_calib.measurements.checks import numbered, numbers_of
 from diffeo_calib.measurements.readings import CONTACT, Readings, read_of_tool
 
 if TYPE_CHECKING:
@@ -155,10 +155,18 @@ class SocketReadings(Readings):
         """The names of the sockets."""
         return {"socket": self.device_names}
 
+    @property
+    def compared(self) -> Tensor:
+        """See :class:`RowGroups`: in one configuration the ball rests in one socket."""
+        return self.q
+
     def with_sessions(self, names: object, **_: object) -> Self:
-        """Raise MeasurementError: sockets of another set-up are other sockets."""
-        fix = "give the sockets of each session names of their own, and leave the sessions out"
-        raise MeasurementError.of("rows with sockets", expected="no sessions", got=as_written(names), fix=fix)
+        """The same rows; MeasurementError for several sessions: sockets of another set-up are other sockets."""
+        sessions = () if names is None else numbered(names, len(self))[1]
+        if len(sessions) > 1:
+            fix = "give the sockets of each session names of their own, and leave the sessions out"
+            raise MeasurementError.of("rows with sockets", expected="no sessions", got=few(sessions), fix=fix)
+        return self
 
     def explained(self) -> tuple[Tensor, Tensor, str | None]:
         """See :meth:`Measurements.explained`: every socket is at one place."""

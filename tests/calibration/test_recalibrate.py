@@ -238,6 +238,9 @@ def test_another_tool_of_a_worn_robot_is_found() -> None:
     assert "shoulder_joint has changed by 2." in found.status
     assert rms(found.model, worn) < 1e-3
     assert covered(found.model, measured(worn, 100, 6)) > 0.8  # though the joint errs by 25 times what it did
+    sister = SimulatedArm(7)
+    found, _ = warned(dc.recalibrate, old(), measured(sister, 12))
+    assert covered(found.model, measured(sister, 100, 6)) > 0.88  # all parts differ by more than their old errors
 
 
 @few_rows
@@ -252,9 +255,10 @@ def test_another_marker_or_ball_is_neither_a_change_nor_a_contradiction(rows: An
 def test_outliers_hardly_count() -> None:
     new = measured(rows=12)
     points = new.points.clone()
-    points[3] += again_bank.one(0.003, -0.004, 0.0)
-    clean, spoilt = (dc.recalibrate(old(), dc.Measurements(new.q, own), drift="none") for own in (new.points, points))
-    assert spoilt.outliers == (3,)
+    for row, sign in {0: -1, 3: 1, 5: -1, 10: 1}.items():  # that everything has changed explains them less well
+        points[row] += sign * again_bank.one(0.003, -0.004, 0.0)
+    clean, spoilt = (dc.recalibrate(old(), dc.Measurements(new.q, own)) for own in (new.points, points))
+    assert spoilt.outliers == (0, 3, 5, 10)
     assert rms(spoilt.model) < 1.2 * rms(clean.model)
     assert spoilt.inflation < 1.5 * clean.inflation  # regions are those of the robot, not of the wrong row
 

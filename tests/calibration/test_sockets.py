@@ -177,6 +177,7 @@ def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows
         (r"expected about (49|50)\..* mm, by the robot, got 5e\+04 mm", staged(table(some, distances={PAIR: 50.0}))),
         ("check the unit of `distances`", staged(table(some, distances={PAIR: 5e-5}))),
         ("rows with sockets: expected no sessions", lambda: table(some).with_sessions(["a"] * 18 + ["b"] * 18)),
+        ("expected names alone", lambda: dc.Readings.of("socket", some.q, 0.0, some.names)),
         ("rows with sockets: expected no payloads", staged(table(some).with_payload(2.0))),
         *(
             ("calibrated with measured positions", lambda verb=verb: verb(kind_named("positions").model, table(some)))
@@ -257,6 +258,9 @@ def test_tables_that_cannot_be_made(some: SocketRows) -> None:
         (f"a known distance: {pair}", lambda: wrong(some, distances={("0", "0"): 0.1})),
         ("expected one value", lambda: wrong(some, distances={PAIR: 0.05, ("0/0", "0/1"): 0.06})),
     )
+    with pytest.warns(dc.DiffeoCalibWarning, match="1 of 2 rows repeat an earlier row"):
+        dc.Measurements.from_sockets(some.q[[0, 0]], ["a", "b"])
+    assert table(some).with_sessions(["day"] * 36).names == table(some).names
     known = wrong(some, distances={PAIR: 0.05, ("0/0", "2/1"): 0.7}).sockets
     assert known.distances == ((0, 1, 0.05), (2, 3, 0.05), (4, 5, 0.05), (0, 5, 0.7))
 

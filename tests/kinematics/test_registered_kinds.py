@@ -13,6 +13,7 @@ from kind_bank import ELSEWHERE, Kind, kind_named, marked
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.recalibration.new_set_up import weighed
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots.se3 import twist_transform
@@ -92,6 +93,9 @@ def test_sockets_follow_every_registration(*, learn: bool) -> None:
     before, after = (placement(model) for model in (kind.model, found))
     sockets = [name for own in kind.model.placement if own.kind == "socket" for name in own.names]
     assert sockets
+    rows, size = weighed(kind.placed_again, "same"), kind.model.map.noise.covariance.diagonal(dim1=1, dim2=2)
+    noise = rows.noise.diagonal(dim1=1, dim2=2)[rows.visible].median()  # which the fit knows
+    assert float(noise / size[kind.model.map.noise.visible].median()) > 0.5
     for name in sockets:
         assert_close(after[name][:3], before[name][:3] + 2 * shift, rtol=0, atol=2e-3)
 
@@ -112,7 +116,6 @@ def test_a_registered_robot_carries_its_payload() -> None:
     assert kind.model.with_payload(3.0).registered(kind.moved).payload == 3.0
 
 
-@pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 # --- markers of new rows in another order than in the fit -----------------------------------------------------------
 
 

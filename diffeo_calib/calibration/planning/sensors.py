@@ -33,7 +33,7 @@ from diffeo_calib.measurements.poses import inverse_poses, pose_jacobian, poses_
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.board_camera import BoardCamera
-from diffeo_calib.sensors.kinds import WITHOUT_READINGS, known_kinds
+from diffeo_calib.sensors.kinds import known_kinds
 from diffeo_calib.sensors.set_ups import TRANSFORMS, frame_slopes
 
 NEW = -1
@@ -187,7 +187,7 @@ class DeviceReadings(Sensor):
     @classmethod
     def of(cls, kind: str, numbers: object, std: float | None, offset_std: float = 0.0) -> DeviceReadings:
         """Devices that a user describes, see :attr:`Devices.stated_as`."""
-        family: Any = {**known_kinds(), **WITHOUT_READINGS}[kind]
+        family: Any = known_kinds()[kind]
         count = family.stated_as.count(",") + 1
         given = as_tensor(numbers, f"devices of {kind}s", ("D", count), fix=f"pass {family.stated_as} of each, in m")
         constants = family.stated(given)

@@ -35,6 +35,7 @@ from diffeo_calib.kinematics.registered_map import Registration, fitted_markers,
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
+from diffeo_calib.maps.observation import single_coordinates
 from diffeo_calib.measurements.checks import in_other_unit
 from diffeo_calib.measurements.poses import own_blocks
 from diffeo_calib.measurements.rows import RowGroups
@@ -156,11 +157,12 @@ NOISE_EFOLDS = 2.0
 
 def _levelled(rows: NewRows) -> NewRows:
     """The rows with the likeliest noise of every kind of device that the old fit does not know."""
-    if rows.of_coordinates:
+    known = rows.fitted.shows_points
+    if known and single_coordinates(rows.slopes):
         return rows
     drifting = rows.drifting([part.root(rows.at) for part in parts_of(rows.fitted)])  # no noise
     kinds, noise = rows.noise_model.kinds, rows.noise
-    for kind in range(int(rows.fitted.shows_points), int(kinds.max()) + 1):
+    for kind in range(int(known), int(kinds.max()) + 1):
         mask = (kinds == kind).repeat_interleave(rows.y.shape[1] // kinds.shape[1], 1) & rows.visible
         levels = []
         for factor in NOISE_LEVELS.tolist():
