@@ -98,9 +98,8 @@ def commanded(sheet: Sheet) -> Source:
     bodies = poses_in(sheet)
     if not bodies:
         expected = "a ROBOT whose joints the table has columns of, or columns of the poses of a machine"
-        raise InputError.of(
-            f"'{sheet.path}' without a robot's description", expected=expected, got=few(sheet.header, 20)
-        )
+        what, got = f"'{sheet.path}' without a robot's description", few(sheet.header, 20)
+        raise InputError.of(what, expected=expected, got=got)
     machine = machine_of(bodies)
     used = [*machine.place, *machine.turn]
     others = tuple(name for name in sheet.numbers if name not in used)
@@ -199,9 +198,8 @@ def _lengths(names: Sequence[str], values: Tensor) -> tuple[str, ...]:
     """Units of lengths that places may have, by their names, else by the size of the numbers; the likeliest first."""
     named = {column(name).unit for name in names} - {""}
     if others := named - {*UNITS_PER_METRE}:
-        raise InputError.of(
-            f"{few(names)} in {few(sorted(others))}", expected=few([*UNITS_PER_METRE]), fix="convert them"
-        )
+        what, expected = f"{few(names)} in {few(sorted(others))}", few([*UNITS_PER_METRE])
+        raise InputError.of(what, expected=expected, fix="convert them")
     if len(named) == 1:
         return (named.pop(),)
     largest = float(values.abs().max()) if values.numel() else 0.0

@@ -100,8 +100,7 @@ def _middle(R: Tensor) -> Tensor:
     draws = torch.randn(DIRECTIONS, 3, generator=seeded(0), dtype=torch.float64, device=HOST)
     ways = torch.nn.functional.normalize(draws, dim=1).to(R)
     z = ways[(x @ ways.mT).abs().amax(0).argmin()]
-    side = torch.linalg.cross(z, mean[:, (mean.mT @ z).abs().argmin()], dim=0)
-    side = side / side.norm()
+    side = torch.nn.functional.normalize(torch.linalg.cross(z, mean[:, (mean.mT @ z).abs().argmin()], dim=0), dim=0)
     return torch.stack([torch.linalg.cross(side, z, dim=0), side, z], 1)
 
 

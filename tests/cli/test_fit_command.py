@@ -43,23 +43,26 @@ def test_fit_prints_three_stages_in_training_and_held_out(
 
 @pytest.mark.usefixtures("given_scales")
 def test_without_held_out_rows_and_all_that_can_be_printed(site: Site, command: Command, tmp_path: Path) -> None:
-    """Joint columns with names of their own; points and commas of the other kind; the solver and what parts do."""
+    """Joint columns of other names; other points and commas; a wrong row by its line; the solver, what parts do."""
     table, model, names = tmp_path / "t.csv", tmp_path / "all.safetensors", list("abcdef")
-    write_measurements(table, site.data.rows(slice(20)), TableFormat("m", "rad", "\t"), joints=names)
+    (data := site.data.rows([*range(20)])).points[7] += 0.03  # of a copy
+    write_measurements(table, data, TableFormat("m", "rad", "\t"), joints=names)
     given = ["--position", "x,y,z", "--length", "m", "--angle", "rad", "--joints", ",".join(names), "--sep", "\\t"]
     done = command("--verbose", "fit", table, *site.robot(), *given, "--holdout", 0, "-o", model)
     assert done.code == 0
     assert not done.warnings
     assert "held out │" not in done.out
     assert "no row was held out: these are errors on rows that were fitted" in done.out
-    assert re.search(r"leave-one-out RMS: position 0\.\d+ mm", done.out) is not None
+    assert re.search(r"leave-one-out RMS: position \d+\.\d+ mm", done.out) is not None
     for stage in STAGES:
         assert len(done.numbers(stage, "20 training")) == 4
     residuals = re.search(r"coupling residual (\S+), end residual (\S+), time-stepping error \S+ mm", done.out)
     assert residuals is not None
     assert all(float(value) <= 1e-4 for value in residuals.groups())
     loaded: Any = dc.load(model)
-    assert (loaded.report["rows"], loaded.robot.joint_names) == (20, site.arm.nominal.joint_names)
+    assert "1 of 20 training rows look wrong (numbers are lines of the file); none was dropped:\n  row 9: " in done.out
+    assert (loaded.report["rows"], loaded.report["outliers"]) == (20, 1)
+    assert loaded.robot.joint_names == site.arm.nominal.joint_names
     rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in done.out.splitlines() if "│" in line]
     sizes = {
         part.name: [f"{1e3 * part.displacement:.4f}", "" if part.angle is None else f"{1e3 * part.angle:.4f}"]

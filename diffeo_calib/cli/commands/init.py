@@ -222,8 +222,9 @@ def _arms(robot: Path, sheet: Sheet) -> list[Arm]:
         missing = few(joints_without_column(sheet.numbers, longest[0]), 20) if longest else "a joint"
         fix = f"no column is named after {missing}" if missing else "numbered columns are more than the joints"
         fix += ": name the columns as the joints, or q1, q2, ... in their order"
-        got = few(sheet.numbers, 20)
-        raise InputError.of(f"columns of the joints of '{robot}'", expected=expected, got=got, fix=fix)
+        raise InputError.of(
+            f"columns of the joints of '{robot}'", expected=expected, got=few(sheet.numbers, 20), fix=fix
+        )
     arms = [arm for arm in arms if arm.columns.how == "named as in the URDF"] or arms
     most = max(len(arm.joints) for arm in arms)
     return list({(*arm.joints, arm.links.dh_convention): arm for arm in arms if len(arm.joints) == most}.values())
