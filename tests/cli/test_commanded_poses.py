@@ -139,9 +139,9 @@ def in_sockets(path: Path) -> Path:
     """A ball near the flange: quaternions in the wrong order leave little too."""
     commanded, ball = flange(), torch.tensor([0.03, -0.02, 0.02], dtype=torch.float64)
     commanded[:, :3, 3] = places(3).repeat(len(commanded) // 3, 1) - commanded[:, :3, :3] @ ball
-    quaternions = rotation_numbers(commanded[:, :3, :3], "quat_xyzw")
-    names = torch.arange(len(commanded))[:, None] % 3
-    return write_columns(path, X_Y_Z=1e3 * commanded[:, :3, 3], qx_qy_qz_qw=quaternions, socket=names)
+    turns = rotation_numbers(commanded[:, :3, :3], "quat_xyzw")
+    sockets = {"qx_qy_qz_qw": turns, "socket": torch.arange(len(commanded))[:, None] % 3}
+    return write_columns(path, X_Y_Z=1e3 * commanded[:, :3, 3], **sockets)
 
 
 TOOL = {"rotation": "qx,qy,qz,qw", "convention": "quat_xyzw", "length": "mm", "camera-on-tool": True}
