@@ -201,9 +201,11 @@ def test_a_row_in_a_socket_says_why_it_is_far() -> None:
 
 def test_rows_in_a_wrong_socket_are_named(plain: SimulatedArm, some: SocketRows) -> None:
     names = list(some.names)
-    names[3], names[20] = "0/1", "0/0"
+    names[3], names[20] = "2/1", "0/0"
     with pytest.warns(dc.DiffeoCalibWarning, match=r"2 of 36 rows .* row 3 fits '0/0', row 20 fits '1/1'"):
-        place(plain.nominal, table(some, tuple(names)), silent)
+        placed = place(plain.nominal, table(some, tuple(names)), silent)
+    weights = placed.identification.tails.weights.flatten()
+    assert (weights < 1e-3).nonzero()[:, 0].tolist() == [3, 20], "the other rows of these sockets count"
 
 
 def test_a_known_distance_is_judged_by_how_well_its_own_rows_fit(plain: SimulatedArm, some: SocketRows) -> None:
