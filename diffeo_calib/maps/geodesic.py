@@ -155,13 +155,8 @@ class GeodesicDeformation(Deformation):
         slopes = self._slopes if x is None else nominal.jacobian(chi[-1], theta)
         to_end = self._apply_blocks(m_y[-1], slopes) @ m_x[-1]
         sensitivity = self._apply_blocks(m_y[-1], nominal.sensitivities(chi[-1], theta))
-        linearisation = Linearisation(
-            self.spec,
-            self._nodes(chi, m_x, to_end),
-            self._nodes(z, m_y, m_y[-1]),
-            sensitivity,
-        )
-        return z[-1].reshape(sensitivity.shape[:2]), linearisation
+        nodes = self._nodes(chi, m_x, to_end), self._nodes(z, m_y, m_y[-1])
+        return z[-1].reshape(sensitivity.shape[:2]), Linearisation(self.spec, *nodes, sensitivity)
 
     def linear_response(self, at: Linearisation, *, elsewhere: bool = False) -> Tensor:
         """Linear effect of this deformation's own fields and theta on k1 at its controls: (N, m).

@@ -29,13 +29,7 @@ from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.joint_ranges import check_same_robot
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap, SessionMarkers
-from diffeo_calib.kinematics.registered_map import (
-    RegisteredMap,
-    Registration,
-    fitted_markers,
-    moved,
-    robot_map,
-)
+from diffeo_calib.kinematics.registered_map import RegisteredMap, Registration, fitted_markers, moved, robot_map
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.maps.observation import LinearFunctionals, Observation, Part, Stacked
