@@ -48,10 +48,6 @@ def from_the_tool(path: Path, commanded: Tensor, convention: str = "xyz", angle:
     return poses_table(path, commanded, seen(commanded, camera_on_tool=True), convention, angle)
 
 
-def fixed_camera(path: Path, convention: str) -> Path:
-    return poses_table(path, flange(), seen(flange(), camera_on_tool=False), convention)
-
-
 # --- what `init` finds ---
 
 
@@ -139,11 +135,12 @@ def in_sockets(path: Path) -> Path:
     """A ball near the flange: quaternions in the wrong order leave little too."""
     commanded, ball = flange(), torch.tensor([0.03, -0.02, 0.02], dtype=torch.float64)
     commanded[:, :3, 3] = places(3).repeat(len(commanded) // 3, 1) - commanded[:, :3, :3] @ ball
-    quaternions = rotation_numbers(commanded[:, :3, :3], "quat_xyzw")
-    names = torch.arange(len(commanded))[:, None] % 3
-    return write_columns(path, X_Y_Z=1e3 * commanded[:, :3, 3], qx_qy_qz_qw=quaternions, socket=names)
+    turns = rotation_numbers(commanded[:, :3, :3], "quat_xyzw")
+    sockets = {"qx_qy_qz_qw": turns, "socket": torch.arange(len(commanded))[:, None] % 3}
+    return write_columns(path, X_Y_Z=1e3 * commanded[:, :3, 3], **sockets)
 
 
+FIXED_CAMERA = partial(poses_table, commanded=flange(), found=seen(flange(), camera_on_tool=False))
 TOOL = {"rotation": "qx,qy,qz,qw", "convention": "quat_xyzw", "length": "mm", "camera-on-tool": True}
 FIXED = {**TOOL, "camera-on-tool": None}
 QUATERNIONS = {**FIXED, "robot-pose": "X,Y,Z,q0,q1,q2,q3=quat_wxyz"}
@@ -156,8 +153,8 @@ EITHER = [f'# robot-pose = "{POSE}={name}"' for name in ("xyz", "XYZ")]
 IN_INCHES = {"joint-length": "inch", "length": "mm"}
 READ: dict[str, tuple[Callable[[Path], Path], dict[str, Any], list[str]]] = {
     "fixed angles": (partial(from_the_tool, commanded=flange()), {**TOOL, **SOME, "angle": "deg"}, []),
-    "Euler angles": (partial(fixed_camera, convention="ZYX"), {**FIXED, "robot-pose": f"{POSE}=ZYX"}, []),
-    "quaternions": (partial(fixed_camera, convention="quat_wxyz"), QUATERNIONS, []),
+    "Euler angles": (partial(FIXED_CAMERA, convention="ZYX"), {**FIXED, "robot-pose": f"{POSE}=ZYX"}, []),
+    "quaternions": (partial(FIXED_CAMERA, convention="quat_wxyz"), QUATERNIONS, []),
     "inches": (in_inches, {**SOME, **IN_INCHES}, []),
     "turned about one axis": (turned_about_z, {}, EITHER),
     "turned at one place": (at_one_place, {}, [f'robot-pose = "{POSE}=xyz"']),  # among others
@@ -174,8 +171,6 @@ READ: dict[str, tuple[Callable[[Path], Path], dict[str, Any], list[str]]] = {
     "15 inches": (partial(of_places, size=0.381, per_metre=1000 / 25.4, measured=1e3), IN_INCHES, []),
 }
 """What is in a table -> how it is written; entries, None for one that is missing or open; texts."""
-
-
 LONGEST = ("a degree and wrong rows", "inches", "never turned")
 
 

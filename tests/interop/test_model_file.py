@@ -239,6 +239,10 @@ def test_the_hash_is_that_of_the_file_or_of_the_arrays(arm: Case, tmp_path: Path
     data = dc.read_measurements(tmp_path / "table.csv", names, ["x", "y", "z"], length="m", angle="rad")
     of_the_file = hashlib.sha256((tmp_path / "table.csv").read_bytes()).hexdigest()
     assert data.sha256 == data.split(0.5)[0].sha256 == data.file_sha256 == of_the_file
+    origin: Any = data.origin
+    assert list(origin.texts(data.line_numbers)) == [*names, "x", "y", "z"]
+    (tmp_path / "table.csv").write_text((tmp_path / "table.csv").read_text() + "\n")
+    assert origin.texts(data.line_numbers) == {}  # of another file
     arrays = dc.Measurements(data.q, data.points)  # not read from a file
     assert arrays.file_sha256 is None
     assert arrays.sha256 == dc.Measurements(data.q.clone(), data.points.clone()).sha256

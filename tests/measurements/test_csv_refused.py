@@ -51,6 +51,7 @@ FILES: list[Case] = [
     (b"\0\1" + TABLE.encode(), {}, "is no text but binary"),
     (TABLE.replace("x,", "x (cm),"), {"position": ["x (cm)", "y", "z"], "length": "mm"}, STATED.format("cm")),
     (HEADER + "rad,rad,m,mm,mm\n" + ROWS, {"length": "mm"}, "column 'x': " + STATED.format("m")),
+    (HEADER + "degree,弧度,米,mm,毫米\n" + ROWS, {"length": "mm"}, "column 'q1': expected rad, as stated, got deg"),
     (TABLE.replace("0.1,", "12°30',"), {}, "column 'q1': expected rad, as stated, got deg"),
     (TABLE.replace("0.1,", "12°75',"), {"angle": "deg"}, "column 'q1': expected a number, got \"12°75'"),
     ('q1,q2,p\n0,0,"[1, 2, 3]"\n1,1,"[1, 2, 4]"\n1,2,7\n', PARTS, "line 4, column 'p_x' ... got '7_1'"),

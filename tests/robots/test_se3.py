@@ -11,6 +11,7 @@ from diffeo_calib.robots.se3 import (
     roll_pitch_yaw,
     roll_pitch_yaw_angles,
     rotation,
+    twist_at,
 )
 
 
@@ -20,6 +21,7 @@ def test_rotation_and_its_jacobian_at_every_angle(angle: float) -> None:
     x, y, z = w.tolist()
     W = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
     torch.testing.assert_close(rotation(w), torch.linalg.matrix_exp(W), rtol=0, atol=2e-15)
+    torch.testing.assert_close(twist_at(w.roll(1)) @ torch.cat([w, w]), torch.cat([w + W @ w.roll(1), w]))
     # Jr(w) = int_0^1 exp(-s [w]x) ds: the corner of the exponential of [[-W, 1], [0, 0]]
     block = torch.zeros(6, 6, dtype=torch.float64)
     block[:3, :3], block[:3, 3:] = -W, torch.eye(3)

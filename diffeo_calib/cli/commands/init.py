@@ -56,8 +56,7 @@ def run(given: InitOptions) -> None:
         raise type(error)(f"{error} {sheet.odd}".strip()) from error
     with quiet():
         copies = len(source.data.copies())
-    why = {"by": getattr(csv, "sentence", "")}
-    source = source.into(why, csv=given.csv, places=given.places, by=by or None)
+    source = source.into({"by": getattr(csv, "sentence", "")}, csv=given.csv, places=given.places, by=by or None)
     if copies:
         exactly = f"{copies} line(s) repeat others exactly; real repeats differ"
         source = source.into({"duplicates": exactly}, duplicates="drop")

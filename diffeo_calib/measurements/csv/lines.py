@@ -13,7 +13,7 @@ import io
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
-from itertools import combinations, islice, takewhile, zip_longest
+from itertools import chain, combinations, islice, takewhile, zip_longest
 from math import isfinite, isnan, prod
 from os import PathLike
 from pathlib import Path
@@ -74,7 +74,7 @@ class CsvLines:
         header: the names of the columns; by position, "1", "2", ..., where no line names them.
         units: by name of column, of a row of units below the header.
         notes: what was decided, in words; after :meth:`rows` also which lines between them were skipped.
-        sha256: of the file; None of what can be read only once, a pipe.
+        sha256: of the file.
 
     Raises:
         MeasurementError: a file that cannot be read, is empty, no text or no valid CSV.
@@ -199,7 +199,7 @@ class CsvLines:
         self.header, self._extra = header, max(width - len(header), 0)
 
 
-def _text(path: Path, sep: str) -> tuple[str, list[str], str | None]:
+def _text(path: Path, sep: str) -> tuple[str, list[str], str]:
     """The text of a file, what was decided about it, its SHA-256; MeasurementError if it is none, or no table."""
     try:
         with path.open("rb") as file:
@@ -219,7 +219,7 @@ def _text(path: Path, sep: str) -> tuple[str, list[str], str | None]:
     if path.suffix.lower() in NO_TABLES:
         what, fix = f"'{path}' is no table", "write one: a line with the names of the columns, then a line for each row"
         raise MeasurementError.of(what, expected="CSV, a spreadsheet or arrays", got=path.suffix, fix=fix)
-    sha256 = hashlib.sha256(data).hexdigest() if path.is_file() else None
+    sha256 = hashlib.sha256(data).hexdigest()
     if data.startswith(WIDE):
         return data.decode("utf-16", "replace"), ["text in utf-16, not UTF-8"], sha256
     if (sheet := as_text(path, data, sep)) is not None:
@@ -406,8 +406,7 @@ def write_rows(path: str | PathLike[str], names: Sequence[str], blocks: Iterable
         return repr(value).replace(".", table.decimal) if isfinite(value) else ""
 
     with WholeFile(path) as file:
-        file.write(csv_text([names], table.sep, "\r\n").encode())
-        for block in blocks:
+        for block in chain([[names]], blocks):
             file.write(csv_text((map(cell, row) for row in block), table.sep, "\r\n").encode())
 
 

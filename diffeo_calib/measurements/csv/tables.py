@@ -32,11 +32,11 @@ from diffeo_calib.measurements.table_format import ANGLE_UNITS, EULER, UNITS_PER
 
 @dataclass(frozen=True)
 class TableOrigin:
-    """A table in a file, which of its columns were read, and how; no SHA-256 of what can be read only once, a pipe."""
+    """A table in a file, which of its columns were read, and how."""
 
     path: Path
     columns: Columns
-    sha256: str | None
+    sha256: str
 
     @property
     def options(self) -> str:
@@ -61,7 +61,7 @@ class TableOrigin:
 
     def texts(self, line_numbers: Tensor) -> dict[str, list[str]]:
         """The cells of all columns in these lines (N,); empty if the file has changed since, or is gone."""
-        if self.sha256 is None or not self.path.is_file():
+        if not self.path.is_file():
             return {}
         try:
             file = CsvLines(self.path, self.columns.table.sep, self.columns.names)
@@ -86,7 +86,7 @@ class FileRows(NamedTuple):
     raw: Tensor  # (N, c) numbers in these, in its units
     texts: Mapping[str, Sequence[str]]  # its columns of texts
     lines: Sequence[int]  # their numbers in the file
-    sha256: str | None  # of the file, as of :class:`CsvLines`
+    sha256: str  # of the file, as of :class:`CsvLines`
 
     def of(self, rows: Tensor) -> FileRows:
         """The rows with these numbers (M,), or those that a mask (N,) chooses."""
