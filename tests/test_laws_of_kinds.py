@@ -80,7 +80,10 @@ def test_a_model_is_saved_whole(kind: str) -> None:
 def test_a_fit_in_another_frame_is_the_fit_moved() -> None:
     """Of positions beside rows in sockets, whose places move along."""
     kind, T = kind_named("mixture"), twist_transform(ELSEWHERE)
-    rows, q = with_attributes(kind.data, points=kind.data.points @ T[:3, :3].mT + T[:3, 3]), kind.q(20)
+    parts: Any = kind.data.parts
+    measured, others = ([part for part in parts if part.without_device is free] for free in (False, True))
+    measured = [part.in_frames(T.expand(len(part), 4, 4)) for part in measured]
+    rows, q = dc.Observations.joined([*measured, *others]), kind.q(20)
     moved, here = dc.calibrate(kind.robot, rows, hyperparameters=kind.scales), kind.result
     for there, own in ((moved.model(q), here.model(q)), (moved.sockets.positions, here.sockets.positions)):
         assert_close(there, own @ T[:3, :3].mT + T[:3, 3], rtol=0, atol=2e-6)
@@ -220,7 +223,8 @@ def test_devices_are_kept_where_positions_alone_are_registered(name: str) -> Non
     (measured,) = (part for part in parts if not part.without_device)
     for T in (torch.eye(4, dtype=torch.float64), twist_transform(0.5 * ELSEWHERE)):
         rows = measured.in_frames(T.expand(len(measured), 4, 4))
-        model = model.registered(rows)
+        assert [own.names for own in model.registered(rows).placement] == names
+        model = model.registered(rows, learn=False)  # else `recalibrate` would count them twice
         assert [own.names for own in model.placement] == names
     judged = dc.Observations.joined([rows, *(part for part in parts if part.without_device)])
     for again in (model, dc.recalibrate(model, rows).model):

@@ -223,7 +223,8 @@ def _result(
 ) -> CalibrationResult:
     """Findings about model and rows, and everything together."""
     data, scales, fitted_map = chosen.data, chosen.selection.scales, fitted.model
-    fitted_map = with_open_directions(fitted_map, placed.data.q, placed.registration, rigid=placed.lever is not None)
+    q = placed.data.q if placed.coordinates is None else placed.coordinates.table.q
+    fitted_map = with_open_directions(fitted_map, q, placed.registration, rigid=placed.lever is not None)
     fitted_map = fitted_map.without_rigid_motions() if placed.free else fitted_map
     placed = placed.settled(fitted, fitted_map, chosen)
     model = CalibratedKinematics(robot, fitted_map, lever=placed.lever, ball=placed.ball)
