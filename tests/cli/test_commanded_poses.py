@@ -418,6 +418,13 @@ def test_a_table_with_two_slides_is_corrected_where_it_can_move(tmp_path: Path, 
         (None, r"'own.py' cannot be read \(No such file or directory\)"),
         ("1 +", "'own.py' does not run: got SyntaxError"),
         ("f = 1 / 0", "'own.py' does not run: got ZeroDivisionError"),
+        ("import sys; sys.exit()", "'own.py' does not run: got SystemExit"),
+        ("def f(q): raise SystemExit", "own.py:f of 5 rows: got SystemExit"),
+        (
+            "from __future__ import annotations; import dataclasses, other; f = other.f\n"
+            "@dataclasses.dataclass\nclass A: a: int\n",
+            r"returns: expected places \(5, k\).* got \(4, 2\)",
+        ),
         ("f = None", "the file 'own.py': expected a function f"),
         ("def f(q): return q @ q", "own.py:f of 5 rows: got RuntimeError"),
         ("def f(q): return q[:, :1].expand(-1, 4)", r"returns: expected places \(5, k\).* got \(5, 4\)"),
@@ -430,9 +437,10 @@ def test_functions_that_are_none(
     text: str | None, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    joints._module.cache_clear()
+    joints._names.cache_clear()
     if text is not None:
         (tmp_path / "own.py").write_text(text, encoding="utf-8")
+        (tmp_path / "other.py").write_text("def f(q): return q[:4]", encoding="utf-8")
     with pytest.raises(MeasurementError, match=message):
         PoseColumns.of("a,b=own.py:f").poses(drawn(5, 2, seed=0))
 

@@ -141,10 +141,11 @@ def files(arm: Case, tmp_path: Path) -> tuple[Path, Path]:
 def test_the_command(files: tuple[Path, Path], tmp_path: Path, command: Command) -> None:
     model, table = files
     out = tmp_path / "report.html"
-    for tolerance, sentence in (("5mm", "Within the tolerance of 5 mm"), ("10um", "Above the tolerance of 0.01 mm")):
+    judged = ("5mm", "Within the tolerance of 5 mm", 0), ("10um", "Above the tolerance of 0.01 mm", 4)
+    for tolerance, sentence, code in judged:
         words = (*POSITION, "--against", "humidity", "--tolerance", tolerance)
         done = command("evaluate", model, table, "--report", out, *words)
-        assert (done.code, done.err) == (0, "")
+        assert (done.code, done.err) == (code, "")
         text = out.read_text(encoding="utf-8")
         check_page(text)
         assert sentence in done.out

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import typer
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.judged_rows import evaluate, expected_rms, judge
@@ -179,6 +180,8 @@ def _reported(model: CalibratedKinematics, page: Path, options: EvaluateOptions)
         each = "as fitted" if not findings.errors else "each predicted by all others"
         say(f"all rows of the table were used before: the rows of the fit are shown, {each}")
     say(words, *printed.expectation_lines(model, None, findings.deviations.error), f"report: {page}")
+    if tolerance is not None and findings.judged.value > tolerance:
+        raise typer.Exit(printed.EXIT_ABOVE)
 
 
 # --- predictions

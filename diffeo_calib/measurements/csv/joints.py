@@ -8,6 +8,7 @@ table. Any other text is the name of a column. Poses stand in place of joint val
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ from functools import cache
 from itertools import product
 from math import pi
 from pathlib import Path
-from types import ModuleType
+from runpy import run_path
 from typing import Any
 
 import torch
@@ -207,12 +208,12 @@ class PoseColumns:
 def _made(program: str, cells: Tensor) -> Tensor:
     """Poses (N, 4, 4) or places (N, k) that a function makes of cells (N, c); MeasurementError if it does not."""
     path, _, name = program.rpartition(":")
-    function: Callable[[Tensor], Any] | None = getattr(_module(path), name, None)
+    function: Callable[[Tensor], Any] | None = _names(path).get(name)
     if function is None:
         raise MeasurementError.of(f"the file '{path}'", expected=f"a function {name}", got="none of this name")
     try:
         output = torch.as_tensor(function(cells), dtype=cells.dtype, device=cells.device)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise MeasurementError.of(f"{program} of {len(cells)} rows", got=f"{type(error).__name__}: {error}") from error
     places = output.ndim == 2 and 1 <= output.shape[1] <= 3
     if output.ndim == 0 or len(output) != len(cells) or not (places or output.shape[1:] == (4, 4)):
@@ -227,14 +228,13 @@ def _made(program: str, cells: Tensor) -> Tensor:
 
 
 @cache
-def _module(path: str) -> ModuleType:
-    """A file of Python, run once."""
-    module = ModuleType(Path(path).stem)
+def _names(path: str) -> dict[str, Any]:
+    """What a file of Python defines, run once; it may import files beside it."""
+    sys.path.append(str(Path(path).resolve().parent))
     try:
-        exec(compile(Path(path).read_bytes(), path, "exec"), vars(module))
+        return run_path(path, run_name=Path(path).stem)
     except OSError as error:
         fix = "check the path, relative to the current folder"
         raise MeasurementError.of(f"'{path}' cannot be read ({error.strerror})", fix=fix) from error
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise MeasurementError.of(f"'{path}' does not run", got=f"{type(error).__name__}: {error}") from error
-    return module
