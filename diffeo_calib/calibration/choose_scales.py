@@ -201,7 +201,7 @@ FEWEST_REPEATS = 10
 SUPPORT = 2.0
 """Log marginal likelihood by which noise of each command must be better than noise of the device alone: the two numbers
 that it has more along three axes (H. Akaike, "A new look at the statistical model identification", 1974)."""
-NOTHING = 1e-6
+NOTHING = 1e-6  # share of a noise that counts as none
 
 
 def unresolved_errors(

@@ -201,7 +201,7 @@ class Drift:
     @property
     def parts(self) -> list[ChangedPart]:
         """What differs. Unless load or geometry are named it has to be clear: one worn joint changes nothing else."""
-        unclear = parts_of(self.rows.fitted) == [] or self.sizes[2] < gates.DRIFT_ODDS
+        unclear = not parts_of(self.rows.fitted) or self.sizes[2] < gates.DRIFT_ODDS
         if unclear and all(each.joint is not None for each in self.named):
             return [*self.named]
         if not self.named and not self.explains:
