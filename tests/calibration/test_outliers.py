@@ -26,7 +26,7 @@ from diffeo_calib.calibration.diagnostics.open_directions import warn_of_flat_pl
 from diffeo_calib.calibration.diagnostics.outliers import FAR, Outlier, contradicted, excluded
 from diffeo_calib.calibration.diagnostics.row_order import find_block, out_of_step
 from diffeo_calib.calibration.expected_errors import workspace_deviation
-from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
+from diffeo_calib.calibration.placing.readings import contradicted_in_sockets
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm
