@@ -130,11 +130,12 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
     }
     if isinstance(model, CalibratedKinematics):
         tensors |= {name: getattr(model, name) for name in ROBOT_TENSORS}
+        made = model.provenance
         entries = {
             "tool": None if torch.equal(model.tool, tool_transform(None)) else model.tool.tolist(),
             "tool_tip": model.tool_tip,
             "urdf": model.robot.source,
-            "provenance": None if model.provenance is None else entries_of(model.provenance),
+            "provenance": None if made is None else entries_of(made, *["program_rows"] * (not made.program_rows)),
             "ball": True if model.ball and model.map.workspace is None else None,
             "placement": [device.stored() for device in model.placement] or None,
         }

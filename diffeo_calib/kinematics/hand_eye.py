@@ -28,6 +28,8 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import twist_at
 from diffeo_calib.sensors.set_ups import NUMBERS_OF_A_FRAME, SESSION, TRANSFORMS, frame_slopes, own_slopes
 
+IN_TIP = "in_tip"
+
 
 @dataclass(frozen=True, eq=False)
 class KnownPose:
@@ -105,7 +107,7 @@ class HandEye:
         of_base = torch.block_diag(back, back) @ twist_at(geometry.base[:3, 3]) @ set_up.of_frame
         in_base = _covariance(model.map, geometry.slices["base"], by_base, set_up.columns, by_base @ of_base)
         tip, base = geometry.on[0], model.robot.base
-        there = KnownPose(carried, in_tip, tip, f"in the frame of '{tip}'", "in_tip")
+        there = KnownPose(carried, in_tip, tip, f"in the frame of '{tip}'", IN_TIP)
         poses = there, KnownPose(standing, in_base, base, "in the robot's base", "in_base")
         return cls(*(poses if camera_on_tool else reversed(poses)))
 

@@ -7,13 +7,17 @@ from typing import Any
 
 import pytest
 import torch
+from commanded_bank import CAMERA, flange
+from commanded_bank import seen as seen_poses
 from product_bank import usual_scales
 from simulated_camera import CameraArm, camera_arm
 from simulated_head import CAMERA as HEAD_CAMERA
 from simulated_head import CAMERA_AWAY, SeeingHead
 from table_bank import held, says
+from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.placing.lens import BoardSize
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.kinematics.hand_eye import HandEye, hand_eye_sentences
@@ -87,3 +91,24 @@ def test_the_optical_frame_is_where_it_is_in_the_link_of_the_camera() -> None:
     assert own.link == HEAD_CAMERA
     assert bool(((own.pose - truth)[:3, 3].abs() < 4 * own.deviations[:3]).all())
     assert float(own.deviations[:3].max()) < 3e-3
+
+
+def test_a_board_of_another_size() -> None:
+    """Its squares are 0.3 % larger than the detector was told: it is said, and the camera stays where it is."""
+    commanded, size = flange(), 3e-3
+    machine = dc.cartesian(commanded)
+    q, boards = dc.pose_inputs(machine, commanded), seen_poses(commanded, camera_on_tool=True)
+    boards[:, :3, 3] /= 1.0 + size
+    data = dc.Measurements.from_poses(q, boards, camera_on_tool=True, doubt=False)
+    smaller = boards.clone()
+    smaller[:, :3, 3] /= 1.0 + 1e-6
+    (part,) = BoardSize.of_table(data, torch.arange(len(q)))
+    moved = dc.Measurements.from_poses(q, smaller, camera_on_tool=True, doubt=False).points - data.points
+    assert_close(1e-3 * moved.flatten(1) / 1e-6, part.larger[..., 0], rtol=1e-3, atol=1e-7)
+    result = dc.calibrate(machine, data, hyperparameters=usual_scales(machine))
+    (line,) = [text for text in result.placement.sentences() if text.startswith("board: scale")]
+    assert abs(float(line.split()[2]) - 1e6 * size) < 4 * float(line.split()[4])
+    camera = HandEye.of(result.model).camera
+    off = (camera.pose - CAMERA)[:3, 3].abs()
+    assert bool((off < 3 * camera.deviations[:3]).all())
+    assert float(off.norm()) < 2e-4

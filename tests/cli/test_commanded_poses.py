@@ -267,8 +267,16 @@ def test_hand_eye_in_two_commands(tmp_path: Path, command: Command) -> None:
     assert 'calibration_type: "eye_in_hand"' in text
     x = float(text.partition("x: ")[2].partition("\n")[0])
     assert x == pytest.approx(float(CAMERA[0, 3]), abs=1e-3)
-    assert command("predict", model, table, "-o", tmp_path / "p.csv").code == 0
-    assert command("plan", model, "-n", "3", "-o", tmp_path / "n.csv").code == 0
+    done = command("predict", model, table, "-o", tmp_path / "p.csv")
+    assert "the poses are those of the camera on the tool, in the frame of the board that stands" in done.out
+    assert command("plan", model, "-n", "20", "--range", "X=450:600", "-o", tmp_path / "n.csv").code == 0
+    new = torch.tensor(
+        [[float(cell) for cell in row[:6]] for row in cells(tmp_path / "n.csv")[1:]], dtype=torch.float64
+    )
+    assert bool(((new[:, 0] >= 450) & (new[:, 0] <= 600)).all())
+    went = transforms(rotation_matrices(new[:, 3:], "xyz", angle="deg"), 1e-3 * new[:, :3])
+    there = (torch.linalg.inv(went @ CAMERA) @ BOARD)[:, :3, 3]
+    assert bool((there[:, 2] > 0.7 * there.norm(dim=1)).all()), "the board is ahead, in the rows within 38 degrees"
     done = command("correct", model, table, "-o", tmp_path / "d.csv")
     assert done.code == 0, done.error
     (header, *before), (_, *after) = cells(table), cells(tmp_path / "d.csv")

@@ -13,11 +13,11 @@ from diffeo_calib.calibration.diagnostics.hypotheses import BASE, MARKERS
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.placing.placement import DeviceSet, Elsewhere, OtherRows, Placement, Seen, Settled
 from diffeo_calib.calibration.placing.sessions import Sessions
-from diffeo_calib.cameras.board import LENS
+from diffeo_calib.cameras.board import LENS, BoardPrior
 from diffeo_calib.cameras.images import expected, sees
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
 from diffeo_calib.measurements.images import SharedErrors
-from diffeo_calib.measurements.poses import inverse_poses, poses_from_marks
+from diffeo_calib.measurements.poses import inverse_poses, pose_jacobian, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.board_camera import BoardCamera, BoardCameras, Explained
 from diffeo_calib.sensors.devices import OUTLIER_MEDIANS, ROW, Hypothesis, median_weights
@@ -57,6 +57,45 @@ class CameraErrors(DeviceSet):
             raise MeasurementError.of("rows of a camera", expected="images", got="none")
         (shared,) = other.aligned.table.shared_errors()
         return replace(self, shared=shared).measuring(other.aligned.rows, shared.seen_by)
+
+
+@dataclass(frozen=True, eq=False)
+class BoardSize(DeviceSet):
+    """The size of a board whose poses a camera on the tool measured: it is as large as the detector was told.
+
+    Args:
+        devices: without names, a model keeps what rows share. larger: (M, 9, 1) effects of one standard deviation, m.
+        found: what a fit says of it, in standard deviations of its prior, and how well; nothing before.
+    """
+
+    devices: BoardCameras
+    larger: Tensor
+    found: tuple[float, float] = (0.0, 1.0)
+
+    @classmethod
+    def of_table(cls, data: Any, rows: Tensor) -> list[Any]:
+        """Of a table of such poses, none for others; ``rows`` (M,) are its numbers in the whole table."""
+        if data.board is None or data.cameras:
+            return []
+        shift = torch.cat([data.board, torch.zeros_like(data.board)], 1)[..., None]
+        larger = BoardPrior().scale * pose_jacobian(data.frames, data.lever, data.board)[:, 0] @ shift
+        return [cls(BoardCameras.of_rows(rows, torch.zeros_like(rows)), larger)]
+
+    def effects(self, data: Seen) -> Tensor:
+        effects = data.y.new_zeros(*data.y.shape, 1)
+        effects[self.rows, : self.larger.shape[1]] = self.larger
+        return effects
+
+    def with_rows(self, other: OtherRows) -> Any:
+        (again,) = [] if other.aligned is None else self.of_table(other.aligned.table, other.aligned.rows)
+        return replace(again, found=self.found)
+
+    def settled(self, fit: Settled) -> BoardSize:
+        return replace(self, found=(float(fit.shifts[0]), float(fit.covariance[0, 0]) ** 0.5))
+
+    def sentences(self) -> list[str]:
+        size, std = (1e6 * BoardPrior().scale * value for value in self.found)
+        return [f"board: scale {size:+.0f} +- {std:.0f} ppm against the size that its detector was told"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,7 +42,7 @@ from diffeo_calib.calibration.identification.identification import (
     with_ball,
 )
 from diffeo_calib.calibration.identification.registration import register_sockets
-from diffeo_calib.calibration.placing.lens import LensAndBoard
+from diffeo_calib.calibration.placing.lens import BoardSize, LensAndBoard
 from diffeo_calib.calibration.placing.placement import Elsewhere, OtherLabel, OtherRows, Placement
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
@@ -357,6 +357,7 @@ def place(robot: Tree, data: Any, progress: Progress) -> Placed:
     model, count = fit.geometry, table.markers  # without a ball, which a device does not see
     check_identification(table, replace(fit, geometry=model.with_tool(model.tool[:count], model.on[:count])))
     cameras = LensAndBoard.of_table(table, coordinates.rows, registration, sessions)
+    cameras += BoardSize.of_table(table, coordinates.rows) if is_cartesian(robot) else []
     placement = Placement((*sessions, *cameras, *reading_sets(readings, fit.devices, "the measuring frame")))
     return Placed(data, coordinates._replace(table=table), placement, registration, fit)
 

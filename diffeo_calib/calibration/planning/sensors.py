@@ -14,20 +14,21 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import cos, radians
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import normalize, pad
 
-from diffeo_calib.calibration.planning.candidates import ranges_around
+from diffeo_calib.calibration.planning.candidates import Criterion, ranges_around
 from diffeo_calib.calibration.planning.knowledge import Scene, without_positions
 from diffeo_calib.cameras.images import expected, sees
 from diffeo_calib.common.checks import as_tensor, check_number
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.device_readings import FittedDevice
-from diffeo_calib.kinematics.hand_eye import SetUp
+from diffeo_calib.kinematics.hand_eye import IN_TIP, HandEye, SetUp
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import inverse_poses, pose_jacobian, poses_from_marks
 from diffeo_calib.robots.placement import PLACES
@@ -39,6 +40,9 @@ from diffeo_calib.sensors.set_ups import TRANSFORMS, frame_slopes
 NEW = -1
 """Number of an unknown that the scene does not have."""
 SMALLEST_REST_M = 1e-6
+FARTHER, LEAST_ASIDE, LEAST_INCLINED = 1.25, radians(10.0), radians(45.0)
+"""How much nearer or farther than in the rows of a fit a board may be; and how far from the middle of the view, or
+inclined, where the rows did not show it so."""
 
 
 class Told(NamedTuple):
@@ -162,6 +166,11 @@ class Positions(Sensor):
     """Positions of the markers, or poses."""
 
     of_positions: ClassVar[bool] = True
+    visible: Criterion | None = None  # of a camera that sees a board
+
+    def reached(self, base: Tensor) -> dict[str, Any]:
+        """Where a camera sees its board."""
+        return {} if self.visible is None else {"keep": self.visible}
 
     def told(self, scene: Scene, among: Tensor) -> Iterator[Told]:
         """At every configuration. The place of the device is unknown where it is new, or nothing shows the robot's."""
@@ -319,13 +328,45 @@ class BoardImages(Sensor):
         yield Told(self.name, rows, every, effects, columns, self._noise(noise))
 
 
+def view_of(model: CalibratedKinematics, eye: HandEye) -> Criterion:
+    """Whether a board is about as near, central and little inclined as in the rows of the fit; no lens is known."""
+    camera, board = (pose.pose for pose in (eye.camera, eye.board))
+    tip = model.robot.tips.index(model.geometry.on[0])
+
+    def seen(q: Tensor) -> tuple[Tensor, Tensor]:
+        """Directions of the board from the camera times distances (N, 3), m; cosines (N,) of its z axis to them."""
+        poses = model.robot.tip_poses(q)[:, tip]
+        there = (
+            inverse_poses(poses @ camera) @ board
+            if eye.camera.key == IN_TIP
+            else inverse_poses(camera[None]) @ poses @ board
+        )
+        return there[:, :3, 3], (there[:, :3, 2] * normalize(there[:, :3, 3], dim=1)).sum(1)
+
+    shown, cosines = seen(model.configurations)
+    away, middle = shown.norm(dim=1), normalize(normalize(shown, dim=1).mean(0), dim=0)
+    near, far, side = float(away.min()) / FARTHER, FARTHER * float(away.max()), float(cosines.median().sign())
+    aside = min(float((shown @ middle / away).min()), cos(LEAST_ASIDE))
+    flat = min(float((side * cosines).min()), cos(LEAST_INCLINED))
+
+    def visible(q: Tensor) -> Tensor:
+        shown, cosines = seen(q)
+        away = shown.norm(dim=1)
+        return (away > near) & (away < far) & (shown @ middle >= aside * away) & (side * cosines >= flat)
+
+    return visible
+
+
 def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
     """Sensors that measured the rows of a model, cameras, devices of readings and sockets where the fit found them.
 
     Raises:
         InputError: files of early versions, which do not say where devices of readings are.
     """
-    sensors: list[Sensor] = [] if without_positions(model) else [Positions(of_frames=model.lever is not None)]
+    sensors: list[Sensor] = []
+    if not without_positions(model):
+        eyes = [view_of(model, eye) for eye in HandEye.of_fit(model).values()]
+        sensors.append(Positions(of_frames=model.lever is not None, visible=eyes[0] if len(eyes) == 1 else None))
     for kit in model.placement:
         for k, (name, camera) in enumerate(kit.cameras.items()):
             sensors.append(BoardImages.last(model, name, camera, kit.rows[kit.device == k]))

@@ -38,6 +38,7 @@ from diffeo_calib.kinematics.evaluation import (
     rows_used_in_fit,
     unseen,
 )
+from diffeo_calib.kinematics.hand_eye import IN_TIP, HandEye
 from diffeo_calib.kinematics.joint_ranges import refuse_other_angles, repeated_lines, warn_outside_range
 from diffeo_calib.measurements.csv.cells import number
 from diffeo_calib.measurements.csv.columns import Columns
@@ -238,8 +239,11 @@ def run_predict(given: PredictOptions) -> None:
     with progress_bar() as progress:
         write_predictions(output, blocks(), written, prefixes=prefixes, more=readings.names, poses=with_poses)
     record.add(rows=len(q), files={"table": output})
-    what = "poses" if with_poses else "positions"
+    what, eye = "poses" if with_poses else "positions", next(iter(HandEye.of_fit(kinematics).values()), None)
     say(f"{len(q)} predictions written to {output}: joints, {what} and standard deviations of a new measurement")
+    if eye is not None:
+        on_tool, stands = ("camera", "board") if eye.camera.key == IN_TIP else ("board", "camera")
+        say(f"the poses are those of the {on_tool} on the tool, in the frame of the {stands} that stands")
     if kinematics.own_frame:
         say(OWN_FRAME)
     say(*readings.sentences())

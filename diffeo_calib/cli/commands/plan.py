@@ -27,6 +27,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.csv.joints import PoseColumns
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots.cartesian import SLIDES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.range import UNKNOWN_ZERO_M
 
@@ -124,11 +125,13 @@ def _cell(cell: Candidates, robot: Tree, table: TableFormat) -> dict[str, Any]:
 
 
 def _ranges(cell: Candidates, robot: Tree, table: TableFormat) -> dict[str, list[float]]:
-    """Name of a joint -> its range, rad or m."""
-    turns = dict(zip(robot.joint_names, robot.periodic, strict=True))
+    """Name of a joint -> its range, rad or m; a column of a commanded place stands for the slide that goes there."""
+    turns, columns = dict(zip(robot.joint_names, robot.periodic, strict=True)), as_written(table).joints
+    slides = dict(zip(columns.columns, SLIDES, strict=False)) if isinstance(columns, PoseColumns) else {}
     ranges = {}
     for text in cell.range or ():
         name, _, ends = text.rpartition("=")
+        name = slides.get(name, name)
         if not name or ends.count(":") != 1:
             raise InputError.of(f"--range {text}", expected="JOINT=A:B, such as joint_1=-90:90")
         numbers = stated_numbers("--range", ends.replace(":", ","), (2,))
