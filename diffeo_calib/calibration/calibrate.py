@@ -234,10 +234,7 @@ def _result(
     explained, outlying = parts(model), outliers(model, placed, data, chosen.judged, least)
     LOG.info("rows that look wrong and hardly count: %s", few([outlier.number for outlier in outlying], 20) or "none")
     warn_of_outliers(outlying, placed.data)
-    said = best and best.text
-    if best is None or not best.of_table:
-        said = placed.mislabelled(model, outlying) or said
-    warn_of_contradictions(model, placed.coordinates, outlying, said)
+    warn_of_contradictions(model, placed.coordinates, outlying, best and best.text)
     warn_of_rounding(robot, placed.data, data, chosen.left_out)
     found_lengths = lengths(data, scales, placed.placement.hypotheses(data, VALUE))
     summary = Summary(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +15,6 @@ from math_bank import normal
 from product_bank import Case, simulated, usual_scales, with_usual_scales
 from reading_bank import scales
 from simulated_sockets import rest_in_sockets
-from table_bank import warned
 from torch import Tensor
 from varied_arms import KINDS, VariedArm
 
@@ -226,32 +224,6 @@ def test_the_block_is_where_the_wrong_rows_are() -> None:
     wrong[45] = False
     assert find_block(wrong) == (40, 50)
     assert find_block(~wrong) is None  # nearly all rows
-
-
-# --- wrong labels -----------------------------------------------------------------------------------------------------
-
-ARM, ROWS = SimulatedArm(seed=0), 60
-
-
-def test_a_session_that_begins_earlier_than_said_and_a_payload_that_rows_did_not_carry() -> None:
-    """Of right labels nothing is said."""
-    whole = dc.Measurements(*ARM.measure(ROWS, seed=1))
-    points, names = whole.points.clone(), ["before"] * 33 + ["after"] * 27
-    points[30:] += torch.tensor([2e-3, -1e-3, 5e-4], dtype=torch.float64)
-    far = whole.points + 0.03 * (torch.arange(ROWS) >= 18)[:, None, None]
-    masses = torch.tensor([0.0, 5.0, 10.0], dtype=torch.float64)[torch.arange(ROWS) % 3]
-    laden, labels = dc.Measurements(*ARM.measure(ROWS, seed=1, payload=masses)), masses.clone()
-    labels[2:9:3] = 0.0
-    for data, words in (
-        (dc.Measurements(whole.q, points).with_sessions(names), "3 rows .* fit session 'after': lines 30, 31, 32"),
-        (dc.Measurements(whole.q, far).with_sessions(names), "15 rows .* fit session 'after': lines 18, 19, 20"),
-        (laden.with_payload(labels), "fit a payload of 10: lines 2,"),
-        (laden.with_payload(masses), ""),
-    ):
-        _, texts = warned(dc.calibrate, ARM.nominal, data, hyperparameters=scales())
-        found = [one for one in texts if "look wrong and fit" in one]
-        assert len(found) == bool(words)
-        assert all(re.search(words, one) for one in found), found
 
 
 # --- names that few rows carry ----------------------------------------------------------------------------------------

@@ -82,8 +82,6 @@ MEDIAN_EFFICIENCY = 0.5
 three and six numbers."""
 REMAINING_ERROR = 0.2
 """Largest part of a row's error that may remain with an explanation that is named."""
-REMAINING_UNDER_LABEL, LABEL_ROWS, MOST_MASSES = 0.3, 2, 10
-"""The same under another label, such as a session; rows that must fit it; payloads up to which each is a label."""
 OVERCONFIDENT = 3.0
 """Factor by which an error must exceed what the model's deviations exclude, outside of the rows of its fit."""
 BLOCK_SHARE, BLOCK_ROWS, BLOCK_CHANCE = 0.9, 4, 1e-3

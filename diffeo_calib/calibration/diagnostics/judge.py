@@ -80,12 +80,10 @@ class Finding(NamedTuple):
     """The best explanation in a sentence.
 
     Columns (N, R, U), m, are the effects of unknowns that the model shall have, with unit variance; None for none.
-    A wrong column of the table explains wrong rows, too.
     """
 
     text: str
     columns: Tensor | None
-    of_table: bool
 
 
 def judge(
@@ -135,7 +133,7 @@ def best_of(candidates: Iterable[Candidate], rows: SampledRows) -> Finding | Non
         fix += f"; the model holds for {best.opens}"
         columns = rows.in_coordinates(rows.process.numbers.in_table(best.columns))
         columns = OPENED_M * columns / columns[columns.any(2)].square().sum(1).mean().sqrt()
-    return Finding(sentence(best.what, expected=best.expected, got=got, fix=fix), columns, best.columns is NOTHING)
+    return Finding(sentence(best.what, expected=best.expected, got=got, fix=fix), columns)
 
 
 # --- changes during the measurements ----------------------------------------------------------------------------------

@@ -27,8 +27,8 @@ from diffeo_calib.calibration.diagnostics.plausibility import check_socket_regis
 from diffeo_calib.calibration.expected_errors import ExpectedError, workspace_deviation
 from diffeo_calib.calibration.identification.identification import (
     Identification,
+    KindRows,
     Prior,
-    ReadRows,
     Rows,
     described,
     solve,
@@ -330,7 +330,7 @@ def register_ball(robot: Tree, tables: Sequence[Readings]) -> Identification:
         start = register_sockets(bare, resting.q, resting.device)
         check_socket_registration(robot, resting, start)
         devices = [fitting_devices(table, start.geometry.points(table.q)) for table in tables]
-        return described(Rows(start.geometry, tuple(map(ReadRows, tables, devices))), adrift=True)
+        return described(Rows(start.geometry, tuple(map(KindRows.read, tables, devices))), adrift=True)
     return register_readings(bare, tables)
 
 
@@ -446,7 +446,7 @@ def _rough_fit(bare: Geometry, tables: Sequence[Readings], ball: Tensor, how: Ma
     """Ball and devices, from these in closed form around a ball (3,), errors of joints zero."""
     geometry = bare.with_tool(ball[None])
     devices = [kind_of(data).at(data, geometry.points(data.q)[:, 0]) for data in tables]
-    rows = Rows(geometry, tuple(map(ReadRows, tables, devices)))
+    rows = Rows(geometry, tuple(map(KindRows.read, tables, devices)))
     sigma = torch.full((sum(map(len, tables)),), ROUGH_M, dtype=torch.float64, device=HOST)
     root = Prior().root(geometry, range(geometry.slices["tool"].start))
     fit = solve(rows, sigma, root, max_nfev=STARTS_STEPS, loss="soft_l1", **how)
@@ -457,4 +457,4 @@ def _rough_fit(bare: Geometry, tables: Sequence[Readings], ball: Tensor, how: Ma
     )
     each = zip(rows.parts, fit.shifts.split(rows.freedom), strict=True)
     moved = [device for part, some in each for device in part.devices(some)]
-    return RoughFit(worst, Rows(geometry.absorb(fit.theta), tuple(map(ReadRows, tables, moved))), fit.errors)
+    return RoughFit(worst, Rows(geometry.absorb(fit.theta), tuple(map(KindRows.read, tables, moved))), fit.errors)
