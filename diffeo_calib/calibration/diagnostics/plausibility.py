@@ -395,7 +395,7 @@ def check_socket_registration(
     far = median > gates.SOCKET_FAR * robot.reach
 
     def left(reading: Reading) -> tuple[float, float]:
-        again = register_sockets(robot if around is None else around, reading.q, socket)
+        again = register_sockets(around or Geometry.nominal(robot), reading.q, socket)
         return float(again.distances.median()), max(spread(robot.tip_poses(reading.q)[..., :3, 3]), 1e-9)
 
     motion, tried = left(Reading.of(robot, data))[1], [partial(other_units, slides=far)]

@@ -82,7 +82,6 @@ class Identification:
     # or is Gaussian
     weights: tuple[Tensor, ...]
     freedom: float = inf  # of Student's t
-    shifts: tuple[Tensor, ...] = ()  # (c,) what the rows of every kind share
     devices: tuple[Devices, ...] = ()  # those of readings, in the order of their tables
     # root mean square distance of the measured bodies, each predicted by the others to first order [m]
     left_out: float = nan
@@ -208,7 +207,6 @@ class Rows:
             prior=prior,
             weights=tuple(_as_bodies(tails.weights, errors)),
             freedom=tails.freedom,
-            shifts=shifts,
             devices=tuple(each for part, some in zip(self.parts, shifts, strict=True) for each in part.devices(some)),
         )
 

@@ -112,14 +112,14 @@ class SocketRegistration(NamedTuple):
     distances: Tensor  # (N,) from the ball to its socket, m
 
 
-def register_sockets(robot: Tree | Geometry, q: Tensor, socket: Tensor) -> SocketRegistration:
+def register_sockets(bare: Geometry, q: Tensor, socket: Tensor) -> SocketRegistration:
     """Find ball and sockets, joint errors untouched.
 
     Args:
-        robot: n joints, with one tip; or a geometry, whose base and joint errors are kept: places are then in its
-            measuring frame. q: (N, n) joint values, rad or m. socket: (N,) number of the socket of each row.
+        bare: whose base and joint errors are kept: places are in its measuring frame. The ball is on the tip of the
+            first marker. q: (N, n) joint values, rad or m. socket: (N,) number of the socket of each row.
     """
-    bare = robot.with_tool(robot.tool[:1], robot.on[:1]) if isinstance(robot, Geometry) else Geometry.nominal(robot, 1)
+    bare = bare.with_tool(bare.tool[:1], bare.on[:1])
     poses = bare.marker_poses(q)[:, 0]
     R, t = poses[:, :3, :3], poses[:, :3, 3]
     weights = torch.ones_like(t[:, 0])

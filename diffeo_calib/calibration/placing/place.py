@@ -329,7 +329,7 @@ def place(robot: Tree, data: Any, progress: Progress) -> Placed:
     model, count = fit.geometry, table.markers  # without a ball, which a device does not see
     check_identification(table, replace(fit, geometry=model.with_tool(model.tool[:count], model.on[:count])))
     cameras = LensAndBoard.of_table(table, coordinates.rows, registration, sessions)
-    placement = Placement((*sessions, *cameras, *reading_sets(readings, fit.devices, "the measuring frame")))
+    placement = Placement((*sessions, *cameras, *reading_sets(readings, fit.devices)))
     return Placed(data, coordinates._replace(table=table), placement, registration, fit)
 
 
