@@ -19,7 +19,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.placing.place import Placed, place
-from diffeo_calib.calibration.placing.readings import SocketDevices, other_socket
+from diffeo_calib.calibration.placing.readings import SocketDevices
 from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places, leave_one_out
 from diffeo_calib.calibration.scales.selection import Selection, defaults
 from diffeo_calib.common.errors import MeasurementError
@@ -169,13 +169,6 @@ def test_rows_and_distances_that_cannot_be(plain: SimulatedArm, some: SocketRows
     ):
         with pytest.warns(dc.DiffeoCalibWarning, match=words):
             place(plain.nominal, table(some, **options), silent)
-
-
-def test_a_row_in_a_socket_says_why_it_is_far() -> None:
-    places = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
-    seen = torch.tensor([[1.0, 1e-3, 0.0], [0.0, 0.4, 0.0]], dtype=torch.float64)
-    assert "'b/0'" in other_socket(seen[0], places, ("a/0", "b/0"), 0.01)
-    assert "its socket" in other_socket(seen[1], places, ("a/0", "b/0"), 0.01)
 
 
 def test_rows_in_a_wrong_socket_are_named(plain: SimulatedArm, some: SocketRows) -> None:

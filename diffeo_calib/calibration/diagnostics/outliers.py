@@ -128,14 +128,11 @@ def outliers(
         sizes = each[kind.rows, 0].nan_to_num(0.0).norm(dim=1)
         shown = errors_of_kinds(left_out.errors, None, [kind]).main
         unit, per_unit = shown.shown
-        wrong = bad[kind.rows, 0].nonzero()[:, 0].tolist()
-        balls = model.at_payloads(kind.data.payload)(kind.data.q).detach()[:, -1] if wrong else ()
-        for number in wrong:
+        for number in bad[kind.rows, 0].nonzero()[:, 0].tolist():
             row, line = int(kind.rows[number]), int(kind.data.line_numbers[number])
             reading, size = (per_unit * float(shown.errors[number, 0]), unit), float(sizes[number])
             name, weight = kind.data.row_names[number], float(weights[row, 0])
-            reason = kind.reason(balls[number], gates.REMAINING_ERROR * size)
-            outlying.append(Outlier(row, None, line, name, size, weight, reason, reading=reading))
+            outlying.append(Outlier(row, None, line, name, size, weight, FAR, reading=reading))
     return sorted(outlying, key=lambda outlier: -outlier.distance)
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import inf, nan, sqrt
+from math import inf, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -83,8 +83,6 @@ class Identification:
     weights: tuple[Tensor, ...]
     freedom: float = inf  # of Student's t
     devices: tuple[Devices, ...] = ()  # those of readings, in the order of their tables
-    # root mean square distance of the measured bodies, each predicted by the others to first order [m]
-    left_out: float = nan
 
     @property
     def deviations(self) -> Tensor:
@@ -95,11 +93,6 @@ class Identification:
     def tails(self) -> Tails:
         """Tails of the first kind of rows, such as those that tell coordinates."""
         return Tails(self.freedom, self.weights[0])
-
-
-def with_ball(geometry: Geometry, ball: Geometry) -> Geometry:
-    """Add the marker of another geometry of the same robot, a ball."""
-    return geometry.with_tool(torch.cat([geometry.tool, ball.tool]), (*geometry.on, *ball.on))
 
 
 def held_parameters(geometry: Geometry, *, adrift: bool = False) -> tuple[int, ...]:
@@ -289,12 +282,11 @@ def estimated(rows: Rows, held: Sequence[int], prior: Prior | None = None) -> Id
         tails = reweight(squares / sigma.square() + fit.leverage / tails.weights, dim)
         if float(((sigma - before).abs() / sigma).max()) < NOISE_CHANGE:
             break
-    left_out = squares / (1.0 - fit.leverage / dim).square()
     if any(part is not whole for part, whole in zip(some.parts, rows.parts, strict=True)):
         errors = rows.errors(*at)
         (dim, kind) = sizes_and_kinds(errors)
         tails = reweight(body_squares(errors) / levels[kind].square(), dim)
-    return replace(rows.found(fit, noise, used, tails), left_out=float(left_out.nanmean().sqrt()))
+    return rows.found(fit, noise, used, tails)
 
 
 def _scaled(prior: Prior, root: Tensor, geometry: Geometry, fit: Fit) -> Prior:

@@ -211,9 +211,9 @@ CONSISTENT = 0.02
 """Residual, a median distance relative to the spread of the markers, with which rows need no draws."""
 EXAMINED, ACCEPTED, REMAINING = 0.01, 0.02, 0.3
 """Such residuals from which joint offsets are estimated and that may remain with them, and which part may remain."""
-LARGEST_OFFSET_RAD, LEFT_OUT = 0.8, 1.1
-"""Largest offset of a turning joint that is accepted, and the largest error of left-out points after a geometric
-calibration, in that of one without these offsets."""
+LARGEST_OFFSET_RAD, WORSE = 0.8, 1.1
+"""Largest offset of a turning joint that is accepted, and largest noise of a geometric calibration with offsets in that
+of one without."""
 REPORTED = 0.2
 """Smallest offset that is reported, as a part of the largest."""
 
@@ -268,7 +268,7 @@ def with_large_offsets(data: Measurements, registration: Identification, inliers
     if not explained or bool((turned.abs() > LARGEST_OFFSET_RAD).any()):
         return registration
     plain, other = (identify(start, data.q[inliers], data.points[inliers]) for start in (geometry, again.geometry))
-    if other.left_out > LEFT_OUT * plain.left_out:
+    if other.noise > WORSE * plain.noise:
         return registration
     named = zip(chain.joint_names, offsets.tolist(), chain.periodic, strict=True)
     each = [

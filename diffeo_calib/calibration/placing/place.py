@@ -36,7 +36,6 @@ from diffeo_calib.calibration.identification.identification import (
     estimated,
     held_parameters,
     identify,
-    with_ball,
 )
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.lens import LensAndBoard
@@ -318,7 +317,8 @@ def place(robot: Tree, data: Any, progress: Progress) -> Placed:
     if not all(map(sees_frame, tables)):
         fitted = identify(geometry, table.q, table.points).geometry  # a nominal robot may miss its ball by centimetres
         ball = ball_of(tables, fitted, ball_tip(readings, geometry.on[-1]))
-        geometry = geometry if ball is None else with_ball(geometry, ball)
+        if ball is not None:
+            geometry = geometry.with_tool(torch.cat([geometry.tool, ball.tool]), (*geometry.on, *ball.on))
     devices = tuple(fitting_devices(other, geometry.points(other.q)) for other in tables)
     rows = Rows(geometry, (KindRows.positions(table.q, table.points), *map(KindRows.read, tables, devices)))
     if ball is not None:

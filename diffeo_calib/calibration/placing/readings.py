@@ -21,7 +21,6 @@ from torch import Tensor
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_flat_places
-from diffeo_calib.calibration.diagnostics.outliers import FAR
 from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration
 from diffeo_calib.calibration.expected_errors import ExpectedError, workspace_deviation
 from diffeo_calib.calibration.identification.identification import (
@@ -59,10 +58,6 @@ class ReadingDevices(DeviceSet):
 
     devices: Devices
     data: Readings
-
-    def reason(self, ball: Tensor, small: float) -> str:
-        """Probable cause of a row whose readings are wrong: its ``ball`` (3,), ``small`` an error that fits, m."""
-        return FAR
 
     @property
     def numbers(self) -> Tensor:
@@ -131,9 +126,6 @@ class SocketDevices(ReadingDevices):
         """(S, 3) most probable places, m."""
         return self.devices.constants
 
-    def reason(self, ball: Tensor, small: float) -> str:
-        return other_socket(ball, self.positions, self.names, small)
-
     def elsewhere(self, row: int, points: Tensor, devices: Placement) -> Elsewhere:
         if not bool((self.rows == row).any()):
             return super().elsewhere(row, points, devices)
@@ -200,25 +192,13 @@ class SocketDevices(ReadingDevices):
         return [*super().sentences(), f"{what}: {1e3 * self.left_out_spread:.4f} mm{among}"]
 
 
-def other_socket(ball: Tensor, positions: Tensor, names: Sequence[str], small: float) -> str:
-    """Why a ball (3,) is far from its socket: it may be in another one of places (S, 3), at most ``small`` m away."""
-    away = (ball - positions).norm(dim=1)
-    nearest = int(away.argmin())
-    if float(away[nearest]) > small:
-        return "far from where the other rows of its socket predict it"
-    return f"fits socket '{names[nearest]}': named after a wrong one?"
-
-
-SETS: Mapping[str, type[ReadingDevices]] = {KIND: SocketDevices}
-"""Sets of devices of readings but :class:`ReadingDevices`."""
-
-
 def reading_sets(readings: Sequence[OtherReadings], devices: Sequence[Devices]) -> tuple[ReadingDevices, ...]:
     """Sets of devices and their rows, with what is known of them before a fit, around places where they were found."""
     sets = list[ReadingDevices]()
     for (table, rows), old in zip(readings, devices, strict=True):
         around = type(old).of(table, old.constants)
-        sets.append(SETS.get(table.kind, ReadingDevices)(around, table).measuring(rows, around.numbers(table)))
+        kind = SocketDevices if table.kind == KIND else ReadingDevices
+        sets.append(kind(around, table).measuring(rows, around.numbers(table)))
     return tuple(sets)
 
 
