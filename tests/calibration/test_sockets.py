@@ -18,6 +18,8 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.choose_scales import ChosenScales
+from diffeo_calib.calibration.diagnostics.plausibility import check_socket_registration
+from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.placing.readings import SocketDevices
 from diffeo_calib.calibration.scales.leave_one_out import inflation_by_places, leave_one_out
@@ -26,7 +28,7 @@ from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.measurements.sockets import SocketReadings
 from diffeo_calib.regression.regions import region_factor
-from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots import Geometry, SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
 
 DISTANCES = {("0", "1"): 0.05}
@@ -185,6 +187,15 @@ def test_names_that_say_nothing_are_warned_about(plain: SimulatedArm, some: Sock
     names = tuple(some.names[(7 * row) % 36] for row in range(36))
     with pytest.warns(dc.DiffeoCalibWarning, match="the ball is in no socket"):
         place(plain.nominal, table(some, names), silent)
+
+
+def test_a_tool_that_never_turns(plain: SimulatedArm, some: SocketRows) -> None:
+    q = some.q[:1].repeat(12, 1)
+    q = q + 1e-4 * torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype)
+    data = dc.Measurements.from_sockets(q, ["a"] * 12)
+    found = register_sockets(Geometry.nominal(plain.nominal), data.q, data.device)
+    with pytest.raises(MeasurementError, match="the tool hardly turns"):
+        check_socket_registration(plain.nominal, data, found)
 
 
 def test_tables_that_cannot_be_made(some: SocketRows) -> None:

@@ -383,7 +383,7 @@ def check_markers(robot: Tree, data: Measurements) -> None:
 def check_socket_registration(
     robot: Tree, data: SocketReadings, fit: SocketRegistration, around: Geometry | None = None
 ) -> None:
-    """Refuse rows that fit with one mistake undone, and known distances that are the robot's in another unit.
+    """Refuse rows that fit with one mistake undone, a tool that never turns, and distances in another unit.
 
     Warns:
         DiffeoCalibWarning: a ball in no socket, a known distance that is not the robot's.
@@ -407,6 +407,9 @@ def check_socket_registration(
     said = {"expected": expected, "got": f"a median of {1e3 * median:.3g} mm"}
     otherwise = fix + "place and of the socket in it" if far else None
     check_fit(robot, data, median, what, **said, otherwise=otherwise, groups=tried, judge=left)
+    if fit.turning < gates.TURNED:
+        what = "the tool hardly turns while the ball rests in a socket: where the ball is on the tool is not determined"
+        raise MeasurementError.of(what, fix="measure each socket with the tool turned and tilted in many ways")
     for first, second, length in data.sockets.distances:
         apart = float((fit.positions[first] - fit.positions[second]).norm())
         there = (socket == first) | (socket == second)

@@ -110,6 +110,7 @@ class SocketRegistration(NamedTuple):
     geometry: Geometry  # with the ball as its marker; where the base is not known, it is the measuring frame
     positions: Tensor  # (S, 3) the sockets in the measuring frame, m
     distances: Tensor  # (N,) from the ball to its socket, m
+    turning: float  # largest RMS motion of the ball's place by turns of the tool in the sockets, per unit of its offset
 
 
 def register_sockets(bare: Geometry, q: Tensor, socket: Tensor) -> SocketRegistration:
@@ -134,7 +135,9 @@ def register_sockets(bare: Geometry, q: Tensor, socket: Tensor) -> SocketRegistr
         before, weights = weights, median_weights(distances, HALF_WEIGHT_MEDIANS)
         if float((weights - before).abs().max()) < SETTLED:
             break
-    return SocketRegistration(bare.with_tool(ball[None]), _means(R @ ball + t, socket, weights), distances)
+    return SocketRegistration(
+        bare.with_tool(ball[None]), _means(R @ ball + t, socket, weights), distances, float(s[0]) / len(A) ** 0.5
+    )
 
 
 def socket_means(points: Tensor, socket: Tensor) -> Tensor:

@@ -72,12 +72,8 @@ class Sessions(DeviceSet):
             other = MeasuringFrames if table.remounted else MountedMarkers
             ratio = cls.find(robot, table, other)[1] / median if table.lever is None else 1.0
             if ratio < TOLD_APART:
-                what, stayed = (
-                    ("device was moved", "markers") if table.remounted else ("markers were remounted", "device")
-                )
-                words = (
-                    f"the sessions fit {1 / ratio:.2g} times better if the {what} between them and the {stayed} stayed"
-                )
+                moved = ("markers were mounted anew", "device was moved")[table.remounted]
+                words = f"the sessions fit {1 / ratio:.2g} times better if between them the {moved} and all else stayed"
                 option = "leave out" if table.remounted else "add"
                 fix = f"{option} --remounted (in Python `remounted=True` of `with_sessions`) if that is so"
                 warn_user(sentence(words, fix=fix))
@@ -97,16 +93,15 @@ class Sessions(DeviceSet):
             start = registered_geometry(robot, data.q, together.points, marker_tips(robot, data))
             geometry = identify(start, data.q, together.points).geometry
         away = (geometry.points(data.q) - together.points).norm(dim=2)
-        each = [sessions.rows[sessions.device == number] for number in range(len(sessions.names))]
-        medians = [float(away[rows].nanmedian()) for rows in each]
-        worst = max(range(len(each)), key=lambda number: medians[number])
-        median, rows = medians[worst], each[worst]
+        each = [(sessions.rows[sessions.device == number], name) for number, name in enumerate(sessions.names)]
+        median, worst = max((float(away[rows].nanmedian()), number) for number, (rows, _) in enumerate(each))
+        rows, name = each[worst]
         alone = data.rows(rows).with_sessions(None)
         if median > gates.GEOMETRIC_RESIDUAL * spread(alone.points):
             try:
                 refuse_mistakes(robot, alone)
             except MeasurementError as error:
-                raise MeasurementError(f"session '{sessions.names[worst]}': {error}") from error
+                raise MeasurementError(f"session '{name}': {error}") from error
         return sessions, median
 
     @classmethod
