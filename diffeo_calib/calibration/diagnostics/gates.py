@@ -186,7 +186,7 @@ READING_ROWS = 40
 UNSEEN = 0.05
 """Motion of a reading, relative to that of a coordinate of the ball, below which it does not show a joint."""
 TURNED, TILTED = 0.02, 0.05
-"""Motion by turns of the tool, per unit of the ball's offset, below which its place is open in any direction, or one."""
+"""Motion by turns of the tool, per unit of the ball's offset, below which its place is open: anywhere, or one way."""
 SIZE_SHARE = 0.8
 """Share of the expected error from which the robot's size is warned about."""
 SOCKET_SURPLUS = 6
