@@ -28,13 +28,14 @@ from diffeo_calib.calibration.choose_scales import (
 from diffeo_calib.calibration.diagnostics import gates
 from diffeo_calib.calibration.diagnostics.hypotheses import lengths, warn_of_lengths, worth_it
 from diffeo_calib.calibration.diagnostics.judge import Finding, judge, warn_of_taken_scales
-from diffeo_calib.calibration.diagnostics.judged_rows import warn_of_contradictions
-from diffeo_calib.calibration.diagnostics.open_directions import warn_of_single_joints, warn_of_what_is_open
-from diffeo_calib.calibration.diagnostics.outliers import (
+from diffeo_calib.calibration.diagnostics.judged_rows import (
+    common_cause,
+    flagged,
     outliers,
     warn_of_outliers,
     warn_of_stuck,
 )
+from diffeo_calib.calibration.diagnostics.open_directions import warn_of_single_joints, warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.plausibility import (
     check_joints,
     check_limits,
@@ -45,7 +46,7 @@ from diffeo_calib.calibration.expected_errors import with_open_directions
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.result import CalibrationResult, parts
 from diffeo_calib.common.checks import check_count, check_seed
-from diffeo_calib.common.device import outside_inference_mode
+from diffeo_calib.common.device import HOST, outside_inference_mode
 from diffeo_calib.common.errors import InputError, as_written, few, kept_warnings, warn_user
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fit import fit
@@ -237,7 +238,11 @@ def _result(
     said = best and best.text
     if best is None or not best.of_table:
         said = placed.mislabelled(model, outlying) or said
-    warn_of_contradictions(model, placed.coordinates, outlying, said)
+    if placed.coordinates is not None:
+        table, rows = placed.coordinates
+        said = common_cause(model, table, flagged(len(data.x), outlying)[rows.to(HOST)], said)
+    if said:
+        warn_user(said)
     warn_of_rounding(robot, placed.data, data, chosen.left_out)
     found_lengths = lengths(data, scales, placed.placement.hypotheses(data, VALUE))
     summary = Summary(

@@ -21,10 +21,18 @@ from torch import Tensor
 from varied_arms import KINDS, VariedArm
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.judged_rows import block_text, steps_of
+from diffeo_calib.calibration.diagnostics.judged_rows import (
+    FAR,
+    Outlier,
+    block_text,
+    contradicted,
+    excluded,
+    find_block,
+    steps_of,
+)
+from diffeo_calib.calibration.diagnostics.judged_rows import flagged as flags_of
+from diffeo_calib.calibration.diagnostics.likely_mistakes import out_of_step
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_flat_places
-from diffeo_calib.calibration.diagnostics.outliers import FAR, Outlier, contradicted, excluded
-from diffeo_calib.calibration.diagnostics.row_order import find_block, out_of_step
 from diffeo_calib.calibration.expected_errors import workspace_deviation
 from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
@@ -99,9 +107,7 @@ def test_an_outlier_among_repeats_is_recognised(arm: Case) -> None:
     points = torch.cat([arm.train.points, simulated(1)[0].true_points(arm.train.q[:20]) + noise])
     points[5] += aside(0.003, 5)
     result = with_usual_scales(arm.robot, dc.Measurements(torch.cat([arm.train.q, arm.train.q[:20]]), points))
-    (found,) = result.outliers
-    assert found.row == 5
-    assert "repeated measurements of this pose agree with the model" in found.reason
+    assert [found.row for found in result.outliers] == [5]
     assert held_out(result, arm.test) < 1.3 * arm.held_out()[2]
 
 
@@ -221,7 +227,7 @@ def test_a_wrong_pose_is_named(posed: Case) -> None:
 )
 def test_a_block_of_rows_that_moved_together(rows: slice, words: str, arm: Case) -> None:
     data = changed(arm, rows, ASIDE)
-    text = block_text(arm.model, data, contradicted(arm.model, data))
+    text = block_text(arm.model, data, flags_of(len(data), contradicted(arm.model, data)))
     assert text.startswith(f"10 rows look wrong that follow one another: {words} a median error of 200 mm")
     assert "moving the measuring device by 200 mm" in text
 

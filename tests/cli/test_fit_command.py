@@ -11,7 +11,7 @@ import torch
 from command_bank import STAGES, Command, Outcome, Site
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.outliers import Outlier, outlier_lines
+from diffeo_calib.calibration.diagnostics.judged_rows import Outlier, outlier_lines
 from diffeo_calib.calibration.result import parts
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat

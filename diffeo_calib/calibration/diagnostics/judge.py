@@ -42,10 +42,8 @@ from diffeo_calib.regression.conditional import Process
 from diffeo_calib.robots.placement import PLACES
 from diffeo_calib.sensors.devices import Hypothesis
 
-ROUNDS = 20
-"""Of the codes of a mixture."""
-MISTYPED = (10.0, 0.1, 1000.0, 0.001, 1 / 0.45359237, 0.45359237)
-"""Factors of payloads in another unit, or with a wrong digit: g, pounds."""
+ROUNDS = 20  # of the codes of a mixture
+MISTYPED = (10.0, 0.1, 1000.0, 0.001, 1 / 0.45359237, 0.45359237)  # payloads with a wrong digit, in g, in pounds
 ONE_SET_UP = "one set-up for all rows, in the order of their numbers"
 NOTHING = torch.zeros(0, 0, dtype=torch.float64, device=HOST)
 OPENED_M = 0.01
@@ -59,12 +57,11 @@ SLOW = (
 
 
 class Candidate(NamedTuple):
-    """An explanation that chance does not explain, in words, and the unknowns that it opens.
+    """An explanation that chance does not explain, in words.
 
     Args:
-        left, most: parts of the RMS left-out error that remain with them, and that may remain. opens: rows for which
-            the model holds, those without effects, once they are opened in it; none if not. columns: (M, U) their
-            effects on the numbers of the rows, of any size.
+        left, most: parts of the RMS left-out error that remain with it, and that may remain. columns: (M, U) effects of
+            unknowns of any size that it opens. opens: the rows for which the model then holds; none if it is not to.
     """
 
     what: str
@@ -77,15 +74,11 @@ class Candidate(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """The best explanation in a sentence.
-
-    Columns (N, R, U), m, are the effects of unknowns that the model shall have, with unit variance; None for none.
-    A wrong column of the table explains wrong rows, too.
-    """
+    """The best explanation in a sentence."""
 
     text: str
-    columns: Tensor | None
-    of_table: bool
+    columns: Tensor | None  # (N, R, U) effects, m, of unknowns of unit variance that the model shall have
+    of_table: bool  # whether a column of the table is wrong, which explains wrong rows, too
 
 
 def judge(
@@ -127,10 +120,8 @@ def best_of(candidates: Iterable[Candidate], rows: SampledRows) -> Finding | Non
     if best is None or best.left > best.most:
         return None
     moved = left_out_rms(rows.process) * (1.0 - best.left**2) ** 0.5
-    got = (
-        f"about {1e3 * moved:.2g} mm of error, and leave-one-out errors that fall to {100 * best.left:.0f} % beside it"
-    )
     fix, columns = best.fix, None
+    got = f"about {1e3 * moved:.2g} mm of error; leave-one-out errors fall to {100 * best.left:.0f} % beside it"
     if best.opens and moved < OPENED_M:
         fix += f"; the model holds for {best.opens}"
         columns = rows.in_coordinates(rows.process.numbers.in_table(best.columns))
@@ -142,19 +133,13 @@ def best_of(candidates: Iterable[Candidate], rows: SampledRows) -> Finding | Non
 
 
 class Change(NamedTuple):
-    """A hypothesis from a row on, or drifting over all rows.
-
-    Args:
-        hypothesis: with effects (N, R, U). codes: (N,) of the rows, see above. size: (U,) unknowns, of a drift between
-            the first row and the last. gain: what it explains. row: the first one after a change, in the order of
-            measurement; None for a drift.
-    """
+    """A hypothesis from a row on, or drifting over all rows."""
 
     hypothesis: Hypothesis
-    codes: Tensor
-    size: Tensor
-    gain: float
-    row: int | None
+    codes: Tensor  # (N,) of the rows, see above
+    size: Tensor  # (U,) unknowns, of a drift between the first row and the last
+    gain: float  # what it explains
+    row: int | None  # the first one after a change, in the order of measurement; None for a drift
 
     @property
     def evidence(self) -> float:
@@ -168,13 +153,8 @@ class Change(NamedTuple):
             verb = verb if self.row is None else "to have changed"
             return f"{name} seems {verb} by about {self.hypothesis.amount(float(self.size.abs().max()))}"
         distances = rows.distances(self.hypothesis.effects, self.size)
-        typical = distances[distances.amax(1) > 0].median(0).values
-        distance = float(typical[typical > 0].median())
-        if name == MARKERS and rows.basis is None:
-            distance = float(typical.max())
-            single = float(typical.min()) < gates.OTHER_MARKERS * distance
-            name = f"marker {int(typical.argmax())}" if single else name
-        return f"{name} seems {verb} by about {self.hypothesis.amount(distance)}"
+        typical = distances[distances.amax(1) > 0].median(0).values  # of each marker
+        return f"{name} seems {verb} by about {self.hypothesis.amount(float(typical.max()))}"
 
 
 def changed(
@@ -191,13 +171,9 @@ def changed(
         yield from changed_twice(rows, cause, order, names, once, excess=excess)
     if not clear:
         return
-    others = [
-        change
-        for change in tried
-        if (change.row is not None) == sudden
-        and change.hypothesis.name != what
-        and min(best.gain - change.gain, best.evidence - change.evidence) < gates.CHANGES_TOLD_APART
-    ]
+    alike = [each for each in tried if (each.row is not None) == sudden and each.hypothesis.name != what]
+    falls = [min(best.gain - other.gain, best.evidence - other.evidence) for other in alike]
+    others = [other for other, fall in zip(alike, falls, strict=True) if fall < gates.CHANGES_TOLD_APART]
     words = ", or ".join(dict.fromkeys(change.words(rows) for change in (best, *others)))
     words += " (these rows do not tell which)" * bool(others)
     words += " over the rows" if best.row is None else f" near {names[order[best.row]]}"

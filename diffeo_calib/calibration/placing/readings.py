@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics import gates
-from diffeo_calib.calibration.diagnostics.outliers import FAR
+from diffeo_calib.calibration.diagnostics.judged_rows import FAR
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import (
     Identification,

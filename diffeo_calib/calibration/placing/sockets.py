@@ -16,13 +16,12 @@ from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics import gates
+from diffeo_calib.calibration.diagnostics.judged_rows import Outlier, excluded
 from diffeo_calib.calibration.diagnostics.open_directions import warn_of_flat_places
-from diffeo_calib.calibration.diagnostics.outliers import Outlier, excluded
 from diffeo_calib.calibration.diagnostics.plausibility import (
     check_readings,
     check_socket_registration,
     check_sockets,
-    warn_of_other_robot,
     warn_of_wrong_sockets,
 )
 from diffeo_calib.calibration.expected_errors import workspace_deviation
@@ -249,8 +248,7 @@ def check_beside(robot: Tree, device: Measurements, start: Identification, table
     """Check rows in sockets beside measured positions; ``start``: the registration of these."""
     if (resting := resting_rows(tables)) is not None:
         fit = register_sockets(start.geometry, resting.q, resting.device)
-        check_socket_registration(robot, resting, fit, start.geometry)
-        warn_of_other_robot(robot, device, start, fit)
+        check_socket_registration(robot, resting, fit, (start.geometry, device))
 
 
 def warn_of_wrong_names(tables: Sequence[Readings], geometry: Geometry) -> None:
