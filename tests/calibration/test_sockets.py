@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -13,7 +12,7 @@ from kind_bank import kind_named
 from product_bank import with_usual_scales
 from reading_bank import scales
 from simulated_sockets import SocketRows, rest_in_sockets
-from table_bank import refused, warned
+from table_bank import refused
 from tangent_bank import covariance
 from torch import Tensor
 
@@ -31,7 +30,6 @@ from diffeo_calib.measurements.sockets import SocketReadings
 from diffeo_calib.regression.regions import region_factor
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
-from diffeo_calib.sensors.tool_frames import SocketPlaces
 
 DISTANCES = {("0", "1"): 0.05}
 
@@ -117,23 +115,6 @@ def test_deviations_grow_where_places_contradict_each_other(data: SocketReadings
     assert inflation_by_places(tangent, wide, data.places, data.device, groups) == region_factor(6, 3)
 
 
-def test_distances_of_a_block_have_one_error() -> None:
-    """The size of what the places span is known as well as the block's distance, not better for more places."""
-    names = [f"{place}/{socket}" for place in "abcdef" for socket in "01"]
-    at = torch.rand(12, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    at[1::2] = at[::2] + torch.tensor([0.05, 0.0, 0.0])
-    q = torch.zeros(12, 1, dtype=torch.float64)
-    mean = torch.zeros(12, 3, dtype=torch.float64)
-    mean[1::2, 0], mean[::2, 0] = 1 / 6, -1 / 6  # of the six distances
-    for distances, deviation in (
-        ({("0", "1"): 0.05}, 1e-4),
-        ({(f"{p}/0", f"{p}/1"): 0.05 + 1e-9 * k for k, p in enumerate("abcdef")}, 1e-4 / 6**0.5),
-    ):
-        data = dc.Measurements.from_sockets(q, names, distances=distances, distance_std=1e-4, doubt=False)
-        places = SocketPlaces.of(data, at)
-        assert float((mean.flatten() @ places.root).norm()) == pytest.approx(deviation, rel=0.01)
-
-
 def test_a_size_that_is_not_the_robots_is_warned_about(arm: SimulatedArm, rows: SocketRows) -> None:
     names = arm.nominal.joint_names
     wrong = dc.Measurements.from_sockets(rows.q, rows.names, names, distances={("0", "1"): 0.051}, distance_std=3e-5)
@@ -208,18 +189,6 @@ def test_rows_in_a_wrong_socket_are_named(plain: SimulatedArm, some: SocketRows)
         placed = place(plain.nominal, table(some, tuple(names)), silent)
     weights = placed.identification.tails.weights.flatten()
     assert (weights < 1e-3).nonzero()[:, 0].tolist() == [3, 20], "the other rows of these sockets count"
-
-
-def test_a_known_distance_is_judged_by_how_well_its_own_rows_fit(plain: SimulatedArm, some: SocketRows) -> None:
-    """Bent links leave its sockets apart from the others."""
-    data, found = table(some), register_sockets(plain.nominal, some.q, table(some).device)
-    positions, own = found.positions.clone(), data.device < 2
-    positions[1] += positions[1] - positions[0]
-    spread = found.distances.masked_fill(own, 0.02)
-    for distances, doubted in ((found.distances, True), (spread, False)):
-        again = replace(found, positions=positions, distances=distances)
-        _, texts = warned(check_socket_registration, plain.nominal, data, again)
-        assert any("known distance of the sockets" in one for one in texts) == doubted
 
 
 @pytest.mark.filterwarnings("ignore:the known distance")
